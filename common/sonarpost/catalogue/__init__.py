@@ -1,0 +1,1 @@
+"""The shared tile database: built (Table IV), stored, identified by hash, loaded."""

@@ -1,0 +1,1 @@
+"""Image codecs: one interface, one registry, one file a codec."""

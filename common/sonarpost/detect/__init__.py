@@ -1,0 +1,1 @@
+"""Target detection: filters, fusion, contacts."""

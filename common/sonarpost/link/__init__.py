@@ -1,0 +1,1 @@
+"""The acoustic link without input or output: wire formats, fragments, assembly."""

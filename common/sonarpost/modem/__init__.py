@@ -1,0 +1,1 @@
+"""NMEA sentences and the Micro-Modem driver, as pure state machines."""

@@ -1,0 +1,1 @@
+"""What makes a service a process: configuration, Zenoh session, durable hand-off, health, logs."""

@@ -1,0 +1,1 @@
+"""The simulated world: seabed and survey, water, emulated modems."""

@@ -1,0 +1,1 @@
+"""Survey readers and writers, geometry, snippets and image files."""

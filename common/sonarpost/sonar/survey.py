@@ -1,0 +1,106 @@
+"""The survey as every reader delivers it: pings of one sonar, port and starboard, with navigation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+Samples = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.uint32]
+FloatImage = npt.NDArray[np.float32]
+
+
+class Side(str, Enum):
+    """Which side of the vehicle a channel looks to."""
+
+    PORT = "port"
+    STARBOARD = "starboard"
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelPing:
+    """One channel of one ping.
+
+    Attributes:
+        side: Port or starboard.
+        samples: Echo strength, shape (n,), the file's own integer dtype; **index 0 is nearest the vehicle** on
+            both sides, whatever order the file uses.
+        slant_range_m: Slant range of the last sample's far edge, in metres.
+        frequency_hz: Sonar frequency where the file gives it.
+    """
+
+    side: Side
+    samples: Samples
+    slant_range_m: float
+    frequency_hz: float | None = None
+
+    @property
+    def sample_spacing_m(self) -> float:
+        """Slant range covered by one sample, in metres."""
+        return self.slant_range_m / self.samples.shape[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Ping:
+    """One ping: its navigation and its channels. A value the file does not give is None, never a guess."""
+
+    number: int
+    time_utc_s: float
+    channels: tuple[ChannelPing, ...]
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    heading_deg: float | None = None
+    altitude_m: float | None = None
+    depth_m: float | None = None
+    speed_mps: float | None = None
+    pitch_deg: float | None = None
+    roll_deg: float | None = None
+
+    def channel(self, side: Side) -> ChannelPing | None:
+        """Return the channel that looks to `side`, or None."""
+        return next((c for c in self.channels if c.side is side), None)
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """A recording held in memory (a file of about 1000 pings).
+
+    Attributes:
+        path: Where it was read from.
+        sonar_id: Name of the sonar as the file gives it, or "unknown".
+        line_name: Survey line, normally the file's stem.
+        pings: In the order of recording.
+        warnings: What the reader met and could explain (a ping without a fix, a skipped packet type), one line each.
+    """
+
+    path: Path
+    sonar_id: str
+    line_name: str
+    pings: tuple[Ping, ...]
+    warnings: tuple[str, ...] = field(default_factory=tuple)
+
+    def sides(self) -> tuple[Side, ...]:
+        """Return the sides that at least one ping has, port first."""
+        present = {c.side for p in self.pings for c in p.channels}
+        return tuple(s for s in Side if s in present)
+
+    def waterfall(self, side: Side) -> FloatImage:
+        """Return one side as an image, shape (pings, samples), float32 in the file's units.
+
+        Row i is `pings[i]`; column 0 is nearest the vehicle. A ping without that channel, and samples beyond a
+        shorter ping, are NaN.
+        """
+        width = max((c.samples.shape[0] for p in self.pings for c in p.channels if c.side is side), default=0)
+        image = np.full((len(self.pings), width), np.nan, dtype=np.float32)
+        for row, ping in enumerate(self.pings):
+            channel = ping.channel(side)
+            if channel is not None:
+                image[row, : channel.samples.shape[0]] = channel.samples
+        return image
+
+    def __iter__(self) -> Iterator[Ping]:
+        return iter(self.pings)

@@ -1,0 +1,1 @@
+"""One folder a process; run as python -m services.<name> --config FILE."""
