@@ -1,0 +1,58 @@
+"""What a packet of each Micro-Modem rate holds and how long it occupies the water.
+
+Source: the modem's host interface documents as collected by Goby3's and WHOI's drivers; rates 0, 1, 4 and 5 are
+Table I of the paper this project re-creates (32, 192, 512 and 2048 bytes a packet). Air times are nominal: they vary with firmware, probe
+length and bandwidth, so the driver's configuration can replace them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """One rate of the modem.
+
+    Attributes:
+        number: 0..6, as in `CCCYC`.
+        modulation: Modulation and code, for people.
+        frames: Frames in a packet.
+        frame_bytes: Bytes in a frame.
+        airtime_s: Nominal time a packet occupies the water, in seconds, however full its frames are.
+    """
+
+    number: int
+    modulation: str
+    frames: int
+    frame_bytes: int
+    airtime_s: float
+
+    @property
+    def packet_bytes(self) -> int:
+        """Bytes in a packet with every frame full."""
+        return self.frames * self.frame_bytes
+
+    @property
+    def throughput_bps(self) -> float:
+        """Bits a second while a full packet is on the air."""
+        return 8 * self.packet_bytes / self.airtime_s
+
+
+RATES: Mapping[int, Rate] = MappingProxyType(
+    {
+        rate.number: rate
+        for rate in (
+            Rate(0, "FH-FSK", frames=1, frame_bytes=32, airtime_s=3.2),
+            Rate(1, "PSK BCH 128:8", frames=3, frame_bytes=64, airtime_s=6.1),
+            Rate(2, "PSK DSS 1/15", frames=3, frame_bytes=64, airtime_s=3.1),
+            Rate(3, "PSK DSS 1/7", frames=2, frame_bytes=256, airtime_s=3.4),
+            Rate(4, "PSK BCH 64:10", frames=2, frame_bytes=256, airtime_s=3.2),
+            Rate(5, "PSK Hamming 14:9", frames=8, frame_bytes=256, airtime_s=3.1),
+            Rate(6, "PSK DSS 1/15 with probe", frames=6, frame_bytes=32, airtime_s=3.25),
+        )
+    }
+)
+"""Every rate by its number."""
