@@ -1,8 +1,8 @@
 r"""NMEA sentences as the Micro-Modem speaks them: `$BODY*HH\r\n`, HH the XOR of the body in upper-case hex.
 
-`parse` reads one line, `format` writes one, and `LineAssembler` cuts a byte stream into lines. The assembler is
-what faces the serial port: whatever bytes it is given, it answers with sentences and `SentenceError` items, raises
-nothing and keeps at most one sentence in memory.
+`parse` reads one line, `format` writes one, and `LineAssembler` cuts a byte stream into sentences. The assembler
+is what faces the serial port: whatever bytes it is given, it answers with sentences and `SentenceError` items,
+raises nothing and keeps at most one sentence in memory.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def format(kind: str, *fields: str | int) -> bytes:  # noqa: A001 - always calle
     r"""Return `$kind,field,…*HH\r\n`.
 
     Raises:
-        SentenceError: A kind that is not capitals and digits, a field that holds `$`, `*`, `,` or anything outside
-            printable ASCII, or a sentence longer than `MAX_SENTENCE_BYTES`.
+        SentenceError: A kind that is not capitals and digits, a field that holds `$`, `*`, `,` or anything
+            outside printable ASCII, or a sentence longer than `MAX_SENTENCE_BYTES`.
     """
     if not _KIND.fullmatch(kind):
         raise SentenceError("sentence to send", "kind", kind, "3 to 12 capitals and digits")
@@ -76,7 +76,8 @@ def parse(line: bytes, where: str = "modem line", *, checksum_required: bool = F
         checksum_required: Refuse a line without a checksum (one that may have lost its tail).
 
     Raises:
-        SentenceError: No `$` in front, characters that no sentence has, a wrong or half checksum, no valid kind.
+        SentenceError: No `$` in front, characters that no sentence has, a wrong or half checksum, no valid
+            kind, or longer than `MAX_SENTENCE_BYTES`.
     """
     text = line.rstrip(b"\r\n")
     if len(text) > MAX_SENTENCE_BYTES:
@@ -103,9 +104,10 @@ def parse(line: bytes, where: str = "modem line", *, checksum_required: bool = F
 class LineAssembler:
     r"""Cuts a byte stream into sentences, in bounded memory.
 
-    A line ends at CR, LF, or at the `$` of the next one: a line whose end was lost still counts when its checksum
-    is there and right. Bytes between sentences are one `SentenceError` a run (NULs and blanks, as a port gives when
-    a modem powers up, are none), a line beyond `MAX_SENTENCE_BYTES` is one, and reading goes on at the next `$`.
+    A line ends at CR, LF, or at the `$` of the next one: a line whose end was lost still counts when its
+    checksum is there and right. Bytes between sentences are one `SentenceError` a run (NULs and blanks, as a port
+    gives when a modem powers up, are none), a line beyond `MAX_SENTENCE_BYTES` is one, and reading goes on at the
+    next `$`.
     """
 
     def __init__(self, where: str = "modem port") -> None:
