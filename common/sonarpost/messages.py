@@ -1,0 +1,287 @@
+"""Everything that travels on Zenoh, as frozen records.
+
+A record is validated when it is made, so a record that exists is right. On the wire it is a plain msgpack map with
+two fields more, `type` and `v` (see `sonarpost.wire`); `docs/wire-zenoh.md` describes the same for other languages.
+A value that is not known is None: nothing is ever guessed. Times are seconds since 1970-01-01 UTC.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+PlatformId = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")]
+ImageId = Annotated[str, Field(pattern=r"^[0-9A-Z]{4}$")]
+Text = Annotated[str, Field(max_length=2000)]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+ModelHash = Annotated[str, Field(pattern=r"^([0-9a-f]{64})?$")]
+Time = Annotated[float, Field(ge=0, le=253402300799)]
+Metres = Annotated[float, Field(ge=0, le=20000)]
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+Longitude = Annotated[float, Field(ge=-180, le=180)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Address = Annotated[int, Field(ge=0, le=127)]
+
+Channel = Literal["port", "starboard"]
+Verdict = Literal["mine_like", "not_mine_like", "unsure"]
+CommandKind = Literal["refine", "resend", "revisit"]
+ServiceState = Literal["starting", "ok", "degraded", "stopping"]
+
+
+class Record(BaseModel):
+    """Base of every record: frozen, strictly typed, unknown fields ignored (a newer minor version adds fields)."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
+
+    TYPE: ClassVar[str] = ""
+    VERSION: ClassVar[int] = 1
+
+
+class Raster(Record):
+    """A grey picture: rows along-track, columns across-track, row by row, little endian."""
+
+    TYPE: ClassVar[str] = "raster"
+
+    height_px: Annotated[int, Field(ge=1, le=4096)]
+    width_px: Annotated[int, Field(ge=1, le=4096)]
+    bits: Literal[8, 16]
+    data: bytes
+
+    @model_validator(mode="after")
+    def _length_fits(self) -> Raster:
+        expected = self.height_px * self.width_px * self.bits // 8
+        if len(self.data) != expected:
+            raise ValueError(f"data of {expected} bytes for {self.height_px} x {self.width_px} px of {self.bits} bits")
+        return self
+
+    @classmethod
+    def from_array(cls, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> Raster:
+        """Make a raster of a two-dimensional uint8 or uint16 array."""
+        bits: Literal[8, 16] = 8 if image.dtype == np.uint8 else 16
+        data = image.astype("<u1" if bits == 8 else "<u2").tobytes()
+        return cls(height_px=image.shape[0], width_px=image.shape[1], bits=bits, data=data)
+
+    def to_array(self) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+        """Return a new array, shape (height_px, width_px), uint8 or uint16."""
+        shape = (self.height_px, self.width_px)
+        if self.bits == 8:
+            return np.frombuffer(self.data, dtype=np.uint8).reshape(shape).copy()
+        return np.frombuffer(self.data, dtype="<u2").reshape(shape).astype(np.uint16)
+
+    @property
+    def sha256(self) -> str:
+        """Hex digest of the pixel bytes, by which two platforms compare pictures."""
+        return hashlib.sha256(self.data).hexdigest()
+
+
+class Contact(Record):
+    """What the detector knows of one object. `atd_confidence` is 0.0 to 2.0, as in the paper.
+
+    `height_m` is shadow x altitude / (slant range + shadow), on a flat bottom.
+    """
+
+    TYPE: ClassVar[str] = "contact"
+
+    contact_id: Annotated[str, Field(min_length=1, max_length=120)]
+    vehicle_id: PlatformId
+    sonar_id: Text | None = None
+    line_name: Text | None = None
+    ping_number: Annotated[int, Field(ge=0)] | None = None
+    channel: Channel | None = None
+    time_utc_s: Time | None = None
+    lat_deg: Latitude | None = None
+    lon_deg: Longitude | None = None
+    position_sigma_m: Metres | None = None
+    depth_m: Annotated[float, Field(ge=-100, le=12000)] | None = None
+    altitude_m: Metres | None = None
+    heading_deg: Annotated[float, Field(ge=0, lt=360)] | None = None
+    speed_mps: Annotated[float, Field(ge=-50, le=50)] | None = None
+    slant_range_m: Metres | None = None
+    ground_range_m: Metres | None = None
+    atd_class: Annotated[str, Field(max_length=60)] | None = None
+    atd_confidence: Annotated[float, Field(ge=0, le=2)] | None = None
+    length_m: Metres | None = None
+    width_m: Metres | None = None
+    shadow_m: Metres | None = None
+    height_m: Metres | None = None
+    pixel_along_m: Annotated[float, Field(gt=0, le=100)] | None = None
+    pixel_across_m: Annotated[float, Field(gt=0, le=100)] | None = None
+
+
+class Snippet(Record):
+    """A contact and its picture (the paper's imgToCompress). The nadir is to the left where the sonar is known."""
+
+    TYPE: ClassVar[str] = "snippet"
+
+    contact: Contact
+    picture: Raster
+    source: Text = ""
+
+
+class EncodedImage(Record):
+    """A picture as a codec stream, ready for the acoustic link (imgToDecompress, UUV side)."""
+
+    TYPE: ClassVar[str] = "encoded_image"
+
+    vehicle_id: PlatformId
+    image_id: ImageId
+    contact: Contact
+    codec: Annotated[str, Field(min_length=1, max_length=40)]
+    model: ModelHash
+    height_px: Annotated[int, Field(ge=1, le=4096)]
+    width_px: Annotated[int, Field(ge=1, le=4096)]
+    stream: Annotated[bytes, Field(min_length=8, max_length=65543)]
+    original_sha256: Sha256
+
+
+class LinkQuality(Record):
+    """What the receiving modem measured of one packet (from CACST)."""
+
+    TYPE: ClassVar[str] = "link_quality"
+
+    snr_in_db: float | None = None
+    snr_out_db: float | None = None
+    spl_db: float | None = None
+    mse_db: float | None = None
+    doppler_mps: float | None = None
+    frames: Annotated[int, Field(ge=0)] | None = None
+    bad_frames: Annotated[int, Field(ge=0)] | None = None
+
+
+class AcousticFrame(Record):
+    """One frame that went into the water (`tx`) or came out of it (`rx`)."""
+
+    TYPE: ClassVar[str] = "acoustic_frame"
+
+    direction: Literal["tx", "rx"]
+    platform_id: PlatformId
+    time_utc_s: Time
+    source: Address
+    destination: Address
+    rate: Annotated[int, Field(ge=0, le=6)]
+    packet: Annotated[int, Field(ge=0)]
+    frame_number: Annotated[int, Field(ge=1, le=8)]
+    frame_count: Annotated[int, Field(ge=0, le=8)]
+    data: Annotated[bytes, Field(max_length=2048)]
+    quality: LinkQuality | None = None
+
+
+class ReconstructedImage(Record):
+    """A picture as the surface vessel rebuilt it (imgToDecompress, operator side, decoded).
+
+    Attributes:
+        version: 1 for the first picture given out under this identifier; more when later frames added to it.
+        missing_mask: One bit a pixel, row by row, most significant first, 1 where nothing was received or what was
+            received cannot be right (those pixels are black); empty when nothing is missing.
+    """
+
+    TYPE: ClassVar[str] = "reconstructed_image"
+
+    vessel_id: PlatformId
+    vehicle_id: PlatformId
+    image_id: ImageId
+    version: Annotated[int, Field(ge=1)]
+    contact: Contact | None
+    codec: Annotated[str, Field(max_length=40)]
+    model: ModelHash
+    picture: Raster
+    picture_sha256: Sha256
+    complete: bool
+    missing_fraction: Fraction
+    missing_mask: bytes
+    missing_halves: tuple[Literal["top", "bottom"], ...]
+    bytes_received: Annotated[int, Field(ge=0)]
+    bytes_total: Annotated[int, Field(ge=0)]
+    frames_received: Annotated[int, Field(ge=0)]
+    first_frame_utc_s: Time
+    last_frame_utc_s: Time
+    notes: tuple[Text, ...] = ()
+
+    @model_validator(mode="after")
+    def _picture_and_mask_fit(self) -> ReconstructedImage:
+        if self.picture.sha256 != self.picture_sha256:
+            raise ValueError("picture_sha256 of the picture's bytes")
+        size = (self.picture.height_px * self.picture.width_px + 7) // 8
+        if len(self.missing_mask) not in (0, size):
+            raise ValueError(f"missing_mask of 0 or {size} bytes")
+        return self
+
+    def missing(self) -> npt.NDArray[np.bool_]:
+        """Return the mask of missing pixels, shape (height_px, width_px)."""
+        shape = (self.picture.height_px, self.picture.width_px)
+        if not self.missing_mask:
+            return np.zeros(shape, dtype=np.bool_)
+        bits = np.unpackbits(np.frombuffer(self.missing_mask, dtype=np.uint8))
+        return bits[: shape[0] * shape[1]].reshape(shape).astype(np.bool_)
+
+
+class Decision(Record):
+    """What an operator decided about one picture."""
+
+    TYPE: ClassVar[str] = "decision"
+
+    decision_id: Annotated[str, Field(min_length=1, max_length=64)]
+    vessel_id: PlatformId
+    vehicle_id: PlatformId
+    image_id: ImageId
+    image_version: Annotated[int, Field(ge=1)]
+    verdict: Verdict
+    confidence: Fraction | None = None
+    mlo_class: Annotated[str, Field(max_length=60)] | None = None
+    remark: Text = ""
+    operator: Annotated[str, Field(min_length=1, max_length=120)]
+    decided_utc_s: Time
+
+
+class Command(Record):
+    """What the vessel asks of a vehicle, carried by sound."""
+
+    TYPE: ClassVar[str] = "command"
+
+    command_id: Annotated[str, Field(min_length=1, max_length=64)]
+    kind: CommandKind
+    vehicle_id: PlatformId
+    image_id: ImageId | None = None
+    lat_deg: Latitude | None = None
+    lon_deg: Longitude | None = None
+    issued_by: Annotated[str, Field(min_length=1, max_length=120)]
+    issued_utc_s: Time
+
+    @model_validator(mode="after")
+    def _kind_has_its_object(self) -> Command:
+        if self.kind == "revisit":
+            if self.lat_deg is None or self.lon_deg is None:
+                raise ValueError("lat_deg and lon_deg for a revisit")
+        elif self.image_id is None:
+            raise ValueError(f"image_id for a {self.kind}")
+        return self
+
+
+class Relayed(Record):
+    """Envelope of what the vessel sends ashore: another record's key and payload, unchanged."""
+
+    TYPE: ClassVar[str] = "relayed"
+
+    vessel_id: PlatformId
+    key: Annotated[str, Field(min_length=1, max_length=300)]
+    payload: bytes
+    relayed_utc_s: Time
+
+
+class Health(Record):
+    """A service's state, published at intervals."""
+
+    TYPE: ClassVar[str] = "health"
+
+    platform_id: PlatformId
+    service: Annotated[str, Field(min_length=1, max_length=40)]
+    time_utc_s: Time
+    started_utc_s: Time
+    state: ServiceState
+    detail: Text = ""
+    counters: dict[str, int]
+    gauges: dict[str, float]

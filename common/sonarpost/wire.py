@@ -1,0 +1,84 @@
+"""Records to msgpack bytes and back.
+
+A payload is one plain msgpack map: the record's fields plus `type` (which record) and `v` (schema version). Any
+msgpack library reads it without sonarpost. Fields that are unknown are ignored, a field that is missing, of another
+type or out of range is refused with the key and the field's name.
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import msgpack
+from pydantic import ValidationError
+
+from sonarpost.errors import PayloadError
+from sonarpost.messages import Record
+
+R = TypeVar("R", bound=Record)
+
+MAX_PAYLOAD_BYTES = 40 * 1024 * 1024
+ENCODING_PREFIX = "application/msgpack;schema=sonarpost."
+
+
+def encoding_of(record_type: type[Record]) -> str:
+    """Return the Zenoh encoding of a record type: application/msgpack;schema=sonarpost.contact.v1."""
+    return f"{ENCODING_PREFIX}{record_type.TYPE}.v{record_type.VERSION}"
+
+
+def encode(record: Record) -> bytes:
+    """Return the record as msgpack bytes; equal records give equal bytes."""
+    fields = {"type": record.TYPE, "v": record.VERSION, **record.model_dump()}
+    packed: bytes = msgpack.packb(fields, use_bin_type=True)
+    return packed
+
+
+def unpack_map(payload: bytes, where: str) -> dict[str, object]:
+    """Return the payload's map, without looking into it.
+
+    Raises:
+        PayloadError: Not msgpack, trailing bytes, or not a map with text keys.
+    """
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise PayloadError(where, "payload", f"{len(payload)} bytes", f"at most {MAX_PAYLOAD_BYTES} bytes")
+    try:
+        value = msgpack.unpackb(payload, raw=False, use_list=False, strict_map_key=True)
+    except (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException) as error:
+        raise PayloadError(
+            where, "payload", payload[:40], f"a msgpack map ({error or type(error).__name__})"
+        ) from error
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise PayloadError(where, "payload", value, "a msgpack map with text keys")
+    return value
+
+
+def decode(record_type: type[R], payload: bytes, where: str) -> R:
+    """Return the record that `payload` holds.
+
+    Args:
+        record_type: What the key promises.
+        payload: msgpack bytes.
+        where: Key expression (or file) named in errors.
+
+    Raises:
+        PayloadError: Not that record; names key, field, value and what was expected.
+    """
+    fields = unpack_map(payload, where)
+    for name, expected in (("type", record_type.TYPE), ("v", record_type.VERSION)):
+        if fields.get(name) != expected:
+            raise PayloadError(where, name, fields.get(name), repr(expected))
+    try:
+        return record_type.model_validate(fields)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field = ".".join(str(part) for part in first["loc"]) or record_type.TYPE
+        value = "nothing" if first["type"] == "missing" else first["input"]
+        raise PayloadError(where, field, value, _expected(first["msg"])) from error
+
+
+def _expected(message: str) -> str:
+    """Turn pydantic's sentence into what stands after 'expected'."""
+    for prefix in ("Input should be ", "Value error, "):
+        if message.startswith(prefix):
+            return message[len(prefix) :]
+    return message
