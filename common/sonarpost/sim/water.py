@@ -1,0 +1,208 @@
+"""The water between the modems: travel time, half duplex, collisions, loss and damage.
+
+Pure: packets and `now` in, events out. The rules, all of them:
+
+- A packet occupies its whole air time, however full its frames are, and reaches every other modem after
+  range / sound speed. Positions count at the moment of transmission.
+- Half duplex: whatever overlaps a modem's own transmission is not heard by it, not even in part.
+- Packets whose arrivals overlap at a receiver destroy each other there, whatever their strengths (no capture effect)
+  and whether or not they were meant for it; one packet may collide at one modem and arrive whole at another.
+  Arrivals that only touch do not overlap.
+- A packet may be lost whole (nothing is detected), each non-empty frame may be lost on its own (a bad CRC is
+  noticed), and the tail of the last non-empty frame may be damaged and still pass for good.
+- With `range_loss`, the frame error rate that belongs to the rate and the signal-to-noise ratio is added, and below
+  `DETECTION_SNR_DB` nothing is detected.
+- Draws depend on (seed, transmitter, its packet number, receiver, frame) alone, so a run can be repeated.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from sonarpost.sim.water_chance import Dice, damage_tail
+from sonarpost.sim.water_physics import Position, frame_error_rate, snr_db
+from sonarpost.sim.water_records import (
+    ArrivalEnded,
+    ArrivalStarted,
+    Fate,
+    FrameArrival,
+    Outcome,
+    Packet,
+    Transmission,
+    WaterConfig,
+)
+
+DETECTION_SNR_DB = -12.0
+"""With `range_loss`, packets weaker than this are not noticed at all."""
+
+_SNR_SPREAD_DB = 1.0
+
+
+@dataclass(slots=True)
+class _Arrival:
+    """A transmission at one receiver, `start_s` to `end_s`."""
+
+    receiver: int
+    transmission: Transmission
+    start_s: float
+    end_s: float
+    range_m: float
+    snr_db: float
+    lost: bool
+    detected: bool = False
+    resolved: bool = False
+
+
+@dataclass(slots=True)
+class _Place:
+    """What the water remembers about one modem."""
+
+    position: Position
+    sent: int = 0
+    transmissions: list[Transmission] = field(default_factory=list)
+    arrivals: list[_Arrival] = field(default_factory=list)
+
+
+class Water:
+    """The shared medium of any number of modems.
+
+    Args:
+        config: What the water does.
+        positions: Where each modem is, by its number.
+    """
+
+    def __init__(self, config: WaterConfig, positions: Mapping[int, Position]) -> None:
+        self.config = config
+        self._places = {modem: _Place(position) for modem, position in positions.items()}
+        # (time, 0 for an end and 1 for a start, order, arrival): ends come first, since touching is not overlapping
+        self._events: list[tuple[float, int, int, _Arrival]] = []
+        self._order = 0
+
+    @property
+    def in_flight(self) -> int:
+        """How many arrivals are still to end."""
+        return sum(not arrival.resolved for place in self._places.values() for arrival in place.arrivals)
+
+    def move(self, modem: int, position: Position) -> None:
+        """Put a modem elsewhere; packets already on their way keep their travel time."""
+        self._places[modem].position = position
+
+    def next_event_s(self) -> float | None:
+        """Return the simulated time of the next event, or None while the water is quiet."""
+        return self._events[0][0] if self._events else None
+
+    def transmit(self, modem: int, packet: Packet, now: float) -> Transmission:
+        """Put a packet into the water at `now`.
+
+        Raises:
+            ValueError: The modem is still transmitting, or `airtime_s` is not above zero.
+        """
+        place = self._places[modem]
+        self._forget(place, now)
+        if packet.airtime_s <= 0:
+            raise ValueError(f"airtime_s: got {packet.airtime_s!r}, expected above 0")
+        if any(now < sent.ended_s for sent in place.transmissions):
+            raise ValueError(f"modem {modem} transmits until {place.transmissions[-1].ended_s}, not again at {now}")
+        place.sent += 1
+        sent = Transmission(modem, place.sent, packet, now, now + packet.airtime_s)
+        place.transmissions.append(sent)
+        for receiver, other in self._places.items():
+            if receiver != modem:
+                self._send_towards(receiver, other, sent, place.position)
+        return sent
+
+    def poll(self, now: float) -> list[ArrivalStarted | ArrivalEnded]:
+        """Return what happened up to and including `now`, in order of time."""
+        happened: list[ArrivalStarted | ArrivalEnded] = []
+        while self._events and self._events[0][0] <= now:
+            at_s, is_start, _, arrival = heapq.heappop(self._events)
+            if is_start:
+                if self._detect(arrival, at_s):
+                    happened.append(ArrivalStarted(arrival.receiver, at_s, arrival.transmission))
+            else:
+                happened.append(self._resolve(arrival, at_s))
+        return happened
+
+    def _send_towards(self, receiver: int, place: _Place, sent: Transmission, origin: Position) -> None:
+        range_m = origin.range_m(place.position)
+        start_s = sent.started_s + range_m / self.config.sound_speed_m_per_s
+        dice = Dice(self.config.seed, sent.transmitter, sent.number, receiver)
+        level_db = snr_db(range_m, self.config.snr_at_1m_db) + _SNR_SPREAD_DB * (2 * dice.uniform("snr") - 1)
+        lost = dice.happens(self.config.packet_loss, "packet loss") or (
+            self.config.range_loss and level_db < DETECTION_SNR_DB
+        )
+        if not sent.packet.frames:  # an acknowledgement or mini-packet is lost like a frame, and then not noticed
+            lost = lost or dice.happens(self._frame_loss(sent.packet.rate, level_db), "frame loss")
+        end_s = start_s + sent.packet.airtime_s
+        arrival = _Arrival(receiver, sent, start_s, end_s, range_m, level_db, lost)
+        place.arrivals.append(arrival)
+        for at_s, is_start in ((start_s, 1), (end_s, 0)):
+            self._order += 1
+            heapq.heappush(self._events, (at_s, is_start, self._order, arrival))
+
+    def _frame_loss(self, rate: int, level_db: float) -> float:
+        by_range = frame_error_rate(rate, level_db) if self.config.range_loss else 0.0
+        return 1.0 - (1.0 - self.config.frame_loss) * (1.0 - by_range)
+
+    def _detect(self, arrival: _Arrival, at_s: float) -> bool:
+        place = self._places[arrival.receiver]
+        transmitting = any(sent.started_s <= at_s < sent.ended_s for sent in place.transmissions)
+        busy = any(other.detected and not other.resolved for other in place.arrivals)
+        arrival.detected = not (arrival.lost or transmitting or busy)
+        return arrival.detected
+
+    def _resolve(self, arrival: _Arrival, at_s: float) -> ArrivalEnded:
+        arrival.resolved = True
+        outcome = self._outcome(arrival)
+        self._forget(self._places[arrival.receiver], at_s)
+        return ArrivalEnded(
+            arrival.receiver,
+            at_s,
+            arrival.transmission,
+            outcome,
+            arrival.detected,
+            self._frames(arrival, outcome),
+            arrival.range_m,
+            arrival.snr_db,
+            arrival.start_s - arrival.transmission.started_s,
+        )
+
+    def _outcome(self, arrival: _Arrival) -> Outcome:
+        place = self._places[arrival.receiver]
+        if any(sent.started_s < arrival.end_s and arrival.start_s < sent.ended_s for sent in place.transmissions):
+            return Outcome.TRANSMITTING
+        if any(
+            other is not arrival and other.start_s < arrival.end_s and arrival.start_s < other.end_s
+            for other in place.arrivals
+        ):
+            return Outcome.COLLISION
+        return Outcome.LOST if arrival.lost else Outcome.ARRIVED
+
+    def _frames(self, arrival: _Arrival, outcome: Outcome) -> tuple[FrameArrival, ...]:
+        sent = arrival.transmission
+        dice = Dice(self.config.seed, sent.transmitter, sent.number, arrival.receiver)
+        loss = self._frame_loss(sent.packet.rate, arrival.snr_db)
+        last = max((n for n, data in enumerate(sent.packet.frames, start=1) if data), default=0)
+        arrivals = []
+        for number, data in enumerate(sent.packet.frames, start=1):
+            received, fate = data, Fate.DELIVERED
+            if not data:
+                fate = Fate.EMPTY
+            elif outcome is not Outcome.ARRIVED or dice.happens(loss, "frame loss", number):
+                received, fate = b"", Fate.LOST
+            elif number == last and dice.happens(self.config.tail_damage, "tail damage"):
+                kind, fraction = self.config.tail_damage_kind, self.config.tail_fraction
+                received = damage_tail(data, dice, number, kind, fraction)
+                fate = Fate.DELIVERED if received == data else Fate.DAMAGED
+            arrivals.append(FrameArrival(number, fate, data, received))
+        return tuple(arrivals)
+
+    @staticmethod
+    def _forget(place: _Place, now: float) -> None:
+        """Drop what can no longer overlap anything: all that ended before the earliest arrival still open began."""
+        earliest_s = min((a.start_s for a in place.arrivals if not a.resolved), default=now)
+        earliest_s = min(earliest_s, now)
+        place.arrivals = [a for a in place.arrivals if not a.resolved or a.end_s > earliest_s]
+        place.transmissions = [t for t in place.transmissions if t.ended_s > earliest_s]
