@@ -1,0 +1,228 @@
+"""The tile database both ends of the link share, and the search for the tile most like a piece of a picture.
+
+Tiles are compared after projection on a principal-component basis, as the paper does (70 dimensions kept). Mean and
+basis are held as **integers** (the basis in units of 1/4096), so projections and squared distances are integers that
+float64 holds exactly: the matrix product gives the same distances, and so the same indices, whatever the processor
+or the linear-algebra library. A stream encoded on one machine is byte for byte the stream of any other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from sonarpost.errors import CatalogueError
+
+MIN_TILE_PX = 4
+MAX_TILE_PX = 32  # a squared distance of 32 x 32 tiles in units of (1/4096)^2 still fits float64's 53 bits
+MAX_DIMS = 70
+BASIS_SCALE = 4096
+
+_QUERY_BLOCK = 256
+_TILE_BLOCK = 4096
+
+Tiles = npt.NDArray[np.uint8]
+Basis = npt.NDArray[np.int16]
+Indices = npt.NDArray[np.int64]
+Distances = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TileDatabase:
+    """A fixed list of tiles with the space they are compared in.
+
+    Attributes:
+        tile_px: Side of the square tiles, 4..32 px.
+        tiles: Shape (n, tile_px * tile_px), uint8, each row one tile in raster order; n is at least 1.
+        mean: Shape (tile_px * tile_px,), uint8, subtracted before projection.
+        basis: Shape (dims, tile_px * tile_px), int16, rows are unit vectors times 4096; 1..70 dims.
+        projections: Shape (n, dims), float64 holding integers: `(tiles - mean) @ basis.T`.
+
+    Raises:
+        CatalogueError: A shape, dtype or count is not as above.
+    """
+
+    tile_px: int
+    tiles: Tiles
+    mean: Tiles
+    basis: Basis
+    projections: npt.NDArray[np.float64] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        pixels = self.tile_px * self.tile_px
+        _check("tile_px", self.tile_px, f"{MIN_TILE_PX}..{MAX_TILE_PX}", MIN_TILE_PX <= self.tile_px <= MAX_TILE_PX)
+        _check_array("tiles", self.tiles, np.dtype(np.uint8), (max(1, self.tiles.shape[0]), pixels))
+        _check_array("mean", self.mean, np.dtype(np.uint8), (pixels,))
+        dims = min(max(1, self.basis.shape[0]), MAX_DIMS, pixels)
+        _check_array("basis", self.basis, np.dtype(np.int16), (dims, pixels))
+        for name in ("tiles", "mean", "basis"):
+            # A private, read-only copy: the identity below must stay true for as long as the object lives.
+            array = np.array(getattr(self, name), order="C")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        projections = self.project(self.tiles)
+        projections.setflags(write=False)
+        object.__setattr__(self, "projections", projections)
+
+    @classmethod
+    def from_tiles(cls, tile_px: int, tiles: Tiles, dims: int = MAX_DIMS) -> TileDatabase:
+        """Make a database whose basis is the principal components of its own tiles.
+
+        Args:
+            tile_px: Side of a tile in pixels.
+            tiles: Shape (n, tile_px * tile_px), uint8.
+            dims: Dimensions to keep, 1..70; fewer are kept where the tiles span fewer.
+
+        Raises:
+            CatalogueError: Shapes or counts outside the documented ranges.
+        """
+        _check("dims", dims, f"1..{MAX_DIMS}", 1 <= dims <= MAX_DIMS)
+        _check("tile_px", tile_px, f"{MIN_TILE_PX}..{MAX_TILE_PX}", MIN_TILE_PX <= tile_px <= MAX_TILE_PX)
+        _check_array("tiles", tiles, np.dtype(np.uint8), (max(1, tiles.shape[0]), tile_px * tile_px))
+        mean, basis = principal_basis(tiles, dims)
+        return cls(tile_px, tiles, mean, basis)
+
+    def __len__(self) -> int:
+        return int(self.tiles.shape[0])
+
+    @property
+    def dims(self) -> int:
+        """Dimensions of the space tiles are compared in."""
+        return int(self.basis.shape[0])
+
+    @cached_property
+    def identity(self) -> str:
+        """Hex sha256 over everything that decides a picture or an index (see docs/catalogue.md)."""
+        digest = hashlib.sha256(b"sonarpost tile database 1\n")
+        digest.update(struct.pack(">HIH", self.tile_px, len(self), self.dims))
+        digest.update(self.tiles.tobytes())
+        digest.update(self.mean.tobytes())
+        digest.update(self.basis.astype(">i2").tobytes())
+        return digest.hexdigest()
+
+    def project(self, tiles: Tiles) -> npt.NDArray[np.float64]:
+        """Return the coordinates of tiles, shape (m, dims), float64 holding integers (1/4096 grey level).
+
+        Args:
+            tiles: Shape (m, tile_px * tile_px), uint8.
+        """
+        centred = tiles.astype(np.float64) - self.mean.astype(np.float64)
+        return np.asarray(centred @ self.basis.T.astype(np.float64), dtype=np.float64)
+
+    def nearest(self, tiles: Tiles) -> tuple[Indices, Distances]:
+        """Find, for each of `tiles`, the database tile with the least Euclidean distance in the basis.
+
+        Squared distances are |a|^2 - 2ab + |b|^2 from a blocked matrix product, exact (module docstring). Of equally
+        near tiles the one with the lowest index is taken.
+
+        Args:
+            tiles: Shape (m, tile_px * tile_px), uint8.
+
+        Returns:
+            Indices, shape (m,), int64; distances, shape (m,), float64, in grey levels times the root of the pixels.
+        """
+        best = np.zeros(tiles.shape[0], dtype=np.int64)
+        squared = np.full(tiles.shape[0], np.inf)
+        for start in range(0, tiles.shape[0], _QUERY_BLOCK):
+            rows = slice(start, min(start + _QUERY_BLOCK, tiles.shape[0]))
+            best[rows], squared[rows] = self._nearest_block(self.project(tiles[rows]))
+        return best, np.sqrt(squared) / BASIS_SCALE
+
+    @cached_property
+    def _squared_norms(self) -> npt.NDArray[np.float64]:
+        return np.asarray(np.einsum("ij,ij->i", self.projections, self.projections), dtype=np.float64)
+
+    def _nearest_block(self, queries: npt.NDArray[np.float64]) -> tuple[Indices, Distances]:
+        best = np.zeros(queries.shape[0], dtype=np.int64)
+        least = np.full(queries.shape[0], np.inf)
+        rows = np.arange(queries.shape[0])
+        doubled = -2.0 * queries
+        for start in range(0, len(self), _TILE_BLOCK):
+            stop = min(start + _TILE_BLOCK, len(self))
+            scores = doubled @ self.projections[start:stop].T
+            scores += self._squared_norms[start:stop]
+            candidate = np.argmin(scores, axis=1)  # the first of equals, so the lowest index
+            value = scores[rows, candidate]
+            better = value < least  # strictly: an equal of a later block does not replace
+            best[better] = candidate[better] + start
+            least[better] = value[better]
+        own = np.einsum("ij,ij->i", queries, queries)
+        return best, least + own
+
+
+def principal_basis(tiles: Tiles, dims: int) -> tuple[Tiles, Basis]:
+    """Return the rounded mean and the leading principal components of `tiles`, in integers.
+
+    Sums and products of pixels are exact integers; only the eigenvectors of the covariance are floating point, and
+    they are rounded to 1/4096. The sign of each is fixed: its entry of largest magnitude (the first of equals) is
+    positive. Components that carry no variance are left out, but at least one is kept.
+
+    Args:
+        tiles: Shape (n, pixels), uint8, n at least 1.
+        dims: Most components to keep.
+
+    Returns:
+        Mean, shape (pixels,), uint8; basis, shape (1..dims, pixels), int16.
+    """
+    count = tiles.shape[0]
+    values = tiles.astype(np.float64)
+    total = values.sum(axis=0)
+    covariance = (values.T @ values) / count - np.outer(total, total) / (count * count)
+    variances, vectors = np.linalg.eigh(covariance)
+    order = np.argsort(-variances, kind="stable")[:dims]
+    kept = max(1, int(np.count_nonzero(variances[order] > 1e-9 * max(float(variances.max()), 1.0))))
+    basis = vectors[:, order[:kept]].T
+    peaks = np.argmax(np.abs(np.round(basis * BASIS_SCALE)), axis=1)
+    signs = np.sign(basis[np.arange(kept), peaks])
+    mean = np.floor(total / count + 0.5).astype(np.uint8)
+    return mean, np.round(basis * signs[:, None] * BASIS_SCALE).astype(np.int16)
+
+
+def cut_tiles(image: npt.NDArray[np.uint8], tile_px: int) -> Tiles:
+    """Cut an image into tiles that cover all of it; edge tiles are filled by repeating the last row and column.
+
+    Args:
+        image: Shape (height, width), uint8.
+        tile_px: Side of a tile in pixels.
+
+    Returns:
+        Shape (ceil(height / tile_px) * ceil(width / tile_px), tile_px * tile_px), uint8, tiles in raster order.
+    """
+    rows, columns = tile_grid(image.shape[0], image.shape[1], tile_px)
+    below, right = rows * tile_px - image.shape[0], columns * tile_px - image.shape[1]
+    padded = np.pad(image, ((0, below), (0, right)), mode="edge")
+    blocks = padded.reshape(rows, tile_px, columns, tile_px).swapaxes(1, 2)
+    return np.ascontiguousarray(blocks.reshape(rows * columns, tile_px * tile_px))
+
+
+def join_tiles(tiles: Tiles, height_px: int, width_px: int, tile_px: int) -> npt.NDArray[np.uint8]:
+    """Put tiles back together and crop to the picture: the inverse of `cut_tiles`.
+
+    Returns:
+        Shape (height_px, width_px), uint8.
+    """
+    rows, columns = tile_grid(height_px, width_px, tile_px)
+    blocks = tiles.reshape(rows, columns, tile_px, tile_px).swapaxes(1, 2)
+    return np.ascontiguousarray(blocks.reshape(rows * tile_px, columns * tile_px)[:height_px, :width_px])
+
+
+def tile_grid(height_px: int, width_px: int, tile_px: int) -> tuple[int, int]:
+    """Return rows and columns of tiles that cover a picture."""
+    return -(-height_px // tile_px), -(-width_px // tile_px)
+
+
+def _check(name: str, value: object, expected: str, good: bool) -> None:  # noqa: FBT001 - a condition, not a switch
+    if not good:
+        raise CatalogueError("tile database", name, value, expected)
+
+
+def _check_array(
+    name: str, array: npt.NDArray[np.generic], dtype: np.dtype[np.generic], shape: tuple[int, ...]
+) -> None:
+    _check(f"{name}.dtype", str(array.dtype), str(dtype), array.dtype == dtype)
+    _check(f"{name}.shape", array.shape, str(shape), array.shape == shape)
