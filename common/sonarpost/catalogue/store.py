@@ -1,0 +1,204 @@
+"""One file that holds a tile database (docs/catalogue.md has the layout), and the catalogues shipped with the package.
+
+Everything in the file is stored plainly, not compressed, so the same database and notes are the same bytes on every
+machine and with every version of every library.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import struct
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from sonarpost.codec.interface import model_tag
+from sonarpost.codec.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase
+from sonarpost.errors import CatalogueError
+
+MAGIC = b"SPTILES\n"
+VERSION = 1
+NOMINAL_TILE_PX = (10, 20)
+
+_HEADER = struct.Struct(">8sHHIHI")  # magic, version, tile_px, tiles, dims, bytes of notes
+_HASH_BYTES = 32
+MAX_NOTES_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """A tile database with notes about where it comes from.
+
+    Attributes:
+        tiles: The database.
+        notes: What people want to know of it (source, licence, rounds); no part of the identity.
+    """
+
+    tiles: TileDatabase
+    notes: Mapping[str, str]
+
+
+def to_bytes(catalogue: Catalogue) -> bytes:
+    """Return the file's bytes.
+
+    Raises:
+        CatalogueError: The notes take more than 1 MiB.
+    """
+    tiles = catalogue.tiles
+    notes = json.dumps(dict(catalogue.notes), sort_keys=True, ensure_ascii=False).encode()
+    if len(notes) > MAX_NOTES_BYTES:
+        raise CatalogueError("tile catalogue", "notes", f"{len(notes)} B", f"at most {MAX_NOTES_BYTES} B")
+    header = _HEADER.pack(MAGIC, VERSION, tiles.tile_px, len(tiles), tiles.dims, len(notes))
+    content = b"".join(
+        (header, notes, tiles.mean.tobytes(), tiles.basis.astype(">i2").tobytes(), tiles.tiles.tobytes())
+    )
+    return content + hashlib.sha256(content).digest()
+
+
+def from_bytes(data: bytes, where: str) -> Catalogue:
+    """Parse a catalogue.
+
+    Args:
+        data: The whole file.
+        where: Its name, for messages.
+
+    Raises:
+        CatalogueError: Not a catalogue, of another version, cut off, or damaged (the sha256 at its end differs).
+    """
+    if len(data) < _HEADER.size + _HASH_BYTES:
+        raise CatalogueError(where, "", f"{len(data)} B", f"a tile catalogue of at least {_HEADER.size + 32} B")
+    magic, version, tile_px, count, dims, notes_bytes = _HEADER.unpack_from(data)
+    if magic != MAGIC:
+        raise CatalogueError(where, "magic", magic, repr(MAGIC))
+    if version != VERSION:
+        raise CatalogueError(where, "version", version, f"{VERSION}, the only one this release reads")
+    if not MIN_TILE_PX <= tile_px <= MAX_TILE_PX:
+        raise CatalogueError(where, "tile_px", tile_px, f"{MIN_TILE_PX}..{MAX_TILE_PX}")
+    if not 1 <= dims <= min(MAX_DIMS, tile_px * tile_px):
+        raise CatalogueError(where, "dims", dims, f"1..{min(MAX_DIMS, tile_px * tile_px)}")
+    if count < 1:
+        raise CatalogueError(where, "tiles", count, "at least 1")
+    pixels = tile_px * tile_px
+    sizes = (_HEADER.size, notes_bytes, pixels, dims * pixels * 2, count * pixels, _HASH_BYTES)
+    if len(data) != sum(sizes):
+        raise CatalogueError(where, "length", f"{len(data)} B", f"{sum(sizes)} B, as its header says")
+    if hashlib.sha256(data[:-_HASH_BYTES]).digest() != data[-_HASH_BYTES:]:
+        raise CatalogueError(
+            where, "sha256", data[-_HASH_BYTES:].hex(), "the hash of the content (the file is damaged)"
+        )
+    ends = np.cumsum(sizes)
+    mean = np.frombuffer(data, np.uint8, pixels, int(ends[1]))
+    basis = np.frombuffer(data, ">i2", dims * pixels, int(ends[2])).reshape(dims, pixels)
+    tiles = np.frombuffer(data, np.uint8, count * pixels, int(ends[3])).reshape(count, pixels)
+    notes = _parse_notes(data[_HEADER.size : int(ends[1])], where)
+    return Catalogue(TileDatabase(tile_px, tiles, mean, basis.astype(np.int16)), notes)
+
+
+def _parse_notes(data: bytes, where: str) -> dict[str, str]:
+    expected = "a JSON object of strings"
+    try:
+        notes = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise CatalogueError(where, "notes", data, expected) from error
+    if not isinstance(notes, dict) or not all(isinstance(value, str) for value in notes.values()):
+        raise CatalogueError(where, "notes", notes, expected)
+    return notes
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file so that at any moment either the old or the whole new content is there.
+
+    Raises:
+        CatalogueError: The operating system refuses (full disk, no right to write).
+    """
+    try:
+        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            # mkstemp makes files private to the user; a catalogue is meant to be read like any other file.
+            Path(name).chmod(0o644)
+            Path(name).replace(path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise CatalogueError(str(path), "", str(error), "a place that can be written to") from error
+
+
+def save(path: Path, catalogue: Catalogue) -> None:
+    """Write a catalogue atomically.
+
+    Raises:
+        CatalogueError: It cannot be written.
+    """
+    write_atomically(path, to_bytes(catalogue))
+
+
+def load(path: Path) -> Catalogue:
+    """Read a catalogue and verify its hash.
+
+    Raises:
+        CatalogueError: The file cannot be read or is damaged.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CatalogueError(str(path), "", str(error), "a tile catalogue file") from error
+    return from_bytes(data, str(path))
+
+
+@cache
+def load_nominal(tile_px: int) -> Catalogue:
+    """Return the catalogue shipped with the package for tiles of 10 or 20 px; kept in memory after the first call.
+
+    Raises:
+        CatalogueError: There is none for that size, or the installed file is damaged.
+    """
+    if tile_px not in NOMINAL_TILE_PX:
+        sizes = " or ".join(str(size) for size in NOMINAL_TILE_PX)
+        raise CatalogueError("nominal catalogues", "tile_px", tile_px, sizes)
+    name = f"nominal-{tile_px}.tiles"
+    try:
+        data = (resources.files("sonarpost.catalogue") / "data" / name).read_bytes()
+    except OSError as error:
+        raise CatalogueError(name, "", str(error), "the file installed with the package") from error
+    return from_bytes(data, name)
+
+
+def open_catalogue(name_or_path: str) -> Catalogue:
+    """Return a shipped catalogue by its name (`nominal-10`, `nominal-20`) or any other by its path.
+
+    Raises:
+        CatalogueError: It cannot be read.
+    """
+    for tile_px in NOMINAL_TILE_PX:
+        if name_or_path == f"nominal-{tile_px}":
+            return load_nominal(tile_px)
+    return load(Path(name_or_path))
+
+
+def nominal_for_tag(tag: int) -> Catalogue:
+    """Return the shipped catalogue whose identity has the 16-bit tag that a stream header carries.
+
+    Raises:
+        CatalogueError: The stream was made with a catalogue that is not one of the shipped ones.
+    """
+    tags = {}
+    for tile_px in NOMINAL_TILE_PX:
+        catalogue = load_nominal(tile_px)
+        own = model_tag(catalogue.tiles.identity)
+        if own == tag:
+            return catalogue
+        tags[f"nominal-{tile_px}"] = own
+    known = ", ".join(f"{own:#06x} ({name})" for name, own in tags.items())
+    raise CatalogueError("stream", "model_tag", f"{tag:#06x}", f"one of {known}, or the catalogue it was made with")

@@ -1,0 +1,178 @@
+"""Codecs by name (to encode) and by the id in a stream's header (to decode).
+
+Codecs of this package are listed in `BUILTINS`. Another distribution adds its own through the entry-point group
+`sonarpost.codecs`: the entry point loads to a `CodecSpec` whose name equals the entry point's.
+
+Codec ids are never reused. 0x10..0x13 belong to vq (one for each packing); 0x80 and above are left to other
+distributions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+
+from sonarpost.codec.interface import Codec, StreamHeader
+from sonarpost.codec.tiles import TileDatabase
+from sonarpost.codec.vq import IndexPacking, VqCodec
+from sonarpost.errors import ConfigError, StreamError
+
+ENTRY_POINT_GROUP = "sonarpost.codecs"
+
+
+@dataclass(frozen=True)
+class CodecResources:
+    """What a codec may need to be made. A codec ignores what it does not use.
+
+    Attributes:
+        tiles: The tile database, for codecs with a catalogue.
+        packing: How vq writes indices.
+        codec_id: Which of its ids the codec is wanted for; None for the one that follows from the rest. Set when a
+            stream is to be decoded.
+    """
+
+    tiles: TileDatabase | None = None
+    packing: IndexPacking = IndexPacking.BITS14
+    codec_id: int | None = None
+
+
+@dataclass(frozen=True)
+class CodecSpec:
+    """A codec as the registry knows it.
+
+    Attributes:
+        name: Name in configurations.
+        codec_ids: Every id its streams may carry.
+        create: Makes the codec; raises ConfigError where a resource it needs is absent.
+        summary: One line for people.
+    """
+
+    name: str
+    codec_ids: tuple[int, ...]
+    create: Callable[[CodecResources], Codec]
+    summary: str = ""
+
+
+def _create_vq(resources: CodecResources) -> Codec:
+    if resources.tiles is None:
+        raise ConfigError("codec vq", "tiles", None, "a tile catalogue, for example nominal-10")
+    packing = resources.packing
+    if resources.codec_id is not None:
+        packing = IndexPacking.from_codec_id(resources.codec_id) or packing
+    return VqCodec(resources.tiles, packing)
+
+
+BUILTINS = (
+    CodecSpec(
+        "vq",
+        tuple(packing.codec_id for packing in IndexPacking),
+        _create_vq,
+        "vector quantisation with a shared tile catalogue (the paper's codec)",
+    ),
+)
+
+
+class CodecRegistry:
+    """Codecs by name and by id; neither can be taken twice."""
+
+    def __init__(self, specs: Iterable[CodecSpec] = ()) -> None:
+        self._by_name: dict[str, CodecSpec] = {}
+        self._by_id: dict[int, CodecSpec] = {}
+        for spec in specs:
+            self.register(spec)
+
+    def register(self, spec: CodecSpec) -> None:
+        """Add a codec.
+
+        Raises:
+            ConfigError: Its name or one of its ids is taken, is outside 0..255, or it has no id.
+        """
+        where = f"codec {spec.name}"
+        if spec.name in self._by_name:
+            raise ConfigError("codec registry", "name", spec.name, "a name that is not taken")
+        if not spec.codec_ids or len(set(spec.codec_ids)) != len(spec.codec_ids):
+            raise ConfigError(where, "codec_ids", spec.codec_ids, "at least one id, none twice")
+        for codec_id in spec.codec_ids:
+            if not 0 <= codec_id <= 0xFF:
+                raise ConfigError(where, "codec_ids", codec_id, "0..255")
+            if codec_id in self._by_id:
+                taken = self._by_id[codec_id].name
+                raise ConfigError(where, "codec_ids", f"{codec_id:#04x}", f"an id that is not taken (it is {taken}'s)")
+        self._by_name[spec.name] = spec
+        self._by_id.update(dict.fromkeys(spec.codec_ids, spec))
+
+    def names(self) -> tuple[str, ...]:
+        """Return the names, sorted."""
+        return tuple(sorted(self._by_name))
+
+    def spec(self, name: str) -> CodecSpec:
+        """Return a codec's entry.
+
+        Raises:
+            ConfigError: No codec has this name; the message lists those there are.
+        """
+        if name not in self._by_name:
+            raise ConfigError("codec registry", "name", name, "one of " + ", ".join(self.names()))
+        return self._by_name[name]
+
+    def create(self, name: str, resources: CodecResources) -> Codec:
+        """Make the codec called `name`.
+
+        Raises:
+            ConfigError: No codec has this name, or a resource it needs is absent or does not suit it.
+        """
+        return self.spec(name).create(resources)
+
+    def spec_for_id(self, codec_id: int) -> CodecSpec:
+        """Return the entry of the codec whose streams carry `codec_id`.
+
+        Raises:
+            StreamError: No codec does.
+        """
+        if codec_id not in self._by_id:
+            known = ", ".join(f"{number:#04x} ({self._by_id[number].name})" for number in sorted(self._by_id))
+            raise StreamError("stream", "codec_id", f"{codec_id:#04x}", f"one of {known}")
+        return self._by_id[codec_id]
+
+    def create_for_stream(self, stream: bytes, resources: CodecResources) -> Codec:
+        """Make the codec that a stream (or any 8 bytes of its header) was encoded with.
+
+        Raises:
+            StreamError: The header is wrong or its codec unknown.
+            ConfigError: A resource the codec needs is absent or does not suit it.
+        """
+        codec_id = StreamHeader.unpack(stream).codec_id
+        return self.spec_for_id(codec_id).create(replace(resources, codec_id=codec_id))
+
+
+def load_plugins(registry: CodecRegistry, found: Iterable[EntryPoint]) -> None:
+    """Register the codecs that other distributions offer, in the order of their names.
+
+    Raises:
+        ConfigError: An entry point does not load, is not a `CodecSpec`, has another name, or takes a name or id again.
+    """
+    for point in sorted(found, key=lambda p: (p.name, p.value)):
+        where = f"entry point {ENTRY_POINT_GROUP}:{point.name}"
+        try:
+            spec = point.load()
+        except Exception as error:  # whatever foreign code raises while it is imported, this names the culprit
+            raise ConfigError(where, "value", f"{point.value} ({error!r})", "an object that imports") from error
+        if not isinstance(spec, CodecSpec):
+            raise ConfigError(where, "value", repr(spec), "a sonarpost.codec.registry.CodecSpec")
+        if spec.name != point.name:
+            raise ConfigError(where, "name", spec.name, f"{point.name!r}, the entry point's name")
+        registry.register(spec)
+
+
+@cache
+def default_registry() -> CodecRegistry:
+    """Return the registry of this package's codecs and installed plug-ins, made on first use.
+
+    Raises:
+        ConfigError: A plug-in is wrong.
+    """
+    registry = CodecRegistry(BUILTINS)
+    load_plugins(registry, entry_points(group=ENTRY_POINT_GROUP))
+    return registry
