@@ -1,8 +1,8 @@
 r"""NMEA sentences as the Micro-Modem speaks them: `$BODY*HH\r\n`, HH the XOR of the body in upper-case hex.
 
-`parse` reads one line, `format` writes one, and `LineAssembler` cuts a byte stream into sentences. The assembler
-is what faces the serial port: whatever bytes it is given, it answers with sentences and `SentenceError` items,
-raises nothing and keeps at most one sentence in memory.
+`parse` reads one line, `format` writes one, and `LineAssembler` cuts a byte stream into sentences. The
+assembler is what faces the serial port: whatever bytes it is given, it answers with sentences and
+`SentenceError` items, raises nothing and keeps at most one sentence in memory.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def checksum(body: bytes) -> int:
     return value
 
 
-def format(kind: str, *fields: str | int) -> bytes:  # noqa: A001 - always called as nmea.format, and it formats
+def format(kind: str, *fields: str | int) -> bytes:  # noqa: A001 - called as nmea.format
     r"""Return `$kind,field,…*HH\r\n`.
 
     Raises:
@@ -90,9 +90,7 @@ def parse(line: bytes, where: str = "modem line", *, checksum_required: bool = F
     if not star and checksum_required:
         raise SentenceError(where, "checksum", _excerpt(text), "*HH at the end of a line that was cut off")
     if star and int(digits, 16) != checksum(body):
-        raise SentenceError(
-            where, "checksum", digits.decode("ascii"), f"{checksum(body):02X} for {_excerpt(body)!r}"
-        )
+        raise SentenceError(where, "checksum", digits.decode("ascii"), f"{checksum(body):02X} for {_excerpt(body)!r}")
     if not _BODY.fullmatch(body):
         raise SentenceError(where, "", _excerpt(text), "printable ASCII without a second $ or *")
     kind, *fields = body.decode("ascii").split(",")
@@ -105,9 +103,9 @@ class LineAssembler:
     r"""Cuts a byte stream into sentences, in bounded memory.
 
     A line ends at CR, LF, or at the `$` of the next one: a line whose end was lost still counts when its
-    checksum is there and right. Bytes between sentences are one `SentenceError` a run (NULs and blanks, as a port
-    gives when a modem powers up, are none), a line beyond `MAX_SENTENCE_BYTES` is one, and reading goes on at the
-    next `$`.
+    checksum is there and right. Bytes between sentences are one `SentenceError` a run (NULs and blanks,
+    as a port gives when a modem powers up, are none), a line beyond `MAX_SENTENCE_BYTES` is one, and
+    reading goes on at the next `$`.
     """
 
     def __init__(self, where: str = "modem port") -> None:
@@ -153,9 +151,7 @@ class LineAssembler:
         if not length:
             return
         if not line.startswith(b"$"):
-            items.append(
-                SentenceError(self._where, "", _excerpt(line), f"sentences, not {length} bytes of noise")
-            )
+            items.append(SentenceError(self._where, "", _excerpt(line), f"sentences, not {length} bytes of noise"))
         elif length > len(line):
             expected = f"at most {MAX_SENTENCE_BYTES} bytes a sentence"
             items.append(SentenceError(self._where, f"length of {_excerpt(line[:12])!r}", length, expected))

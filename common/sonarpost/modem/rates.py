@@ -1,8 +1,8 @@
 """What a packet of each Micro-Modem rate holds and how long it occupies the water.
 
-Source: the tables of open Micro-Modem drivers (Goby3, WHOI's ros_acomms); rates 0, 1, 4 and 5 are Table I of the
-paper this project re-creates (32, 192, 512 and 2048 bytes a packet). Air times are nominal: they vary with
-firmware, probe length and bandwidth, so the driver's configuration can replace them.
+Source: the tables of open Micro-Modem drivers (Goby3, WHOI's ros_acomms); rates 0, 1, 4 and 5 are Table I
+of the paper this project re-creates (32, 192, 512 and 2048 bytes a packet). Air times are nominal: they
+vary with firmware, probe length and bandwidth, so the driver's configuration can replace them.
 """
 
 from __future__ import annotations

@@ -1,0 +1,237 @@
+"""What the driver tells: frozen records, in the order in which things happened."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from enum import StrEnum
+
+from sonarpost.errors import SentenceError
+from sonarpost.modem.nmea import Sentence
+from sonarpost.modem.sentences import ModemMessage
+from sonarpost.modem.settings import ModemComplaint
+from sonarpost.modem.statistics import LinkStatistics, TransmitStatistics
+
+
+class FailureReason(StrEnum):
+    """Why a packet did not go."""
+
+    NO_ECHO = "no CACYC: the modem did not take the cycle command"
+    NO_DATA_REQUEST = "no CADRQ: the modem did not ask for a frame"
+    NO_DATA_ECHO = "no CATXD: the modem did not take a frame"
+    NO_TRANSMIT_START = "no CATXP: the modem did not start to transmit"
+    NO_TRANSMIT_END = "no CATXF: the modem did not end the transmission"
+    DATA_TIMEOUT = "the modem went on without the data of a frame"
+    FRAME_REFUSED = "the modem asked for fewer bytes than the frame has"
+    REBOOTED = "the modem restarted in the middle of the cycle"
+    PORT_LOST = "the port to the modem went away"
+    QUEUE_FULL = "too many packets wait already"
+    WAITED_TOO_LONG = "the modem or the water was not free in time"
+
+
+@dataclass(frozen=True, slots=True)
+class ModemReady:
+    """The modem has its address and settings, and has confirmed them.
+
+    Attributes:
+        address: Its address.
+        firmware: Version it has told in a `CAREV`, or None.
+    """
+
+    address: int
+    firmware: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class ModemUnresponsive:
+    """The modem did not answer; said once until the next `ModemReady`. The driver keeps trying.
+
+    Attributes:
+        waiting_for: The command that has no right answer.
+        attempts: How often it was sent.
+        silent_s: Time since the last valid sentence, None when there was none yet.
+    """
+
+    waiting_for: str
+    attempts: int
+    silent_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class ModemRebooted:
+    """The modem has restarted by itself; it is configured again."""
+
+    firmware: str
+
+
+@dataclass(frozen=True, slots=True)
+class SettingRefused:
+    """A setting the driver can do without was not confirmed; the driver goes on."""
+
+    command: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClockConfirmed:
+    """The modem has taken the time it was given."""
+
+    utc: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class ModemComplained:
+    """The modem has reported an error of its own."""
+
+    complaint: ModemComplaint
+
+
+@dataclass(frozen=True, slots=True)
+class ModemSaid:
+    """A `CAMSG` that is no news of a frame."""
+
+    message: ModemMessage
+
+
+@dataclass(frozen=True, slots=True)
+class SentenceRejected:
+    """Bytes that are no valid sentence, or a sentence whose fields are wrong."""
+
+    error: SentenceError
+
+
+@dataclass(frozen=True, slots=True)
+class OtherSentence:
+    """A valid sentence that the driver has no use for (pings, mini-packets, a setting nobody asked for)."""
+
+    sentence: Sentence
+
+
+@dataclass(frozen=True, slots=True)
+class PacketSent:
+    """A packet has gone into the water.
+
+    Attributes:
+        packet_id: What `send_packet` returned.
+        dest: Address meant.
+        rate: Rate number.
+        frames: The frames, as given.
+        acknowledged: Numbers (from 1) of the frames the far side has acknowledged; empty without `ack`.
+        started_s: Clock of the driver when the cycle was started.
+        finished_s: And when it was over.
+        statistics: What the modem told about the transmission, or None.
+    """
+
+    packet_id: int
+    dest: int
+    rate: int
+    frames: tuple[bytes, ...]
+    acknowledged: tuple[int, ...]
+    started_s: float
+    finished_s: float
+    statistics: TransmitStatistics | None
+
+
+@dataclass(frozen=True, slots=True)
+class PacketFailed:
+    """A packet did not go, or it is not known whether it went.
+
+    Attributes:
+        packet_id: What `send_packet` returned.
+        dest: Address meant.
+        rate: Rate number.
+        frames: The frames, as given.
+        reason: Why.
+        maybe_sent: Whether all or part of it may have gone into the water all the same.
+    """
+
+    packet_id: int
+    dest: int
+    rate: int
+    frames: tuple[bytes, ...]
+    reason: FailureReason
+    maybe_sent: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FrameReceived:
+    """One good frame. `data` is what the modem gave: a short frame may have been padded on its way.
+
+    Attributes:
+        src: Address that sent.
+        dest: Address meant (which may be another modem).
+        ack: Whether an acknowledgement was asked for.
+        frame_number: From 1.
+        data: Its bytes.
+        received_s: Clock of the driver when it came.
+        rate: Rate number where known.
+        statistics: Of its packet, None when the modem did not give them.
+    """
+
+    src: int
+    dest: int
+    ack: bool
+    frame_number: int
+    data: bytes
+    received_s: float
+    rate: int | None
+    statistics: LinkStatistics | None
+
+
+@dataclass(frozen=True, slots=True)
+class PacketReceived:
+    """The end of a packet; its `FrameReceived` events came just before.
+
+    Attributes:
+        frames: The good frames.
+        bad_frames: How many the modem said were damaged.
+        nframes: How many the packet had, None when nobody told.
+        src: Address that sent, where known.
+        dest: Address meant, where known.
+        rate: Rate number, where known.
+        statistics: None when the modem did not give them.
+        complete: Every announced frame is here and the modem said that the packet is over.
+    """
+
+    frames: tuple[FrameReceived, ...]
+    bad_frames: int
+    nframes: int | None
+    src: int | None
+    dest: int | None
+    rate: int | None
+    statistics: LinkStatistics | None
+    complete: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAcknowledged:
+    """The far side `src` has acknowledged a frame."""
+
+    src: int
+    dest: int
+    frame_number: int
+
+
+@dataclass(frozen=True, slots=True)
+class StatisticsReceived:
+    """Link quality from something other than a data packet (an acknowledgement, a ping, a cycle start)."""
+
+    statistics: LinkStatistics
+
+
+Event = (
+    ModemReady
+    | ModemUnresponsive
+    | ModemRebooted
+    | SettingRefused
+    | ClockConfirmed
+    | ModemComplained
+    | ModemSaid
+    | SentenceRejected
+    | OtherSentence
+    | PacketSent
+    | PacketFailed
+    | FrameReceived
+    | PacketReceived
+    | FrameAcknowledged
+    | StatisticsReceived
+)
