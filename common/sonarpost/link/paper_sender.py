@@ -1,0 +1,137 @@
+"""From an encoded picture to acoustic packets of the `paper` wire format.
+
+Rules, in the order in which they bind:
+
+1. One half a packet, as in the paper: when each half fits one packet, the first packet carries the top half and the
+   second the bottom half, and nothing of the other.
+2. A half that does not fit is spread over several packets. The halves then share a packet when, and only when, that
+   saves one: a packet costs its whole air time however little is in it.
+3. The contact record fills every frame left free, which costs no air time. It leads the first group of packets that
+   has a free frame, because where and how sure matters before what it looks like; the other free frames come last.
+4. When no packet of the image has a free frame (always so at one frame a packet), the contact record goes first, in
+   a packet of its own.
+
+The top half always goes before the bottom half: embedded codecs put the coarse picture first.
+"""
+
+from __future__ import annotations
+
+from sonarpost.codec.interface import StreamHeader
+from sonarpost.errors import FrameError, StreamError
+from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.paper_format import (
+    CONTACT_FRAME_SIZE,
+    HALF_HEADER_SIZE,
+    ContactFrame,
+    HalfFrame,
+    HalfName,
+    half_bounds,
+)
+
+Packet = tuple[bytes, ...]
+
+_MAX_BODY_BYTES = 0xFFFF
+
+
+def plan_packets(
+    image_id: str,
+    stream: bytes,
+    contact: ContactSummary | None,
+    frames_per_packet: int,
+    frame_bytes: int,
+) -> tuple[Packet, ...]:
+    """Return the packets of one image in the order of sending.
+
+    Args:
+        image_id: Four characters 0-9A-Z.
+        stream: The codec's stream, header and the whole body.
+        contact: The contact record to send along, or None.
+        frames_per_packet: Most frames in a packet at the rate in use (1 to 8 on a Micro-Modem).
+        frame_bytes: Most bytes in a frame at that rate (32, 64 or 256).
+
+    Returns:
+        Packets, each a tuple of one to `frames_per_packet` frames, none longer than `frame_bytes`.
+
+    Raises:
+        FrameError: The identifier is wrong, or the frames are too few or too small for a header and one byte (or
+            for the contact record).
+        StreamError: The stream's header is wrong or its body is not as long as the header says.
+    """
+    _check_sizes(frames_per_packet, frame_bytes, with_contact=contact is not None)
+    header = StreamHeader.unpack(stream)
+    body = stream[StreamHeader.SIZE :]
+    if len(body) != header.body_length:
+        raise StreamError("stream", "body", f"{len(body)} bytes", f"{header.body_length} bytes as in its header")
+    top = _half_frames("top", image_id, header, body, frame_bytes)
+    bottom = _half_frames("bottom", image_id, header, body, frame_bytes) if header.body_length > 1 else ()
+    record = None if contact is None else ContactFrame(image_id, contact).pack()
+    groups = _group(top, bottom, frames_per_packet, with_contact=record is not None)
+    if record is not None:
+        groups = _place_contact(groups, record, frames_per_packet)
+    return tuple(
+        group[first : first + frames_per_packet]
+        for group in groups
+        for first in range(0, len(group), frames_per_packet)
+    )
+
+
+def body_capacity_bytes(frames_per_packet: int, frame_bytes: int, *, with_contact: bool) -> int:
+    """Return the longest stream body of which each half fits one packet.
+
+    With a contact record, one frame of each packet is kept for it, unless a packet has only one frame: then the
+    record travels in a packet of its own and takes nothing from the body.
+
+    Raises:
+        FrameError: As for `plan_packets`.
+    """
+    _check_sizes(frames_per_packet, frame_bytes, with_contact=with_contact)
+    frames = frames_per_packet - 1 if with_contact and frames_per_packet > 1 else frames_per_packet
+    return min(2 * frames * (frame_bytes - HALF_HEADER_SIZE), _MAX_BODY_BYTES)
+
+
+def _check_sizes(frames_per_packet: int, frame_bytes: int, *, with_contact: bool) -> None:
+    if frames_per_packet < 1:
+        raise FrameError("packet plan", "frames_per_packet", frames_per_packet, "at least 1")
+    least = CONTACT_FRAME_SIZE if with_contact else HALF_HEADER_SIZE + 1
+    if frame_bytes < least:
+        raise FrameError("packet plan", "frame_bytes", frame_bytes, f"at least {least}")
+
+
+def _half_frames(half: HalfName, image_id: str, header: StreamHeader, body: bytes, frame_bytes: int) -> Packet:
+    start, stop = half_bounds(header.body_length, half)
+    step = frame_bytes - HALF_HEADER_SIZE
+    # An empty half still needs its start in the list: a picture with an empty body travels as one bare header.
+    offsets = range(start, stop, step) or (start,)
+    return tuple(
+        HalfFrame(half, image_id, offset, header, body[offset : min(offset + step, stop)]).pack() for offset in offsets
+    )
+
+
+def _group(top: Packet, bottom: Packet, frames_per_packet: int, *, with_contact: bool) -> tuple[Packet, ...]:
+    """Return the frames as groups; a group starts a packet and fills as many as it needs."""
+    apart = tuple(half for half in (top, bottom) if half)
+    if max(len(top), len(bottom)) <= frames_per_packet:
+        return apart
+    extra = 1 if with_contact else 0
+    packets_apart = sum(_packets(len(half), frames_per_packet) for half in apart)
+    if with_contact and all(len(half) % frames_per_packet == 0 for half in apart):
+        packets_apart += 1
+    together = _packets(len(top) + len(bottom) + extra, frames_per_packet)
+    return (top + bottom,) if together < packets_apart else apart
+
+
+def _place_contact(groups: tuple[Packet, ...], record: bytes, frames_per_packet: int) -> tuple[Packet, ...]:
+    placed: list[Packet] = []
+    led = False
+    for group in groups:
+        free = -len(group) % frames_per_packet
+        if free and not led:
+            placed.append((record, *group, *(record,) * (free - 1)))
+            led = True
+        else:
+            placed.append(group + (record,) * free)
+    return tuple(placed) if led else ((record,), *placed)
+
+
+def _packets(frames: int, frames_per_packet: int) -> int:
+    return -(-frames // frames_per_packet)
