@@ -1,0 +1,116 @@
+"""What the two ends of the durable hand-off say to each other.
+
+The producer asks the consumer's queryable at `{key}/handoff/{consumer}`; the query's payload is a piece of the record
+of at most 32 kB, its attachment says which record and which piece; the reply, given after the consumer has committed,
+says what it has. `docs/wire-zenoh.md` describes the same for other languages.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import msgpack
+
+from sonarpost import wire
+from sonarpost.errors import PayloadError
+from sonarpost.runtime.store import Chunk, OutboxItem
+
+CHUNK_BYTES = 32 * 1024
+MAX_RECORD_BYTES = 8 * 1024 * 1024
+HANDOFF_VERSION = 1
+
+Status = Literal["stored", "more", "refused", "later"]
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """The consumer's answer.
+
+    Attributes:
+        status: "stored": the whole record is on the consumer's disk. "more": send on from `next_offset`. "refused": the
+            record is wrong and will never be taken, `reason` says why. "later": the consumer cannot store at the
+            moment (a full disk), try again.
+    """
+
+    status: Status
+    next_offset: int = 0
+    reason: str = ""
+
+    def pack(self) -> bytes:
+        """Return the reply as msgpack."""
+        fields = {"v": HANDOFF_VERSION, "status": self.status, "next": self.next_offset, "reason": self.reason}
+        packed: bytes = msgpack.packb(fields)
+        return packed
+
+    @classmethod
+    def unpack(cls, payload: bytes, where: str) -> Reply:
+        """Parse a reply.
+
+        Raises:
+            PayloadError: Not a hand-off reply.
+        """
+        fields = wire.unpack_map(payload, where)
+        status = fields.get("status")
+        next_offset = _integer(fields, "next", where)
+        for known in ("stored", "more", "refused", "later"):
+            if status == known:
+                return cls(known, next_offset, str(fields.get("reason", "")))
+        raise PayloadError(where, "status", status, "stored, more, refused or later")
+
+
+def attachment(origin: bytes, item: OutboxItem, offset: int = 0) -> bytes:
+    """Return the attachment that names a record and, in a hand-over query, a piece of it."""
+    packed: bytes = msgpack.packb(
+        {
+            "v": HANDOFF_VERSION,
+            "origin": origin,
+            "seq": item.seq,
+            "size": len(item.payload),
+            "sha256": item.sha256,
+            "offset": offset,
+        }
+    )
+    return packed
+
+
+def parse_chunk(attached: bytes, data: bytes, where: str) -> Chunk:
+    """Parse a hand-over query.
+
+    Raises:
+        PayloadError: A field is missing, wrong or out of bounds.
+    """
+    fields = wire.unpack_map(attached, where)
+    if fields.get("v") != HANDOFF_VERSION:
+        raise PayloadError(where, "v", fields.get("v"), str(HANDOFF_VERSION))
+    chunk = Chunk(
+        origin=_binary(fields, "origin", 16, where),
+        seq=_integer(fields, "seq", where),
+        size=_integer(fields, "size", where),
+        sha256=_binary(fields, "sha256", 32, where),
+        offset=_integer(fields, "offset", where),
+        data=data,
+    )
+    if chunk.size > MAX_RECORD_BYTES:
+        raise PayloadError(where, "size", chunk.size, f"at most {MAX_RECORD_BYTES} bytes")
+    if chunk.seq < 1:
+        raise PayloadError(where, "seq", chunk.seq, "at least 1")
+    if len(data) > CHUNK_BYTES or chunk.offset + len(data) > chunk.size:
+        raise PayloadError(
+            where, "payload", f"{len(data)} bytes", f"a piece of at most {CHUNK_BYTES} bytes inside size"
+        )
+    return chunk
+
+
+def _integer(fields: dict[str, object], name: str, where: str) -> int:
+    value = fields.get(name)
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 63:
+        raise PayloadError(where, name, value, "a whole number from 0")
+    return value
+
+
+def _binary(fields: dict[str, object], name: str, length: int, where: str) -> bytes:
+    value = fields.get(name)
+    if not isinstance(value, bytes) or len(value) != length:
+        raise PayloadError(where, name, value, f"{length} bytes")
+    return value

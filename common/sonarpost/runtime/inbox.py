@@ -1,0 +1,172 @@
+"""The consumer's side of the durable hand-off: commit first, then acknowledge."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import zenoh
+
+from sonarpost import keys
+from sonarpost.errors import BadInputError, HandoffError
+from sonarpost.runtime.handoff import Reply, parse_chunk
+from sonarpost.runtime.logs import kv
+from sonarpost.runtime.store import Chunk, Store, Transaction
+
+log = logging.getLogger(__name__)
+
+BATCH = 64
+QUEUE_LIMIT = 256
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrival:
+    """A hand-over query, or (query None) a plain publication by somebody without an outbox."""
+
+    key: str
+    payload: bytes
+    attached: bytes
+    query: zenoh.Query | None
+
+
+class Inbox:
+    """Takes records for one consumer: queries of the hand-off, and plain publications of third parties.
+
+    A publication that carries a hand-off attachment is a copy for watchers and is left alone; the same record comes by
+    query. One without comes from a program that has no outbox (somebody's own detector): it is committed like any
+    other, but nobody is told, so a loss on the way to us is not repaired.
+
+    Args:
+        check: Called with (key, payload) before a record is stored; raises BadInputError to refuse it.
+        on_refused: Called with every error that made a record be refused.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        store: Store,
+        consumer: str,
+        key_expressions: tuple[str, ...],
+        check: Callable[[str, bytes], None],
+        on_refused: Callable[[BadInputError], None],
+    ) -> None:
+        self._store = store
+        self._suffix = "/handoff/" + consumer
+        self._check = check
+        self._on_refused = on_refused
+        self._arrivals: queue.Queue[_Arrival] = queue.Queue(QUEUE_LIMIT)
+        self._stop = threading.Event()
+        self._trouble = False
+        self._thread = threading.Thread(target=self._run, name=f"inbox-{consumer}", daemon=True)
+        self._thread.start()
+        self._declared: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
+        for key in key_expressions:
+            self._declared.append(session.declare_queryable(keys.handoff(key, consumer), self._on_query))
+            self._declared.append(session.declare_subscriber(key, self._on_sample))
+
+    @property
+    def in_trouble(self) -> bool:
+        """True while records cannot be stored (a full disk, for example)."""
+        return self._trouble
+
+    def close(self) -> None:
+        """Stop taking records; what was not committed is not acknowledged and will be sent again."""
+        for declared in self._declared:
+            declared.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
+        self._stop.set()
+        self._thread.join()
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        key = str(query.key_expr).removesuffix(self._suffix)
+        payload = query.payload.to_bytes() if query.payload is not None else b""
+        attached = query.attachment.to_bytes() if query.attachment is not None else b""
+        self._arrive(_Arrival(key, payload, attached, query))
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        if sample.attachment is None and sample.kind == zenoh.SampleKind.PUT:
+            self._arrive(_Arrival(str(sample.key_expr), sample.payload.to_bytes(), b"", None))
+
+    def _arrive(self, arrival: _Arrival) -> None:
+        while not self._stop.is_set():
+            try:
+                self._arrivals.put(arrival, timeout=0.2)
+            except queue.Full:
+                continue
+            return
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            batch = self._next_batch()
+            if batch:
+                self._answer(batch, self._commit(batch))
+
+    def _next_batch(self) -> list[_Arrival]:
+        try:
+            batch = [self._arrivals.get(timeout=0.2)]
+        except queue.Empty:
+            return []
+        while len(batch) < BATCH:
+            try:
+                batch.append(self._arrivals.get_nowait())
+            except queue.Empty:
+                break
+        return batch
+
+    def _commit(self, batch: list[_Arrival]) -> list[Reply]:
+        """Store a batch in one transaction, so that many records share one write to the disk."""
+        try:
+            with self._store.transaction() as tx:
+                replies = [self._take(tx, arrival) for arrival in batch]
+        except HandoffError as error:
+            if not self._trouble:
+                log.exception("Records cannot be stored, their senders keep them", extra=kv(error=str(error)))
+            self._trouble = True
+            return [Reply("later", reason=str(error)[:200])] * len(batch)
+        if self._trouble:
+            log.info("Records can be stored again")
+        self._trouble = False
+        return replies
+
+    def _take(self, tx: Transaction, arrival: _Arrival) -> Reply:
+        if arrival.query is None:
+            return self._take_checked(tx, arrival.key, arrival.payload, None)
+        try:
+            chunk = parse_chunk(arrival.attached, arrival.payload, arrival.key + self._suffix)
+        except BadInputError as error:
+            self._on_refused(error)
+            return Reply("refused", reason=str(error))
+        if tx.was_seen(chunk.origin, chunk.seq):
+            return Reply("stored")
+        whole = tx.add_chunk(chunk)
+        if isinstance(whole, int):
+            return Reply("more", next_offset=whole)
+        return self._take_checked(tx, arrival.key, whole, chunk)
+
+    def _take_checked(self, tx: Transaction, key: str, payload: bytes, chunk: Chunk | None) -> Reply:
+        try:
+            self._check(key, payload)
+        except BadInputError as error:
+            self._on_refused(error)
+            tx.refuse("in", key, payload, str(error))
+            if chunk is not None:
+                tx.mark_seen(chunk.origin, chunk.seq)
+            return Reply("refused", reason=str(error))
+        if chunk is None:
+            tx.accept(key, payload)
+        else:
+            tx.accept(key, payload, chunk.origin, chunk.seq)
+        return Reply("stored")
+
+    def _answer(self, batch: list[_Arrival], replies: list[Reply]) -> None:
+        for arrival, reply in zip(batch, replies, strict=True):
+            if arrival.query is None:
+                continue
+            try:
+                with arrival.query as query:
+                    query.reply(query.key_expr, reply.pack())
+            except zenoh.ZError as error:
+                # The asker is gone or the link is down: it asks again, and (origin, seq) is known here.
+                log.debug("A reply could not be sent", extra=kv(key=arrival.key, error=str(error)))

@@ -1,0 +1,70 @@
+"""Structured logs: one line an event, as text for people or JSON for machines, on standard error."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from datetime import UTC, datetime
+from typing import Literal
+
+LogFormat = Literal["text", "json"]
+
+
+def kv(**fields: object) -> dict[str, object]:
+    """Return the `extra` of a log call, so that fields stay apart from the sentence: log.info("…", extra=kv(…))."""
+    return {"fields": fields}
+
+
+def _time_text(record: logging.LogRecord) -> str:
+    return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+class TextFormatter(logging.Formatter):
+    """`2016-10-12T09:00:00.000Z INFO compressor: Image encoded image_id=0001 bytes=232`."""
+
+    def __init__(self, service: str) -> None:
+        super().__init__()
+        self._service = service
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        fields = getattr(record, "fields", {})
+        pairs = "".join(f" {name}={_shown(value)}" for name, value in fields.items())
+        line = f"{_time_text(record)} {record.levelname} {self._service}: {record.getMessage()}{pairs}"
+        return line if record.exc_info is None else f"{line}\n{self.formatException(record.exc_info)}"
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line: time, level, service, message, then the event's fields."""
+
+    def __init__(self, service: str) -> None:
+        super().__init__()
+        self._service = service
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        event: dict[str, object] = {
+            "time": _time_text(record),
+            "level": record.levelname.lower(),
+            "service": self._service,
+            "message": record.getMessage(),
+        }
+        event.update(getattr(record, "fields", {}))
+        if record.exc_info is not None:
+            event["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(event, default=str)
+
+
+def _shown(value: object) -> str:
+    text = value if isinstance(value, str) else f"{value:.6g}" if isinstance(value, float) else str(value)
+    return json.dumps(text) if not text or any(c in text for c in " \"'=\n\r\t") else text
+
+
+def set_up(service: str, level: str = "info", log_format: LogFormat = "text") -> None:
+    """Send all logs of this process to standard error in one format."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonFormatter(service) if log_format == "json" else TextFormatter(service))
+    root = logging.getLogger()
+    root.handlers[:] = [handler]
+    root.setLevel(level.upper())

@@ -1,0 +1,74 @@
+"""Running a service as a process: command line, signals, exit status."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+
+from sonarpost.errors import ConfigError, SonarpostError
+from sonarpost.runtime import config, logs
+from sonarpost.runtime.service import C, Service
+
+log = logging.getLogger(__name__)
+
+SHUTDOWN_S = 2.5
+EXIT_CONFIG = 2
+EXIT_STUCK = 3
+
+
+def main(service_type: type[Service[C]], config_type: type[C], arguments: Sequence[str] | None = None) -> int:
+    """Run a service until SIGTERM or SIGINT; return the exit status (2: wrong configuration).
+
+    Args:
+        service_type: The service's class.
+        config_type: Type of its configuration table.
+        arguments: Command line, normally the process's own.
+    """
+    parser = argparse.ArgumentParser(prog=f"python -m services.{service_type.NAME}", description=service_type.__doc__)
+    parser.add_argument("--config", type=Path, required=True, help="TOML file of the platform")
+    path: Path = parser.parse_args(arguments).config
+    try:
+        platform, own = config.load(path, service_type.NAME, config_type, os.environ)
+    except ConfigError as error:
+        print(f"{service_type.NAME}: {error}", file=sys.stderr)
+        return EXIT_CONFIG
+    logs.set_up(service_type.NAME, platform.log_level, platform.log_format)
+    try:
+        service = service_type(platform, own)
+    except SonarpostError as error:
+        log.error("Service cannot start", extra=logs.kv(reason=str(error)))  # noqa: TRY400 the message says it all
+        return EXIT_CONFIG
+    return _run(service)
+
+
+def _run(service: Service[C]) -> int:
+    def on_signal(number: int, _frame: FrameType | None) -> None:
+        log.info("Stopping", extra=logs.kv(signal=signal.Signals(number).name))
+        service.stopping.set()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, on_signal)
+    try:
+        if service.start():
+            service.stopping.wait()
+    finally:
+        guard = threading.Timer(SHUTDOWN_S, _give_up)
+        guard.daemon = True
+        guard.start()
+        service.stop()
+        guard.cancel()
+    return 0
+
+
+def _give_up() -> None:
+    """End a process whose shutdown hangs: everything accepted is on the disk, so nothing is lost by it."""
+    log.error("Shutdown takes too long, leaving at once")
+    logging.shutdown()
+    os._exit(EXIT_STUCK)

@@ -1,0 +1,71 @@
+"""What many tests share: an in-process Zenoh router, platforms in a temporary folder, waiting for a condition."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from sonarpost.runtime.config import PlatformConfig
+from sonarpost.runtime.session import client_config, router_config
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def free_port() -> int:
+    """Return a TCP port that was free a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def eventually(condition: Callable[[], bool], timeout_s: float = 15.0, what: str = "condition") -> None:
+    """Wait until `condition()` holds; fail the test when it does not in time."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline:
+            pytest.fail(f"{what} did not come true within {timeout_s} s")
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def router() -> Iterator[str]:
+    """An in-process Zenoh router; the fixture is its endpoint."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    session = zenoh.open(router_config([endpoint]))
+    yield endpoint
+    session.close()
+
+
+@pytest.fixture
+def client(router: str) -> Iterator[zenoh.Session]:
+    """A client of the in-process router, for the test itself."""
+    session = zenoh.open(client_config([router]))
+    yield session
+    session.close()
+
+
+@pytest.fixture
+def platform(router: str, tmp_path: Path) -> Callable[[str], PlatformConfig]:
+    """Makes platform configurations that use the in-process router and a temporary state folder."""
+
+    def make(platform_id: str) -> PlatformConfig:
+        return PlatformConfig(
+            id=platform_id, router=(router,), state_dir=tmp_path / "state" / platform_id, health_interval_s=0.1
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of real surveys and snippets; the test is skipped where it is absent."""
+    folder = Path(os.environ.get("SONARPOST_DATA", REPOSITORY.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no real survey data at {folder} (set SONARPOST_DATA)")
+    return folder
