@@ -1,0 +1,130 @@
+"""Altitude from the picture itself: the water column is dark, and the bottom's first return ends it."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import median_filter, uniform_filter
+
+from sonarpost.sonar.survey import Side, Survey
+
+FloatArray = npt.NDArray[np.float64]
+
+_BINS: Final = 512
+_RING_DOWN_M: Final = 0.4
+"""The transducers still ring from the transmission this near; no vehicle surveys lower."""
+_SUSTAINED_FRACTION: Final = 1 / 40
+"""A rise must last this part of the range: fish and bubbles do not."""
+_RISE: Final = 0.5
+"""Where between the water's level and the bottom's, in decibels, the first return is taken to begin."""
+_MIN_CONTRAST: Final = 1.8
+_SMOOTHING_PINGS: Final = 5
+
+
+def track_bottom(survey: Survey, *, window_pings: int = 31) -> FloatArray:
+    """Estimate the altitude of every ping from its first sustained rise of echo strength.
+
+    Both sides are averaged by slant range (a rise on one only is an object, not the bottom). In each ping the first
+    place after the transmission's ringing is sought where the echo climbs out of the water's level and stays up;
+    the row of estimates is then cleaned by a median over `window_pings`.
+
+    Args:
+        survey: Pings of any sample count and range.
+        window_pings: Length of the median; odd. Also the longest gap that is bridged.
+
+    Returns:
+        Altitude in metres, shape (pings,), float64; NaN where no rise stands out.
+
+    Raises:
+        ValueError: `window_pings` is even or not positive.
+    """
+    if window_pings < 1 or window_pings % 2 == 0:
+        raise ValueError(f"window_pings is {window_pings}, expected an odd number above 0")
+    reach_m = max((c.slant_range_m for ping in survey.pings for c in ping.channels), default=0.0)
+    if reach_m <= 0:
+        return np.full(len(survey.pings), np.nan)
+    echo = _common_range(survey, reach_m)
+    echo = uniform_filter(echo, size=(_SMOOTHING_PINGS, 3), mode="nearest")
+    first = _first_rise(echo, round(_RING_DOWN_M / reach_m * _BINS))
+    return _median_smoothed(first * reach_m / _BINS, window_pings)
+
+
+def _common_range(survey: Survey, reach_m: float) -> FloatArray:
+    """Return the mean echo of both sides, shape (pings, bins) over 0..reach_m, each side scaled to its own mean."""
+    centres_m = (np.arange(_BINS) + 0.5) * reach_m / _BINS
+    total = np.zeros((len(survey.pings), _BINS))
+    for side in survey.sides():
+        image = np.zeros_like(total)
+        for row, ping in enumerate(survey.pings):
+            channel = ping.channel(side)
+            if channel is not None:
+                image[row] = _resampled(channel.samples, channel.sample_spacing_m, centres_m)
+        mean = image.mean()
+        total += image / mean if mean > 0 else image
+    return total
+
+
+def _resampled(samples: npt.NDArray[np.unsignedinteger], spacing_m: float, centres_m: FloatArray) -> FloatArray:
+    """Average the samples that fall into each bin (or interpolate, where bins are finer); 0 beyond the last one."""
+    cumulative = np.concatenate([[0.0], np.cumsum(samples, dtype=np.float64)])
+    half_m = (centres_m[1] - centres_m[0]) / 2
+    edges = np.concatenate([centres_m - half_m, [centres_m[-1] + half_m]]) / spacing_m
+    filled = np.interp(edges, np.arange(cumulative.shape[0]), cumulative)
+    mean: FloatArray = np.diff(filled) / np.diff(edges)
+    return mean
+
+
+def _first_rise(echo: FloatArray, skip: int) -> FloatArray:
+    """Return the bin of the first sustained rise of each row, float64, NaN where there is none."""
+    searched = echo[:, skip:]
+    water = np.percentile(searched, 5, axis=1, keepdims=True)
+    bottom = np.percentile(searched, 70, axis=1, keepdims=True)
+    # A silent water column (zeros) is given the level of a thousandth of the bottom's.
+    water = np.maximum(water, bottom / 1000)
+    level = water ** (1 - _RISE) * bottom**_RISE
+    above = searched >= level
+    hold = max(math.ceil(echo.shape[1] * _SUSTAINED_FRACTION), 2)
+    # How many of the `hold` bins that begin at each place are above the level.
+    counts = np.cumsum(np.pad(above, ((0, 0), (1, hold))), axis=1)
+    sustained = above & (counts[:, hold:-1] - counts[:, : -hold - 1] >= 0.8 * hold)
+    # The search begins once the water's level has been seen: until then it is the transmission that is met.
+    started = np.maximum.accumulate(~above, axis=1)
+    found = sustained & started
+    first = np.where(found.any(axis=1), found.argmax(axis=1) + float(skip), np.nan)
+    first[(bottom <= _MIN_CONTRAST * water)[:, 0]] = np.nan
+    return first
+
+
+def _median_smoothed(values: FloatArray, window: int) -> FloatArray:
+    """Median over `window` rows, bridging gaps no longer than it."""
+    known = np.flatnonzero(np.isfinite(values))
+    if not known.size:
+        return values
+    rows = np.arange(values.shape[0])
+    filled = np.interp(rows, known, values[known])
+    smooth = np.asarray(median_filter(filled, size=window, mode="nearest"), dtype=np.float64)
+    nearest = np.min(np.abs(rows[:, None] - known[_neighbours(rows, known)]), axis=1)
+    smooth[nearest > window // 2] = np.nan
+    return smooth
+
+
+def _neighbours(rows: npt.NDArray[np.intp], known: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """Return the places in `known` (ascending) just below and just above each row, shape (rows, 2)."""
+    above = np.searchsorted(known, rows).clip(0, known.size - 1)
+    return np.stack([(above - 1).clip(0), above], axis=1)
+
+
+def altitudes_m(survey: Survey) -> FloatArray:
+    """Return the altitude of every ping: the file's own, and `track_bottom`'s where the file gives none.
+
+    Returns:
+        Shape (pings,), float64, metres; NaN where neither is known.
+    """
+    given = np.array([math.nan if p.altitude_m is None else p.altitude_m for p in survey.pings], dtype=np.float64)
+    missing = np.isnan(given)
+    if missing.any() and any(side in survey.sides() for side in Side):
+        given[missing] = track_bottom(survey)[missing]
+    return given
