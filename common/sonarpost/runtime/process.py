@@ -43,7 +43,7 @@ def main(service_type: type[Service[C]], config_type: type[C], arguments: Sequen
     try:
         service = service_type(platform, own)
     except SonarpostError as error:
-        log.error("Service cannot start", extra=logs.kv(reason=str(error)))  # noqa: TRY400 the message says it all
+        log.error("Service cannot start", extra=logs.kv(reason=str(error)))
         return EXIT_CONFIG
     return _run(service)
 

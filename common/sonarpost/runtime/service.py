@@ -35,12 +35,17 @@ C = TypeVar("C", bound=ServiceConfig)
 RETRY_AFTER_S = 1.0
 
 
+class InterruptedByStopError(Exception):
+    """Raised by `Service.handle` when the service stops before the record is handled; it stays in the inbox."""
+
+
 class Effects:
     """What handling one record leads to; committed all together, or not at all."""
 
     def __init__(self) -> None:
         self._sends: list[tuple[str, str, Record, int]] = []
         self._state: dict[str, bytes | None] = {}
+        self._apart: list[tuple[str, bytes, str]] = []
         self._counts: Counter[str] = Counter()
 
     def send(self, key: str, consumer: str, record: Record, *, priority: int = 4) -> None:
@@ -54,6 +59,10 @@ class Effects:
     def delete_state(self, name: str) -> None:
         """Forget `name`."""
         self._state[name] = None
+
+    def keep_apart(self, key: str, payload: bytes, reason: str) -> None:
+        """Keep something that cannot be used, with the reason, in the store's `refused` table."""
+        self._apart.append((key, payload, reason))
 
     def count(self, name: str, by: int = 1) -> None:
         """Add to a health counter once the effects are committed."""
@@ -69,6 +78,8 @@ class Effects:
                 tx.delete_state(name)
             else:
                 tx.put_state(name, value)
+        for key, payload, reason in self._apart:
+            tx.refuse("in", key, payload, reason)
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -115,6 +126,7 @@ class Service(ABC, Generic[C]):
         Raises:
             BadInputError: The record cannot be handled, now or ever: it is kept apart, logged and counted.
             OSError, HandoffError: It cannot be handled now (a full disk): it is tried again.
+            InterruptedByStopError: The service is stopping; the record is handled after the next start.
         """
 
     def check(self, record: Record) -> None:
@@ -206,6 +218,8 @@ class Service(ABC, Generic[C]):
                 self.problem(f"{type(error).__name__}: {error}")
                 self.stopping.wait(RETRY_AFTER_S)
                 continue
+            except InterruptedByStopError:
+                return
             self.problem("")
             if not items:
                 self.store.inbox_changed.wait(1.0)
@@ -214,7 +228,7 @@ class Service(ABC, Generic[C]):
         effects = Effects()
         try:
             self.handle(item.key, wire.decode(self._record_type(item.key), item.payload, item.key), effects)
-        except (OSError, HandoffError):
+        except (OSError, HandoffError, InterruptedByStopError):
             raise
         except BadInputError as error:
             self._refused(error)

@@ -1,0 +1,36 @@
+"""`sonarpost run SERVICE --config FILE` and `sonarpost router`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+
+from sonarpost.runtime import logs, router
+from sonarpost.runtime.config import SERVICES
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommands."""
+    run = subparsers.add_parser("run", help="run one service of the chain", description="Run one service.")
+    run.add_argument("service", choices=SERVICES)
+    run.add_argument("--config", type=Path, required=True, help="TOML file of the platform")
+    run.set_defaults(run=run_service)
+    route = subparsers.add_parser("router", help="run an embedded Zenoh router", description=router.__doc__)
+    router.add_arguments(route)
+    route.set_defaults(run=run_router)
+
+
+def run_service(parsed: argparse.Namespace) -> int:
+    """Run the service's own module, as `python -m services.NAME` does."""
+    sys.argv = [f"services.{parsed.service}", "--config", str(parsed.config)]
+    module = importlib.import_module(f"services.{parsed.service}.__main__")
+    status: int = module.run()
+    return status
+
+
+def run_router(parsed: argparse.Namespace) -> int:
+    """Run an embedded router."""
+    logs.set_up("router")
+    return router.run(parsed.listen, parsed.connect)

@@ -1,0 +1,1 @@
+"""Survey files or snippets to contacts."""

@@ -1,0 +1,1 @@
+"""C2: the shore side."""

@@ -1,0 +1,1 @@
+"""Compressor: snippets to codec streams."""

@@ -1,0 +1,24 @@
+"""Configuration of the compressor: the `[compressor]` table."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from sonarpost.codec.vq import IndexPacking
+from sonarpost.runtime.config import ServiceConfig
+
+
+class CompressorConfig(ServiceConfig):
+    """Which codec, with which model.
+
+    Attributes:
+        codec: Name in the codec registry.
+        catalogue: Tile catalogue: nominal-10, nominal-20 or a file. The receiving end needs the same one.
+        packing: How the vq codec writes an index: 14bit, 2byte, 3byte, ascii5.
+        budget_bytes: Upper bound of a stream, header included; 0 for the codec's natural size.
+    """
+
+    codec: str = "vq"
+    catalogue: str = "nominal-10"
+    packing: IndexPacking = IndexPacking.BITS14
+    budget_bytes: Annotated[int, Field(ge=0, le=65543)] = 0

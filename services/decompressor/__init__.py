@@ -1,0 +1,1 @@
+"""Decompressor: acoustic frames to pictures."""

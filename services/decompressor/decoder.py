@@ -1,0 +1,128 @@
+"""From what the link gave out to the record of a reconstructed picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sonarpost.catalogue.store import open_catalogue
+from sonarpost.codec.interface import Codec, Decoded, Mask, model_tag
+from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.codec.tiles import TileDatabase
+from sonarpost.errors import CatalogueError
+from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.paper_events import ContactOnly, ImageReady
+from sonarpost.messages import Contact, Raster, ReconstructedImage
+
+
+class Decoder:
+    """Decodes with whichever of its catalogues the sender used.
+
+    Args:
+        vessel_id: Name of the vessel in the records.
+        catalogues: Names or files of tile catalogues.
+
+    Raises:
+        CatalogueError: A catalogue cannot be read, or two have the same tag.
+    """
+
+    def __init__(self, vessel_id: str, catalogues: Sequence[str]) -> None:
+        self._vessel_id = vessel_id
+        self._tiles: dict[int, TileDatabase] = {}
+        for name in catalogues:
+            tiles = open_catalogue(name).tiles
+            tag = model_tag(tiles.identity)
+            if tag in self._tiles and self._tiles[tag].identity != tiles.identity:
+                raise CatalogueError(name, "identity", tiles.identity, f"a tag other than {tag:#06x}, which is taken")
+            self._tiles[tag] = tiles
+
+    def image(self, event: ImageReady, vehicle_id: str) -> ReconstructedImage:
+        """Decode an image, or what there is of it.
+
+        Raises:
+            CatalogueError: It was made with a catalogue that is not at hand.
+            StreamError: It cannot be decoded.
+        """
+        codec = self._codec(event)
+        decoded = codec.decode(event.stream, event.received_mask())
+        notes = list(decoded.notes)
+        if event.conflicts:
+            notes.append(f"{event.conflicts} frames disagreed with others of this image")
+        return self._record(event, vehicle_id, decoded, codec, notes)
+
+    def contact_only(self, event: ContactOnly, vehicle_id: str) -> ReconstructedImage:
+        """Return the record of a contact whose picture did not arrive: all of it is missing."""
+        shape = (event.contact.height_px or 16, event.contact.width_px or 16)
+        decoded = Decoded(np.zeros(shape, dtype=np.uint8), np.ones(shape, dtype=np.bool_))
+        return self._record(event, vehicle_id, decoded, None, ["only the contact record arrived"])
+
+    def _codec(self, event: ImageReady) -> Codec:
+        tag = event.header.model_tag
+        tiles = self._tiles.get(tag)
+        if tag and tiles is None:
+            own = ", ".join(f"{known:#06x}" for known in self._tiles)
+            raise CatalogueError(f"image {event.image_id}", "model_tag", f"{tag:#06x}", f"a catalogue at hand: {own}")
+        return default_registry().create_for_stream(event.stream, CodecResources(tiles))
+
+    def _record(
+        self,
+        event: ImageReady | ContactOnly,
+        vehicle_id: str,
+        decoded: Decoded,
+        codec: Codec | None,
+        notes: Sequence[str],
+    ) -> ReconstructedImage:
+        picture = Raster.from_array(decoded.image)
+        return ReconstructedImage(
+            vessel_id=self._vessel_id,
+            vehicle_id=vehicle_id,
+            image_id=event.image_id,
+            version=event.version,
+            contact=contact_of(event, vehicle_id),
+            codec=codec.name if codec else "",
+            model=codec.model_hash if codec else "",
+            picture=picture,
+            picture_sha256=picture.sha256,
+            complete=isinstance(event, ImageReady) and event.complete and not decoded.missing.any(),
+            missing_fraction=float(decoded.missing.mean()),
+            missing_mask=pack_mask(decoded.missing),
+            missing_halves=event.missing_halves if isinstance(event, ImageReady) else ("top", "bottom"),
+            bytes_received=sum(stop - start for start, stop in event.received) if isinstance(event, ImageReady) else 0,
+            bytes_total=event.header.body_length if isinstance(event, ImageReady) else 0,
+            frames_received=event.frames if isinstance(event, ImageReady) else 0,
+            first_frame_utc_s=event.first_at,
+            last_frame_utc_s=event.last_at,
+            notes=tuple(notes),
+        )
+
+
+def pack_mask(missing: Mask) -> bytes:
+    """Return the mask as the record carries it: empty when nothing is missing."""
+    return np.packbits(missing).tobytes() if missing.any() else b""
+
+
+def contact_of(event: ImageReady | ContactOnly, vehicle_id: str) -> Contact | None:
+    """Return the contact as the vessel knows it, None when its record has not arrived.
+
+    The vehicle's own contact identifier does not travel; on this side a contact is vehicle and image identifier.
+    """
+    summary: ContactSummary | None = event.contact
+    if summary is None:
+        return None
+    return Contact(
+        contact_id=f"{vehicle_id}/{event.image_id}",
+        vehicle_id=vehicle_id,
+        channel=summary.side.value if summary.side else None,
+        time_utc_s=summary.time_utc_s,
+        lat_deg=summary.lat_deg,
+        lon_deg=summary.lon_deg,
+        position_sigma_m=summary.position_sigma_m,
+        depth_m=summary.depth_m,
+        altitude_m=summary.altitude_m,
+        heading_deg=summary.heading_deg,
+        ground_range_m=summary.ground_range_m,
+        atd_confidence=summary.confidence,
+        pixel_along_m=summary.pixel_along_m,
+        pixel_across_m=summary.pixel_across_m,
+    )

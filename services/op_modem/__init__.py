@@ -1,0 +1,1 @@
+"""The vessel side of the acoustic link."""

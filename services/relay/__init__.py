@@ -1,0 +1,1 @@
+"""Relay: the vessel to the shore, store and forward."""
