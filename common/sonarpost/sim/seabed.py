@@ -1,0 +1,209 @@
+"""Seabeds to survey: a height map and a backscatter map, seeded.
+
+A seabed is a pair of maps over the surveyed strip, along the track and across it. Heights are metres about a mean of
+zero; backscatter is the Lambert coefficient, linear in intensity (mud about 0.1, sand 0.3, gravel 0.6, rock 0.8 at
+the some hundred kilohertz of a side-scan sonar). The shapes follow what such sonars show: power-law relief, sharp
+crested ripples that meander and fork, patches with soft borders, outcrops that break through sand.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+FloatMap = npt.NDArray[np.float32]
+
+SAND_BACKSCATTER: Final = 0.3
+
+
+class SeabedKind(StrEnum):
+    """What lies on the bottom."""
+
+    SAND = "sand"
+    RIPPLES = "ripples"
+    GRAVEL = "gravel"
+    MUD = "mud"
+    ROCK = "rock"
+    MIXED = "mixed"
+
+
+@dataclass(frozen=True, slots=True)
+class Seabed:
+    """A strip of bottom. The arrays are the strip's own: objects are placed by changing them.
+
+    Attributes:
+        height_m: Shape (along, across), float32, metres.
+        backscatter: Same shape, float32, linear.
+        cell_m: Side of a cell.
+        along_start_m: Along-track coordinate of row 0.
+        across_start_m: Across-track coordinate of column 0; starboard is positive.
+    """
+
+    height_m: FloatMap
+    backscatter: FloatMap
+    cell_m: float
+    along_start_m: float
+    across_start_m: float
+
+    def sampled(self, along_m: npt.NDArray[np.float64], across_m: npt.NDArray[np.float64]) -> tuple[FloatMap, FloatMap]:
+        """Return height and backscatter at places, interpolated linearly, held constant beyond the strip's edge."""
+        where = np.stack([(along_m - self.along_start_m) / self.cell_m, (across_m - self.across_start_m) / self.cell_m])
+        height = map_coordinates(self.height_m, where, order=1, mode="nearest")
+        backscatter = map_coordinates(self.backscatter, where, order=1, mode="nearest")
+        return height, backscatter
+
+
+@dataclass(frozen=True, slots=True)
+class _Patch:
+    height_m: FloatMap
+    backscatter: FloatMap
+
+
+class _Maker:
+    """Draws textures of one shape from one generator."""
+
+    def __init__(self, shape: tuple[int, int], cell_m: float, rng: np.random.Generator) -> None:
+        self._shape = shape
+        self._cell_m = cell_m
+        self._rng = rng
+        along = scipy.fft.fftfreq(shape[0], cell_m).astype(np.float32)
+        across = scipy.fft.rfftfreq(shape[1], cell_m).astype(np.float32)
+        self._wavenumber = np.hypot(along[:, None], across[None, :])
+
+    def fractal(self, exponent: float, longest_m: float, shortest_m: float) -> FloatMap:
+        """Return unit-variance noise whose power falls as wavenumber**-exponent between two wavelengths."""
+        k = self._wavenumber
+        with np.errstate(divide="ignore"):
+            amplitude = np.where(k > 0, k ** np.float32(-exponent / 2), np.float32(0))
+        amplitude *= (k >= 1 / longest_m) * np.exp(-((k * np.float32(shortest_m) / 2) ** 2))
+        white = self._rng.standard_normal(self._shape, dtype=np.float32)
+        noise = scipy.fft.irfft2(scipy.fft.rfft2(white) * amplitude, s=self._shape)
+        spread = float(noise.std())
+        # A strip smaller than the longest wavelength can be left with nothing: flat, then.
+        return np.asarray(noise / spread if spread > 0 else noise, dtype=np.float32)
+
+    def sand(self) -> _Patch:
+        height = 0.05 * self.fractal(3.2, 18.0, 0.5) + 0.004 * self.fractal(2.0, 1.0, 0.12)
+        patches = 0.16 * self.fractal(3.0, 25.0, 1.0) + 0.06 * self.fractal(2.0, 1.5, 0.15)
+        return _Patch(height, SAND_BACKSCATTER * np.exp(patches))
+
+    def ripples(self) -> _Patch:
+        wavelength_m = self._rng.uniform(0.55, 1.1)
+        direction = self._rng.uniform(-math.pi, math.pi)
+        along = np.arange(self._shape[0], dtype=np.float32)[:, None] * self._cell_m
+        across = np.arange(self._shape[1], dtype=np.float32)[None, :] * self._cell_m
+        carrier = (along * math.cos(direction) + across * math.sin(direction)) / wavelength_m
+        # Strong, slow changes of phase make the crests meander and, where they cannot keep up, fork and end.
+        phase = 2 * math.pi * carrier + 2.2 * self.fractal(3.5, 16.0, 2.0) + 0.35 * self.fractal(2.0, 2.5, 0.4)
+        # Waves leave sharp crests and round troughs.
+        profile = np.exp(1.1 * np.sin(phase)) - 1.26
+        strength = np.clip(0.75 + 0.35 * self.fractal(3.0, 20.0, 3.0), 0.15, 1.3)
+        relief = np.asarray(wavelength_m / 38 * strength * profile, dtype=np.float32)
+        bed = self.sand()
+        # Coarser grains and shell gather in the troughs.
+        coarse = np.asarray(1.15 - 0.12 * np.clip(profile, -1, 1), dtype=np.float32)
+        return _Patch(relief + np.float32(0.6) * bed.height_m, bed.backscatter * coarse)
+
+    def gravel(self) -> _Patch:
+        stones = np.clip(self.fractal(0.8, 0.8, 0.12) - 0.9, 0, None) * 0.055
+        height = stones + 0.05 * self.fractal(3.0, 12.0, 0.8) + 0.008 * self.fractal(1.0, 0.6, 0.1)
+        mottled = 0.2 * self.fractal(2.4, 10.0, 0.5) + 0.22 * self.fractal(1.0, 0.6, 0.1)
+        return _Patch(height, 0.55 * np.exp(mottled))
+
+    def mud(self) -> _Patch:
+        height = 0.04 * self.fractal(3.6, 22.0, 2.0)
+        backscatter = 0.09 * np.exp(0.1 * self.fractal(3.2, 25.0, 1.0))
+        pits = np.clip(self.fractal(2.0, 3.0, 0.5) - 2.9, 0, 0.8) * 0.12
+        height = height - pits
+        along = np.arange(self._shape[0], dtype=np.float32)[:, None] * self._cell_m
+        across = np.arange(self._shape[1], dtype=np.float32)[None, :] * self._cell_m
+        for _ in range(int(self._rng.integers(0, 3))):
+            # The furrow of a trawl door or an anchor: a groove with spoil on one side.
+            direction = self._rng.uniform(0, math.pi)
+            through = (self._rng.uniform(0, self._shape[0]), self._rng.uniform(0, self._shape[1]))
+            off = (along - through[0] * self._cell_m) * math.sin(direction)
+            off = off - (across - through[1] * self._cell_m) * math.cos(direction)
+            off = off + 0.25 * self.fractal(3.6, 30.0, 5.0)
+            furrow = 0.05 * np.exp(-(((off - 0.5) / 0.2) ** 2)) - 0.07 * np.exp(-((off / 0.3) ** 2))
+            height = height + np.asarray(furrow, dtype=np.float32)
+        return _Patch(height, backscatter)
+
+    def rock(self) -> _Patch:
+        sand = self.sand()
+        outcrop = self.fractal(2.6, 28.0, 0.5)
+        ridged = 1 - np.abs(self.fractal(2.4, 6.0, 0.25))
+        cover = 1 / (1 + np.exp(-6 * (outcrop - 0.15)))
+        relief = np.clip(outcrop, 0, None) * 0.22 + 0.14 * ridged + 0.03 * self.fractal(1.6, 0.8, 0.12)
+        strength = 0.62 * np.exp(0.3 * self.fractal(1.8, 4.0, 0.15))
+        return _Patch(
+            np.asarray(sand.height_m + cover * relief, dtype=np.float32),
+            np.asarray(sand.backscatter * (1 - cover) + cover * strength, dtype=np.float32),
+        )
+
+    def mixed(self) -> _Patch:
+        """Sand with fields of three other bottoms, their borders as ragged as tides leave them."""
+        patches = [self.sand(), self.ripples(), self.mud() if self._rng.random() < 0.5 else self.gravel(), self.rock()]
+        favour = [0.35, 0.25, 0.0, -0.35]
+        scores = np.stack([bias + self.fractal(3.0, 45.0, 0.8) for bias in favour])
+        weights = np.exp(9 * (scores - scores.max(axis=0)))
+        weights /= weights.sum(axis=0)
+        height = sum(w * p.height_m for w, p in zip(weights, patches, strict=True))
+        backscatter = sum(w * p.backscatter for w, p in zip(weights, patches, strict=True))
+        return _Patch(np.asarray(height, dtype=np.float32), np.asarray(backscatter, dtype=np.float32))
+
+    def make(self, kind: SeabedKind) -> _Patch:
+        draw = {
+            SeabedKind.SAND: self.sand,
+            SeabedKind.RIPPLES: self.ripples,
+            SeabedKind.GRAVEL: self.gravel,
+            SeabedKind.MUD: self.mud,
+            SeabedKind.ROCK: self.rock,
+            SeabedKind.MIXED: self.mixed,
+        }
+        return draw[kind]()
+
+
+def make_seabed(
+    kind: SeabedKind,
+    *,
+    along_m: tuple[float, float],
+    across_m: tuple[float, float],
+    cell_m: float,
+    rng: np.random.Generator,
+) -> Seabed:
+    """Draw a seabed.
+
+    Args:
+        kind: What lies there; `MIXED` is sand with patches of the others.
+        along_m: First and last along-track coordinate to cover.
+        across_m: First and last across-track coordinate to cover, starboard positive.
+        cell_m: Side of a cell.
+        rng: Source of chance; the same state gives the same seabed.
+
+    Raises:
+        ValueError: An empty strip, or one of more than 200 million cells.
+    """
+    if not cell_m > 0 or not along_m[1] > along_m[0] or not across_m[1] > across_m[0]:
+        raise ValueError(f"no strip: {along_m} by {across_m} m in cells of {cell_m} m")
+    wanted = [math.ceil((high - low) / cell_m) + 1 for low, high in (along_m, across_m)]
+    if wanted[0] * wanted[1] > 200_000_000:
+        raise ValueError(f"{wanted[0]} x {wanted[1]} cells are more than memory should be asked for")
+    # Lengths of small prime factors keep the Fourier transforms fast.
+    rows, columns = (scipy.fft.next_fast_len(n, real=True) for n in wanted)
+    patch = _Maker((rows, columns), cell_m, rng).make(kind)
+    # Nothing on the bottom is sharper than a few centimetres.
+    height = gaussian_filter(patch.height_m, 0.02 / cell_m)
+    return Seabed(
+        height_m=np.ascontiguousarray(height[: wanted[0], : wanted[1]], dtype=np.float32),
+        backscatter=np.ascontiguousarray(patch.backscatter[: wanted[0], : wanted[1]], dtype=np.float32),
+        cell_m=cell_m,
+        along_start_m=along_m[0],
+        across_start_m=across_m[0],
+    )

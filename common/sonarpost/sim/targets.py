@@ -1,0 +1,255 @@
+"""Objects on the bottom: the shapes of real sea mines, and the clutter that is taken for them.
+
+Dimensions follow the published ones of the classes that mine hunters train on: a cylinder like a ground mine of
+bomb shape (about 2 m by 0.5 m), a truncated cone like the Manta (0.98 m at the base, 0.44 m high), a wedge like the
+Rockan (1.0 m by 0.8 m, 0.38 m high), and the sphere of a moored mine that lies on the bottom (0.8 to 1.0 m).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from sonarpost.sim.seabed import Seabed
+
+FloatMap = npt.NDArray[np.float32]
+
+
+class ObjectKind(StrEnum):
+    """What lies on the bottom and casts a shadow."""
+
+    CYLINDER = "cylinder"
+    TRUNCATED_CONE = "truncated_cone"
+    SPHERE = "sphere"
+    WEDGE = "wedge"
+    BOULDER = "boulder"
+    DEBRIS = "debris"
+    RIDGE = "ridge"
+
+
+MINE_LIKE_KINDS: Final = (ObjectKind.CYLINDER, ObjectKind.TRUNCATED_CONE, ObjectKind.SPHERE, ObjectKind.WEDGE)
+CLUTTER_KINDS: Final = (ObjectKind.BOULDER, ObjectKind.DEBRIS, ObjectKind.RIDGE)
+
+_BACKSCATTER: Final = {
+    ObjectKind.CYLINDER: 1.1,
+    ObjectKind.TRUNCATED_CONE: 0.9,
+    ObjectKind.SPHERE: 1.2,
+    ObjectKind.WEDGE: 0.9,
+    ObjectKind.BOULDER: 0.6,
+    ObjectKind.DEBRIS: 0.9,
+}
+"""Lambert coefficient of the material; a ridge is of what lies there."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeabedObject:
+    """An object where it lies.
+
+    Attributes:
+        kind: Its shape.
+        along_m: Along-track coordinate of its middle.
+        across_m: Across-track coordinate of its middle, starboard positive.
+        length_m: Along its own long axis.
+        width_m: Across that axis.
+        height_m: Above the bottom around it, which for a partly buried object is less than its own.
+        orientation_deg: Its long axis, clockwise from along-track.
+        seed: What an irregular shape is drawn from.
+    """
+
+    kind: ObjectKind
+    along_m: float
+    across_m: float
+    length_m: float
+    width_m: float
+    height_m: float
+    orientation_deg: float = 0.0
+    seed: int = 0
+
+    @property
+    def is_mine_like(self) -> bool:
+        """Whether it has the shape and size of a sea mine."""
+        return self.kind in MINE_LIKE_KINDS
+
+
+def random_object(kind: ObjectKind, along_m: float, across_m: float, rng: np.random.Generator) -> SeabedObject:
+    """Draw an object of a kind with the sizes that occur, any orientation, buried a little or not at all."""
+    length_m, width_m, height_m = _SIZES[kind](rng)
+    return SeabedObject(
+        kind=kind,
+        along_m=along_m,
+        across_m=across_m,
+        length_m=length_m,
+        width_m=width_m,
+        height_m=height_m,
+        orientation_deg=float(rng.uniform(0, 360)),
+        seed=int(rng.integers(0, 2**31)),
+    )
+
+
+def _cylinder_size(rng: np.random.Generator) -> tuple[float, float, float]:
+    diameter_m = rng.uniform(0.45, 0.6)
+    return rng.uniform(1.6, 2.6), diameter_m, diameter_m * rng.uniform(0.8, 1.0)
+
+
+def _cone_size(rng: np.random.Generator) -> tuple[float, float, float]:
+    base_m = rng.uniform(0.94, 1.05)
+    return base_m, base_m, 0.45 * base_m * rng.uniform(0.85, 1.0)
+
+
+def _sphere_size(rng: np.random.Generator) -> tuple[float, float, float]:
+    diameter_m = rng.uniform(0.8, 1.0)
+    return diameter_m, diameter_m, diameter_m * rng.uniform(0.75, 0.95)
+
+
+def _wedge_size(rng: np.random.Generator) -> tuple[float, float, float]:
+    return rng.uniform(0.95, 1.1), rng.uniform(0.75, 0.85), 0.38 * rng.uniform(0.9, 1.0)
+
+
+def _boulder_size(rng: np.random.Generator) -> tuple[float, float, float]:
+    length_m = rng.uniform(0.5, 1.6)
+    return length_m, length_m * rng.uniform(0.55, 0.95), length_m * rng.uniform(0.25, 0.6)
+
+
+def _debris_size(rng: np.random.Generator) -> tuple[float, float, float]:
+    return rng.uniform(2.0, 5.0), rng.uniform(0.8, 2.0), rng.uniform(0.12, 0.35)
+
+
+def _ridge_size(rng: np.random.Generator) -> tuple[float, float, float]:
+    return rng.uniform(4.0, 9.0), rng.uniform(0.7, 1.4), rng.uniform(0.18, 0.35)
+
+
+_SIZES: Final[dict[ObjectKind, Callable[[np.random.Generator], tuple[float, float, float]]]] = {
+    ObjectKind.CYLINDER: _cylinder_size,
+    ObjectKind.TRUNCATED_CONE: _cone_size,
+    ObjectKind.SPHERE: _sphere_size,
+    ObjectKind.WEDGE: _wedge_size,
+    ObjectKind.BOULDER: _boulder_size,
+    ObjectKind.DEBRIS: _debris_size,
+    ObjectKind.RIDGE: _ridge_size,
+}
+
+
+def surface_height_m(thing: SeabedObject, u_m: FloatMap, v_m: FloatMap) -> FloatMap:
+    """Return how high an object's top stands over the bottom.
+
+    Args:
+        thing: The object.
+        u_m: Distance from its middle along its long axis, metres, any shape.
+        v_m: Distance across that axis, same shape.
+
+    Returns:
+        float32 of that shape; 0 outside the object.
+    """
+    return np.asarray(np.clip(_SURFACES[thing.kind](thing, u_m, v_m), 0, None), dtype=np.float32)
+
+
+def _cylinder(thing: SeabedObject, u_m: FloatMap, v_m: FloatMap) -> FloatMap:
+    radius_m = thing.width_m / 2
+    inside = (np.abs(u_m) <= thing.length_m / 2) & (np.abs(v_m) <= radius_m)
+    top = np.sqrt(np.clip(radius_m**2 - v_m**2, 0, None)) + thing.height_m - radius_m
+    return np.asarray(np.where(inside, top, 0))
+
+
+def _truncated_cone(thing: SeabedObject, u_m: FloatMap, v_m: FloatMap) -> FloatMap:
+    base_m = thing.length_m / 2
+    return np.asarray(thing.height_m * np.clip((base_m - np.hypot(u_m, v_m)) / (0.45 * base_m), 0, 1))
+
+
+def _sphere(thing: SeabedObject, u_m: FloatMap, v_m: FloatMap) -> FloatMap:
+    radius_m = thing.length_m / 2
+    squared = radius_m**2 - u_m**2 - v_m**2
+    top = np.sqrt(np.clip(squared, 0, None)) + thing.height_m - radius_m
+    return np.asarray(np.where(squared >= 0, top, 0))
+
+
+def _wedge(thing: SeabedObject, u_m: FloatMap, v_m: FloatMap) -> FloatMap:
+    inside = (np.abs(u_m) <= thing.length_m / 2) & (np.abs(v_m) <= thing.width_m / 2)
+    return np.asarray(np.where(inside, thing.height_m * (0.6 + 0.8 * u_m / thing.length_m), 0))
+
+
+def _boulder(thing: SeabedObject, u_m: FloatMap, v_m: FloatMap) -> FloatMap:
+    rng = np.random.default_rng(thing.seed)
+    angle = np.arctan2(v_m / thing.width_m, u_m / thing.length_m)
+    outline = np.ones_like(angle)
+    for harmonic in range(2, 7):
+        outline += rng.normal(0, 0.22 / harmonic) * np.cos(harmonic * angle + rng.uniform(0, 2 * math.pi))
+    inner = 2 * np.hypot(u_m / thing.length_m, v_m / thing.width_m) / outline
+    facets = 1 + 0.2 * np.cos(6 * u_m / thing.length_m + rng.uniform(0, 6)) * np.cos(
+        6 * v_m / thing.width_m + rng.uniform(0, 6)
+    )
+    return np.asarray(thing.height_m * np.clip(1 - inner**3, 0, None) * facets / 1.1)
+
+
+def _debris(thing: SeabedObject, u_m: FloatMap, v_m: FloatMap) -> FloatMap:
+    """A few beams and plates that lie across one another."""
+    rng = np.random.default_rng(thing.seed)
+    top = np.zeros_like(u_m)
+    for piece in range(int(rng.integers(3, 7))):
+        turn = rng.normal(0, 0.7)
+        middle = rng.uniform(-0.3, 0.3) * thing.length_m, rng.uniform(-0.3, 0.3) * thing.width_m
+        along = (u_m - middle[0]) * math.cos(turn) + (v_m - middle[1]) * math.sin(turn)
+        across = (v_m - middle[1]) * math.cos(turn) - (u_m - middle[0]) * math.sin(turn)
+        long_m, thick_m = rng.uniform(0.3, 0.7) * thing.length_m, rng.uniform(0.12, 0.3)
+        inside = (np.abs(along) < long_m / 2) & (np.abs(across) < thick_m / 2)
+        raised = thing.height_m * (1.0 if piece == 0 else rng.uniform(0.4, 1.0))
+        top = np.maximum(top, np.where(inside, raised * (0.8 + 0.4 * along / long_m), 0))
+    return np.asarray(top)
+
+
+def _ridge(thing: SeabedObject, u_m: FloatMap, v_m: FloatMap) -> FloatMap:
+    rng = np.random.default_rng(thing.seed)
+    bend = 0.12 * thing.length_m * np.sin(2.2 * u_m / thing.length_m * math.pi + rng.uniform(0, 6))
+    taper = np.clip(1 - (2 * u_m / thing.length_m) ** 4, 0, None)
+    return np.asarray(thing.height_m * taper * np.exp(-(((v_m - bend) / (0.35 * thing.width_m)) ** 2)))
+
+
+_SURFACES: Final[dict[ObjectKind, Callable[[SeabedObject, FloatMap, FloatMap], FloatMap]]] = {
+    ObjectKind.CYLINDER: _cylinder,
+    ObjectKind.TRUNCATED_CONE: _truncated_cone,
+    ObjectKind.SPHERE: _sphere,
+    ObjectKind.WEDGE: _wedge,
+    ObjectKind.BOULDER: _boulder,
+    ObjectKind.DEBRIS: _debris,
+    ObjectKind.RIDGE: _ridge,
+}
+
+
+def place_object(seabed: Seabed, thing: SeabedObject) -> float:
+    """Put an object on a seabed, changing the seabed's maps.
+
+    Args:
+        seabed: The strip; what lies outside of it is cut off.
+        thing: The object.
+
+    Returns:
+        Height of the bottom it stands on, in metres; NaN where the whole object lies outside the strip.
+    """
+    reach = math.ceil((math.hypot(thing.length_m, thing.width_m) / 2 + 0.5) / seabed.cell_m)
+    row = round((thing.along_m - seabed.along_start_m) / seabed.cell_m)
+    column = round((thing.across_m - seabed.across_start_m) / seabed.cell_m)
+    rows = slice(max(row - reach, 0), max(row + reach + 1, 0))
+    columns = slice(max(column - reach, 0), max(column + reach + 1, 0))
+    height, backscatter = seabed.height_m[rows, columns], seabed.backscatter[rows, columns]
+    if not height.size:
+        return math.nan
+    along = seabed.along_start_m + seabed.cell_m * np.arange(rows.start, rows.start + height.shape[0]) - thing.along_m
+    across = seabed.across_start_m + seabed.cell_m * np.arange(columns.start, columns.start + height.shape[1])
+    across = across - thing.across_m
+    turn = math.radians(thing.orientation_deg)
+    u_m = np.asarray(along[:, None] * math.cos(turn) + across[None, :] * math.sin(turn), dtype=np.float32)
+    v_m = np.asarray(across[None, :] * math.cos(turn) - along[:, None] * math.sin(turn), dtype=np.float32)
+    top = surface_height_m(thing, u_m, v_m)
+    ground_m = float(np.median(height))
+    if thing.kind is ObjectKind.RIDGE:
+        height += top
+        return ground_m
+    inside = top > 0
+    height[inside] = np.maximum(height, ground_m + top)[inside]
+    backscatter[inside] = _BACKSCATTER[thing.kind]
+    return ground_m
