@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import struct
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -21,7 +19,8 @@ import numpy as np
 
 from sonarpost.codec.interface import model_tag
 from sonarpost.codec.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase
-from sonarpost.errors import CatalogueError
+from sonarpost.errors import CatalogueError, SurveyFileError
+from sonarpost.sonar.atomic_file import write_atomically
 
 MAGIC = b"SPTILES\n"
 VERSION = 1
@@ -112,36 +111,16 @@ def _parse_notes(data: bytes, where: str) -> dict[str, str]:
     return notes
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that at any moment either the old or the whole new content is there.
-
-    Raises:
-        CatalogueError: The operating system refuses (full disk, no right to write).
-    """
-    try:
-        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            # mkstemp makes files private to the user; a catalogue is meant to be read like any other file.
-            Path(name).chmod(0o644)
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise CatalogueError(str(path), "", str(error), "a place that can be written to") from error
-
-
 def save(path: Path, catalogue: Catalogue) -> None:
     """Write a catalogue atomically.
 
     Raises:
         CatalogueError: It cannot be written.
     """
-    write_atomically(path, to_bytes(catalogue))
+    try:
+        write_atomically(path, to_bytes(catalogue))
+    except SurveyFileError as error:
+        raise CatalogueError(error.where, error.field, error.value, error.expected) from error
 
 
 def load(path: Path) -> Catalogue:

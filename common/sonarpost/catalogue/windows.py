@@ -1,0 +1,129 @@
+"""Training images cut from whole side-scan lines, stretched to 8 bits as snippets are.
+
+A catalogue serves many sonars, so a line is looked at in several scales and tones: each window is reduced by block
+means (finer or coarser sampling than the line's own), mirrored in turn (port and starboard cast shadows to opposite
+sides), and shown in one of a few tones (a snippet may be dark with one bright target, or bright all over).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from sonarpost.catalogue.build import TrainingImage
+
+Picture = npt.NDArray[np.uint8]
+Line = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Tone:
+    """A tone curve: `255 * gain * (value / 255) ** gamma`, limited to 255."""
+
+    gamma: float
+    gain: float
+
+    def table(self) -> Picture:
+        """Return the curve as a table, shape (256,), uint8."""
+        values = 255.0 * self.gain * (np.arange(256) / 255.0) ** self.gamma
+        return np.minimum(np.floor(values + 0.5), 255.0).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class WindowPlan:
+    """How a line is cut.
+
+    Attributes:
+        side_px: Side of the square windows after reduction.
+        reductions: (pings, samples) averaged into one pixel, one set of windows for each.
+        per_reduction: Most windows of one line and reduction, spread evenly over it.
+        least_std: Windows flatter than this (grey levels, before stretching) hold no bottom and are left out.
+        tones: Given to the windows in turn.
+        copies: How often each window is used, each time with the next tone and another mirroring.
+    """
+
+    side_px: int = 80
+    reductions: tuple[tuple[int, int], ...] = ((1, 1), (2, 2), (3, 3), (4, 4), (2, 1), (4, 2), (6, 6))
+    per_reduction: int = 250
+    least_std: float = 12.0
+    tones: tuple[Tone, ...] = field(
+        default=(
+            Tone(1.0, 1.0),
+            Tone(1.3, 0.9),
+            Tone(1.7, 0.8),
+            Tone(0.85, 0.8),
+            Tone(1.5, 0.6),
+            Tone(1.2, 1.15),
+            Tone(2.0, 0.95),
+        )
+    )
+    copies: int = 1
+
+
+def stretch(window: npt.NDArray[np.float64], low_percent: float = 1.0, high_percent: float = 99.5) -> Picture:
+    """Map a window to 8 bits: the two percentiles become 0 and 255, what lies beyond is limited.
+
+    Percentiles are order statistics (no interpolation), so the result is the same everywhere.
+    """
+    ordered = np.sort(window, axis=None)
+    low = float(ordered[int((ordered.size - 1) * low_percent / 100)])
+    high = float(ordered[int((ordered.size - 1) * high_percent / 100)])
+    span = high - low if high > low else 1.0
+    scaled = np.floor((window - low) * 255.0 / span + 0.5)
+    return np.clip(scaled, 0.0, 255.0).astype(np.uint8)
+
+
+def reduce_line(line: Line, pings: int, samples: int) -> npt.NDArray[np.float64]:
+    """Average blocks of (pings, samples); the remainder at the far edges is left out."""
+    rows, columns = line.shape[0] // pings, line.shape[1] // samples
+    blocks = line[: rows * pings, : columns * samples].astype(np.float64).reshape(rows, pings, columns, samples)
+    return np.asarray(blocks.mean(axis=(1, 3)), dtype=np.float64)
+
+
+def cut_line(name: str, line: Line, plan: WindowPlan) -> Iterator[TrainingImage]:
+    """Cut one side of a survey line into training images.
+
+    Args:
+        name: Name of the line, the start of the images' names.
+        line: Shape (pings, samples), float32; NaN where there is no sample.
+        plan: How to cut.
+    """
+    tables = [tone.table() for tone in plan.tones]
+    serial = 0
+    for pings, samples in plan.reductions:
+        reduced = reduce_line(line, pings, samples)
+        corners = _usable_corners(reduced, plan)
+        wanted = min(plan.per_reduction, len(corners))
+        for number in range(wanted):
+            top, left = corners[number * len(corners) // wanted]
+            window = stretch(reduced[top : top + plan.side_px, left : left + plan.side_px])
+            for _ in range(plan.copies):
+                mirrored = window[:: -1 if serial & 1 else 1, :: -1 if serial & 2 else 1]
+                # The step of 1 + the reduction's own count keeps tone and mirroring from going in step.
+                pixels = tables[(serial + serial // len(tables)) % len(tables)][mirrored]
+                label = f"{name} {pings}x{samples} at {top},{left} #{serial}"
+                yield _training_image(label, np.ascontiguousarray(pixels))
+                serial += 1
+
+
+def shuffled(images: Sequence[TrainingImage]) -> list[TrainingImage]:
+    """Return the images in an order that mixes lines and scales yet depends only on their names."""
+    return sorted(images, key=lambda image: hashlib.sha256(image.name.encode()).digest())
+
+
+def _usable_corners(line: npt.NDArray[np.float64], plan: WindowPlan) -> list[tuple[int, int]]:
+    corners = []
+    for top in range(0, line.shape[0] - plan.side_px + 1, plan.side_px):
+        for left in range(0, line.shape[1] - plan.side_px + 1, plan.side_px):
+            window = line[top : top + plan.side_px, left : left + plan.side_px]
+            if np.isfinite(window).all() and float(window.std()) >= plan.least_std:
+                corners.append((top, left))
+    return corners
+
+
+def _training_image(name: str, pixels: Picture) -> TrainingImage:
+    return TrainingImage(name, lambda: pixels)
