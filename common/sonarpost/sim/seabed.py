@@ -91,7 +91,7 @@ class _Maker:
 
     def sand(self) -> _Patch:
         height = 0.05 * self.fractal(3.2, 18.0, 0.5) + 0.004 * self.fractal(2.0, 1.0, 0.12)
-        patches = 0.16 * self.fractal(3.0, 25.0, 1.0) + 0.06 * self.fractal(2.0, 1.5, 0.15)
+        patches = 0.22 * self.fractal(3.2, 30.0, 0.8) + 0.06 * self.fractal(2.0, 1.5, 0.15)
         return _Patch(height, SAND_BACKSCATTER * np.exp(patches))
 
     def ripples(self) -> _Patch:
@@ -137,11 +137,11 @@ class _Maker:
 
     def rock(self) -> _Patch:
         sand = self.sand()
-        outcrop = self.fractal(2.6, 28.0, 0.5)
-        ridged = 1 - np.abs(self.fractal(2.4, 6.0, 0.25))
+        outcrop = self.fractal(3.2, 28.0, 0.7)
+        ridged = 1 - np.abs(self.fractal(3.3, 7.0, 0.5))
         cover = 1 / (1 + np.exp(-6 * (outcrop - 0.15)))
-        relief = np.clip(outcrop, 0, None) * 0.22 + 0.14 * ridged + 0.03 * self.fractal(1.6, 0.8, 0.12)
-        strength = 0.62 * np.exp(0.3 * self.fractal(1.8, 4.0, 0.15))
+        relief = np.clip(outcrop, 0, None) * 0.16 + 0.2 * ridged + 0.012 * self.fractal(2.4, 1.2, 0.15)
+        strength = 0.5 * np.exp(0.25 * self.fractal(1.8, 4.0, 0.15))
         return _Patch(
             np.asarray(sand.height_m + cover * relief, dtype=np.float32),
             np.asarray(sand.backscatter * (1 - cover) + cover * strength, dtype=np.float32),

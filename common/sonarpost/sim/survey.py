@@ -22,7 +22,7 @@ FloatArray = npt.NDArray[np.float64]
 
 SONAR_NAME: Final = "simulated SSS"
 _SIGN: Final = {Side.PORT: -1, Side.STARBOARD: 1}
-_SAND_LEVEL: Final = 0.2
+_SAND_LEVEL: Final = 0.26
 """Part of full scale that flat sand at half range comes to."""
 _MARGIN_M: Final = 2.0
 _APART_M: Final = 5.0
@@ -238,7 +238,7 @@ def _drive(spec: SurveySpec, seabed: Seabed, rng: np.random.Generator) -> tuple[
     bottom_m = np.asarray(seabed.sampled(along_m, across_m)[0], dtype=np.float64)
     # The vehicle holds its altitude over the bottom as its altimeter shows it, some seconds late and not quite.
     held = gaussian_filter1d(bottom_m, 3.0 * spec.ping_rate_hz, mode="nearest")
-    drift = 1 + spec.wobble * (0.05 * _wander(spec.pings, slow, rng) + 0.006 * _wander(spec.pings, swell, rng))
+    drift = 1 + spec.wobble * (0.08 * _wander(spec.pings, slow, rng) + 0.006 * _wander(spec.pings, swell, rng))
     height_m = held + spec.altitude_m * np.clip(drift, 0.5, 1.5)
     track = Track(along_m, across_m, height_m, np.radians(yaw_deg), np.radians(roll_deg))
     return track, height_m - bottom_m

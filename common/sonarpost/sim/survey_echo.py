@@ -171,7 +171,7 @@ def received(
     """
     centres = (np.arange(settings.samples) + 0.5) / settings.samples
     noise = _NOISE * (0.004 + 0.03 * centres + centres**4)
-    drift = gaussian_filter1d(rng.standard_normal(intensity.shape[0]), 8.0) * 0.12
+    drift = gaussian_filter1d(rng.standard_normal(intensity.shape[0]), 8.0) * 0.3
     gain = np.exp(drift + 0.015 * rng.standard_normal(intensity.shape[0]))[:, None]
     # Plankton and bubbles drift through the water column in faint clouds.
     cloud = gaussian_filter1d(gaussian_filter1d(rng.standard_normal(intensity.shape), 30.0, axis=0), 12.0, axis=1)

@@ -1,0 +1,79 @@
+"""`sonarpost simulate`: write a simulated survey, and what is truly in it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+from sonarpost.sim.seabed import SeabedKind
+from sonarpost.sim.survey import SimulatedSurvey, SurveySpec, simulate_survey
+from sonarpost.sonar.atomic_file import write_atomically
+from sonarpost.sonar.xtf_writer import write_xtf
+
+TRUTH_SCHEMA = 1
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the `simulate` command."""
+    default = SurveySpec()
+    parser = subparsers.add_parser(
+        "simulate",
+        help="write a simulated side-scan survey as XTF",
+        description="Write a simulated side-scan survey as XTF. The same options give the same file.",
+    )
+    parser.add_argument("out", type=Path, metavar="OUT.xtf", help="the file to create or replace")
+    parser.add_argument("--seed", type=int, default=default.seed, help="source of every chance (%(default)s)")
+    parser.add_argument(
+        "--seabed",
+        choices=[kind.value for kind in SeabedKind],
+        default=default.seabed.value,
+        help="what lies on the bottom (%(default)s)",
+    )
+    parser.add_argument("--pings", type=int, default=default.pings, help="length of the line (%(default)s)")
+    parser.add_argument("--samples", type=int, default=default.samples, help="samples a side (%(default)s)")
+    parser.add_argument(
+        "--range-m", type=float, default=default.range_m, help="slant range a side in metres (%(default)s)"
+    )
+    parser.add_argument(
+        "--altitude-m", type=float, default=default.altitude_m, help="height over the bottom (%(default)s)"
+    )
+    parser.add_argument("--bits", type=int, choices=(8, 16), default=default.bits, help="a sample (%(default)s)")
+    parser.add_argument("--targets", type=int, default=default.targets, help="mine-like objects (%(default)s)")
+    parser.add_argument("--clutter", type=int, default=default.clutter, help="other objects (%(default)s)")
+    parser.add_argument("--truth", type=Path, metavar="FILE.json", help="write what is truly there, as JSON")
+    parser.set_defaults(run=run_simulate)
+
+
+def run_simulate(args: argparse.Namespace) -> int:
+    """Simulate, write and say what was written.
+
+    Raises:
+        ConfigError: An option out of range.
+        SurveyFileError: A file cannot be written.
+    """
+    spec = SurveySpec(
+        seed=args.seed,
+        seabed=SeabedKind(args.seabed),
+        pings=args.pings,
+        samples=args.samples,
+        range_m=args.range_m,
+        altitude_m=args.altitude_m,
+        bits=args.bits,
+        targets=args.targets,
+        clutter=args.clutter,
+    )
+    simulated = simulate_survey(spec)
+    write_xtf(simulated.survey, args.out)
+    if args.truth is not None:
+        write_atomically(args.truth, truth_json(simulated, args.out.name).encode())
+    mines = sum(thing.is_mine_like for thing in simulated.truth)
+    print(f"{args.out}: {spec.pings} pings, {mines} mine-like objects, {len(simulated.truth) - mines} others")
+    return 0
+
+
+def truth_json(simulated: SimulatedSurvey, survey_name: str) -> str:
+    """Return the truth of a simulated survey as a JSON document, one object for each thing on the bottom."""
+    objects = [asdict(thing) for thing in simulated.truth]
+    return json.dumps({"schema": TRUTH_SCHEMA, "survey": survey_name, "objects": objects}, indent=2) + "\n"
