@@ -19,6 +19,7 @@ from sonarpost.runtime.service import C, Service
 log = logging.getLogger(__name__)
 
 SHUTDOWN_S = 2.5
+EXIT_DEFECT = 1
 EXIT_CONFIG = 2
 EXIT_STUCK = 3
 
@@ -64,7 +65,7 @@ def _run(service: Service[C]) -> int:
         guard.start()
         service.stop()
         guard.cancel()
-    return 0
+    return EXIT_DEFECT if service.failed else 0
 
 
 def _give_up() -> None:

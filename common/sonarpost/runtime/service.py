@@ -13,7 +13,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import ClassVar, Generic, TypeVar
 
 import zenoh
@@ -102,6 +102,7 @@ class Service(ABC, Generic[C]):
         self.platform = platform
         self.config = config
         self.stopping = threading.Event()
+        self.failed = False
         self.started_utc_s = time.time()
         self.store = Store(platform.state_dir / f"{self.NAME}.db")
         self._counters: Counter[str] = Counter()
@@ -183,10 +184,18 @@ class Service(ABC, Generic[C]):
         self.store.close()
         log.info("Service stopped")
 
-    def spawn(self, target: object, name: str) -> None:
-        """Run `target` in a thread that `stop` waits for."""
-        assert callable(target)
-        thread = threading.Thread(target=target, name=name, daemon=True)
+    def spawn(self, target: Callable[[], None], name: str) -> None:
+        """Run `target` in a thread that `stop` waits for; a defect in it ends the service instead of maiming it."""
+
+        def guarded() -> None:
+            try:
+                target()
+            except Exception:
+                log.exception("Defect in a thread, the service ends", extra=kv(thread=name))
+                self.failed = True
+                self.stopping.set()
+
+        thread = threading.Thread(target=guarded, name=name, daemon=True)
         self._threads.append(thread)
         thread.start()
 

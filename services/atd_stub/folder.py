@@ -1,0 +1,68 @@
+"""Which files of a polled folder are complete, decided from what two looks at it have seen."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class FileSeen:
+    """A file as one look at the folder found it."""
+
+    path: Path
+    size_bytes: int
+    modified_ns: int
+
+
+class SettledFiles:
+    """Tells which files have stopped growing.
+
+    Args:
+        settle_s: How long size and date must stay as they are.
+    """
+
+    def __init__(self, settle_s: float) -> None:
+        self._settle_s = settle_s
+        self._since: dict[FileSeen, float] = {}
+
+    def look(self, files: tuple[FileSeen, ...], now: float) -> tuple[FileSeen, ...]:
+        """Return the files that have settled, oldest first (then by name, for files of one date).
+
+        Args:
+            files: Everything in the folder now.
+            now: Seconds on a clock that never goes back.
+        """
+        self._since = {seen: self._since.get(seen, now) for seen in files}
+        settled = (seen for seen, since in self._since.items() if now - since >= self._settle_s)
+        return tuple(sorted(settled, key=lambda seen: (seen.modified_ns, seen.path.name)))
+
+
+def look_at(folder: Path, suffixes: tuple[str, ...]) -> tuple[FileSeen, ...]:
+    """Return the regular files of these suffixes in `folder`, hidden ones (still being copied) left out.
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
+    found = []
+    for path in folder.iterdir():
+        if path.name.startswith(".") or path.suffix.lower() not in suffixes:
+            continue
+        try:
+            status = path.stat()
+        except FileNotFoundError:
+            continue  # taken away since the folder was listed
+        if path.is_file():
+            found.append(FileSeen(path, status.st_size, status.st_mtime_ns))
+    return tuple(found)
+
+
+def content_hash(path: Path) -> str:
+    """Return the hex sha256 of a file's content, by which it is known whatever its name.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,148 @@
+"""Polls a folder for files, finds what is worth sending in each, and hands it on."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import msgpack
+
+from services.atd_stub import snippets
+from services.atd_stub.config import AtdStubConfig
+from services.atd_stub.folder import FileSeen, SettledFiles, content_hash, look_at
+from sonarpost import keys
+from sonarpost.errors import HandoffError, SurveyFileError
+from sonarpost.files import write_atomically
+from sonarpost.messages import Record, Snippet
+from sonarpost.runtime.config import PlatformConfig
+from sonarpost.runtime.logs import kv
+from sonarpost.runtime.service import Effects, Service
+from sonarpost.sonar.readers import SUPPORTED_SUFFIXES
+
+log = logging.getLogger(__name__)
+
+PICTURE_SUFFIXES = (".tif", ".tiff", ".png")
+
+
+class AtdStubService(Service[AtdStubConfig]):
+    """Processes every file once ever, known by its content.
+
+    That a file was processed and the snippets found in it are committed together: a process killed while it works on
+    a file begins that file again and owes its snippets once.
+    """
+
+    NAME = "atd_stub"
+
+    def __init__(self, platform: PlatformConfig, config: AtdStubConfig) -> None:
+        super().__init__(platform, config)
+        self._suffixes = SUPPORTED_SUFFIXES if config.mode == "survey" else PICTURE_SUFFIXES
+        self._settled = SettledFiles(config.settle_s)
+        self._dealt_with: set[FileSeen] = set()
+        self._waiting = -1
+
+    def handle(self, key: str, record: Record, effects: Effects) -> None:
+        """Refuse: nothing is sent to this service."""
+        raise NotImplementedError("atd_stub consumes no records")
+
+    def on_start(self) -> None:
+        """Start to poll."""
+        self.config.input_dir.mkdir(parents=True, exist_ok=True)
+        self.spawn(self._poll, "poll")
+
+    def gauges(self) -> Mapping[str, float]:
+        """Return how many files wait; -1 before the first look."""
+        return {"files_waiting": float(self._waiting)}
+
+    def _poll(self) -> None:
+        while not self.stopping.is_set():
+            try:
+                self._look()
+            except (OSError, HandoffError) as error:
+                self.problem(f"{type(error).__name__}: {error}")
+            else:
+                self.problem("")
+            self.stopping.wait(self.config.poll_s)
+
+    def _look(self) -> None:
+        here = look_at(self.config.input_dir, self._suffixes)
+        self._dealt_with &= set(here)
+        fresh = tuple(seen for seen in here if seen not in self._dealt_with)
+        ready = self._settled.look(fresh, time.monotonic())
+        self._waiting = len(fresh)
+        for seen in ready:
+            if self.stopping.is_set():
+                return
+            self._process(seen)
+            self._dealt_with.add(seen)
+            self._waiting -= 1
+
+    def _process(self, seen: FileSeen) -> None:
+        try:
+            content = content_hash(seen.path)
+        except FileNotFoundError:
+            return
+        if (kept := self.store.get_state(_state_name(content))) is not None:
+            self._meet_again(seen.path, kept)
+            return
+        started = time.perf_counter()
+        try:
+            found = self._snippets(seen.path, content)
+        except SurveyFileError as error:
+            self._quarantine(seen.path, content, str(error))
+            return
+        except (OSError, HandoffError):
+            raise
+        except Exception as error:
+            # A defect of ours must not stop the files behind this one.
+            log.exception("File not processed", extra=kv(file=seen.path.name))
+            self._quarantine(seen.path, content, f"{type(error).__name__}: {error}")
+            return
+        if content_hash(seen.path) != content:
+            log.warning("File changed while it was read, looking again later", extra=kv(file=seen.path.name))
+            return
+        effects = Effects()
+        for snippet in found:
+            effects.send(keys.contact_detected(self.platform.id), "compressor", snippet)
+        effects.put_state(_state_name(content), msgpack.packb({"file": seen.path.name, "contacts": len(found)}))
+        effects.count("files_processed")
+        effects.count("contacts_detected", len(found))
+        self.commit(effects)
+        seconds = round(time.perf_counter() - started, 2)
+        log.info("File processed", extra=kv(file=seen.path.name, contacts=len(found), seconds=seconds))
+
+    def _snippets(self, path: Path, content: str) -> tuple[Snippet, ...]:
+        if self.config.mode == "snippets":
+            return snippets.from_picture(path, content, self.platform.id)
+        return snippets.from_survey(path, content, self.platform.id, self.config)
+
+    def _meet_again(self, path: Path, kept: bytes) -> None:
+        """Leave a file that was processed; put one that was refused aside again, where it will be found."""
+        reason = msgpack.unpackb(kept).get("refused")
+        log.info("File known already", extra=kv(file=path.name, refused=reason or "no"))
+        if reason is not None:
+            self._move_aside(path, reason)
+
+    def _quarantine(self, path: Path, content: str, reason: str) -> None:
+        """Remember a bad file, so that it is looked at once, and move it aside with its reason."""
+        log.error("File quarantined", extra=kv(file=path.name, reason=reason))
+        effects = Effects()
+        effects.put_state(_state_name(content), msgpack.packb({"file": path.name, "refused": reason}))
+        effects.count("files_quarantined")
+        self.commit(effects)
+        self._move_aside(path, reason)
+
+    def _move_aside(self, path: Path, reason: str) -> None:
+        folder = self.config.quarantine_dir or self.config.input_dir / "quarantine"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(folder / f"{path.name}.reason.txt", f"{reason}\n".encode())
+            path.replace(folder / path.name)
+        except OSError as trouble:
+            # A read-only folder: the file stays, and is known by its content.
+            log.warning("File cannot be moved", extra=kv(file=path.name, error=str(trouble)))
+
+
+def _state_name(content: str) -> str:
+    return f"file:{content}"
