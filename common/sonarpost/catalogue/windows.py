@@ -110,6 +110,36 @@ def cut_line(name: str, line: Line, plan: WindowPlan) -> Iterator[TrainingImage]
                 serial += 1
 
 
+def cut_around(name: str, line: Line, places: Sequence[tuple[int, int]], plan: WindowPlan) -> Iterator[TrainingImage]:
+    """Cut windows that each show one place, for what is rare on the bottom (objects with their shadows).
+
+    Args:
+        name: Name of the line, the start of the images' names.
+        line: As for `cut_line`.
+        places: (ping, sample) to show. They come to lie off the windows' middle, by turns to each side.
+        plan: How to cut; `per_reduction` and `least_std` do not apply.
+    """
+    tables = [tone.table() for tone in plan.tones]
+    offsets = ((0, 0), (3, -9), (-7, 5), (9, 8), (-4, -13), (13, -3), (-11, 11))  # no two alike modulo a tile's side
+    serial = 0
+    for pings, samples in plan.reductions:
+        reduced = reduce_line(line, pings, samples)
+        if min(reduced.shape) < plan.side_px:
+            continue
+        for ping, sample in places:
+            for _ in range(plan.copies):
+                down, right = offsets[serial % len(offsets)]
+                top = min(max(ping // pings - plan.side_px // 2 + down, 0), reduced.shape[0] - plan.side_px)
+                left = min(max(sample // samples - plan.side_px // 2 + right, 0), reduced.shape[1] - plan.side_px)
+                window = reduced[top : top + plan.side_px, left : left + plan.side_px]
+                if np.isfinite(window).all():
+                    mirrored = stretch(window)[:: -1 if serial & 1 else 1, :: -1 if serial & 2 else 1]
+                    pixels = tables[(serial + serial // len(tables)) % len(tables)][mirrored]
+                    label = f"{name} object {pings}x{samples} at {top},{left} #{serial}"
+                    yield _training_image(label, np.ascontiguousarray(pixels))
+                serial += 1
+
+
 def shuffled(images: Sequence[TrainingImage]) -> list[TrainingImage]:
     """Return the images in an order that mixes lines and scales yet depends only on their names."""
     return sorted(images, key=lambda image: hashlib.sha256(image.name.encode()).digest())

@@ -47,12 +47,14 @@ class CodecSpec:
         codec_ids: Every id its streams may carry.
         create: Makes the codec; raises ConfigError where a resource it needs is absent.
         summary: One line for people.
+        needs_tiles: Whether `create` needs a tile database.
     """
 
     name: str
     codec_ids: tuple[int, ...]
     create: Callable[[CodecResources], Codec]
     summary: str = ""
+    needs_tiles: bool = False
 
 
 def _create_vq(resources: CodecResources) -> Codec:
@@ -70,6 +72,7 @@ BUILTINS = (
         tuple(packing.codec_id for packing in IndexPacking),
         _create_vq,
         "vector quantisation with a shared tile catalogue (the paper's codec)",
+        needs_tiles=True,
     ),
 )
 
