@@ -1,8 +1,8 @@
 """The dice of the simulated water.
 
 Every draw is a keyed hash of what it is about (seed, transmitter, packet number, receiver, frame, purpose), not
-the next number of a running generator. So a packet meets the same fate whatever happened around it, however the process was
-scheduled, and on every platform and Python version.
+the next number of a running generator. So a packet meets the same fate whatever happened around it, however the
+process was scheduled, and on every platform and Python version.
 """
 
 from __future__ import annotations

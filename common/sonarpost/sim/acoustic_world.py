@@ -1,0 +1,121 @@
+"""Emulated modems in one water: the whole simulated acoustic side, still without clock or port.
+
+Whoever drives it passes bytes from the hosts in with `receive`, calls `advance` with the simulated time, and writes
+what `take_outputs` returns. Everything that happens by itself happens at its own exact time, however late `advance` is
+called, so a slow or jittery driver changes no result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from sonarpost.sim.micromodem import Micromodem
+from sonarpost.sim.micromodem_config import ModemConfig, Output, Report
+from sonarpost.sim.serial_pace import SerialPace
+from sonarpost.sim.water import Water
+from sonarpost.sim.water_physics import Position
+from sonarpost.sim.water_records import ArrivalStarted, Transmission, WaterConfig
+
+
+@dataclass(frozen=True, slots=True)
+class ModemPlace:
+    """One modem and where it is."""
+
+    config: ModemConfig
+    position: Position = field(default_factory=Position)
+
+
+@dataclass(slots=True)
+class _Port:
+    """A modem with the two directions of its serial line."""
+
+    modem: Micromodem
+    to_modem: SerialPace[bytes]
+    to_host: SerialPace[Output]
+    passed: list[Output] = field(default_factory=list)
+
+
+class AcousticWorld:
+    """Modems, their serial lines, and the water.
+
+    Args:
+        water: What the water does.
+        modems: Each modem by its number.
+        serial_baud: Speed of the serial lines, or None for lines without delay.
+    """
+
+    def __init__(self, water: WaterConfig, modems: Mapping[int, ModemPlace], serial_baud: float | None = None) -> None:
+        self.now = 0.0
+        self.water = Water(water, {number: place.position for number, place in modems.items()})
+        self._ports = {
+            number: _Port(Micromodem(place.config), SerialPace(serial_baud), SerialPace(serial_baud))
+            for number, place in modems.items()
+        }
+
+    def modem(self, number: int) -> Micromodem:
+        """Return one modem.
+
+        Raises:
+            KeyError: No modem of that number.
+        """
+        return self._ports[number].modem
+
+    def receive(self, number: int, data: bytes, now: float) -> None:
+        """Put bytes from a host on its modem's serial line; `advance` acts on them."""
+        port = self._ports[number]
+        for piece in data.splitlines(keepends=True):
+            port.to_modem.put(piece, len(piece), max(now, self.now))
+
+    def forget_host(self, number: int) -> None:
+        """The host of a modem went away."""
+        self._ports[number].modem.forget_host()
+
+    def next_deadline_s(self) -> float:
+        """Return the simulated time at which `advance` has something to do."""
+        times_s = [port.modem.next_deadline_s() for port in self._ports.values()]
+        for port in self._ports.values():
+            times_s += [time_s for time_s in (port.to_modem.next_s(), port.to_host.next_s()) if time_s is not None]
+        water_s = self.water.next_event_s()
+        return min(times_s if water_s is None else [*times_s, water_s])
+
+    def advance(self, now: float) -> list[Transmission | Report]:
+        """Let everything happen up to `now`.
+
+        Returns:
+            Every packet put into the water, and of the packets that passed a modem the reports that its host is
+            not told; the others come with `take_outputs`, when their bytes do.
+        """
+        happened: list[Transmission | Report] = []
+        while (due_s := self.next_deadline_s()) <= now:
+            happened += self._step(max(due_s, self.now))
+        self.now = max(self.now, now)
+        return happened
+
+    def take_outputs(self, number: int) -> list[Output]:
+        """Return, once, what has come out of a modem's serial line by the last `advance`."""
+        port = self._ports[number]
+        passed, port.passed = port.passed, []
+        return passed
+
+    def _step(self, now: float) -> list[Transmission | Report]:
+        """Let happen what happens at `now`, which no event lies before."""
+        self.now = now
+        happened: list[Transmission | Report] = []
+        for event in self.water.poll(now):
+            modem = self._ports[event.receiver].modem
+            if isinstance(event, ArrivalStarted):
+                modem.packet_started(event)
+                continue
+            report = modem.packet_ended(event)
+            if report.untold is not None:
+                happened.append(report)
+        for number, port in self._ports.items():
+            for data in port.to_modem.take(now):
+                port.modem.receive(data, now)
+            port.modem.poll(now)
+            happened += [self.water.transmit(number, packet, now) for packet in port.modem.packets_to_transmit()]
+            for output in port.modem.take_outputs():
+                port.to_host.put(output, len(output.data), now)
+            port.passed += port.to_host.take(now)
+        return happened

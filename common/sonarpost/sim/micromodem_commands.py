@@ -1,0 +1,152 @@
+"""What hosts say to the emulated modem, from sentences to typed commands.
+
+Every function takes a sentence and either returns a command or raises `SentenceError`.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from sonarpost.errors import SentenceError
+from sonarpost.modem.nmea import Sentence
+from sonarpost.modem.rates import RATES
+
+MOST_ADDRESS = 127
+
+_INTEGER = re.compile(r"-?[0-9]{1,10}")
+_HEX = re.compile(r"(?:[0-9A-Fa-f]{2})*")
+_MINI = re.compile(r"[0-9A-Fa-f]{1,4}")
+
+
+@dataclass(frozen=True, slots=True)
+class StartCycle:
+    """`CCCYC`: ask for a packet of `frames` frames to be filled and sent."""
+
+    command: int
+    source: int
+    destination: int
+    rate: int
+    ack_requested: bool
+    frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class FillFrame:
+    """`CCTXD`: the data of the frame that was asked for; none means that there is no more."""
+
+    source: int
+    destination: int
+    ack_requested: bool
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Mini:
+    """`CCMPC` or `CCMUC`: a ping, or a user mini-packet of 13 bits."""
+
+    source: int
+    destination: int
+    bits: int = 0
+
+
+def integer(sentence: Sentence, index: int, name: str, low: int, high: int) -> int:
+    """Return field `index` (from 0, after the kind) as an integer within `low`..`high`.
+
+    Raises:
+        SentenceError: The field is absent, not an integer, or out of bounds.
+    """
+    text = field(sentence, index, name)
+    if not _INTEGER.fullmatch(text) or not low <= int(text) <= high:
+        raise SentenceError(sentence.kind, name, text, f"an integer {low}..{high}")
+    return int(text)
+
+
+def field(sentence: Sentence, index: int, name: str) -> str:
+    """Return field `index` as text.
+
+    Raises:
+        SentenceError: The sentence is too short.
+    """
+    if index >= len(sentence.fields):
+        raise SentenceError(sentence.kind, name, ",".join(sentence.fields), f"at least {index + 1} fields")
+    return sentence.fields[index]
+
+
+def start_cycle(sentence: Sentence) -> StartCycle:
+    """Read `$CCCYC,command,source,destination,rate,ack,frames`.
+
+    Raises:
+        SentenceError: A field that is absent or out of bounds, a rate without so many frames.
+    """
+    rate = integer(sentence, 3, "rate", 0, max(RATES))
+    return StartCycle(
+        integer(sentence, 0, "command", 0, 1),
+        integer(sentence, 1, "source", 0, MOST_ADDRESS),
+        integer(sentence, 2, "destination", 0, MOST_ADDRESS),
+        rate,
+        bool(integer(sentence, 4, "ack", 0, 1)),
+        integer(sentence, 5, "frames", 1, RATES[rate].frames),
+    )
+
+
+def fill_frame(sentence: Sentence) -> FillFrame:
+    """Read `$CCTXD,source,destination,ack,hex`.
+
+    Raises:
+        SentenceError: A field that is absent, out of bounds or not hex.
+    """
+    data = field(sentence, 3, "data")
+    if not _HEX.fullmatch(data):
+        raise SentenceError(sentence.kind, "data", data, "pairs of hex digits")
+    return FillFrame(
+        integer(sentence, 0, "source", 0, MOST_ADDRESS),
+        integer(sentence, 1, "destination", 0, MOST_ADDRESS),
+        bool(integer(sentence, 2, "ack", 0, 1)),
+        bytes.fromhex(data),
+    )
+
+
+def mini(sentence: Sentence) -> Mini:
+    """Read `$CCMPC,source,destination` or `$CCMUC,source,destination,HHHH`.
+
+    Raises:
+        SentenceError: A field that is absent, out of bounds or more than 13 bits.
+    """
+    source = integer(sentence, 0, "source", 0, MOST_ADDRESS)
+    destination = integer(sentence, 1, "destination", 0, MOST_ADDRESS)
+    if sentence.kind == "CCMPC":
+        return Mini(source, destination)
+    text = field(sentence, 2, "bits")
+    if not _MINI.fullmatch(text) or int(text, 16) > 0x1FFF:
+        raise SentenceError(sentence.kind, "bits", text, "hex, at most 1FFF")
+    return Mini(source, destination, int(text, 16))
+
+
+def calendar_fields(sentence: Sentence) -> datetime:
+    """Read `$CCCLK,year,month,day,hour,minute,second` (UTC).
+
+    Raises:
+        SentenceError: A field that is absent, or no such date or time.
+    """
+    names = ("year", "month", "day", "hour", "minute", "second")
+    year, month, day, hour, minute, second = (integer(sentence, i, name, 0, 9999) for i, name in enumerate(names))
+    try:
+        return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
+    except ValueError as error:
+        raise SentenceError(sentence.kind, "date", ",".join(sentence.fields), "a date and time") from error
+
+
+def iso_time(sentence: Sentence) -> datetime:
+    """Read `$CCTMS,2019-12-02T03:02:59Z,mode` (UTC; the mode has to be 0, at once).
+
+    Raises:
+        SentenceError: A field that is absent, not such a time, or another mode.
+    """
+    text = field(sentence, 0, "time")
+    integer(sentence, 1, "mode", 0, 0)
+    try:
+        return datetime.strptime(text, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)
+    except ValueError as error:
+        raise SentenceError(sentence.kind, "time", text, "YYYY-MM-DDThh:mm:ssZ") from error
