@@ -92,7 +92,7 @@ class _Maker:
     def sand(self) -> _Patch:
         height = 0.05 * self.fractal(3.2, 18.0, 0.5) + 0.004 * self.fractal(2.0, 1.0, 0.12)
         patches = 0.22 * self.fractal(3.2, 30.0, 0.8) + 0.06 * self.fractal(2.0, 1.5, 0.15)
-        return _Patch(height, SAND_BACKSCATTER * np.exp(patches))
+        return _Patch(height, np.asarray(SAND_BACKSCATTER * np.exp(patches), dtype=np.float32))
 
     def ripples(self) -> _Patch:
         wavelength_m = self._rng.uniform(0.55, 1.1)
@@ -115,7 +115,7 @@ class _Maker:
         stones = np.clip(self.fractal(0.8, 0.8, 0.12) - 0.9, 0, None) * 0.055
         height = stones + 0.05 * self.fractal(3.0, 12.0, 0.8) + 0.008 * self.fractal(1.0, 0.6, 0.1)
         mottled = 0.2 * self.fractal(2.4, 10.0, 0.5) + 0.22 * self.fractal(1.0, 0.6, 0.1)
-        return _Patch(height, 0.55 * np.exp(mottled))
+        return _Patch(height, np.asarray(0.55 * np.exp(mottled), dtype=np.float32))
 
     def mud(self) -> _Patch:
         height = 0.04 * self.fractal(3.6, 22.0, 2.0)

@@ -232,7 +232,7 @@ def _drive(spec: SurveySpec, seabed: Seabed, rng: np.random.Generator) -> tuple[
     slow, swell = 12.0 * spec.ping_rate_hz, 1.6 * spec.ping_rate_hz
     yaw_deg = spec.wobble * (1.2 * _wander(spec.pings, slow, rng) + 0.12 * _wander(spec.pings, swell, rng))
     roll_deg = spec.wobble * (0.8 * _wander(spec.pings, slow, rng) + 0.4 * _wander(spec.pings, swell, rng))
-    along_m = np.arange(spec.pings) * spec.ping_spacing_m
+    along_m = np.arange(spec.pings, dtype=np.float64) * spec.ping_spacing_m
     slide = np.sin(np.radians(yaw_deg)) * spec.ping_spacing_m
     across_m = np.cumsum(slide - slide.mean())
     bottom_m = np.asarray(seabed.sampled(along_m, across_m)[0], dtype=np.float64)
@@ -247,7 +247,8 @@ def _drive(spec: SurveySpec, seabed: Seabed, rng: np.random.Generator) -> tuple[
 def _quantised(amplitude: FloatImage, bits: int) -> Samples:
     full = 255 if bits == 8 else 32767  # recorders of 16 bits leave the highest one free
     counts = np.clip(np.rint(amplitude * (_SAND_LEVEL * full)), 0, full)
-    return counts.astype(np.uint8) if bits == 8 else counts.astype(np.uint16)
+    samples: Samples = counts.astype(np.uint8) if bits == 8 else counts.astype(np.uint16)
+    return samples
 
 
 def _chart_position(spec: SurveySpec, along_m: float, across_m: float) -> Position:

@@ -106,7 +106,7 @@ def _cast(seabed: Seabed, track: Track, settings: SonarSettings, sign: int, ping
     scattered = backscatter * (incidence**2 + np.float32(_SPECULAR) * incidence**_SPECULAR_POWER)
     depression = np.arctan2(drop_m, ground_m.astype(np.float32)) + sign * track.roll_rad[rows, None]
     energy = lit * scattered * stretch * _vertical_beam(depression)
-    binned = _binned(energy, slant_m / np.float32(settings.sample_m), settings.samples)
+    binned = _binned(energy, np.asarray(slant_m / np.float32(settings.sample_m)), settings.samples)
     # Per unit of slant range, with the receiver's gain, on the scale of flat sand at half range.
     centres_m = (np.arange(settings.samples) + 0.5) * settings.sample_m
     gain = (centres_m / (settings.range_m / 2)) ** _TVG_POWER / _CELLS_PER_SAMPLE
@@ -124,10 +124,10 @@ def _lit(drop_m: FloatImage, ground_m: FloatImage) -> npt.NDArray[np.bool_]:
 def _vertical_beam(depression_rad: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
     """Return the two-way beam pattern over the angle below the horizontal: a broad lobe and its skirts."""
     off = (np.degrees(depression_rad) - _MAIN_LOBE_DEG) / _LOBE_WIDTH_DEG
-    return (1 - _BACK_LOBE) * np.exp(-(off**2)) + _BACK_LOBE
+    return np.asarray((1 - _BACK_LOBE) * np.exp(-(off**2)) + _BACK_LOBE)
 
 
-def _binned(energy: npt.NDArray[np.floating], place: FloatImage, samples: int) -> FloatArray:
+def _binned(energy: npt.NDArray[np.floating], place: npt.NDArray[np.floating], samples: int) -> FloatArray:
     """Share each cell's energy between the two samples next to its slant range (in samples)."""
     shifted = place - np.float32(0.5)
     left = np.floor(shifted).astype(np.int64)

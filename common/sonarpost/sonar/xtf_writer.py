@@ -82,7 +82,7 @@ def _file_header(survey: Survey, slots: dict[_Slot, ChannelPing], path: Path) ->
         expected = f"at most {_SONAR_NAME_BYTES} ASCII characters"
         raise SurveyFileError(str(path), "sonar_id", survey.sonar_id, expected)
     header = XTFFileHeader()
-    header.RecordingProgramName = b"sonarpos"  # the field has eight bytes
+    header.RecordingProgramName = b"snrpost"  # the field has eight bytes, the last of them zero
     header.RecordingProgramVersion = b"1"
     header.SonarName = b"" if survey.sonar_id == "unknown" else survey.sonar_id.encode("ascii")
     header.ThisFileName = path.name.encode("ascii", "replace")[:63]

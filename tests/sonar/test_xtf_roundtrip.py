@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyxtf
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonarpost.errors import SurveyFileError
+from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
+from sonarpost.sonar.xtf_reader import read_xtf
+from sonarpost.sonar.xtf_writer import write_xtf
+
+
+def assert_same(read: Survey, written: Survey) -> None:
+    assert len(read.pings) == len(written.pings)
+    for got, want in zip(read, written, strict=True):
+        assert got.number == want.number
+        assert got.time_utc_s == pytest.approx(want.time_utc_s, abs=0.0051)
+        assert (got.lat_deg, got.lon_deg) == (want.lat_deg, want.lon_deg)
+        for name in ("heading_deg", "altitude_m", "depth_m", "speed_mps", "pitch_deg", "roll_deg"):
+            assert getattr(got, name) == pytest.approx(getattr(want, name), rel=1e-6), name
+        assert len(got.channels) == len(want.channels)
+        for got_channel, want_channel in zip(got.channels, want.channels, strict=True):
+            assert got_channel.side is want_channel.side
+            assert got_channel.samples.dtype == want_channel.samples.dtype
+            np.testing.assert_array_equal(got_channel.samples, want_channel.samples)
+            assert got_channel.slant_range_m == pytest.approx(want_channel.slant_range_m, rel=1e-6)
+            assert got_channel.frequency_hz == want_channel.frequency_hz
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
+def test_what_is_written_is_read_back(small_survey, tmp_path, dtype):
+    survey = small_survey(dtype)
+    write_xtf(survey, tmp_path / "line7.xtf")
+    read = read_xtf(tmp_path / "line7.xtf")
+    assert_same(read, survey)
+    assert (read.sonar_id, read.line_name, read.warnings) == ("HDS", "line7", ())
+    assert read.path == tmp_path / "line7.xtf"
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
+def test_pyxtf_reads_what_is_written(small_survey, tmp_path, dtype):
+    survey = small_survey(dtype)
+    write_xtf(survey, tmp_path / "a.xtf")
+    header, packets = pyxtf.xtf_read(str(tmp_path / "a.xtf"))
+    assert header.SonarName == b"HDS"
+    assert header.NavUnits == 3
+    pings = packets[pyxtf.XTFHeaderType.sonar]
+    assert len(pings) == len(survey.pings)
+    for got, want in zip(pings, survey, strict=True):
+        np.testing.assert_array_equal(got.data[0][::-1], want.channels[0].samples)
+        np.testing.assert_array_equal(got.data[1], want.channels[1].samples)
+        assert got.get_time() == np.datetime64(round(want.time_utc_s * 100) * 10, "ms")
+        assert got.SensorYcoordinate == want.lat_deg
+        assert got.NumBytesThisRecord % 64 == 0
+
+
+def test_same_survey_gives_same_bytes_and_no_leftovers(small_survey, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        write_xtf(small_survey(), tmp_path / name / "x.xtf")
+    assert (tmp_path / "a/x.xtf").read_bytes() == (tmp_path / "b/x.xtf").read_bytes()
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["x.xtf"]
+
+
+def test_golden_bytes_of_a_ping(tmp_path):
+    port = ChannelPing(Side.PORT, np.array([1, 2, 3], np.uint16), 30.0, 600_000.0)
+    ping = Ping(7, 1_378_847_588.13, (port,), lat_deg=48.5, lon_deg=-68.5, heading_deg=0.0)
+    write_xtf(Survey(Path("x"), "HDS", "x", (ping,)), tmp_path / "x.xtf")
+    raw = (tmp_path / "x.xtf").read_bytes()
+    assert raw[0] == 0x7B
+    assert raw[256:260] == b"\x01\x00\x01\x00"  # port, sub-channel 0, slant range
+    packet = raw[1024:]
+    assert len(packet) == 384  # 256 + 64 + 6, padded to 64
+    assert packet[:14] == bytes.fromhex("cefa 00 00 0100 00000000 80010000")
+    assert packet[14:22] == bytes.fromhex("dd07 09 0a 15 0d 08 0d")  # 2013-09-10 21:13:08.13
+    assert packet[22:24] == bytes.fromhex("fd00")  # day 253 of the year
+    assert packet[28:32] == bytes.fromhex("07000000")
+    assert packet[320:326] == bytes.fromhex("0300 0200 0100")  # farthest first
+
+
+def test_missing_navigation_comes_back_as_none(small_survey, tmp_path):
+    survey = small_survey()
+    bare = tuple(Ping(p.number, p.time_utc_s, p.channels) for p in survey.pings)
+    write_xtf(dataclasses.replace(survey, pings=bare), tmp_path / "a.xtf")
+    read = read_xtf(tmp_path / "a.xtf")
+    for ping in read:
+        assert {ping.lat_deg, ping.lon_deg, ping.heading_deg, ping.altitude_m, ping.speed_mps} == {None}
+    assert read.warnings == ("no position fix in 5 of 5 pings, the first in row 0",)
+
+
+def test_one_ping_without_navigation_among_others(small_survey, tmp_path):
+    survey = small_survey()
+    first = Ping(1, survey.pings[0].time_utc_s, survey.pings[0].channels)
+    write_xtf(dataclasses.replace(survey, pings=(first, *survey.pings[1:])), tmp_path / "a.xtf")
+    read = read_xtf(tmp_path / "a.xtf")
+    assert_same(dataclasses.replace(read, pings=read.pings[1:]), dataclasses.replace(survey, pings=survey.pings[1:]))
+    assert (read.pings[0].lat_deg, read.pings[0].heading_deg, read.pings[0].pitch_deg) == (None, None, None)
+
+
+def test_due_north_is_not_mistaken_for_no_heading(small_survey, tmp_path):
+    survey = small_survey()
+    north = tuple(dataclasses.replace(p, heading_deg=0.0) for p in survey.pings)
+    write_xtf(dataclasses.replace(survey, pings=north), tmp_path / "a.xtf")
+    assert [p.heading_deg for p in read_xtf(tmp_path / "a.xtf")] == [0.0] * 5
+
+
+def test_two_frequencies_and_a_ping_without_one_side(small_survey, tmp_path):
+    survey = small_survey()
+    low = ChannelPing(Side.PORT, np.arange(17, dtype=np.uint16), 80.0, 262_500.0)
+    pings = list(survey.pings)
+    pings[1] = dataclasses.replace(pings[1], channels=(*pings[1].channels, low))
+    pings[2] = dataclasses.replace(pings[2], channels=pings[2].channels[1:])
+    survey = dataclasses.replace(survey, pings=tuple(pings))
+    write_xtf(survey, tmp_path / "a.xtf")
+    assert_same(read_xtf(tmp_path / "a.xtf"), survey)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    lat=st.floats(-90, 90).filter(lambda v: v != 0),
+    lon=st.floats(-180, 180),
+    heading=st.floats(0, 359.5, width=32),
+    altitude=st.floats(0.5, 5000, width=32),
+    time=st.floats(0, 4e9),
+    samples=st.lists(st.integers(0, 65535), min_size=1, max_size=70),
+)
+def test_any_ping_survives(tmp_path_factory, lat, lon, heading, altitude, time, samples):
+    channel = ChannelPing(Side.PORT, np.array(samples, np.uint16), 30.0, None)
+    ping = Ping(1, time, (channel,), lat, lon, heading, altitude, depth_m=3.0, speed_mps=1.0, pitch_deg=1, roll_deg=1)
+    path = tmp_path_factory.mktemp("any") / "x.xtf"
+    survey = Survey(path, "A", "x", (ping,))
+    write_xtf(survey, path)
+    assert_same(read_xtf(path), survey)
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"sonar_id": "a name longer than the field"}, "sonar_id"),
+        ({"sonar_id": "söder"}, "sonar_id"),
+        ({"pings": ()}, "channels"),
+    ],
+)
+def test_a_survey_that_does_not_fit_the_format(small_survey, tmp_path, change, field):
+    with pytest.raises(SurveyFileError, match=field):
+        write_xtf(dataclasses.replace(small_survey(), **change), tmp_path / "a.xtf")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"number": -1}, "number"),
+        ({"time_utc_s": float("nan")}, "time_utc_s"),
+        ({"time_utc_s": 1e18}, "time_utc_s"),
+        ({"altitude_m": float("inf")}, "SensorPrimaryAltitude"),
+        ({"channels": (ChannelPing(Side.PORT, np.zeros(3, np.uint8), 0.0),)}, "slant_range_m"),
+        ({"channels": (ChannelPing(Side.PORT, np.zeros(0, np.uint8), 9.0),)}, "samples"),
+        ({"channels": (ChannelPing(Side.PORT, np.zeros(3, np.uint16), 9.0),)}, "sample type"),
+    ],
+)
+def test_a_ping_that_does_not_fit_the_format(small_survey, tmp_path, change, field):
+    survey = small_survey()
+    pings = (*survey.pings[:2], dataclasses.replace(survey.pings[2], **change))
+    with pytest.raises(SurveyFileError, match=f"row 2, {field}"):
+        write_xtf(dataclasses.replace(survey, pings=pings), tmp_path / "a.xtf")
+
+
+def test_float_samples_are_refused(small_survey, tmp_path):
+    channel = ChannelPing(Side.PORT, np.zeros(3, np.float32), 9.0)
+    ping = dataclasses.replace(small_survey().pings[0], channels=(channel,))
+    with pytest.raises(SurveyFileError, match="uint8, uint16 or uint32"):
+        write_xtf(Survey(Path("x"), "A", "x", (ping,)), tmp_path / "a.xtf")
+
+
+def test_nowhere_to_write(small_survey, tmp_path):
+    with pytest.raises(SurveyFileError, match="No such file"):
+        write_xtf(small_survey(), tmp_path / "absent" / "a.xtf")
+
+
+def test_reading_is_silent(small_survey, tmp_path, capfd):
+    write_xtf(small_survey(), tmp_path / "a.xtf")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        read_xtf(tmp_path / "a.xtf")
+    assert caught == []
+    assert capfd.readouterr() == ("", "")
+
+
+def test_structures_have_the_sizes_of_the_format():
+    sizes = [ctypes.sizeof(c) for c in (pyxtf.XTFFileHeader, pyxtf.XTFPingHeader, pyxtf.XTFPingChanHeader)]
+    assert sizes == [1024, 256, 64]
