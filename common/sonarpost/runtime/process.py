@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ctypes
 import logging
 import os
 import signal
@@ -19,6 +20,8 @@ from sonarpost.runtime.service import C, Service
 log = logging.getLogger(__name__)
 
 SHUTDOWN_S = 2.5
+EXIT_WITH_PARENT = "SONARPOST_EXIT_WITH_PARENT"
+_PR_SET_PDEATHSIG = 1
 EXIT_DEFECT = 1
 EXIT_CONFIG = 2
 EXIT_STUCK = 3
@@ -40,6 +43,7 @@ def main(service_type: type[Service[C]], config_type: type[C], arguments: Sequen
     except ConfigError as error:
         print(f"{service_type.NAME}: {error}", file=sys.stderr)
         return EXIT_CONFIG
+    exit_with_parent()
     logs.set_up(service_type.NAME, platform.log_level, platform.log_format)
     try:
         service = service_type(platform, own)
@@ -66,6 +70,17 @@ def _run(service: Service[C]) -> int:
         service.stop()
         guard.cancel()
     return EXIT_DEFECT if service.failed else 0
+
+
+def exit_with_parent() -> None:
+    """End this process when the one that started it ends, if the environment asks for it (the demo does; Linux)."""
+    parent = os.environ.get(EXIT_WITH_PARENT)
+    if parent is None or not sys.platform.startswith("linux"):
+        return
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != int(parent):
+        # It ended before the request above was in force.
+        os._exit(EXIT_DEFECT)
 
 
 def _give_up() -> None:

@@ -13,6 +13,7 @@ from types import FrameType
 import zenoh
 
 from sonarpost.runtime import logs
+from sonarpost.runtime.process import exit_with_parent
 from sonarpost.runtime.session import router_config
 
 log = logging.getLogger(__name__)
@@ -45,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m sonarpost.runtime.router", description=__doc__)
     add_arguments(parser)
     parsed = parser.parse_args(arguments)
+    exit_with_parent()
     logs.set_up("router")
     return run(parsed.listen, parsed.connect)
 

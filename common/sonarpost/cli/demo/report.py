@@ -1,0 +1,122 @@
+"""What the demo shows at its end: the contact sheet, the table, the summary."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from sonarpost.catalogue.store import open_catalogue
+from sonarpost.cli.demo.account import Result
+from sonarpost.cli.demo.settings import ChainSettings
+from sonarpost.cli.demo.sheet import SheetRow, write_sheet
+from sonarpost.cli.demo.watch import Watcher
+from sonarpost.codec.interface import Decoded
+from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.messages import EncodedImage
+
+
+def show(watcher: Watcher, settings: ChainSettings, result: Result, console: Console) -> None:
+    """Write the sheet into the demo's folder, print table and summary."""
+    sheet = settings.folder / "demo.png"
+    write_sheet(sheet, _title(settings, result), _rows(watcher, settings))
+    _print_table(watcher, settings, console)
+    _print_summary(result, sheet, console)
+
+
+def _as_sent(image: EncodedImage, settings: ChainSettings) -> Decoded:
+    """Decode the stream as it left the vehicle, nothing lost."""
+    resources = CodecResources(open_catalogue(settings.catalogue).tiles)
+    return default_registry().create_for_stream(image.stream, resources).decode(image.stream)
+
+
+def _rows(watcher: Watcher, settings: ChainSettings) -> list[SheetRow]:
+    rows = []
+    for image in watcher.encoded.values():
+        snippet = watcher.snippets.get(image.contact.contact_id)
+        vessel, shore = watcher.vessel.get(image.image_id), watcher.shore.get(image.image_id)
+        got = [
+            (None, None)
+            if received is None or not received.frames_received
+            else (received.picture.to_array(), received.missing())
+            for received in (vessel, shore)
+        ]
+        confidence = image.contact.atd_confidence
+        rows.append(
+            SheetRow(
+                title=f"{image.image_id}  {image.contact.contact_id}",
+                detail=f"{_position(image)}   confidence {'-' if confidence is None else f'{confidence:.2f}'}   "
+                f"{image.height_px} x {image.width_px} px in {len(image.stream)} B   {_completeness(watcher, image)}",
+                pictures=(
+                    snippet.picture.to_array() if snippet else None,
+                    _as_sent(image, settings).image,
+                    got[0][0],
+                    got[1][0],
+                ),
+                missing=(None, None, got[0][1], got[1][1]),
+            )
+        )
+    return rows
+
+
+def _position(image: EncodedImage) -> str:
+    contact = image.contact
+    if contact.lat_deg is None or contact.lon_deg is None:
+        return "no position"
+    return f"{contact.lat_deg:.6f}, {contact.lon_deg:.6f}"
+
+
+def _completeness(watcher: Watcher, image: EncodedImage) -> str:
+    received = watcher.shore.get(image.image_id)
+    if received is None:
+        return "not received"
+    if received.complete:
+        return "complete"
+    halves = f" ({' and '.join(received.missing_halves)} half)" if received.missing_halves else ""
+    return f"{100 * received.missing_fraction:.0f} % missing{halves}"
+
+
+def _title(settings: ChainSettings, result: Result) -> str:
+    return (
+        f"sonarpost: {result.images_shore} of {result.contacts} pictures ashore, rate {settings.rate}, "
+        f"frame loss {settings.loss:g}, {result.acoustic_s:.0f} s in the water"
+    )
+
+
+def _print_table(watcher: Watcher, settings: ChainSettings, console: Console) -> None:
+    table = Table(title=f"pictures sent at rate {settings.rate}")
+    for heading in ("image", "contact", "confidence", "position", "bytes", "vessel", "shore"):
+        table.add_column(heading, justify="right" if heading in ("confidence", "bytes") else "left")
+    for image in watcher.encoded.values():
+        confidence = image.contact.atd_confidence
+        vessel, shore = watcher.vessel.get(image.image_id), watcher.shore.get(image.image_id)
+        same = vessel is not None and shore is not None and vessel.picture_sha256 == shore.picture_sha256
+        table.add_row(
+            image.image_id,
+            image.contact.contact_id,
+            "-" if confidence is None else f"{confidence:.2f}",
+            _position(image),
+            str(len(image.stream)),
+            "-"
+            if vessel is None
+            else "complete"
+            if vessel.complete
+            else f"{100 * vessel.missing_fraction:.0f} % missing",
+            "the same" if same else "-" if shore is None else "other",
+        )
+    console.print(table)
+
+
+def _print_summary(result: Result, sheet: Path, console: Console) -> None:
+    console.print(
+        f"{result.contacts} contacts, {result.frames_sent} frames sent, {result.frames_lost} lost, "
+        f"{result.images_vessel} pictures on the vessel, {result.images_shore} ashore "
+        f"({result.images_complete} complete), "
+        f"{'identical' if result.sha256_match else '[red]not identical[/red]'}; "
+        f"{result.acoustic_s:.0f} s in the water, {result.elapsed_s:.0f} s here"
+    )
+    if result.missing_ashore:
+        console.print(f"[red]let through by the water but not ashore: {', '.join(result.missing_ashore)}")
+    print(f"contact sheet: {sheet}", file=sys.stderr)

@@ -1,0 +1,142 @@
+"""The configuration files of a chain on one host, written from a few choices."""
+
+from __future__ import annotations
+
+import socket
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from sonarpost.modem.rates import RATES
+
+UUV, VESSEL, SHORE, WATER = "uuv-1", "vessel-1", "shore-1", "water"
+UUV_ADDRESS, VESSEL_ADDRESS = 3, 1
+PLATFORM_OF = {
+    "atd_stub": UUV,
+    "compressor": UUV,
+    "uuv_modem": UUV,
+    "acoustic_channel": WATER,
+    "op_modem": VESSEL,
+    "decompressor": VESSEL,
+    "relay": VESSEL,
+    "c2": SHORE,
+}
+HEALTH_INTERVAL_S = 0.25
+
+
+@dataclass(frozen=True)
+class ChainSettings:
+    """What a chain on one host is to do.
+
+    Attributes:
+        folder: Everything the chain writes lies here.
+        mode: As of atd_stub.
+        rate: Micro-Modem rate.
+        loss: Probability that a frame is lost.
+        seed: Of the water.
+        time_scale: Simulated seconds in the water a real second.
+        catalogue: Of the vehicle.
+        vessel_catalogues: Of the vessel; normally the same.
+        router_ports: TCP ports of the uuv, vessel and shore routers.
+        shore_port_for_vessel: Where the vessel's router looks for the shore's; another than the shore's own where a
+            test puts a link in between that can be cut.
+        extra: More lines for a service's table, by service.
+    """
+
+    folder: Path
+    mode: Literal["survey", "snippets"] = "survey"
+    rate: int = 1
+    loss: float = 0.0
+    seed: int = 1
+    time_scale: float = 20.0
+    catalogue: str = "nominal-10"
+    vessel_catalogues: tuple[str, ...] = ("nominal-10", "nominal-20")
+    router_ports: tuple[int, int, int] = (0, 0, 0)
+    shore_port_for_vessel: int = 0
+    extra: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def incoming(self) -> Path:
+        """Folder that atd_stub polls."""
+        return self.folder / "uuv" / "incoming"
+
+    @property
+    def vessel_pictures(self) -> Path:
+        """Where the decompressor writes."""
+        return self.folder / "vessel" / "pictures"
+
+    @property
+    def shore_pictures(self) -> Path:
+        """Where c2 writes what this vessel relays."""
+        return self.folder / "shore" / "pictures" / VESSEL
+
+    @property
+    def channel_log(self) -> Path:
+        """What the water did with every packet."""
+        return self.folder / "water" / "channel.jsonl"
+
+    @property
+    def pairing_timeout_s(self) -> float:
+        """Real seconds after which an image waits no longer: a few packets, and what a loaded host may add."""
+        return 4 * RATES[self.rate].airtime_s / self.time_scale + 3.0
+
+    def modem_port(self, address: int) -> Path:
+        """Path of the pseudo-terminal of an emulated modem."""
+        return self.folder / "water" / "ports" / f"modem-{address}"
+
+    def config_file(self, service: str) -> Path:
+        """Return the file a service reads."""
+        return self.folder / "config" / f"{PLATFORM_OF[service]}.toml"
+
+
+def free_ports(count: int) -> tuple[int, ...]:
+    """Return TCP ports that are free now, all different."""
+    probes = [socket.socket() for _ in range(count)]
+    try:
+        for probe in probes:
+            probe.bind(("127.0.0.1", 0))
+        return tuple(int(probe.getsockname()[1]) for probe in probes)
+    finally:
+        for probe in probes:
+            probe.close()
+
+
+def write_config(settings: ChainSettings) -> None:
+    """Write one TOML file a platform."""
+    folder = settings.folder / "config"
+    folder.mkdir(parents=True, exist_ok=True)
+    uuv_port, vessel_port, shore_port = settings.router_ports
+    ports = {UUV: uuv_port, VESSEL: vessel_port, SHORE: shore_port, WATER: uuv_port}
+    for platform, port in ports.items():
+        parts = [_platform_table(settings, platform, port)]
+        parts += [_service_table(settings, service) for service, where in PLATFORM_OF.items() if where == platform]
+        (folder / f"{platform}.toml").write_text("\n".join(parts), encoding="utf-8")
+
+
+def _platform_table(settings: ChainSettings, platform: str, port: int) -> str:
+    return (
+        f'[platform]\nid = "{platform}"\nrouter = ["tcp/127.0.0.1:{port}"]\n'
+        f'state_dir = "{settings.folder / "state" / platform}"\n'
+        f"health_interval_s = {HEALTH_INTERVAL_S}\n"
+    )
+
+
+def _service_table(settings: ChainSettings, service: str) -> str:
+    modem = '[{name}]\nport = "{port}"\naddress = {address}\n'
+    catalogues = ", ".join(f'"{name}"' for name in settings.vessel_catalogues)
+    tables = {
+        "atd_stub": f'[atd_stub]\nmode = "{settings.mode}"\ninput_dir = "{settings.incoming}"\n'
+        "poll_s = 0.2\nsettle_s = 0.5\n",
+        "compressor": f'[compressor]\ncatalogue = "{settings.catalogue}"\n',
+        "uuv_modem": modem.format(name="uuv_modem", port=settings.modem_port(UUV_ADDRESS), address=UUV_ADDRESS)
+        + f"destination = {VESSEL_ADDRESS}\nrate = {settings.rate}\n",
+        "op_modem": modem.format(name="op_modem", port=settings.modem_port(VESSEL_ADDRESS), address=VESSEL_ADDRESS),
+        "decompressor": f'[decompressor]\nout_dir = "{settings.vessel_pictures}"\n'
+        f"pairing_timeout_s = {settings.pairing_timeout_s:.3f}\ncatalogues = [{catalogues}]\n"
+        f'vehicles = {{ {UUV_ADDRESS} = "{UUV}" }}\n',
+        "relay": "[relay]\n",
+        "c2": f'[c2]\nout_dir = "{settings.shore_pictures.parent}"\n',
+        "acoustic_channel": f"[acoustic_channel]\nseed = {settings.seed}\ntime_scale = {settings.time_scale}\n",
+    }
+    extra = "".join(f"{line}\n" for name, line in settings.extra if name == service)
+    return tables[service] + extra

@@ -1,0 +1,180 @@
+"""Watches a running chain over Zenoh, as any subscriber could, and tells when nothing is left to do."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import TypeVar
+
+import zenoh
+
+from sonarpost import keys, wire
+from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
+from sonarpost.errors import PayloadError, PortError
+from sonarpost.link.paper_sender import plan_packets
+from sonarpost.messages import AcousticFrame, EncodedImage, Health, ReconstructedImage, Record, Snippet
+from sonarpost.modem.rates import RATES
+from sonarpost.runtime.session import client_config, open_with_retry
+
+log = logging.getLogger(__name__)
+
+R = TypeVar("R", bound=Record)
+
+CONNECT_S = 20.0
+# Gauges that are zero when a service has nothing left to do.
+IDLE_GAUGES: Mapping[str, tuple[str, ...]] = {
+    "atd_stub": ("files_waiting", "outbox"),
+    "compressor": ("inbox", "outbox"),
+    "uuv_modem": ("inbox",),
+    "op_modem": ("outbox", "unsaved"),
+    "decompressor": ("inbox", "outbox", "images_waiting"),
+    "relay": ("inbox", "outbox"),
+    "c2": ("inbox",),
+}
+
+
+class Watcher:
+    """Collects what the chain publishes.
+
+    Attributes:
+        snippets: By contact identifier.
+        encoded: By image identifier.
+        vessel: Latest version of every picture on the vessel, by image identifier.
+        shore: The same, as shown to shore subscribers.
+        health: Latest health by service.
+    """
+
+    def __init__(self, settings: ChainSettings) -> None:
+        self.settings = settings
+        self.snippets: dict[str, Snippet] = {}
+        self.encoded: dict[str, EncodedImage] = {}
+        self.vessel: dict[str, ReconstructedImage] = {}
+        self.shore: dict[str, ReconstructedImage] = {}
+        self.health: dict[str, Health] = {}
+        self.packets_sent = 0
+        self.changes = 0
+        self._packets: set[tuple[float, int]] = set()
+        self._lock = threading.Lock()
+        self._sessions: list[zenoh.Session] = []
+
+    def __enter__(self) -> Watcher:
+        uuv, vessel, shore = (self._open(port) for port in self.settings.router_ports)
+        self._subscribe(uuv, keys.contact_detected(UUV), Snippet, self._on_snippet)
+        self._subscribe(uuv, keys.image_encoded(UUV), EncodedImage, self._on_encoded)
+        self._subscribe(uuv, keys.acoustic_tx(UUV), AcousticFrame, self._on_sent)
+        self._subscribe(vessel, keys.image_reconstructed(VESSEL), ReconstructedImage, self._on_vessel)
+        self._subscribe(shore, keys.shore_image(VESSEL), ReconstructedImage, self._on_shore)
+        for session, platform in ((uuv, UUV), (uuv, WATER), (vessel, VESSEL), (shore, SHORE)):
+            self._subscribe(session, keys.health_all(platform), Health, self._on_health)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for session in self._sessions:
+            session.close()
+
+    def _open(self, port: int) -> zenoh.Session:
+        endpoint = f"tcp/127.0.0.1:{port}"
+        give_up = threading.Event()
+        timer = threading.Timer(CONNECT_S, give_up.set)
+        timer.daemon = True
+        timer.start()
+        session = open_with_retry(client_config([endpoint]), give_up, endpoint)
+        timer.cancel()
+        if session is None:
+            raise PortError(f"{endpoint}: no router answered within {CONNECT_S:.0f} s")
+        self._sessions.append(session)
+        return session
+
+    def _subscribe(self, session: zenoh.Session, key: str, record_type: type[R], take: Callable[[R], None]) -> None:
+        def on_sample(sample: zenoh.Sample) -> None:
+            try:
+                record = wire.decode(record_type, sample.payload.to_bytes(), str(sample.key_expr))
+            except PayloadError as error:
+                log.warning("%s", error)
+                return
+            with self._lock:
+                take(record)
+
+        session.declare_subscriber(key, on_sample)
+
+    def _on_snippet(self, snippet: Snippet) -> None:
+        self.changes += snippet.contact.contact_id not in self.snippets
+        self.snippets[snippet.contact.contact_id] = snippet
+
+    def _on_encoded(self, image: EncodedImage) -> None:
+        self.changes += image.image_id not in self.encoded
+        self.encoded[image.image_id] = image
+
+    def _on_sent(self, frame: AcousticFrame) -> None:
+        packet = (frame.time_utc_s, frame.packet)
+        if packet not in self._packets:
+            self._packets.add(packet)
+            self.packets_sent += 1
+            self.changes += 1
+
+    def _on_vessel(self, image: ReconstructedImage) -> None:
+        self._latest(self.vessel, image)
+
+    def _on_shore(self, image: ReconstructedImage) -> None:
+        self._latest(self.shore, image)
+
+    def _latest(self, known: dict[str, ReconstructedImage], image: ReconstructedImage) -> None:
+        before = known.get(image.image_id)
+        if before is None or before.version < image.version:
+            known[image.image_id] = image
+            self.changes += 1
+
+    def _on_health(self, health: Health) -> None:
+        self.health[health.service] = health
+
+    @property
+    def packets_planned(self) -> int:
+        """Packets that the images encoded so far take (the contact record never needs one more at these rates)."""
+        rate = RATES[self.settings.rate]
+        with self._lock:
+            images = tuple(self.encoded.values())
+        return sum(len(plan_packets(i.image_id, i.stream, None, rate.frames, rate.frame_bytes)) for i in images)
+
+    def busy(self, files_expected: int, since_utc_s: float) -> str:
+        """Return what still keeps the chain busy, an empty text when nothing does.
+
+        Args:
+            files_expected: Input files that atd_stub is to have dealt with.
+            since_utc_s: Health older than this says nothing.
+        """
+        with self._lock:
+            health = dict(self.health)
+            contacts, encoded = len(self.snippets), len(self.encoded)
+        for service, gauges in IDLE_GAUGES.items():
+            report = health.get(service)
+            if report is None or report.time_utc_s < since_utc_s:
+                return f"waiting for {service}"
+            for gauge in gauges:
+                if report.gauges.get(gauge, 1.0) != 0.0:
+                    return f"{service}: {gauge} {report.gauges.get(gauge, 1.0):g}"
+        counters = health["atd_stub"].counters
+        dealt_with = counters.get("files_processed", 0) + counters.get("files_quarantined", 0)
+        if dealt_with < files_expected:
+            return f"atd_stub: {dealt_with} of {files_expected} files"
+        if encoded < contacts:
+            return f"compressor: {encoded} of {contacts} contacts"
+        return ""
+
+    def wait_until_started(self, check: Callable[[], None]) -> None:
+        """Wait for the first health of every service.
+
+        Args:
+            check: Called now and then; raises when waiting is in vain.
+        """
+        deadline = time.monotonic() + 2 * CONNECT_S
+        while True:
+            with self._lock:
+                missing = [service for service in PLATFORM_OF if service not in self.health]
+            if not missing:
+                return
+            check()
+            if time.monotonic() > deadline:
+                raise PortError(f"no sign of life from {', '.join(missing)} within {2 * CONNECT_S:.0f} s")
+            time.sleep(0.05)
