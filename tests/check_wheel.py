@@ -1,0 +1,46 @@
+"""Builds the wheel and checks what is in it: everything that runs, nothing that does not."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+FORBIDDEN = ("tests/", "bench/", "docs/", "demo-out/", "__pycache__")
+
+
+def wanted() -> set[str]:
+    """Return the files of the source tree that belong into the wheel."""
+    files = {p.relative_to(REPOSITORY / "common").as_posix() for p in (REPOSITORY / "common" / "sonarpost").rglob("*")}
+    files |= {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "services").rglob("*")}
+    suffixes = (".py", ".typed", ".tiles", ".md")
+    return {name for name in files if name.endswith(suffixes) and "__pycache__" not in name}
+
+
+def main() -> int:
+    """Return 0 when the wheel holds exactly what it should."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, str(REPOSITORY)]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        (wheel,) = Path(folder).glob("*.whl")
+        with zipfile.ZipFile(wheel) as archive:
+            names = set(archive.namelist())
+    missing = wanted() - names
+    extra = {name for name in names if name.startswith(FORBIDDEN) or "__pycache__" in name}
+    licence = any(name.endswith("licenses/LICENSE") for name in names)
+    for problem, which in (("missing from", missing), ("does not belong into", extra)):
+        for name in sorted(which):
+            print(f"{name}: {problem} the wheel")
+    if not licence:
+        print("LICENSE: missing from the wheel")
+    if missing or extra or not licence:
+        return 1
+    print(f"{wheel.name}: {len(names)} files, as they should be")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
