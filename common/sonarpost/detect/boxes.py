@@ -78,7 +78,7 @@ def in_noise_units(response: FloatImage, half: tuple[int, int]) -> FloatImage:
     parts' means, its noise the 40th percentile of their deviations (an order statistic, so that a wreck or the edge
     of another seabed, which fills some of the parts, does not pass for noise). Both change slowly and are taken from
     every fourth row and pixel. Responses are first limited to three robust deviations of the whole picture, and the
-    noise is held between half and twice that deviation: a mirror-flat patch is not infinitely quiet.
+    noise is held between half and three times that deviation: a mirror-flat patch is not infinitely quiet.
 
     Returns:
         float32, shape of the response; NaN where the response is.
@@ -100,7 +100,7 @@ def in_noise_units(response: FloatImage, half: tuple[int, int]) -> FloatImage:
     square = BoxMeans(limited * limited, reach).mean(rows, columns, 0.3)[picked]
     deviation = np.sqrt(np.maximum(square - mean * mean, 0.0))
     level = _rank(mean, 50.0, 0.0)
-    noise = np.clip(_rank(deviation, 40.0, spread), 0.5 * spread, 2.0 * spread)
+    noise = np.clip(_rank(deviation, 40.0, spread), 0.5 * spread, 3.0 * spread)
     units: FloatImage = response - np.float32(centre) - _fine(level, step, response.shape)
     units /= _fine(noise, step, response.shape)
     return units

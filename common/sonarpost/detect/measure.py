@@ -2,7 +2,8 @@
 
 The matched filter says where to look; these two look again, each at one property alone, so that their agreement means
 something: the constant-false-alarm test compares the highlight with a guarded ring of seabed, the shadow test asks
-whether the dark behind it is dark, begins at the highlight, and is as wide as the highlight and no wider.
+whether the dark behind it is dark, begins at the highlight, is not riddled with echoes, and goes on along-track no farther than the highlight
+suggests.
 """
 
 from __future__ import annotations
@@ -104,7 +105,9 @@ def _highlight_extent(
     reach_cells = max(6, round(4.0 / grid.cell_across_m))
     top, left = max(0, peak.row - reach_rows), max(0, peak.cell - reach_cells)
     patch = grid.level[top : peak.row + reach_rows + 1, left : peak.cell + reach_cells + 1]
-    smooth = ndimage.uniform_filter(np.nan_to_num(patch, nan=seabed), size=(1, 3), mode="nearest")
+    # Smoothed over half of the filter's size that answered best: speckle must not break a large highlight into cells.
+    size = (max(1, peak.highlight_rows // 2), max(3, peak.highlight_cells // 2))
+    smooth = ndimage.uniform_filter(np.nan_to_num(patch, nan=seabed), size=size, mode="nearest")
     row, cell = peak.row - top, peak.cell - left
     near = (slice(max(0, row - 1), row + 2), slice(max(0, cell - 2), cell + 3))
     start = np.unravel_index(int(np.argmax(smooth[near])), smooth[near].shape)
@@ -140,8 +143,10 @@ def _shadow(
         return 0, False, 0.0, 0.0
     depth = (seabed - float(behind[:, first:last].mean())) / deviation
     filled = float((behind[:, first:last] < seabed - 0.5 * deviation).mean())
-    flanks = _flank_darkness(grid, rows, (cells[1] + first, cells[1] + last), seabed - deviation)
-    return last, last == end, depth, filled * (1.0 - 0.7 * flanks)
+    spread_rows = _dark_rows(grid, middle, (cells[1] + first, cells[1] + last), seabed - deviation)
+    # An object's shadow is about as wide along-track as its highlight; twice that, and at least a metre, is granted.
+    granted_rows = max(2.0 * (rows[1] - rows[0]), 1.0 / grid.row_along_m)
+    return last, last == end, depth, filled * min(1.0, granted_rows / max(spread_rows, 1))
 
 
 def _run(dark: npt.NDArray[np.bool_], start_within: int, gap: int) -> tuple[int, int]:
@@ -156,13 +161,20 @@ def _run(dark: npt.NDArray[np.bool_], start_within: int, gap: int) -> tuple[int,
     return first, last
 
 
-def _flank_darkness(grid: LevelGrid, rows: tuple[int, int], cells: tuple[int, int], threshold: float) -> float:
-    """Fraction of dark cells beside the shadow, one highlight length away on both sides (0 when out of the picture)."""
-    away = max(2, rows[1] - rows[0], round(0.5 / grid.row_along_m))
-    thick = max(1, round(0.5 / grid.row_along_m))
-    pieces = [
-        grid.level[max(0, rows[0] - away - thick) : max(0, rows[0] - away), cells[0] : cells[1]],
-        grid.level[rows[1] + away : rows[1] + away + thick, cells[0] : cells[1]],
-    ]
-    values = np.concatenate([p[np.isfinite(p)] for p in pieces])
-    return float((values < threshold).mean()) if values.size else 0.0
+def _dark_rows(grid: LevelGrid, middle: int, cells: tuple[int, int], threshold: float) -> int:
+    """Along-track extent, in rows, of the dark region that the shadow belongs to, looked at for 6 m to either side.
+
+    A trawl scar, a trench or the lee of a sand wave is dark behind something bright too, but goes on along-track.
+    """
+    reach_rows = max(3, round(6.0 / grid.row_along_m))
+    reach_cells = max(4, round(3.0 / grid.cell_across_m))
+    top, left = max(0, middle - reach_rows), max(0, cells[0] - reach_cells)
+    patch = grid.level[top : middle + reach_rows + 1, left : cells[1] + reach_cells]
+    smooth = ndimage.uniform_filter(np.nan_to_num(patch, nan=0.0), size=(3, 5), mode="nearest")
+    labels, _ = ndimage.label(smooth < threshold)
+    own = labels[middle - top, cells[0] - left : cells[1] - left]
+    touched = np.unique(own[own > 0])
+    if touched.size == 0:
+        return 0
+    rows = np.flatnonzero(np.isin(labels, touched).any(axis=1))
+    return int(rows[-1] - rows[0]) + 1

@@ -48,7 +48,7 @@ class DetectorSettings:
     noise_window_m: tuple[float, float] = (24.0, 12.0)
     guard_m: float = 0.6
     ring_m: float = 1.5
-    matched_at_threshold: float = 3.5
+    matched_at_threshold: float = 4.0
     cfar_at_threshold: float = 1.8
     shadow_at_threshold: float = 1.2
     separation_along_m: float = 3.0

@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+import itertools
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonarpost.detect.contacts import MINE_LIKE, detect
+from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detect.snippet import cut_snippet
+from sonarpost.sim.seabed import SeabedKind
+from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.geometry import Position, offset_between_m
+from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.survey import Ping, Side, Survey
+
+
+def box(**fields):
+    """An object of `make_survey`, by the fields that differ from the default."""
+    return fields
+
+
+@pytest.mark.parametrize("side", list(Side))
+def test_an_object_is_found_where_it_lies_with_its_size(make_survey, side):
+    survey = make_survey(box(side=side))
+    (found,) = detect(survey)
+    assert found.side is side
+    assert found.ping_index == pytest.approx(100, abs=2)
+    assert found.ping_number == found.ping_index + 1000
+    assert found.time_utc_s == survey.pings[found.ping_index].time_utc_s
+    assert found.sample == pytest.approx(250, abs=5)
+    assert found.slant_range_m == pytest.approx(250.5 * 20 / 512, abs=0.2)
+    assert found.ground_range_m == pytest.approx(np.sqrt(found.slant_range_m**2 - 9.0))
+    assert found.length_m == pytest.approx(0.8, abs=0.25)
+    assert found.width_m == pytest.approx(12 * 20 / 512, abs=0.2)
+    assert found.shadow_m == pytest.approx(30 * 20 / 512, abs=0.25)
+    assert found.height_m == pytest.approx(found.shadow_m * 3.0 / (found.slant_range_m + found.shadow_m))
+    assert found.atd_class == MINE_LIKE
+    assert 1.0 <= found.confidence < 2.0
+    assert (found.heading_deg, found.altitude_m, found.depth_m, found.speed_mps) == (0.0, 3.0, 12.0, 1.0)
+
+
+@pytest.mark.parametrize(("side", "sign"), [(Side.PORT, -1), (Side.STARBOARD, 1)])
+def test_port_is_left_of_the_heading_and_starboard_right(make_survey, side, sign):
+    (found,) = detect(make_survey(box(side=side)))
+    north_m, east_m = offset_between_m(found.vehicle, found.position)
+    assert east_m == pytest.approx(sign * found.ground_range_m, abs=0.01)
+    assert north_m == pytest.approx(0.0, abs=0.01)
+
+
+def test_what_the_survey_does_not_tell_is_none(make_survey):
+    (found,) = detect(make_survey(box(), navigation=False))
+    assert (found.vehicle, found.position, found.heading_deg, found.speed_mps) == (None, None, None, None)
+    assert (found.length_m, found.pixel_along_m) == (None, None)
+    assert found.height_m is not None  # from range alone
+
+
+def test_without_an_altitude_the_first_return_gives_it(make_survey):
+    (found,) = detect(make_survey(box(), altitude=False))
+    assert found.altitude_m == pytest.approx(3.0, abs=0.25)
+    assert found.position is not None
+
+
+def test_both_sides_are_searched_and_the_most_confident_comes_first(make_survey):
+    boxes = (box(ping=50, sample=400, highlight=3.0), box(side=Side.STARBOARD, ping=150), box(ping=140))
+    found = detect(make_survey(*boxes))
+    assert {(d.side, round(d.ping_index, -1)) for d in found} == {
+        (Side.PORT, 50),
+        (Side.STARBOARD, 150),
+        (Side.PORT, 140),
+    }
+    assert all(a.confidence >= b.confidence for a, b in itertools.pairwise(found))
+    assert detect(make_survey(*boxes), DetectorSettings(max_contacts=2)) == found[:2]
+    strict = DetectorSettings(confidence_threshold=found[0].confidence)
+    assert detect(make_survey(*boxes), strict) == found[:1]
+
+
+def test_an_empty_seabed_gives_nothing(make_survey):
+    assert sum(len(detect(make_survey(seed=seed))) for seed in range(4)) <= 2
+
+
+def test_the_unit_of_the_samples_does_not_matter(make_survey):
+    places = [
+        [(d.side, d.ping_index, d.sample) for d in detect(make_survey(box(), dtype=dtype, scale=scale))]
+        for dtype, scale in ((np.uint16, 1.0), (np.uint32, 50_000.0), (np.uint16, 4.0))
+    ]
+    assert places[0] == places[1] == places[2] != []
+    eight_bits = detect(make_survey(box(), dtype=np.uint8, scale=1 / 80))
+    assert [(d.side, d.ping_index // 8) for d in eight_bits] == [(Side.PORT, 100 // 8)]
+
+
+def test_the_sides_are_mirror_images(make_survey):
+    survey = make_survey(box())
+    swap = {Side.PORT: Side.STARBOARD, Side.STARBOARD: Side.PORT}
+    swapped = tuple(replace(p, channels=tuple(replace(c, side=swap[c.side]) for c in p.channels)) for p in survey.pings)
+    (one,), (other,) = detect(survey), detect(replace(survey, pings=swapped))
+    assert (one.ping_index, one.sample, one.confidence) == (other.ping_index, other.sample, other.confidence)
+    assert one.side is swap[other.side]
+
+
+@pytest.mark.parametrize("pings", [0, 1, 2, 7])
+def test_short_and_empty_surveys_give_nothing(make_survey, pings):
+    survey = make_survey()
+    assert detect(replace(survey, pings=survey.pings[:pings])) == ()
+    assert detect(Survey(Path("x"), "x", "x", tuple(Ping(i, float(i), ()) for i in range(pings)))) == ()
+
+
+@pytest.mark.parametrize("seabed", [SeabedKind.SAND, SeabedKind.MUD, SeabedKind.GRAVEL])
+def test_simulated_mines_are_found_with_few_false_alarms(seabed):
+    simulated = simulate_survey(SurveySpec(seed=7, seabed=seabed, targets=8, clutter=2))
+    began = time.process_time()
+    found = detect(simulated.survey)
+    spent_s = time.process_time() - began
+
+    def near(detection, truth):
+        along_m = abs(detection.ping_index - truth.ping) * 0.1
+        across_m = abs(detection.sample - truth.sample_index) * 30 / 1024
+        return detection.side is truth.side and along_m < 1.5 and across_m < 1.5
+
+    mines = [t for t in simulated.truth if t.is_mine_like]
+    pairs = [(t, d) for t in mines for d in found if near(d, t)]
+    assert len({id(t) for t, _ in pairs}) >= 0.9 * len(mines) > 0
+    assert sum(d.atd_class == MINE_LIKE for _, d in pairs) >= 0.8 * len(mines)
+    false_alarms = [d for d in found if not any(near(d, t) for t in simulated.truth)]
+    assert len(false_alarms) <= 3
+    for truth, detection in pairs:
+        place = Position(truth.lat_deg, truth.lon_deg)
+        assert np.hypot(*offset_between_m(place, detection.position)) < 2.0
+    errors = [abs(d.height_m - t.height_m) / t.height_m for t, d in pairs]
+    assert np.median(errors) < 0.25
+    assert spent_s < 6.0  # two seconds on a quiet core; room for a busy machine
+
+
+@pytest.mark.realdata
+def test_the_scotsman_gives_the_wreck_and_the_small_objects_to_port(data_dir):
+    survey = read_survey(data_dir / "surveys" / "scotsman-iver2.xtf")
+    found = detect(survey)
+    assert len(found) <= 20
+    # The wreck, read off the picture: pings 165 to 365, samples 150 to 600. The label beside the file (sample 138,
+    # ping 281) marks its near edge, a few samples before the bottom's first return.
+    assert [d for d in found if d.side is Side.STARBOARD and 165 <= d.ping_index <= 365 and 150 <= d.sample <= 600]
+    # Small objects with a shadow to port, likewise.
+    for ping, sample in ((241, 895), (276, 611), (313, 945), (356, 283)):
+        assert [
+            d
+            for d in found
+            if d.side is Side.PORT
+            and abs(d.ping_index - ping) <= 4
+            and abs(d.sample - sample) <= 15
+            and d.atd_class == MINE_LIKE
+        ], (ping, sample)
+    for d in found:
+        snippet = cut_snippet(survey, d)
+        assert snippet.image.shape == (100, 100)
+        assert snippet.image.std() > 20
+
+
+@pytest.mark.realdata
+def test_an_eight_bit_survey_without_altitude_or_speed_works(data_dir):
+    survey = read_survey(data_dir / "surveys" / "000_1236.xtf")
+    found = detect(survey, DetectorSettings(max_contacts=20))
+    assert len(found) == 20
+    assert all(d.height_m is not None and d.position is not None and d.length_m is not None for d in found)
+    # A branched object with its shadow on open sand, the plainest on this line's port side.
+    assert any(d.side is Side.PORT and abs(d.ping_index - 330) < 8 and abs(d.sample - 327) < 15 for d in found)

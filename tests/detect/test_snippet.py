@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonarpost.detect.contacts import detect
+from sonarpost.detect.snippet import cut_snippet, to_grey
+from sonarpost.sonar.survey import ChannelPing, Side
+
+
+@pytest.fixture(scope="module")
+def found(make_survey):
+    survey = make_survey({"side": Side.STARBOARD})
+    return survey, detect(survey)[0]
+
+
+def raw_window(survey, side, snippet):
+    rows, columns = snippet.image.shape
+    image = survey.waterfall(side)
+    return image[
+        snippet.first_ping_index : snippet.first_ping_index + rows,
+        snippet.first_sample : snippet.first_sample + columns,
+    ]
+
+
+def test_the_default_picture_is_centred_on_highlight_and_shadow(found):
+    survey, detection = found
+    snippet = cut_snippet(survey, detection)
+    assert snippet.image.shape == snippet.image16.shape == (100, 100)
+    assert snippet.target_row == 50
+    assert snippet.target_column == 50 - detection.shadow_samples // 2
+    assert (snippet.pixel_along_m, snippet.pixel_across_m) == (detection.pixel_along_m, 20 / 512)
+    assert np.array_equal(snippet.image16, raw_window(survey, Side.STARBOARD, snippet))
+    # Bright at the target, dark to its right: the nadir is to the left.
+    row, column = snippet.target_row, snippet.target_column
+    shadow_column = column + 6 + detection.shadow_samples // 2
+    assert snippet.image[row - 2 : row + 3, column - 3 : column + 4].mean() > 180
+    assert snippet.image[row - 2 : row + 3, shadow_column - 5 : shadow_column + 6].mean() < 60
+
+
+@given(ping=st.integers(0, 199), sample=st.integers(0, 511), height=st.integers(1, 230), width=st.integers(1, 600))
+def test_the_window_is_shifted_at_borders_never_shrunk(found, ping, sample, height, width):
+    survey, detection = found
+    snippet = cut_snippet(survey, replace(detection, ping_index=ping, sample=sample), height, width)
+    assert snippet.image.shape == (min(height, 200), min(width, 512))
+    assert raw_window(survey, Side.STARBOARD, snippet).shape == snippet.image.shape
+    assert snippet.first_ping_index + snippet.target_row == ping
+    assert snippet.first_sample + snippet.target_column == sample
+    assert 0 <= snippet.target_row < snippet.image.shape[0]
+    assert 0 <= snippet.target_column < snippet.image.shape[1]
+
+
+def test_samples_a_ping_does_not_have_are_black_and_do_not_shift_the_greys(found):
+    survey, detection = found
+    pings = list(survey.pings)
+    cut = pings[90].channel(Side.STARBOARD)
+    pings[90] = replace(pings[90], channels=())
+    pings[91] = replace(pings[91], channels=(ChannelPing(Side.STARBOARD, cut.samples[:250], cut.slant_range_m),))
+    whole = cut_snippet(survey, detection)
+    holed = cut_snippet(replace(survey, pings=tuple(pings)), detection)
+    row = 90 - holed.first_ping_index
+    assert not holed.image[row].any()
+    assert not holed.image[row + 1, 250 - holed.first_sample :].any()
+    untouched = np.r_[0:row, row + 2 : 100]
+    assert np.abs(holed.image[untouched].astype(int) - whole.image[untouched]).max() <= 4
+
+
+def test_values_beyond_16_bits_are_divided_by_a_power_of_two(found, make_survey):
+    _, detection = found
+    survey = make_survey({"side": Side.STARBOARD}, dtype=np.uint32, scale=10_000.0)
+    snippet = cut_snippet(survey, detection)
+    assert snippet.divisor16 > 1
+    assert snippet.divisor16 & (snippet.divisor16 - 1) == 0
+    assert snippet.image16.max() >= 32768
+    pixel = survey.pings[snippet.first_ping_index].channel(Side.STARBOARD).samples[snippet.first_sample]
+    assert snippet.image16[0, 0] == pixel // snippet.divisor16
+
+
+def test_greys_follow_the_documented_formula():
+    raw = np.arange(10_000, dtype=np.uint32).reshape(100, 100) ** 2
+    grey = to_grey(raw, np.ones(raw.shape, dtype=np.bool_))
+    low, high = np.percentile(np.arange(10_000), (0.5, 99.5))
+    expected = np.clip(np.rint(255 * (np.arange(10_000) - low) / (high - low)), 0, 255).reshape(100, 100)
+    assert np.abs(grey - expected).max() <= 1
+    assert (grey[0, 0], grey[-1, -1]) == (0, 255)
+
+
+def test_a_glint_does_not_turn_the_rest_black():
+    rng = np.random.default_rng(0)
+    raw = rng.integers(100, 200, (100, 100), dtype=np.uint32)
+    plain = to_grey(raw, np.ones(raw.shape, dtype=np.bool_))
+    raw[50, 50] = 60_000
+    assert abs(float(to_grey(raw, np.ones(raw.shape, dtype=np.bool_)).mean()) - float(plain.mean())) < 2
+
+
+def test_a_window_of_one_value_is_mid_grey_and_an_unknown_one_black():
+    flat = np.full((4, 5), 77, dtype=np.uint32)
+    assert (to_grey(flat, np.ones(flat.shape, dtype=np.bool_)) == 128).all()
+    assert not to_grey(flat, np.zeros(flat.shape, dtype=np.bool_)).any()
+
+
+@pytest.mark.parametrize("change", [{"ping_index": 200}, {"ping_index": -1}, {"sample": 512}])
+def test_a_detection_of_another_survey_is_refused(found, change):
+    survey, detection = found
+    with pytest.raises(ValueError, match="expected inside 200 pings of 512 samples"):
+        cut_snippet(survey, replace(detection, **change))
+
+
+@pytest.mark.parametrize("size", [(0, 10), (10, 0)])
+def test_a_picture_without_pixels_is_refused(found, size):
+    with pytest.raises(ValueError, match="expected 1 or more"):
+        cut_snippet(*found, *size)
