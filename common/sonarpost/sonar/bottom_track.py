@@ -94,7 +94,9 @@ def _first_rise(echo: FloatArray, skip: int) -> FloatArray:
     started = np.maximum.accumulate(~above, axis=1)
     found = sustained & started
     first = np.where(found.any(axis=1), found.argmax(axis=1) + float(skip), np.nan)
-    first[(bottom <= _MIN_CONTRAST * water)[:, 0]] = np.nan
+    # Sides are scaled to a mean of 1: a ping below a ten-thousandth of it is silent, whatever its contrast.
+    flat = (bottom <= _MIN_CONTRAST * water) | (bottom < 1e-4)
+    first[flat[:, 0]] = np.nan
     return first
 
 

@@ -27,6 +27,7 @@ MAX_PIXELS: Final = 1 << 26
 MAX_FILE_BYTES: Final = 1 << 28
 
 _PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+_PNG_END: Final = b"IEND\xaeB`\x82"
 _TIFF_SIGNATURES: Final = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 _DEPTH_EXPECTED: Final = "grey of 8 or 16 bits"
 _PNG_COLOURS: Final = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGB with alpha"}
@@ -127,6 +128,9 @@ def _read_png(raw: bytes, path: Path) -> npt.NDArray[np.generic]:
         # Pillow would silently drop the low byte.
         raise SurveyFileError(str(path), "depth", "RGB of 16 bits", _DEPTH_EXPECTED)
     _check_size(path, rows, columns)
+    if _PNG_END not in raw:
+        # Pillow is content when the last pixel has arrived, though the checksum after it has not.
+        raise SurveyFileError(str(path), "IEND", "absent", "an end chunk: the file is truncated")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonarpost.sim.seabed import SeabedKind
+from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.bottom_track import altitudes_m, track_bottom
+from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
+from sonarpost.sonar.xtf_reader import read_xtf
+
+
+def survey_of(rows: np.ndarray, range_m: float = 30.0) -> Survey:
+    pings = tuple(
+        Ping(i, i * 0.1, tuple(ChannelPing(side, row, range_m) for side in Side)) for i, row in enumerate(rows)
+    )
+    return Survey(Path("x"), "x", "x", pings)
+
+
+def drawn(altitude_m: np.ndarray, samples: int = 600, range_m: float = 30.0) -> np.ndarray:
+    """Return pings with a ring-down, dark water and a bright, speckled bottom from `altitude_m` on."""
+    rng = np.random.default_rng(1)
+    centres = (np.arange(samples) + 0.5) * range_m / samples
+    level = np.where(centres >= altitude_m[:, None], 90.0, 2.0)
+    level[:, centres < 0.3] = 250
+    return np.clip(level * rng.rayleigh(0.8, level.shape), 0, 255).astype(np.uint8)
+
+
+def test_a_sloping_bottom_is_followed():
+    altitude = np.linspace(4.0, 9.0, 200)
+    assert np.abs(track_bottom(survey_of(drawn(altitude))) - altitude).max() < 0.25
+
+
+def test_fish_and_gaps_do_not_mislead():
+    altitude = np.full(200, 7.0)
+    rows = drawn(altitude)
+    rows[50:56, 60:66] = 255  # a school of fish at 3 m
+    rows[100:110] = 0  # lost pings
+    assert np.abs(track_bottom(survey_of(rows)) - altitude).max() < 0.25
+
+
+def test_where_nothing_stands_out_there_is_no_altitude():
+    assert np.isnan(track_bottom(survey_of(np.full((60, 400), 80, np.uint8)))).all()
+    assert np.isnan(track_bottom(survey_of(np.zeros((60, 400), np.uint8)))).all()
+    assert track_bottom(dataclasses.replace(survey_of(drawn(np.full(3, 5.0))), pings=())).shape == (0,)
+
+
+def test_a_long_gap_stays_open():
+    rows = drawn(np.full(200, 7.0))
+    rows[60:140] = 0
+    tracked = track_bottom(survey_of(rows))
+    assert np.isnan(tracked[80:120]).all()
+    assert np.isfinite(tracked[:55]).all()
+
+
+def test_sides_of_another_range_and_sampling():
+    near = drawn(np.full(80, 6.0), samples=300, range_m=20.0)
+    far = drawn(np.full(80, 6.0), samples=900, range_m=60.0)
+    pings = tuple(
+        Ping(i, i * 0.1, (ChannelPing(Side.PORT, near[i], 20.0), ChannelPing(Side.STARBOARD, far[i], 60.0)))
+        for i in range(80)
+    )
+    assert np.abs(track_bottom(Survey(Path("x"), "x", "x", pings)) - 6.0).max() < 0.4
+
+
+@pytest.mark.parametrize("window", [0, 4, -1])
+def test_the_window_is_odd(window):
+    with pytest.raises(ValueError, match="odd"):
+        track_bottom(survey_of(drawn(np.full(5, 5.0))), window_pings=window)
+
+
+@pytest.mark.parametrize("kind", list(SeabedKind))
+def test_a_simulated_vehicle_is_tracked_to_its_true_altitude(kind):
+    survey = simulate_survey(SurveySpec(seed=2, seabed=kind, pings=200, samples=512, targets=1, clutter=1)).survey
+    truth = np.array([p.altitude_m for p in survey])
+    assert np.median(np.abs(track_bottom(survey) - truth)) < 0.2
+
+
+def test_the_files_own_altitude_goes_first():
+    survey = survey_of(drawn(np.full(60, 7.0)))
+    pings = list(survey.pings)
+    pings[5] = dataclasses.replace(pings[5], altitude_m=6.5)
+    altitude = altitudes_m(dataclasses.replace(survey, pings=tuple(pings)))
+    assert altitude[5] == 6.5
+    assert altitude[6] == pytest.approx(7.0, abs=0.25)
+
+
+@pytest.mark.realdata
+def test_real_first_returns(data_dir):
+    """Against the first returns read off the pictures by eye."""
+    river = track_bottom(read_xtf(data_dir / "surveys" / "000_1236.xtf"))
+    assert np.isfinite(river).all()
+    assert river[[100, 480, 1000, 1363]] == pytest.approx([6.7, 6.7, 4.1, 1.4], abs=0.5)
+    dive = track_bottom(read_xtf(data_dir / "surveys" / "scotsman-iver2.xtf"))
+    assert dive[[10, 120, 260, 450]] == pytest.approx([13.9, 9.4, 4.3, 3.0], abs=0.6)

@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonarpost.sonar.geometry import (
+    WGS84_EQUATORIAL_RADIUS_M,
+    WGS84_FLATTENING,
+    Position,
+    along_track_m,
+    ground_position,
+    ground_to_slant_range_m,
+    offset_between_m,
+    offset_position,
+    ping_spacing_m,
+    sample_position,
+    sample_slant_range_m,
+    slant_to_ground_range_m,
+)
+from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
+from sonarpost.sonar.xtf_reader import read_xtf
+
+
+def geodesic(origin: Position, bearing_deg: float, distance_m: float) -> Position:
+    """Vincenty's direct formula (Survey Review 1975): exact to a tenth of a millimetre, and another way altogether."""
+    f, a = WGS84_FLATTENING, WGS84_EQUATORIAL_RADIUS_M
+    b = a * (1 - f)
+    azimuth = math.radians(bearing_deg)
+    reduced = math.atan((1 - f) * math.tan(math.radians(origin.lat_deg)))
+    sin_u, cos_u = math.sin(reduced), math.cos(reduced)
+    start = math.atan2(math.tan(reduced), math.cos(azimuth))
+    sin_alpha = cos_u * math.sin(azimuth)
+    cos2_alpha = 1 - sin_alpha**2
+    u2 = cos2_alpha * (a**2 - b**2) / b**2
+    big_a = 1 + u2 / 16384 * (4096 + u2 * (-768 + u2 * (320 - 175 * u2)))
+    big_b = u2 / 1024 * (256 + u2 * (-128 + u2 * (74 - 47 * u2)))
+    sigma = distance_m / (b * big_a)
+    for _ in range(20):
+        cos_m = math.cos(2 * start + sigma)
+        inner = math.cos(sigma) * (2 * cos_m**2 - 1)
+        inner -= big_b / 6 * cos_m * (4 * math.sin(sigma) ** 2 - 3) * (4 * cos_m**2 - 3)
+        sigma = distance_m / (b * big_a) + big_b * math.sin(sigma) * (cos_m + big_b / 4 * inner)
+    cross = sin_u * math.sin(sigma) - cos_u * math.cos(sigma) * math.cos(azimuth)
+    lat = math.atan2(
+        sin_u * math.cos(sigma) + cos_u * math.sin(sigma) * math.cos(azimuth),
+        (1 - f) * math.hypot(sin_alpha, cross),
+    )
+    lam = math.atan2(
+        math.sin(sigma) * math.sin(azimuth),
+        cos_u * math.cos(sigma) - sin_u * math.sin(sigma) * math.cos(azimuth),
+    )
+    c = f / 16 * cos2_alpha * (4 + f * (4 - 3 * cos2_alpha))
+    cos_m = math.cos(2 * start + sigma)
+    lon = lam - (1 - c) * f * sin_alpha * (sigma + c * math.sin(sigma) * cos_m)
+    return Position(math.degrees(lat), (origin.lon_deg + math.degrees(lon) + 180) % 360 - 180)
+
+
+ORIGINS = st.builds(Position, st.floats(-80, 80), st.floats(-180, 179.99))
+
+
+@given(origin=ORIGINS, bearing=st.floats(0, 360), distance=st.floats(0, 500))
+def test_offsets_agree_with_the_geodesic_to_a_millimetre(origin, bearing, distance):
+    got, want = offset_position(origin, bearing, distance), geodesic(origin, bearing, distance)
+    metres = 111_000.0
+    assert abs(got.lat_deg - want.lat_deg) * metres < 1e-3
+    lon_error = (got.lon_deg - want.lon_deg + 180) % 360 - 180
+    assert abs(lon_error) * metres * math.cos(math.radians(origin.lat_deg)) < 1e-3
+    assert -180 <= got.lon_deg < 180
+
+
+@given(origin=ORIGINS, bearing=st.floats(0, 360), distance=st.floats(0, 500))
+def test_offset_between_undoes_offset_position(origin, bearing, distance):
+    north, east = offset_between_m(origin, offset_position(origin, bearing, distance))
+    assert north == pytest.approx(distance * math.cos(math.radians(bearing)), abs=1e-3)
+    assert east == pytest.approx(distance * math.sin(math.radians(bearing)), abs=1e-3)
+
+
+def test_ground_range_is_the_flat_bottom_triangle():
+    assert slant_to_ground_range_m(5.0, 3.0) == pytest.approx(4.0)
+    np.testing.assert_allclose(slant_to_ground_range_m([3.0, 5.0, 13.0], [3.0, 3.0, 12.0]), [0.0, 4.0, 5.0])
+    assert np.isnan(slant_to_ground_range_m(2.9, 3.0))
+
+
+@given(ground=st.floats(0, 500), altitude=st.floats(0.1, 100))
+def test_slant_and_ground_are_inverse(ground, altitude):
+    back = slant_to_ground_range_m(ground_to_slant_range_m(ground, altitude), altitude)
+    # At nadir a slant range says little about the ground range.
+    assert np.nan_to_num(back) == pytest.approx(ground, abs=1e-5)
+
+
+def ping_at(heading_deg: float | None, **changes: object) -> Ping:
+    channels = tuple(ChannelPing(side, np.zeros(100, np.uint8), 50.0) for side in Side)
+    ping = Ping(1, 0.0, channels, lat_deg=60.0, lon_deg=10.0, heading_deg=heading_deg, altitude_m=12.25)
+    return dataclasses.replace(ping, **changes)
+
+
+@pytest.mark.parametrize(
+    ("heading", "side", "north", "east"),
+    [
+        (0, Side.STARBOARD, 0, 1),
+        (0, Side.PORT, 0, -1),
+        (90, Side.STARBOARD, -1, 0),
+        (90, Side.PORT, 1, 0),
+        (225, Side.STARBOARD, math.sqrt(0.5), -math.sqrt(0.5)),
+    ],
+)
+def test_a_sample_lies_abeam_on_its_side(heading, side, north, east):
+    ping = ping_at(heading)
+    index = 60
+    slant_m = sample_slant_range_m(ping.channel(side), index)
+    assert slant_m == pytest.approx(30.25)
+    ground_m = math.sqrt(30.25**2 - 12.25**2)
+    place = sample_position(ping, side, index)
+    got = offset_between_m(Position(60.0, 10.0), place)
+    assert got == pytest.approx((north * ground_m, east * ground_m), abs=1e-3)
+    assert place == ground_position(ping, side, ground_m)
+
+
+def test_a_tracked_altitude_takes_the_place_of_the_pings_own():
+    higher = sample_position(ping_at(0), Side.PORT, 60, altitude_m=25.0)
+    assert offset_between_m(Position(60, 10), higher)[1] == pytest.approx(-math.sqrt(30.25**2 - 25**2), abs=1e-3)
+    assert sample_position(ping_at(0, altitude_m=None), Side.PORT, 60) is None
+
+
+@pytest.mark.parametrize("missing", ["lat_deg", "lon_deg", "heading_deg", "altitude_m"])
+def test_no_position_without_navigation(missing):
+    assert sample_position(dataclasses.replace(ping_at(0), **{missing: None}), Side.PORT, 60) is None
+
+
+def test_no_position_in_the_water_column_or_without_the_channel():
+    assert sample_position(ping_at(0), Side.PORT, 20) is None
+    assert sample_position(ping_at(0, channels=()), Side.PORT, 60) is None
+
+
+def straight_line(step_m: float, count: int, digits: int = 12, **changes: object) -> Survey:
+    origin = Position(48.0, -68.0)
+    pings = []
+    for row in range(count):
+        place = offset_position(origin, 30.0, row * step_m)
+        ping = Ping(row, row * 0.1, (), round(place.lat_deg, digits), round(place.lon_deg, digits), **changes)
+        pings.append(ping)
+    return Survey(Path("x"), "x", "x", tuple(pings))
+
+
+def test_distance_along_a_straight_line():
+    np.testing.assert_allclose(along_track_m(straight_line(0.12, 300)), 0.12 * np.arange(300), atol=1e-3)
+    assert ping_spacing_m(straight_line(0.12, 300)) == pytest.approx(0.12, rel=1e-4)
+
+
+def test_coarse_fixes_do_not_lengthen_the_track():
+    coarse = straight_line(0.12, 600, digits=5)  # steps of 1.1 m north and 0.75 m east
+    raw = [
+        offset_between_m(Position(coarse.pings[0].lat_deg, coarse.pings[0].lon_deg), Position(p.lat_deg, p.lon_deg))
+        for p in coarse
+    ]
+    assert np.hypot(*np.diff(raw, axis=0).T).sum() > 1.2 * 0.12 * 599
+    assert ping_spacing_m(coarse) == pytest.approx(0.12, rel=0.03)
+
+
+def test_pings_without_a_fix_are_bridged():
+    survey = straight_line(0.12, 300)
+    lost = {*range(5), 100, 101, 102, *range(290, 300)}
+    pings = tuple(
+        dataclasses.replace(p, lat_deg=None, lon_deg=None) if row in lost else p for row, p in enumerate(survey)
+    )
+    distance = along_track_m(dataclasses.replace(survey, pings=pings))
+    np.testing.assert_allclose(distance, 0.12 * np.arange(300), atol=2e-3)
+
+
+def test_speed_and_time_where_there_are_no_fixes():
+    survey = straight_line(1.0, 50, speed_mps=1.5)
+    pings = [dataclasses.replace(p, lat_deg=None, lon_deg=None) for p in survey]
+    pings[7] = dataclasses.replace(pings[7], speed_mps=None)
+    np.testing.assert_allclose(
+        along_track_m(dataclasses.replace(survey, pings=tuple(pings))), 0.15 * np.arange(50), atol=1e-9
+    )
+
+
+def test_nothing_is_guessed():
+    survey = straight_line(1.0, 5)
+    bare = dataclasses.replace(survey, pings=tuple(dataclasses.replace(p, lat_deg=None, lon_deg=None) for p in survey))
+    assert along_track_m(bare) is None
+    assert ping_spacing_m(bare) is None
+    assert ping_spacing_m(straight_line(0.0, 5)) is None
+    assert along_track_m(dataclasses.replace(survey, pings=())) is None
+
+
+@pytest.mark.realdata
+def test_the_real_vehicle_went_as_fast_as_it_says(data_dir):
+    survey = read_xtf(data_dir / "surveys" / "scotsman-iver2.xtf")
+    speeds = [p.speed_mps for p in survey if p.speed_mps is not None]
+    lasted_s = survey.pings[-1].time_utc_s - survey.pings[0].time_utc_s
+    assert along_track_m(survey)[-1] / lasted_s == pytest.approx(np.mean(speeds), rel=0.05)
