@@ -98,6 +98,10 @@ class AcousticWorld:
         passed, port.passed = port.passed, []
         return passed
 
+    def abandon_outputs(self, number: int) -> list[Output]:
+        """Return what has not come out of a modem's serial line, and drop it."""
+        return self.take_outputs(number) + self._ports[number].to_host.abandon()
+
     def _step(self, now: float) -> list[Transmission | Report]:
         """Let happen what happens at `now`, which no event lies before."""
         self.now = now

@@ -41,6 +41,12 @@ class SerialPace(Generic[Item]):
             passed.append(self._items.popleft()[1])
         return passed
 
+    def abandon(self) -> list[Item]:
+        """Return what is still on the line, and drop it."""
+        dropped = [item for _, item in self._items]
+        self._items.clear()
+        return dropped
+
     def next_s(self) -> float | None:
         """Return when the next item has passed, or None."""
         return self._items[0][0] if self._items else None

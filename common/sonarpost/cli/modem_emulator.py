@@ -1,0 +1,131 @@
+"""`sonarpost modem-emulator`: emulated Micro-Modems in one simulated water, without any configuration file."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import threading
+from pathlib import Path
+from types import FrameType
+
+from sonarpost.errors import ConfigError
+from sonarpost.modem.rates import RATES
+from sonarpost.sim.acoustic_channel import AcousticChannel
+from sonarpost.sim.channel_config import ChannelConfig, ModemSite
+from sonarpost.sim.micromodem_config import ModemConfig
+from sonarpost.sim.water_physics import Position
+from sonarpost.sim.water_records import WaterConfig
+
+WATCH_S = 0.2
+EXIT_FAILED = 1
+MOST_MODEMS = 64
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser(
+        "modem-emulator",
+        help="emulated acoustic modems on pseudo-terminals or TCP ports",
+        description="Emulates Micro-Modems in one water until SIGINT or SIGTERM. The first line of the output is a "
+        'JSON object, {"modems":[{"address":1,"device":"…"},…]}; open the devices with any serial program or, for '
+        "TCP, with a socket:// URL.",
+    )
+    parser.add_argument("--modems", type=int, default=2, metavar="N", help="how many, addresses from 1 (2)")
+    ports = parser.add_mutually_exclusive_group()
+    ports.add_argument("--pty", type=Path, metavar="DIR", help="folder for the links modem-1, … (./modems)")
+    ports.add_argument("--tcp", type=int, nargs="+", metavar="PORT", help="TCP port of each modem, 0 for a free one")
+    parser.add_argument("--spacing", type=float, default=100.0, metavar="M", help="metres from modem to modem (100)")
+    parser.add_argument("--loss", type=float, default=0.0, metavar="P", help="chance that a frame is lost (0)")
+    parser.add_argument("--packet-loss", type=float, default=0.0, metavar="P", help="chance for a whole packet (0)")
+    parser.add_argument("--tail-damage", type=float, default=0.0, metavar="P", help="chance of a damaged tail (0)")
+    parser.add_argument("--range-loss", action="store_true", help="lose frames by signal-to-noise ratio too")
+    parser.add_argument("--snr-at-1m", type=float, default=60.0, metavar="DB", help="signal-to-noise at 1 m (60)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of every draw (0)")
+    parser.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="simulated seconds a second (1)")
+    parser.add_argument(
+        "--airtime", action="append", default=[], metavar="RATE=S", help="air time of a rate, instead of the nominal"
+    )
+    parser.add_argument("--baud", type=float, metavar="B", help="simulate the serial lines' speed, as 19200")
+    parser.add_argument("--log", type=Path, metavar="FILE", help="append what became of every packet, as JSON lines")
+    parser.add_argument("--json", action="store_true", help="print those JSON lines too, instead of text")
+    parser.set_defaults(run=run)
+
+
+def run(parsed: argparse.Namespace) -> int:
+    """Run the emulator until SIGINT or SIGTERM; return 0, or 1 when it failed by itself."""
+    stopping = threading.Event()
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        stopping.set()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        return _serve(parsed, stopping)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _serve(parsed: argparse.Namespace, stopping: threading.Event) -> int:
+    channel = AcousticChannel(_config(parsed), echo=sys.stdout if parsed.json else None)
+    channel.open()
+    try:
+        devices = channel.devices()
+        listed = [{"address": device.address, "device": device.device} for device in devices]
+        print(json.dumps({"modems": listed}), flush=True)
+        channel.start()
+        if not parsed.json:
+            for device in devices:
+                print(f"modem {device.modem}: address {device.address}, {device.device}", flush=True)
+        while not stopping.wait(WATCH_S):
+            if channel.failure is not None:
+                print(f"sonarpost: the emulator failed: {channel.failure}", file=sys.stderr)
+                return EXIT_FAILED
+    finally:
+        channel.stop()
+    return 0
+
+
+def _config(parsed: argparse.Namespace) -> ChannelConfig:
+    """Turn the command line into a configuration.
+
+    Raises:
+        ConfigError: A value out of its bounds, named as the library names it.
+    """
+    if not 1 <= parsed.modems <= MOST_MODEMS:
+        raise ConfigError("command line", "--modems", parsed.modems, f"1..{MOST_MODEMS}")
+    try:
+        water = WaterConfig(
+            seed=parsed.seed,
+            frame_loss=parsed.loss,
+            packet_loss=parsed.packet_loss,
+            tail_damage=parsed.tail_damage,
+            snr_at_1m_db=parsed.snr_at_1m,
+            range_loss=parsed.range_loss,
+        )
+        sites = tuple(ModemSite(n + 1, Position(east_m=n * parsed.spacing)) for n in range(parsed.modems))
+        airtimes_s = dict(_airtime(text) for text in parsed.airtime)
+        return ChannelConfig(
+            sites=sites,
+            water=water,
+            modem=ModemConfig(address=0, airtimes_s=airtimes_s),
+            pty_dir=None if parsed.tcp else parsed.pty or Path("modems"),
+            tcp_ports=tuple(parsed.tcp or ()),
+            time_scale=parsed.time_scale,
+            serial_baud=parsed.baud,
+            log_path=parsed.log,
+        )
+    except ValueError as error:
+        name, _, rest = str(error).partition(": ")
+        raise ConfigError("command line", name, rest, "a value within its bounds") from error
+
+
+def _airtime(text: str) -> tuple[int, float]:
+    rate, _, seconds = text.partition("=")
+    try:
+        return int(rate), float(seconds)
+    except ValueError as error:
+        expected = f"RATE=SECONDS with a rate {min(RATES)}..{max(RATES)}"
+        raise ConfigError("command line", "--airtime", text, expected) from error
