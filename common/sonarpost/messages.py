@@ -147,7 +147,7 @@ class LinkQuality(Record):
     snr_out_db: float | None = None
     spl_db: float | None = None
     mse_db: float | None = None
-    doppler_mps: float | None = None
+    doppler: float | None = None
     frames: Annotated[int, Field(ge=0)] | None = None
     bad_frames: Annotated[int, Field(ge=0)] | None = None
 
@@ -162,10 +162,10 @@ class AcousticFrame(Record):
     time_utc_s: Time
     source: Address
     destination: Address
-    rate: Annotated[int, Field(ge=0, le=6)]
+    rate: Annotated[int, Field(ge=0, le=6)] | None
     packet: Annotated[int, Field(ge=0)]
     frame_number: Annotated[int, Field(ge=1, le=8)]
-    frame_count: Annotated[int, Field(ge=0, le=8)]
+    frame_count: Annotated[int, Field(ge=0, le=8)] | None
     data: Annotated[bytes, Field(max_length=2048)]
     quality: LinkQuality | None = None
 

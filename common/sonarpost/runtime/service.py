@@ -143,6 +143,10 @@ class Service(ABC, Generic[C]):
         """Return momentary values for the health record."""
         return {}
 
+    def trouble(self) -> str:
+        """Return what keeps the service from working at this moment, for the health record; empty when nothing."""
+        return ""
+
     # Life
 
     @property
@@ -288,6 +292,7 @@ class Service(ABC, Generic[C]):
         detail = self._problem
         if self._inbox is not None and self._inbox.in_trouble:
             detail = detail or "records cannot be stored"
+        detail = detail or self.trouble()
         with self._counter_lock:
             counters = dict(self._counters)
         gauges = {

@@ -1,0 +1,156 @@
+"""Sends encoded images through the vehicle's modem, one half a packet, and remembers how far it has come."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import time
+from collections.abc import Mapping
+
+import msgpack
+
+from services.uuv_modem.config import UuvModemConfig
+from sonarpost import keys, wire
+from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.paper_sender import Packet, plan_packets
+from sonarpost.messages import AcousticFrame, Contact, EncodedImage, Record
+from sonarpost.modem.events import Event, PacketFailed, PacketSent
+from sonarpost.modem.rates import RATES
+from sonarpost.runtime.config import PlatformConfig
+from sonarpost.runtime.logs import kv
+from sonarpost.runtime.modem_service import ModemService
+from sonarpost.runtime.service import Effects, InterruptedByStopError
+from sonarpost.sonar.survey import Side
+
+log = logging.getLogger(__name__)
+
+_PROGRESS = "progress"
+_WAIT_S = 0.2
+
+
+class UuvModemService(ModemService[UuvModemConfig]):
+    """The vehicle's end of the acoustic link.
+
+    An image leaves the inbox when its last packet has gone into the water. Which of its packets have gone is kept
+    after each, so that a restart sends at most one packet twice; the receiver knows repeated frames.
+    """
+
+    NAME = "uuv_modem"
+
+    def __init__(self, platform: PlatformConfig, config: UuvModemConfig) -> None:
+        super().__init__(platform, config)
+        self._outcomes: queue.Queue[PacketSent | PacketFailed] = queue.Queue()
+        self._packet_number = 0
+
+    def consumes(self) -> Mapping[str, type[Record]]:
+        """Encoded images of this vehicle."""
+        return {keys.image_encoded(self.platform.id): EncodedImage}
+
+    def check(self, record: Record) -> None:
+        """Refuse an image that can never be sent, while its sender can still be told."""
+        assert isinstance(record, EncodedImage)
+        self._plan(record)
+
+    def handle(self, key: str, record: Record, effects: Effects) -> None:
+        """Send an image, however long it takes."""
+        assert isinstance(record, EncodedImage)
+        packets = self._plan(record)
+        done = self._packets_done(record, len(packets))
+        log.info("Sending", extra=kv(image_id=record.image_id, packets=len(packets), already_sent=done))
+        for number in range(done, len(packets)):
+            self._send(packets[number])
+            if number + 1 < len(packets):
+                self._remember(record, number + 1)
+        effects.delete_state(_PROGRESS)
+        effects.count("images_sent")
+        log.info("Image sent", extra=kv(image_id=record.image_id, contact=record.contact.contact_id))
+
+    def on_modem_event(self, event: Event) -> None:
+        """Hand the fate of packets to the sending thread."""
+        if isinstance(event, (PacketSent, PacketFailed)):
+            self._outcomes.put(event)
+
+    def _plan(self, image: EncodedImage) -> tuple[Packet, ...]:
+        rate = RATES[self.config.rate]
+        summary = summary_of(image.contact, image.height_px, image.width_px)
+        return plan_packets(image.image_id, image.stream, summary, rate.frames, rate.frame_bytes)
+
+    def _packets_done(self, image: EncodedImage, packets: int) -> int:
+        """Return how many packets of this image have gone, 0 when they were planned for another rate."""
+        kept = self.store.get_state(_PROGRESS)
+        if kept is None:
+            return 0
+        progress = msgpack.unpackb(kept)
+        same = (progress["image_id"], progress["rate"], progress["of"]) == (image.image_id, self.config.rate, packets)
+        return int(progress["done"]) if same else 0
+
+    def _remember(self, image: EncodedImage, done: int) -> None:
+        rate, packets = self.config.rate, len(self._plan(image))
+        progress = {"image_id": image.image_id, "rate": rate, "of": packets, "done": done}
+        with self.store.transaction() as tx:
+            tx.put_state(_PROGRESS, msgpack.packb(progress))
+
+    def _send(self, packet: Packet) -> None:
+        """Send one packet, trying until the modem has sent it."""
+        while True:
+            packet_id = self.modem.send_packet(self.config.destination, self.config.rate, packet)
+            outcome = self._wait_for(packet_id)
+            if isinstance(outcome, PacketSent):
+                self._show(outcome)
+                return
+            self.count("packets_failed")
+            log.warning("Packet not sent, trying again", extra=kv(reason=outcome.reason, maybe=outcome.maybe_sent))
+            if self.stopping.wait(self.config.retry_s):
+                raise InterruptedByStopError
+
+    def _wait_for(self, packet_id: int) -> PacketSent | PacketFailed:
+        while not self.stopping.is_set():
+            try:
+                outcome = self._outcomes.get(timeout=_WAIT_S)
+            except queue.Empty:
+                continue
+            if outcome.packet_id == packet_id:
+                return outcome
+        raise InterruptedByStopError
+
+    def _show(self, sent: PacketSent) -> None:
+        """Publish the frames for observers."""
+        self._packet_number += 1
+        self.count("packets_sent")
+        self.count("frames_sent", len(sent.frames))
+        now_utc_s = time.time()
+        for number, data in enumerate(sent.frames, start=1):
+            frame = AcousticFrame(
+                direction="tx",
+                platform_id=self.platform.id,
+                time_utc_s=now_utc_s,
+                source=self.config.address,
+                destination=sent.dest,
+                rate=sent.rate,
+                packet=self._packet_number,
+                frame_number=number,
+                frame_count=len(sent.frames),
+                data=data,
+            )
+            key = keys.acoustic_tx(self.platform.id)
+            self.session.put(key, wire.encode(frame), encoding=wire.encoding_of(AcousticFrame))
+
+
+def summary_of(contact: Contact, height_px: int, width_px: int) -> ContactSummary:
+    """Return what of a contact travels by sound, with the size of its picture."""
+    return ContactSummary(
+        height_px=height_px,
+        width_px=width_px,
+        lat_deg=contact.lat_deg if contact.lon_deg is not None else None,
+        lon_deg=contact.lon_deg if contact.lat_deg is not None else None,
+        time_utc_s=contact.time_utc_s,
+        confidence=contact.atd_confidence,
+        heading_deg=contact.heading_deg,
+        altitude_m=contact.altitude_m,
+        depth_m=contact.depth_m,
+        side=Side(contact.channel) if contact.channel else None,
+        ground_range_m=contact.ground_range_m if contact.channel else None,
+        pixel_along_m=contact.pixel_along_m,
+        pixel_across_m=contact.pixel_across_m,
+        position_sigma_m=contact.position_sigma_m if contact.lat_deg is not None else None,
+    )
