@@ -1,0 +1,118 @@
+"""The codec registry and its plug-ins."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+
+from sonarpost.codec.registry import (
+    BUILTINS,
+    ENTRY_POINT_GROUP,
+    CodecRegistry,
+    CodecResources,
+    CodecSpec,
+    default_registry,
+    load_plugins,
+)
+from sonarpost.codec.tiles import TileDatabase
+from sonarpost.codec.vq import IndexPacking, VqCodec
+from sonarpost.errors import ConfigError, StreamError
+
+TILES = TileDatabase.from_tiles(8, np.random.default_rng(0).integers(0, 256, (50, 64), dtype=np.uint8))
+
+
+def make_nothing(resources: CodecResources) -> VqCodec:
+    return VqCodec(TILES, IndexPacking.BYTES3)
+
+
+PLUGIN = CodecSpec("plugin", (0x80, 0x81), make_nothing, "for the tests")
+NOT_A_SPEC = 5
+
+
+@pytest.fixture
+def registry(monkeypatch: pytest.MonkeyPatch) -> CodecRegistry:
+    import sys
+    import types
+
+    module = types.ModuleType("sonarpost_test_plugin")
+    module.PLUGIN, module.NOT_A_SPEC = PLUGIN, NOT_A_SPEC
+    monkeypatch.setitem(sys.modules, "sonarpost_test_plugin", module)
+    return CodecRegistry(BUILTINS)
+
+
+def plugin(name: str, value: str) -> EntryPoint:
+    return EntryPoint(name, f"sonarpost_test_plugin:{value}", ENTRY_POINT_GROUP)
+
+
+def test_vq_is_there_by_name_and_by_every_id(registry: CodecRegistry) -> None:
+    assert "vq" in registry.names()
+    image = np.random.default_rng(1).integers(0, 256, (16, 24), dtype=np.uint8)
+    for packing in IndexPacking:
+        codec = registry.create("vq", CodecResources(TILES, packing))
+        stream = codec.encode(image)
+        reader = registry.create_for_stream(stream, CodecResources(TILES))
+        assert reader.codec_id == codec.codec_id == packing.codec_id
+        assert np.array_equal(reader.decode(stream).image, codec.decode(stream).image)
+
+
+def test_unknown_names_and_ids_list_what_there_is(registry: CodecRegistry) -> None:
+    with pytest.raises(ConfigError, match="vq"):
+        registry.create("jpg", CodecResources())
+    with pytest.raises(StreamError, match=r"0x10 \(vq\)"):
+        registry.spec_for_id(0xFE)
+    with pytest.raises(StreamError):
+        registry.create_for_stream(b"\x10", CodecResources(TILES))
+
+
+def test_vq_without_tiles_says_what_it_needs(registry: CodecRegistry) -> None:
+    with pytest.raises(ConfigError, match="nominal-10"):
+        registry.create("vq", CodecResources())
+
+
+@pytest.mark.parametrize(
+    ("name", "ids", "match"),
+    [
+        ("vq", (0x90,), "not taken"),
+        ("other", (0x90, 0x12), "it is vq's"),
+        ("other", (), "at least one"),
+        ("other", (0x90, 0x90), "none twice"),
+        ("other", (256,), "0..255"),
+        ("other", (-1,), "0..255"),
+    ],
+)
+def test_a_name_or_id_is_taken_once(registry: CodecRegistry, name: str, ids: tuple[int, ...], match: str) -> None:
+    before = registry.names()
+    with pytest.raises(ConfigError, match=match):
+        registry.register(CodecSpec(name, ids, make_nothing))
+    assert registry.names() == before
+    if 0x90 in ids:
+        with pytest.raises(StreamError):
+            registry.spec_for_id(0x90)  # a refused codec leaves nothing behind
+
+
+def test_a_plug_in_is_registered_like_a_codec_of_ours(registry: CodecRegistry) -> None:
+    load_plugins(registry, [plugin("plugin", "PLUGIN")])
+    assert "plugin" in registry.names()
+    assert registry.spec_for_id(0x81) is PLUGIN
+    assert registry.create("plugin", CodecResources()).codec_id == 0x12
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "match"),
+    [
+        ("plugin", "ABSENT", "an object that imports"),
+        ("plugin", "NOT_A_SPEC", "CodecSpec"),
+        ("another", "PLUGIN", "entry point's name"),
+    ],
+)
+def test_a_wrong_plug_in_is_named(registry: CodecRegistry, name: str, value: str, match: str) -> None:
+    with pytest.raises(ConfigError, match=match) as caught:
+        load_plugins(registry, [plugin(name, value)])
+    assert name in caught.value.where
+
+
+def test_the_default_registry_is_made_once() -> None:
+    assert default_registry() is default_registry()
+    assert "vq" in default_registry().names()

@@ -1,0 +1,169 @@
+"""The tile database and its exact nearest search."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from sonarpost.codec.tiles import BASIS_SCALE, TileDatabase, cut_tiles, join_tiles, principal_basis
+from sonarpost.errors import CatalogueError
+
+
+def random_tiles(count: int, tile_px: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (count, tile_px * tile_px), dtype=np.uint8)
+
+
+def brute_force(database: TileDatabase, tiles: np.ndarray) -> tuple[list[int], list[float]]:
+    """Integer arithmetic of Python, one pair at a time: nothing in common with the matrix product."""
+    basis = database.basis.astype(object)
+    indices, distances = [], []
+    for tile in tiles:
+        squares = []
+        for other in database.tiles:
+            difference = basis @ (tile.astype(int) - other.astype(int)).astype(object)
+            squares.append(sum(int(value) ** 2 for value in difference))
+        indices.append(squares.index(min(squares)))
+        distances.append(min(squares) ** 0.5 / BASIS_SCALE)
+    return indices, distances
+
+
+@pytest.mark.parametrize(("tile_px", "dims"), [(4, 16), (5, 7), (10, 70), (20, 70), (32, 70)])
+def test_nearest_is_the_brute_force_nearest_exactly(tile_px: int, dims: int) -> None:
+    database = TileDatabase.from_tiles(tile_px, random_tiles(90, tile_px), dims)
+    queries = np.concatenate([random_tiles(6, tile_px, 1), database.tiles[40:42]])
+    indices, distances = database.nearest(queries)
+    expected_indices, expected_distances = brute_force(database, queries)
+    assert indices.tolist() == expected_indices
+    assert distances.tolist() == pytest.approx(expected_distances, rel=1e-12)
+
+
+def test_extreme_tiles_stay_within_exact_integers() -> None:
+    # All black against all white at the largest tile is the greatest distance there can be.
+    tiles = np.stack([np.zeros(1024, np.uint8), np.full(1024, 255, np.uint8)])
+    database = TileDatabase.from_tiles(32, tiles)
+    assert database.dims == 1
+    indices, distances = database.nearest(tiles)
+    assert indices.tolist() == [0, 1]
+    assert distances.tolist() == [0.0, 0.0]
+    middle = np.full((1, 1024), 127, np.uint8)
+    index, distance = database.nearest(middle)
+    assert index.tolist() == [0]
+    assert distance[0] == pytest.approx(127 * 32, rel=1e-3)
+    assert np.abs(database.projections).max() ** 2 * 4 < 2**53
+
+
+@pytest.mark.parametrize("copies", [2, 3, 5000])
+def test_of_equal_tiles_the_lowest_index_wins_within_and_across_blocks(copies: int) -> None:
+    one = random_tiles(2, 4)
+    tiles = np.concatenate([one[:1], np.repeat(one[1:], copies, axis=0)])
+    index, distance = TileDatabase.from_tiles(4, tiles).nearest(one)
+    assert index.tolist() == [0, 1]
+    assert distance.tolist() == [0.0, 0.0]
+
+
+def test_every_stored_tile_finds_itself_over_all_query_blocks() -> None:
+    tiles = np.unique(random_tiles(600, 5), axis=0)
+    index, _ = TileDatabase.from_tiles(5, tiles).nearest(tiles)
+    assert index.tolist() == list(range(len(tiles)))
+
+
+def test_no_queries_give_no_indices() -> None:
+    index, distance = TileDatabase.from_tiles(4, random_tiles(3, 4)).nearest(np.zeros((0, 16), np.uint8))
+    assert index.shape == distance.shape == (0,)
+
+
+def test_basis_rows_are_orthonormal_signed_and_ordered_by_variance() -> None:
+    tiles = random_tiles(500, 6)
+    tiles[:, :6] = tiles[:, :1]  # six pixels in step: one strong component
+    mean, basis = principal_basis(tiles, 20)
+    assert mean.tolist() == np.floor(tiles.mean(axis=0) + 0.5).astype(int).tolist()
+    rows = basis.astype(float) / BASIS_SCALE
+    assert np.abs(rows @ rows.T - np.eye(20)).max() < 2e-3
+    assert all(row[np.argmax(np.abs(row))] > 0 for row in rows)
+    variances = ((tiles - tiles.mean(axis=0)) @ rows.T).var(axis=0)
+    assert (np.diff(variances) < variances[:-1] * 1e-2).all()
+    assert np.abs(rows[0, :6]).sum() > np.abs(rows[0, 6:]).sum()
+
+
+@pytest.mark.parametrize("tiles", [np.zeros((1, 16), np.uint8), np.full((9, 16), 200, np.uint8)])
+def test_tiles_without_variance_still_make_a_database(tiles: np.ndarray) -> None:
+    database = TileDatabase.from_tiles(4, tiles)
+    assert database.dims == 1
+    assert database.nearest(random_tiles(4, 4))[0].tolist() == [0, 0, 0, 0]
+
+
+def test_identity_changes_with_everything_that_decides_a_picture_or_an_index() -> None:
+    tiles = random_tiles(40, 4)
+    base = TileDatabase.from_tiles(4, tiles, 8)
+    altered = tiles.copy()
+    altered[3, 5] ^= 1
+    mean = base.mean.copy()
+    mean[0] ^= 1
+    basis = base.basis.copy()
+    basis[2, 2] += 1
+    others = [
+        TileDatabase(4, altered, base.mean, base.basis),
+        TileDatabase(4, tiles[::-1], base.mean, base.basis),
+        TileDatabase(4, tiles[:-1], base.mean, base.basis),
+        TileDatabase(4, tiles, mean, base.basis),
+        TileDatabase(4, tiles, base.mean, basis),
+        TileDatabase(4, tiles, base.mean, base.basis[:-1]),
+    ]
+    assert len({database.identity for database in [base, *others]}) == 7
+    assert TileDatabase(4, tiles.copy(), base.mean, base.basis).identity == base.identity
+    assert len(base.identity) == 64
+
+
+def test_a_database_cannot_be_changed_behind_its_identity() -> None:
+    tiles = random_tiles(10, 4)
+    database = TileDatabase.from_tiles(4, tiles)
+    before = database.identity
+    tiles[:] = 0
+    with pytest.raises(ValueError, match="read-only"):
+        database.tiles[0, 0] = 1
+    assert TileDatabase(4, database.tiles, database.mean, database.basis).identity == before
+
+
+@pytest.mark.parametrize(
+    ("field", "make"),
+    [
+        ("tile_px", lambda t: TileDatabase.from_tiles(3, t[:, :9])),
+        ("tile_px", lambda t: TileDatabase.from_tiles(33, np.zeros((1, 33 * 33), np.uint8))),
+        ("tiles.shape", lambda t: TileDatabase.from_tiles(5, t)),
+        ("tiles.shape", lambda t: TileDatabase.from_tiles(4, t[:0])),
+        ("tiles.dtype", lambda t: TileDatabase.from_tiles(4, t.astype(np.int16))),
+        ("dims", lambda t: TileDatabase.from_tiles(4, t, 71)),
+        ("dims", lambda t: TileDatabase.from_tiles(4, t, 0)),
+        ("mean.shape", lambda t: TileDatabase(4, t, t[0, :5], np.ones((2, 16), np.int16))),
+        ("basis.dtype", lambda t: TileDatabase(4, t, t[0], np.ones((2, 16)))),
+        ("basis.shape", lambda t: TileDatabase(4, t, t[0], np.ones((17, 16), np.int16))),
+        ("basis.shape", lambda t: TileDatabase(4, t, t[0], np.ones((0, 16), np.int16))),
+    ],
+)
+def test_a_wrong_shape_or_type_is_refused_by_name(field: str, make) -> None:
+    with pytest.raises(CatalogueError) as caught:
+        make(random_tiles(6, 4))
+    assert caught.value.field == field
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    image=hnp.arrays(np.uint8, st.tuples(st.integers(1, 50), st.integers(1, 50))),
+    tile_px=st.integers(4, 32),
+)
+def test_cutting_and_joining_gives_the_picture_back(image: np.ndarray, tile_px: int) -> None:
+    tiles = cut_tiles(image, tile_px)
+    assert np.array_equal(join_tiles(tiles, *image.shape, tile_px), image)
+
+
+def test_tiles_come_in_raster_order_with_edges_repeated() -> None:
+    image = np.arange(30, dtype=np.uint8).reshape(5, 6)
+    tiles = cut_tiles(image, 4)
+    assert tiles.shape == (4, 16)
+    assert tiles[0, :4].tolist() == [0, 1, 2, 3]
+    assert tiles[1, :4].tolist() == [4, 5, 5, 5]
+    assert tiles[2].reshape(4, 4).tolist() == [[24, 25, 26, 27]] * 4
+    assert tiles[3].reshape(4, 4).tolist() == [[28, 29, 29, 29]] * 4
