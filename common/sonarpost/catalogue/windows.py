@@ -40,7 +40,7 @@ class WindowPlan:
     Attributes:
         side_px: Side of the square windows after reduction.
         reductions: (pings, samples) averaged into one pixel, one set of windows for each.
-        per_reduction: Most windows of one line and reduction, spread evenly over it.
+        per_reduction: Most windows of one line and reduction, scattered over it.
         least_std: Windows flatter than this (grey levels, before stretching) hold no bottom and are left out.
         tones: Given to the windows in turn.
         copies: How often each window is used, each time with the next tone and another mirroring.
@@ -96,10 +96,7 @@ def cut_line(name: str, line: Line, plan: WindowPlan) -> Iterator[TrainingImage]
     serial = 0
     for pings, samples in plan.reductions:
         reduced = reduce_line(line, pings, samples)
-        corners = _usable_corners(reduced, plan)
-        wanted = min(plan.per_reduction, len(corners))
-        for number in range(wanted):
-            top, left = corners[number * len(corners) // wanted]
+        for top, left in _scattered(_usable_corners(reduced, plan), plan.per_reduction):
             window = stretch(reduced[top : top + plan.side_px, left : left + plan.side_px])
             for _ in range(plan.copies):
                 mirrored = window[:: -1 if serial & 1 else 1, :: -1 if serial & 2 else 1]
@@ -153,6 +150,11 @@ def _usable_corners(line: npt.NDArray[np.float64], plan: WindowPlan) -> list[tup
             if np.isfinite(window).all() and float(window.std()) >= plan.least_std:
                 corners.append((top, left))
     return corners
+
+
+def _scattered(corners: list[tuple[int, int]], wanted: int) -> list[tuple[int, int]]:
+    """Return some corners by the order of their hashes: even steps could meet the same column (the nadir) each time."""
+    return sorted(corners, key=lambda corner: hashlib.sha256(repr(corner).encode()).digest())[:wanted]
 
 
 def _training_image(name: str, pixels: Picture) -> TrainingImage:
