@@ -97,7 +97,7 @@ def test_a_bad_field_is_named(tmp_path, raw, offset, fmt, value, field):
     assert caught.value.expected
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damage_reads_or_raises_one_error(tmp_path, raw, data):
     damaged = bytearray(raw)

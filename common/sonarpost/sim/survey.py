@@ -155,7 +155,7 @@ def simulate_survey(spec: SurveySpec) -> SimulatedSurvey:
         spec: What to simulate.
 
     Returns:
-        The survey, its path naming the seed since there is no file, and the truth in order of along-track place.
+        The survey, its path naming the seed since there is no file, and the truth in order of pings.
 
     Raises:
         ConfigError: More objects than find room with a few metres between them.
@@ -184,6 +184,7 @@ def simulate_survey(spec: SurveySpec) -> SimulatedSurvey:
         for side, sign in _SIGN.items()
     }
     truth = [_truth(spec, track, *pair) for pair in zip(things, grounds_m, strict=True)]
+    truth.sort(key=lambda thing: thing.ping)
     return SimulatedSurvey(_survey(spec, track, altitude_m, sides), tuple(truth))
 
 
@@ -217,7 +218,7 @@ def _lay_out(spec: SurveySpec, length_m: float, rng: np.random.Generator) -> lis
         else:
             expected = f"objects that find room on {length_m:.0f} m of track"
             raise ConfigError("survey simulator", "targets and clutter", len(kinds), expected)
-    return sorted(things, key=lambda thing: thing.along_m)
+    return things
 
 
 def _wander(count: int, scale_pings: float, rng: np.random.Generator) -> FloatArray:

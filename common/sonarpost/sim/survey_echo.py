@@ -191,6 +191,6 @@ def _speckle(shape: tuple[int, ...], rng: np.random.Generator) -> FloatImage:
     """
     total = np.zeros(shape, dtype=np.float32)
     for _ in range(2 * _LOOKS):
-        field = gaussian_filter1d(rng.standard_normal(shape, dtype=np.float32), 0.6, axis=1, mode="wrap")
+        field = gaussian_filter1d(rng.standard_normal(shape, dtype=np.float32), 0.75, axis=1, mode="wrap")
         total += field**2
     return total / np.float32(total.mean())

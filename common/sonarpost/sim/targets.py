@@ -191,11 +191,13 @@ def _debris(thing: SeabedObject, u_m: FloatMap, v_m: FloatMap) -> FloatMap:
     rng = np.random.default_rng(thing.seed)
     top = np.zeros_like(u_m)
     for piece in range(int(rng.integers(3, 7))):
-        turn = rng.normal(0, 0.7)
-        middle = rng.uniform(-0.3, 0.3) * thing.length_m, rng.uniform(-0.3, 0.3) * thing.width_m
+        turn = rng.normal(0, 0.4)
+        middle = rng.uniform(-0.25, 0.25) * thing.length_m, rng.uniform(-0.3, 0.3) * thing.width_m
         along = (u_m - middle[0]) * math.cos(turn) + (v_m - middle[1]) * math.sin(turn)
         across = (v_m - middle[1]) * math.cos(turn) - (u_m - middle[0]) * math.sin(turn)
-        long_m, thick_m = rng.uniform(0.3, 0.7) * thing.length_m, rng.uniform(0.12, 0.3)
+        long_m, thick_m = rng.uniform(0.2, 0.6) * thing.length_m, rng.uniform(0.12, 0.3)
+        if piece == 0:  # the longest one gives the heap its length
+            along, across, long_m = u_m, v_m, thing.length_m
         inside = (np.abs(along) < long_m / 2) & (np.abs(across) < thick_m / 2)
         raised = thing.height_m * (1.0 if piece == 0 else rng.uniform(0.4, 1.0))
         top = np.maximum(top, np.where(inside, raised * (0.8 + 0.4 * along / long_m), 0))
