@@ -161,8 +161,8 @@ def test_the_scotsman_gives_the_wreck_and_the_small_objects_to_port(data_dir):
 @pytest.mark.realdata
 def test_an_eight_bit_survey_without_altitude_or_speed_works(data_dir):
     survey = read_survey(data_dir / "surveys" / "000_1236.xtf")
-    found = detect(survey, DetectorSettings(max_contacts=20))
-    assert len(found) == 20
+    found = detect(survey)
+    assert 10 <= len(found) <= 60  # a river bed strewn with debris
     assert all(d.height_m is not None and d.position is not None and d.length_m is not None for d in found)
     # A branched object with its shadow on open sand, the plainest on this line's port side.
     assert any(d.side is Side.PORT and abs(d.ping_index - 330) < 8 and abs(d.sample - 327) < 15 for d in found)

@@ -2,8 +2,8 @@
 
 The matched filter says where to look; these two look again, each at one property alone, so that their agreement means
 something: the constant-false-alarm test compares the highlight with a guarded ring of seabed, the shadow test asks
-whether the dark behind it is dark, begins at the highlight, is not riddled with echoes, and goes on along-track no farther than the highlight
-suggests.
+whether the dark behind it is dark, begins at the highlight, is not riddled with echoes, and goes on along-track no
+farther than the highlight suggests.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class DetectorSettings:
     ring_m: float = 1.5
     matched_at_threshold: float = 4.0
     cfar_at_threshold: float = 1.8
-    shadow_at_threshold: float = 1.2
+    shadow_at_threshold: float = 1.5
     separation_along_m: float = 3.0
     separation_across_m: float = 3.0
     mine_length_m: tuple[float, float] = (0.3, 4.0)
