@@ -32,13 +32,12 @@ class ChannelAccount:
     images_through: set[str] = field(default_factory=set)
     frames_through: Counter[tuple[str, str]] = field(default_factory=Counter)
 
-    def add_frame(self, content: bytes, fate: str) -> None:
-        """Count one frame."""
+    def add_frame(self, content: bytes, *, heard: bool) -> None:
+        """Count one frame; `content` is what the receiver got."""
         self.frames_sent += 1
-        if fate != "delivered":
-            self.frames_lost += fate == "lost"
-            if fate != "damaged":
-                return
+        if not heard:
+            self.frames_lost += 1
+            return
         try:
             frame = parse_frame(content)
         except FrameError:
@@ -65,7 +64,7 @@ def read_channel_log(path: Path) -> ChannelAccount:
             account.acoustic_s += entry["airtime_s"]
         for frame in entry["frames"]:
             if frame["fate"] != "empty":
-                account.add_frame(bytes.fromhex(frame["hex"]), frame["fate"])
+                account.add_frame(bytes.fromhex(frame["hex"]), heard=entry["heard"] and frame["fate"] != "lost")
     return account
 
 

@@ -80,9 +80,14 @@ class ChainSettings:
         """Real seconds after which an image waits no longer: a few packets, and what a loaded host may add."""
         return 4 * RATES[self.rate].airtime_s / self.time_scale + 3.0
 
+    @property
+    def ports_folder(self) -> Path:
+        """Folder of the emulated modems' pseudo-terminals."""
+        return self.folder / "water" / "ports"
+
     def modem_port(self, address: int) -> Path:
-        """Path of the pseudo-terminal of an emulated modem."""
-        return self.folder / "water" / "ports" / f"modem-{address}"
+        """Path of the pseudo-terminal of an emulated modem: the emulator numbers them in the order of its table."""
+        return self.ports_folder / f"modem-{(UUV_ADDRESS, VESSEL_ADDRESS).index(address) + 1}"
 
     def config_file(self, service: str) -> Path:
         """Return the file a service reads."""
@@ -136,7 +141,9 @@ def _service_table(settings: ChainSettings, service: str) -> str:
         f'vehicles = {{ {UUV_ADDRESS} = "{UUV}" }}\n',
         "relay": "[relay]\n",
         "c2": f'[c2]\nout_dir = "{settings.shore_pictures.parent}"\n',
-        "acoustic_channel": f"[acoustic_channel]\nseed = {settings.seed}\ntime_scale = {settings.time_scale}\n",
+        "acoustic_channel": f'[acoustic_channel]\npty_dir = "{settings.ports_folder}"\nlog = "{settings.channel_log}"\n'
+        f"seed = {settings.seed}\nframe_loss = {settings.loss}\ntime_scale = {settings.time_scale}\n"
+        f"modem = [{{ address = {UUV_ADDRESS} }}, {{ address = {VESSEL_ADDRESS}, east_m = 100.0 }}]\n",
     }
     extra = "".join(f"{line}\n" for name, line in settings.extra if name == service)
     return tables[service] + extra

@@ -1,0 +1,101 @@
+"""What the services on both ends of the acoustic link share: a modem on a port, its troubles told in health and log."""
+
+from __future__ import annotations
+
+import logging
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Annotated, TypeVar
+
+from pydantic import Field
+
+from sonarpost.modem import events as ev
+from sonarpost.modem.config import MicroModemConfig
+from sonarpost.modem.events import Event
+from sonarpost.modem.micromodem import MicroModem
+from sonarpost.runtime.config import PlatformConfig, ServiceConfig
+from sonarpost.runtime.logs import kv
+from sonarpost.runtime.modem_runner import ModemRunner
+from sonarpost.runtime.serial_port import SerialLink
+from sonarpost.runtime.service import Service
+
+log = logging.getLogger(__name__)
+
+
+class ModemServiceConfig(ServiceConfig):
+    """What every service with a modem configures.
+
+    Attributes:
+        port: Any pyserial URL: /dev/ttyUSB0, socket://host:port, rfc2217://host:port.
+        baud: Speed of the serial line.
+        address: The modem's own address, set at start-up.
+        reply_timeout_s: Wait for the modem's answer to a command before it is sent again.
+    """
+
+    port: Annotated[str, Field(min_length=1)]
+    baud: Annotated[int, Field(ge=300, le=4_000_000)] = 19200
+    address: Annotated[int, Field(ge=0, le=127)]
+    reply_timeout_s: Annotated[float, Field(gt=0, le=600)] = 5.0
+
+
+M = TypeVar("M", bound=ModemServiceConfig)
+
+
+class ModemService(Service[M]):
+    """A service that drives a Micro-Modem. Subclasses act on events in `on_modem_event`.
+
+    Raises:
+        ConfigError: The port's URL is of no known kind.
+    """
+
+    def __init__(self, platform: PlatformConfig, config: M) -> None:
+        super().__init__(platform, config)
+        self._link = SerialLink(config.port, config.baud)
+        driver = MicroModem(MicroModemConfig(config.address, reply_timeout_s=config.reply_timeout_s), config.port)
+        self.modem = ModemRunner(driver, self._link, self._on_event)
+        self._modem_problem = "the modem has not answered yet"
+
+    @abstractmethod
+    def on_modem_event(self, event: Event) -> None:
+        """Act on an event of the driver; called in the modem's thread."""
+
+    def on_start(self) -> None:
+        """Open the port."""
+        self.modem.start()
+
+    def on_stop(self) -> None:
+        """Close the port."""
+        self.modem.stop()
+
+    def gauges(self) -> Mapping[str, float]:
+        """Return whether the modem is ready."""
+        return {"modem_ready": float(self.modem.ready)}
+
+    def trouble(self) -> str:
+        """Return what is wrong with the port or the modem."""
+        if not self._link.is_open:
+            return f"{self.config.port}: {self._link.problem or 'not open yet'}"
+        return "" if self.modem.ready else self._modem_problem
+
+    def _on_event(self, event: Event) -> None:
+        match event:
+            case ev.ModemReady():
+                log.info("Modem ready", extra=kv(port=self.config.port, address=event.address, firmware=event.firmware))
+            case ev.ModemUnresponsive():
+                self._modem_problem = f"{self.config.port}: no right answer to {event.waiting_for}"
+                self.count("modem_unresponsive")
+                log.error("Modem does not answer", extra=kv(port=self.config.port, waiting_for=event.waiting_for))
+            case ev.ModemRebooted():
+                self.count("modem_restarts")
+                log.warning("Modem restarted", extra=kv(firmware=event.firmware))
+            case ev.SettingRefused():
+                log.warning("Modem did not confirm a setting", extra=kv(command=event.command))
+            case ev.ModemComplained():
+                self.count("modem_errors")
+                log.warning("Modem reports an error", extra=kv(complaint=event.complaint))
+            case ev.SentenceRejected():
+                self.count("sentences_rejected")
+                log.warning("Line from the modem rejected", extra=kv(reason=str(event.error)))
+            case _:
+                pass
+        self.on_modem_event(event)
