@@ -17,23 +17,24 @@ class MicroModemConfig:
     """How the driver treats its modem.
 
     Attributes:
-        address: This modem's address (`SRC`), 0..127. settings: More settings, (name, integer value),
-        sent after `SRC` and `CST`. A modem that does not confirm
+        address: This modem's address (`SRC`), 0..127.
+        settings: More settings, (name, integer value), sent after `SRC` and `CST`. A modem that does not confirm
             one of them is used all the same, and a `SettingRefused` says so. `RXP` makes the modem announce a
             reception at its start, which keeps the driver from talking into it.
-        airtimes_s: Air time by rate, where it differs from the nominal one in `RATES`. airtime_margin: A
-        transmission or reception may take this many times its air time. reply_timeout_s: Wait for the
-        answer to a command; what Goby3's driver has found to be enough. tries: How often a command, a
-        cycle or a frame is sent before it counts as failed. retry_cap_s: The wait between tries doubles
-        up to this. init_pause_s: Silence kept after a restart of the modem. keepalive_s: After this long
-        without a valid sentence the modem is asked for its address. request_timeout_s: Wait for the
-        request of the next frame. start_timeout_s: Wait between the last frame's data and the start of
-        the transmission. statistics_timeout_s: Wait for the statistics at the end of a transmission or
-        reception. ack_wait_s: Wait for acknowledgements: the way there and back at the longest range and
-        their own packet. dump_quiet_s: While the modem dumps its configuration, the wait for an answer
-        goes on until this long
-            after the last line of it,
-        dump_limit_s: but no longer than this in all.
+        airtimes_s: Air time by rate, where it differs from the nominal one in `RATES`.
+        airtime_margin: A transmission or reception may take this many times its air time.
+        reply_timeout_s: Wait for the answer to a command; what Goby3's driver has found to be enough.
+        tries: How often a command or a cycle is sent before it counts as failed.
+        retry_cap_s: The wait between tries doubles up to this.
+        init_pause_s: Silence kept after a restart of the modem.
+        keepalive_s: After this long without a valid sentence the modem is asked for its address.
+        request_timeout_s: Wait for the request of the next frame.
+        start_timeout_s: Wait between the last frame's data and the start of the transmission.
+        statistics_timeout_s: Wait for the statistics at the end of a transmission or reception.
+        ack_wait_s: Wait for acknowledgements: the way there and back at the longest range and their own packet.
+        dump_quiet_s: While the modem dumps its configuration, the wait for an answer goes on until this long
+            after the last line of it, but
+        dump_limit_s: no longer than this in all.
         queued_packets: How many packets may wait.
         patience_s: How long one may wait before it fails.
     """

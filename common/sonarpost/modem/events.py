@@ -22,7 +22,7 @@ class FailureReason(StrEnum):
     NO_TRANSMIT_START = "no CATXP: the modem did not start to transmit"
     NO_TRANSMIT_END = "no CATXF: the modem did not end the transmission"
     DATA_TIMEOUT = "the modem went on without the data of a frame"
-    FRAME_REFUSED = "the modem asked for fewer bytes than the frame has"
+    FRAME_REFUSED = "the modem takes fewer bytes than the frame has"
     REBOOTED = "the modem restarted in the middle of the cycle"
     PORT_LOST = "the port to the modem went away"
     QUEUE_FULL = "too many packets wait already"

@@ -87,8 +87,8 @@ class Stage(Enum):
 class TransmitCycle:
     """Takes one packet through the modem. When `result` is set the cycle is over, whatever was lost on the way.
 
-    A later sentence stands for the earlier ones that must have gone before it: a lost echo does no harm. What
-    the modem does not answer is sent again, a frame or the cycle command, and every wait has its end.
+    A later sentence stands for the earlier ones that must have gone before it: a lost echo does no harm. A cycle
+    command without an answer is sent again, a frame when the modem asks again, and every wait has its end.
     """
 
     def __init__(self, packet: Packet, config: MicroModemConfig, send: Callable[[Sentence], None], now: float) -> None:
@@ -131,15 +131,16 @@ class TransmitCycle:
             return
         self._frame_number = number
         self._given.add(number)
-        self._attempt = 1
         self._send(self._data(frame))
         self._wait(Stage.DATA_ECHO, now, self._config.reply_timeout_s)
 
     def on_data_accepted(self, accepted: DataAccepted, now: float) -> None:
-        """The modem has taken a frame, if the number of bytes is right; otherwise the frame is sent again."""
-        if self.stage is not Stage.DATA_ECHO or accepted.nbytes != len(self._frame(self._frame_number)):
+        """The modem has taken a frame, or not all of it."""
+        if self.stage is not Stage.DATA_ECHO:
             return
-        if self._missing():
+        if accepted.nbytes != len(self._frame(self._frame_number)):
+            self._fail(FailureReason.FRAME_REFUSED)
+        elif self._missing():
             self._wait(Stage.REQUEST, now, self._config.request_timeout_s)
         else:
             self._wait_for_transmission(now)
@@ -204,12 +205,8 @@ class TransmitCycle:
         self._fail(FailureReason.NO_DATA_REQUEST)
 
     def _data_echo_late(self, now: float) -> None:
-        if self._attempt >= self._config.tries:
-            self._fail(FailureReason.NO_DATA_ECHO)
-            return
-        self._attempt += 1
-        self._send(self._data(self._frame(self._frame_number)))
-        self._wait(Stage.DATA_ECHO, now, self._config.reply_timeout_s)
+        # Not sent again unasked: a modem whose echo is only late would take it for the next frame.
+        self._fail(FailureReason.NO_DATA_ECHO)
 
     def _on_air_late(self, now: float) -> None:
         reason = FailureReason.NO_TRANSMIT_END if self._on_air else FailureReason.NO_TRANSMIT_START
@@ -234,8 +231,7 @@ class TransmitCycle:
 
     def _fail(self, reason: FailureReason) -> None:
         # With a frame in the modem nobody knows what it does after an exchange that broke off.
-        maybe_sent = bool(self._given) and reason is not FailureReason.FRAME_REFUSED
-        self.result = self.packet.failed(reason, maybe_sent=maybe_sent)
+        self.result = self.packet.failed(reason, maybe_sent=bool(self._given))
         self.stage = Stage.OVER
 
     def _wait_for_transmission(self, now: float) -> None:

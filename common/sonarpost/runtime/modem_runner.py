@@ -1,0 +1,155 @@
+"""Joins the pure driver, the port and the clock: one thread in which everything that concerns the modem happens."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from datetime import datetime
+
+from sonarpost.errors import PortError
+from sonarpost.modem.events import Event
+from sonarpost.modem.micromodem import MicroModem
+from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialLink
+
+log = logging.getLogger(__name__)
+
+_STOP_S = 1.0
+
+
+class ModemRunner:
+    """Feeds bytes to the driver, polls its timers and writes what it wants to send.
+
+    Args:
+        driver: Used by nobody else from now on.
+        link: Not started yet.
+        on_event: Called with each event, in order, in the runner's thread and without a lock: it may call
+            `send_packet`. An exception from it is logged and costs that event only.
+        clock: Seconds, monotonic.
+        longest_wait_s: The timers are looked at this often even if none is due, for clocks that run fast.
+    """
+
+    def __init__(
+        self,
+        driver: MicroModem,
+        link: SerialLink,
+        on_event: Callable[[Event], None],
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        longest_wait_s: float = 0.25,
+    ) -> None:
+        self._driver = driver
+        self._link = link
+        self._on_event = on_event
+        self._clock = clock
+        self._longest_wait_s = longest_wait_s
+        self._lock = threading.Lock()
+        self._inputs: queue.SimpleQueue[PortEvent | None] = queue.SimpleQueue()
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def ready(self) -> bool:
+        """Whether the modem is configured and answers."""
+        with self._lock:
+            return self._driver.ready
+
+    @property
+    def queued(self) -> int:
+        """How many packets wait or are on their way."""
+        with self._lock:
+            return self._driver.queued
+
+    def start(self) -> None:
+        """Open the port and begin; returns at once.
+
+        Raises:
+            PortError: Started already.
+        """
+        if self._thread is not None:
+            raise PortError(f"{self._link.url}: the runner is already started")
+        self._stopping.clear()
+        self._thread = threading.Thread(target=self._run, name=f"modem {self._link.url}", daemon=True)
+        self._thread.start()
+        self._link.start(self._inputs.put)
+
+    def stop(self) -> None:
+        """Close the port and end the thread; what was not sent is reported before this returns."""
+        self._link.close()
+        self._stopping.set()
+        self._inputs.put(None)
+        thread, self._thread = self._thread, None
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(_STOP_S)
+
+    def send_packet(self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False) -> int:
+        """Queue a packet, from any thread; see `MicroModem.send_packet`.
+
+        Raises:
+            FrameError: An address, a rate or frames that the modem cannot send.
+        """
+        with self._lock:
+            packet_id = self._driver.send_packet(destination, rate, frames, ack=ack, now=self._clock())
+        self._inputs.put(None)
+        return packet_id
+
+    def set_clock(self, utc: datetime) -> bool:
+        """Set the modem's clock if it is free at this moment, from any thread; see `MicroModem.set_clock`."""
+        with self._lock:
+            sent = self._driver.set_clock(utc, self._clock())
+        self._inputs.put(None)
+        return sent
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            self._step(self._wait())
+        with self._lock:
+            self._driver.port_lost(self._clock())
+            events = self._driver.poll(self._clock())
+        self._deliver(events)
+
+    def _wait(self) -> PortEvent | None:
+        with self._lock:
+            wakeup_s = self._driver.next_wakeup()
+        wait_s = self._longest_wait_s
+        if wakeup_s is not None:
+            wait_s = min(max(0.0, wakeup_s - self._clock()), wait_s)
+        try:
+            return self._inputs.get(timeout=wait_s)
+        except queue.Empty:
+            return None
+
+    def _step(self, item: PortEvent | None) -> None:
+        with self._lock:
+            now = self._clock()
+            events = self._take(item, now)
+            events += self._driver.poll(now)
+            data = self._driver.bytes_to_send()
+        if data:
+            self._write(data)
+        self._deliver(events)
+
+    def _take(self, item: PortEvent | None, now: float) -> list[Event]:
+        if isinstance(item, bytes):
+            return self._driver.receive(item, now)
+        if isinstance(item, PortOpened):
+            self._driver.port_opened(now)
+        elif isinstance(item, PortLost):
+            self._driver.port_lost(now)
+        return []
+
+    def _write(self, data: bytes) -> None:
+        try:
+            self._link.write(data)
+        except PortError as error:
+            # The link tells the loss itself, and the driver's time-outs cover what was not written.
+            log.debug("%s", error)
+
+    def _deliver(self, events: list[Event]) -> None:
+        for event in events:
+            try:
+                self._on_event(event)
+            except Exception:
+                log.exception("%s: %s was not handled", self._link.url, type(event).__name__)
