@@ -52,6 +52,8 @@ class AcousticWorld:
             number: _Port(Micromodem(place.config), SerialPace(serial_baud), SerialPace(serial_baud))
             for number, place in modems.items()
         }
+        # What the modems say when they are switched on belongs to this moment, not to the first event.
+        self._step(self.now)
 
     def modem(self, number: int) -> Micromodem:
         """Return one modem.
