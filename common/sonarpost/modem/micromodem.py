@@ -54,7 +54,7 @@ class MicroModem:
 
     def __init__(self, config: MicroModemConfig, where: str = "modem port") -> None:
         self.config = config
-        self._lines = LineAssembler(where)
+        self._lines = LineAssembler(where, learn_checksums=True)
         self._supervisor = Supervisor(config, self._send)
         self._listener = Listener(config)
         self._cycle: TransmitCycle | None = None

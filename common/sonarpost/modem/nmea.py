@@ -106,10 +106,16 @@ class LineAssembler:
     checksum is there and right. Bytes between sentences are one `SentenceError` a run (NULs and blanks,
     as a port gives when a modem powers up, are none), a line beyond `MAX_SENTENCE_BYTES` is one, and
     reading goes on at the next `$`.
+
+    Args:
+        where: Names the port in errors.
+        learn_checksums: Once a line has had a checksum, refuse lines without: a damaged `*` hides other damage.
     """
 
-    def __init__(self, where: str = "modem port") -> None:
+    def __init__(self, where: str = "modem port", *, learn_checksums: bool = False) -> None:
         self._where = where
+        self._learn_checksums = learn_checksums
+        self._checksums_seen = False
         self._line = bytearray()
         self._length = 0
 
@@ -132,7 +138,11 @@ class LineAssembler:
         return items
 
     def reset(self) -> None:
-        """Forget an unfinished line (the port was closed in the middle of it)."""
+        """Start anew (the port was closed, perhaps in the middle of a line)."""
+        self._checksums_seen = False
+        self._clear()
+
+    def _clear(self) -> None:
         self._line.clear()
         self._length = 0
 
@@ -147,7 +157,7 @@ class LineAssembler:
 
     def _finish(self, items: list[Sentence | SentenceError], *, cut_off: bool) -> None:
         line, length = bytes(self._line), self._length
-        self.reset()
+        self._clear()
         if not length:
             return
         if not line.startswith(b"$"):
@@ -157,7 +167,8 @@ class LineAssembler:
             items.append(SentenceError(self._where, f"length of {_excerpt(line[:12])!r}", length, expected))
         else:
             try:
-                items.append(parse(line, self._where, checksum_required=cut_off))
+                items.append(parse(line, self._where, checksum_required=cut_off or self._checksums_seen))
+                self._checksums_seen = self._learn_checksums and (self._checksums_seen or b"*" in line)
             except SentenceError as error:
                 items.append(error)
 
