@@ -94,6 +94,9 @@ class ContactSummary:
             _check_within(name, getattr(self, name), -math.inf, math.inf)
         for name in ("ground_range_m", "pixel_along_m", "pixel_across_m", "position_sigma_m"):
             _check_within(name, getattr(self, name), 0, math.inf)
+        # A word that is neither would travel as port, and the contact would lie on the wrong side of the track.
+        if self.side not in (None, Side.PORT, Side.STARBOARD):
+            raise FrameError(_WHERE, "side", self.side, "port, starboard or None")
         if self.ground_range_m is not None and self.side is None:
             raise FrameError(_WHERE, "side", None, "port or starboard where there is a ground_range_m")
         if self.position_sigma_m is not None and self.lat_deg is None:
@@ -185,7 +188,7 @@ def _heading_code(heading_deg: float | None) -> int:
 def _side_range_code(side: Side | None, ground_range_m: float | None) -> int:
     if side is None:
         return _SIDE_UNKNOWN
-    side_bit = _STARBOARD_BIT if side is Side.STARBOARD else 0
+    side_bit = _STARBOARD_BIT if side == Side.STARBOARD else 0
     return side_bit | _linear_code(ground_range_m, _RANGE_STEPS, _LAST_RANGE, _RANGE_UNKNOWN)
 
 

@@ -1,0 +1,203 @@
+"""The contact record: what travels is what was meant, within the step of each field, or is unknown."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import struct
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonarpost.errors import FrameError
+from sonarpost.link.contact_record import RECORD_SIZE, ContactSummary
+from sonarpost.sonar.survey import Side
+
+
+def maybe(strategy: st.SearchStrategy[float]) -> st.SearchStrategy[float | None]:
+    return st.none() | strategy
+
+
+SIZES = st.none() | st.tuples(st.integers(16, 512), st.integers(16, 512))
+FIXES = st.none() | st.tuples(st.floats(-90, 90), st.floats(-180, 180), maybe(st.floats(0, 5500)))
+PLACES = st.none() | st.tuples(st.sampled_from(Side), maybe(st.floats(0, 3276)))
+
+
+@st.composite
+def contacts(draw: st.DrawFn) -> ContactSummary:
+    """Any contact whose every known value the record can hold."""
+    height_px, width_px = draw(SIZES) or (None, None)
+    lat_deg, lon_deg, sigma_m = draw(FIXES) or (None, None, None)
+    side, ground_range_m = draw(PLACES) or (None, None)
+    return ContactSummary(
+        height_px=height_px,
+        width_px=width_px,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        time_utc_s=draw(maybe(st.floats(0, 4e9))),
+        confidence=draw(maybe(st.floats(0, 2))),
+        heading_deg=draw(maybe(st.floats(-720, 720))),
+        altitude_m=draw(maybe(st.floats(0, 127))),
+        depth_m=draw(maybe(st.floats(0, 6553))),
+        side=side,
+        ground_range_m=ground_range_m,
+        pixel_along_m=draw(maybe(st.floats(0.005, 2.69))),
+        pixel_across_m=draw(maybe(st.floats(0.005, 2.69))),
+        position_sigma_m=sigma_m,
+    )
+
+
+def unknown_fields(contact: ContactSummary) -> set[str]:
+    return {f.name for f in dataclasses.fields(contact) if getattr(contact, f.name) is None}
+
+
+HALF_STEPS = {
+    "height_px": 0,
+    "width_px": 0,
+    "lat_deg": 0.5e-7,
+    "lon_deg": 0.5e-7,
+    "time_utc_s": 0.5,
+    "confidence": 0.5 / 127,
+    "altitude_m": 0.25,
+    "depth_m": 0.05,
+    "ground_range_m": 0.05,
+}
+
+
+@given(contacts())
+def test_every_value_arrives_within_half_a_step(sent: ContactSummary) -> None:
+    packed = sent.pack()
+    assert len(packed) == RECORD_SIZE
+    read = ContactSummary.unpack(packed)
+    assert unknown_fields(read) == unknown_fields(sent)
+    assert read.side is sent.side
+    for name, half_step in HALF_STEPS.items():
+        if getattr(sent, name) is not None:
+            assert abs(getattr(read, name) - getattr(sent, name)) <= half_step * (1 + 1e-6) + 1e-12, name
+    if sent.heading_deg is not None and read.heading_deg is not None:
+        turn = (read.heading_deg - sent.heading_deg + 180) % 360 - 180
+        assert abs(turn) <= 180 / 255 + 1e-9
+        assert 0 <= read.heading_deg < 360
+    for name in ("pixel_along_m", "pixel_across_m"):
+        if getattr(sent, name) is not None:
+            assert abs(math.log2(getattr(read, name) / getattr(sent, name))) <= 0.5 / 28 + 1e-3
+    if sent.position_sigma_m is not None and read.position_sigma_m is not None:
+        assert read.position_sigma_m >= sent.position_sigma_m * (1 - 1e-9)
+        assert read.position_sigma_m <= max(0.1, sent.position_sigma_m) * 2 ** (1 / 16) * (1 + 1e-9)
+
+
+@given(contacts())
+def test_rounding_is_done_once(sent: ContactSummary) -> None:
+    once = sent.rounded()
+    assert once.rounded() == once
+    assert once.pack() == sent.pack()
+
+
+@given(st.binary(min_size=RECORD_SIZE, max_size=RECORD_SIZE))
+def test_any_record_that_parses_packs_to_the_same_bytes(data: bytes) -> None:
+    try:
+        contact = ContactSummary.unpack(data)
+    except FrameError:
+        return
+    assert contact.pack() == data
+
+
+@pytest.mark.parametrize("position", [20, 21, 22, 27, 28, 29])
+def test_every_code_of_the_one_byte_fields_survives(position: int) -> None:
+    # Random records rarely have a picture size and a position in range, so the codes are walked through here.
+    base = bytearray(ContactSummary(height_px=80, width_px=140, lat_deg=1, lon_deg=2).pack())
+    values = []
+    for code in range(256):
+        base[position - 5] = code
+        contact = ContactSummary.unpack(bytes(base))
+        assert contact.pack() == bytes(base)
+        values.append(contact)
+    assert len(set(values)) == 256
+
+
+@pytest.mark.parametrize("start", [18, 20])
+def test_every_code_of_the_two_byte_fields_survives(start: int) -> None:
+    base = bytearray(ContactSummary().pack())
+    refused = []
+    for code in range(65536):
+        base[start : start + 2] = struct.pack(">H", code)
+        try:
+            contact = ContactSummary.unpack(bytes(base))
+        except FrameError:
+            refused.append(code)
+            continue
+        assert contact.pack() == bytes(base)
+    assert refused == ([] if start == 18 else [0xFFFE])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("altitude_m", 127.3),
+        ("altitude_m", -0.3),
+        ("altitude_m", 1e308),
+        ("depth_m", 6553.5),
+        ("depth_m", -1.0),
+        ("ground_range_m", 3276.6),
+        ("ground_range_m", 1.7e308),
+        ("pixel_along_m", 2.8),
+        ("pixel_along_m", 0.0049),
+        ("pixel_across_m", 0.0),
+        ("pixel_across_m", 1.7e308),
+        ("pixel_across_m", 5e-324),
+        ("position_sigma_m", 6100.0),
+        ("position_sigma_m", 1.7e308),
+    ],
+)
+def test_a_value_the_field_cannot_hold_travels_as_unknown(name: str, value: float) -> None:
+    contact = dataclasses.replace(ContactSummary(lat_deg=1, lon_deg=2, side=Side.STARBOARD), **{name: value})
+    read = contact.rounded()
+    assert getattr(read, name) is None
+    assert read.side is Side.STARBOARD
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"height_px": 80}, "height_px and width_px"),
+        ({"height_px": 15, "width_px": 80}, "height_px"),
+        ({"height_px": 80, "width_px": 513}, "width_px"),
+        ({"lon_deg": 1.0}, "lat_deg and lon_deg"),
+        ({"lat_deg": 90.1, "lon_deg": 0.0}, "lat_deg"),
+        ({"lat_deg": 0.0, "lon_deg": -180.1}, "lon_deg"),
+        ({"lat_deg": math.nan, "lon_deg": 0.0}, "lat_deg"),
+        ({"time_utc_s": -1.0}, "time_utc_s"),
+        ({"time_utc_s": 2.0**32}, "time_utc_s"),
+        ({"confidence": 2.1}, "confidence"),
+        ({"heading_deg": math.inf}, "heading_deg"),
+        ({"altitude_m": math.nan}, "altitude_m"),
+        ({"depth_m": -math.inf}, "depth_m"),
+        ({"ground_range_m": 10.0}, "side"),
+        ({"ground_range_m": -1.0, "side": Side.PORT}, "ground_range_m"),
+        ({"side": "Starboard"}, "side"),
+        ({"pixel_along_m": -0.1}, "pixel_along_m"),
+        ({"position_sigma_m": 1.0}, "lat_deg"),
+    ],
+)
+def test_values_that_cannot_be_meant_are_refused(fields: dict[str, Any], named: str) -> None:
+    with pytest.raises(FrameError) as caught:
+        ContactSummary(**fields)
+    assert caught.value.field == named
+
+
+def test_a_small_accuracy_never_looks_better_than_the_first_step() -> None:
+    contact = ContactSummary(lat_deg=1, lon_deg=2, position_sigma_m=0.0).rounded()
+    assert contact.position_sigma_m == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("length", [0, RECORD_SIZE - 1, RECORD_SIZE + 1])
+def test_another_length_is_refused(length: int) -> None:
+    with pytest.raises(FrameError, match="25 bytes"):
+        ContactSummary.unpack(bytes(length))
+
+
+def test_a_side_by_its_plain_name_is_that_side() -> None:
+    plain: Any = "starboard"
+    assert ContactSummary(side=plain).rounded().side is Side.STARBOARD

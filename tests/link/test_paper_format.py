@@ -1,0 +1,199 @@
+"""Frames of the paper format: golden bytes, round trips, hostile input."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from sonarpost.codec.interface import StreamHeader
+from sonarpost.errors import FrameError
+from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.paper_format import (
+    CONTACT_FRAME_SIZE,
+    HALF_HEADER_SIZE,
+    ContactFrame,
+    HalfFrame,
+    format_image_id,
+    frame_checksum,
+    half_bounds,
+    is_image_id,
+    parse_frame,
+)
+
+GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "link" / "paper_frames.json").read_text())
+HEADER = StreamHeader(1, 0xBEEF, 113, 49, 9)
+
+
+def by_name(cases: list[dict[str, Any]]) -> Any:
+    return pytest.mark.parametrize("case", cases, ids=[c["name"] for c in cases])
+
+
+@by_name([c for c in GOLDEN["frames"] if c["kind"] == "half"])
+def test_golden_half_frames(case: dict[str, Any]) -> None:
+    data = bytes.fromhex(case["hex"])
+    frame = parse_frame(data)
+    assert frame == HalfFrame(
+        case["half"], case["image_id"], case["offset"], StreamHeader(**case["header"]), bytes.fromhex(case["payload"])
+    )
+    assert frame.pack() == data[: len(data) - case["padding_bytes"]]
+
+
+@by_name([c for c in GOLDEN["frames"] if c["kind"] == "contact"])
+def test_golden_contact_frames(case: dict[str, Any]) -> None:
+    data = bytes.fromhex(case["hex"])
+    frame = parse_frame(data)
+    assert isinstance(frame, ContactFrame)
+    assert frame.image_id == case["image_id"]
+    read = dataclasses.asdict(frame.contact)
+    assert read.keys() == case["contact"].keys()
+    for name, expected in case["contact"].items():
+        same = expected if expected is None or isinstance(expected, str) else pytest.approx(expected, rel=1e-12)
+        assert read[name] == same, name
+    assert frame.pack() == data[: len(data) - case["padding_bytes"]]
+
+
+@by_name(GOLDEN["rejected"])
+def test_golden_rejected_frames(case: dict[str, Any]) -> None:
+    with pytest.raises(FrameError) as caught:
+        parse_frame(bytes.fromhex(case["hex"]), "frame 7")
+    assert caught.value.field == case["field"]
+    assert str(caught.value).startswith("frame 7: ")
+
+
+def test_checksum_has_the_published_check_value() -> None:
+    assert frame_checksum(b"123456789") == 0x29B1
+
+
+@given(st.binary(max_size=300))
+def test_random_bytes_parse_or_raise_frame_error(data: bytes) -> None:
+    try:
+        frame = parse_frame(data)
+    except FrameError:
+        return
+    assert data.startswith(frame.pack())
+
+
+@given(st.sampled_from([b"T", b"B", b"C"]), st.binary(max_size=60), st.integers(0, 2**16 - 1))
+def test_plausible_bytes_parse_or_raise_frame_error(kind: bytes, rest: bytes, length: int) -> None:
+    header = StreamHeader(1, 0, 80, 140, length).pack()
+    for data in (kind + b"00A7" + rest, kind + b"00A7" + rest[:2] + header + rest[2:]):
+        try:
+            frame = parse_frame(data)
+        except FrameError:
+            continue
+        assert data.startswith(frame.pack())
+
+
+@given(
+    st.binary(min_size=CONTACT_FRAME_SIZE - 7, max_size=CONTACT_FRAME_SIZE - 7),
+    st.text("0123456789AZ", min_size=4, max_size=4),
+)
+def test_contact_bytes_with_a_right_checksum_parse_or_raise_frame_error(record: bytes, image_id: str) -> None:
+    body = b"C" + image_id.encode() + record
+    data = body + frame_checksum(body).to_bytes(2, "big")
+    try:
+        frame = parse_frame(data)
+    except FrameError:
+        return
+    assert frame.pack() == data
+
+
+@st.composite
+def half_frames(draw: st.DrawFn) -> HalfFrame:
+    header = StreamHeader(
+        draw(st.integers(0, 255)),
+        draw(st.integers(0, 65535)),
+        draw(st.integers(16, 512)),
+        draw(st.integers(16, 512)),
+        draw(st.integers(0, 300) | st.integers(0, 65535)),
+    )
+    half = draw(st.sampled_from(["top", "bottom"]))
+    start, stop = half_bounds(header.body_length, half)
+    offset = draw(st.integers(start, max(start, stop - 1)))
+    payload = draw(st.binary(max_size=min(stop - offset, 241)))
+    return HalfFrame(half, format_image_id(draw(st.integers(0, 36**4 - 1))), offset, header, payload)
+
+
+@given(half_frames(), st.binary(max_size=40))
+def test_half_frames_round_trip_and_drop_what_follows_the_half(frame: HalfFrame, tail: bytes) -> None:
+    packed = frame.pack()
+    assert len(packed) == HALF_HEADER_SIZE + len(frame.payload)
+    assert parse_frame(packed) == frame
+    reaches_the_end = frame.stop == half_bounds(frame.header.body_length, frame.half)[1]
+    if reaches_the_end:
+        assert parse_frame(packed + tail) == frame
+
+
+@given(half_frames(), st.integers(0, 300))
+def test_a_half_frame_cut_short_keeps_what_it_has(frame: HalfFrame, length: int) -> None:
+    assume(length < HALF_HEADER_SIZE + len(frame.payload))
+    cut = frame.pack()[:length]
+    if length < HALF_HEADER_SIZE:
+        with pytest.raises(FrameError):
+            parse_frame(cut)
+    else:
+        assert parse_frame(cut) == dataclasses.replace(frame, payload=frame.payload[: length - HALF_HEADER_SIZE])
+
+
+@given(st.integers(0, 8 * CONTACT_FRAME_SIZE - 1), st.integers(1, 16), st.integers(1, 2**16 - 1))
+def test_any_burst_of_up_to_16_wrong_bits_is_seen_in_a_contact_frame(first_bit: int, length: int, pattern: int) -> None:
+    frame = ContactFrame("00A7", ContactSummary(height_px=80, width_px=140, lat_deg=44.7, lon_deg=-63.6)).pack()
+    burst = (pattern & ((1 << length) - 1)) << first_bit
+    assume(burst)
+    assume(burst < 1 << (8 * CONTACT_FRAME_SIZE))
+    damaged = (int.from_bytes(frame, "big") ^ burst).to_bytes(CONTACT_FRAME_SIZE, "big")
+    if damaged[:1] in b"TB":
+        return  # read as a half frame, which carries no position
+    with pytest.raises(FrameError):
+        parse_frame(damaged)
+
+
+@pytest.mark.parametrize("length", [0, 1, 2, 9, 10, 65535])
+def test_the_halves_are_the_whole_body(length: int) -> None:
+    top, bottom = half_bounds(length, "top"), half_bounds(length, "bottom")
+    assert top[0] == 0
+    assert top[1] == bottom[0]
+    assert bottom[1] == length
+    assert 0 <= (top[1] - top[0]) - (bottom[1] - bottom[0]) <= 1
+
+
+def test_image_identifiers_count_in_base_36_and_start_again() -> None:
+    assert [format_image_id(n) for n in (0, 35, 36, 36**4 - 1, 36**4)] == ["0000", "000Z", "0010", "ZZZZ", "0000"]
+    assert all(int(format_image_id(n), 36) == n for n in range(0, 36**4, 9973))
+    assert not any(
+        is_image_id(text) for text in ("", "000", "00000", "00a7", "00 7", "00A7\n", "\u0660\u0661\u0662\u0663")
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"offset": -1}, "offset"),
+        ({"offset": 5}, "offset"),
+        ({"payload": bytes(6)}, "payload"),
+        ({"image_id": "A7"}, "image identifier"),
+        ({"header": StreamHeader(256, 0, 80, 80, 9)}, "stream header codec_id"),
+        ({"header": StreamHeader(1, 65536, 80, 80, 9)}, "stream header model_tag"),
+        ({"header": StreamHeader(1, 0, 513, 80, 9)}, "stream header height_px"),
+        ({"header": StreamHeader(1, 0, 80, 15, 9)}, "stream header width_px"),
+        ({"header": StreamHeader(1, 0, 80, 80, 65536)}, "stream header body_length"),
+    ],
+)
+def test_a_half_frame_that_cannot_be_packed_cannot_be_made(change: dict[str, Any], named: str) -> None:
+    frame = HalfFrame("top", "00A7", 0, HEADER, bytes(5))
+    with pytest.raises(FrameError) as caught:
+        dataclasses.replace(frame, **change)
+    assert caught.value.field == named
+
+
+def test_a_contact_frame_fills_a_rate_0_frame_exactly() -> None:
+    assert CONTACT_FRAME_SIZE == 32
+    assert len(ContactFrame("00A7", ContactSummary()).pack()) == 32
+    with pytest.raises(FrameError, match="four characters"):
+        ContactFrame("00a7", ContactSummary())

@@ -1,0 +1,364 @@
+"""The pairing receiver: golden scenarios, and single rules."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+
+from sonarpost.codec.interface import StreamHeader
+from sonarpost.errors import FrameError
+from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.paper_format import ContactFrame, HalfFrame, format_image_id, half_bounds
+from sonarpost.link.paper_receiver import (
+    ContactOnly,
+    Event,
+    FrameRejected,
+    ImageReady,
+    PairingReceiver,
+    ReceiverCounts,
+)
+
+GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "link" / "paper_receiver.json").read_text())["scenarios"]
+HEADER = StreamHeader(1, 0xBEEF, 113, 49, 9)
+BODY = bytes(range(0xA1, 0xAA))
+CONTACT = ContactSummary(height_px=113, width_px=49, lat_deg=44.7, lon_deg=-63.6).rounded()
+
+
+def half(name: Any, image_id: str = "00A7", header: StreamHeader = HEADER, body: bytes = BODY) -> bytes:
+    start, stop = half_bounds(header.body_length, name)
+    return HalfFrame(name, image_id, start, header, body[start:stop]).pack()
+
+
+def piece(start: int, stop: int, image_id: str = "00A7") -> bytes:
+    name: Any = "top" if start < 5 else "bottom"
+    return HalfFrame(name, image_id, start, HEADER, BODY[start:stop]).pack()
+
+
+def contact(image_id: str = "00A7", record: ContactSummary = CONTACT) -> bytes:
+    return ContactFrame(image_id, record).pack()
+
+
+def images(events: list[Event]) -> list[ImageReady]:
+    assert all(isinstance(e, ImageReady) for e in events)
+    return [e for e in events if isinstance(e, ImageReady)]
+
+
+def describe(event: Event) -> dict[str, Any]:
+    """The event as the golden files write it."""
+    match event:
+        case ImageReady():
+            return {
+                "event": "image",
+                "source": event.source,
+                "image_id": event.image_id,
+                "version": event.version,
+                "body": event.body.hex(),
+                "received": [list(r) for r in event.received],
+                "missing_halves": list(event.missing_halves),
+                "complete": event.complete,
+                "has_contact": event.contact is not None,
+                "frames": event.frames,
+                "conflicts": event.conflicts,
+            }
+        case ContactOnly():
+            return {
+                "event": "contact",
+                "source": event.source,
+                "image_id": event.image_id,
+                "version": event.version,
+                "conflicts": event.conflicts,
+            }
+        case FrameRejected():
+            return {"event": "rejected", "source": event.source, "field": event.reason.field}
+
+
+@pytest.mark.parametrize("case", GOLDEN, ids=[c["name"] for c in GOLDEN])
+def test_golden_scenarios(case: dict[str, Any]) -> None:
+    receiver = PairingReceiver(case["timeout_s"])
+    for step in case["steps"]:
+        if "frame" in step:
+            events = receiver.accept(step["source"], bytes.fromhex(step["frame"]), step["at"])
+        else:
+            events = receiver.poll(step["at"])
+        assert [describe(e) for e in events] == step["events"], step
+
+
+def test_an_event_carries_times_stream_and_mask_for_the_decoder() -> None:
+    receiver = PairingReceiver(60)
+    assert receiver.accept(2, piece(0, 2), 10) == []
+    assert receiver.accept(2, contact(), 11) == []
+    assert receiver.accept(2, piece(5, 8), 12) == []
+    assert receiver.next_deadline() == 72
+    (event,) = images(receiver.poll(72))
+    assert (event.first_at, event.last_at) == (10, 12)
+    assert event.contact == CONTACT
+    assert event.stream == HEADER.pack() + BODY[:2] + bytes(3) + BODY[5:8] + bytes(1)
+    assert event.received_mask().tolist() == [True, True, False, False, False, True, True, True, False]
+    assert event.missing_halves == ()
+    assert receiver.next_deadline() is None
+
+
+def test_the_wait_counts_from_the_last_frame_that_added_something() -> None:
+    receiver = PairingReceiver(60)
+    receiver.accept(2, piece(0, 2), 0)
+    receiver.accept(2, piece(2, 3), 50)
+    receiver.accept(2, piece(0, 3), 100)  # nothing new
+    assert receiver.next_deadline() == 110
+    assert receiver.poll(109.9) == []
+    (event,) = images(receiver.poll(110))
+    assert event.received == ((0, 3),)
+    assert receiver.counts.duplicates == 1
+
+
+def test_accept_first_gives_out_what_is_due() -> None:
+    receiver = PairingReceiver(60)
+    receiver.accept(2, half("top"), 0)
+    first, second = images(receiver.accept(2, half("bottom"), 1000))
+    assert (first.version, first.complete) == (1, False)
+    assert (second.version, second.complete, second.body) == (2, True, BODY)
+
+
+def test_a_late_frame_does_not_push_out_the_image_that_waits() -> None:
+    receiver = PairingReceiver(60)
+    receiver.accept(2, half("top", "00A7"), 0)
+    (old,) = images(receiver.accept(2, half("top", "00A8"), 1))
+    assert old.image_id == "00A7"
+    (late,) = images(receiver.accept(2, half("bottom", "00A7"), 2))
+    assert (late.image_id, late.version, late.complete) == ("00A7", 2, True)
+    (new,) = images(receiver.accept(2, half("bottom", "00A8"), 3))
+    assert (new.image_id, new.version, new.complete) == ("00A8", 1, True)
+
+
+def test_an_image_reopened_by_a_late_frame_is_given_out_with_the_next_image() -> None:
+    receiver = PairingReceiver(60)
+    receiver.accept(2, piece(0, 2), 0)
+    assert [e.version for e in images(receiver.accept(2, half("top", "00A8"), 1))] == [1]
+    assert receiver.accept(2, piece(2, 3), 2) == []
+    given = images(receiver.accept(2, half("top", "00A9"), 3))
+    assert [(e.image_id, e.version) for e in given] == [("00A8", 1), ("00A7", 2)]
+
+
+@pytest.mark.parametrize("image_ids", [["00A7"], ["00A8"]])
+def test_a_contact_frame_pushes_nothing_out(image_ids: list[str]) -> None:
+    receiver = PairingReceiver(60)
+    receiver.accept(2, half("top"), 0)
+    assert [e for i in image_ids for e in receiver.accept(2, contact(i), 1)] == []
+
+
+def test_a_second_different_contact_record_is_counted_and_the_first_stays() -> None:
+    receiver = PairingReceiver(60)
+    other = dataclasses.replace(CONTACT, lat_deg=45.0)
+    receiver.accept(2, contact(), 0)
+    receiver.accept(2, contact(record=other), 1)
+    receiver.accept(2, contact(), 2)
+    (event,) = receiver.poll(60)
+    assert isinstance(event, ContactOnly)
+    assert event.contact == CONTACT
+    assert event.conflicts == 1
+    assert receiver.counts == ReceiverCounts(frames=3, duplicates=2, conflicts=1, contacts_only=1)
+
+
+def test_bytes_that_are_there_stay_when_a_repetition_says_otherwise() -> None:
+    receiver = PairingReceiver(60)
+    receiver.accept(2, piece(0, 3), 0)
+    damaged = HalfFrame("top", "00A7", 1, HEADER, b"\xa2\x00\xa4\xa5").pack()
+    receiver.accept(2, damaged, 1)
+    (event,) = images(receiver.poll(61))
+    assert event.body == BODY[:5] + bytes(4)
+    assert (event.frames, event.conflicts) == (2, 1)
+
+
+def test_the_checked_contact_record_decides_between_stream_headers() -> None:
+    wrong = StreamHeader(1, 0xBEEF, 113, 48, 9)
+    receiver = PairingReceiver(60)
+    receiver.accept(2, HalfFrame("top", "00A7", 0, wrong, BODY[:2]).pack(), 0)
+    receiver.accept(2, HalfFrame("top", "00A7", 2, wrong, BODY[2:4]).pack(), 1)
+    receiver.accept(2, half("top"), 2)
+    assert receiver.accept(2, contact(), 3) == []
+    (event,) = images(receiver.poll(63))
+    assert event.header == HEADER
+    assert event.frames == 1
+
+
+def test_a_header_outvoted_after_it_was_given_out_is_corrected_by_a_new_version() -> None:
+    wrong = StreamHeader(1, 0xBEEF, 113, 48, 9)
+    receiver = PairingReceiver(60)
+    receiver.accept(2, half("top", header=wrong), 0)
+    assert [e.header for e in images(receiver.poll(60))] == [wrong]
+    assert receiver.accept(2, half("top"), 61) == []  # a draw: the first one stays, nothing new to give out
+    assert receiver.next_deadline() is None
+    (event,) = images(receiver.accept(2, half("bottom"), 62))
+    assert (event.version, event.header, event.body, event.complete) == (2, HEADER, BODY, True)
+
+
+def test_a_fourth_stream_header_is_refused() -> None:
+    receiver = PairingReceiver(60)
+    for width in (49, 50, 51):
+        assert receiver.accept(2, half("top", header=dataclasses.replace(HEADER, width_px=width)), 0) == []
+    (event,) = receiver.accept(2, half("top", header=dataclasses.replace(HEADER, width_px=52)), 1)
+    assert isinstance(event, FrameRejected)
+    assert event.source == 2
+    assert event.reason.field == "stream header"
+    assert receiver.counts == ReceiverCounts(frames=4, rejected=1, conflicts=3)
+
+
+@pytest.mark.parametrize("length", [0, 1])
+def test_an_image_without_a_bottom_half_is_complete_with_its_top(length: int) -> None:
+    header = dataclasses.replace(HEADER, body_length=length)
+    receiver = PairingReceiver(60)
+    (event,) = images(receiver.accept(2, half("top", header=header, body=BODY[:length]), 0))
+    assert (event.complete, event.body, event.missing_halves) == (True, BODY[:length], ())
+
+
+def test_a_frame_without_body_bytes_announces_the_picture() -> None:
+    receiver = PairingReceiver(60)
+    receiver.accept(2, half("bottom")[:15], 0)
+    (event,) = images(receiver.poll(60))
+    assert (event.received, event.body, event.missing_halves) == ((), bytes(9), ("top", "bottom"))
+    assert event.received_mask().tolist() == [False] * 9
+
+
+def test_an_identifier_used_again_much_later_is_a_new_image() -> None:
+    receiver = PairingReceiver(60, memory_s=3600)
+    receiver.accept(2, half("top"), 0)
+    receiver.accept(2, half("bottom"), 1)
+    assert receiver.accept(2, half("top"), 3601) == []
+    assert receiver.counts.duplicates == 1  # heard again, so remembered from here
+    assert receiver.accept(2, half("top"), 7202) == []
+    (event,) = images(receiver.accept(2, half("bottom"), 7203))
+    assert (event.version, event.first_at, event.complete) == (1, 7202, True)
+
+
+def test_a_clock_that_is_set_back_does_not_hold_an_image() -> None:
+    receiver = PairingReceiver(60)
+    receiver.accept(2, half("top"), 1_000_000)
+    assert receiver.poll(500) == []
+    assert receiver.next_deadline() == 560
+    assert len(images(receiver.poll(560))) == 1
+
+
+def test_memory_is_bounded_and_nothing_is_dropped_unsaid() -> None:
+    receiver = PairingReceiver(60, max_images=4)
+    header = dataclasses.replace(HEADER, body_length=65535)
+    events: list[Event] = []
+    for number in range(50):
+        frame = HalfFrame("top", format_image_id(number), 0, header, b"x").pack()
+        events += receiver.accept(number, frame, number / 100)
+    assert [e.source for e in images(events)] == list(range(46))  # the longest unheard first
+    state: Any = receiver.snapshot()
+    assert len(state["images"]) == 4
+    assert receiver.counts.evicted == 46
+    assert sorted(e.source for e in images(receiver.poll(100))) == [46, 47, 48, 49]
+
+
+def test_making_room_forgets_what_was_given_out_before_what_waits() -> None:
+    receiver = PairingReceiver(60, max_images=2)
+    receiver.accept(1, half("top"), 0)
+    receiver.accept(2, half("top"), 1)
+    assert len(images(receiver.accept(2, half("bottom"), 2))) == 1
+    assert receiver.accept(3, half("top"), 3) == []  # source 2's image made room, although heard later than 1's
+    (event,) = images(receiver.accept(1, half("bottom"), 4))
+    assert (event.source, event.version, event.complete) == (1, 1, True)
+
+
+def test_contact_frames_alone_are_bounded_too() -> None:
+    receiver = PairingReceiver(60, max_images=3)
+    events = [e for n in range(10) for e in receiver.accept(2, contact(format_image_id(n)), n / 10)]
+    assert [e.image_id for e in events if isinstance(e, ContactOnly)] == [format_image_id(n) for n in range(7)]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"timeout_s": 0},
+        {"timeout_s": math.nan},
+        {"timeout_s": 60, "memory_s": 59},
+        {"timeout_s": 60, "memory_s": math.nan},
+        {"timeout_s": 60, "max_images": 0},
+    ],
+)
+def test_settings_that_cannot_work_are_refused(settings: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="timeout_s > 0"):
+        PairingReceiver(**settings)
+
+
+def busy_receiver() -> PairingReceiver:
+    receiver = PairingReceiver(60)
+    receiver.accept(2, half("top"), 0)
+    receiver.accept(2, half("bottom"), 1)
+    receiver.accept(2, contact("00A8"), 2)
+    receiver.accept(2, piece(6, 8, "00A9"), 3)
+    receiver.accept(3, half("top", header=dataclasses.replace(HEADER, width_px=50)), 4)
+    receiver.accept(3, half("top"), 4)
+    return receiver
+
+
+def test_the_state_survives_msgpack_and_is_the_same_state() -> None:
+    receiver = busy_receiver()
+    state = msgpack.unpackb(msgpack.packb(receiver.snapshot()))
+    other = PairingReceiver(60)
+    other.restore(state)
+    assert other.snapshot() == receiver.snapshot()
+    assert other.counts == receiver.counts
+    assert other.next_deadline() == receiver.next_deadline()
+
+
+def _edits() -> list[Any]:
+    """One wrong value for every place of a state, as (path, value)."""
+    image = ("images", 0)
+    return [
+        (("format",), 2),
+        (("images",), {}),
+        (("images", 0), 7),
+        ((*image, "source"), "2"),
+        ((*image, "image_id"), "a7"),
+        ((*image, "image_id"), 7),
+        ((*image, "first_at"), 1),
+        ((*image, "news_at"), math.nan),
+        ((*image, "heard_at"), None),
+        ((*image, "candidates"), []),
+        ((*image, "candidates"), None),
+        ((*image, "candidates", 0), []),
+        ((*image, "candidates", 0, "header"), b"short"),
+        ((*image, "candidates", 0, "pieces", 0), [5, bytes(5)]),
+        ((*image, "candidates", 0, "pieces", 0), [-1, b"x"]),
+        ((*image, "candidates", 0, "pieces", 0), ["0", b"x"]),
+        ((*image, "candidates", 0, "frames"), 1.5),
+        ((*image, "contact"), bytes(24)),
+        ((*image, "contact"), "text"),
+        ((*image, "conflicts"), None),
+        ((*image, "version"), "1"),
+        ((*image, "given"), [0, 9]),
+        ((*image, "given"), "given"),
+        (("counts",), []),
+        (("counts", "frames"), None),
+    ]
+
+
+@pytest.mark.parametrize(("path", "value"), _edits(), ids=str)
+def test_a_damaged_state_is_refused_and_changes_nothing(path: tuple[Any, ...], value: Any) -> None:
+    state: Any = copy.deepcopy(busy_receiver().snapshot())
+    inner = state
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    receiver = busy_receiver()
+    before = receiver.snapshot()
+    with pytest.raises(FrameError) as caught:
+        receiver.restore(state)
+    assert "receiver state" in str(caught.value)
+    assert receiver.snapshot() == before
+
+
+def test_too_many_candidates_in_a_state_are_refused() -> None:
+    state: Any = busy_receiver().snapshot()
+    state["images"][0]["candidates"] *= 4
+    with pytest.raises(FrameError, match="candidates"):
+        PairingReceiver(60).restore(state)

@@ -1,0 +1,231 @@
+"""What holds for any frames in any order: right bytes at the right place, every version once, restarts unseen."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonarpost.codec.interface import StreamHeader
+from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.intervals import Ranges
+from sonarpost.link.paper_format import ContactFrame, HalfFrame, parse_frame
+from sonarpost.link.paper_receiver import ContactOnly, Event, FrameRejected, ImageReady, PairingReceiver
+from sonarpost.link.paper_sender import plan_packets
+
+RATES = [(1, 32), (3, 64), (2, 256), (6, 32)]
+CONTACT = ContactSummary(height_px=80, width_px=140, lat_deg=44.7, lon_deg=-63.6, confidence=1.5)
+TIMEOUT_S = 60.0
+Key = tuple[int, str]
+
+
+@dataclass(frozen=True)
+class Sent:
+    """One image of one source: its body, and its frames."""
+
+    source: int
+    image_id: str
+    header: StreamHeader
+    body: bytes
+    frames: tuple[bytes, ...]
+
+
+@dataclass(frozen=True)
+class Step:
+    """A frame that arrives, or None for a look at the clock."""
+
+    at: float
+    source: int
+    frame: bytes | None
+
+
+@st.composite
+def sent_images(draw: st.DrawFn) -> list[Sent]:
+    images = []
+    for source in range(1, draw(st.integers(1, 2)) + 1):
+        for number in range(draw(st.integers(1, 3))):
+            length = draw(st.integers(0, 3) | st.integers(0, 200))
+            body = bytes((source * 83 + number * 31 + i * 7 + 1) % 255 + 1 for i in range(length))  # never zero
+            header = StreamHeader(1, number, 80, 140, length)
+            contact = draw(st.sampled_from([CONTACT, None]))
+            rate = draw(st.sampled_from(RATES))
+            image_id = f"00{source}{number}"
+            plan = plan_packets(image_id, header.pack() + body, contact, *rate)
+            images.append(Sent(source, image_id, header, body, tuple(f for packet in plan for f in packet)))
+    return images
+
+
+@st.composite
+def deliveries(draw: st.DrawFn) -> tuple[list[Sent], list[Step]]:
+    """Images, and any selection of their frames in any order, repeated, padded or cut, at any pace."""
+    images = draw(sent_images())
+    frames = [(image.source, frame) for image in images for frame in image.frames]
+    chosen = draw(st.lists(st.sampled_from(frames), max_size=25))
+    if draw(st.booleans()):  # mostly in order, as real packets come, so that images do get complete
+        chosen = sorted(chosen, key=frames.index) + draw(st.lists(st.sampled_from(frames), max_size=5))
+    steps, now = [], 0.0
+    for source, frame in chosen:
+        now += draw(st.sampled_from([0.0, 1.0, 6.1, 30.0, 61.0]))
+        if draw(st.integers(0, 9)) == 0:
+            steps.append(Step(now, source, None))
+        steps.append(Step(now, source, draw(as_it_arrives(frame))))
+    return images, steps
+
+
+@st.composite
+def as_it_arrives(draw: st.DrawFn, frame: bytes) -> bytes:
+    how = draw(st.sampled_from(["whole"] * 6 + ["padded", "cut"]))
+    if how == "padded" and reaches_the_end(frame):
+        return frame + bytes(draw(st.integers(1, 40)))
+    if how == "cut":
+        return frame[: draw(st.integers(0, len(frame)))]
+    return frame
+
+
+def reaches_the_end(frame: bytes) -> bool:
+    parsed = parse_frame(frame)
+    return isinstance(parsed, ContactFrame) or parse_frame(frame + b"\0") == parsed
+
+
+def take(receiver: PairingReceiver, step: Step) -> list[Event]:
+    if step.frame is None:
+        return receiver.poll(step.at)
+    return receiver.accept(step.source, step.frame, step.at)
+
+
+def positions(ranges: Ranges) -> set[int]:
+    return {i for start, stop in ranges for i in range(start, stop)}
+
+
+class Ledger:
+    """What has really been delivered, kept without any of the receiver's code but the parser."""
+
+    def __init__(self, images: list[Sent]) -> None:
+        self.images = {(image.source, image.image_id): image for image in images}
+        self.bytes_there: dict[Key, set[int]] = defaultdict(set)
+        self.contact_there: dict[Key, bool] = defaultdict(bool)
+        self.versions: dict[Key, list[ImageReady | ContactOnly]] = defaultdict(list)
+
+    def deliver(self, step: Step) -> bool:
+        """Note what the frame brings; return whether it parses."""
+        try:
+            parsed = parse_frame(step.frame or b"")
+        except Exception:  # noqa: BLE001 - which exceptions there are is another test's matter
+            return False
+        key = (step.source, parsed.image_id)
+        if isinstance(parsed, HalfFrame):
+            self.bytes_there[key] |= set(range(parsed.offset, parsed.stop))
+        else:
+            self.contact_there[key] = True
+        return True
+
+    def check(self, event: ImageReady | ContactOnly) -> None:
+        key = (event.source, event.image_id)
+        earlier = self.versions[key]
+        assert event.version == len(earlier) + 1
+        if isinstance(event, ImageReady):
+            image, there = self.images[key], positions(event.received)
+            assert event.header == image.header
+            assert event.body == bytes(b if i in there else 0 for i, b in enumerate(image.body))
+            assert there <= self.bytes_there[key]
+            assert event.complete == (len(there) == len(image.body))
+            assert event.conflicts == 0
+            assert event.contact in (None, CONTACT.rounded())
+        if earlier:  # a new version says more than the one before
+            assert knowledge(event) > knowledge(earlier[-1])
+        earlier.append(event)
+
+
+def knowledge(event: ImageReady | ContactOnly) -> tuple[int, ...]:
+    if isinstance(event, ContactOnly):
+        return 1, -1
+    return int(event.contact is not None) + len(positions(event.received)), int(event.contact is not None)
+
+
+@settings(max_examples=250, deadline=None)
+@given(deliveries())
+def test_any_frames_in_any_order_give_right_bytes_and_every_version_once(
+    delivery: tuple[list[Sent], list[Step]],
+) -> None:
+    images, steps = delivery
+    receiver, ledger = PairingReceiver(TIMEOUT_S), Ledger(images)
+    for step in steps:
+        parses = step.frame is None or ledger.deliver(step)
+        events = take(receiver, step)
+        rejected = [e for e in events if isinstance(e, FrameRejected)]
+        assert len(rejected) == (0 if parses else 1)
+        for event in events:
+            if not isinstance(event, FrameRejected):
+                ledger.check(event)
+    for event in receiver.poll(1e9):
+        assert not isinstance(event, FrameRejected)
+        ledger.check(event)
+    assert receiver.next_deadline() is None
+    # Nothing that arrived is held back: the last version of each image tells all of it.
+    for key, there in ledger.bytes_there.items():
+        last = ledger.versions[key][-1]
+        assert isinstance(last, ImageReady)
+        assert positions(last.received) == there
+        assert (last.contact is not None) == ledger.contact_there[key]
+    assert set(ledger.versions) == set(ledger.bytes_there) | set(ledger.contact_there)
+
+
+@settings(max_examples=120, deadline=None)
+@given(deliveries(), st.integers(1, 4))
+def test_a_restart_at_every_point_changes_nothing(delivery: tuple[list[Sent], list[Step]], max_images: int) -> None:
+    steps = [*delivery[1], Step(1e9, 0, None)]
+    steady = PairingReceiver(TIMEOUT_S, max_images=max_images)
+    restarted = PairingReceiver(TIMEOUT_S, max_images=max_images)
+    for step in steps:
+        state = msgpack.unpackb(msgpack.packb(restarted.snapshot()))
+        restarted = PairingReceiver(TIMEOUT_S, max_images=max_images)
+        restarted.restore(state)
+        assert comparable(take(restarted, step)) == comparable(take(steady, step))
+        assert restarted.next_deadline() == steady.next_deadline()
+        assert restarted.counts == steady.counts
+        assert restarted.snapshot() == steady.snapshot()
+
+
+def comparable(events: list[Event]) -> list[Any]:
+    """Errors have no equality of their own."""
+    return [(e.source, e.at, str(e.reason)) if isinstance(e, FrameRejected) else e for e in events]
+
+
+@st.composite
+def hostile_frames(draw: st.DrawFn) -> bytes:
+    header = StreamHeader(draw(st.integers(0, 2)), 0, 80, draw(st.integers(16, 19)), draw(st.integers(0, 12)))
+    letter = draw(st.sampled_from([b"T", b"B"]))
+    image_id = draw(st.sampled_from([b"0000", b"0001", b"0002", b"000x"]))
+    offset = draw(st.integers(0, 12)).to_bytes(2, "big")
+    half_frame = letter + image_id + offset + header.pack() + draw(st.binary(max_size=10))
+    contact = ContactFrame("0001", ContactSummary(confidence=draw(st.sampled_from([0.0, 1.0, None])))).pack()
+    return draw(st.sampled_from([half_frame, half_frame, contact, draw(st.binary(max_size=40))]))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.integers(-1, 2), hostile_frames(), st.floats(-100, 1e6)), max_size=40))
+def test_hostile_frames_at_wild_times_never_raise_and_memory_stays_bounded(
+    arrivals: list[tuple[int, bytes, float]],
+) -> None:
+    receiver = PairingReceiver(TIMEOUT_S, max_images=3)
+    versions: dict[Key, int] = {}
+    for source, frame, now in arrivals:
+        for event in receiver.accept(source, frame, now):
+            if isinstance(event, FrameRejected):
+                continue
+            key = (event.source, event.image_id)
+            # Forgotten images start again at 1; otherwise versions count up one by one.
+            assert event.version in (1, versions.get(key, 0) + 1)
+            versions[key] = event.version
+            if isinstance(event, ImageReady):
+                there = positions(event.received)
+                assert len(event.body) == event.header.body_length
+                assert all(byte == 0 for i, byte in enumerate(event.body) if i not in there)
+        state: Any = receiver.snapshot()
+        assert len(state["images"]) <= 3
+        assert all(len(image["candidates"]) <= 3 for image in state["images"])
+    assert receiver.counts.frames == len(arrivals)
