@@ -81,6 +81,10 @@ class Chain:
         self._processes[name].wait(timeout=STOP_S)
         return time.monotonic() - started
 
+    def status(self, name: str) -> int | None:
+        """Return the exit status of a process, None while it runs."""
+        return self._processes[name].poll()
+
     def check(self) -> None:
         """Raise ChainError when a process has ended by itself."""
         for name, process in self._processes.items():
