@@ -181,7 +181,7 @@ def test_float_samples_are_refused(small_survey, tmp_path):
 
 
 def test_nowhere_to_write(small_survey, tmp_path):
-    with pytest.raises(SurveyFileError, match="No such file"):
+    with pytest.raises(FileNotFoundError, match="No such file"):
         write_xtf(small_survey(), tmp_path / "absent" / "a.xtf")
 
 

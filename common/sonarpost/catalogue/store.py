@@ -19,8 +19,8 @@ import numpy as np
 
 from sonarpost.codec.interface import model_tag
 from sonarpost.codec.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase
-from sonarpost.errors import CatalogueError, SurveyFileError
-from sonarpost.sonar.atomic_file import write_atomically
+from sonarpost.errors import CatalogueError
+from sonarpost.files import write_atomically
 
 MAGIC = b"SPTILES\n"
 VERSION = 1
@@ -119,8 +119,8 @@ def save(path: Path, catalogue: Catalogue) -> None:
     """
     try:
         write_atomically(path, to_bytes(catalogue))
-    except SurveyFileError as error:
-        raise CatalogueError(error.where, error.field, error.value, error.expected) from error
+    except OSError as error:
+        raise CatalogueError(str(path), "", str(error), "a place that can be written to") from error
 
 
 def load(path: Path) -> Catalogue:

@@ -12,7 +12,7 @@ from sonarpost.detect.contacts import Detection, detect
 from sonarpost.detect.plot import annotated_waterfall
 from sonarpost.detect.settings import DetectorSettings
 from sonarpost.errors import ConfigError
-from sonarpost.sonar.atomic_file import write_atomically
+from sonarpost.files import write_atomically
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Survey
 
@@ -51,7 +51,8 @@ def run(parsed: argparse.Namespace) -> int:
     """Detect in every file and print what was found.
 
     Raises:
-        SurveyFileError: A file cannot be read, or the plot cannot be written.
+        SurveyFileError: A file cannot be read.
+        OSError: The plot cannot be written.
         ConfigError: An option's value is out of range.
     """
     try:

@@ -14,7 +14,7 @@ from sonarpost.codec.interface import Codec, StreamHeader
 from sonarpost.codec.registry import CodecRegistry, CodecResources, default_registry
 from sonarpost.codec.vq import IndexPacking
 from sonarpost.errors import SonarpostError, StreamError
-from sonarpost.sonar.atomic_file import write_atomically
+from sonarpost.files import write_atomically
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff
 
 IMAGE_SUFFIXES = (".tiff", ".tif", ".png")

@@ -20,7 +20,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command."""
     whole = argparse.ArgumentParser(
         prog="sonarpost",
-        description="Side-scan-sonar snippets from an underwater vehicle, through an acoustic modem, to ship and shore.",
+        description="Side-scan-sonar snippets from an underwater vehicle, by acoustic modem, to ship and shore.",
     )
     whole.add_argument("--version", action="version", version=f"sonarpost {__version__}")
     subparsers = whole.add_subparsers(metavar="COMMAND", required=False)
@@ -41,12 +41,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SonarpostError as error:
         print(f"sonarpost: {error}", file=sys.stderr)
         return EXIT_ERROR
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            # The reader of our output has left (`| head`): not an error, and nothing more can be said to it.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        print(f"sonarpost: {error}", file=sys.stderr)
+        return EXIT_ERROR
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        # The reader of our output has left (`| head`): not an error, and nothing more can be said to it.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     return status
 
 

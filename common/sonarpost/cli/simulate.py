@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SimulatedSurvey, SurveySpec, simulate_survey
-from sonarpost.sonar.atomic_file import write_atomically
+from sonarpost.files import write_atomically
 from sonarpost.sonar.xtf_writer import write_xtf
 
 TRUTH_SCHEMA = 1
@@ -51,7 +51,7 @@ def run_simulate(args: argparse.Namespace) -> int:
 
     Raises:
         ConfigError: An option out of range.
-        SurveyFileError: A file cannot be written.
+        OSError: A file cannot be written.
     """
     spec = SurveySpec(
         seed=args.seed,

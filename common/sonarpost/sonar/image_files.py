@@ -18,7 +18,7 @@ import tifffile
 from PIL import Image
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.atomic_file import write_atomically
+from sonarpost.files import write_atomically
 
 GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
@@ -73,7 +73,8 @@ def write_tiff(path: Path, image: GreyImage, description: str | None = None) -> 
         description: Text for the ImageDescription tag, ASCII.
 
     Raises:
-        SurveyFileError: Another shape or depth, a description that is not ASCII, or the file cannot be written.
+        SurveyFileError: Another shape or depth, or a description that is not ASCII.
+        OSError: The file cannot be written.
     """
     _check_writable(path, image)
     if description is not None and not description.isascii():
@@ -101,7 +102,8 @@ def write_png(path: Path, image: GreyImage) -> None:
         image: Shape (rows, columns), uint8 or uint16.
 
     Raises:
-        SurveyFileError: Another shape or depth, or the file cannot be written.
+        SurveyFileError: Another shape or depth.
+        OSError: The file cannot be written.
     """
     _check_writable(path, image)
     buffer = io.BytesIO()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ Samples = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.uint32
 FloatImage = npt.NDArray[np.float32]
 
 
-class Side(str, Enum):
+class Side(StrEnum):
     """Which side of the vehicle a channel looks to."""
 
     PORT = "port"
@@ -41,7 +41,7 @@ class ChannelPing:
     @property
     def sample_spacing_m(self) -> float:
         """Slant range covered by one sample, in metres."""
-        return self.slant_range_m / self.samples.shape[0]
+        return self.slant_range_m / len(self.samples)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ import numpy as np
 from pyxtf import XTFFileHeader, XTFPingChanHeader, XTFPingHeader
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.atomic_file import write_atomically
+from sonarpost.files import write_atomically
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_navigation import KNOT_MPS, NAV_UNITS_DEGREES
 
@@ -43,7 +43,8 @@ def write_xtf(survey: Survey, path: Path) -> None:
 
     Raises:
         SurveyFileError: The survey cannot be put into the format (more than six channels, a channel whose sample
-            size changes, a sonar name over 15 ASCII characters, a value out of range), or the file cannot be written.
+            size changes, a sonar name over 15 ASCII characters, or a value out of range).
+        OSError: The file cannot be written.
     """
     slots = _slots(survey, path)
     chunks = [bytes(_file_header(survey, slots, path))]
