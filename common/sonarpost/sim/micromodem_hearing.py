@@ -80,7 +80,7 @@ def _data(arrival: ArrivalEnded, listener: Listener) -> Hearing:
     hearing.lines.append(nmea.format("CACYC", *cycle))
     heard = _heard(arrival, listener)
     if packet.rate == 0:
-        header = replace(heard, mode=ReceiveMode.GOOD, frames=0, bad_frames=0)
+        header = replace(heard, mode=ReceiveMode.GOOD, packet_type=PacketType.FSK_MINI, frames=0, bad_frames=0)
         hearing.lines += _statistics(header, listener)
     if not listener.accepts(packet.destination):
         hearing.untold = "addressed to another modem"

@@ -15,7 +15,7 @@ from sonarpost.modem.rates import RATES
 from sonarpost.sim import micromodem_commands as commands
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.micromodem_hearing import packet_type
-from sonarpost.sim.micromodem_sentences import Sent, transmit_statistics
+from sonarpost.sim.micromodem_sentences import PacketType, Sent, transmit_statistics
 from sonarpost.sim.micromodem_settings import ModemClock, Settings
 from sonarpost.sim.water_records import ArrivalEnded, Outcome, Packet, PacketKind
 
@@ -236,9 +236,9 @@ class Transmitter:
             self._say("CATXF", total)
         if not self._settings.on("XST"):
             return
-        # At rate 0 the cycle header is a packet of its own, so it has statistics of its own.
-        header = [(0, 0)] if packet.rate == 0 else []
-        for sent, size in [*header, (sum(map(bool, packet.frames)), total)]:
+        # At rate 0 the cycle header is a mini-packet of its own, so it has statistics of its own.
+        header = [(PacketType.FSK_MINI, 0, 0)] if packet.rate == 0 else []
+        for kind, sent, size in [*header, (packet_type(packet), sum(map(bool, packet.frames)), total)]:
             statistics = Sent(
                 started=self._clock.at(sending.started_s),
                 clock_set=self._clock.was_set,
@@ -248,7 +248,7 @@ class Transmitter:
                 ack_requested=packet.ack_requested,
                 frames_expected=len(packet.frames),
                 frames_sent=sent,
-                packet_type=packet_type(packet),
+                packet_type=kind,
                 data_bytes=size,
             )
             self._write(transmit_statistics(statistics, self._config.generation))
