@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sonarpost.codec.tiles import BASIS_SCALE, TileDatabase, cut_tiles, join_tiles, principal_basis
+from sonarpost.codec.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, cut_tiles, join_tiles, principal_basis
 from sonarpost.errors import CatalogueError
 
 
@@ -16,28 +16,39 @@ def random_tiles(count: int, tile_px: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (count, tile_px * tile_px), dtype=np.uint8)
 
 
-def brute_force(database: TileDatabase, tiles: np.ndarray) -> tuple[list[int], list[float]]:
-    """Integer arithmetic of Python, one pair at a time: nothing in common with the matrix product."""
-    basis = database.basis.astype(object)
-    indices, distances = [], []
-    for tile in tiles:
-        squares = []
-        for other in database.tiles:
-            difference = basis @ (tile.astype(int) - other.astype(int)).astype(object)
-            squares.append(sum(int(value) ** 2 for value in difference))
-        indices.append(squares.index(min(squares)))
-        distances.append(min(squares) ** 0.5 / BASIS_SCALE)
-    return indices, distances
+def brute_force(database: TileDatabase, tile: np.ndarray) -> list[tuple[int, int]]:
+    """Squared distance in the basis and index of every tile, nearest first, in Python's own integers."""
+    basis = [[int(value) for value in row] for row in database.basis]
+    squares = []
+    for index, other in enumerate(database.tiles):
+        difference = [int(a) - int(b) for a, b in zip(tile, other, strict=True)]
+        projected = (sum(x * y for x, y in zip(row, difference, strict=True)) for row in basis)
+        squares.append((sum(value**2 for value in projected), index))
+    return sorted(squares)
 
 
-@pytest.mark.parametrize(("tile_px", "dims"), [(4, 16), (5, 7), (10, 70), (20, 70), (32, 70)])
-def test_nearest_is_the_brute_force_nearest_exactly(tile_px: int, dims: int) -> None:
-    database = TileDatabase.from_tiles(tile_px, random_tiles(90, tile_px), dims)
-    queries = np.concatenate([random_tiles(6, tile_px, 1), database.tiles[40:42]])
-    indices, distances = database.nearest(queries)
-    expected_indices, expected_distances = brute_force(database, queries)
-    assert indices.tolist() == expected_indices
-    assert distances.tolist() == pytest.approx(expected_distances, rel=1e-12)
+@pytest.mark.parametrize(("tile_px", "dims"), [(4, 16), (5, 7), (10, 70), (20, 30), (32, 70)])
+def test_nearest_in_the_basis_is_the_brute_force_nearest_exactly(tile_px: int, dims: int) -> None:
+    database = TileDatabase.from_tiles(tile_px, random_tiles(30, tile_px), dims)
+    queries = np.concatenate([random_tiles(2, tile_px, 1), database.tiles[20:21]])
+    indices, distances = database.nearest_in_basis(queries, 5)
+    first, _ = database.nearest_in_basis(queries)
+    for query, found, near in zip(queries, indices, distances, strict=True):
+        expected = brute_force(database, query)[:5]
+        assert found.tolist() == [index for _, index in expected]
+        assert near.tolist() == pytest.approx([square**0.5 / BASIS_SCALE for square, _ in expected], rel=1e-12)
+    assert first[:, 0].tolist() == indices[:, 0].tolist()
+
+
+def test_the_shortlist_is_judged_in_all_pixels() -> None:
+    database = TileDatabase.from_tiles(10, random_tiles(3000, 10), 6)  # a basis that sees little
+    queries = random_tiles(20, 10, 1)
+    index, distance = database.nearest(queries)
+    shortlist, _ = database.nearest_in_basis(queries, SHORTLIST)
+    exact = ((database.tiles[shortlist].astype(int) - queries[:, None].astype(int)) ** 2).sum(axis=2)
+    assert (index == shortlist[np.arange(20), exact.argmin(axis=1)]).all()
+    assert (distance == np.sqrt(exact.min(axis=1))).all()
+    assert (index != shortlist[:, 0]).any()
 
 
 def test_extreme_tiles_stay_within_exact_integers() -> None:
@@ -51,7 +62,7 @@ def test_extreme_tiles_stay_within_exact_integers() -> None:
     middle = np.full((1, 1024), 127, np.uint8)
     index, distance = database.nearest(middle)
     assert index.tolist() == [0]
-    assert distance[0] == pytest.approx(127 * 32, rel=1e-3)
+    assert distance[0] == 127 * 32
     assert np.abs(database.projections).max() ** 2 * 4 < 2**53
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 from rich.console import Console
 
 from sonarpost.catalogue.build import MAX_TILES, Progress, Round, TrainingImage, build, rms_distance
-from sonarpost.catalogue.nominal import RECIPES, Recipe, build_nominal, humminbird_lines, training_images
+from sonarpost.catalogue.nominal import RECIPES, Recipe, build_nominal, humminbird_images
 from sonarpost.catalogue.refine import refine
 from sonarpost.catalogue.store import Catalogue, load, open_catalogue, save
-from sonarpost.catalogue.windows import Line, WindowPlan, cut_around, cut_line, shuffled
+from sonarpost.catalogue.windows import Line, WindowPlan, cut_around, cut_line
 from sonarpost.codec.interface import model_tag, to_uint8
 from sonarpost.codec.tiles import MAX_DIMS, Tiles
 from sonarpost.errors import CatalogueError, ConfigError, SurveyFileError
@@ -139,7 +139,7 @@ def run_nominal(args: argparse.Namespace) -> int:
         SonarpostError: The recording cannot be read or a catalogue not be written.
     """
     console = Console(stderr=True)
-    images = shuffled([*training_images(humminbird_lines(args.humminbird)), *_simulated_images(console)])
+    images = [*humminbird_images(args.humminbird), *_simulated_images(console)]
     console.print(f"{len(images)} training images")
     for recipe in RECIPES:
         _write_nominal(recipe, images, args.out, console)
@@ -213,8 +213,8 @@ def _progress_to(console: Console) -> Callable[[Progress], None]:
 
 def _simulated_images(console: Console) -> Iterator[TrainingImage]:
     """Windows of simulated lines over every kind of bottom, and of the objects that lie there."""
-    bottom = WindowPlan(reductions=SIMULATED_REDUCTIONS, per_reduction=12, least_std=4.0)
-    objects = WindowPlan(reductions=SIMULATED_REDUCTIONS[:5], copies=1)
+    bottom = WindowPlan(reductions=SIMULATED_REDUCTIONS, per_reduction=16, least_std=4.0)
+    objects = WindowPlan(reductions=SIMULATED_REDUCTIONS[:5], copies=2)
     for spec in SIMULATED_SURVEYS:
         simulated = simulate_survey(spec)
         name = simulated.survey.line_name

@@ -123,7 +123,10 @@ def _over_files(source: Path, suffixes: tuple[str, ...], work: Callable[[Path], 
 def _encode_file(codec: Codec, path: Path, target: Path, args: argparse.Namespace) -> str:
     image = read_image(path)
     stream = codec.encode(image, args.budget)
-    write_atomically(target, (stream.hex() + "\n").encode() if args.text else stream)
+    try:
+        write_atomically(target, (stream.hex() + "\n").encode() if args.text else stream)
+    except OSError as error:
+        raise StreamError(str(target), "", error.strerror or str(error), "a file that can be written") from error
     return f"{path} -> {target}: {image.nbytes} B -> {len(stream)} B ({image.nbytes / len(stream):.1f}:1)"
 
 

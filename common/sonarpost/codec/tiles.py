@@ -1,9 +1,12 @@
 """The tile database both ends of the link share, and the search for the tile most like a piece of a picture.
 
-Tiles are compared after projection on a principal-component basis, as the paper does (70 dimensions kept). Mean and
-basis are held as **integers** (the basis in units of 1/4096), so projections and squared distances are integers that
-float64 holds exactly: the matrix product gives the same distances, and so the same indices, whatever the processor
-or the linear-algebra library. A stream encoded on one machine is byte for byte the stream of any other.
+Tiles are compared after projection on a principal-component basis, as the paper does (70 dimensions kept). The basis
+cannot see a tile's finest grain, and a grainy tile would be chosen where a smooth one is nearer; so the few tiles
+nearest in the basis are compared once more in all pixels (with 20 x 20 tiles this gains 0.1 to 0.2 dB).
+
+Mean and basis are held as **integers** (the basis in units of 1/4096), so projections and squared distances are
+integers that float64 holds exactly: the matrix product gives the same distances, and so the same indices, whatever
+the processor or the linear-algebra library. A stream encoded on one machine is byte for byte the stream of any other.
 """
 
 from __future__ import annotations
@@ -22,6 +25,9 @@ MIN_TILE_PX = 4
 MAX_TILE_PX = 32  # a squared distance of 32 x 32 tiles in units of (1/4096)^2 still fits float64's 53 bits
 MAX_DIMS = 70
 BASIS_SCALE = 4096
+
+SHORTLIST = 8
+"""Tiles nearest in the basis that are compared in all pixels; 32 or 128 give the same pictures, measured."""
 
 _QUERY_BLOCK = 256
 _TILE_BLOCK = 4096
@@ -115,44 +121,81 @@ class TileDatabase:
         return np.asarray(centred @ self.basis.T.astype(np.float64), dtype=np.float64)
 
     def nearest(self, tiles: Tiles) -> tuple[Indices, Distances]:
-        """Find, for each of `tiles`, the database tile with the least Euclidean distance in the basis.
-
-        Squared distances are |a|^2 - 2ab + |b|^2 from a blocked matrix product, exact (module docstring). Of equally
-        near tiles the one with the lowest index is taken.
+        """Find, for each of `tiles`, the nearest in all pixels among the `SHORTLIST` nearest in the basis.
 
         Args:
             tiles: Shape (m, tile_px * tile_px), uint8.
 
         Returns:
-            Indices, shape (m,), int64; distances, shape (m,), float64, in grey levels times the root of the pixels.
+            Indices, shape (m,), int64 (the lowest of equally near ones); Euclidean distances over all pixels, shape
+            (m,), float64, grey levels.
         """
-        best = np.zeros(tiles.shape[0], dtype=np.int64)
-        squared = np.full(tiles.shape[0], np.inf)
+        candidates, _ = self.nearest_in_basis(tiles, SHORTLIST)
+        candidates = np.sort(candidates, axis=1)  # so that the first of equals is the lowest index
+        squared = np.empty(candidates.shape, dtype=np.int64)
+        wide = tiles.astype(np.int64)
+        for rank in range(candidates.shape[1]):
+            difference = self.tiles[candidates[:, rank]].astype(np.int64) - wide
+            squared[:, rank] = np.einsum("ij,ij->i", difference, difference)
+        rows = np.arange(tiles.shape[0])
+        best = np.argmin(squared, axis=1)
+        return candidates[rows, best], np.sqrt(squared[rows, best].astype(np.float64))
+
+    def nearest_in_basis(self, tiles: Tiles, count: int = 1) -> tuple[Indices, Distances]:
+        """Find, for each of `tiles`, the `count` database tiles of least Euclidean distance in the basis.
+
+        With a count of 1 this is the paper's search. Squared distances are |a|^2 - 2ab + |b|^2 from a blocked matrix
+        product, exact (module docstring). Of equally near tiles those with lower indices come first.
+
+        Args:
+            tiles: Shape (m, tile_px * tile_px), uint8.
+            count: How many; at most as many as there are tiles are returned.
+
+        Returns:
+            Indices, shape (m, count), int64, nearest first; distances, same shape, float64, grey levels.
+        """
+        count = min(count, len(self))
+        found = np.zeros((tiles.shape[0], count), dtype=np.int64)
+        squared = np.zeros((tiles.shape[0], count))
         for start in range(0, tiles.shape[0], _QUERY_BLOCK):
             rows = slice(start, min(start + _QUERY_BLOCK, tiles.shape[0]))
-            best[rows], squared[rows] = self._nearest_block(self.project(tiles[rows]))
-        return best, np.sqrt(squared) / BASIS_SCALE
+            found[rows], squared[rows] = self._nearest_block(self.project(tiles[rows]), count)
+        return found, np.sqrt(squared) / BASIS_SCALE
 
     @cached_property
     def _squared_norms(self) -> npt.NDArray[np.float64]:
         return np.asarray(np.einsum("ij,ij->i", self.projections, self.projections), dtype=np.float64)
 
-    def _nearest_block(self, queries: npt.NDArray[np.float64]) -> tuple[Indices, Distances]:
-        best = np.zeros(queries.shape[0], dtype=np.int64)
-        least = np.full(queries.shape[0], np.inf)
-        rows = np.arange(queries.shape[0])
+    def _nearest_block(self, queries: npt.NDArray[np.float64], count: int) -> tuple[Indices, Distances]:
+        indices: list[Indices] = []
+        values: list[Distances] = []
         doubled = -2.0 * queries
         for start in range(0, len(self), _TILE_BLOCK):
             stop = min(start + _TILE_BLOCK, len(self))
             scores = doubled @ self.projections[start:stop].T
             scores += self._squared_norms[start:stop]
-            candidate = np.argmin(scores, axis=1)  # the first of equals, so the lowest index
-            value = scores[rows, candidate]
-            better = value < least  # strictly: an equal of a later block does not replace
-            best[better] = candidate[better] + start
-            least[better] = value[better]
-        own = np.einsum("ij,ij->i", queries, queries)
-        return best, least + own
+            block_indices, block_values = _smallest(scores, min(count, stop - start))
+            indices.append(block_indices + start)
+            values.append(block_values)
+        every_index, every_value = np.concatenate(indices, axis=1), np.concatenate(values, axis=1)
+        order = np.lexsort((every_index, every_value), axis=1)[:, :count]
+        own = np.einsum("ij,ij->i", queries, queries)[:, None]
+        return np.take_along_axis(every_index, order, axis=1), np.take_along_axis(every_value, order, axis=1) + own
+
+
+def _smallest(scores: Distances, count: int) -> tuple[Indices, Distances]:
+    """Return, for each row, place and value of the `count` smallest, the first of equals first; spoils `scores`.
+
+    Repeated minima, because a partition leaves open which of equals it returns.
+    """
+    rows = np.arange(scores.shape[0])
+    places = np.empty((scores.shape[0], count), dtype=np.int64)
+    values = np.empty((scores.shape[0], count))
+    for rank in range(count):
+        places[:, rank] = np.argmin(scores, axis=1)
+        values[:, rank] = scores[rows, places[:, rank]]
+        scores[rows, places[:, rank]] = np.inf
+    return places, values
 
 
 def principal_basis(tiles: Tiles, dims: int) -> tuple[Tiles, Basis]:
