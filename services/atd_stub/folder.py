@@ -49,13 +49,19 @@ def look_at(folder: Path, suffixes: tuple[str, ...]) -> tuple[FileSeen, ...]:
     for path in folder.iterdir():
         if path.name.startswith(".") or path.suffix.lower() not in suffixes:
             continue
+        if not path.is_file():
+            continue  # a folder, a pipe, a link that leads nowhere
         try:
             status = path.stat()
         except FileNotFoundError:
             continue  # taken away since the folder was listed
-        if path.is_file():
-            found.append(FileSeen(path, status.st_size, status.st_mtime_ns))
+        found.append(FileSeen(path, status.st_size, status.st_mtime_ns))
     return tuple(found)
+
+
+def printable(text: str) -> str:
+    """Return `text` with the bytes of a file name that are not UTF-8 written out, as records and logs need it."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def content_hash(path: Path) -> str:

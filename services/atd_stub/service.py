@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +12,7 @@ import msgpack
 
 from services.atd_stub import snippets
 from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.folder import FileSeen, SettledFiles, content_hash, look_at
+from services.atd_stub.folder import FileSeen, SettledFiles, content_hash, look_at, printable
 from sonarpost import keys
 from sonarpost.errors import HandoffError, SurveyFileError
 from sonarpost.files import write_atomically
@@ -48,7 +49,6 @@ class AtdStubService(Service[AtdStubConfig]):
 
     def on_start(self) -> None:
         """Start to poll."""
-        self.config.input_dir.mkdir(parents=True, exist_ok=True)
         self.spawn(self._poll, "poll")
 
     def gauges(self) -> Mapping[str, float]:
@@ -66,17 +66,26 @@ class AtdStubService(Service[AtdStubConfig]):
             self.stopping.wait(self.config.poll_s)
 
     def _look(self) -> None:
+        self.config.input_dir.mkdir(parents=True, exist_ok=True)
         here = look_at(self.config.input_dir, self._suffixes)
         self._dealt_with &= set(here)
         fresh = tuple(seen for seen in here if seen not in self._dealt_with)
         ready = self._settled.look(fresh, time.monotonic())
         self._waiting = len(fresh)
+        unreadable: OSError | None = None
         for seen in ready:
             if self.stopping.is_set():
                 return
-            self._process(seen)
+            try:
+                self._process(seen)
+            except OSError as error:
+                # Told when the files behind it have had their turn; it is tried again at the next look.
+                unreadable = unreadable or error
+                continue
             self._dealt_with.add(seen)
             self._waiting -= 1
+        if unreadable is not None:
+            raise unreadable
 
     def _process(self, seen: FileSeen) -> None:
         try:
@@ -84,13 +93,15 @@ class AtdStubService(Service[AtdStubConfig]):
         except FileNotFoundError:
             return
         if (kept := self.store.get_state(_state_name(content))) is not None:
-            self._meet_again(seen.path, kept)
+            self._meet_again(seen.path, content, kept)
             return
         started = time.perf_counter()
         try:
             found = self._snippets(seen.path, content)
         except SurveyFileError as error:
-            self._quarantine(seen.path, content, str(error))
+            # A file that went away or changed while it was read says nothing about the content that was meant.
+            if _is_still(seen.path, content):
+                self._quarantine(seen.path, content, str(error))
             return
         except (OSError, HandoffError):
             raise
@@ -99,13 +110,15 @@ class AtdStubService(Service[AtdStubConfig]):
             log.exception("File not processed", extra=kv(file=seen.path.name))
             self._quarantine(seen.path, content, f"{type(error).__name__}: {error}")
             return
-        if content_hash(seen.path) != content:
+        if not _is_still(seen.path, content):
             log.warning("File changed while it was read, looking again later", extra=kv(file=seen.path.name))
             return
         effects = Effects()
         for snippet in found:
             effects.send(keys.contact_detected(self.platform.id), "compressor", snippet)
-        effects.put_state(_state_name(content), msgpack.packb({"file": seen.path.name, "contacts": len(found)}))
+        effects.put_state(
+            _state_name(content), msgpack.packb({"file": printable(seen.path.name), "contacts": len(found)})
+        )
         effects.count("files_processed")
         effects.count("contacts_detected", len(found))
         self.commit(effects)
@@ -117,31 +130,45 @@ class AtdStubService(Service[AtdStubConfig]):
             return snippets.from_picture(path, content, self.platform.id)
         return snippets.from_survey(path, content, self.platform.id, self.config)
 
-    def _meet_again(self, path: Path, kept: bytes) -> None:
+    def _meet_again(self, path: Path, content: str, kept: bytes) -> None:
         """Leave a file that was processed; put one that was refused aside again, where it will be found."""
         reason = msgpack.unpackb(kept).get("refused")
         log.info("File known already", extra=kv(file=path.name, refused=reason or "no"))
         if reason is not None:
-            self._move_aside(path, reason)
+            self._move_aside(path, content, reason)
 
     def _quarantine(self, path: Path, content: str, reason: str) -> None:
         """Remember a bad file, so that it is looked at once, and move it aside with its reason."""
+        reason = printable(reason)
         log.error("File quarantined", extra=kv(file=path.name, reason=reason))
         effects = Effects()
-        effects.put_state(_state_name(content), msgpack.packb({"file": path.name, "refused": reason}))
+        effects.put_state(_state_name(content), msgpack.packb({"file": printable(path.name), "refused": reason}))
         effects.count("files_quarantined")
         self.commit(effects)
-        self._move_aside(path, reason)
+        self._move_aside(path, content, reason)
 
-    def _move_aside(self, path: Path, reason: str) -> None:
+    def _move_aside(self, path: Path, content: str, reason: str) -> None:
         folder = self.config.quarantine_dir or self.config.input_dir / "quarantine"
+        target = folder / path.name
+        if target.exists():
+            # Another bad file of this name lies there, and stays.
+            target = folder / f"{path.stem}-{content[:8]}{path.suffix}"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            write_atomically(folder / f"{path.name}.reason.txt", f"{reason}\n".encode())
-            path.replace(folder / path.name)
+            write_atomically(target.with_name(f"{target.name}.reason.txt"), f"{reason}\n".encode())
+            # The quarantine may be on another disk, where a rename does not reach.
+            shutil.move(path, target)
         except OSError as trouble:
             # A read-only folder: the file stays, and is known by its content.
             log.warning("File cannot be moved", extra=kv(file=path.name, error=str(trouble)))
+
+
+def _is_still(path: Path, content: str) -> bool:
+    """Return whether the file is there and its content is the one that was read; OSError when it cannot be told."""
+    try:
+        return content_hash(path) == content
+    except FileNotFoundError:
+        return False
 
 
 def _state_name(content: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from services.atd_stub.config import AtdStubConfig
+from services.atd_stub.folder import printable
 from sonarpost.codec.interface import check_image
 from sonarpost.detect.contacts import Detection, detect
 from sonarpost.detect.settings import DetectorSettings
@@ -38,11 +39,12 @@ def from_survey(path: Path, content: str, vehicle_id: str, config: AtdStubConfig
 
 def _snippet(survey: Survey, found: Detection, content: str, vehicle_id: str, config: AtdStubConfig) -> Snippet:
     cut = cut_snippet(survey, found, config.snippet_height_px, config.snippet_width_px)
+    line_name = printable(survey.line_name)
     contact = Contact(
-        contact_id=f"{survey.line_name[:60]}-{content[:8]}-{found.ping_number}-{found.side.value}-{found.sample}",
+        contact_id=f"{line_name[:60]}-{content[:8]}-{found.ping_number}-{found.side.value}-{found.sample}",
         vehicle_id=vehicle_id,
         sonar_id=survey.sonar_id,
-        line_name=survey.line_name,
+        line_name=line_name,
         ping_number=found.ping_number,
         channel=found.side.value,
         time_utc_s=found.time_utc_s,
@@ -63,7 +65,7 @@ def _snippet(survey: Survey, found: Detection, content: str, vehicle_id: str, co
         pixel_along_m=found.pixel_along_m,
         pixel_across_m=found.pixel_across_m,
     )
-    return Snippet(contact=contact, picture=Raster.from_array(cut.image), source=survey.path.name)
+    return Snippet(contact=contact, picture=Raster.from_array(cut.image), source=printable(survey.path.name))
 
 
 def from_picture(path: Path, content: str, vehicle_id: str) -> tuple[Snippet, ...]:
@@ -77,5 +79,5 @@ def from_picture(path: Path, content: str, vehicle_id: str) -> tuple[Snippet, ..
         check_image(picture, str(path))
     except StreamError as error:
         raise SurveyFileError(error.where, error.field, error.value, error.expected) from error
-    contact = Contact(contact_id=f"{path.stem[:80]}-{content[:8]}", vehicle_id=vehicle_id)
-    return (Snippet(contact=contact, picture=Raster.from_array(picture), source=path.name),)
+    contact = Contact(contact_id=f"{printable(path.stem)[:80]}-{content[:8]}", vehicle_id=vehicle_id)
+    return (Snippet(contact=contact, picture=Raster.from_array(picture), source=printable(path.name)),)
