@@ -34,9 +34,10 @@ class CompressorService(Service[CompressorConfig]):
     NAME = "compressor"
 
     def __init__(self, platform: PlatformConfig, config: CompressorConfig) -> None:
-        super().__init__(platform, config)
+        # Before the store is opened: what is wrong with the configuration leaves nothing open behind it.
         tiles = open_catalogue(config.catalogue).tiles
         self._codec: Codec = default_registry().create(config.codec, CodecResources(tiles, config.packing))
+        super().__init__(platform, config)
         log.info("Codec ready", extra=kv(codec=self._codec.name, model=self._codec.model_hash[:16]))
 
     def consumes(self) -> Mapping[str, type[Record]]:

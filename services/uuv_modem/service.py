@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping
 
 import msgpack
+import zenoh
 
 from services.uuv_modem.config import UuvModemConfig
 from sonarpost import keys, wire
@@ -26,6 +27,8 @@ log = logging.getLogger(__name__)
 
 _PROGRESS = "progress"
 _WAIT_S = 0.2
+_LAST_TIME_UTC_S = 0xFFFF_FFFE
+"""The latest second the contact record of the link can name, in the year 2106."""
 
 
 class UuvModemService(ModemService[UuvModemConfig]):
@@ -132,18 +135,29 @@ class UuvModemService(ModemService[UuvModemConfig]):
                 frame_count=len(sent.frames),
                 data=data,
             )
+            self._publish(frame)
+
+    def _publish(self, frame: AcousticFrame) -> None:
+        try:
             key = keys.acoustic_tx(self.platform.id)
             self.session.put(key, wire.encode(frame), encoding=wire.encoding_of(AcousticFrame))
+        except zenoh.ZError as error:
+            # The frame has gone into the water; that nobody could watch must not send it again.
+            log.warning("Frame not shown to observers", extra=kv(error=str(error)))
 
 
 def summary_of(contact: Contact, height_px: int, width_px: int) -> ContactSummary:
-    """Return what of a contact travels by sound, with the size of its picture."""
+    """Return what of a contact travels by sound, with the size of its picture.
+
+    What the record cannot hold travels as unknown: a vehicle's wrong clock must not cost the picture.
+    """
+    time_utc_s = contact.time_utc_s
     return ContactSummary(
         height_px=height_px,
         width_px=width_px,
         lat_deg=contact.lat_deg if contact.lon_deg is not None else None,
         lon_deg=contact.lon_deg if contact.lat_deg is not None else None,
-        time_utc_s=contact.time_utc_s,
+        time_utc_s=time_utc_s if time_utc_s is not None and time_utc_s <= _LAST_TIME_UTC_S else None,
         confidence=contact.atd_confidence,
         heading_deg=contact.heading_deg,
         altitude_m=contact.altitude_m,

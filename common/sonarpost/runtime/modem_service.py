@@ -49,11 +49,12 @@ class ModemService(Service[M]):
     """
 
     def __init__(self, platform: PlatformConfig, config: M) -> None:
-        super().__init__(platform, config)
+        # Before the store is opened: what is wrong with the configuration leaves nothing open behind it.
         self._link = SerialLink(config.port, config.baud)
+        super().__init__(platform, config)
         driver = MicroModem(MicroModemConfig(config.address, reply_timeout_s=config.reply_timeout_s), config.port)
         self.modem = ModemRunner(driver, self._link, self._on_event)
-        self._modem_problem = "the modem has not answered yet"
+        self._modem_problem = f"{config.port}: the modem has not answered yet"
 
     @abstractmethod
     def on_modem_event(self, event: Event) -> None:
