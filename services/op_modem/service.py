@@ -8,11 +8,14 @@ import time
 from collections import deque
 from collections.abc import Mapping
 
+from pydantic import ValidationError
+
 from services.op_modem.config import OpModemConfig
 from sonarpost import keys
 from sonarpost.errors import HandoffError
 from sonarpost.messages import AcousticFrame, LinkQuality, Record
 from sonarpost.modem.events import Event, FrameReceived, PacketReceived
+from sonarpost.modem.rates import RATES
 from sonarpost.modem.statistics import LinkStatistics
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.logs import kv
@@ -24,6 +27,7 @@ log = logging.getLogger(__name__)
 _PACKETS = "packets"
 SAVE_AGAIN_S = 1.0
 MAX_UNSAVED = 10_000
+MAX_FRAMES = 8
 
 
 class OpModemService(ModemService[OpModemConfig]):
@@ -37,7 +41,7 @@ class OpModemService(ModemService[OpModemConfig]):
 
     def __init__(self, platform: PlatformConfig, config: OpModemConfig) -> None:
         super().__init__(platform, config)
-        self._unsaved: deque[tuple[PacketReceived, float]] = deque(maxlen=MAX_UNSAVED)
+        self._unsaved: deque[tuple[PacketReceived, float]] = deque()
         self._lock = threading.Lock()
 
     def handle(self, key: str, record: Record, effects: Effects) -> None:
@@ -49,18 +53,33 @@ class OpModemService(ModemService[OpModemConfig]):
         super().on_start()
         self.spawn(self._save_later, "save")
 
+    def on_stop(self) -> None:
+        """Close the port, and try once more to save what is not on the disk yet."""
+        super().on_stop()
+        self._save()
+        if self._unsaved:
+            log.error("Packets are lost, the disk refused them to the end", extra=kv(packets=len(self._unsaved)))
+
     def on_modem_event(self, event: Event) -> None:
         """Take a packet; its frames come with it."""
         if isinstance(event, PacketReceived):
             self.count("packets_received")
             self.count("frames_received", len(event.frames))
             self.count("frames_bad", event.bad_frames)
-            self._unsaved.append((event, time.time()))
+            self._keep(event, time.time())
             self._save()
 
     def gauges(self) -> Mapping[str, float]:
         """Return how many packets are not on the disk yet."""
         return {**super().gauges(), "unsaved": float(len(self._unsaved))}
+
+    def _keep(self, packet: PacketReceived, heard_utc_s: float) -> None:
+        with self._lock:
+            if len(self._unsaved) >= MAX_UNSAVED:
+                self._unsaved.popleft()
+                self.count("packets_lost")
+                log.error("The oldest unsaved packet is lost", extra=kv(unsaved=len(self._unsaved)))
+            self._unsaved.append((packet, heard_utc_s))
 
     def _save(self) -> None:
         with self._lock:
@@ -84,10 +103,16 @@ class OpModemService(ModemService[OpModemConfig]):
             return
         number = int(self.store.get_state(_PACKETS) or b"0") + 1
         effects = Effects()
+        key = keys.acoustic_rx(self.platform.id)
         for frame in packet.frames:
-            effects.send(
-                keys.acoustic_rx(self.platform.id), "decompressor", self._record(frame, packet, number, heard_utc_s)
-            )
+            try:
+                effects.send(key, "decompressor", self._record(frame, packet, number, heard_utc_s))
+            except ValidationError as error:
+                # No Micro-Modem sends such a frame: a fault on the serial line that its checksum missed.
+                reason = f"frame {frame.frame_number} of {len(frame.data)} bytes: {error.errors()[0]['msg']}"
+                log.error("Frame refused", extra=kv(source=frame.src, reason=reason))
+                effects.keep_apart(key, frame.data, reason)
+                effects.count("frames_refused")
         effects.put_state(_PACKETS, str(number).encode())
         self.commit(effects)
         log.info(
@@ -102,10 +127,10 @@ class OpModemService(ModemService[OpModemConfig]):
             time_utc_s=heard_utc_s,
             source=frame.src,
             destination=frame.dest,
-            rate=frame.rate,
+            rate=frame.rate if frame.rate in RATES else None,
             packet=number,
             frame_number=frame.frame_number,
-            frame_count=packet.nframes,
+            frame_count=_within(packet.nframes, MAX_FRAMES),
             data=frame.data,
             quality=quality_of(packet.statistics),
         )
@@ -121,6 +146,11 @@ def quality_of(statistics: LinkStatistics | None) -> LinkQuality | None:
         spl_db=None if statistics.spl_db is None else float(statistics.spl_db),
         mse_db=statistics.mse_db,
         doppler=statistics.doppler,
-        frames=statistics.nframes,
-        bad_frames=statistics.nbad,
+        frames=_within(statistics.nframes),
+        bad_frames=_within(statistics.nbad),
     )
+
+
+def _within(number: int | None, high: int | None = None) -> int | None:
+    """Return a count the modem has told, None where it is none."""
+    return number if number is not None and number >= 0 and (high is None or number <= high) else None
