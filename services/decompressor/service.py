@@ -19,13 +19,14 @@ from sonarpost.messages import AcousticFrame, ReconstructedImage, Record
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.picture_files import write_picture
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import RETRY_AFTER_S, Effects, Service
 from sonarpost.runtime.store import InboxItem
 
 log = logging.getLogger(__name__)
 
 _RECEIVER = "receiver"
 POLL_S = 0.2
+MEMORY_S = 6 * 3600.0
 
 
 class DecompressorService(Service[DecompressorConfig]):
@@ -41,12 +42,18 @@ class DecompressorService(Service[DecompressorConfig]):
     NAME = "decompressor"
 
     def __init__(self, platform: PlatformConfig, config: DecompressorConfig) -> None:
-        super().__init__(platform, config)
+        # Before the store is opened: what is wrong with the configuration leaves nothing open behind it.
         self._decoder = Decoder(platform.id, config.catalogues)
-        self._receiver = PairingReceiver(config.pairing_timeout_s, memory_s=max(6 * 3600.0, config.pairing_timeout_s))
+        super().__init__(platform, config)
+        self._receiver = self._new_receiver()
+        self._pairing_problem = ""
         # One thread handles frames, another the waiting time; the receiver belongs to whoever holds the lock.
         self._lock = threading.Lock()
         self._in_step = False
+
+    def _new_receiver(self) -> PairingReceiver:
+        timeout_s = self.config.pairing_timeout_s
+        return PairingReceiver(timeout_s, memory_s=max(MEMORY_S, timeout_s))
 
     def consumes(self) -> Mapping[str, type[Record]]:
         """Frames this vessel's modem received."""
@@ -75,6 +82,7 @@ class DecompressorService(Service[DecompressorConfig]):
         """Go back to the last committed state when memory may be ahead of it."""
         if not self._in_step:
             kept = self.store.get_state(_RECEIVER)
+            self._receiver = self._new_receiver()
             if kept is not None:
                 self._receiver.restore(msgpack.unpackb(kept, strict_map_key=False))
         self._in_step = False
@@ -85,10 +93,21 @@ class DecompressorService(Service[DecompressorConfig]):
                 with self._lock:
                     self._poll()
             except (OSError, HandoffError) as error:
-                self.problem(f"{type(error).__name__}: {error}")
-                self.stopping.wait(1.0)
+                # Not `problem`: the thread that handles frames says through it that frames can be handled.
+                self._pairing_problem = f"{type(error).__name__}: {error}"
+                log.exception("Picture not given out, trying again")
+                self.stopping.wait(RETRY_AFTER_S)
+            else:
+                self._pairing_problem = ""
+
+    def trouble(self) -> str:
+        """Return what keeps pictures whose time is up from being given out."""
+        return self._pairing_problem
 
     def _poll(self) -> None:
+        if self.store.inbox_depth():
+            # Frames that came in time may lie in the queue: they are looked at before the waiting ends.
+            return
         self._load()
         effects = Effects()
         events = self._receiver.poll(time.time())
@@ -112,10 +131,13 @@ class DecompressorService(Service[DecompressorConfig]):
         try:
             image = self._decode(event, vehicle)
         except BadInputError as error:
-            effects.count("images_undecodable")
-            body = event.stream if isinstance(event, ImageReady) else b""
-            effects.keep_apart(f"image {vehicle}/{event.image_id}", body, str(error))
             log.error("Image cannot be decoded", extra=kv(image_id=event.image_id, reason=str(error)))
+            self._keep_apart_image(event, vehicle, str(error), effects)
+            return
+        except Exception as error:
+            # A defect of ours would meet the same image again at every start.
+            log.exception("Image not decoded", extra=kv(image_id=event.image_id))
+            self._keep_apart_image(event, vehicle, f"{type(error).__name__}: {error}", effects)
             return
         path, _ = write_picture(self.config.out_dir, image)
         effects.send(keys.image_reconstructed(self.platform.id), "relay", image, priority=5)
@@ -132,6 +154,11 @@ class DecompressorService(Service[DecompressorConfig]):
                 file=path,
             ),
         )
+
+    def _keep_apart_image(self, event: ImageReady | ContactOnly, vehicle: str, reason: str, effects: Effects) -> None:
+        effects.count("images_undecodable")
+        body = event.stream if isinstance(event, ImageReady) else b""
+        effects.keep_apart(f"image {vehicle}/{event.image_id}", body, reason)
 
     def _decode(self, event: ImageReady | ContactOnly, vehicle: str) -> ReconstructedImage:
         if isinstance(event, ContactOnly):
