@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 from collections.abc import Mapping
+
+import zenoh
 
 from services.c2.config import C2Config
 from sonarpost import keys, wire
@@ -13,7 +16,7 @@ from sonarpost.files import write_atomically
 from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.picture_files import write_picture
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Effects, InterruptedByStopError, Service
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +43,10 @@ class C2Service(Service[C2Config]):
     def handle(self, key: str, record: Record, effects: Effects) -> None:
         """Write the record's files and show it."""
         assert isinstance(record, Relayed)
+        expected_key = keys.shore_inbox(record.vessel_id)
+        if key != expected_key:
+            # Access control lets a vessel write under its own key only: no vessel speaks for another.
+            raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
         inner = self._open(record)
         if isinstance(inner, ReconstructedImage):
             self._keep_image(record.vessel_id, inner, effects)
@@ -68,16 +75,38 @@ class C2Service(Service[C2Config]):
             "Picture accepted" if new else "Picture known already",
             extra=kv(vessel=vessel, image_id=image.image_id, version=image.version, file=path),
         )
-        self.session.put(keys.shore_image(vessel), wire.encode(image), encoding=wire.encoding_of(ReconstructedImage))
+        self._show(keys.shore_image(vessel), image)
 
     def _keep_decision(self, vessel: str, decision: Decision, effects: Effects) -> None:
         folder = self.config.out_dir / vessel / "decisions"
         folder.mkdir(parents=True, exist_ok=True)
-        # The identifier is the operator's text: only its hexadecimal form is safe as a file name.
-        path = folder / f"{decision.decision_id.encode().hex()}.json"
+        path = folder / decision_file_name(decision.decision_id)
+        text = (json.dumps(decision.model_dump(), indent=1) + "\n").encode()
         new = not path.is_file()
         if new:
-            write_atomically(path, (json.dumps(decision.model_dump(), indent=1) + "\n").encode())
+            write_atomically(path, text)
+        elif path.read_bytes() != text:
+            expected = f"an identifier that no other decision has ({path})"
+            raise PayloadError(keys.contact_decision(vessel), "decision_id", decision.decision_id, expected)
         effects.count("decisions_stored" if new else "decisions_repeated")
         log.info("Decision accepted", extra=kv(vessel=vessel, image_id=decision.image_id, verdict=decision.verdict))
-        self.session.put(keys.shore_decision(vessel), wire.encode(decision), encoding=wire.encoding_of(Decision))
+        self._show(keys.shore_decision(vessel), decision)
+
+    def _show(self, key: str, record: Record) -> None:
+        try:
+            self.session.put(key, wire.encode(record), encoding=wire.encoding_of(type(record)))
+        except zenoh.ZError as error:
+            if self.stopping.is_set():
+                # The session closed under us: the record is shown after the next start.
+                raise InterruptedByStopError from error
+            log.warning("Record not shown to the shore", extra=kv(key=key, error=str(error)))
+
+
+def decision_file_name(decision_id: str) -> str:
+    """Return the file name of a decision.
+
+    The identifier is the operator's text: only its hexadecimal form is safe as a file name, and of a long one, which
+    no file system would take in that form, its hash.
+    """
+    encoded = decision_id.encode()
+    return f"{encoded.hex()}.json" if len(encoded) <= 64 else f"sha256-{hashlib.sha256(encoded).hexdigest()}.json"

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from services.relay.config import RelayConfig
 from sonarpost import keys, wire
+from sonarpost.errors import PayloadError
 from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
 from sonarpost.runtime.service import Effects, Service
 
@@ -25,6 +26,12 @@ class RelayService(Service[RelayConfig]):
         """Pictures and decisions of this vessel."""
         vessel = self.platform.id
         return {keys.image_reconstructed(vessel): ReconstructedImage, keys.contact_decision(vessel): Decision}
+
+    def check(self, record: Record) -> None:
+        """Refuse another vessel's record, which c2 would refuse in its turn."""
+        assert isinstance(record, (ReconstructedImage, Decision))
+        if record.vessel_id != self.platform.id:
+            raise PayloadError(record.TYPE, "vessel_id", record.vessel_id, self.platform.id)
 
     def handle(self, key: str, record: Record, effects: Effects) -> None:
         """Put the record into an envelope for c2."""
