@@ -326,6 +326,16 @@ def test_ports_that_cannot_be_had_are_named(make: Make, tmp_path: Path):
         make(log_path=tmp_path, tcp_ports=(0, 0))
 
 
+def test_a_log_that_cannot_be_written_ends_the_channel(tmp_path: Path):
+    config = ChannelConfig(sites=SITES, pty_dir=tmp_path / "ports", log_path=Path("/dev/full"))
+    channel = AcousticChannel(config)
+    channel.start()
+    eventually(lambda: channel.failure is not None, what="failure")
+    assert isinstance(channel.failure, PortError)
+    assert list((tmp_path / "ports").iterdir()) == []
+    channel.stop()
+
+
 @pytest.mark.parametrize(
     "config",
     [

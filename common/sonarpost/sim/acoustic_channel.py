@@ -176,6 +176,7 @@ class AcousticChannel:
     # The thread
 
     def _run(self) -> None:
+        failure: Exception | None = None
         try:
             self._write("start", **self._settings())
             while not self._stopping.is_set():
@@ -188,10 +189,12 @@ class AcousticChannel:
             with self._lock:
                 self._finish()
         except Exception as error:
-            self.failure = error
+            failure = error
             log.exception("Acoustic channel failed")
         finally:
             self._close()
+            # Told last: who sees it may count on closed ports.
+            self.failure = failure
 
     def _now_s(self) -> float:
         return self._clock.simulated_s(time.monotonic())

@@ -17,6 +17,7 @@ which the packet had passed the receiver.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections import Counter
@@ -106,7 +107,9 @@ class WaterLog:
     def close(self) -> None:
         """Close the file."""
         if self._file is not None:
-            self._file.close()
+            # Every line was flushed, so closing only fails over a line whose failure `write` has raised already.
+            with contextlib.suppress(OSError):
+                self._file.close()
 
 
 def packet_fields(report: Report, not_heard_because: str | None) -> dict[str, object]:
