@@ -12,12 +12,14 @@ from sonarpost.errors import BadInputError
 
 ROOT = "sonarpost/v1"
 SHORE = "shore"
-_NAME = re.compile(r"^[a-z0-9][a-z0-9_-]{0,39}$")
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}")
 
 
 def _name(field: str, value: str) -> str:
-    if not _NAME.match(value):
-        raise BadInputError("key expression", field, value, "lower-case letters, digits, '-' and '_' (1 to 40)")
+    if not _NAME.fullmatch(value):
+        raise BadInputError(
+            "key expression", field, value, "1 to 40 of a-z, 0-9, '-' and '_', the first a letter or digit"
+        )
     return value
 
 

@@ -12,7 +12,9 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+
+from sonarpost.errors import BadInputError
 
 PlatformId = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")]
 ImageId = Annotated[str, Field(pattern=r"^[0-9A-Z]{4}$")]
@@ -25,6 +27,11 @@ Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Address = Annotated[int, Field(ge=0, le=127)]
+# Not every language has unsigned integers of 64 bits.
+Count = Annotated[int, Field(ge=0, le=2**63 - 1)]
+Ordinal = Annotated[int, Field(ge=1, le=2**63 - 1)]
+# Becomes part of file names, so its characters and its length are bounded.
+RecordId = Annotated[str, Field(pattern=r"^[!-~]{1,64}$")]
 
 Channel = Literal["port", "starboard"]
 Verdict = Literal["mine_like", "not_mine_like", "unsure"]
@@ -51,16 +58,31 @@ class Raster(Record):
     bits: Literal[8, 16]
     data: bytes
 
-    @model_validator(mode="after")
-    def _length_fits(self) -> Raster:
-        expected = self.height_px * self.width_px * self.bits // 8
-        if len(self.data) != expected:
-            raise ValueError(f"data of {expected} bytes for {self.height_px} x {self.width_px} px of {self.bits} bits")
-        return self
+    @field_validator("data")
+    @classmethod
+    def _length_fits(cls, data: bytes, info: ValidationInfo) -> bytes:
+        if not {"height_px", "width_px", "bits"} <= info.data.keys():
+            return data  # one of them is wrong itself, and is what the error is about
+        height_px, width_px, bits = info.data["height_px"], info.data["width_px"], info.data["bits"]
+        expected = height_px * width_px * bits // 8
+        if len(data) != expected:
+            raise ValueError(f"{expected} bytes for {height_px} x {width_px} px of {bits} bits, not {len(data)}")
+        return data
 
     @classmethod
     def from_array(cls, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> Raster:
-        """Make a raster of a two-dimensional uint8 or uint16 array."""
+        """Make a raster of an array.
+
+        Args:
+            image: Shape (height_px, width_px), uint8 or uint16 of any byte order and memory layout.
+
+        Raises:
+            BadInputError: Another shape or type: a cast would change values without a word.
+        """
+        if image.ndim != 2 or image.dtype.kind != "u" or image.dtype.itemsize not in (1, 2):
+            raise BadInputError(
+                "raster", "image", f"{image.dtype} of shape {image.shape}", "rows and columns of uint8 or uint16"
+            )
         bits: Literal[8, 16] = 8 if image.dtype == np.uint8 else 16
         data = image.astype("<u1" if bits == 8 else "<u2").tobytes()
         return cls(height_px=image.shape[0], width_px=image.shape[1], bits=bits, data=data)
@@ -90,7 +112,7 @@ class Contact(Record):
     vehicle_id: PlatformId
     sonar_id: Text | None = None
     line_name: Text | None = None
-    ping_number: Annotated[int, Field(ge=0)] | None = None
+    ping_number: Count | None = None
     channel: Channel | None = None
     time_utc_s: Time | None = None
     lat_deg: Latitude | None = None
@@ -148,8 +170,8 @@ class LinkQuality(Record):
     spl_db: float | None = None
     mse_db: float | None = None
     doppler: float | None = None
-    frames: Annotated[int, Field(ge=0)] | None = None
-    bad_frames: Annotated[int, Field(ge=0)] | None = None
+    frames: Count | None = None
+    bad_frames: Count | None = None
 
 
 class AcousticFrame(Record):
@@ -163,7 +185,7 @@ class AcousticFrame(Record):
     source: Address
     destination: Address
     rate: Annotated[int, Field(ge=0, le=6)] | None
-    packet: Annotated[int, Field(ge=0)]
+    packet: Count
     frame_number: Annotated[int, Field(ge=1, le=8)]
     frame_count: Annotated[int, Field(ge=0, le=8)] | None
     data: Annotated[bytes, Field(max_length=2048)]
@@ -184,7 +206,7 @@ class ReconstructedImage(Record):
     vessel_id: PlatformId
     vehicle_id: PlatformId
     image_id: ImageId
-    version: Annotated[int, Field(ge=1)]
+    version: Ordinal
     contact: Contact | None
     codec: Annotated[str, Field(max_length=40)]
     model: ModelHash
@@ -194,21 +216,30 @@ class ReconstructedImage(Record):
     missing_fraction: Fraction
     missing_mask: bytes
     missing_halves: tuple[Literal["top", "bottom"], ...]
-    bytes_received: Annotated[int, Field(ge=0)]
-    bytes_total: Annotated[int, Field(ge=0)]
-    frames_received: Annotated[int, Field(ge=0)]
+    bytes_received: Count
+    bytes_total: Count
+    frames_received: Count
     first_frame_utc_s: Time
     last_frame_utc_s: Time
     notes: tuple[Text, ...] = ()
 
-    @model_validator(mode="after")
-    def _picture_and_mask_fit(self) -> ReconstructedImage:
-        if self.picture.sha256 != self.picture_sha256:
-            raise ValueError("picture_sha256 of the picture's bytes")
-        size = (self.picture.height_px * self.picture.width_px + 7) // 8
-        if len(self.missing_mask) not in (0, size):
-            raise ValueError(f"missing_mask of 0 or {size} bytes")
-        return self
+    @field_validator("picture_sha256")
+    @classmethod
+    def _is_of_the_picture(cls, sha256: str, info: ValidationInfo) -> str:
+        picture = info.data.get("picture")
+        if isinstance(picture, Raster) and picture.sha256 != sha256:
+            raise ValueError(f"{picture.sha256}, the sha256 of the picture's bytes")
+        return sha256
+
+    @field_validator("missing_mask")
+    @classmethod
+    def _fits_the_picture(cls, mask: bytes, info: ValidationInfo) -> bytes:
+        picture = info.data.get("picture")
+        if isinstance(picture, Raster):
+            size = (picture.height_px * picture.width_px + 7) // 8
+            if len(mask) not in (0, size):
+                raise ValueError(f"0 or {size} bytes, not {len(mask)}")
+        return mask
 
     def missing(self) -> npt.NDArray[np.bool_]:
         """Return the mask of missing pixels, shape (height_px, width_px)."""
@@ -224,11 +255,11 @@ class Decision(Record):
 
     TYPE: ClassVar[str] = "decision"
 
-    decision_id: Annotated[str, Field(min_length=1, max_length=64)]
+    decision_id: RecordId
     vessel_id: PlatformId
     vehicle_id: PlatformId
     image_id: ImageId
-    image_version: Annotated[int, Field(ge=1)]
+    image_version: Ordinal
     verdict: Verdict
     confidence: Fraction | None = None
     mlo_class: Annotated[str, Field(max_length=60)] | None = None
@@ -242,23 +273,29 @@ class Command(Record):
 
     TYPE: ClassVar[str] = "command"
 
-    command_id: Annotated[str, Field(min_length=1, max_length=64)]
+    command_id: RecordId
     kind: CommandKind
     vehicle_id: PlatformId
-    image_id: ImageId | None = None
-    lat_deg: Latitude | None = None
-    lon_deg: Longitude | None = None
+    image_id: Annotated[ImageId | None, Field(validate_default=True)] = None
+    lat_deg: Annotated[Latitude | None, Field(validate_default=True)] = None
+    lon_deg: Annotated[Longitude | None, Field(validate_default=True)] = None
     issued_by: Annotated[str, Field(min_length=1, max_length=120)]
     issued_utc_s: Time
 
-    @model_validator(mode="after")
-    def _kind_has_its_object(self) -> Command:
-        if self.kind == "revisit":
-            if self.lat_deg is None or self.lon_deg is None:
-                raise ValueError("lat_deg and lon_deg for a revisit")
-        elif self.image_id is None:
-            raise ValueError(f"image_id for a {self.kind}")
-        return self
+    @field_validator("image_id")
+    @classmethod
+    def _names_an_image(cls, image_id: str | None, info: ValidationInfo) -> str | None:
+        kind = info.data.get("kind")
+        if image_id is None and kind in ("refine", "resend"):
+            raise ValueError(f"the image to {kind}")
+        return image_id
+
+    @field_validator("lat_deg", "lon_deg")
+    @classmethod
+    def _says_where(cls, degrees: float | None, info: ValidationInfo) -> float | None:
+        if degrees is None and info.data.get("kind") == "revisit":
+            raise ValueError("where to revisit")
+        return degrees
 
 
 class Relayed(Record):
@@ -283,5 +320,5 @@ class Health(Record):
     started_utc_s: Time
     state: ServiceState
     detail: Text = ""
-    counters: dict[str, int]
+    counters: dict[str, Count]
     gauges: dict[str, float]

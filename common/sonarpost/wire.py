@@ -27,7 +27,10 @@ def encoding_of(record_type: type[Record]) -> str:
 
 
 def encode(record: Record) -> bytes:
-    """Return the record as msgpack bytes; equal records give equal bytes."""
+    """Return the record as msgpack bytes: `type`, `v`, then its fields in the order of their definition.
+
+    The same values give the same bytes, on every platform.
+    """
     fields = {"type": record.TYPE, "v": record.VERSION, **record.model_dump()}
     packed: bytes = msgpack.packb(fields, use_bin_type=True)
     return packed
@@ -65,7 +68,8 @@ def decode(record_type: type[R], payload: bytes, where: str) -> R:
     """
     fields = unpack_map(payload, where)
     for name, expected in (("type", record_type.TYPE), ("v", record_type.VERSION)):
-        if fields.get(name) != expected:
+        # 1.0 and true are equal to 1 in Python, and are not what other languages read as a version.
+        if type(fields.get(name)) is not type(expected) or fields[name] != expected:
             raise PayloadError(where, name, fields.get(name), repr(expected))
     try:
         return record_type.model_validate(fields)
@@ -73,11 +77,13 @@ def decode(record_type: type[R], payload: bytes, where: str) -> R:
         first = error.errors(include_url=False)[0]
         field = ".".join(str(part) for part in first["loc"]) or record_type.TYPE
         value = "nothing" if first["type"] == "missing" else first["input"]
-        raise PayloadError(where, field, value, _expected(first["msg"])) from error
+        raise PayloadError(where, field, value, expected_text(first["type"], first["msg"])) from error
 
 
-def _expected(message: str) -> str:
-    """Turn pydantic's sentence into what stands after 'expected'."""
+def expected_text(kind: str, message: str) -> str:
+    """Turn pydantic's kind of error and its sentence into what stands after 'expected'."""
+    if kind == "missing":
+        return "a value"
     for prefix in ("Input should be ", "Value error, "):
         if message.startswith(prefix):
             return message[len(prefix) :]

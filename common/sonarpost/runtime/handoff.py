@@ -50,21 +50,25 @@ class Reply:
         Raises:
             PayloadError: Not a hand-off reply.
         """
-        fields = wire.unpack_map(payload, where)
+        fields = _versioned(payload, where)
         status = fields.get("status")
         next_offset = _integer(fields, "next", where)
         for known in ("stored", "more", "refused", "later"):
             if status == known:
-                return cls(known, next_offset, str(fields.get("reason", "")))
+                return cls(known, next_offset, _reason(fields, where))
         raise PayloadError(where, "status", status, "stored, more, refused or later")
 
 
 def attachment(origin: bytes, item: OutboxItem, offset: int = 0) -> bytes:
-    """Return the attachment that names a record and, in a hand-over query, a piece of it."""
+    """Return the attachment that names a record and, in a hand-over query, a piece of it.
+
+    Sequence numbers run per consumer, so a watcher of a key with two consumers needs the consumer's name as well.
+    """
     packed: bytes = msgpack.packb(
         {
             "v": HANDOFF_VERSION,
             "origin": origin,
+            "consumer": item.consumer,
             "seq": item.seq,
             "size": len(item.payload),
             "sha256": item.sha256,
@@ -80,9 +84,7 @@ def parse_chunk(attached: bytes, data: bytes, where: str) -> Chunk:
     Raises:
         PayloadError: A field is missing, wrong or out of bounds.
     """
-    fields = wire.unpack_map(attached, where)
-    if fields.get("v") != HANDOFF_VERSION:
-        raise PayloadError(where, "v", fields.get("v"), str(HANDOFF_VERSION))
+    fields = _versioned(attached, where)
     chunk = Chunk(
         origin=_binary(fields, "origin", 16, where),
         seq=_integer(fields, "seq", where),
@@ -102,10 +104,24 @@ def parse_chunk(attached: bytes, data: bytes, where: str) -> Chunk:
     return chunk
 
 
+def _versioned(payload: bytes, where: str) -> dict[str, object]:
+    fields = wire.unpack_map(payload, where)
+    if _integer(fields, "v", where) != HANDOFF_VERSION:
+        raise PayloadError(where, "v", fields["v"], str(HANDOFF_VERSION))
+    return fields
+
+
 def _integer(fields: dict[str, object], name: str, where: str) -> int:
     value = fields.get(name)
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 63:
         raise PayloadError(where, name, value, "a whole number from 0")
+    return value
+
+
+def _reason(fields: dict[str, object], where: str) -> str:
+    value = fields.get("reason", "")
+    if not isinstance(value, str):
+        raise PayloadError(where, "reason", value, "text")
     return value
 
 
