@@ -17,6 +17,7 @@ from sonarpost.cli.demo.settings import ChainSettings, free_ports
 from sonarpost.cli.demo.watch import Watcher
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.modem.rates import RATES
+from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.readers import SUPPORTED_SUFFIXES
 from sonarpost.sonar.xtf_writer import write_xtf
@@ -131,9 +132,13 @@ def _deposit(inputs: tuple[Path, ...] | None, settings: ChainSettings, seed: int
     """Put the input where the vehicle polls, as its own recorder would; return how many files."""
     if inputs is None:
         with console.status("simulating a survey of 1000 pings"):
-            simulated = simulate_survey(SurveySpec(seed=seed))
+            simulated = simulate_survey(SurveySpec(seed=seed, seabed=SeabedKind.SAND, targets=6, clutter=6))
         write_xtf(simulated.survey, settings.incoming / f"simulated-{seed}.xtf")
-        console.print(f"simulated survey: {len(simulated.truth)} objects on {len(simulated.survey.pings)} pings")
+        mines = sum(truth.is_mine_like for truth in simulated.truth)
+        console.print(
+            f"simulated survey of {len(simulated.survey.pings)} pings over sand: "
+            f"{mines} mine-like objects, {len(simulated.truth) - mines} others"
+        )
         return 1
     for path in inputs:
         partial = settings.incoming / f".{path.name}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Literal
 
 from rich.console import Console
 from rich.table import Table
@@ -16,6 +17,17 @@ from sonarpost.cli.demo.watch import Watcher
 from sonarpost.codec.interface import Decoded
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.messages import EncodedImage
+
+
+_COLUMNS: tuple[tuple[str, Literal["left", "right"]], ...] = (
+    ("image", "left"),
+    ("ping", "right"),
+    ("conf.", "right"),
+    ("position ashore", "left"),
+    ("bytes", "right"),
+    ("vessel", "left"),
+    ("shore", "left"),
+)
 
 
 def show(watcher: Watcher, settings: ChainSettings, result: Result, console: Console) -> None:
@@ -43,11 +55,10 @@ def _rows(watcher: Watcher, settings: ChainSettings) -> list[SheetRow]:
             else (received.picture.to_array(), received.missing())
             for received in (vessel, shore)
         ]
-        confidence = image.contact.atd_confidence
         rows.append(
             SheetRow(
                 title=f"{image.image_id}  {image.contact.contact_id}",
-                detail=f"{_position(image)}   confidence {'-' if confidence is None else f'{confidence:.2f}'}   "
+                detail=f"{_position(watcher, image)}   confidence {_confidence(image)}   "
                 f"{image.height_px} x {image.width_px} px in {len(image.stream)} B   {_completeness(watcher, image)}",
                 pictures=(
                     snippet.picture.to_array() if snippet else None,
@@ -61,11 +72,19 @@ def _rows(watcher: Watcher, settings: ChainSettings) -> list[SheetRow]:
     return rows
 
 
-def _position(image: EncodedImage) -> str:
-    contact = image.contact
-    if contact.lat_deg is None or contact.lon_deg is None:
-        return "no position"
-    return f"{contact.lat_deg:.6f}, {contact.lon_deg:.6f}"
+def _confidence(image: EncodedImage) -> str:
+    return "-" if image.contact.atd_confidence is None else f"{image.contact.atd_confidence:.2f}"
+
+
+def _position(watcher: Watcher, image: EncodedImage) -> str:
+    """Return the position as the shore knows it."""
+    if image.contact.lat_deg is None:
+        return "no fix"
+    received = watcher.shore.get(image.image_id)
+    contact = received.contact if received else None
+    if contact is None or contact.lat_deg is None or contact.lon_deg is None:
+        return "position not received"
+    return f"{contact.lat_deg:.6f} {contact.lon_deg:.6f}"
 
 
 def _completeness(watcher: Watcher, image: EncodedImage) -> str:
@@ -87,24 +106,20 @@ def _title(settings: ChainSettings, result: Result) -> str:
 
 def _print_table(watcher: Watcher, settings: ChainSettings, console: Console) -> None:
     table = Table(title=f"pictures sent at rate {settings.rate}")
-    for heading in ("image", "contact", "confidence", "position", "bytes", "vessel", "shore"):
-        table.add_column(heading, justify="right" if heading in ("confidence", "bytes") else "left")
+    for heading, justify in _COLUMNS:
+        table.add_column(heading, justify=justify, no_wrap=True)
     for image in watcher.encoded.values():
-        confidence = image.contact.atd_confidence
+        contact = image.contact
         vessel, shore = watcher.vessel.get(image.image_id), watcher.shore.get(image.image_id)
         same = vessel is not None and shore is not None and vessel.picture_sha256 == shore.picture_sha256
         table.add_row(
             image.image_id,
-            image.contact.contact_id,
-            "-" if confidence is None else f"{confidence:.2f}",
-            _position(image),
+            "-" if contact.ping_number is None else f"{contact.ping_number} {(contact.channel or '-')[:4]}",
+            _confidence(image),
+            _position(watcher, image),
             str(len(image.stream)),
-            "-"
-            if vessel is None
-            else "complete"
-            if vessel.complete
-            else f"{100 * vessel.missing_fraction:.0f} % missing",
-            "the same" if same else "-" if shore is None else "other",
+            "-" if vessel is None else "complete" if vessel.complete else f"{100 * vessel.missing_fraction:.0f} % lost",
+            "same" if same else "-" if shore is None else "other",
         )
     console.print(table)
 

@@ -13,6 +13,7 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
 from sonarpost.errors import PayloadError, PortError
+from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_sender import plan_packets
 from sonarpost.messages import AcousticFrame, EncodedImage, Health, ReconstructedImage, Record, Snippet
 from sonarpost.modem.rates import RATES
@@ -131,11 +132,12 @@ class Watcher:
 
     @property
     def packets_planned(self) -> int:
-        """Packets that the images encoded so far take (the contact record never needs one more at these rates)."""
+        """Packets that the images encoded so far take, each with its contact record."""
         rate = RATES[self.settings.rate]
         with self._lock:
             images = tuple(self.encoded.values())
-        return sum(len(plan_packets(i.image_id, i.stream, None, rate.frames, rate.frame_bytes)) for i in images)
+        contact = ContactSummary()
+        return sum(len(plan_packets(i.image_id, i.stream, contact, rate.frames, rate.frame_bytes)) for i in images)
 
     def busy(self, files_expected: int, since_utc_s: float) -> str:
         """Return what still keeps the chain busy, an empty text when nothing does.
