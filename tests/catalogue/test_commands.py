@@ -1,0 +1,203 @@
+"""`sonarpost catalogue`, `sonarpost encode` and `sonarpost decode`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonarpost.catalogue.build import Round
+from sonarpost.catalogue.store import load, load_nominal
+from sonarpost.cli import catalogue, encode
+from sonarpost.codec.quality import psnr_db
+from sonarpost.errors import CatalogueError, ConfigError, SonarpostError, StreamError
+from sonarpost.sonar.image_files import read_image, write_png, write_tiff
+
+Run = Callable[..., int]
+
+
+@pytest.fixture
+def run() -> Run:
+    parser = argparse.ArgumentParser()
+    subparsers = parser.add_subparsers()
+    catalogue.add_parser(subparsers)
+    encode.add_parser(subparsers)
+
+    def go(*arguments: object) -> int:
+        parsed = parser.parse_args([str(argument) for argument in arguments])
+        status: int = parsed.run(parsed)
+        return status
+
+    return go
+
+
+def snippet(seed: int, height_px: int = 60, width_px: int = 45) -> np.ndarray:
+    image = 50 * np.random.default_rng(seed).rayleigh(1.0, (height_px, width_px))
+    image[20:40, 10:20] *= 4
+    image[20:40, 20:40] *= 0.1
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    images = tmp_path / "images"
+    images.mkdir()
+    write_tiff(images / "a.tiff", snippet(0))
+    write_png(images / "b.png", snippet(1, 37, 81))
+    write_tiff(images / "c.tif", snippet(2).astype(np.uint16) * 257)
+    (images / "notes.md").write_text("not an image")
+    return images
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("packing", ["14bit", "2byte", "3byte", "ascii5"])
+def test_a_folder_goes_there_and_back(run: Run, folder: Path, text: bool, packing: str) -> None:
+    assert run("encode", folder, "--packing", packing, *(["--text"] if text else [])) == 0
+    suffix = ".txt" if text else ".vq"
+    streams = sorted(folder.glob(f"*{suffix}"))
+    assert [stream.stem for stream in streams] == ["a", "b", "c"]
+    if text:
+        assert set(streams[0].read_text()) <= set("0123456789abcdef\n")
+    assert run("decode", folder) == 0
+    for name, size in (("a", (60, 45)), ("b", (37, 81)), ("c", (60, 45))):
+        image = read_image(folder / "out" / f"{name}.tiff")
+        assert image.shape == size
+        assert image.dtype == np.uint8
+        assert np.array_equal(read_image(folder / "out" / f"{name}.png"), image)
+    assert psnr_db(snippet(0), read_image(folder / "out" / "a.tiff")) > 14
+    assert not list((folder / "out").glob("*missing*"))
+
+
+def test_one_file_with_another_catalogue_into_a_folder(run: Run, folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "deeper"
+    assert run("encode", folder / "b.png", "--catalogue", "nominal-20", "--out", out) == 0
+    assert [path.name for path in out.iterdir()] == ["b.vq"]
+    # The decoder finds the shipped catalogue by the tag in the stream.
+    assert run("decode", out / "b.vq", "--out", tmp_path / "pictures") == 0
+    assert read_image(tmp_path / "pictures" / "b.tiff").shape == (37, 81)
+    with pytest.raises(StreamError, match="another identity"):
+        run("decode", out / "b.vq", "--catalogue", "nominal-10")
+
+
+def test_bad_files_of_a_folder_are_told_and_counted_and_the_rest_goes_on(
+    run: Run, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "0bad.png").write_bytes(b"\x89PNG\r\n\x1a\n but no more")
+    write_png(folder / "small.png", np.zeros((8, 8), np.uint8))
+    write_png(folder / "a.png", snippet(5))  # the stem of a.tiff: one stream would overwrite the other
+    assert run("encode", folder) == 1
+    told = capsys.readouterr()
+    assert "3 of 6 files done" in told.out
+    for name in ("0bad.png", "small.png", "a.tiff"):
+        assert name in told.err
+    assert sorted(path.name for path in folder.glob("*.vq")) == ["a.vq", "b.vq", "c.vq"]
+    (folder / "a.vq").write_bytes(b"\x10\0")
+    (folder / "d.txt").write_text("xyz")
+    assert run("decode", folder) == 1
+    told = capsys.readouterr()
+    assert "2 of 4 files done" in told.out
+    assert "a.vq" in told.err
+    assert "hexadecimal" in told.err
+
+
+def test_what_is_missing_is_drawn_and_told(run: Run, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run("encode", folder / "a.tiff")
+    stream = folder / "a.vq"
+    stream.write_bytes(stream.read_bytes()[:-20])
+    capsys.readouterr()
+    assert run("decode", stream) == 0
+    assert "missing (white in a.missing.png)" in capsys.readouterr().out
+    mask = read_image(folder / "out" / "a.missing.png")
+    assert set(np.unique(mask).tolist()) == {0, 255}
+    assert not read_image(folder / "out" / "a.tiff")[mask == 255].any()
+
+
+def test_wrong_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Path) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    (tmp_path / "big.vq").write_bytes(bytes(1 << 19))
+    (tmp_path / "file").write_text("")
+    wrong = [
+        ("encode", tmp_path / "absent.png"),
+        ("encode", empty),
+        ("encode", folder / "notes.md"),
+        ("encode", folder / "a.tiff", "--codec", "zip"),
+        ("encode", folder / "a.tiff", "--catalogue", tmp_path / "absent.tiles"),
+        ("encode", folder / "a.tiff", "--budget", 30),
+        ("encode", folder / "a.tiff", "--out", tmp_path / "file" / "x"),
+        ("decode", tmp_path / "absent.vq"),
+        ("decode", tmp_path / "big.vq"),
+        ("decode", folder, "--catalogue", tmp_path / "absent.tiles"),
+        ("catalogue", "info", tmp_path / "file"),
+        ("catalogue", "build", "--images", empty, "--out", tmp_path / "x.tiles"),
+        ("catalogue", "nominal", "--humminbird", empty, "--out", tmp_path),
+    ]
+    for arguments in wrong:
+        with pytest.raises(SonarpostError):
+            run(*arguments)
+    assert not (tmp_path / "x.tiles").exists()
+
+
+def test_the_codecs_are_listed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("encode", "unused", "--codec", "help") == 0
+    assert "vector quantisation" in capsys.readouterr().out
+
+
+def test_info_shows_a_shipped_catalogue(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("catalogue", "info", "nominal-10") == 0
+    shown = capsys.readouterr().out
+    assert load_nominal(10).tiles.identity in shown
+    assert "10 x 10 px" in shown
+    assert run("catalogue") == 0
+    assert "build" in capsys.readouterr().out
+
+
+def test_a_catalogue_is_built_from_a_folder_and_used(run: Run, folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "mine.tiles"
+    (folder / "broken.tif").write_bytes(b"II*\0")
+    assert run("catalogue", "build", "--images", folder, "--tile", 8, "--out", out, "--rounds", "90:8,99:1:2") == 1
+    built = load(out)
+    assert built.notes["images"] == "3"
+    assert built.tiles.tile_px == 8
+    assert not out.with_name("mine.tiles.journal").exists()
+    assert run("encode", folder / "a.tiff", "--catalogue", out) == 0
+    with pytest.raises(CatalogueError, match="the catalogue it was made with"):
+        run("decode", folder / "a.vq")
+    assert run("decode", folder / "a.vq", "--catalogue", out) == 0
+    # The first image's tiles are all in the catalogue, so it comes back as it was.
+    assert np.array_equal(read_image(folder / "out" / "a.tiff"), snippet(0))
+    more = tmp_path / "more.tiles"
+    assert run("catalogue", "build", "--images", folder / "b.png", "--tile", 8, "--out", more, "--core", out) == 0
+    assert np.array_equal(load(more).tiles.tiles[: len(built.tiles)], built.tiles.tiles)
+
+
+def test_a_stopped_build_is_resumed_only_when_asked(run: Run, folder: Path, tmp_path: Path, monkeypatch) -> None:
+    out = tmp_path / "mine.tiles"
+    arguments = ("catalogue", "build", "--images", folder, "--out", out, "--rounds", "90:4", "--refine", 1)
+    assert run(*arguments) == 0
+    expected = out.read_bytes()
+    out.unlink()
+
+    def stop(progress: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(catalogue, "_progress_to", lambda console: stop)
+        with pytest.raises(KeyboardInterrupt):
+            run(*arguments)
+    assert out.with_name("mine.tiles.journal").exists()
+    with pytest.raises(CatalogueError, match="--resume"):
+        run(*arguments)
+    assert run(*arguments, "--resume") == 0
+    assert out.read_bytes() == expected
+
+
+def test_rounds_are_read_in_grey_levels() -> None:
+    assert catalogue.parse_rounds("39:16", 20) == (Round(39.0, 320.0, None),)
+    assert catalogue.parse_rounds("30:40.5:500, 60:8", 10) == (Round(30.0, 405.0, 500), Round(60.0, 80.0, None))
+    for wrong in ("", "39", "39:", "39:16:", "39:16:1.5", "39:-1", "nan:1", "39:16,", "39:16:5:5", "٣٩:16"):
+        with pytest.raises(ConfigError, match="FOM:RMS"):
+            catalogue.parse_rounds(wrong, 10)
