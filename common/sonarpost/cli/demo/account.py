@@ -56,6 +56,8 @@ def read_channel_log(path: Path) -> ChannelAccount:
     seen_packets = set()
     for line in path.read_text(encoding="utf-8").splitlines():
         entry = json.loads(line)
+        if entry.get("event") == "start":
+            seen_packets.clear()  # a restarted emulator counts from 1 again
         if entry.get("event") != "packet" or entry["source"] != UUV_ADDRESS:
             continue
         if entry["packet"] not in seen_packets:

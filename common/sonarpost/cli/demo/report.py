@@ -18,7 +18,6 @@ from sonarpost.codec.interface import Decoded
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.messages import EncodedImage
 
-
 _COLUMNS: tuple[tuple[str, Literal["left", "right"]], ...] = (
     ("image", "left"),
     ("ping", "right"),
