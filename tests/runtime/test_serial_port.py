@@ -4,10 +4,11 @@ import pty
 import queue
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import serial
 
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialLink
@@ -66,6 +67,13 @@ def server() -> Iterator[socket.socket]:
         yield listening
 
 
+def eventually(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s, "did not come true in time"
+        time.sleep(0.005)
+
+
 def links(url: str, **options: float) -> SerialLink:
     return SerialLink(url, first_retry_s=0.02, longest_retry_s=0.1, **options)
 
@@ -90,8 +98,13 @@ def test_pty_carries_bytes_both_ways(cable: Pty) -> None:
     assert not link.is_open
 
 
-def test_unplugged_pty_is_noticed_and_opened_again(cable: Pty, caplog: pytest.LogCaptureFixture) -> None:
+def test_unplugged_pty_is_noticed_and_opened_again(
+    cable: Pty, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     caplog.set_level(logging.INFO, "sonarpost.runtime.serial_port")
+    attempts: list[str] = []
+    make = serial.serial_for_url
+    monkeypatch.setattr(serial, "serial_for_url", lambda url, **options: attempts.append(url) or make(url, **options))
     link = links(str(cable.path))
     heard = Heard(link)
     try:
@@ -106,7 +119,8 @@ def test_unplugged_pty_is_noticed_and_opened_again(cable: Pty, caplog: pytest.Lo
             assert not link.is_open
             with pytest.raises(PortError, match="ttyMODEM"):
                 link.write(b"x")
-            time.sleep(0.3)  # several attempts to open pass
+            attempts.clear()
+            eventually(lambda: len(attempts) >= 3)
             assert link.problem is not None
             assert "No such file" in link.problem
             cable.plug()

@@ -76,7 +76,10 @@ class ModemRunner:
         self._link.start(self._inputs.put)
 
     def stop(self) -> None:
-        """Close the port and end the thread; what was not sent is reported before this returns."""
+        """Close the port and end the thread.
+
+        A packet on its way is reported as failed before this returns; those that wait go after the next `start`.
+        """
         self._link.close()
         self._stopping.set()
         self._inputs.put(None)

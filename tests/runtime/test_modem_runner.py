@@ -1,0 +1,251 @@
+import logging
+import os
+import pty
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sonarpost.errors import FrameError, PortError
+from sonarpost.modem import nmea
+from sonarpost.modem.config import MicroModemConfig
+from sonarpost.modem.events import (
+    ClockConfirmed,
+    Event,
+    FailureReason,
+    FrameReceived,
+    ModemReady,
+    PacketFailed,
+    PacketReceived,
+    PacketSent,
+)
+from sonarpost.modem.micromodem import MicroModem
+from sonarpost.runtime.modem_runner import ModemRunner
+from sonarpost.runtime.serial_port import SerialLink
+
+CONFIG = MicroModemConfig(address=3, settings=())
+
+
+class PtyModem:
+    """A modem on a pseudo-terminal that answers at once; the water takes no time."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.answers = True
+        self.commands: list[nmea.Sentence] = []
+        self.plug()
+
+    def plug(self) -> None:
+        self.master, slave = pty.openpty()
+        tty.setraw(slave)
+        self.path.symlink_to(os.ttyname(slave))
+        os.close(slave)
+        self._plugged = True
+        self._thread = threading.Thread(target=self._serve, args=(self.master,), daemon=True)
+        self._thread.start()
+
+    def unplug(self) -> None:
+        if self._plugged:
+            self._plugged = False
+            self.path.unlink()
+            os.close(self.master)
+            self._thread.join(5.0)
+
+    def say(self, kind: str, *fields: str | int) -> None:
+        os.write(self.master, nmea.format(kind, *fields))
+
+    def _serve(self, master: int) -> None:
+        lines = nmea.LineAssembler()
+        os.set_blocking(master, False)
+        while self._plugged:
+            try:
+                items = lines.feed(os.read(master, 4096))
+            except BlockingIOError:
+                time.sleep(0.002)
+                continue
+            except OSError:
+                # Nobody has the other side open, or the cable is out.
+                time.sleep(0.002)
+                continue
+            for sentence in items:
+                assert isinstance(sentence, nmea.Sentence)
+                self.commands.append(sentence)
+                if self.answers:
+                    self._answer(*([sentence.kind, *sentence.fields]))
+
+    def _answer(self, kind: str, *fields: str) -> None:
+        if kind == "CCCFG":
+            self.say("CACFG", *fields)
+        elif kind == "CCCFQ":
+            self.say("CACFG", fields[0], {"SRC": 3, "CST": 1}[fields[0]])
+        elif kind == "CCCLK":
+            self.say("CACLK", *fields)
+        elif kind == "CCCYC":
+            self.say("CACYC", *fields)
+            self.say("CADRQ", "000000", *fields[1:3], fields[4], 256, 1)
+        elif kind == "CCTXD":
+            size = len(fields[3]) // 2
+            self.say("CATXD", *fields[:3], size)
+            self.say("CATXP", size)
+            self.say("CATXF", size)
+            self.say("CAXST", 7, "20250606", "230117.336548")
+
+
+class Rig:
+    def __init__(self, modem: PtyModem) -> None:
+        self.modem = modem
+        self.events: list[Event] = []
+        self.link = SerialLink(str(modem.path), first_retry_s=0.02, longest_retry_s=0.1)
+        self.runner = ModemRunner(MicroModem(CONFIG), self.link, self.events.append)
+
+    def of(self, *kinds: type) -> list[Event]:
+        return [event for event in self.events if isinstance(event, kinds)]
+
+
+def eventually(condition: Callable[[], object], timeout_s: float = 10.0) -> None:
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s, "did not come true in time"
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    modem = PtyModem(tmp_path / "ttyMODEM")
+    rig = Rig(modem)
+    rig.runner.start()
+    yield rig
+    rig.runner.stop()
+    modem.unplug()
+
+
+def test_configures_sends_and_receives(rig: Rig) -> None:
+    eventually(lambda: rig.runner.ready)
+    assert rig.events == [ModemReady(3, None)]
+    packet_id = rig.runner.send_packet(1, 4, [b"snippet"])
+    eventually(lambda: rig.of(PacketSent))
+    (sent,) = rig.of(PacketSent)
+    assert (sent.packet_id, sent.frames) == (packet_id, (b"snippet",))
+    assert rig.modem.commands[-1].fields == ("3", "1", "0", b"snippet".hex().upper())
+    assert rig.runner.queued == 0
+    rig.modem.say("CARXP", 1)
+    rig.modem.say("CARXD", 1, 3, 0, 1, "00FF")
+    rig.modem.say("CACST", 8, 0)
+    eventually(lambda: rig.of(PacketReceived))
+    assert [event.data for event in rig.of(FrameReceived)] == [b"\x00\xff"]
+
+
+def test_clock_is_set_through_the_runner(rig: Rig) -> None:
+    eventually(lambda: rig.runner.ready)
+    utc = datetime(2016, 10, 12, 9, 0, 5, tzinfo=UTC)
+    assert rig.runner.set_clock(utc)
+    eventually(lambda: rig.of(ClockConfirmed))
+
+
+def test_wrong_packet_is_refused_in_the_caller(rig: Rig) -> None:
+    with pytest.raises(FrameError):
+        rig.runner.send_packet(1, 9, [b"x"])
+
+
+def test_packets_from_many_threads_all_go(rig: Rig) -> None:
+    eventually(lambda: rig.runner.ready)
+    ids: list[int] = []
+
+    def sender(number: int) -> None:
+        for n in range(4):
+            while rig.runner.queued > 4:
+                time.sleep(0.002)
+            ids.append(rig.runner.send_packet(1, 4, [bytes([number, n])]))
+
+    threads = [threading.Thread(target=sender, args=(n,)) for n in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    eventually(lambda: len(rig.of(PacketSent, PacketFailed)) == 16)
+    assert sorted(event.packet_id for event in rig.of(PacketSent)) == sorted(ids)
+    assert len(set(ids)) == 16
+
+
+def test_unplugged_in_the_middle_of_a_cycle_and_plugged_in_again(rig: Rig) -> None:
+    eventually(lambda: rig.runner.ready)
+    rig.modem.answers = False
+    first, second = rig.runner.send_packet(1, 4, [b"first"]), rig.runner.send_packet(1, 4, [b"second"])
+    eventually(lambda: any(s.kind == "CCCYC" for s in rig.modem.commands))
+    rig.modem.unplug()
+    eventually(lambda: rig.of(PacketFailed))
+    (failed,) = rig.of(PacketFailed)
+    assert (failed.packet_id, failed.reason) == (first, FailureReason.PORT_LOST)
+    assert not rig.runner.ready
+    rig.modem.answers = True
+    rig.modem.plug()
+    eventually(lambda: rig.of(PacketSent))
+    assert [event.packet_id for event in rig.of(PacketSent)] == [second]
+    assert len(rig.of(ModemReady)) == 2
+
+
+def test_callback_may_send_and_may_fail(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    modem = PtyModem(tmp_path / "ttyMODEM")
+    sent: list[int] = []
+
+    def fail() -> None:
+        raise RuntimeError("a careless consumer")
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, ModemReady):
+            runner.send_packet(1, 4, [b"from the callback"])
+            fail()
+        if isinstance(event, PacketSent):
+            sent.append(event.packet_id)
+
+    runner = ModemRunner(MicroModem(CONFIG), SerialLink(str(modem.path)), on_event)
+    with caplog.at_level(logging.ERROR):
+        runner.start()
+        eventually(lambda: sent)
+    runner.stop()
+    modem.unplug()
+    (record,) = caplog.records
+    assert "ModemReady was not handled" in record.getMessage()
+
+
+def test_stop_is_quick_and_tells_what_did_not_go(tmp_path: Path) -> None:
+    modem = PtyModem(tmp_path / "ttyMODEM")
+    rig = Rig(modem)
+    rig.runner.start()
+    with pytest.raises(PortError, match="already started"):
+        rig.runner.start()
+    eventually(lambda: rig.runner.ready)
+    modem.answers = False
+    packet_id = rig.runner.send_packet(1, 4, [b"x"])
+    eventually(lambda: any(s.kind == "CCCYC" for s in modem.commands))
+    begun_s = time.monotonic()
+    rig.runner.stop()
+    assert time.monotonic() - begun_s < 2.0
+    assert [(event.packet_id, event.reason) for event in rig.of(PacketFailed)] == [(packet_id, FailureReason.PORT_LOST)]
+    assert not any(thread.name.endswith("ttyMODEM") for thread in threading.enumerate())
+    rig.runner.stop()
+    modem.unplug()
+
+
+def test_timers_run_without_a_byte_from_the_port(tmp_path: Path) -> None:
+    """A clock that runs fifty times faster: the silent modem is asked again and again."""
+    modem = PtyModem(tmp_path / "ttyMODEM")
+    modem.answers = False
+    events: list[Event] = []
+    runner = ModemRunner(
+        MicroModem(CONFIG),
+        SerialLink(str(modem.path)),
+        events.append,
+        clock=lambda: 50.0 * time.monotonic(),
+        longest_wait_s=0.02,
+    )
+    runner.start()
+    eventually(lambda: events)
+    runner.stop()
+    modem.unplug()
+    assert [s.fields for s in modem.commands[:3]] == [("SRC", "3")] * 3
+    assert events[0].attempts == 3
