@@ -192,6 +192,14 @@ def test_a_small_accuracy_never_looks_better_than_the_first_step() -> None:
     assert contact.position_sigma_m == pytest.approx(0.1)
 
 
+def test_the_last_bit_of_a_logarithm_does_not_round_an_accuracy_up() -> None:
+    for code in range(255):
+        value = 0.1 * 2 ** (code / 16)
+        for near in (value, math.nextafter(value, 0), math.nextafter(value, math.inf), value * (1 + 1e-13)):
+            packed = ContactSummary(lat_deg=1, lon_deg=2, position_sigma_m=near).pack()
+            assert packed[24] == code
+
+
 @pytest.mark.parametrize("length", [0, RECORD_SIZE - 1, RECORD_SIZE + 1])
 def test_another_length_is_refused(length: int) -> None:
     with pytest.raises(FrameError, match="25 bytes"):

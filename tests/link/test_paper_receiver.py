@@ -152,6 +152,15 @@ def test_a_contact_frame_pushes_nothing_out(image_ids: list[str]) -> None:
     assert [e for i in image_ids for e in receiver.accept(2, contact(i), 1)] == []
 
 
+def test_a_half_of_another_image_leaves_a_contact_record_waiting_for_its_picture() -> None:
+    receiver = PairingReceiver(60)
+    receiver.accept(2, contact("00A7"), 0)
+    assert receiver.accept(2, half("top", "00A8"), 1) == []
+    (event,) = receiver.poll(60)
+    assert isinstance(event, ContactOnly)
+    assert event.image_id == "00A7"
+
+
 def test_a_second_different_contact_record_is_counted_and_the_first_stays() -> None:
     receiver = PairingReceiver(60)
     other = dataclasses.replace(CONTACT, lat_deg=45.0)
@@ -185,6 +194,16 @@ def test_the_checked_contact_record_decides_between_stream_headers() -> None:
     (event,) = images(receiver.poll(63))
     assert event.header == HEADER
     assert event.frames == 1
+
+
+def test_more_frames_outvote_more_bytes() -> None:
+    wrong = StreamHeader(1, 0xBEEF, 113, 48, 9)
+    receiver = PairingReceiver(60)
+    receiver.accept(2, half("top", header=wrong), 0)
+    receiver.accept(2, piece(0, 1), 1)
+    receiver.accept(2, piece(1, 2), 2)
+    (event,) = images(receiver.poll(62))
+    assert (event.header, event.received) == (HEADER, ((0, 2),))
 
 
 def test_a_header_outvoted_after_it_was_given_out_is_corrected_by_a_new_version() -> None:
@@ -242,6 +261,25 @@ def test_a_clock_that_is_set_back_does_not_hold_an_image() -> None:
     assert receiver.poll(500) == []
     assert receiver.next_deadline() == 560
     assert len(images(receiver.poll(560))) == 1
+
+
+def test_a_clock_that_was_set_back_stays_so_over_a_restart() -> None:
+    receiver = PairingReceiver(60)
+    receiver.accept(2, half("top"), 1_000_000)
+    receiver.poll(500)
+    other = PairingReceiver(60)
+    other.restore(receiver.snapshot())
+    assert other.next_deadline() == 560
+
+
+def test_a_clock_that_is_set_back_does_not_make_the_memory_longer() -> None:
+    receiver = PairingReceiver(60, memory_s=3600)
+    receiver.accept(2, half("top"), 1_000_000)
+    receiver.accept(2, half("bottom"), 1_000_000)
+    receiver.poll(500)
+    receiver.accept(2, half("top"), 4101)
+    (event,) = images(receiver.accept(2, half("bottom"), 4102))
+    assert event.version == 1
 
 
 def test_memory_is_bounded_and_nothing_is_dropped_unsaid() -> None:

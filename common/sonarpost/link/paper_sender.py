@@ -112,11 +112,9 @@ def _group(top: Packet, bottom: Packet, frames_per_packet: int, *, with_contact:
     apart = tuple(half for half in (top, bottom) if half)
     if max(len(top), len(bottom)) <= frames_per_packet:
         return apart
-    extra = 1 if with_contact else 0
     packets_apart = sum(_packets(len(half), frames_per_packet) for half in apart)
-    if with_contact and all(len(half) % frames_per_packet == 0 for half in apart):
-        packets_apart += 1
-    together = _packets(len(top) + len(bottom) + extra, frames_per_packet)
+    # The contact record's frame counts here: where it alone would fill a packet, apart is no worse.
+    together = _packets(len(top) + len(bottom) + (1 if with_contact else 0), frames_per_packet)
     return (top + bottom,) if together < packets_apart else apart
 
 
