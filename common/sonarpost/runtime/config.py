@@ -7,17 +7,19 @@ what compose files set); its text is read as a TOML value, or as a plain string 
 
 from __future__ import annotations
 
-import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import to_json
 
 from sonarpost.errors import ConfigError
 from sonarpost.messages import PlatformId
 from sonarpost.runtime.logs import LogFormat
+from sonarpost.runtime.toml_lines import key_lines
+from sonarpost.wire import expected_text
 
 ENVIRONMENT_PREFIX = "SONARPOST_"
 
@@ -74,43 +76,41 @@ def load(path: Path, service: str, model: type[C], environment: Mapping[str, str
     """
     try:
         text = path.read_text(encoding="utf-8")
-        tables: dict[str, object] = tomllib.loads(text)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(str(path), "", str(error), "a readable TOML file") from error
-    except tomllib.TOMLDecodeError as error:
+    try:
+        tables: dict[str, object] = tomllib.loads(text)
+        source = _Source(path, text)
+    except (ValueError, RecursionError) as error:
+        # Besides its own error tomllib lets through what endless digits and brackets lead to.
         raise ConfigError(str(path), "", str(error), "valid TOML") from error
-    source = _Source(path, text)
     for name, table in tables.items():
         if name not in ("platform", *SERVICES):
-            raise source.error(name, "", "an unknown table", "platform, " + ", ".join(SERVICES))
+            raise source.error((name,), "an unknown table", "platform, " + ", ".join(SERVICES))
         if not isinstance(table, dict):
-            raise source.error("", name, table, f"a table [{name}]")
+            raise source.error((name,), table, f"a table [{name}]")
     overrides = _overrides(environment)
     platform = _validated(PlatformConfig, "platform", tables, overrides, source)
     return platform, _validated(model, service, tables, overrides, source)
 
 
 class _Source:
-    """Finds the line of a key in the file, for error messages."""
+    """Names the file and the line of a key in errors."""
 
     def __init__(self, path: Path, text: str) -> None:
         self._path = path
-        self._lines = text.splitlines()
+        self._lines = key_lines(text)
 
-    def error(self, table: str, key: str, value: object, expected: str) -> ConfigError:
-        where = f"{self._path}:{line}" if (line := self._line(table, key)) else str(self._path)
-        return ConfigError(where, ".".join(part for part in (table, key) if part), value, expected)
+    def error(self, names: Sequence[str], value: object, expected: str) -> ConfigError:
+        where = f"{self._path}:{line}" if (line := self._line(names)) else str(self._path)
+        return ConfigError(where, ".".join(names), value, expected)
 
-    def _line(self, table: str, key: str) -> int | None:
-        current, table_line = "", None
-        wanted = key.split(".", maxsplit=1)[0]
-        for number, line in enumerate(self._lines, start=1):
-            if header := re.match(r"\s*\[+\s*\"?([\w-]+)", line):
-                current = header.group(1)
-                table_line = number if current == table else table_line
-            elif current == table and wanted and re.match(rf"\s*\"?{re.escape(wanted)}\"?\s*[=.]", line):
-                return number
-        return table_line
+    def _line(self, names: Sequence[str]) -> int | None:
+        """Return the line of a key or, where it is not written, of the nearest table around it."""
+        for length in range(len(names), 0, -1):
+            if (line := self._lines.get(tuple(names[:length]))) is not None:
+                return line
+        return None
 
 
 def _overrides(environment: Mapping[str, str]) -> dict[str, dict[str, object]]:
@@ -118,8 +118,8 @@ def _overrides(environment: Mapping[str, str]) -> dict[str, dict[str, object]]:
     for name, text in environment.items():
         if not name.startswith(ENVIRONMENT_PREFIX) or "__" not in name:
             continue
-        table, key = name[len(ENVIRONMENT_PREFIX) :].lower().split("__", 1)
-        if table not in ("platform", *SERVICES):
+        table, _, key = name[len(ENVIRONMENT_PREFIX) :].lower().partition("__")
+        if not key or table not in ("platform", *SERVICES):
             raise ConfigError("environment", name, text, "SONARPOST_{platform or a service's name}__{KEY}")
         found.setdefault(table, {})[key] = _toml_value(text)
     return found
@@ -127,9 +127,11 @@ def _overrides(environment: Mapping[str, str]) -> dict[str, dict[str, object]]:
 
 def _toml_value(text: str) -> object:
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        parsed = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
         return text
+    # A text of several lines may look like more keys; it is one value all the same.
+    return parsed["value"] if len(parsed) == 1 else text
 
 
 def _validated(
@@ -143,15 +145,22 @@ def _validated(
     assert isinstance(written, dict)
     extra = overrides.get(table, {})
     try:
-        return model.model_validate({**written, **extra})
+        # As JSON, because pydantic's strictness (no "5" for 5, no true for 1) is made for the types that JSON has.
+        return model.model_validate_json(to_json({**written, **extra}), strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
+        names = [str(part) for part in first["loc"] if part != "[key]"]
         value = "nothing" if first["type"] == "missing" else first["input"]
-        expected = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+        expected = expected_text(first["type"], first["msg"])
         if first["type"] == "extra_forbidden":
-            value, expected = "an unknown key", "one of: " + ", ".join(sorted(model.model_fields))
-        if key.split(".")[0] in extra:
-            name = f"{ENVIRONMENT_PREFIX}{table.upper()}__{key.split('.', maxsplit=1)[0].upper()}"
+            value, expected = "an unknown key", _known_keys(model, names)
+        if names and names[0] in extra:
+            name = f"{ENVIRONMENT_PREFIX}{table.upper()}__{names[0].upper()}"
             raise ConfigError("environment", name, value, expected) from error
-        raise source.error(table, key, value, expected) from error
+        raise source.error((table, *names), value, expected) from error
+
+
+def _known_keys(model: type[ServiceConfig], names: Sequence[str]) -> str:
+    if len(names) != 1:
+        return "a key that this table has"
+    return "one of: " + ", ".join(sorted(model.model_fields)) if model.model_fields else "no keys in this table"

@@ -31,12 +31,18 @@ class TextFormatter(logging.Formatter):
         """Return the line."""
         fields = getattr(record, "fields", {})
         pairs = "".join(f" {name}={_shown(value)}" for name, value in fields.items())
-        line = f"{_time_text(record)} {record.levelname} {self._service}: {record.getMessage()}{pairs}"
-        return line if record.exc_info is None else f"{line}\n{self.formatException(record.exc_info)}"
+        message = record.getMessage()
+        if not message.isprintable():
+            message = json.dumps(message)[1:-1]
+        line = f"{_time_text(record)} {record.levelname} {self._service}: {message}{pairs}"
+        return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line: time, level, service, message, then the event's fields."""
+    """One JSON object a line: time, level, service, message, then the event's fields.
+
+    A field of one of those four names gets an underscore behind it.
+    """
 
     def __init__(self, service: str) -> None:
         super().__init__()
@@ -50,15 +56,26 @@ class JsonFormatter(logging.Formatter):
             "service": self._service,
             "message": record.getMessage(),
         }
-        event.update(getattr(record, "fields", {}))
-        if record.exc_info is not None:
+        for name, value in getattr(record, "fields", {}).items():
+            event[f"{name}_" if name in event else name] = _jsonable(value)
+        if record.exc_info:
             event["traceback"] = self.formatException(record.exc_info)
-        return json.dumps(event, default=str)
+        return json.dumps(event)
+
+
+def _jsonable(value: object) -> object:
+    """Return what JSON can say of a value: its text where it has no type for it (NaN and infinity among those)."""
+    try:
+        json.dumps(value, allow_nan=False)
+    except (ValueError, TypeError):
+        return str(value)
+    return value
 
 
 def _shown(value: object) -> str:
     text = value if isinstance(value, str) else f"{value:.6g}" if isinstance(value, float) else str(value)
-    return json.dumps(text) if not text or any(c in text for c in " \"'=\n\r\t") else text
+    # What came from outside may hold ends of line or a terminal's control characters.
+    return json.dumps(text) if not text.isprintable() or not text or any(c in text for c in " \"'=") else text
 
 
 def set_up(service: str, level: str = "info", log_format: LogFormat = "text") -> None:
