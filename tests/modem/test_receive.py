@@ -293,3 +293,37 @@ def test_no_frame_is_ever_lost_or_given_twice(script: list[int], data: st.DataOb
     assert frames_of(modem) == given_frames
     assert [f.data for packet in modem.of(PacketReceived) for f in packet.frames] == given_frames
     assert not modem.driver.receiving
+
+
+def test_slow_serial_line_does_not_tear_a_packet() -> None:
+    """Eight full frames in hex take seconds at 19200 baud, after the air time is over."""
+    modem = ready()
+    for step in packet_steps(modem)[:2]:
+        step()
+    modem.run(5.0 + CONFIG.on_air_limit_s(4) - 0.1)
+    modem.say("CARXD", 3, 1, 0, 1, "AA")
+    modem.run(modem.now + CONFIG.statistics_timeout_s - 0.1)
+    modem.say("CARXD", 3, 1, 0, 2, "BB")
+    modem.run(modem.now + CONFIG.statistics_timeout_s - 0.1)
+    assert modem.events == []
+    cst(modem)
+    assert modem.of(PacketReceived)[0].complete
+
+
+def test_damage_alone_is_told_when_nothing_else_comes() -> None:
+    modem = ready()
+    modem.say("CAMSG", "BAD_CRC", 1)
+    modem.run(30.0)
+    (packet,) = modem.events
+    assert (packet.frames, packet.bad_frames, packet.nframes, packet.complete) == ((), 1, None, False)
+
+
+def test_announcement_of_the_next_packet_ends_the_one_before() -> None:
+    modem = ready()
+    modem.say("CACYC", 0, 3, 1, 4, 0, 2)
+    modem.say("CARXD", 3, 1, 0, 1, "AA")
+    modem.say("CACYC", 0, 3, 1, 4, 0, 2)
+    modem.say("CARXD", 3, 1, 0, 2, "BB")
+    cst(modem)
+    assert [[f.data for f in packet.frames] for packet in modem.of(PacketReceived)] == [[b"\xaa"], [b"\xbb"]]
+    assert [packet.complete for packet in modem.of(PacketReceived)] == [False, False]

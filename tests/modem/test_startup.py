@@ -284,3 +284,15 @@ def test_scaled_configuration_changes_times_only() -> None:
     assert fast.airtime_s(1) == pytest.approx(0.31)
     assert fast.reply_timeout_s == pytest.approx(0.5)
     assert (fast.tries, fast.queued_packets, fast.airtime_margin) == (3, 8, 1.5)
+
+
+def test_every_outage_is_reported() -> None:
+    modem = started()
+    for outage in range(3):
+        modem.run(modem.now + 10.0)
+        modem.dead = True
+        modem.run(modem.now + 200.0)
+        assert len(modem.of(ModemUnresponsive)) == outage + 1
+        modem.dead = False
+        modem.run(modem.now + 100.0)
+        assert modem.driver.ready

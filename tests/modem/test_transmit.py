@@ -382,3 +382,32 @@ def test_whatever_is_lost_every_packet_has_one_outcome_and_the_last_goes(lost: l
     assert modem.events[-1].packet_id == last
     assert isinstance(modem.events[-1], PacketSent)
     assert modem.driver.ready
+
+
+def test_address_lost_in_the_middle_of_a_cycle() -> None:
+    """A restart whose INIT was lost shows itself by the factory address."""
+    modem = ready()
+    first, second = send(modem, FIRST), send(modem, SECOND)
+    modem.run(6.0)
+    modem._cycle, modem._due = None, []
+    modem.say("CACFG", "SRC", 0)
+    assert [(e.packet_id, e.reason) for e in modem.of(PacketFailed)] == [(first, FailureReason.REBOOTED)]
+    modem.run(30.0)
+    assert [event.packet_id for event in modem.of(PacketSent)] == [second]
+
+
+def test_rate_0_is_given_the_time_its_announcement_takes() -> None:
+    modem = ready(lambda sentence, _: sentence.kind in {"CADRQ", "CAERR"})
+    send(modem, [b"x"], 0)
+    modem.run(5.0 + CONFIG.request_timeout_s + CONFIG.airtime_s(0))
+    assert modem.events == []
+    modem.say("CACFG", "X", 1)
+    modem.run(40.0)
+    assert [event.reason for event in modem.of(PacketFailed)] == [FailureReason.NO_DATA_REQUEST]
+
+
+def test_late_echo_of_our_own_command_is_no_reception() -> None:
+    modem = ready()
+    modem.say("CACYC", 0, 3, 1, 4, 0, 2)
+    assert [type(event) for event in modem.events] == [OtherSentence]
+    assert not modem.driver.receiving
