@@ -77,53 +77,60 @@ class AtdStubService(Service[AtdStubConfig]):
             if self.stopping.is_set():
                 return
             try:
-                self._process(seen)
+                finished = self._process(seen)
             except OSError as error:
                 # Told when the files behind it have had their turn; it is tried again at the next look.
                 unreadable = unreadable or error
                 continue
-            self._dealt_with.add(seen)
-            self._waiting -= 1
+            if finished:
+                self._dealt_with.add(seen)
+                self._waiting -= 1
         if unreadable is not None:
             raise unreadable
 
-    def _process(self, seen: FileSeen) -> None:
+    def _process(self, seen: FileSeen) -> bool:
+        """Deal with a file; False when it went away or changed meanwhile and is to be looked at again."""
         try:
             content = content_hash(seen.path)
         except FileNotFoundError:
-            return
+            return False
         if (kept := self.store.get_state(_state_name(content))) is not None:
             self._meet_again(seen.path, content, kept)
-            return
+            return True
+        return self._detect(seen.path, content)
+
+    def _detect(self, path: Path, content: str) -> bool:
         started = time.perf_counter()
         try:
-            found = self._snippets(seen.path, content)
+            found = self._snippets(path, content)
         except SurveyFileError as error:
             # A file that went away or changed while it was read says nothing about the content that was meant.
-            if _is_still(seen.path, content):
-                self._quarantine(seen.path, content, str(error))
-            return
+            if not _is_still(path, content):
+                return False
+            self._quarantine(path, content, str(error))
+            return True
         except (OSError, HandoffError):
             raise
         except Exception as error:
             # A defect of ours must not stop the files behind this one.
-            log.exception("File not processed", extra=kv(file=seen.path.name))
-            self._quarantine(seen.path, content, f"{type(error).__name__}: {error}")
-            return
-        if not _is_still(seen.path, content):
-            log.warning("File changed while it was read, looking again later", extra=kv(file=seen.path.name))
-            return
+            log.exception("File not processed", extra=kv(file=path.name))
+            self._quarantine(path, content, f"{type(error).__name__}: {error}")
+            return True
+        if not _is_still(path, content):
+            log.warning("File changed while it was read, looking again later", extra=kv(file=path.name))
+            return False
+        self._hand_on(path, content, found, round(time.perf_counter() - started, 2))
+        return True
+
+    def _hand_on(self, path: Path, content: str, found: tuple[Snippet, ...], seconds: float) -> None:
         effects = Effects()
         for snippet in found:
             effects.send(keys.contact_detected(self.platform.id), "compressor", snippet)
-        effects.put_state(
-            _state_name(content), msgpack.packb({"file": printable(seen.path.name), "contacts": len(found)})
-        )
+        effects.put_state(_state_name(content), msgpack.packb({"file": printable(path.name), "contacts": len(found)}))
         effects.count("files_processed")
         effects.count("contacts_detected", len(found))
         self.commit(effects)
-        seconds = round(time.perf_counter() - started, 2)
-        log.info("File processed", extra=kv(file=seen.path.name, contacts=len(found), seconds=seconds))
+        log.info("File processed", extra=kv(file=path.name, contacts=len(found), seconds=seconds))
 
     def _snippets(self, path: Path, content: str) -> tuple[Snippet, ...]:
         if self.config.mode == "snippets":
