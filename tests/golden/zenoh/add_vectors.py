@@ -1,0 +1,80 @@
+"""Adds golden vectors of the Zenoh wire: `python tests/golden/zenoh/add_vectors.py` from the repository root.
+
+A vector says what bytes a record had when the vector was made. Programs of that time are still out there, so a vector
+is never changed or removed: this script adds those of `samples.py` and `handoff_samples()` that are not there yet, and
+stops when one that is there would come out otherwise. When a record gains a field, give the sample a new name.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import msgpack
+
+FOLDER = Path(__file__).resolve().parent
+sys.path.insert(0, str(FOLDER.parents[1]))
+
+from golden.zenoh.samples import SAMPLES  # noqa: E402  # the line above makes it importable
+
+from sonarpost import wire  # noqa: E402
+from sonarpost.runtime.handoff import Reply, attachment  # noqa: E402
+from sonarpost.runtime.store import OutboxItem  # noqa: E402
+
+
+def plain(value: object) -> object:
+    """Return a msgpack value as JSON can hold it: bytes become {"$hex": "…"}."""
+    if isinstance(value, bytes):
+        return {"$hex": value.hex()}
+    if isinstance(value, dict):
+        return {name: plain(inner) for name, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(inner) for inner in value]
+    return value
+
+
+def handoff_samples() -> dict[str, dict[str, bytes]]:
+    """Return attachments and replies by file and name."""
+    item = OutboxItem("c2", 7, "k", "", 4, b"\x80", bytes.fromhex("11" * 32))
+    large = OutboxItem("relay", 2**40, "k", "", 4, b"\x00" * 100_000, bytes.fromhex("22" * 32))
+    return {
+        "handoff-attachment": {
+            "first-piece": attachment(bytes(range(16)), item),
+            "second-piece": attachment(bytes(range(16)), large, 32768),
+        },
+        "handoff-reply": {
+            "stored": Reply("stored").pack(),
+            "more": Reply("more", next_offset=65536).pack(),
+            "refused": Reply("refused", reason="k: v: got 2, expected 1").pack(),
+            "later": Reply("later", reason="disk is full").pack(),
+        },
+    }
+
+
+def add(path: Path, name: str, payload: bytes) -> bool:
+    """Add one vector to its file; tell whether it was new."""
+    vectors = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    vector = {"hex": payload.hex(), "fields": plain(msgpack.unpackb(payload))}
+    if name in vectors:
+        if vectors[name] != vector:
+            raise SystemExit(f"{path.name}: {name} would change; give the new one another name")
+        return False
+    vectors[name] = vector
+    path.write_text(json.dumps(vectors, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return True
+
+
+def main() -> None:
+    """Add what is missing."""
+    added = 0
+    for name, record in SAMPLES.items():
+        added += add(FOLDER / f"{record.TYPE}.json", name, wire.encode(record))
+    for file, payloads in handoff_samples().items():
+        for name, payload in payloads.items():
+            added += add(FOLDER / f"{file}.json", name, payload)
+    print(f"{added} vectors added")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,395 @@
+"""One example of every record, and Hypothesis strategies for all of them; what the tests of the wire share."""
+
+from __future__ import annotations
+
+import hashlib
+import string
+from typing import Any
+
+from hypothesis import strategies as st
+
+from sonarpost.messages import (
+    AcousticFrame,
+    Command,
+    Contact,
+    Decision,
+    EncodedImage,
+    Health,
+    LinkQuality,
+    Raster,
+    ReconstructedImage,
+    Record,
+    Relayed,
+    Snippet,
+)
+
+BARE_CONTACT = Contact(contact_id="c1", vehicle_id="uuv-1")
+
+FULL_CONTACT = Contact(
+    contact_id="line-7-ab12cd34-0412-port-377",
+    vehicle_id="uuv-1",
+    sonar_id="Marine Sonic 600 kHz",
+    line_name="line-7",
+    ping_number=412,
+    channel="port",
+    time_utc_s=1476262800.25,
+    lat_deg=41.5251,
+    lon_deg=-70.6712,
+    position_sigma_m=4.5,
+    depth_m=12.25,
+    altitude_m=3.5,
+    heading_deg=271.5,
+    speed_mps=1.5,
+    slant_range_m=21.0,
+    ground_range_m=20.5,
+    atd_class="sphere",
+    atd_confidence=1.75,
+    length_m=1.25,
+    width_m=0.5,
+    shadow_m=2.75,
+    height_m=0.375,
+    pixel_along_m=0.0625,
+    pixel_across_m=0.03125,
+)
+
+RASTER_8 = Raster(height_px=2, width_px=3, bits=8, data=bytes([0, 1, 2, 127, 128, 255]))
+RASTER_16 = Raster(height_px=1, width_px=2, bits=16, data=b"\x01\x00\xff\xfe")
+
+QUALITY = LinkQuality(
+    snr_in_db=11.5, snr_out_db=9.25, spl_db=132.0, mse_db=-9.75, doppler=-0.125, frames=3, bad_frames=1
+)
+
+COMPLETE_IMAGE = ReconstructedImage(
+    vessel_id="vessel-1",
+    vehicle_id="uuv-1",
+    image_id="00A7",
+    version=1,
+    contact=FULL_CONTACT,
+    codec="vq",
+    model="1f" * 32,
+    picture=RASTER_8,
+    picture_sha256=RASTER_8.sha256,
+    complete=True,
+    missing_fraction=0.0,
+    missing_mask=b"",
+    missing_halves=(),
+    bytes_received=232,
+    bytes_total=232,
+    frames_received=6,
+    first_frame_utc_s=1476262801.0,
+    last_frame_utc_s=1476262833.5,
+    notes=(),
+)
+
+DAMAGED_IMAGE = ReconstructedImage(
+    **COMPLETE_IMAGE.model_dump(
+        include={"vessel_id", "vehicle_id", "image_id", "codec", "model", "first_frame_utc_s", "last_frame_utc_s"}
+    ),
+    version=2,
+    contact=None,
+    picture=RASTER_8,
+    picture_sha256=RASTER_8.sha256,
+    complete=False,
+    missing_fraction=0.5,
+    missing_mask=b"\xa8",
+    missing_halves=("top", "bottom"),
+    bytes_received=100,
+    bytes_total=232,
+    frames_received=2,
+    notes=("1 frames disagreed with others of this image",),
+)
+
+SAMPLES: dict[str, Record] = {
+    "contact-full": FULL_CONTACT,
+    "contact-bare": BARE_CONTACT,
+    "raster-8-bits": RASTER_8,
+    "raster-16-bits": RASTER_16,
+    "snippet": Snippet(contact=FULL_CONTACT, picture=RASTER_16, source="line-7.xtf"),
+    "encoded-image": EncodedImage(
+        vehicle_id="uuv-1",
+        image_id="00A7",
+        contact=BARE_CONTACT,
+        codec="vq",
+        model="1f" * 32,
+        height_px=80,
+        width_px=140,
+        stream=bytes(range(16)),
+        original_sha256="e0" * 32,
+    ),
+    "link-quality-full": QUALITY,
+    "link-quality-bare": LinkQuality(),
+    "acoustic-frame-received": AcousticFrame(
+        direction="rx",
+        platform_id="vessel-1",
+        time_utc_s=1476262801.5,
+        source=3,
+        destination=1,
+        rate=1,
+        packet=17,
+        frame_number=2,
+        frame_count=3,
+        data=b"00A7\x00\x01\x02\x03",
+        quality=QUALITY,
+    ),
+    "acoustic-frame-of-unknown-rate": AcousticFrame(
+        direction="tx",
+        platform_id="uuv-1",
+        time_utc_s=0.0,
+        source=3,
+        destination=127,
+        rate=None,
+        packet=0,
+        frame_number=1,
+        frame_count=None,
+        data=b"",
+    ),
+    "reconstructed-image-complete": COMPLETE_IMAGE,
+    "reconstructed-image-damaged": DAMAGED_IMAGE,
+    "decision-full": Decision(
+        decision_id="d-1",
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        image_id="00A7",
+        image_version=2,
+        verdict="mine_like",
+        confidence=0.75,
+        mlo_class="cylinder",
+        remark="shadow länger als das Echo",
+        operator="op",
+        decided_utc_s=1476262900.0,
+    ),
+    "decision-bare": Decision(
+        decision_id="d-2",
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        image_id="0001",
+        image_version=1,
+        verdict="unsure",
+        operator="op",
+        decided_utc_s=0.0,
+    ),
+    "command-refine": Command(
+        command_id="c-1",
+        kind="refine",
+        vehicle_id="uuv-1",
+        image_id="00A7",
+        issued_by="op",
+        issued_utc_s=1476262901.0,
+    ),
+    "command-revisit": Command(
+        command_id="c-2",
+        kind="revisit",
+        vehicle_id="uuv-1",
+        lat_deg=41.5251,
+        lon_deg=-70.6712,
+        issued_by="op",
+        issued_utc_s=1476262902.0,
+    ),
+    "relayed": Relayed(
+        vessel_id="vessel-1",
+        key="sonarpost/v1/vessel-1/contact/decision",
+        payload=b"\x80",
+        relayed_utc_s=1476262903.0,
+    ),
+    "health": Health(
+        platform_id="uuv-1",
+        service="compressor",
+        time_utc_s=1476262904.0,
+        started_utc_s=1476262800.0,
+        state="degraded",
+        detail="no space left",
+        counters={"records_handled": 12, "records_refused": 1},
+        gauges={"inbox": 0.0, "outbox": 3.0},
+    ),
+}
+
+RECORD_TYPES: tuple[type[Record], ...] = tuple(
+    sorted({type(sample) for sample in SAMPLES.values()}, key=lambda t: t.TYPE)
+)
+
+
+# Strategies
+
+_LOWER = string.ascii_lowercase + string.digits
+
+
+def _real(low: float, high: float, **more: bool) -> st.SearchStrategy[float]:
+    return st.floats(low, high, allow_nan=False, allow_infinity=False, **more)
+
+
+def _maybe(strategy: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    return st.none() | strategy
+
+
+def _text(low: int, high: int) -> st.SearchStrategy[str]:
+    # Surrogates are no characters: UTF-8 has no bytes for them.
+    return st.text(st.characters(exclude_categories=("Cs",)), min_size=low, max_size=min(high, 60))
+
+
+_name = st.builds(lambda a, b: a + b, st.sampled_from(_LOWER), st.text(_LOWER + "-", max_size=31))
+_image_id = st.text(string.digits + string.ascii_uppercase, min_size=4, max_size=4)
+_sha256 = st.text("0123456789abcdef", min_size=64, max_size=64)
+_model = st.just("") | _sha256
+_time = _real(0, 253402300799)
+_metres = _maybe(_real(0, 20000))
+_count = st.integers(0, 2**63 - 1)
+_ordinal = st.integers(1, 2**63 - 1)
+_record_id = st.text([chr(code) for code in range(0x21, 0x7F)], min_size=1, max_size=64)
+_lat, _lon = _real(-90, 90), _real(-180, 180)
+_finite = st.floats(allow_nan=False, allow_infinity=False)
+
+contacts = st.builds(
+    Contact,
+    contact_id=_text(1, 120),
+    vehicle_id=_name,
+    sonar_id=_maybe(_text(0, 2000)),
+    line_name=_maybe(_text(0, 2000)),
+    ping_number=_maybe(_count),
+    channel=st.sampled_from([None, "port", "starboard"]),
+    time_utc_s=_maybe(_time),
+    lat_deg=_maybe(_lat),
+    lon_deg=_maybe(_lon),
+    position_sigma_m=_metres,
+    depth_m=_maybe(_real(-100, 12000)),
+    altitude_m=_metres,
+    heading_deg=_maybe(_real(0, 360, exclude_max=True)),
+    speed_mps=_maybe(_real(-50, 50)),
+    slant_range_m=_metres,
+    ground_range_m=_metres,
+    atd_class=_maybe(_text(0, 60)),
+    atd_confidence=_maybe(_real(0, 2)),
+    length_m=_metres,
+    width_m=_metres,
+    shadow_m=_metres,
+    height_m=_metres,
+    pixel_along_m=_maybe(_real(0, 100, exclude_min=True)),
+    pixel_across_m=_maybe(_real(0, 100, exclude_min=True)),
+)
+
+
+@st.composite
+def rasters(draw: st.DrawFn) -> Raster:
+    height_px, width_px, bits = draw(st.integers(1, 12)), draw(st.integers(1, 12)), draw(st.sampled_from([8, 16]))
+    size = height_px * width_px * bits // 8
+    return Raster(height_px=height_px, width_px=width_px, bits=bits, data=draw(st.binary(min_size=size, max_size=size)))
+
+
+qualities = st.builds(
+    LinkQuality,
+    snr_in_db=_maybe(_finite),
+    snr_out_db=_maybe(_finite),
+    spl_db=_maybe(_finite),
+    mse_db=_maybe(_finite),
+    doppler=_maybe(_finite),
+    frames=_maybe(_count),
+    bad_frames=_maybe(_count),
+)
+
+
+@st.composite
+def images(draw: st.DrawFn) -> ReconstructedImage:
+    picture = draw(rasters())
+    size = (picture.height_px * picture.width_px + 7) // 8
+    return ReconstructedImage(
+        vessel_id=draw(_name),
+        vehicle_id=draw(_name),
+        image_id=draw(_image_id),
+        version=draw(_ordinal),
+        contact=draw(_maybe(contacts)),
+        codec=draw(_text(0, 40)),
+        model=draw(_model),
+        picture=picture,
+        picture_sha256=hashlib.sha256(picture.data).hexdigest(),
+        complete=draw(st.booleans()),
+        missing_fraction=draw(_real(0, 1)),
+        missing_mask=draw(st.just(b"") | st.binary(min_size=size, max_size=size)),
+        missing_halves=draw(st.sampled_from([(), ("top",), ("bottom",), ("top", "bottom")])),
+        bytes_received=draw(_count),
+        bytes_total=draw(_count),
+        frames_received=draw(_count),
+        first_frame_utc_s=draw(_time),
+        last_frame_utc_s=draw(_time),
+        notes=tuple(draw(st.lists(_text(0, 2000), max_size=3))),
+    )
+
+
+@st.composite
+def commands(draw: st.DrawFn) -> Command:
+    kind = draw(st.sampled_from(["refine", "resend", "revisit"]))
+    place = kind == "revisit"
+    return Command(
+        command_id=draw(_record_id),
+        kind=kind,
+        vehicle_id=draw(_name),
+        image_id=draw(_maybe(_image_id) if place else _image_id),
+        lat_deg=draw(_lat if place else _maybe(_lat)),
+        lon_deg=draw(_lon if place else _maybe(_lon)),
+        issued_by=draw(_text(1, 120)),
+        issued_utc_s=draw(_time),
+    )
+
+
+STRATEGIES: dict[type[Record], st.SearchStrategy[Any]] = {
+    Contact: contacts,
+    Raster: rasters(),
+    Snippet: st.builds(Snippet, contact=contacts, picture=rasters(), source=_text(0, 2000)),
+    EncodedImage: st.builds(
+        EncodedImage,
+        vehicle_id=_name,
+        image_id=_image_id,
+        contact=contacts,
+        codec=_text(1, 40),
+        model=_model,
+        height_px=st.integers(1, 4096),
+        width_px=st.integers(1, 4096),
+        stream=st.binary(min_size=8, max_size=300),
+        original_sha256=_sha256,
+    ),
+    LinkQuality: qualities,
+    AcousticFrame: st.builds(
+        AcousticFrame,
+        direction=st.sampled_from(["tx", "rx"]),
+        platform_id=_name,
+        time_utc_s=_time,
+        source=st.integers(0, 127),
+        destination=st.integers(0, 127),
+        rate=_maybe(st.integers(0, 6)),
+        packet=_count,
+        frame_number=st.integers(1, 8),
+        frame_count=_maybe(st.integers(0, 8)),
+        data=st.binary(max_size=256),
+        quality=_maybe(qualities),
+    ),
+    ReconstructedImage: images(),
+    Decision: st.builds(
+        Decision,
+        decision_id=_record_id,
+        vessel_id=_name,
+        vehicle_id=_name,
+        image_id=_image_id,
+        image_version=_ordinal,
+        verdict=st.sampled_from(["mine_like", "not_mine_like", "unsure"]),
+        confidence=_maybe(_real(0, 1)),
+        mlo_class=_maybe(_text(0, 60)),
+        remark=_text(0, 2000),
+        operator=_text(1, 120),
+        decided_utc_s=_time,
+    ),
+    Command: commands(),
+    Relayed: st.builds(
+        Relayed, vessel_id=_name, key=_text(1, 300), payload=st.binary(max_size=200), relayed_utc_s=_time
+    ),
+    Health: st.builds(
+        Health,
+        platform_id=_name,
+        service=_text(1, 40),
+        time_utc_s=_time,
+        started_utc_s=_time,
+        state=st.sampled_from(["starting", "ok", "degraded", "stopping"]),
+        detail=_text(0, 2000),
+        counters=st.dictionaries(_text(0, 40), _count, max_size=4),
+        gauges=st.dictionaries(_text(0, 40), _finite, max_size=4),
+    ),
+}
+
+any_record: st.SearchStrategy[Record] = st.one_of(*STRATEGIES.values())

@@ -1,0 +1,159 @@
+"""Files that are whole or absent."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonarpost.files import write_atomically
+
+
+def leftovers(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.name.startswith("."))
+
+
+@given(st.lists(st.binary(max_size=200), min_size=1, max_size=3))
+def test_a_file_holds_what_was_written_last(tmp_path_factory: pytest.TempPathFactory, versions: list[bytes]) -> None:
+    folder = tmp_path_factory.mktemp("atomic")
+    for data in versions:
+        write_atomically(folder / "file.bin", data)
+        assert (folder / "file.bin").read_bytes() == data
+    assert [path.name for path in folder.iterdir()] == ["file.bin"]
+
+
+def test_others_may_read_the_file(tmp_path: Path) -> None:
+    write_atomically(tmp_path / "f", b"x")
+    assert (tmp_path / "f").stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("call", ["fsync", "fchmod", "write", "replace"])
+def test_when_a_step_fails_the_old_file_stays_and_nothing_else(
+    call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "f"
+    target.write_bytes(b"old")
+
+    def fail(*_args: object, **_more: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    if call == "replace":
+        monkeypatch.setattr(Path, "replace", fail)
+    elif call == "write":
+
+        class FullFile:
+            def __init__(self, descriptor: int) -> None:
+                self.descriptor = descriptor
+
+            def __enter__(self) -> FullFile:
+                return self
+
+            def __exit__(self, *_: object) -> None:
+                os.close(self.descriptor)
+
+            write = fail
+
+        monkeypatch.setattr(os, "fdopen", lambda descriptor, _mode: FullFile(descriptor))
+    else:
+        monkeypatch.setattr(os, call, fail)
+    with pytest.raises(OSError, match="No space left"):
+        write_atomically(target, b"new")
+    monkeypatch.undo()
+    assert target.read_bytes() == b"old"
+    assert leftovers(tmp_path) == []
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write anywhere")
+def test_a_folder_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+    tmp_path.chmod(0o555)
+    try:
+        with pytest.raises(PermissionError):
+            write_atomically(tmp_path / "f", b"x")
+    finally:
+        tmp_path.chmod(0o755)
+
+
+def test_a_folder_that_is_absent_says_so(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        write_atomically(tmp_path / "absent" / "f", b"x")
+
+
+def test_a_folder_in_the_files_place_stays(tmp_path: Path) -> None:
+    (tmp_path / "f").mkdir()
+    with pytest.raises(OSError, match="directory"):
+        write_atomically(tmp_path / "f", b"x")
+    assert (tmp_path / "f").is_dir()
+    assert leftovers(tmp_path) == []
+
+
+def test_the_data_are_on_the_disk_before_the_name_and_the_name_before_the_return(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[str] = []
+    sync, replace = os.fsync, Path.replace
+
+    def fsync(descriptor: int) -> None:
+        steps.append("sync folder" if os.path.isdir(f"/proc/self/fd/{descriptor}") else "sync file")  # noqa: PTH112
+        sync(descriptor)
+
+    def rename(self: Path, target: Path) -> Path:
+        steps.append("rename")
+        return replace(self, target)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(Path, "replace", rename)
+    write_atomically(tmp_path / "f", b"x")
+    assert steps == ["sync file", "rename", "sync folder"]
+
+
+def test_a_reader_never_meets_half_a_file(tmp_path: Path) -> None:
+    target = tmp_path / "f"
+    versions = [bytes([n]) * 20_000 for n in range(1, 40)]
+    write_atomically(target, versions[0])
+    stop = threading.Event()
+    met: set[bytes] = set()
+
+    def read() -> None:
+        while not stop.is_set():
+            met.add(target.read_bytes())
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for data in versions:
+        write_atomically(target, data)
+    stop.set()
+    reader.join()
+    assert met
+    assert met <= set(versions)
+
+
+def test_a_killed_writer_leaves_a_whole_file(tmp_path: Path) -> None:
+    script = (
+        "import sys, itertools; from pathlib import Path; from sonarpost.files import write_atomically\n"
+        "for n in itertools.count(1):\n"
+        "    write_atomically(Path(sys.argv[1]), str(n).encode() * 30000)\n"
+        "    print(n, flush=True)\n"
+    )
+    target = tmp_path / "f"
+    writer = subprocess.Popen([sys.executable, "-c", script, str(target)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert writer.stdout is not None
+        for _ in range(20):
+            written = int(writer.stdout.readline())
+        time.sleep(0.003)
+    finally:
+        writer.send_signal(signal.SIGKILL)
+        writer.communicate()
+    text = target.read_text()
+    number = text[: len(text) // 30000]
+    assert text == number * 30000
+    assert int(number) >= written

@@ -1,0 +1,335 @@
+"""Records: what each field takes and what it refuses, and pictures to and from arrays."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from golden.zenoh.samples import COMPLETE_IMAGE, DAMAGED_IMAGE, RASTER_8, RASTER_16, RECORD_TYPES, SAMPLES
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from pydantic import ValidationError
+
+from sonarpost.errors import BadInputError
+from sonarpost.messages import Command, Contact, Raster, ReconstructedImage, Record
+
+NAN, INF = math.nan, math.inf
+LONG = "x" * 2001
+NO_TIME = [-0.001, 253402300800.0, NAN, INF]
+NO_NAME = ["", "UUV", "uuv_1", "-uuv", "uuv/1", "u" * 33, "uuv\n", "*"]
+NO_SHA = ["", "0" * 63, "0" * 65, "G" * 64, "A" * 64]
+NO_METRES = [-0.1, 20000.1, NAN, -INF]
+NO_COUNT = [-1, 2**63]
+NO_IMAGE = ["", "001", "00001", "00a7", "00 7", "00A\n"]
+NO_ID = ["", "x" * 65, "two words", "ünïcode", "tab\t", "\x7f"]
+
+# For every field that does not take all of its type: values of the right type that it refuses.
+OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
+    SAMPLES["contact-full"].__class__: {
+        "contact_id": ["", "x" * 121],
+        "vehicle_id": NO_NAME,
+        "sonar_id": [LONG],
+        "line_name": [LONG],
+        "ping_number": NO_COUNT,
+        "channel": ["", "Port", "nadir"],
+        "time_utc_s": NO_TIME,
+        "lat_deg": [-90.1, 90.1, NAN],
+        "lon_deg": [-180.1, 180.1, INF],
+        "position_sigma_m": NO_METRES,
+        "depth_m": [-100.1, 12000.1, NAN],
+        "altitude_m": NO_METRES,
+        "heading_deg": [-0.1, 360.0, NAN],
+        "speed_mps": [-50.1, 50.1, NAN],
+        "slant_range_m": NO_METRES,
+        "ground_range_m": NO_METRES,
+        "atd_class": ["x" * 61],
+        "atd_confidence": [-0.1, 2.01, NAN],
+        "length_m": NO_METRES,
+        "width_m": NO_METRES,
+        "shadow_m": NO_METRES,
+        "height_m": NO_METRES,
+        "pixel_along_m": [0.0, 100.1, NAN],
+        "pixel_across_m": [0.0, 100.1, NAN],
+    },
+    SAMPLES["raster-8-bits"].__class__: {
+        "height_px": [0, -1, 4097],
+        "width_px": [0, -1, 4097],
+        "bits": [0, 1, 32],
+        "data": [b"", b"12345", b"1234567"],
+    },
+    SAMPLES["snippet"].__class__: {"source": [LONG]},
+    SAMPLES["encoded-image"].__class__: {
+        "vehicle_id": NO_NAME,
+        "image_id": NO_IMAGE,
+        "codec": ["", "x" * 41],
+        "model": ["0" * 63, "G" * 64],
+        "height_px": [0, 4097],
+        "width_px": [0, 4097],
+        "stream": [b"", b"1234567", b"x" * 65544],
+        "original_sha256": NO_SHA,
+    },
+    SAMPLES["link-quality-full"].__class__: {
+        **{name: [NAN, INF, -INF] for name in ("snr_in_db", "snr_out_db", "spl_db", "mse_db", "doppler")},
+        "frames": NO_COUNT,
+        "bad_frames": NO_COUNT,
+    },
+    SAMPLES["acoustic-frame-received"].__class__: {
+        "direction": ["", "RX", "both"],
+        "platform_id": NO_NAME,
+        "time_utc_s": NO_TIME,
+        "source": [-1, 128],
+        "destination": [-1, 128],
+        "rate": [-1, 7],
+        "packet": NO_COUNT,
+        "frame_number": [0, 9],
+        "frame_count": [-1, 9],
+        "data": [b"x" * 2049],
+    },
+    SAMPLES["reconstructed-image-complete"].__class__: {
+        "vessel_id": NO_NAME,
+        "vehicle_id": NO_NAME,
+        "image_id": NO_IMAGE,
+        "version": [0, *NO_COUNT],
+        "codec": ["x" * 41],
+        "model": ["0" * 63, "G" * 64],
+        "picture_sha256": [*NO_SHA, "0" * 64],
+        "missing_fraction": [-0.1, 1.1, NAN],
+        "missing_mask": [b"12", b"123456"],
+        "missing_halves": [("left",), ("top", "TOP")],
+        "bytes_received": NO_COUNT,
+        "bytes_total": NO_COUNT,
+        "frames_received": NO_COUNT,
+        "first_frame_utc_s": NO_TIME,
+        "last_frame_utc_s": NO_TIME,
+        "notes": [(LONG,)],
+    },
+    SAMPLES["decision-full"].__class__: {
+        "decision_id": NO_ID,
+        "vessel_id": NO_NAME,
+        "vehicle_id": NO_NAME,
+        "image_id": NO_IMAGE,
+        "image_version": [0, *NO_COUNT],
+        "verdict": ["", "MINE_LIKE", "maybe"],
+        "confidence": [-0.1, 1.1, NAN],
+        "mlo_class": ["x" * 61],
+        "remark": [LONG],
+        "operator": ["", "x" * 121],
+        "decided_utc_s": NO_TIME,
+    },
+    SAMPLES["command-refine"].__class__: {
+        "command_id": NO_ID,
+        "kind": ["", "sink"],
+        "vehicle_id": NO_NAME,
+        "image_id": [None, *NO_IMAGE],
+        "lat_deg": [-90.1, 90.1, NAN],
+        "lon_deg": [-180.1, 180.1, NAN],
+        "issued_by": ["", "x" * 121],
+        "issued_utc_s": NO_TIME,
+    },
+    SAMPLES["relayed"].__class__: {
+        "vessel_id": NO_NAME,
+        "key": ["", "x" * 301],
+        "relayed_utc_s": NO_TIME,
+    },
+    SAMPLES["health"].__class__: {
+        "platform_id": NO_NAME,
+        "service": ["", "x" * 41],
+        "time_utc_s": NO_TIME,
+        "started_utc_s": NO_TIME,
+        "state": ["", "OK"],
+        "detail": [LONG],
+        "counters": [{"n": -1}, {"n": 2**63}],
+        "gauges": [{"n": NAN}, {"n": -INF}],
+    },
+}
+# These take every value of their type, or are records with fields of their own.
+ANY_VALUE = {
+    ("snippet", "contact"),
+    ("snippet", "picture"),
+    ("encoded_image", "contact"),
+    ("acoustic_frame", "quality"),
+    ("reconstructed_image", "contact"),
+    ("reconstructed_image", "picture"),
+    ("reconstructed_image", "complete"),
+    ("relayed", "payload"),
+}
+
+EXAMPLE = {type(sample): sample for sample in reversed(SAMPLES.values())}
+EXAMPLE[Command] = Command(**(SAMPLES["command-revisit"].model_dump() | {"kind": "refine", "image_id": "00A7"}))
+FIELDS = [(t, name) for t in RECORD_TYPES for name in t.model_fields]
+
+
+def changed(record_type: type[Record], **change: object) -> Record:
+    return record_type(**(EXAMPLE[record_type].model_dump() | change))
+
+
+def label(value: object) -> str:
+    return value.TYPE if isinstance(value, type) else str(value)
+
+
+def test_the_examples_are_of_every_record_there_is() -> None:
+    def subclasses(of: type[Record]) -> set[type[Record]]:
+        direct = {t for t in of.__subclasses__() if t.__module__ == "sonarpost.messages"}
+        return direct | {deeper for t in direct for deeper in subclasses(t)}
+
+    assert set(RECORD_TYPES) == subclasses(Record)
+    assert len({t.TYPE for t in RECORD_TYPES}) == len(RECORD_TYPES)
+
+
+@pytest.mark.parametrize(("record_type", "name"), FIELDS, ids=label)
+def test_a_field_refuses_what_is_out_of_its_range(record_type: type[Record], name: str) -> None:
+    if (record_type.TYPE, name) in ANY_VALUE:
+        assert name not in OUT_OF_RANGE[record_type]
+        return
+    for value in OUT_OF_RANGE[record_type][name]:
+        with pytest.raises(ValidationError) as caught:
+            changed(record_type, **{name: value})
+        assert caught.value.errors()[0]["loc"][0] == name, value
+
+
+WRONG_TYPES: list[object] = [None, True, 1, 1.5, "text", b"bytes", (1,), {"a": 1}, {1: "a"}]
+
+
+@pytest.mark.parametrize(("record_type", "name"), FIELDS, ids=label)
+def test_a_field_refuses_what_is_of_another_type(record_type: type[Record], name: str) -> None:
+    """Right types are told from the example's own value, None from the annotation; a whole number may stand for a
+    real one, in no other case does one type stand for another."""
+    right = type(getattr(EXAMPLE[record_type], name))
+    nullable = type(None) in getattr(record_type.model_fields[name].annotation, "__args__", ())
+    for value in WRONG_TYPES:
+        if type(value) is right or (value is None and nullable) or (right is float and type(value) is int):
+            continue
+        if isinstance(value, dict) and issubclass(right, (Record, dict)):
+            continue  # the maps are of the right type; what is in them is another test
+        with pytest.raises(ValidationError) as caught:
+            changed(record_type, **{name: value})
+        assert caught.value.errors()[0]["loc"][0] == name, value
+
+
+@pytest.mark.parametrize(("record_type", "name"), FIELDS, ids=label)
+def test_a_field_without_a_default_must_be_there(record_type: type[Record], name: str) -> None:
+    fields = EXAMPLE[record_type].model_dump()
+    del fields[name]
+    if record_type.model_fields[name].is_required():
+        with pytest.raises(ValidationError) as caught:
+            record_type(**fields)
+        assert caught.value.errors()[0]["loc"] == (name,)
+    elif record_type is not Command:
+        default = getattr(record_type(**fields), name)
+        assert default is None or default in ("", ())
+
+
+@pytest.mark.parametrize("sample", SAMPLES.values(), ids=SAMPLES)
+def test_records_cannot_be_changed(sample: Record) -> None:
+    name = next(iter(type(sample).model_fields))
+    with pytest.raises(ValidationError, match="frozen"):
+        setattr(sample, name, getattr(sample, name))
+
+
+@pytest.mark.parametrize("text", ["\ud800", "a\udcffb"])
+def test_text_that_utf8_has_no_bytes_for_is_refused(text: str) -> None:
+    with pytest.raises(ValidationError):
+        changed(Contact, contact_id=text)
+
+
+# Pictures
+
+pictures = st.one_of(
+    *(
+        hnp.arrays(dtype, hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9))
+        for dtype in ("u1", "<u2", ">u2")
+    )
+)
+
+
+@given(pictures)
+def test_a_raster_gives_back_the_array_it_was_made_of(image: Any) -> None:
+    raster = Raster.from_array(image)
+    back = raster.to_array()
+    assert back.dtype == (np.uint8 if image.dtype.itemsize == 1 else np.uint16)
+    assert back.dtype.isnative
+    np.testing.assert_array_equal(back, image)
+    assert raster.sha256 == hashlib.sha256(raster.data).hexdigest()
+    back[0, 0] ^= 1  # the caller's own
+    np.testing.assert_array_equal(raster.to_array(), image)
+
+
+def test_pixels_lie_row_by_row_and_little_endian() -> None:
+    image = np.array([[1, 2], [0x1234, 0xFFFE]], dtype=">u2")
+    assert Raster.from_array(image).data == bytes.fromhex("0100 0200 3412 feff")
+    assert Raster.from_array(image.T).data == bytes.fromhex("0100 3412 0200 feff")
+    assert Raster.from_array(np.arange(12, dtype=np.uint8).reshape(3, 4)[::2, ::-2]).data == bytes([3, 1, 11, 9])
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.ones((2, 2)),
+        np.ones((2, 2), np.float32),
+        np.ones((2, 2), np.int16),
+        np.ones((2, 2), np.uint32),
+        np.ones((2, 2), np.bool_),
+        np.ones(4, np.uint8),
+        np.ones((2, 2, 1), np.uint8),
+        np.uint8(1).reshape(()),
+    ],
+    ids=lambda image: f"{image.dtype}-{image.ndim}d",
+)
+def test_an_array_that_is_no_picture_is_refused(image: Any) -> None:
+    with pytest.raises(BadInputError, match="expected rows and columns of uint8 or uint16"):
+        Raster.from_array(image)
+
+
+@pytest.mark.parametrize("shape", [(0, 4), (4, 0), (4097, 1), (1, 4097)])
+def test_an_array_of_a_size_no_raster_has_is_refused(shape: tuple[int, int]) -> None:
+    with pytest.raises(ValidationError):
+        Raster.from_array(np.zeros(shape, np.uint8))
+
+
+@given(hnp.arrays(np.bool_, hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=11)))
+def test_the_mask_says_which_pixels_are_missing(missing: Any) -> None:
+    picture = Raster.from_array(np.zeros(missing.shape, np.uint8))
+    fields = COMPLETE_IMAGE.model_dump() | {
+        "picture": picture,
+        "picture_sha256": picture.sha256,
+        "missing_mask": np.packbits(missing).tobytes(),
+    }
+    np.testing.assert_array_equal(ReconstructedImage(**fields).missing(), missing)
+
+
+def test_the_first_bit_of_a_mask_is_the_first_pixel() -> None:
+    assert DAMAGED_IMAGE.missing_mask == b"\xa8"
+    assert DAMAGED_IMAGE.missing().tolist() == [[True, False, True], [False, True, False]]
+    assert COMPLETE_IMAGE.missing().tolist() == [[False] * 3] * 2
+
+
+def test_the_digest_of_another_picture_is_refused_by_name() -> None:
+    with pytest.raises(ValidationError) as caught:
+        changed(ReconstructedImage, picture=RASTER_16)
+    assert caught.value.errors()[0]["loc"] == ("picture_sha256",)
+    assert RASTER_16.sha256 in str(caught.value)
+    assert changed(ReconstructedImage, picture=RASTER_16, picture_sha256=RASTER_16.sha256)
+    assert RASTER_16.sha256 != RASTER_8.sha256
+
+
+@pytest.mark.parametrize(
+    ("kind", "given_fields", "missing"),
+    [
+        ("refine", {}, "image_id"),
+        ("resend", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
+        ("revisit", {"lon_deg": 1.0}, "lat_deg"),
+        ("revisit", {"lat_deg": 1.0}, "lon_deg"),
+        ("revisit", {"image_id": "0001"}, "lat_deg"),
+    ],
+)
+def test_a_command_without_its_object_is_refused_by_name(
+    kind: str, given_fields: dict[str, object], missing: str
+) -> None:
+    common = {"command_id": "c", "kind": kind, "vehicle_id": "uuv-1", "issued_by": "op", "issued_utc_s": 0.0}
+    with pytest.raises(ValidationError) as caught:
+        Command(**common, **given_fields)
+    assert caught.value.errors()[0]["loc"] == (missing,)
