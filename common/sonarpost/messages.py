@@ -156,7 +156,7 @@ class EncodedImage(Record):
     model: ModelHash
     height_px: Annotated[int, Field(ge=1, le=4096)]
     width_px: Annotated[int, Field(ge=1, le=4096)]
-    stream: Annotated[bytes, Field(min_length=8, max_length=65543)]
+    stream: Annotated[bytes, Field(min_length=2, max_length=65542)]
     original_sha256: Sha256
 
 

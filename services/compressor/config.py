@@ -21,4 +21,4 @@ class CompressorConfig(ServiceConfig):
     codec: str = "vq"
     catalogue: str = "nominal-10"
     packing: IndexPacking = IndexPacking.BITS14
-    budget_bytes: Annotated[int, Field(ge=0, le=65543)] = 0
+    budget_bytes: Annotated[int, Field(ge=0, le=65542)] = 0

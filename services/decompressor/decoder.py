@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from sonarpost.catalogue.store import open_catalogue
-from sonarpost.codec.interface import Codec, Decoded, Mask, model_tag
+from sonarpost.codec.interface import Codec, Decoded, Mask
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.tiles import TileDatabase
+from sonarpost.codec.vq import catalogue_tag
 from sonarpost.errors import CatalogueError
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_events import ContactOnly, ImageReady
@@ -32,7 +33,7 @@ class Decoder:
         self._tiles: dict[int, TileDatabase] = {}
         for name in catalogues:
             tiles = open_catalogue(name).tiles
-            tag = model_tag(tiles.identity)
+            tag = catalogue_tag(tiles)
             if tag in self._tiles and self._tiles[tag].identity != tiles.identity:
                 raise CatalogueError(name, "identity", tiles.identity, f"a tag other than {tag:#06x}, which is taken")
             self._tiles[tag] = tiles
@@ -89,7 +90,7 @@ class Decoder:
             missing_mask=pack_mask(decoded.missing),
             missing_halves=event.missing_halves if isinstance(event, ImageReady) else ("top", "bottom"),
             bytes_received=sum(stop - start for start, stop in event.received) if isinstance(event, ImageReady) else 0,
-            bytes_total=event.header.body_length if isinstance(event, ImageReady) else 0,
+            bytes_total=len(event.body) if isinstance(event, ImageReady) else 0,
             frames_received=event.frames if isinstance(event, ImageReady) else 0,
             first_frame_utc_s=event.first_at,
             last_frame_utc_s=event.last_at,

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.codec.interface import model_tag
 from sonarpost.codec.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase
+from sonarpost.codec.vq import catalogue_tag
 from sonarpost.errors import CatalogueError
 from sonarpost.files import write_atomically
 
@@ -175,7 +175,7 @@ def nominal_for_tag(tag: int) -> Catalogue:
     tags = {}
     for tile_px in NOMINAL_TILE_PX:
         catalogue = load_nominal(tile_px)
-        own = model_tag(catalogue.tiles.identity)
+        own = catalogue_tag(catalogue.tiles)
         if own == tag:
             return catalogue
         tags[f"nominal-{tile_px}"] = own

@@ -15,8 +15,9 @@ from sonarpost.catalogue.nominal import RECIPES, Recipe, build_nominal, humminbi
 from sonarpost.catalogue.refine import refine
 from sonarpost.catalogue.store import Catalogue, load, open_catalogue, save
 from sonarpost.catalogue.windows import Line, WindowPlan, cut_around, cut_line
-from sonarpost.codec.interface import model_tag, to_uint8
+from sonarpost.codec.interface import to_uint8
 from sonarpost.codec.tiles import MAX_DIMS, Tiles
+from sonarpost.codec.vq import catalogue_tag
 from sonarpost.errors import CatalogueError, ConfigError, SurveyFileError
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
@@ -123,7 +124,7 @@ def run_info(args: argparse.Namespace) -> int:
         "tiles": f"{len(tiles)} of {tiles.tile_px} x {tiles.tile_px} px",
         "dimensions": f"{tiles.dims} of {tiles.tile_px**2}",
         "identity": tiles.identity,
-        "tag in streams": f"{model_tag(tiles.identity):#06x}",
+        "tag in streams": f"{catalogue_tag(tiles):#06x}",
         **catalogue.notes,
     }
     width = max(len(name) for name in facts)

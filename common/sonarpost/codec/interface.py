@@ -1,12 +1,11 @@
 """What every codec is: a name, an encoder, a decoder, and one stream header that all streams share.
 
-The stream of any codec is `header || body`. The header is 8 bytes, the same for all codecs, so that the acoustic
-link can repeat it in every frame and a receiver knows picture size, codec, model and body length from any of them.
+The stream of any codec is `header || body`. The header is two to seven bytes, the same for all codecs: in a 22-byte
+picture every one of them counts. It says codec, model and picture size; how long the body is, whoever carries it knows.
 """
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -22,43 +21,83 @@ MIN_SIDE_PX = 16
 MAX_SIDE_PX = 512
 
 
+# Sides that sonar snippets commonly have; a picture with two of these says its size in one byte. Part of the wire
+# format: never changed.
+COMMON_SIDES_PX = (16, 32, 48, 64, 80, 96, 100, 112, 120, 128, 140, 160, 200, 256, 512)
+_OTHER_SIZE = 0xFF
+
+
+def tag_length(codec_id: int) -> int:
+    """Return how many bytes of the model's hash a codec's streams carry.
+
+    Ids below 0x10 have no model. Ids 0x20 to 0x7F have models that ship with releases and are few: one byte tells them
+    apart. The others have models that users build, any number of them: two bytes.
+    """
+    if codec_id < 0x10:
+        return 0
+    return 1 if 0x20 <= codec_id < 0x80 else 2
+
+
 @dataclass(frozen=True, slots=True)
 class StreamHeader:
-    """The first 8 bytes of every codec stream.
+    """The start of every codec stream.
 
-    Layout, big endian: codec id (u8); model tag (u16, the first two bytes of the model's hash, 0 for codecs
-    without a model); height and width in pixels (12 bits each); body length in bytes (u16).
+    Layout: codec id (u8); model tag (`tag_length` bytes, the first of the model's hash); size: one byte
+    15 * row + column into `COMMON_SIDES_PX` for height and width, or 0xFF and height and width in 12 bits each.
     """
 
     codec_id: int
     model_tag: int
     height_px: int
     width_px: int
-    body_length: int
 
-    SIZE = 8
+    MAX_SIZE = 7
+
+    @property
+    def size(self) -> int:
+        """Length of the header in bytes."""
+        return 1 + tag_length(self.codec_id) + (1 if self._is_common else 4)
+
+    @property
+    def _is_common(self) -> bool:
+        return self.height_px in COMMON_SIDES_PX and self.width_px in COMMON_SIDES_PX
 
     def pack(self) -> bytes:
-        """Return the 8 bytes."""
-        size = (self.height_px << 12) | self.width_px
-        return struct.pack(">BH3sH", self.codec_id, self.model_tag, size.to_bytes(3, "big"), self.body_length)
+        """Return the bytes."""
+        head = bytes([self.codec_id]) + self.model_tag.to_bytes(tag_length(self.codec_id), "big")
+        if self._is_common:
+            row, column = COMMON_SIDES_PX.index(self.height_px), COMMON_SIDES_PX.index(self.width_px)
+            return head + bytes([len(COMMON_SIDES_PX) * row + column])
+        return head + bytes([_OTHER_SIZE]) + ((self.height_px << 12) | self.width_px).to_bytes(3, "big")
 
     @classmethod
     def unpack(cls, data: bytes, where: str = "stream") -> StreamHeader:
-        """Parse the first 8 bytes of `data`.
+        """Parse the start of `data`.
 
         Raises:
-            StreamError: Too short, or a picture size outside 16..512 px.
+            StreamError: Too short, or a picture size that is not 16..512 px a side.
         """
-        if len(data) < cls.SIZE:
-            raise StreamError(where, "header", data, f"at least {cls.SIZE} bytes")
-        codec_id, model_tag, size_bytes, body_length = struct.unpack(">BH3sH", data[: cls.SIZE])
-        size = int.from_bytes(size_bytes, "big")
-        height_px, width_px = size >> 12, size & 0xFFF
-        for name, value in (("height_px", height_px), ("width_px", width_px)):
+        if not data:
+            raise StreamError(where, "header", data, "2 to 7 bytes")
+        after_tag = 1 + tag_length(data[0])
+        tag = int.from_bytes(data[1:after_tag], "big")
+        code = data[after_tag : after_tag + 1]
+        more = data[after_tag + 1 : after_tag + 4]
+        if not code or (code[0] == _OTHER_SIZE and len(more) < 3):
+            raise StreamError(where, "header", data, "2 to 7 bytes")
+        if code[0] != _OTHER_SIZE:
+            row, column = divmod(code[0], len(COMMON_SIDES_PX))
+            if row >= len(COMMON_SIDES_PX):
+                raise StreamError(where, "size", code[0], f"0..{len(COMMON_SIDES_PX) ** 2 - 1} or {_OTHER_SIZE}")
+            return cls(data[0], tag, COMMON_SIDES_PX[row], COMMON_SIDES_PX[column])
+        size = int.from_bytes(more, "big")
+        header = cls(data[0], tag, size >> 12, size & 0xFFF)
+        for name, value in (("height_px", header.height_px), ("width_px", header.width_px)):
             if not MIN_SIDE_PX <= value <= MAX_SIDE_PX:
                 raise StreamError(where, name, value, f"{MIN_SIDE_PX}..{MAX_SIDE_PX} px")
-        return cls(codec_id, model_tag, height_px, width_px, body_length)
+        if header._is_common:
+            raise StreamError(where, "size", size, "the one-byte form of a common size")
+        return header
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,18 +147,18 @@ class Codec(Protocol):
         """Rebuild the picture.
 
         Args:
-            stream: Header and body; a body shorter than the header says counts as missing at its end.
-            received: Shape (body_length,), False where a body byte did not arrive and its place holds a zero;
-                None when everything did.
+            stream: Header and body; a body that ends early counts as missing at its end.
+            received: Shape (len(stream) - header.size,), False where a body byte did not arrive and its place holds a
+                zero; None when everything did.
 
         Raises:
             StreamError: The header is wrong, or the stream was made with another codec or model.
         """
 
 
-def model_tag(model_hash: str) -> int:
-    """Return the 16-bit tag of a model hash that travels in the stream header."""
-    return int(model_hash[:4], 16) if model_hash else 0
+def model_tag(codec_id: int, model_hash: str) -> int:
+    """Return the tag of a model hash that streams of a codec carry; 0 for codecs without a model."""
+    return int(model_hash[: 2 * tag_length(codec_id)] or "0", 16)
 
 
 def check_image(image: npt.NDArray[np.generic], where: str = "image") -> None:

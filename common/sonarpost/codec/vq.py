@@ -77,6 +77,11 @@ _CODEC_IDS = {
 }
 
 
+def catalogue_tag(tiles: TileDatabase) -> int:
+    """Return the tag that streams made with a tile database carry, the same for every packing."""
+    return model_tag(IndexPacking.BITS14.codec_id, tiles.identity)
+
+
 @dataclass(frozen=True)
 class VqCodec:
     """Vector quantisation with a shared tile database. Satisfies `sonarpost.codec.interface.Codec`.
@@ -125,17 +130,17 @@ class VqCodec:
                 size alone, so a smaller budget cannot be met.
 
         Raises:
-            StreamError: Size or dtype is not supported, or the budget (or the header's 65,535 bytes) is too small.
+            StreamError: Size or dtype is not supported, or the budget (or 65,535 body bytes) is too small.
         """
         check_image(image)
         height_px, width_px = int(image.shape[0]), int(image.shape[1])
         length = self._body_length(height_px, width_px)
-        limit = MAX_BODY_BYTES if budget_bytes is None else min(budget_bytes - StreamHeader.SIZE, MAX_BODY_BYTES)
+        header = StreamHeader(self.codec_id, self._tag, height_px, width_px)
+        limit = MAX_BODY_BYTES if budget_bytes is None else min(budget_bytes - header.size, MAX_BODY_BYTES)
         if length > limit:
-            needed = f"at least {length + StreamHeader.SIZE} B for {height_px} x {width_px} px"
-            raise StreamError("codec vq", "budget_bytes", limit + StreamHeader.SIZE, needed)
+            needed = f"at least {length + header.size} B for {height_px} x {width_px} px"
+            raise StreamError("codec vq", "budget_bytes", limit + header.size, needed)
         indices, _ = self.tiles.nearest(cut_tiles(to_uint8(image), self.tiles.tile_px))
-        header = StreamHeader(self.codec_id, model_tag(self.model_hash), height_px, width_px, length)
         return header.pack() + pack_indices(indices + 1, self.packing)
 
     def decode(self, stream: bytes, received: Mask | None = None) -> Decoded:
@@ -143,14 +148,15 @@ class VqCodec:
 
         Args:
             stream: Header and body. A short body counts as missing at its end; bytes beyond it are ignored and noted.
-            received: Shape (body_length,), False where a body byte did not arrive.
+            received: Shape (body bytes in `stream`,), False where a body byte did not arrive.
 
         Raises:
             StreamError: The header is wrong, the stream is of another codec or packing, or it was made with a
                 catalogue of another identity.
         """
         header = self._check_header(stream)
-        body, arrived, notes = _complete_body(stream, header.body_length, received)
+        length = self._body_length(header.height_px, header.width_px)
+        body, arrived, notes = _complete_body(stream[header.size :], length, received)
         rows, columns = tile_grid(header.height_px, header.width_px, self.tiles.tile_px)
         wire = unpack_indices(body, rows * columns, self.packing)
         lost = ~_indices_arrived(arrived, rows * columns, self.packing.bits)
@@ -172,6 +178,10 @@ class VqCodec:
         size = (header.height_px, header.width_px, self.tiles.tile_px)
         return Decoded(join_tiles(chosen, *size), join_tiles(blank, *size).astype(np.bool_), tuple(notes))
 
+    @property
+    def _tag(self) -> int:
+        return catalogue_tag(self.tiles)
+
     def _body_length(self, height_px: int, width_px: int) -> int:
         rows, columns = tile_grid(height_px, width_px, self.tiles.tile_px)
         return self.packing.body_length(rows * columns)
@@ -181,14 +191,9 @@ class VqCodec:
         if header.codec_id != self.codec_id:
             expected = f"{self.codec_id:#04x} (vq, {self.packing.value} indices)"
             raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", expected)
-        own_tag = model_tag(self.model_hash)
-        if header.model_tag != own_tag:
-            expected = f"{own_tag:#06x}: the stream was made with a catalogue of another identity"
+        if header.model_tag != self._tag:
+            expected = f"{self._tag:#06x}: the stream was made with a catalogue of another identity"
             raise StreamError("stream", "model_tag", f"{header.model_tag:#06x}", expected)
-        length = self._body_length(header.height_px, header.width_px)
-        if header.body_length != length:
-            expected = f"{length} B for {header.height_px} x {header.width_px} px"
-            raise StreamError("stream", "body_length", header.body_length, expected)
         return header
 
 
@@ -224,23 +229,21 @@ def unpack_indices(body: bytes, count: int, packing: IndexPacking) -> _WireIndic
     return np.asarray(bits @ (np.int64(1) << np.arange(packing.bits - 1, -1, -1, dtype=np.int64)), dtype=np.int64)
 
 
-def _complete_body(stream: bytes, length: int, received: Mask | None) -> tuple[bytes, Mask, list[str]]:
+def _complete_body(body: bytes, length: int, received: Mask | None) -> tuple[bytes, Mask, list[str]]:
     """Cut or zero-fill the body to `length`; return it with a mask of what arrived, and notes."""
-    body = stream[StreamHeader.SIZE : StreamHeader.SIZE + length]
+    if received is None:
+        received = np.ones(len(body), dtype=np.bool_)
+    elif received.shape != (len(body),) or received.dtype != np.bool_:
+        met = f"{received.dtype} {received.shape}"
+        raise StreamError("stream", "received", met, f"bool ({len(body)},), one for each body byte")
     arrived = np.zeros(length, dtype=np.bool_)
-    arrived[: len(body)] = True
-    if received is not None:
-        if received.shape != (length,) or received.dtype != np.bool_:
-            met = f"{received.dtype} {received.shape}"
-            raise StreamError("stream", "received", met, f"bool ({length},), one for each body byte")
-        arrived &= received
+    arrived[: len(body)] = received[:length]
     notes = []
     if len(body) < length:
         notes.append(f"body ends after {len(body)} of {length} B")
-    excess = len(stream) - StreamHeader.SIZE - length
-    if excess > 0:
-        notes.append(f"{excess} B after the body ignored")
-    return body.ljust(length, b"\0"), arrived, notes
+    if len(body) > length:
+        notes.append(f"{len(body) - length} B after the body ignored")
+    return body[:length].ljust(length, b"\0"), arrived, notes
 
 
 def _indices_arrived(arrived: Mask, count: int, bits: int) -> Mask:

@@ -22,7 +22,7 @@ class ImageReady:
         image_id: Four characters 0-9A-Z.
         version: 1 for the first time anything of this image is given out, one more each time more is known.
         header: Of the codec stream.
-        body: Exactly `header.body_length` bytes; zero where nothing arrived.
+        body: As long as the sender said; zero where nothing arrived.
         received: Byte ranges [start, stop) of the body that arrived, sorted, disjoint, not touching.
         missing_halves: The halves of which not one byte arrived.
         contact: The contact record, or None when it has not arrived.
@@ -54,8 +54,8 @@ class ImageReady:
         return self.header.pack() + self.body
 
     def received_mask(self) -> Mask:
-        """Return shape (body_length,), True where a body byte arrived, as `Codec.decode` takes it."""
-        mask = np.zeros(self.header.body_length, dtype=np.bool_)
+        """Return shape (len(body),), True where a body byte arrived, as `Codec.decode` takes it."""
+        mask = np.zeros(len(self.body), dtype=np.bool_)
         for start, stop in self.received:
             mask[start:stop] = True
         return mask

@@ -1,9 +1,9 @@
 """The `paper` acoustic wire format: half-image frames and contact frames, each decodable alone.
 
 After Fig. 6 and section III-D of the paper: a message starts with one character that says top or bottom half and
-four characters that identify the image. The paper's five bytes assume one half in one message; here ten more (an
-offset and the stream header) let a half be spread over many frames and let either half be placed when the other is
-lost. docs/wire-acoustic.md is the specification.
+four characters that identify the image. The paper's five bytes assume one half in one message; here an offset, the
+body's length and the stream header (six to eleven bytes more) let a half be spread over many frames, and let either
+half be placed when the other is lost. docs/wire-acoustic.md is the specification.
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ import struct
 from dataclasses import dataclass
 from typing import Literal
 
-from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX, StreamHeader
+from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX, StreamHeader, tag_length
 from sonarpost.errors import BadInputError, FrameError
 from sonarpost.link.contact_record import RECORD_SIZE, ContactSummary
 
 HalfName = Literal["top", "bottom"]
 
-HALF_HEADER_SIZE = 15
+HALF_PREFIX_SIZE = 9
+"""Bytes of a half frame before the stream header."""
+MAX_HALF_HEADER_SIZE = HALF_PREFIX_SIZE + StreamHeader.MAX_SIZE
 CONTACT_FRAME_SIZE = 1 + 4 + RECORD_SIZE + 2
 IMAGE_ID_COUNT = 36**4
 
@@ -68,6 +70,7 @@ class HalfFrame:
         image_id: Four characters 0-9A-Z.
         offset: Position of the first payload byte in the whole body, inside the half; the half's start when the
             half is empty.
+        body_length: Length of the whole body.
         header: The codec stream's header, the same in every frame of the image.
         payload: Body bytes, none beyond the half's end; may be empty.
 
@@ -78,13 +81,16 @@ class HalfFrame:
     half: HalfName
     image_id: str
     offset: int
+    body_length: int
     header: StreamHeader
     payload: bytes
 
     def __post_init__(self) -> None:
         _check_image_id("half frame", self.image_id)
         _check_stream_header(self.header)
-        start, stop = half_bounds(self.header.body_length, self.half)
+        if not 0 <= self.body_length <= 0xFFFF:
+            raise FrameError("half frame", "body_length", self.body_length, "0..65535")
+        start, stop = half_bounds(self.body_length, self.half)
         if not (start <= self.offset < stop or self.offset == start == stop):
             raise FrameError("half frame", "offset", self.offset, f"{start}..{max(start, stop - 1)} ({self.half} half)")
         if self.offset + len(self.payload) > stop:
@@ -98,9 +104,9 @@ class HalfFrame:
         return self.offset + len(self.payload)
 
     def pack(self) -> bytes:
-        """Return the frame, 15 bytes and the payload, without padding."""
-        head = _TYPE_OF_HALF[self.half] + self.image_id.encode("ascii") + struct.pack(">H", self.offset)
-        return head + self.header.pack() + self.payload
+        """Return the frame without padding: nine bytes, the stream header, the payload."""
+        head = _TYPE_OF_HALF[self.half] + self.image_id.encode("ascii")
+        return head + struct.pack(">HH", self.offset, self.body_length) + self.header.pack() + self.payload
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,14 +159,13 @@ def parse_frame(data: bytes, where: str = "acoustic frame") -> HalfFrame | Conta
 
 
 def _parse_half(half: HalfName, data: bytes) -> HalfFrame:
-    if len(data) < HALF_HEADER_SIZE:
-        raise FrameError("half frame", "length", len(data), f"at least {HALF_HEADER_SIZE} bytes")
-    image_id = _parse_image_id(data)
-    (offset,) = struct.unpack_from(">H", data, 5)
-    header = StreamHeader.unpack(data[7:HALF_HEADER_SIZE])
-    stop = half_bounds(header.body_length, half)[1]
-    wanted = max(0, stop - offset)
-    return HalfFrame(half, image_id, offset, header, data[HALF_HEADER_SIZE : HALF_HEADER_SIZE + wanted])
+    if len(data) < HALF_PREFIX_SIZE:
+        raise FrameError("half frame", "length", len(data), f"at least {HALF_PREFIX_SIZE} bytes and a stream header")
+    offset, body_length = struct.unpack_from(">HH", data, 5)
+    header = StreamHeader.unpack(data[HALF_PREFIX_SIZE:])
+    payload = data[HALF_PREFIX_SIZE + header.size :]
+    wanted = max(0, half_bounds(body_length, half)[1] - offset)
+    return HalfFrame(half, _parse_image_id(data), offset, body_length, header, payload[:wanted])
 
 
 def _parse_contact(data: bytes) -> ContactFrame:
@@ -185,10 +190,9 @@ def _check_image_id(where: str, image_id: str) -> None:
 def _check_stream_header(header: StreamHeader) -> None:
     limits = (
         ("codec_id", 0, 0xFF),
-        ("model_tag", 0, 0xFFFF),
+        ("model_tag", 0, (1 << 8 * tag_length(header.codec_id)) - 1),
         ("height_px", MIN_SIDE_PX, MAX_SIDE_PX),
         ("width_px", MIN_SIDE_PX, MAX_SIDE_PX),
-        ("body_length", 0, 0xFFFF),
     )
     for name, low, high in limits:
         value = getattr(header, name)

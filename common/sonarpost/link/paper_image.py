@@ -26,11 +26,11 @@ class Outcome(Enum):
 
 @dataclass(slots=True)
 class Candidate:
-    """The body as told by all frames that agree on one stream header.
+    """The body as told by all frames that agree on one stream header and body length.
 
     Attributes:
         header: The stream header they agree on.
-        body: `header.body_length` bytes, zero where nothing arrived.
+        body: As many bytes as they agree on, zero where nothing arrived.
         received: The ranges that arrived.
         frames: Frames that added a byte, and the one that brought the header.
     """
@@ -60,7 +60,7 @@ class Candidate:
     def missing_halves(self) -> tuple[HalfName, ...]:
         """Return the halves that are not empty and of which nothing arrived."""
         names: tuple[HalfName, ...] = ("top", "bottom")
-        bounds = {name: half_bounds(self.header.body_length, name) for name in names}
+        bounds = {name: half_bounds(len(self.body), name) for name in names}
         return tuple(n for n, (a, b) in bounds.items() if a < b and not covered_within(self.received, a, b))
 
 
@@ -115,7 +115,7 @@ class PendingImage:
     def complete(self) -> bool:
         """Whether the whole body of the leading candidate has arrived."""
         leader = self.leader
-        return leader is not None and leader.received_bytes == leader.header.body_length
+        return leader is not None and leader.received_bytes == len(leader.body)
 
     @property
     def open(self) -> bool:
@@ -132,13 +132,14 @@ class PendingImage:
     def add_half(self, frame: HalfFrame, now: float) -> Outcome:
         """Put in one half frame."""
         self.heard_at = now
-        candidate = next((c for c in self.candidates if c.header == frame.header), None)
+        agreeing = (c for c in self.candidates if c.header == frame.header and len(c.body) == frame.body_length)
+        candidate = next(agreeing, None)
         if candidate is not self.leader:
             self.conflicts += 1
         if candidate is None:
             if len(self.candidates) >= MAX_CANDIDATES:
                 return Outcome.REFUSED
-            candidate = Candidate(frame.header, bytearray(frame.header.body_length))
+            candidate = Candidate(frame.header, bytearray(frame.body_length))
             candidate.fill(frame)
             self.candidates.append(candidate)
             self._note_news(now)

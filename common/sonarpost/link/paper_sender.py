@@ -6,8 +6,8 @@ Rules, in the order in which they bind:
    second the bottom half, and nothing of the other.
 2. A half that does not fit is spread over several packets. The halves then share a packet when, and only when, that
    saves one: a packet costs its whole air time however little is in it.
-3. The contact record fills every frame left free, which costs no air time. It leads the first group of packets that
-   has a free frame, because where and how sure matters before what it looks like; the other free frames come last.
+3. The contact record fills every frame left free, which costs no air time. It leads each group of packets that has a
+   free frame, because where and how sure matters before what it looks like; further copies come last.
 4. When no packet of the image has a free frame (always so at one frame a packet), the contact record goes first, in
    a packet of its own.
 
@@ -21,7 +21,8 @@ from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_format import (
     CONTACT_FRAME_SIZE,
-    HALF_HEADER_SIZE,
+    HALF_PREFIX_SIZE,
+    MAX_HALF_HEADER_SIZE,
     ContactFrame,
     HalfFrame,
     HalfName,
@@ -55,15 +56,15 @@ def plan_packets(
     Raises:
         FrameError: The identifier is wrong, or the frames are too few or too small for a header and one byte (or
             for the contact record).
-        StreamError: The stream's header is wrong or its body is not as long as the header says.
+        StreamError: The stream's header is wrong or its body too long.
     """
     _check_sizes(frames_per_packet, frame_bytes, with_contact=contact is not None)
     header = StreamHeader.unpack(stream)
-    body = stream[StreamHeader.SIZE :]
-    if len(body) != header.body_length:
-        raise StreamError("stream", "body", f"{len(body)} bytes", f"{header.body_length} bytes as in its header")
+    body = stream[header.size :]
+    if len(body) > _MAX_BODY_BYTES:
+        raise StreamError("stream", "body", f"{len(body)} bytes", f"at most {_MAX_BODY_BYTES} bytes")
     top = _half_frames("top", image_id, header, body, frame_bytes)
-    bottom = _half_frames("bottom", image_id, header, body, frame_bytes) if header.body_length > 1 else ()
+    bottom = _half_frames("bottom", image_id, header, body, frame_bytes) if len(body) > 1 else ()
     record = None if contact is None else ContactFrame(image_id, contact).pack()
     groups = _group(top, bottom, frames_per_packet, with_contact=record is not None)
     if record is not None:
@@ -86,24 +87,25 @@ def body_capacity_bytes(frames_per_packet: int, frame_bytes: int, *, with_contac
     """
     _check_sizes(frames_per_packet, frame_bytes, with_contact=with_contact)
     frames = frames_per_packet - 1 if with_contact and frames_per_packet > 1 else frames_per_packet
-    return min(2 * frames * (frame_bytes - HALF_HEADER_SIZE), _MAX_BODY_BYTES)
+    return min(2 * frames * (frame_bytes - MAX_HALF_HEADER_SIZE), _MAX_BODY_BYTES)
 
 
 def _check_sizes(frames_per_packet: int, frame_bytes: int, *, with_contact: bool) -> None:
     if frames_per_packet < 1:
         raise FrameError("packet plan", "frames_per_packet", frames_per_packet, "at least 1")
-    least = CONTACT_FRAME_SIZE if with_contact else HALF_HEADER_SIZE + 1
+    least = CONTACT_FRAME_SIZE if with_contact else MAX_HALF_HEADER_SIZE + 1
     if frame_bytes < least:
         raise FrameError("packet plan", "frame_bytes", frame_bytes, f"at least {least}")
 
 
 def _half_frames(half: HalfName, image_id: str, header: StreamHeader, body: bytes, frame_bytes: int) -> Packet:
-    start, stop = half_bounds(header.body_length, half)
-    step = frame_bytes - HALF_HEADER_SIZE
+    start, stop = half_bounds(len(body), half)
+    step = frame_bytes - HALF_PREFIX_SIZE - header.size
     # An empty half still needs its start in the list: a picture with an empty body travels as one bare header.
     offsets = range(start, stop, step) or (start,)
     return tuple(
-        HalfFrame(half, image_id, offset, header, body[offset : min(offset + step, stop)]).pack() for offset in offsets
+        HalfFrame(half, image_id, offset, len(body), header, body[offset : min(offset + step, stop)]).pack()
+        for offset in offsets
     )
 
 
@@ -120,15 +122,12 @@ def _group(top: Packet, bottom: Packet, frames_per_packet: int, *, with_contact:
 
 def _place_contact(groups: tuple[Packet, ...], record: bytes, frames_per_packet: int) -> tuple[Packet, ...]:
     placed: list[Packet] = []
-    led = False
     for group in groups:
         free = -len(group) % frames_per_packet
-        if free and not led:
-            placed.append((record, *group, *(record,) * (free - 1)))
-            led = True
-        else:
-            placed.append(group + (record,) * free)
-    return tuple(placed) if led else ((record,), *placed)
+        placed.append((record, *group, *(record,) * (free - 1)) if free else group)
+    if any(record in group for group in placed):
+        return tuple(placed)
+    return ((record,), *placed)
 
 
 def _packets(frames: int, frames_per_packet: int) -> int:

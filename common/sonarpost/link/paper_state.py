@@ -97,12 +97,20 @@ def _read_time(entry: object, name: str) -> float:
 
 def _export_candidate(candidate: Candidate) -> dict[str, object]:
     pieces = [[start, bytes(candidate.body[start:stop])] for start, stop in candidate.received]
-    return {"header": candidate.header.pack(), "pieces": pieces, "frames": candidate.frames}
+    return {
+        "header": candidate.header.pack(),
+        "body_length": len(candidate.body),
+        "pieces": pieces,
+        "frames": candidate.frames,
+    }
 
 
 def _import_candidate(image_id: str, entry: object) -> Candidate:
     header = StreamHeader.unpack(read_field(entry, "header", bytes))
-    body = bytearray(header.body_length)
+    body_length = read_field(entry, "body_length", int)
+    if not 0 <= body_length <= 0xFFFF:
+        raise FrameError(_WHERE, "body_length", body_length, "0..65535")
+    body = bytearray(body_length)
     received: Ranges = ()
     for piece in read_list(entry, "pieces"):
         match piece:

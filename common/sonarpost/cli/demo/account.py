@@ -53,7 +53,7 @@ def read_channel_log(path: Path) -> ChannelAccount:
     account = ChannelAccount()
     if not path.is_file():
         return account
-    seen_packets = set()
+    seen_packets: set[int] = set()
     for line in path.read_text(encoding="utf-8").splitlines():
         entry = json.loads(line)
         if entry.get("event") == "start":
