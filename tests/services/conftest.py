@@ -107,7 +107,9 @@ def is_told(client: zenoh.Session, crew: Crew) -> Callable[[Service[Any]], None]
         eventually(lambda: any(h.service == service.NAME for h in heard), what="health record")
         crew.stop(service)
         eventually(lambda: tokens(key) == [], what=f"end of token {key}")
-        eventually(lambda: heard[-1].state == "stopping", what="last health record")
+        eventually(
+            lambda: "stopping" in [h.state for h in heard if h.service == service.NAME], what="last health record"
+        )
         subscriber.undeclare()
 
     return check
