@@ -1,0 +1,285 @@
+"""c2: what vessels relay is committed, kept in files and shown; nobody speaks for another vessel."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import msgpack
+import numpy as np
+import pytest
+from conftest import eventually
+
+from services.c2.config import C2Config
+from services.c2.service import C2Service
+from sonarpost import keys, wire
+from sonarpost.messages import Contact, Decision, Raster, ReconstructedImage, Relayed
+from sonarpost.sonar.image_files import read_image
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out"
+
+
+@pytest.fixture
+def begin(crew, platform, out):
+    return lambda folder=None: crew.start(C2Service(platform("shore-1"), C2Config(out_dir=folder or out)))
+
+
+@pytest.fixture
+def relay(crew):
+    return crew.neighbour("vessel-1", "relay")
+
+
+@pytest.fixture
+def image(texture):
+    def make(image_id="AAAA", vessel="vessel-1", seed=1):
+        picture = Raster.from_array(texture(seed=seed))
+        missing = np.zeros((40, 60), dtype=np.bool_)
+        missing[30:, :] = True
+        return ReconstructedImage(
+            vessel_id=vessel,
+            vehicle_id="uuv-1",
+            image_id=image_id,
+            version=1,
+            contact=Contact(contact_id="uuv-1/AAAA", vehicle_id="uuv-1", lat_deg=56.4, lon_deg=-5.6),
+            codec="vq",
+            model="",
+            picture=picture,
+            picture_sha256=picture.sha256,
+            complete=False,
+            missing_fraction=0.25,
+            missing_mask=np.packbits(missing).tobytes(),
+            missing_halves=(),
+            bytes_received=30,
+            bytes_total=42,
+            frames_received=2,
+            first_frame_utc_s=1_700_000_000.0,
+            last_frame_utc_s=1_700_000_001.0,
+        )
+
+    return make
+
+
+def decision(decision_id="d1", vessel="vessel-1", **changes):
+    fields = {
+        "decision_id": decision_id,
+        "vessel_id": vessel,
+        "vehicle_id": "uuv-1",
+        "image_id": "AAAA",
+        "image_version": 1,
+        "verdict": "mine_like",
+        "operator": "op",
+        "decided_utc_s": 1.0,
+    }
+    return Decision(**(fields | changes))
+
+
+def key_of(record, vessel):
+    return keys.image_reconstructed(vessel) if isinstance(record, ReconstructedImage) else keys.contact_decision(vessel)
+
+
+def envelope(record, vessel="vessel-1", **changes):
+    fields = {"vessel_id": vessel, "key": key_of(record, vessel), "payload": wire.encode(record), "relayed_utc_s": 5.0}
+    return Relayed(**(fields | changes))
+
+
+def send(relay, *records, vessel="vessel-1"):
+    relay.owe(
+        keys.shore_inbox(vessel), "c2", *(envelope(r, vessel) if not isinstance(r, Relayed) else r for r in records)
+    )
+
+
+def files(folder):
+    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+
+
+def test_a_picture_is_kept_and_shown_for_msgpack_alone(begin, relay, image, out, watch, is_told):
+    seen = watch(keys.shore_image("vessel-1"))
+    service = begin()
+    sent = image()
+    send(relay, sent)
+    eventually(lambda: len(seen) == 1)
+    shown = msgpack.unpackb(seen[0].payload.to_bytes())
+    assert (shown["type"], shown["image_id"], shown["contact"]["lat_deg"]) == ("reconstructed_image", "AAAA", 56.4)
+    picture = shown["picture"]
+    pixels = np.frombuffer(picture["data"], np.uint8).reshape(picture["height_px"], picture["width_px"])
+    assert hashlib.sha256(pixels.tobytes()).hexdigest() == shown["picture_sha256"]
+    assert str(seen[0].encoding) == "application/msgpack;schema=sonarpost.reconstructed_image.v1"
+    name = "uuv-1_20231114T221320Z_AAAA_v1"
+    assert files(out) == [f"vessel-1/{name}.{kind}" for kind in ("json", "png", "tiff")]
+    np.testing.assert_array_equal(read_image(out / "vessel-1" / f"{name}.tiff"), pixels)
+    side = json.loads((out / "vessel-1" / f"{name}.json").read_text())
+    assert (side["picture_sha256"], side["missing_pixels"], side["missing_rows"]) == (
+        sent.picture_sha256,
+        600,
+        [30, 40],
+    )
+    eventually(lambda: relay.store.outbox_depth() == 0)
+    assert service.health().counters == {"records_handled": 1, "images_stored": 1}
+    is_told(service)
+
+
+def test_a_decision_is_kept_and_shown(begin, relay, out, watch):
+    seen = watch(keys.shore_decision("vessel-1"))
+    begin()
+    send(relay, decision("d1", remark="Stein oder Mine? \u2014 pr\u00fcfen", confidence=0.75))
+    eventually(lambda: len(seen) == 1)
+    assert msgpack.unpackb(seen[0].payload.to_bytes())["verdict"] == "mine_like"
+    [kept] = (out / "vessel-1" / "decisions").iterdir()
+    assert (
+        json.loads(kept.read_text())
+        == decision("d1", remark="Stein oder Mine? \u2014 prüfen", confidence=0.75).model_dump()
+    )
+
+
+def test_the_same_record_again_changes_no_file_and_is_shown_again(begin, relay, image, out, watch):
+    pictures, decisions = watch(keys.shore_image("vessel-1")), watch(keys.shore_decision("vessel-1"))
+    service = begin()
+    send(relay, image(), decision())
+    eventually(lambda: len(decisions) == 1)
+    before = {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in out.rglob("*") if p.is_file()}
+    send(relay, image(), decision())
+    eventually(lambda: (len(pictures), len(decisions)) == (2, 2))
+    assert before == {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in out.rglob("*") if p.is_file()}
+    eventually(lambda: service.health().counters.get("records_handled") == 4)
+    counters = service.health().counters
+    assert (counters["images_stored"], counters["images_repeated"]) == (1, 1)
+    assert (counters["decisions_stored"], counters["decisions_repeated"]) == (1, 1)
+
+
+def test_another_decision_under_the_same_identifier_is_refused(begin, relay, out, refused, watch):
+    seen = watch(keys.shore_decision("vessel-1"))
+    service = begin()
+    send(relay, decision("d1"), decision("d1", verdict="not_mine_like"), decision("d2"))
+    eventually(lambda: len(seen) == 2)
+    assert [msgpack.unpackb(s.payload.to_bytes())["decision_id"] for s in seen] == ["d1", "d2"]
+    [(_, reason)] = refused(service)
+    assert "decision_id: got 'd1', expected an identifier that no other decision has" in reason
+    assert [json.loads(p.read_text())["verdict"] for p in (out / "vessel-1" / "decisions").iterdir()] == [
+        "mine_like"
+    ] * 2
+
+
+@pytest.mark.parametrize(
+    "hostile",
+    ["../../escaped", "/etc/cron.d/x", "..", ".", "a/b", "x" * 64, "%2e%2e%2f", "~root", "-rf", "CON:|<>?*", "$(x)`y`"],
+)
+def test_no_identifier_leads_out_of_the_folder(hostile, begin, relay, out, tmp_path):
+    service = begin()
+    send(relay, decision(hostile), decision("after"))
+    eventually(lambda: service.health().counters.get("decisions_stored") == 2)
+    kept = list((out / "vessel-1" / "decisions").iterdir())
+    assert {json.loads(p.read_text())["decision_id"] for p in kept} == {hostile, "after"}
+    assert files(tmp_path / "out") == sorted(f"vessel-1/decisions/{p.name}" for p in kept)
+    assert {p.name for p in tmp_path.iterdir()} == {"out", "state"}
+
+
+@pytest.mark.parametrize("long", ["\u00fc" * 64, "\U0001f41f" * 64, "x" * 65, "a\x00b", "a\nb"])
+def test_an_identifier_that_is_no_file_name_blocks_nothing(long, begin, relay, refused):
+    """A vessel's console may be of another make; whatever it sends, the records behind go on."""
+    service = begin()
+    fields = msgpack.unpackb(wire.encode(decision())) | {"decision_id": long}
+    send(relay, envelope(decision(), payload=msgpack.packb(fields)), decision("after"))
+    eventually(lambda: service.health().counters.get("decisions_stored", 0) >= 1)
+    assert service.store.inbox_depth() == 0
+    assert len(refused(service)) + service.health().counters["decisions_stored"] == 2
+    assert service.health().state == "ok"
+
+
+def wrong_vessel(image):
+    return envelope(image(vessel="vessel-2"), "vessel-1", key=keys.image_reconstructed("vessel-1"))
+
+
+def unknown_key(image):
+    return envelope(decision(), key="sonarpost/v1/vessel-1/health/relay")
+
+
+def escaping_key(image):
+    return envelope(decision(), key="../../../etc")
+
+
+def wrong_record(image):
+    return envelope(decision(), key=keys.image_reconstructed("vessel-1"))
+
+
+def damaged(image):
+    return envelope(decision(), payload=wire.encode(decision())[:-3])
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (wrong_vessel, "vessel_id"),
+        (unknown_key, "key"),
+        (escaping_key, "key"),
+        (wrong_record, "type"),
+        (damaged, "payload"),
+    ],
+)
+def test_an_envelope_with_the_wrong_content_is_refused_and_said(make, field, begin, relay, image, refused, out):
+    service = begin()
+    send(relay, make(image), image())
+    eventually(lambda: service.health().counters.get("images_stored") == 1)
+    eventually(lambda: len(refused(relay)) == 1)
+    reason = refused(relay)[0][1]
+    assert f"{field}: got" in reason
+    assert "expected" in reason
+    assert refused(service) == refused(relay)
+    assert {p.parts[0] for p in (f.relative_to(out) for f in out.rglob("*.json"))} == {"vessel-1"}
+
+
+def test_no_vessel_speaks_for_another(begin, relay, image, refused, out):
+    service = begin()
+    forged = envelope(image(vessel="vessel-2"), "vessel-2")
+    relay.owe(keys.shore_inbox("vessel-1"), "c2", forged)
+    send(relay, image())
+    eventually(lambda: service.health().counters.get("images_stored") == 1)
+    [(key, reason)] = refused(service)
+    assert key == keys.shore_inbox("vessel-1")
+    assert "vessel_id: got 'vessel-2'" in reason
+    assert not (out / "vessel-2").exists()
+
+
+def test_two_vessels_are_kept_apart(begin, crew, relay, image, out):
+    begin()
+    other = crew.neighbour("vessel-2", "relay")
+    send(relay, image(seed=1), decision())
+    send(other, image(vessel="vessel-2", seed=2), decision(vessel="vessel-2"), vessel="vessel-2")
+    eventually(lambda: len(list(out.rglob("*.json"))) == 4)
+    one, two = (json.loads(next((out / v).glob("*.json")).read_text()) for v in ("vessel-1", "vessel-2"))
+    assert (one["vessel_id"], two["vessel_id"]) == ("vessel-1", "vessel-2")
+    assert one["picture_sha256"] != two["picture_sha256"]
+
+
+def test_what_was_committed_before_a_stop_is_handled_after_it(begin, crew, platform, relay, image, out, watch):
+    seen = watch(keys.shore_image("vessel-1"))
+    idle = C2Service(platform("shore-1"), C2Config(out_dir=out))
+    with idle.store.transaction() as tx:
+        tx.accept(keys.shore_inbox("vessel-1"), wire.encode(envelope(image())), b"o" * 16, 1)
+    idle.store.close()
+    assert not out.exists()
+    service = begin()
+    eventually(lambda: len(seen) == 1)
+    assert len(files(out)) == 3
+    crew.stop(service)
+    again = begin()
+    assert again.store.inbox_depth() == 0
+    assert len(seen) == 1
+
+
+def test_a_folder_that_takes_nothing_keeps_records_in_the_store(begin, relay, image, tmp_path, watch):
+    seen = watch(keys.shore_image("vessel-1"))
+    blocker = tmp_path / "disk"
+    blocker.write_text("not mounted")
+    service = begin(blocker / "out")
+    send(relay, image("AAAA"), image("BBBB"))
+    eventually(lambda: service.health().state == "degraded")
+    assert str(blocker) in service.health().detail
+    eventually(lambda: relay.store.outbox_depth() == 0, what="acknowledgement of what is in the store")
+    assert seen == []
+    blocker.unlink()
+    eventually(lambda: len(seen) == 2)
+    assert [msgpack.unpackb(s.payload.to_bytes())["image_id"] for s in seen] == ["AAAA", "BBBB"]
+    eventually(lambda: service.health().state == "ok")
