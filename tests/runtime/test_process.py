@@ -1,0 +1,349 @@
+"""A service as a process of its own: it ends when told to, says what is wrong in one line, and dies with its parent."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+from conftest import REPOSITORY, eventually
+
+from sonarpost import keys, wire
+from sonarpost.messages import Health
+from sonarpost.runtime.store import Store
+
+TINY = """
+import sys, threading
+from collections.abc import Mapping
+from sonarpost.messages import Decision, Record
+from sonarpost.runtime.config import ServiceConfig
+from sonarpost.runtime.process import main
+from sonarpost.runtime.service import Effects, Service
+
+class TinyConfig(ServiceConfig):
+    loops_forever_on_stop: bool = False
+    breaks: bool = False
+
+class Tiny(Service[TinyConfig]):
+    '''Takes decisions.'''
+    NAME = "relay"
+
+    def consumes(self) -> Mapping[str, type[Record]]:
+        return {"sonarpost/v1/vessel-1/contact/decision": Decision}
+
+    def handle(self, key: str, record: Record, effects: Effects) -> None:
+        effects.count("decisions")
+
+    def on_start(self) -> None:
+        if self.config.breaks:
+            self.spawn(lambda: 1 // 0, "breaks")
+
+    def on_stop(self) -> None:
+        if self.config.loops_forever_on_stop:
+            threading.Event().wait()
+
+sys.exit(main(Tiny, TinyConfig))
+"""
+
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Starts the tiny service with a configuration file of the given text."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start_one(configuration: str, **environment: str) -> subprocess.Popen[str]:
+        path = tmp_path / "vessel.toml"
+        path.write_text(configuration)
+        process = subprocess.Popen(
+            [sys.executable, "-c", TINY, "--config", str(path)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **environment},
+        )
+        started.append(process)
+        return process
+
+    yield start_one
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def configuration(tmp_path: Path, router: str, own: str = "") -> str:
+    return textwrap.dedent(f"""\
+        [platform]
+        id = "vessel-1"
+        router = ["{router}"]
+        state_dir = "{tmp_path / "state"}"
+        health_interval_s = 0.1
+        [relay]
+        {own}
+        """)
+
+
+def read_until(process: subprocess.Popen[str], text: str) -> str:
+    """Return the log up to the line that holds `text`."""
+    assert process.stderr is not None
+    lines = []
+    for line in process.stderr:
+        lines.append(line)
+        if text in line:
+            return "".join(lines)
+    pytest.fail(f"ended without {text!r}:\n" + "".join(lines))
+
+
+def end(process: subprocess.Popen[str], number: signal.Signals) -> tuple[int, float, str]:
+    """Send a signal; return status, seconds until the end, and the rest of the log."""
+    began = time.monotonic()
+    process.send_signal(number)
+    _, err = process.communicate(timeout=20)
+    return process.returncode, time.monotonic() - began, err
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_a_running_service_soon_and_well(
+    number: signal.Signals, start: Start, tmp_path: Path, router: str
+) -> None:
+    process = start(configuration(tmp_path, router))
+    read_until(process, "Service started")
+    status, seconds, log = end(process, number)
+    assert status == 0
+    assert seconds < 3
+    assert f"Stopping signal={number.name}" in log
+    assert log.rstrip().endswith("Service stopped")
+    assert "Traceback" not in log
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_a_service_that_waits_for_its_router(
+    number: signal.Signals, start: Start, tmp_path: Path
+) -> None:
+    process = start(configuration(tmp_path, "tcp/127.0.0.1:1"))
+    read_until(process, "Zenoh router not reached")
+    status, seconds, log = end(process, number)
+    assert (status, "Traceback" in log) == (0, False)
+    assert seconds < 3
+
+
+def test_a_signal_ends_a_service_whose_record_nobody_takes(start: Start, tmp_path: Path, router: str) -> None:
+    (tmp_path / "state").mkdir()
+    store = Store(tmp_path / "state" / "relay.db")
+    with store.transaction() as tx:
+        for _ in range(20):
+            tx.send("sonarpost/v1/shore/inbox/vessel-1", "c2", b"x" * 100_000, encoding="e")
+    store.close()
+    process = start(configuration(tmp_path, router))
+    read_until(process, "A consumer does not answer, records wait")
+    status, seconds, log = end(process, signal.SIGTERM)
+    assert (status, "Traceback" in log) == (0, False)
+    assert seconds < 3
+    store = Store(tmp_path / "state" / "relay.db")
+    assert store.outbox_depth() == 20
+    store.close()
+
+
+def test_a_shutdown_that_hangs_is_cut_short(start: Start, tmp_path: Path, router: str) -> None:
+    process = start(configuration(tmp_path, router, "loops_forever_on_stop = true"))
+    read_until(process, "Service started")
+    status, seconds, log = end(process, signal.SIGTERM)
+    assert status == 3
+    assert seconds < 5
+    assert "Shutdown takes too long" in log
+
+
+def test_a_defect_in_a_thread_ends_the_service_with_its_traceback(start: Start, tmp_path: Path, router: str) -> None:
+    process = start(configuration(tmp_path, router, "breaks = true"))
+    _, log = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert "ZeroDivisionError" in log
+    assert "Service stopped" in log
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[platform]\nid = 'vessel-1'\nrouters = []\n", "vessel.toml:3: platform.routers: got 'an unknown key'"),
+        ("[relay]\n", "vessel.toml: platform.id: got 'nothing', expected a value"),
+        ("[platform\n", "expected valid TOML"),
+    ],
+)
+def test_a_wrong_configuration_is_status_2_and_one_line(start: Start, text: str, message: str) -> None:
+    process = start(text)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert out == ""
+    assert err.startswith("relay: ")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_a_wrong_override_is_status_2_and_one_line(start: Start, tmp_path: Path, router: str) -> None:
+    process = start(configuration(tmp_path, router), SONARPOST_RELAY__BREAKS="often")
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert err == "relay: environment: SONARPOST_RELAY__BREAKS: got 'often', expected a valid boolean\n"
+
+
+def test_a_store_that_cannot_be_opened_is_status_2_and_one_line(start: Start, tmp_path: Path, router: str) -> None:
+    (tmp_path / "state").mkdir()
+    (tmp_path / "state" / "relay.db").write_bytes(b"somebody's file" * 100)
+    process = start(configuration(tmp_path, router))
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert err.count("\n") == 1
+    assert "ERROR relay: Service cannot start" in err
+    assert "cannot be opened as a sonarpost store" in err
+
+
+def test_logs_are_json_when_asked_for(start: Start, tmp_path: Path, router: str) -> None:
+    process = start(configuration(tmp_path, router), SONARPOST_PLATFORM__LOG_FORMAT="json")
+    log = read_until(process, "Service started")
+    assert all(
+        re.match(r'\{"time": "20[^"]+Z", "level": "info", "service": "relay", ', line) for line in log.splitlines()
+    )
+
+
+def test_a_running_service_shows_that_it_is_alive_and_well(
+    start: Start, tmp_path: Path, router: str, client: zenoh.Session
+) -> None:
+    seen: list[Health] = []
+    key = keys.health("vessel-1", "relay")
+    client.declare_subscriber(key, lambda sample: seen.append(wire.decode(Health, sample.payload.to_bytes(), key)))
+    process = start(configuration(tmp_path, router))
+
+    def alive() -> bool:
+        replies = client.liveliness().get(keys.alive("vessel-1", "relay"), timeout=2)
+        return any(reply.ok is not None for reply in replies)
+
+    eventually(lambda: len(seen) > 2 and seen[-1].state == "ok")
+    assert alive()
+    assert seen[-1].gauges == {"inbox": 0.0, "outbox": 0.0, "refused": 0.0}
+    assert seen[-1].started_utc_s <= seen[0].time_utc_s < seen[-1].time_utc_s
+    assert end(process, signal.SIGTERM)[0] == 0
+    eventually(lambda: seen[-1].state == "stopping")
+    eventually(lambda: not alive())
+
+
+def test_help_names_the_service(start: Start) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", TINY, "--help"], capture_output=True, text=True, check=False, timeout=20
+    )
+    assert done.returncode == 0
+    assert "usage: python -m services.relay" in done.stdout
+    assert "Takes decisions." in done.stdout
+
+
+# Ending with the parent
+
+PARENT = """
+import os, subprocess, sys
+child = subprocess.Popen(sys.argv[1:], env={**os.environ, "SONARPOST_EXIT_WITH_PARENT": str(os.getpid())},
+                         stdout=subprocess.DEVNULL)
+print(child.pid, flush=True)
+child.wait()
+"""
+on_linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a Linux call makes it so")
+
+
+def running(pid: int) -> bool:
+    """Tell whether a process runs (one that ended and was not collected by its new parent does not)."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state not in "ZX"
+
+
+@on_linux
+def test_a_service_ends_when_the_process_that_started_it_is_killed(tmp_path: Path, router: str) -> None:
+    path = tmp_path / "vessel.toml"
+    path.write_text(configuration(tmp_path, router))
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PARENT, sys.executable, "-c", TINY, "--config", str(path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert parent.stdout is not None
+    child = int(parent.stdout.readline())
+    try:
+        read_until(parent, "Service started")
+        assert running(child)
+    finally:
+        parent.kill()
+        # The child has the other end of this pipe: it reads empty once both are gone.
+        _, log = parent.communicate(timeout=20)
+    eventually(lambda: not running(child), 5, "the end of the service")
+    assert "Stopping signal=SIGTERM" in log
+    assert "Service stopped" in log
+
+
+@on_linux
+def test_a_service_whose_starter_is_gone_already_does_not_start(start: Start, tmp_path: Path, router: str) -> None:
+    process = start(configuration(tmp_path, router), SONARPOST_EXIT_WITH_PARENT=str(os.getpid() + 1_000_000))
+    _, log = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert log == ""
+
+
+def test_without_the_variable_a_service_outlives_its_starter(tmp_path: Path, router: str) -> None:
+    path = tmp_path / "vessel.toml"
+    path.write_text(configuration(tmp_path, router))
+    log_path = tmp_path / "log"
+    script = PARENT.replace(', "SONARPOST_EXIT_WITH_PARENT": str(os.getpid())', "").replace("child.wait()", "")
+    with log_path.open("w") as log:
+        done = subprocess.run(
+            [sys.executable, "-c", script, sys.executable, "-c", TINY, "--config", str(path)],
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            check=True,
+            timeout=20,
+        )
+    child = int(done.stdout)
+    try:
+        eventually(lambda: "Service started" in log_path.read_text())
+    finally:
+        os.kill(child, signal.SIGTERM)
+    eventually(lambda: "Service stopped" in log_path.read_text())
+
+
+# The embedded router
+
+
+def router_process(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "sonarpost.runtime.router", *arguments],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=REPOSITORY,
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_the_router_ends_on_a_signal(number: signal.Signals) -> None:
+    process = router_process("--listen", "tcp/127.0.0.1:0")
+    read_until(process, "Router started")
+    status, seconds, _ = end(process, number)
+    assert status == 0
+    assert seconds < 3
+
+
+def test_a_router_that_cannot_listen_is_status_2(router: str) -> None:
+    process = router_process("--listen", router)
+    _, log = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert "Router cannot start" in log
+    assert router in log
