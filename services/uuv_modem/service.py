@@ -152,11 +152,12 @@ def summary_of(contact: Contact, height_px: int, width_px: int) -> ContactSummar
     What the record cannot hold travels as unknown: a vehicle's wrong clock must not cost the picture.
     """
     time_utc_s = contact.time_utc_s
+    has_fix = contact.lat_deg is not None and contact.lon_deg is not None
     return ContactSummary(
         height_px=height_px,
         width_px=width_px,
-        lat_deg=contact.lat_deg if contact.lon_deg is not None else None,
-        lon_deg=contact.lon_deg if contact.lat_deg is not None else None,
+        lat_deg=contact.lat_deg if has_fix else None,
+        lon_deg=contact.lon_deg if has_fix else None,
         time_utc_s=time_utc_s if time_utc_s is not None and time_utc_s <= _LAST_TIME_UTC_S else None,
         confidence=contact.atd_confidence,
         heading_deg=contact.heading_deg,
@@ -166,5 +167,5 @@ def summary_of(contact: Contact, height_px: int, width_px: int) -> ContactSummar
         ground_range_m=contact.ground_range_m if contact.channel else None,
         pixel_along_m=contact.pixel_along_m,
         pixel_across_m=contact.pixel_across_m,
-        position_sigma_m=contact.position_sigma_m if contact.lat_deg is not None else None,
+        position_sigma_m=contact.position_sigma_m if has_fix else None,
     )
