@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import select
+import threading
+import tty
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +19,11 @@ from sonarpost import keys, wire
 from sonarpost.messages import Contact, Health, Raster, Record, Snippet
 from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.service import Effects, Service
+from sonarpost.sim.acoustic_channel import AcousticChannel
+from sonarpost.sim.channel_config import ChannelConfig, ModemSite
 from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.sim.water_physics import Position
+from sonarpost.sim.water_records import WaterConfig
 from sonarpost.sonar.xtf_writer import write_xtf
 
 PlatformMaker = Callable[[str], PlatformConfig]
@@ -202,3 +210,90 @@ def put_file(tmp_path: Path) -> Callable[[str, bytes], Path]:
         return hidden.rename(folder / name)
 
     return put
+
+
+class SerialCable:
+    """A pseudo-terminal between a service and an emulated modem, into which a test can speak.
+
+    Args:
+        device: The emulated modem's port, or None for a cable with nothing at its end.
+    """
+
+    def __init__(self, device: str | None) -> None:
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.port = os.ttyname(self._slave)
+        self._modem = -1
+        if device is not None:
+            self._modem = os.open(device, os.O_RDWR | os.O_NOCTTY)
+            tty.setraw(self._modem)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._copy, daemon=True)
+        self._thread.start()
+
+    def say(self, data: bytes) -> None:
+        """Let the service read these bytes."""
+        while data:
+            data = data[os.write(self._master, data) :]
+
+    def _copy(self) -> None:
+        ends = {self._master: self._modem, self._modem: self._master}
+        ends.pop(-1, None)
+        while not self._stop.is_set():
+            for end in select.select(list(ends), [], [], 0.05)[0]:
+                data = os.read(end, 4096)
+                if ends[end] >= 0:
+                    os.write(ends[end], data)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        for descriptor in (self._master, self._slave, self._modem):
+            if descriptor >= 0:
+                os.close(descriptor)
+
+
+@pytest.fixture
+def cable() -> Iterator[Callable[[str | None], SerialCable]]:
+    """Lays serial cables."""
+    laid: list[SerialCable] = []
+
+    def lay(device: str | None) -> SerialCable:
+        laid.append(SerialCable(device))
+        return laid[-1]
+
+    yield lay
+    for each in laid:
+        each.close()
+
+
+class Sea:
+    """Two emulated modems, the vessel's (1) and the vehicle's (3), 150 m apart, where time runs fast."""
+
+    VESSEL, VEHICLE = 1, 2
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._channel: AcousticChannel | None = None
+
+    def port(self, modem: int) -> str:
+        return str(self.folder / f"modem-{modem}")
+
+    def start(self, **water: Any) -> AcousticChannel:
+        sites = (ModemSite(1), ModemSite(3, Position(150.0)))
+        config = ChannelConfig(sites, WaterConfig(**water), pty_dir=self.folder, time_scale=150.0)
+        self._channel = AcousticChannel(config)
+        self._channel.start()
+        return self._channel
+
+    def stop(self) -> None:
+        if self._channel is not None:
+            self._channel.stop()
+            self._channel = None
+
+
+@pytest.fixture
+def sea(tmp_path: Path) -> Iterator[Sea]:
+    sea = Sea(tmp_path / "modems")
+    yield sea
+    sea.stop()

@@ -368,7 +368,7 @@ def test_a_full_disk_finds_nothing_twice_and_loses_nothing(begin, compressor, pu
     service = begin()
     service.store._db.execute("PRAGMA max_page_count=1")
     put_file("line.xtf", xtf(1))
-    eventually(lambda: "full" in service.health().detail)
+    eventually(lambda: "disk is full" in service.health().detail)
     assert compressor.got == []
     service.store._db.execute("PRAGMA max_page_count=1000000")
     eventually(lambda: len(compressor.got) == 3)
