@@ -10,11 +10,16 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from hypothesis import settings
 
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.session import client_config, router_config
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+
+# An example that waits for the disk of a loaded machine is slow, not wrong; pytest-timeout ends what hangs.
+settings.register_profile("sonarpost", deadline=None)
+settings.load_profile("sonarpost")
 
 
 def free_port() -> int:
