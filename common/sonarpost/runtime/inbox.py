@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import zenoh
 
 from sonarpost import keys
-from sonarpost.errors import BadInputError, HandoffError
-from sonarpost.runtime.handoff import Reply, parse_chunk
+from sonarpost.errors import BadInputError, HandoffError, PayloadError
+from sonarpost.runtime.handoff import MAX_RECORD_BYTES, Reply, parse_chunk
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.store import Chunk, Store, Transaction
 
@@ -86,8 +86,13 @@ class Inbox:
         self._arrive(_Arrival(key, payload, attached, query))
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
-        if sample.attachment is None and sample.kind == zenoh.SampleKind.PUT:
-            self._arrive(_Arrival(str(sample.key_expr), sample.payload.to_bytes(), b"", None))
+        if sample.attachment is not None or sample.kind != zenoh.SampleKind.PUT:
+            return
+        key, size = str(sample.key_expr), len(sample.payload)
+        if size > MAX_RECORD_BYTES:
+            self._on_refused(PayloadError(key, "payload", f"{size} bytes", f"at most {MAX_RECORD_BYTES} bytes"))
+            return
+        self._arrive(_Arrival(key, sample.payload.to_bytes(), b"", None))
 
     def _arrive(self, arrival: _Arrival) -> None:
         while not self._stop.is_set():

@@ -63,6 +63,9 @@ def _run(service: Service[C]) -> int:
     try:
         if service.start():
             service.stopping.wait()
+    except (OSError, SonarpostError) as error:
+        log.error("Service cannot start", extra=logs.kv(reason=str(error)))
+        service.failed = True
     finally:
         guard = threading.Timer(SHUTDOWN_S, _give_up)
         guard.daemon = True

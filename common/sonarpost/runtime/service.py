@@ -25,7 +25,7 @@ from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.inbox import Inbox
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.outbox import Outbox
-from sonarpost.runtime.session import client_config, open_with_retry
+from sonarpost.runtime.session import open_with_retry
 from sonarpost.runtime.store import InboxItem, Store, Transaction
 
 log = logging.getLogger(__name__)
@@ -158,7 +158,7 @@ class Service(ABC, Generic[C]):
     def start(self) -> bool:
         """Open the session and begin; False when stopped before a router was reached."""
         endpoints = self.platform.router
-        self._session = open_with_retry(client_config(endpoints), self.stopping, ", ".join(endpoints))
+        self._session = open_with_retry(endpoints, self.stopping)
         if self._session is None:
             return False
         self._token = self._session.liveliness().declare_token(keys.alive(self.platform.id, self.NAME))

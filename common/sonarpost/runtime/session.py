@@ -48,18 +48,20 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.C
     return zenoh.Config.from_json5(json.dumps(settings))
 
 
-def open_with_retry(config: zenoh.Config, stop: threading.Event, where: str) -> zenoh.Session | None:
-    """Open a session, trying again until it opens or `stop` is set (then None).
+def open_with_retry(endpoints: Sequence[str], stop: threading.Event) -> zenoh.Session | None:
+    """Open a client session, trying each endpoint in turn until one opens or `stop` is set (then None).
 
-    The library's own endless retry cannot be interrupted by a signal, so the loop is here.
+    The library's own endless retry cannot be interrupted by a signal and stays with the first endpoint, so the loop is
+    here. Once open, the session finds back to its endpoint by itself.
     """
     attempt = 0
     while not stop.is_set():
+        endpoint = endpoints[attempt % len(endpoints)]
         try:
-            return zenoh.open(config)
+            return zenoh.open(client_config([endpoint]))
         except zenoh.ZError as error:
             if attempt == 0:
-                log.warning("Zenoh router not reached, trying again", extra=kv(router=where, error=str(error)[:200]))
-            stop.wait(RETRY_S[min(attempt, len(RETRY_S) - 1)])
+                log.warning("Zenoh router not reached, trying again", extra=kv(router=endpoint, error=str(error)[:200]))
             attempt += 1
+            stop.wait(RETRY_S[min(attempt // len(endpoints), len(RETRY_S) - 1)])
     return None

@@ -7,6 +7,7 @@ acknowledged. Handling a record removes it from the inbox, adds what it leads to
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import sqlite3
 import threading
@@ -16,10 +17,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from sonarpost.errors import HandoffError
 
 SCHEMA_VERSION = 1
+
+# Bounds on what strangers can make a store keep: whatever is beyond them, the oldest goes.
+REFUSED_KEPT = 1000
+REFUSED_BYTES = 256 * 1024
+PARTIALS_KEPT = 64
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
@@ -132,11 +139,12 @@ class Transaction:
         self._db.execute("DELETE FROM inbox WHERE id = ?", (item.id,))
 
     def refuse(self, direction: str, key: str, payload: bytes, reason: str) -> None:
-        """Keep a record that cannot be handled, with the reason."""
-        self._db.execute(
-            "INSERT INTO refused (direction, key, payload, reason, at_utc_s) VALUES (?, ?, ?, ?, ?)",
-            (direction, key, payload, reason, time.time()),
-        )
+        """Keep a record that cannot be handled, with the reason: the latest 1000, of each at most 256 kB."""
+        row = self._db.execute(
+            "INSERT INTO refused (direction, key, payload, reason, at_utc_s) VALUES (?, ?, ?, ?, ?) RETURNING id",
+            (direction, key, payload[:REFUSED_BYTES], reason, time.time()),
+        ).fetchone()
+        self._db.execute("DELETE FROM refused WHERE id <= ?", (int(row[0]) - REFUSED_KEPT,))
 
     def mark_seen(self, origin: bytes, seq: int) -> bool:
         """Remember (origin, seq) without an inbox record; False when it was known."""
@@ -187,6 +195,10 @@ class Transaction:
             "INSERT OR REPLACE INTO partial VALUES (?, ?, ?, ?, ?, ?)",
             (*which, chunk.size, chunk.sha256, data, time.time()),
         )
+        self._db.execute(
+            "DELETE FROM partial WHERE rowid NOT IN (SELECT rowid FROM partial ORDER BY touched_utc_s DESC LIMIT ?)",
+            (PARTIALS_KEPT,),
+        )
         return len(data)
 
     def put_state(self, name: str, value: bytes) -> None:
@@ -217,22 +229,31 @@ class Store:
         self.inbox_changed = threading.Event()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._db = sqlite3.connect(path, check_same_thread=False, isolation_level=None, timeout=10)
-            self._open()
-        except (sqlite3.Error, OSError) as error:
+            self._lock_file = _only_user(path)
+        except OSError as error:
             raise HandoffError(f"{path}: cannot be opened as a sonarpost store: {error}") from error
-        with self.transaction() as tx:
-            self.origin = self._meta(tx, "origin", uuid.uuid4().bytes)
-            version = int(self._meta(tx, "version", str(SCHEMA_VERSION).encode()))
-        if version != SCHEMA_VERSION:
-            raise HandoffError(f"{path}: store version {version}, expected {SCHEMA_VERSION}")
+        try:
+            self._open()
+        except BaseException:
+            self._lock_file.close()
+            raise
 
     def _open(self) -> None:
-        self._db.execute("PRAGMA journal_mode=WAL")
-        self._db.execute("PRAGMA synchronous=FULL")
-        self._db.executescript(_SCHEMA)
+        try:
+            self._db = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
+            self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.execute("PRAGMA synchronous=FULL")
+            self._db.executescript(_SCHEMA)
+        except sqlite3.Error as error:
+            raise HandoffError(f"{self.path}: cannot be opened as a sonarpost store: {error}") from error
+        with self.transaction():
+            self.origin = self._meta("origin", uuid.uuid4().bytes)
+            version = int(self._meta("version", str(SCHEMA_VERSION).encode()))
+        if version != SCHEMA_VERSION:
+            self._db.close()
+            raise HandoffError(f"{self.path}: store version {version}, expected {SCHEMA_VERSION}")
 
-    def _meta(self, tx: Transaction, name: str, initial: bytes) -> bytes:
+    def _meta(self, name: str, initial: bytes) -> bytes:
         self._db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?)", (name, initial))
         row = self._db.execute("SELECT value FROM meta WHERE name = ?", (name,)).fetchone()
         return bytes(row[0])
@@ -322,6 +343,22 @@ class Store:
         """Close the file."""
         with self._lock:
             self._db.close()
+            self._lock_file.close()
+
+
+def _only_user(path: Path) -> IO[bytes]:
+    """Lock the store for this process; the kernel lets go when it ends, however it ends.
+
+    Raises:
+        HandoffError: Another process has it: two of them would handle every record twice.
+    """
+    file = path.with_name(f"{path.name}.lock").open("ab")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        file.close()
+        raise HandoffError(f"{path}: in use by another process of this service") from error
+    return file
 
 
 def _bytes(value: object) -> bytes:

@@ -17,7 +17,7 @@ from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_sender import plan_packets
 from sonarpost.messages import AcousticFrame, EncodedImage, Health, ReconstructedImage, Record, Snippet
 from sonarpost.modem.rates import RATES
-from sonarpost.runtime.session import client_config, open_with_retry
+from sonarpost.runtime.session import open_with_retry
 
 log = logging.getLogger(__name__)
 
@@ -81,7 +81,7 @@ class Watcher:
         timer = threading.Timer(CONNECT_S, give_up.set)
         timer.daemon = True
         timer.start()
-        session = open_with_retry(client_config([endpoint]), give_up, endpoint)
+        session = open_with_retry([endpoint], give_up)
         timer.cancel()
         if session is None:
             raise PortError(f"{endpoint}: no router answered within {CONNECT_S:.0f} s")
