@@ -1,0 +1,205 @@
+"""A program of other people: `zenoh` (zenoh-cli), which knows nothing of sonarpost, and plain msgpack.
+
+It sees what services publish, can decode it, and cannot do harm by publishing rubbish.
+"""
+
+from __future__ import annotations
+
+import base64
+import queue
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from conftest import eventually
+
+from services.atd_stub.config import AtdStubConfig
+from services.atd_stub.service import AtdStubService
+from services.c2.config import C2Config
+from services.c2.service import C2Service
+from sonarpost.runtime.config import PlatformConfig
+from sonarpost.sonar.image_files import write_tiff
+
+ZENOH = Path(sys.executable).with_name("zenoh")
+pytestmark = pytest.mark.skipif(
+    not ZENOH.is_file() and shutil.which("zenoh") is None, reason="zenoh-cli is not installed (pip install zenoh-cli)"
+)
+
+PlatformMaker = Callable[[str], PlatformConfig]
+DETECTED = "sonarpost/v1/uuv-1/contact/detected"
+INBOX = "sonarpost/v1/shore/inbox/vessel-1"
+ACCEPTED = "sonarpost/v1/shore/contact/vessel-1/decision"
+DECISION_KEY = "sonarpost/v1/vessel-1/contact/decision"
+
+
+def command(router: str, *arguments: str) -> list[str]:
+    program = str(ZENOH) if ZENOH.is_file() else str(shutil.which("zenoh"))
+    quiet = ["--cfg", "scouting/multicast/enabled:false", "--cfg", "transport/shared_memory/enabled:false"]
+    return [program, "--mode", "client", "--connect", router, *quiet, *arguments]
+
+
+class Subscriber:
+    """`zenoh subscribe` as a process; what it prints, decoded with base64 and msgpack and nothing else."""
+
+    def __init__(self, router: str, *key_expressions: str) -> None:
+        wanted = [part for key in key_expressions for part in ("-k", key)]
+        self._process = subprocess.Popen(
+            command(router, "subscribe", *wanted, "--decoder", "base64", "--line", "{key} {value}"),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        self._lines: queue.Queue[str] = queue.Queue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.put(line)
+
+    def next(self) -> tuple[str, dict[str, Any]]:
+        key, value = self._lines.get(timeout=15).split()
+        return key, msgpack.unpackb(base64.b64decode(value))
+
+    def until(self, key: str) -> dict[str, Any]:
+        deadline = time.monotonic() + 15
+        while time.monotonic() < deadline:
+            met, fields = self.next()
+            if met == key:
+                return fields
+        pytest.fail(f"nothing on {key}")
+
+    def close(self) -> None:
+        self._process.terminate()
+        self._process.communicate(timeout=10)
+
+
+@pytest.fixture
+def subscribe(router: str) -> Iterator[Callable[..., Subscriber]]:
+    opened: list[Subscriber] = []
+
+    def make(*key_expressions: str) -> Subscriber:
+        opened.append(Subscriber(router, *key_expressions))
+        return opened[-1]
+
+    yield make
+    for subscriber in opened:
+        subscriber.close()
+
+
+def put(router: str, key: str, payload: bytes) -> None:
+    """Publish bytes, as `zenoh put` does: no attachment, no encoding."""
+    value = base64.b64encode(payload).decode()
+    done = subprocess.run(
+        command(router, "put", "-k", key, "-v", value, "--encoder", "base64"),
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_subscriber_without_sonarpost_reads_what_a_service_publishes(
+    tmp_path: Path, router: str, platform: PlatformMaker, subscribe: Callable[..., Subscriber]
+) -> None:
+    pixels = np.arange(32 * 48, dtype=np.uint16).reshape(32, 48)
+    incoming = tmp_path / "incoming"
+    incoming.mkdir()
+    service = AtdStubService(
+        platform("uuv-1"), AtdStubConfig(mode="snippets", input_dir=incoming, poll_s=0.05, settle_s=0)
+    )
+    service.start()
+    try:
+        watcher = subscribe(DETECTED, "sonarpost/v1/uuv-1/health/*")
+        # Its first health record shows that the subscriber is there, before the one record that comes once only.
+        health = watcher.until("sonarpost/v1/uuv-1/health/atd_stub")
+        write_tiff(incoming / "rock.tif", pixels)
+        snippet = watcher.until(DETECTED)
+    finally:
+        service.stop()
+    assert (health["type"], health["v"], health["state"], health["service"]) == ("health", 1, "ok", "atd_stub")
+    assert (snippet["type"], snippet["v"], snippet["source"]) == ("snippet", 1, "rock.tif")
+    assert snippet["contact"]["vehicle_id"] == "uuv-1"
+    assert snippet["contact"]["lat_deg"] is None
+    picture = snippet["picture"]
+    assert (picture["height_px"], picture["width_px"], picture["bits"]) == (32, 48, 16)
+    assert np.frombuffer(picture["data"], "<u2").reshape(32, 48).tolist() == pixels.tolist()
+
+
+def decision(number: int) -> bytes:
+    """Return a decision packed by hand, from the document alone."""
+    return bytes(
+        msgpack.packb(
+            {
+                "type": "decision",
+                "v": 1,
+                "decision_id": f"d{number}",
+                "vessel_id": "vessel-1",
+                "vehicle_id": "uuv-1",
+                "image_id": "0001",
+                "image_version": 1,
+                "verdict": "unsure",
+                "operator": "somebody",
+                "decided_utc_s": 1476262900,
+            }
+        )
+    )
+
+
+def envelope(payload: bytes, key: str = DECISION_KEY) -> bytes:
+    fields = {"type": "relayed", "v": 1, "vessel_id": "vessel-1", "key": key, "payload": payload, "relayed_utc_s": 0}
+    return bytes(msgpack.packb(fields))
+
+
+RUBBISH = {
+    "no msgpack": (b"\xc1 rubbish", "payload"),
+    "text": (b"hello", "payload"),
+    "another record": (decision(9), "type"),
+    "a later version": (msgpack.packb(msgpack.unpackb(envelope(decision(9))) | {"v": 2}), "v"),
+    "a field missing": (msgpack.packb({"type": "relayed", "v": 1, "vessel_id": "vessel-1"}), "key"),
+    "rubbish in an envelope": (envelope(b"\xc1"), "payload"),
+    "an unknown key in an envelope": (envelope(decision(9), "sonarpost/v1/vessel-1/etc/passwd"), "key"),
+    "one vessel in the name of another": (envelope(decision(9), "sonarpost/v1/vessel-2/contact/decision"), "key"),
+}
+
+
+def test_rubbish_is_refused_and_logged_and_the_service_goes_on(
+    tmp_path: Path,
+    router: str,
+    platform: PlatformMaker,
+    subscribe: Callable[..., Subscriber],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out"))
+    service.start()
+    try:
+        watcher = subscribe(ACCEPTED, "sonarpost/v1/shore-1/health/c2")
+        watcher.until("sonarpost/v1/shore-1/health/c2")
+        put(router, INBOX, envelope(decision(1)))
+        assert watcher.until(ACCEPTED)["decision_id"] == "d1"
+        for number, (payload, _) in enumerate(RUBBISH.values(), start=1):
+            put(router, INBOX, payload)
+            eventually(lambda number=number: service.store.refused_count() == number)  # type: ignore[misc]
+        # What is right still comes through, and what was wrong has harmed nothing.
+        put(router, INBOX, envelope(decision(2)))
+        assert watcher.until(ACCEPTED)["decision_id"] == "d2"
+        health = watcher.until("sonarpost/v1/shore-1/health/c2")
+        assert health["state"] == "ok"
+        assert health["counters"]["records_refused"] == len(RUBBISH)
+        assert health["gauges"]["refused"] == len(RUBBISH)
+    finally:
+        service.stop()
+    kept = sorted(path.name for path in (tmp_path / "out").rglob("*") if path.is_file())
+    assert kept == ["6431.json", "6432.json"]
+    complaints = [vars(record)["fields"] for record in caplog.records if record.message == "Record refused"]
+    assert [complaint["field"] for complaint in complaints] == [field for _, field in RUBBISH.values()]
+    assert all("expected" in complaint["reason"] for complaint in complaints)
