@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 from collections.abc import Mapping
@@ -105,8 +104,7 @@ class C2Service(Service[C2Config]):
 def decision_file_name(decision_id: str) -> str:
     """Return the file name of a decision.
 
-    The identifier is the operator's text: only its hexadecimal form is safe as a file name, and of a long one, which
-    no file system would take in that form, its hash.
+    The identifier is the operator's text: only its hexadecimal form is safe as a file name. `RecordId` bounds it to 64
+    characters of one byte, so that no file system refuses the name for its length.
     """
-    encoded = decision_id.encode()
-    return f"{encoded.hex()}.json" if len(encoded) <= 64 else f"sha256-{hashlib.sha256(encoded).hexdigest()}.json"
+    return f"{decision_id.encode().hex()}.json"
