@@ -27,6 +27,8 @@ log = logging.getLogger(__name__)
 _RECEIVER = "receiver"
 POLL_S = 0.2
 MEMORY_S = 6 * 3600.0
+QUIET_S = 2.0
+"""No image's time is up before frames have stopped coming for this long, twice the longest pause of a hand-over."""
 
 
 class DecompressorService(Service[DecompressorConfig]):
@@ -47,6 +49,7 @@ class DecompressorService(Service[DecompressorConfig]):
         super().__init__(platform, config)
         self._receiver = self._new_receiver()
         self._pairing_problem = ""
+        self._last_frame_s = time.monotonic()
         # One thread handles frames, another the waiting time; the receiver belongs to whoever holds the lock.
         self._lock = threading.Lock()
         self._in_step = False
@@ -61,11 +64,13 @@ class DecompressorService(Service[DecompressorConfig]):
 
     def on_start(self) -> None:
         """Start to watch the waiting time."""
+        self._last_frame_s = time.monotonic()
         self.spawn(self._watch_deadlines, "pairing")
 
     def handle(self, key: str, record: Record, effects: Effects) -> None:
         """Give a frame to the receiver and act on what follows."""
         assert isinstance(record, AcousticFrame)
+        self._last_frame_s = time.monotonic()
         self._load()
         self._follow(self._receiver.accept(record.source, record.data, record.time_utc_s), effects)
 
@@ -97,25 +102,24 @@ class DecompressorService(Service[DecompressorConfig]):
                 self._pairing_problem = f"{type(error).__name__}: {error}"
                 log.exception("Picture not given out, trying again")
                 self.stopping.wait(RETRY_AFTER_S)
-            else:
-                self._pairing_problem = ""
 
     def trouble(self) -> str:
         """Return what keeps pictures whose time is up from being given out."""
         return self._pairing_problem
 
     def _poll(self) -> None:
-        if self.store.inbox_depth():
-            # Frames that came in time may lie in the queue: they are looked at before the waiting ends.
+        if self.store.inbox_depth() or time.monotonic() - self._last_frame_s < QUIET_S:
+            # After an outage, frames that were heard in time come in one after the other. While they do, it is their
+            # own times by which the receiver ends the waiting.
             return
         self._load()
         effects = Effects()
         events = self._receiver.poll(time.time())
-        if not events:
-            self._in_step = True
-            return
-        self._follow(events, effects)
-        self.commit(effects)
+        if events:
+            self._follow(events, effects)
+            self.commit(effects)
+        self._in_step = True
+        self._pairing_problem = ""
 
     def _follow(self, events: Iterable[Event], effects: Effects) -> None:
         for event in events:

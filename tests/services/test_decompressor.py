@@ -291,6 +291,7 @@ def test_a_stop_in_the_middle_of_an_image_changes_nothing(begin, crew, modem, re
 def test_frames_that_waited_long_are_looked_at_before_time_is_up(begin, modem, relay, stream, monkeypatch, platform):
     """After the service was down for hours, halves that came seconds apart still make one whole picture."""
     monkeypatch.setattr(decompressor, "POLL_S", 0.0005)
+    monkeypatch.setattr(decompressor, "QUIET_S", 2.0)
     streams = {f"{n:04d}": stream(n) for n in range(30)}
     for image_id, data in streams.items():
         modem.owe(IN, "decompressor", *(frame(f, at_utc_s=1_700_000_000.0) for f in frames_of(image_id, data)))
