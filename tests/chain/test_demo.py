@@ -139,3 +139,14 @@ def test_a_folder_that_is_not_the_demos_is_left_alone(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert "a folder that is new, empty or of an earlier demo" in done.stderr
     assert (tmp_path / "precious.txt").read_text() == "mine"
+
+
+def test_a_survey_that_cannot_be_read_is_named_with_its_reason(tmp_path: Path) -> None:
+    survey = tmp_path / "empty.xtf"
+    survey.touch()
+    options = ("--survey", str(survey), "--json")
+    done = subprocess.run(demo(tmp_path / "out", *options), capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert "refused: " in done.stderr
+    assert "empty.xtf" in done.stderr
+    assert json.loads(done.stdout.splitlines()[-1])["contacts"] == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import shutil
 import time
 from pathlib import Path
@@ -67,6 +68,8 @@ def _positive(text: str) -> float:
 def run(parsed: argparse.Namespace) -> int:
     """Run the demo; return 0 when everything the water let through is ashore, unchanged."""
     console = Console(stderr=True)
+    # The routers start at the same time as those who look for them; that they are not there at once is no news.
+    logging.getLogger("sonarpost.runtime.session").setLevel(logging.ERROR)
     started = time.monotonic()
     inputs = _inputs(parsed)
     folder = _fresh_folder(parsed.out)
@@ -89,7 +92,8 @@ def run(parsed: argparse.Namespace) -> int:
     show(watcher, settings, result, console)
     if parsed.json:
         print(result.as_json(), flush=True)
-    return 0 if not result.missing_ashore and result.sha256_match else 1
+    refused = _refused(settings, console)
+    return 0 if not result.missing_ashore and result.sha256_match and refused < files else 1
 
 
 def _inputs(parsed: argparse.Namespace) -> tuple[Path, ...] | None:
@@ -126,6 +130,14 @@ def _fresh_folder(folder: Path) -> Path:
     folder.mkdir(parents=True)
     (folder / MARKER).touch()
     return folder
+
+
+def _refused(settings: ChainSettings, console: Console) -> int:
+    """Say which input files were put aside and why; return how many."""
+    reasons = sorted((settings.incoming / "quarantine").glob("*.reason.txt"))
+    for path in reasons:
+        console.print(f"[red]refused:[/red] {path.read_text(encoding='utf-8').strip()}", soft_wrap=True)
+    return len(reasons)
 
 
 def _deposit(inputs: tuple[Path, ...] | None, settings: ChainSettings, seed: int, console: Console) -> int:
