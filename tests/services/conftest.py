@@ -7,6 +7,7 @@ import select
 import threading
 import tty
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Crew:
-    """The services of one test; whatever still runs at its end is stopped, neighbours last."""
+    """The services of one test; whatever still runs at its end is stopped."""
 
     def __init__(self, platform: PlatformMaker) -> None:
         self._platform = platform
@@ -87,8 +88,11 @@ class Crew:
         return self.start(named(self._platform(platform_id), takes or {}))
 
     def stop_all(self) -> None:
-        while self._running:
-            self._running.pop().stop()
+        """Stop all at once, as a platform that is switched off does, and as quickly."""
+        running, self._running = self._running, []
+        with ThreadPoolExecutor() as pool:
+            for stopped in [pool.submit(service.stop) for service in running]:
+                stopped.result()
 
 
 @pytest.fixture
