@@ -107,6 +107,19 @@ def test_what_was_refused_is_kept_with_its_reason(store: Store) -> None:
     ]
 
 
+def test_of_what_was_refused_the_latest_are_kept_and_the_beginning_of_each(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sonarpost.runtime.store.REFUSED_KEPT", 5)
+    monkeypatch.setattr("sonarpost.runtime.store.REFUSED_BYTES", 3)
+    for number in range(12):
+        with store.transaction() as tx:
+            tx.refuse("in", "k", b"%02d and more" % number, "no")
+    assert store.refused_count() == 5
+    kept = [payload for (payload,) in store._query("SELECT payload FROM refused ORDER BY id")]
+    assert kept == [b"%02d " % number for number in range(7, 12)]
+
+
 def test_listeners_hear_of_commits_and_not_of_failures(store: Store) -> None:
     event = threading.Event()
     store.listen_outbox(event)
@@ -198,23 +211,23 @@ def partials(store: Store) -> int:
     return len(store._query("SELECT 1 FROM partial"))
 
 
-@given(data=st.binary(min_size=1, max_size=60), seed=st.randoms(use_true_random=False))
+@given(data=st.binary(min_size=1, max_size=60), seed=st.integers(0, 2**32))
 @settings(max_examples=30)
 def test_pieces_in_any_order_and_number_end_in_the_whole(
-    tmp_path_factory: pytest.TempPathFactory, data: bytes, seed: random.Random
+    tmp_path_factory: pytest.TempPathFactory, data: bytes, seed: int
 ) -> None:
     """As a producer would: it sends pieces, some twice, some lost, and goes on where it is told to."""
-    folder = tmp_path_factory.mktemp("pieces")
+    folder, chance = tmp_path_factory.mktemp("pieces"), random.Random(seed)
     store = Store(folder / "s.db")
     sha = hashlib.sha256(data).digest()
     offset: bytes | int = 0
     for _ in range(1000):
         assert isinstance(offset, int)
-        if seed.random() < 0.2:
+        if chance.random() < 0.2:
             store.close()
             store = Store(folder / "s.db")
-        start = offset if seed.random() < 0.6 else seed.randrange(len(data))
-        offset = add(store, Chunk(ORIGIN, 1, len(data), sha, start, data[start : start + seed.randint(1, 20)]))
+        start = offset if chance.random() < 0.6 else chance.randrange(len(data))
+        offset = add(store, Chunk(ORIGIN, 1, len(data), sha, start, data[start : start + chance.randint(1, 20)]))
         if isinstance(offset, bytes):
             break
     assert offset == data
@@ -261,6 +274,19 @@ def test_accepting_a_record_forgets_its_pieces(store: Store) -> None:
     with store.transaction() as tx:
         tx.accept("k", b"0123456789", ORIGIN, 1)
     assert partials(store) == 0
+
+
+def test_only_the_pieces_touched_last_are_kept(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sonarpost.runtime.store.PARTIALS_KEPT", 3)
+    firsts = {seq: pieces(b"0123456789", 4, seq=seq) for seq in range(1, 5)}
+    for seq in (1, 2, 3):
+        assert add(store, firsts[seq][0]) == 4
+    assert add(store, firsts[1][0]) == 4  # touched again
+    assert add(store, firsts[4][0]) == 4
+    assert partials(store) == 3
+    # The second went; its producer is told to begin again, and loses nothing by it.
+    assert add(store, firsts[2][1]) == 0
+    assert add(store, firsts[1][1]) == b"0123456789"
 
 
 # State
@@ -380,6 +406,18 @@ def test_threads_take_turns(store: Store) -> None:
         thread.join()
     assert store.get_state("n") == b"100"
     assert [item.seq for item in store.owed("c", 999)] == list(range(1, 101))
+
+
+def test_a_store_belongs_to_one_process_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "s.db"
+    script = f"from pathlib import Path; from sonarpost.runtime.store import Store; Store(Path({str(path)!r}))"
+    store = Store(path)
+    other = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert "HandoffError" in other.stderr
+    assert "in use by another process" in other.stderr
+    send(store, b"still mine")
+    store.close()
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, check=False).returncode == 0
 
 
 # Files that are no stores
