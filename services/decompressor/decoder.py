@@ -59,12 +59,16 @@ class Decoder:
         return self._record(event, vehicle_id, decoded, None, ["only the contact record arrived"])
 
     def _codec(self, event: ImageReady) -> Codec:
-        tag = event.header.model_tag
-        tiles = self._tiles.get(tag)
-        if tag and tiles is None:
-            own = ", ".join(f"{known:#06x}" for known in self._tiles)
-            raise CatalogueError(f"image {event.image_id}", "model_tag", f"{tag:#06x}", f"a catalogue at hand: {own}")
-        return default_registry().create_for_stream(event.stream, CodecResources(tiles))
+        registry, tiles = default_registry(), None
+        # The tag of a codec without tiles is that of another kind of model, or of none.
+        if registry.spec_for_id(event.header.codec_id).needs_tiles:
+            tag = event.header.model_tag
+            tiles = self._tiles.get(tag)
+            if tiles is None:
+                own = ", ".join(f"{known:#06x}" for known in self._tiles)
+                where = f"image {event.image_id}"
+                raise CatalogueError(where, "model_tag", f"{tag:#06x}", f"a catalogue at hand: {own}")
+        return registry.create_for_stream(event.stream, CodecResources(tiles))
 
     def _record(
         self,

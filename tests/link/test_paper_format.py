@@ -11,12 +11,13 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from sonarpost.codec.interface import StreamHeader
+from sonarpost.codec.interface import COMMON_SIDES_PX, StreamHeader, tag_length
 from sonarpost.errors import FrameError
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_format import (
     CONTACT_FRAME_SIZE,
-    HALF_HEADER_SIZE,
+    HALF_PREFIX_SIZE,
+    MAX_HALF_HEADER_SIZE,
     ContactFrame,
     HalfFrame,
     format_image_id,
@@ -27,7 +28,7 @@ from sonarpost.link.paper_format import (
 )
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "link" / "paper_frames.json").read_text())
-HEADER = StreamHeader(1, 0xBEEF, 113, 49, 9)
+HEADER = StreamHeader(0x10, 0xBEEF, 113, 49)
 
 
 def by_name(cases: list[dict[str, Any]]) -> Any:
@@ -39,7 +40,12 @@ def test_golden_half_frames(case: dict[str, Any]) -> None:
     data = bytes.fromhex(case["hex"])
     frame = parse_frame(data)
     assert frame == HalfFrame(
-        case["half"], case["image_id"], case["offset"], StreamHeader(**case["header"]), bytes.fromhex(case["payload"])
+        case["half"],
+        case["image_id"],
+        case["offset"],
+        case["body_length"],
+        StreamHeader(**case["header"]),
+        bytes.fromhex(case["payload"]),
     )
     assert frame.pack() == data[: len(data) - case["padding_bytes"]]
 
@@ -79,10 +85,17 @@ def test_random_bytes_parse_or_raise_frame_error(data: bytes) -> None:
     assert data.startswith(frame.pack())
 
 
-@given(st.sampled_from([b"T", b"B", b"C"]), st.binary(max_size=60), st.integers(0, 2**16 - 1))
-def test_plausible_bytes_parse_or_raise_frame_error(kind: bytes, rest: bytes, length: int) -> None:
-    header = StreamHeader(1, 0, 80, 140, length).pack()
-    for data in (kind + b"00A7" + rest, kind + b"00A7" + rest[:2] + header + rest[2:]):
+@given(
+    st.sampled_from([b"T", b"B", b"C"]),
+    st.binary(max_size=60),
+    st.integers(0, 2**16 - 1),
+    st.sampled_from([StreamHeader(1, 0, 80, 140), HEADER]),
+)
+def test_plausible_bytes_parse_or_raise_frame_error(
+    kind: bytes, rest: bytes, length: int, header: StreamHeader
+) -> None:
+    known = length.to_bytes(2, "big") + header.pack()
+    for data in (kind + b"00A7" + rest, kind + b"00A7" + rest[:2] + known + rest[2:]):
         try:
             frame = parse_frame(data)
         except FrameError:
@@ -106,39 +119,48 @@ def test_contact_bytes_with_a_right_checksum_parse_or_raise_frame_error(record: 
 
 @st.composite
 def half_frames(draw: st.DrawFn) -> HalfFrame:
-    header = StreamHeader(
-        draw(st.integers(0, 255)),
-        draw(st.integers(0, 65535)),
-        draw(st.integers(16, 512)),
-        draw(st.integers(16, 512)),
-        draw(st.integers(0, 300) | st.integers(0, 65535)),
-    )
+    codec_id = draw(st.integers(0, 255))
+    sides = st.sampled_from(COMMON_SIDES_PX) | st.integers(16, 512)
+    header = StreamHeader(codec_id, draw(st.integers(0, 256 ** tag_length(codec_id) - 1)), draw(sides), draw(sides))
+    body_length = draw(st.integers(0, 300) | st.integers(0, 65535))
     half = draw(st.sampled_from(["top", "bottom"]))
-    start, stop = half_bounds(header.body_length, half)
+    start, stop = half_bounds(body_length, half)
     offset = draw(st.integers(start, max(start, stop - 1)))
     payload = draw(st.binary(max_size=min(stop - offset, 241)))
-    return HalfFrame(half, format_image_id(draw(st.integers(0, 36**4 - 1))), offset, header, payload)
+    return HalfFrame(half, format_image_id(draw(st.integers(0, 36**4 - 1))), offset, body_length, header, payload)
 
 
 @given(half_frames(), st.binary(max_size=40))
 def test_half_frames_round_trip_and_drop_what_follows_the_half(frame: HalfFrame, tail: bytes) -> None:
     packed = frame.pack()
-    assert len(packed) == HALF_HEADER_SIZE + len(frame.payload)
+    assert len(packed) == HALF_PREFIX_SIZE + frame.header.size + len(frame.payload)
+    assert len(packed) <= MAX_HALF_HEADER_SIZE + len(frame.payload)
     assert parse_frame(packed) == frame
-    reaches_the_end = frame.stop == half_bounds(frame.header.body_length, frame.half)[1]
+    reaches_the_end = frame.stop == half_bounds(frame.body_length, frame.half)[1]
     if reaches_the_end:
         assert parse_frame(packed + tail) == frame
 
 
 @given(half_frames(), st.integers(0, 300))
 def test_a_half_frame_cut_short_keeps_what_it_has(frame: HalfFrame, length: int) -> None:
-    assume(length < HALF_HEADER_SIZE + len(frame.payload))
+    head = HALF_PREFIX_SIZE + frame.header.size
+    assume(length < head + len(frame.payload))
     cut = frame.pack()[:length]
-    if length < HALF_HEADER_SIZE:
+    if length < head:
         with pytest.raises(FrameError):
             parse_frame(cut)
     else:
-        assert parse_frame(cut) == dataclasses.replace(frame, payload=frame.payload[: length - HALF_HEADER_SIZE])
+        assert parse_frame(cut) == dataclasses.replace(frame, payload=frame.payload[: length - head])
+
+
+@given(half_frames())
+def test_a_half_frame_cut_anywhere_in_its_header_says_where(frame: HalfFrame) -> None:
+    packed = frame.pack()
+    for length in range(HALF_PREFIX_SIZE + frame.header.size):
+        with pytest.raises(FrameError) as caught:
+            parse_frame(packed[:length])
+        expected = "type" if length == 0 else "length" if length < HALF_PREFIX_SIZE else "header"
+        assert caught.value.field == expected
 
 
 @given(st.integers(0, 8 * CONTACT_FRAME_SIZE - 1), st.integers(1, 16), st.integers(1, 2**16 - 1))
@@ -178,18 +200,29 @@ def test_image_identifiers_count_in_base_36_and_start_again() -> None:
         ({"offset": 5}, "offset"),
         ({"payload": bytes(6)}, "payload"),
         ({"image_id": "A7"}, "image identifier"),
-        ({"header": StreamHeader(256, 0, 80, 80, 9)}, "stream header codec_id"),
-        ({"header": StreamHeader(1, 65536, 80, 80, 9)}, "stream header model_tag"),
-        ({"header": StreamHeader(1, 0, 513, 80, 9)}, "stream header height_px"),
-        ({"header": StreamHeader(1, 0, 80, 15, 9)}, "stream header width_px"),
-        ({"header": StreamHeader(1, 0, 80, 80, 65536)}, "stream header body_length"),
+        ({"header": StreamHeader(256, 0, 80, 80)}, "stream header codec_id"),
+        ({"header": StreamHeader(-1, 0, 80, 80)}, "stream header codec_id"),
+        ({"header": StreamHeader(0x10, 65536, 80, 80)}, "stream header model_tag"),
+        ({"header": StreamHeader(0x10, -1, 80, 80)}, "stream header model_tag"),
+        ({"header": StreamHeader(0x20, 256, 80, 80)}, "stream header model_tag"),
+        ({"header": StreamHeader(1, 1, 80, 80)}, "stream header model_tag"),
+        ({"header": StreamHeader(1, 0, 513, 80)}, "stream header height_px"),
+        ({"header": StreamHeader(1, 0, 80, 15)}, "stream header width_px"),
+        ({"body_length": 65536}, "body_length"),
+        ({"body_length": -1}, "body_length"),
     ],
 )
 def test_a_half_frame_that_cannot_be_packed_cannot_be_made(change: dict[str, Any], named: str) -> None:
-    frame = HalfFrame("top", "00A7", 0, HEADER, bytes(5))
+    frame = HalfFrame("top", "00A7", 0, 9, HEADER, bytes(5))
     with pytest.raises(FrameError) as caught:
         dataclasses.replace(frame, **change)
     assert caught.value.field == named
+
+
+def test_a_half_frames_header_is_13_bytes_for_a_common_picture_and_16_at_most() -> None:
+    common, other = StreamHeader(0x10, 0xBEEF, 140, 80), HEADER
+    assert [len(HalfFrame("top", "00A7", 0, 9, header, b"").pack()) for header in (common, other)] == [13, 16]
+    assert MAX_HALF_HEADER_SIZE == 16
 
 
 def test_a_contact_frame_fills_a_rate_0_frame_exactly() -> None:

@@ -26,19 +26,19 @@ from sonarpost.link.paper_receiver import (
 )
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "link" / "paper_receiver.json").read_text())["scenarios"]
-HEADER = StreamHeader(1, 0xBEEF, 113, 49, 9)
+HEADER = StreamHeader(0x10, 0xBEEF, 113, 49)
 BODY = bytes(range(0xA1, 0xAA))
 CONTACT = ContactSummary(height_px=113, width_px=49, lat_deg=44.7, lon_deg=-63.6).rounded()
 
 
 def half(name: Any, image_id: str = "00A7", header: StreamHeader = HEADER, body: bytes = BODY) -> bytes:
-    start, stop = half_bounds(header.body_length, name)
-    return HalfFrame(name, image_id, start, header, body[start:stop]).pack()
+    start, stop = half_bounds(len(body), name)
+    return HalfFrame(name, image_id, start, len(body), header, body[start:stop]).pack()
 
 
 def piece(start: int, stop: int, image_id: str = "00A7") -> bytes:
     name: Any = "top" if start < 5 else "bottom"
-    return HalfFrame(name, image_id, start, HEADER, BODY[start:stop]).pack()
+    return HalfFrame(name, image_id, start, 9, HEADER, BODY[start:stop]).pack()
 
 
 def contact(image_id: str = "00A7", record: ContactSummary = CONTACT) -> bytes:
@@ -177,7 +177,7 @@ def test_a_second_different_contact_record_is_counted_and_the_first_stays() -> N
 def test_bytes_that_are_there_stay_when_a_repetition_says_otherwise() -> None:
     receiver = PairingReceiver(60)
     receiver.accept(2, piece(0, 3), 0)
-    damaged = HalfFrame("top", "00A7", 1, HEADER, b"\xa2\x00\xa4\xa5").pack()
+    damaged = HalfFrame("top", "00A7", 1, 9, HEADER, b"\xa2\x00\xa4\xa5").pack()
     receiver.accept(2, damaged, 1)
     (event,) = images(receiver.poll(61))
     assert event.body == BODY[:5] + bytes(4)
@@ -185,10 +185,10 @@ def test_bytes_that_are_there_stay_when_a_repetition_says_otherwise() -> None:
 
 
 def test_the_checked_contact_record_decides_between_stream_headers() -> None:
-    wrong = StreamHeader(1, 0xBEEF, 113, 48, 9)
+    wrong = StreamHeader(0x10, 0xBEEF, 113, 48)
     receiver = PairingReceiver(60)
-    receiver.accept(2, HalfFrame("top", "00A7", 0, wrong, BODY[:2]).pack(), 0)
-    receiver.accept(2, HalfFrame("top", "00A7", 2, wrong, BODY[2:4]).pack(), 1)
+    receiver.accept(2, HalfFrame("top", "00A7", 0, 9, wrong, BODY[:2]).pack(), 0)
+    receiver.accept(2, HalfFrame("top", "00A7", 2, 9, wrong, BODY[2:4]).pack(), 1)
     receiver.accept(2, half("top"), 2)
     assert receiver.accept(2, contact(), 3) == []
     (event,) = images(receiver.poll(63))
@@ -197,7 +197,7 @@ def test_the_checked_contact_record_decides_between_stream_headers() -> None:
 
 
 def test_more_frames_outvote_more_bytes() -> None:
-    wrong = StreamHeader(1, 0xBEEF, 113, 48, 9)
+    wrong = StreamHeader(0x10, 0xBEEF, 113, 48)
     receiver = PairingReceiver(60)
     receiver.accept(2, half("top", header=wrong), 0)
     receiver.accept(2, piece(0, 1), 1)
@@ -207,7 +207,7 @@ def test_more_frames_outvote_more_bytes() -> None:
 
 
 def test_a_header_outvoted_after_it_was_given_out_is_corrected_by_a_new_version() -> None:
-    wrong = StreamHeader(1, 0xBEEF, 113, 48, 9)
+    wrong = StreamHeader(0x10, 0xBEEF, 113, 48)
     receiver = PairingReceiver(60)
     receiver.accept(2, half("top", header=wrong), 0)
     assert [e.header for e in images(receiver.poll(60))] == [wrong]
@@ -228,17 +228,36 @@ def test_a_fourth_stream_header_is_refused() -> None:
     assert receiver.counts == ReceiverCounts(frames=4, rejected=1, conflicts=3)
 
 
+def test_frames_that_disagree_on_the_body_length_are_kept_apart() -> None:
+    receiver = PairingReceiver(60)
+    longer = HalfFrame("top", "00A7", 0, 300, HEADER, bytes(16)).pack()
+    assert receiver.accept(2, longer, 0) == []
+    assert receiver.accept(2, half("top"), 1) == []
+    (event,) = images(receiver.accept(2, half("bottom"), 2))
+    assert (event.header, event.body, event.complete) == (HEADER, BODY, True)
+    assert event.conflicts == 2
+    assert receiver.counts.rejected == 0
+
+
+def test_a_fourth_body_length_is_refused() -> None:
+    receiver = PairingReceiver(60)
+    for length in (9, 10, 11):
+        assert receiver.accept(2, HalfFrame("top", "00A7", 0, length, HEADER, b"x").pack(), 0) == []
+    (event,) = receiver.accept(2, HalfFrame("top", "00A7", 0, 12, HEADER, b"x").pack(), 1)
+    assert isinstance(event, FrameRejected)
+    assert receiver.counts == ReceiverCounts(frames=4, rejected=1, conflicts=3)
+
+
 @pytest.mark.parametrize("length", [0, 1])
 def test_an_image_without_a_bottom_half_is_complete_with_its_top(length: int) -> None:
-    header = dataclasses.replace(HEADER, body_length=length)
     receiver = PairingReceiver(60)
-    (event,) = images(receiver.accept(2, half("top", header=header, body=BODY[:length]), 0))
+    (event,) = images(receiver.accept(2, half("top", body=BODY[:length]), 0))
     assert (event.complete, event.body, event.missing_halves) == (True, BODY[:length], ())
 
 
 def test_a_frame_without_body_bytes_announces_the_picture() -> None:
     receiver = PairingReceiver(60)
-    receiver.accept(2, half("bottom")[:15], 0)
+    receiver.accept(2, half("bottom")[:16], 0)
     (event,) = images(receiver.poll(60))
     assert (event.received, event.body, event.missing_halves) == ((), bytes(9), ("top", "bottom"))
     assert event.received_mask().tolist() == [False] * 9
@@ -284,10 +303,9 @@ def test_a_clock_that_is_set_back_does_not_make_the_memory_longer() -> None:
 
 def test_memory_is_bounded_and_nothing_is_dropped_unsaid() -> None:
     receiver = PairingReceiver(60, max_images=4)
-    header = dataclasses.replace(HEADER, body_length=65535)
     events: list[Event] = []
     for number in range(50):
-        frame = HalfFrame("top", format_image_id(number), 0, header, b"x").pack()
+        frame = HalfFrame("top", format_image_id(number), 0, 65535, HEADER, b"x").pack()
         events += receiver.accept(number, frame, number / 100)
     assert [e.source for e in images(events)] == list(range(46))  # the longest unheard first
     state: Any = receiver.snapshot()
@@ -364,7 +382,14 @@ def _edits() -> list[Any]:
         ((*image, "candidates"), []),
         ((*image, "candidates"), None),
         ((*image, "candidates", 0), []),
-        ((*image, "candidates", 0, "header"), b"short"),
+        ((*image, "candidates", 0, "header"), b"\x10sh"),
+        ((*image, "candidates", 0, "header"), HEADER.pack() + b"\0"),
+        ((*image, "candidates", 0, "header"), b"\x10\xbe\xef\xe1"),
+        ((*image, "candidates", 0, "body_length"), None),
+        ((*image, "candidates", 0, "body_length"), "9"),
+        ((*image, "candidates", 0, "body_length"), -1),
+        ((*image, "candidates", 0, "body_length"), 65536),
+        ((*image, "candidates", 0, "body_length"), 8),
         ((*image, "candidates", 0, "pieces", 0), [5, bytes(5)]),
         ((*image, "candidates", 0, "pieces", 0), [-1, b"x"]),
         ((*image, "candidates", 0, "pieces", 0), ["0", b"x"]),

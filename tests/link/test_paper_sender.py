@@ -14,6 +14,7 @@ from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_format import ContactFrame, HalfFrame, half_bounds, parse_frame
+from sonarpost.link.paper_receiver import ImageReady, PairingReceiver
 from sonarpost.link.paper_sender import Packet, body_capacity_bytes, plan_packets
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "link" / "paper_packets.json").read_text())["plans"]
@@ -21,8 +22,20 @@ RATES = {0: (1, 32), 1: (3, 64), 2: (3, 64), 3: (2, 256), 4: (2, 256), 5: (8, 25
 CONTACT = ContactSummary(height_px=80, width_px=140, lat_deg=44.7, lon_deg=-63.6, confidence=1.5)
 
 
-def make_stream(length: int) -> bytes:
-    return StreamHeader(1, 0xBEEF, 80, 140, length).pack() + bytes((7 * i + 1) % 256 for i in range(length))
+# By their length: no model, a small one, a catalogue; each with common sides and with another height.
+HEADERS = {
+    header.size: header
+    for height_px in (80, 81)
+    for header in (
+        StreamHeader(1, 0, height_px, 140),
+        StreamHeader(0x20, 0xA5, height_px, 140),
+        StreamHeader(0x10, 0xBEEF, height_px, 140),
+    )
+}
+
+
+def make_stream(length: int, header_bytes: int = 4) -> bytes:
+    return HEADERS[header_bytes].pack() + bytes((7 * i + 1) % 256 for i in range(length))
 
 
 @pytest.mark.parametrize("case", GOLDEN, ids=[c["name"] for c in GOLDEN])
@@ -35,28 +48,33 @@ def test_golden_plans(case: dict[str, Any]) -> None:
     assert [[frame.hex() for frame in packet] for packet in plan] == case["packets"]
 
 
-def fewest_packets(length: int, frames_per_packet: int, frame_bytes: int) -> int:
+def fewest_packets(length: int, frames_per_packet: int, payload_bytes: int) -> int:
     """Packets needed when nothing but the count matters and halves may share."""
-    step = frame_bytes - 15
+    step = payload_bytes
     top, bottom = half_bounds(length, "top")[1], length // 2
     frames = max(1, -(-top // step)) + -(-bottom // step)
     return -(-frames // frames_per_packet)
 
 
-@given(st.integers(0, 700) | st.integers(0, 65535), st.sampled_from(sorted(RATES)), st.booleans())
-@example(65535, 0, True)
-@example(294, 1, True)
-def test_a_plan_keeps_every_rule(length: int, rate: int, with_contact: bool) -> None:
+@given(
+    st.integers(0, 700) | st.integers(0, 65535),
+    st.sampled_from(sorted(RATES)),
+    st.booleans(),
+    st.sampled_from(sorted(HEADERS)),
+)
+@example(65535, 0, True, 7)
+@example(306, 1, True, 4)
+def test_a_plan_keeps_every_rule(length: int, rate: int, with_contact: bool, header_bytes: int) -> None:
     frames_per_packet, frame_bytes = RATES[rate]
-    stream = make_stream(length)
+    stream = make_stream(length, header_bytes)
     plan = plan_packets("0K3P", stream, CONTACT if with_contact else None, frames_per_packet, frame_bytes)
 
     assert all(1 <= len(packet) <= frames_per_packet for packet in plan)
     assert all(len(frame) <= frame_bytes for packet in plan for frame in packet)
     parsed = [[parse_frame(frame) for frame in packet] for packet in plan]
     halves = [f for packet in parsed for f in packet if isinstance(f, HalfFrame)]
-    assert b"".join(f.payload for f in halves) == stream[StreamHeader.SIZE :]  # in order, once, top before bottom
-    assert all(f.header.pack() == stream[: StreamHeader.SIZE] for f in halves)
+    assert b"".join(f.payload for f in halves) == stream[header_bytes:]  # in order, once, top before bottom
+    assert all(f.header == HEADERS[header_bytes] and f.body_length == length for f in halves)
     assert [f.half for f in halves] == sorted((f.half for f in halves), reverse=True)
 
     mixed = any(len({f.half for f in packet if isinstance(f, HalfFrame)}) > 1 for packet in parsed)
@@ -68,7 +86,9 @@ def test_a_plan_keeps_every_rule(length: int, rate: int, with_contact: bool) -> 
     apart = sum(-(-sum(f.half == half for f in halves) // frames_per_packet) for half in ("top", "bottom"))
     if not with_contact:
         needed = (
-            apart if most <= frames_per_packet else min(apart, fewest_packets(length, frames_per_packet, frame_bytes))
+            apart
+            if most <= frames_per_packet
+            else min(apart, fewest_packets(length, frames_per_packet, frame_bytes - 9 - header_bytes))
         )
         assert len(plan) == needed
         assert mixed == (len(plan) < apart)
@@ -93,25 +113,65 @@ def check_contact(
         assert all(len(packet) == frames_per_packet for packet in plan)  # every frame left free is used
         leading = next(i for i, packet in enumerate(records) if packet)
         assert isinstance(parsed[leading][0], ContactFrame)
+        check_contact_leads(parsed, frames_per_packet)
+
+
+def check_contact_leads(parsed: list[list[HalfFrame | ContactFrame]], frames_per_packet: int) -> None:
+    """The record comes first in each half (in both, where they share) that leaves a frame free, other copies last."""
+    kinds = ["".join("C" if isinstance(f, ContactFrame) else f.half[0] for f in packet) for packet in parsed]
+    shared = any("t" in kind and "b" in kind for kind in kinds)
+    groups = ["".join(kinds)] if shared else ["".join(k for k in kinds if half in k) for half in "tb"]
+    for group in groups:
+        halves = group.replace("C", "")
+        free = -len(halves) % frames_per_packet
+        assert group == ("C" + halves + "C" * (free - 1) if free else halves)
+
+
+@pytest.mark.parametrize("header_bytes", sorted(HEADERS))
+@pytest.mark.parametrize("with_contact", [True, False])
+@pytest.mark.parametrize("rate", sorted(RATES))
+def test_capacity_is_the_longest_body_with_one_packet_a_half(rate: int, with_contact: bool, header_bytes: int) -> None:
+    frames_per_packet, frame_bytes = RATES[rate]
+    contact = CONTACT if with_contact else None
+    capacity = body_capacity_bytes(frames_per_packet, frame_bytes, with_contact=with_contact, header_bytes=header_bytes)
+    own_packet = 1 if with_contact and frames_per_packet == 1 else 0
+    plan = plan_packets("0K3P", make_stream(capacity, header_bytes), contact, frames_per_packet, frame_bytes)
+    assert len(plan) == 2 + own_packet
+    if with_contact and not own_packet:
+        assert all(any(frame[:1] == b"C" for frame in packet) for packet in plan)
+    beyond = plan_packets("0K3P", make_stream(capacity + 1, header_bytes), contact, frames_per_packet, frame_bytes)
+    assert len(beyond) > len(plan) or sum(frame[:1] == b"C" for frame in beyond[0]) == 0
+
+
+def test_capacity_never_exceeds_what_a_half_frame_can_say() -> None:
+    assert body_capacity_bytes(8, 2**16, with_contact=False) == 65535
 
 
 @pytest.mark.parametrize("with_contact", [True, False])
 @pytest.mark.parametrize("rate", sorted(RATES))
-def test_capacity_is_the_longest_body_with_one_packet_a_half(rate: int, with_contact: bool) -> None:
-    frames_per_packet, frame_bytes = RATES[rate]
-    contact = CONTACT if with_contact else None
-    capacity = body_capacity_bytes(frames_per_packet, frame_bytes, with_contact=with_contact)
-    own_packet = 1 if with_contact and frames_per_packet == 1 else 0
-    plan = plan_packets("0K3P", make_stream(capacity), contact, frames_per_packet, frame_bytes)
-    assert len(plan) == 2 + own_packet
-    if with_contact and not own_packet:
-        assert all(any(frame[:1] == b"C" for frame in packet) for packet in plan)
-    beyond = plan_packets("0K3P", make_stream(capacity + 1), contact, frames_per_packet, frame_bytes)
-    assert len(beyond) > len(plan) or sum(frame[:1] == b"C" for frame in beyond[0]) == 0
+def test_capacity_without_a_header_is_what_fits_any_picture(rate: int, with_contact: bool) -> None:
+    capacities = [body_capacity_bytes(*RATES[rate], with_contact=with_contact, header_bytes=n) for n in HEADERS]
+    assert body_capacity_bytes(*RATES[rate], with_contact=with_contact) == min(capacities)
 
 
-def test_capacity_never_exceeds_what_the_stream_header_can_say() -> None:
-    assert body_capacity_bytes(8, 2**16, with_contact=False) == 65535
+@pytest.mark.parametrize("header_bytes", [-1, 0, 1, 8])
+def test_capacity_for_a_header_that_there_is_not_is_refused(header_bytes: int) -> None:
+    with pytest.raises(FrameError) as caught:
+        body_capacity_bytes(3, 64, with_contact=False, header_bytes=header_bytes)
+    assert caught.value.field == "header_bytes"
+
+
+@given(st.integers(0, 700), st.sampled_from(sorted(RATES)), st.sampled_from(sorted(HEADERS)))
+def test_a_picture_sent_without_loss_is_complete_with_its_position(length: int, rate: int, header_bytes: int) -> None:
+    stream = make_stream(length, header_bytes)
+    receiver = PairingReceiver(60)
+    plan = plan_packets("0K3P", stream, CONTACT, *RATES[rate])
+    events = [e for packet in plan for frame in packet for e in receiver.accept(2, frame, 0)]
+    (event,) = events  # one version: nothing that comes later was worth another
+    assert isinstance(event, ImageReady)
+    assert event.complete
+    assert event.stream == stream
+    assert event.contact == CONTACT.rounded()
 
 
 @pytest.mark.parametrize(
@@ -119,7 +179,7 @@ def test_capacity_never_exceeds_what_the_stream_header_can_say() -> None:
     [
         ("0k3p", None, 3, 64, "image identifier"),
         ("0K3P", None, 0, 64, "frames_per_packet"),
-        ("0K3P", None, 3, 15, "frame_bytes"),
+        ("0K3P", None, 3, 16, "frame_bytes"),
         ("0K3P", CONTACT, 3, 31, "frame_bytes"),
     ],
 )
@@ -131,12 +191,29 @@ def test_impossible_plans_are_refused(
     assert caught.value.field == named
 
 
-@pytest.mark.parametrize("stream", [b"", make_stream(9)[:-1], make_stream(9) + b"x", b"\x01" + bytes(7)])
-def test_a_stream_that_is_not_whole_is_refused(stream: bytes) -> None:
-    with pytest.raises(StreamError):
+@pytest.mark.parametrize(
+    ("stream", "field"),
+    [
+        (b"", "header"),
+        (make_stream(9)[:3], "header"),
+        (make_stream(9, 7)[:6], "header"),
+        (b"\x01\xff" + bytes(7), "height_px"),
+        (b"\x01\xe1" + bytes(7), "size"),
+        (make_stream(65536), "body"),
+    ],
+    ids=["empty", "cut", "size cut", "no size", "reserved", "too long"],
+)
+def test_a_stream_that_cannot_be_sent_is_refused(stream: bytes, field: str) -> None:
+    with pytest.raises(StreamError) as caught:
         plan_packets("0K3P", stream, None, 3, 64)
+    assert caught.value.field == field
 
 
 def test_one_body_byte_a_frame_is_enough_to_send() -> None:
-    plan = plan_packets("0K3P", make_stream(3), None, 1, 16)
-    assert [len(packet[0]) for packet in plan] == [16, 16, 16]
+    plan = plan_packets("0K3P", make_stream(3, 7), None, 1, 17)
+    assert [len(packet[0]) for packet in plan] == [17, 17, 17]
+
+
+def test_a_shorter_header_leaves_more_of_each_frame_to_the_body() -> None:
+    longest = {n: len(plan_packets("0K3P", make_stream(700, n), None, 3, 64)[0][0]) - 9 - n for n in HEADERS}
+    assert longest == {2: 53, 3: 52, 4: 51, 5: 50, 6: 49, 7: 48}

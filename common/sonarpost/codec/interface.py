@@ -20,7 +20,6 @@ Mask = npt.NDArray[np.bool_]
 MIN_SIDE_PX = 16
 MAX_SIDE_PX = 512
 
-
 # Sides that sonar snippets commonly have; a picture with two of these says its size in one byte. Part of the wire
 # format: never changed.
 COMMON_SIDES_PX = (16, 32, 48, 64, 80, 96, 100, 112, 120, 128, 140, 160, 200, 256, 512)
@@ -43,7 +42,15 @@ class StreamHeader:
     """The start of every codec stream.
 
     Layout: codec id (u8); model tag (`tag_length` bytes, the first of the model's hash); size: one byte
-    15 * row + column into `COMMON_SIDES_PX` for height and width, or 0xFF and height and width in 12 bits each.
+    15 * row + column into `COMMON_SIDES_PX` for height and width, or, when either side is not among them, 0xFF and
+    height and width in 12 bits each. Codes 225 to 254 are reserved. One picture has one header: a receiver compares
+    headers to tell which frames belong together.
+
+    Attributes:
+        codec_id: 0..255.
+        model_tag: 0 up to what `tag_length(codec_id)` bytes hold.
+        height_px: 16..512.
+        width_px: 16..512.
     """
 
     codec_id: int
@@ -63,7 +70,7 @@ class StreamHeader:
         return self.height_px in COMMON_SIDES_PX and self.width_px in COMMON_SIDES_PX
 
     def pack(self) -> bytes:
-        """Return the bytes."""
+        """Return the `size` bytes. The fields must be within their limits; this does not check them."""
         head = bytes([self.codec_id]) + self.model_tag.to_bytes(tag_length(self.codec_id), "big")
         if self._is_common:
             row, column = COMMON_SIDES_PX.index(self.height_px), COMMON_SIDES_PX.index(self.width_px)
@@ -75,16 +82,18 @@ class StreamHeader:
         """Parse the start of `data`.
 
         Raises:
-            StreamError: Too short, or a picture size that is not 16..512 px a side.
+            StreamError: Too short, a reserved size code, a picture side outside 16..512 px, or two common sides in the
+                long form.
         """
         if not data:
-            raise StreamError(where, "header", data, "2 to 7 bytes")
+            raise StreamError(where, "header", data, f"2 to {cls.MAX_SIZE} bytes")
         after_tag = 1 + tag_length(data[0])
         tag = int.from_bytes(data[1:after_tag], "big")
         code = data[after_tag : after_tag + 1]
         more = data[after_tag + 1 : after_tag + 4]
         if not code or (code[0] == _OTHER_SIZE and len(more) < 3):
-            raise StreamError(where, "header", data, "2 to 7 bytes")
+            needed = after_tag + (4 if code else 1)
+            raise StreamError(where, "header", data, f"at least {needed} bytes for codec {data[0]:#04x}")
         if code[0] != _OTHER_SIZE:
             row, column = divmod(code[0], len(COMMON_SIDES_PX))
             if row >= len(COMMON_SIDES_PX):

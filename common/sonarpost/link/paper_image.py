@@ -68,8 +68,8 @@ class Candidate:
 class PendingImage:
     """Everything known of one image of one source.
 
-    Frames with different stream headers are kept apart as candidates, at most `MAX_CANDIDATES`; the best one speaks
-    for the image (see `leader`).
+    Frames with different stream headers or body lengths are kept apart as candidates, at most `MAX_CANDIDATES`; the
+    best one speaks for the image (see `leader`).
 
     Attributes:
         source: Modem address.

@@ -54,8 +54,8 @@ def plan_packets(
         Packets, each a tuple of one to `frames_per_packet` frames, none longer than `frame_bytes`.
 
     Raises:
-        FrameError: The identifier is wrong, or the frames are too few or too small for a header and one byte (or
-            for the contact record).
+        FrameError: The identifier is wrong, or the frames are too few or too small for the longest header and one
+            byte (or for the contact record).
         StreamError: The stream's header is wrong or its body too long.
     """
     _check_sizes(frames_per_packet, frame_bytes, with_contact=contact is not None)
@@ -76,18 +76,28 @@ def plan_packets(
     )
 
 
-def body_capacity_bytes(frames_per_packet: int, frame_bytes: int, *, with_contact: bool) -> int:
+def body_capacity_bytes(
+    frames_per_packet: int, frame_bytes: int, *, with_contact: bool, header_bytes: int = StreamHeader.MAX_SIZE
+) -> int:
     """Return the longest stream body of which each half fits one packet.
 
     With a contact record, one frame of each packet is kept for it, unless a packet has only one frame: then the
     record travels in a packet of its own and takes nothing from the body.
 
+    Args:
+        frames_per_packet: Most frames in a packet.
+        frame_bytes: Most bytes in a frame.
+        with_contact: Whether a contact record goes along.
+        header_bytes: The `size` of the stream's header; left out, what fits whatever codec and picture size.
+
     Raises:
-        FrameError: As for `plan_packets`.
+        FrameError: As for `plan_packets`, or no stream header has this length.
     """
+    if not 2 <= header_bytes <= StreamHeader.MAX_SIZE:
+        raise FrameError("packet plan", "header_bytes", header_bytes, f"2..{StreamHeader.MAX_SIZE}")
     _check_sizes(frames_per_packet, frame_bytes, with_contact=with_contact)
     frames = frames_per_packet - 1 if with_contact and frames_per_packet > 1 else frames_per_packet
-    return min(2 * frames * (frame_bytes - MAX_HALF_HEADER_SIZE), _MAX_BODY_BYTES)
+    return min(2 * frames * (frame_bytes - HALF_PREFIX_SIZE - header_bytes), _MAX_BODY_BYTES)
 
 
 def _check_sizes(frames_per_packet: int, frame_bytes: int, *, with_contact: bool) -> None:

@@ -106,7 +106,10 @@ def _export_candidate(candidate: Candidate) -> dict[str, object]:
 
 
 def _import_candidate(image_id: str, entry: object) -> Candidate:
-    header = StreamHeader.unpack(read_field(entry, "header", bytes))
+    packed = read_field(entry, "header", bytes)
+    header = StreamHeader.unpack(packed)
+    if len(packed) != header.size:
+        raise FrameError(_WHERE, "header", packed, f"{header.size} bytes")
     body_length = read_field(entry, "body_length", int)
     if not 0 <= body_length <= 0xFFFF:
         raise FrameError(_WHERE, "body_length", body_length, "0..65535")

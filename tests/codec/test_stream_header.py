@@ -1,0 +1,164 @@
+"""The header that every codec's stream begins with: golden bytes, every size, every kind of tag, hostile input."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonarpost.codec.interface import (
+    COMMON_SIDES_PX,
+    MAX_SIDE_PX,
+    MIN_SIDE_PX,
+    StreamHeader,
+    model_tag,
+    tag_length,
+)
+from sonarpost.errors import StreamError
+
+GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "codec" / "stream_headers.json").read_text())
+UNCOMMON_SIDES_PX = sorted(set(range(MIN_SIDE_PX, MAX_SIDE_PX + 1)) - set(COMMON_SIDES_PX))
+ONE_ID_OF_EACH_KIND = (0x01, 0x10, 0x20, 0x80)
+SHA256 = "f893" + "a5" * 30
+
+
+def by_name(cases: list[dict[str, Any]]) -> Any:
+    return pytest.mark.parametrize("case", cases, ids=[c["name"] for c in cases])
+
+
+@st.composite
+def headers(draw: st.DrawFn) -> StreamHeader:
+    codec_id = draw(st.integers(0, 255))
+    sides = st.sampled_from(COMMON_SIDES_PX) | st.integers(MIN_SIDE_PX, MAX_SIDE_PX)
+    return StreamHeader(codec_id, draw(st.integers(0, 256 ** tag_length(codec_id) - 1)), draw(sides), draw(sides))
+
+
+@by_name(GOLDEN["headers"])
+def test_golden_headers(case: dict[str, Any]) -> None:
+    data = bytes.fromhex(case["hex"])
+    header = StreamHeader(case["codec_id"], case["model_tag"], case["height_px"], case["width_px"])
+    assert header.pack() == data
+    assert StreamHeader.unpack(data) == header
+    assert header.size == len(data)
+
+
+@by_name(GOLDEN["rejected"])
+def test_golden_rejected_headers(case: dict[str, Any]) -> None:
+    with pytest.raises(StreamError) as caught:
+        StreamHeader.unpack(bytes.fromhex(case["hex"]), "stream 7")
+    assert caught.value.field == case["field"]
+    assert str(caught.value).startswith("stream 7: ")
+
+
+def test_the_common_sides_are_those_of_the_format() -> None:
+    assert list(COMMON_SIDES_PX) == GOLDEN["common_sides_px"]
+
+
+def test_every_codec_id_has_the_tag_length_of_its_class() -> None:
+    lengths = [tag_length(codec_id) for codec_id in range(256)]
+    assert lengths == [0] * 0x10 + [2] * 0x10 + [1] * 0x60 + [2] * 0x80
+
+
+@pytest.mark.parametrize(
+    ("codec_id", "tag"),
+    [(0x00, 0), (0x0F, 0), (0x10, 0xF893), (0x1F, 0xF893), (0x20, 0xF8), (0x7F, 0xF8), (0x80, 0xF893), (0xFF, 0xF893)],
+)
+def test_the_tag_is_the_beginning_of_the_models_hash(codec_id: int, tag: int) -> None:
+    assert model_tag(codec_id, SHA256) == tag
+    assert model_tag(codec_id, "") == 0
+    packed = StreamHeader(codec_id, tag, 80, 140).pack()
+    assert packed[1:-1].hex() == SHA256[: 2 * tag_length(codec_id)]
+
+
+@pytest.mark.parametrize("codec_id", ONE_ID_OF_EACH_KIND)
+def test_every_pair_of_common_sides_has_its_own_byte(codec_id: int) -> None:
+    codes = set()
+    for height_px in COMMON_SIDES_PX:
+        for width_px in COMMON_SIDES_PX:
+            header = StreamHeader(codec_id, 0, height_px, width_px)
+            packed = header.pack()
+            assert len(packed) == header.size == 2 + tag_length(codec_id)
+            assert StreamHeader.unpack(packed) == header
+            codes.add(packed[-1])
+    assert codes == set(range(225))
+
+
+def test_every_other_pair_of_sides_is_written_out() -> None:
+    # Each uncommon side once with a common and once with an uncommon one, as height and as width.
+    for side_px in UNCOMMON_SIDES_PX:
+        for other_px in (80, 512, 17, 511):
+            for height_px, width_px in ((side_px, other_px), (other_px, side_px)):
+                header = StreamHeader(0x10, 0xBEEF, height_px, width_px)
+                packed = header.pack()
+                assert packed.hex() == f"10beefff{height_px:03x}{width_px:03x}"
+                assert len(packed) == header.size == StreamHeader.MAX_SIZE
+                assert StreamHeader.unpack(packed) == header
+
+
+@given(headers(), st.binary(max_size=20))
+def test_headers_round_trip_whatever_follows(header: StreamHeader, body: bytes) -> None:
+    packed = header.pack()
+    assert len(packed) == header.size
+    assert 2 <= header.size <= StreamHeader.MAX_SIZE
+    assert StreamHeader.unpack(packed + body) == header
+
+
+@given(headers())
+def test_a_header_cut_anywhere_is_refused(header: StreamHeader) -> None:
+    packed = header.pack()
+    for length in range(len(packed)):
+        with pytest.raises(StreamError) as caught:
+            StreamHeader.unpack(packed[:length])
+        assert caught.value.field == "header"
+
+
+@pytest.mark.parametrize("codec_id", ONE_ID_OF_EACH_KIND)
+def test_a_header_cut_short_says_how_long_it_should_be(codec_id: int) -> None:
+    common, other = StreamHeader(codec_id, 0, 80, 80), StreamHeader(codec_id, 0, 81, 80)
+    for header, length in ((common, common.size - 1), (other, other.size - 1)):
+        with pytest.raises(StreamError, match=f"at least {header.size} bytes"):
+            StreamHeader.unpack(header.pack()[:length])
+
+
+@pytest.mark.parametrize("codec_id", ONE_ID_OF_EACH_KIND)
+@pytest.mark.parametrize("code", range(225, 255))
+def test_reserved_size_codes_are_refused(codec_id: int, code: int) -> None:
+    data = bytes([codec_id]) + bytes(tag_length(codec_id)) + bytes([code]) + bytes(8)
+    with pytest.raises(StreamError) as caught:
+        StreamHeader.unpack(data)
+    assert (caught.value.field, caught.value.value) == ("size", code)
+
+
+def test_common_sides_written_out_are_refused() -> None:
+    for height_px in COMMON_SIDES_PX:
+        for width_px in COMMON_SIDES_PX:
+            with pytest.raises(StreamError, match="one-byte form"):
+                StreamHeader.unpack(bytes.fromhex(f"10beefff{height_px:03x}{width_px:03x}"))
+
+
+@pytest.mark.parametrize("side_px", [0, 1, 15, 513, 1024, 4095])
+def test_sides_out_of_bounds_are_refused_and_named(side_px: int) -> None:
+    for text, field in ((f"01ff{side_px:03x}011", "height_px"), (f"01ff011{side_px:03x}", "width_px")):
+        with pytest.raises(StreamError) as caught:
+            StreamHeader.unpack(bytes.fromhex(text))
+        assert (caught.value.field, caught.value.value) == (field, side_px)
+
+
+@given(st.binary(max_size=12))
+def test_any_bytes_are_a_header_that_packs_to_them_or_stream_error(data: bytes) -> None:
+    try:
+        header = StreamHeader.unpack(data)
+    except StreamError:
+        return
+    assert data.startswith(header.pack())  # one picture, one header: receivers tell images apart by equal headers
+
+
+def test_headers_are_values() -> None:
+    header = StreamHeader(0x10, 0xBEEF, 80, 140)
+    assert header == StreamHeader(0x10, 0xBEEF, 80, 140)
+    assert len({header, dataclasses.replace(header), dataclasses.replace(header, width_px=141)}) == 2
