@@ -3,8 +3,8 @@
 Codecs of this package are listed in `BUILTINS`. Another distribution adds its own through the entry-point group
 `sonarpost.codecs`: the entry point loads to a `CodecSpec` whose name equals the entry point's.
 
-Codec ids are never reused. 0x10..0x13 belong to vq (one for each packing); 0x80 and above are left to other
-distributions.
+Codec ids are never reused. 0x01..0x0F have no model; 0x10..0x13 belong to vq (one for each packing); 0x80 and above are
+left to other distributions.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
+from sonarpost.codec.huffman import HuffmanCodec
 from sonarpost.codec.interface import Codec, StreamHeader
+from sonarpost.codec.spiht import SpihtCodec
 from sonarpost.codec.tiles import TileDatabase
 from sonarpost.codec.vq import IndexPacking, VqCodec
 from sonarpost.errors import ConfigError, StreamError
@@ -74,6 +76,8 @@ BUILTINS = (
         "vector quantisation with a shared tile catalogue (the paper's codec)",
         needs_tiles=True,
     ),
+    CodecSpec("huffman", (0x01,), lambda _: HuffmanCodec(), "quantised grey levels in a Huffman code (in the paper)"),
+    CodecSpec("spiht", (0x04,), lambda _: SpihtCodec(), "set partitioning of a 9/7 wavelet, embedded (in the paper)"),
 )
 
 
