@@ -155,6 +155,7 @@ def test_two_bad_files_of_one_name_both_stay_in_quarantine(begin, put_file, tmp_
         path = put_file("line.xtf", data)
         eventually(lambda path=path: not path.exists(), what="quarantine")
         assert counter(service, "files_quarantined") == min(number, 2)
+    eventually(lambda: not service._dealt_with, what="forgetting what is no longer there")
     kept = sorted(p for p in (tmp_path / "elsewhere").iterdir() if p.suffix == ".xtf")
     assert {p.read_bytes() for p in kept} == {b"one", b"two"}
     assert all(p.with_name(f"{p.name}.reason.txt").is_file() for p in kept)

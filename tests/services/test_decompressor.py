@@ -28,6 +28,7 @@ from sonarpost.link.paper_format import ContactFrame, parse_frame
 from sonarpost.link.paper_sender import plan_packets
 from sonarpost.messages import AcousticFrame, ReconstructedImage
 from sonarpost.runtime.picture_files import picture_name
+from sonarpost.runtime.service import Effects
 from sonarpost.sonar.image_files import read_image
 
 IN, OUT = keys.acoustic_rx("vessel-1"), keys.image_reconstructed("vessel-1")
@@ -337,6 +338,19 @@ def test_health_stays_degraded_while_a_picture_whose_time_is_up_cannot_be_writte
     blocker.unlink()
     eventually(lambda: len(relay.got) == 1)
     eventually(lambda: service.health().state == "ok")
+
+
+def test_a_frame_whose_commit_failed_is_new_when_it_is_handled_again(platform, out, stream):
+    """Also the very first one, when no state has been committed to go back to."""
+    service = DecompressorService(platform("vessel-1"), DecompressorConfig(out_dir=out))
+    for data in frames_of("AAAA", stream())[:2]:
+        for _ in range(3):
+            service.handle(IN, frame(data), Effects())  # and no commit: the disk was full
+        effects = Effects()
+        service.handle(IN, frame(data), effects)
+        service.commit(effects)
+    assert (service._receiver.counts.frames, service._receiver.counts.duplicates) == (2, 0)
+    service.store.close()
 
 
 def test_a_full_disk_keeps_the_frames_with_the_modem(begin, modem, relay, stream):

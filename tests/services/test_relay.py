@@ -91,6 +91,7 @@ def test_each_record_travels_in_an_envelope_unchanged(begin, c2, source, image, 
 def test_without_the_shore_everything_waits_and_decisions_go_first(begin, crew, c2, source, image):
     service = begin()
     source.owe(IMAGES, "relay", *(image(f"{n:04d}") for n in range(3)))
+    eventually(lambda: service.health().gauges["waiting_for_shore"] == 3.0)
     source.owe(DECISIONS, "relay", decision("d1"), decision("d2"))
     eventually(lambda: service.health().gauges["waiting_for_shore"] == 5.0)
     crew.stop(service)

@@ -165,6 +165,17 @@ def test_progress_at_another_rate_is_no_progress(sea, begin, crew, compressor, e
     assert len(heard) <= before + 1 + len(frames)
 
 
+def test_progress_counts_for_the_same_image_sent_the_same_way_only(platform, sea, encoded):
+    image = encoded()
+    kept = {"image_id": "0001", "rate": 1, "of": 2, "done": 1}
+    for changed, done in (({}, 1), ({"rate": 5}, 0), ({"of": 3}, 0), ({"image_id": "0002"}, 0)):
+        service = UuvModemService(platform("uuv-1"), UuvModemConfig(port=sea.port(sea.VEHICLE), rate=1))
+        with service.store.transaction() as tx:
+            tx.put_state("progress", msgpack.packb(kept | changed))
+        assert service._packets_done(image, 2) == done, changed
+        service.store.close()
+
+
 def test_a_port_that_is_not_there_is_named_and_used_when_it_comes(sea, begin, compressor, encoded):
     service = begin()
     compressor.owe(IN, "uuv_modem", encoded())
