@@ -23,9 +23,8 @@ from sonarpost.catalogue.store import (
     save,
     to_bytes,
 )
-from sonarpost.codec.interface import model_tag
 from sonarpost.codec.tiles import TileDatabase
-from sonarpost.codec.vq import VqCodec
+from sonarpost.codec.vq import VqCodec, catalogue_tag
 from sonarpost.errors import CatalogueError
 
 
@@ -154,7 +153,7 @@ def test_the_shipped_catalogues_are_whole_and_fit_14_bits(tile_px: int) -> None:
 
 
 def test_a_shipped_catalogue_is_found_by_the_tag_in_a_stream() -> None:
-    tags = {tile_px: model_tag(load_nominal(tile_px).tiles.identity) for tile_px in NOMINAL_TILE_PX}
+    tags = {tile_px: catalogue_tag(load_nominal(tile_px).tiles) for tile_px in NOMINAL_TILE_PX}
     assert len(set(tags.values())) == len(tags)
     for tile_px, tag in tags.items():
         assert nominal_for_tag(tag) is load_nominal(tile_px)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from pathlib import Path
 
@@ -11,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.catalogue.store import load, load_nominal
-from sonarpost.codec.interface import Codec, StreamHeader, model_tag
+from sonarpost.codec.interface import Codec, StreamHeader
 from sonarpost.codec.tiles import TileDatabase, cut_tiles
-from sonarpost.codec.vq import IndexPacking, VqCodec, pack_indices, unpack_indices
+from sonarpost.codec.vq import IndexPacking, VqCodec, catalogue_tag, pack_indices, unpack_indices
 from sonarpost.errors import ConfigError, StreamError
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "vq"
@@ -32,6 +33,12 @@ def picture(height_px: int, width_px: int) -> np.ndarray:
     image[height_px // 3 : height_px // 2, width_px // 4 : width_px // 2] = 240
     image[height_px // 3 : height_px // 2, width_px // 2 : width_px * 3 // 4] = 3
     return image.astype(np.uint8)
+
+
+def split(stream: bytes) -> tuple[bytes, bytes]:
+    """Header and body."""
+    size = StreamHeader.unpack(stream).size
+    return stream[:size], stream[size:]
 
 
 @pytest.mark.parametrize("packing", PACKINGS)
@@ -58,7 +65,7 @@ def test_it_is_a_codec(tiles: TileDatabase) -> None:
 
 def test_the_papers_sizes_come_out() -> None:
     tiles = TileDatabase.from_tiles(10, np.arange(0, 200, 2, dtype=np.uint8)[:, None].repeat(100, axis=1))
-    lengths = {packing: len(VqCodec(tiles, packing).encode(picture(140, 80))) - 8 for packing in PACKINGS}
+    lengths = {packing: len(VqCodec(tiles, packing).encode(picture(140, 80))) - 4 for packing in PACKINGS}
     assert lengths == {
         IndexPacking.BITS14: 196,
         IndexPacking.BYTES2: 224,
@@ -91,7 +98,7 @@ def test_a_stored_tile_travels_as_its_number_plus_one(tiles: TileDatabase, packi
     codec = VqCodec(tiles, packing)
     flat = np.tile(tiles.tiles[0].reshape(tiles.tile_px, -1), (4, 4))
     stream = codec.encode(flat)
-    assert set(unpack_indices(stream[8:], 16, packing).tolist()) == {1}
+    assert set(unpack_indices(split(stream)[1], 16, packing).tolist()) == {1}
     assert np.array_equal(codec.decode(stream).image, flat)
     assert codec.encode(image) != stream
 
@@ -100,8 +107,9 @@ def test_a_stored_tile_travels_as_its_number_plus_one(tiles: TileDatabase, packi
 def test_zero_padding_is_black_and_missing_never_tile_0(tiles: TileDatabase, packing: IndexPacking) -> None:
     codec = VqCodec(tiles, packing)
     stream = codec.encode(picture(80, 40))
-    half = 8 + (len(stream) - 8) // 2
-    decoded = codec.decode(stream[:half] + bytes(len(stream) - half))
+    header, body = split(stream)
+    half = len(body) // 2
+    decoded = codec.decode(header + body[:half] + bytes(len(body) - half))
     whole = codec.decode(stream)
     # Indices are in raster order: the first half of the body is the top half of the picture.
     assert np.array_equal(decoded.image[:40], whole.image[:40])
@@ -115,22 +123,24 @@ def test_zero_padding_is_black_and_missing_never_tile_0(tiles: TileDatabase, pac
 def test_an_index_above_the_last_tile_is_black_and_missing(tiles: TileDatabase, packing: IndexPacking) -> None:
     codec = VqCodec(tiles, packing)
     stream = codec.encode(picture(20, 30))
-    indices = unpack_indices(stream[8:], 6, packing)
+    header, body = split(stream)
+    indices = unpack_indices(body, 6, packing)
     indices[4] = len(tiles) + 1
-    decoded = codec.decode(stream[:8] + pack_indices(indices, packing))
+    decoded = codec.decode(header + pack_indices(indices, packing))
     assert decoded.missing[10:, 10:20].all()
     assert decoded.missing.sum() == 100
     assert not decoded.image[decoded.missing].any()
     assert "outside the catalogue" in decoded.notes[0]
     indices[4] = len(tiles)
-    assert not codec.decode(stream[:8] + pack_indices(indices, packing)).missing.any()
+    assert not codec.decode(header + pack_indices(indices, packing)).missing.any()
 
 
 @pytest.mark.parametrize("text", [b"12x45", b"    1", b"-0001", b"+0001", b"\xff" * 5, b"\x000001", b"1_000"])
 def test_ascii_that_is_not_five_digits_is_black_and_missing(tiles: TileDatabase, text: bytes) -> None:
     codec = VqCodec(tiles, IndexPacking.ASCII5)
     stream = codec.encode(picture(16, 16))
-    decoded = codec.decode(stream[:8] + text + stream[13:])
+    header, body = split(stream)
+    decoded = codec.decode(header + text + body[5:])
     assert decoded.missing[:10, :10].all()
     assert decoded.missing.sum() == 100
     assert "damaged" in decoded.notes[0]
@@ -140,14 +150,15 @@ def test_ascii_that_is_not_five_digits_is_black_and_missing(tiles: TileDatabase,
 def test_a_tile_is_missing_if_any_byte_of_its_index_is(tiles: TileDatabase, packing: IndexPacking) -> None:
     codec = VqCodec(tiles, packing)
     stream = codec.encode(picture(16, 160))
-    count, length = 32, len(stream) - 8
+    header, sent = split(stream)
+    count, length = 32, len(sent)
     whole = codec.decode(stream)
     for lost_byte in range(length):
         received = np.ones(length, dtype=np.bool_)
         received[lost_byte] = False
-        body = bytearray(stream[8:])
+        body = bytearray(sent)
         body[lost_byte] = 0
-        decoded = codec.decode(stream[:8] + bytes(body), received)
+        decoded = codec.decode(header + bytes(body), received)
         touched = [i for i in range(count) if i * packing.bits // 8 <= lost_byte <= ((i + 1) * packing.bits - 1) // 8]
         shown = [int(cut_tiles(decoded.missing.astype(np.uint8), 10)[i].max()) for i in range(count)]
         assert [i for i in range(count) if shown[i]] == touched
@@ -172,8 +183,8 @@ def test_a_catalogue_of_another_identity_is_named_with_both_tags(tiles: TileData
     stream = VqCodec(other).encode(picture(20, 20))
     with pytest.raises(StreamError, match="another identity") as caught:
         VqCodec(tiles).decode(stream)
-    assert f"{model_tag(other.identity):#06x}" in str(caught.value)
-    assert f"{model_tag(tiles.identity):#06x}" in str(caught.value)
+    assert f"{catalogue_tag(other):#06x}" in str(caught.value)
+    assert f"{catalogue_tag(tiles):#06x}" in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -181,8 +192,9 @@ def test_a_catalogue_of_another_identity_is_named_with_both_tags(tiles: TileData
     [
         ({"codec_id": 0x11}, "codec_id"),
         ({"codec_id": 0x99}, "codec_id"),
-        ({"body_length": 6}, "body_length"),
-        ({"height_px": 31}, "body_length"),
+        ({"model_tag": 0}, "model_tag"),
+        ({"codec_id": 0x01, "model_tag": 0}, "codec_id"),
+        ({"codec_id": 0x20, "model_tag": 0}, "codec_id"),
         ({"height_px": 15}, "height_px"),
         ({"width_px": 513}, "width_px"),
     ],
@@ -190,10 +202,40 @@ def test_a_catalogue_of_another_identity_is_named_with_both_tags(tiles: TileData
 def test_a_header_that_does_not_fit_is_refused(tiles: TileDatabase, change: dict[str, int], field: str) -> None:
     codec = VqCodec(tiles)
     header = StreamHeader.unpack(codec.encode(picture(20, 20)))
-    values = {name: getattr(header, name) for name in header.__slots__} | change
     with pytest.raises(StreamError) as caught:
-        codec.decode(StreamHeader(**values).pack() + bytes(16))
+        codec.decode(dataclasses.replace(header, **change).pack() + bytes(16))
     assert caught.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("height_px", "note"), [(41, "body ends after 14 of 18 B"), (10 + 6, "7 B after the body ignored")]
+)
+def test_a_header_with_another_height_shows_the_disagreement(tiles: TileDatabase, height_px: int, note: str) -> None:
+    codec = VqCodec(tiles)
+    header, body = split(codec.encode(picture(40, 20)))
+    wrong = dataclasses.replace(StreamHeader.unpack(header), height_px=height_px)
+    decoded = codec.decode(wrong.pack() + body)
+    assert decoded.image.shape == (height_px, 20)
+    assert note in decoded.notes
+    whole = codec.decode(header + body).image
+    assert np.array_equal(decoded.image[:16], whole[:16])
+
+
+@pytest.mark.parametrize("packing", PACKINGS)
+@pytest.mark.parametrize("size", [(80, 80), (140, 80), (81, 80), (17, 31), (512, 512)])
+def test_a_stream_starts_with_four_bytes_or_seven(
+    tiles: TileDatabase, packing: IndexPacking, size: tuple[int, int]
+) -> None:
+    header, _ = split(VqCodec(tiles, packing).encode(picture(*size)))
+    common = all(side in (80, 140, 512) for side in size)
+    assert len(header) == (4 if common else 7)
+    assert header[:3] == bytes([packing.codec_id]) + bytes.fromhex(tiles.identity[:4])
+
+
+def test_the_tag_is_the_same_for_every_packing_and_begins_the_identity(tiles: TileDatabase) -> None:
+    assert f"{catalogue_tag(tiles):04x}" == tiles.identity[:4]
+    tags = {StreamHeader.unpack(VqCodec(tiles, packing).encode(picture(20, 20))).model_tag for packing in PACKINGS}
+    assert tags == {catalogue_tag(tiles)}
 
 
 @pytest.mark.parametrize("received", [np.ones(6, np.bool_), np.ones((7, 1), np.bool_), np.ones(7, np.uint8)])
@@ -211,9 +253,9 @@ def test_a_budget_is_met_or_refused(tiles: TileDatabase) -> None:
         codec.encode(picture(40, 40), needed - 1)
 
 
-def test_a_body_the_header_cannot_count_is_refused() -> None:
+def test_a_body_a_half_frame_cannot_count_is_refused() -> None:
     codec = VqCodec(TileDatabase.from_tiles(4, np.eye(16, dtype=np.uint8)), IndexPacking.ASCII5)
-    with pytest.raises(StreamError, match="81928"):
+    with pytest.raises(StreamError, match="81924"):
         codec.encode(picture(512, 512))
 
 
