@@ -18,7 +18,7 @@ from sonarpost import wire
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Contact, Health, Raster, Record
 from sonarpost.runtime.handoff import Reply, attachment, parse_chunk
-from sonarpost.runtime.store import OutboxItem
+from sonarpost.runtime.transaction import OutboxItem
 
 GOLDEN = Path(__file__).parent / "golden" / "zenoh"
 BY_TYPE = {t.TYPE: t for t in RECORD_TYPES}

@@ -20,7 +20,7 @@ from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.picture_files import write_picture
 from sonarpost.runtime.service import RETRY_AFTER_S, Effects, Service
-from sonarpost.runtime.store import InboxItem
+from sonarpost.runtime.transaction import InboxItem
 
 log = logging.getLogger(__name__)
 

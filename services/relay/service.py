@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 
 from services.relay.config import RelayConfig
-from sonarpost import keys, wire
+from sonarpost import keys
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
 from sonarpost.runtime.service import Effects, Service
@@ -35,7 +35,7 @@ class RelayService(Service[RelayConfig]):
 
     def handle(self, key: str, record: Record, effects: Effects) -> None:
         """Put the record into an envelope for c2."""
-        envelope = Relayed(vessel_id=self.platform.id, key=key, payload=wire.encode(record), relayed_utc_s=time.time())
+        envelope = Relayed(vessel_id=self.platform.id, key=key, payload=effects.payload, relayed_utc_s=time.time())
         effects.send(keys.shore_inbox(self.platform.id), "c2", envelope, priority=PRIORITIES[type(record)])
         effects.count(f"{record.TYPE}s_relayed")
 

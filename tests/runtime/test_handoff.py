@@ -19,7 +19,8 @@ from sonarpost.runtime import handoff
 from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.handoff import CHUNK_BYTES, Reply
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.runtime.store import OutboxItem, Store
+from sonarpost.runtime.store import Store
+from sonarpost.runtime.transaction import OutboxItem
 
 KEY = keys.contact_decision("vessel-1")
 

@@ -19,7 +19,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.errors import HandoffError
-from sonarpost.runtime.store import Chunk, OutboxItem, Store, Transaction
+from sonarpost.runtime.store import Store
+from sonarpost.runtime.transaction import Chunk, OutboxItem, Transaction
 
 ORIGIN = b"o" * 16
 
@@ -110,8 +111,8 @@ def test_what_was_refused_is_kept_with_its_reason(store: Store) -> None:
 def test_of_what_was_refused_the_latest_are_kept_and_the_beginning_of_each(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sonarpost.runtime.store.REFUSED_KEPT", 5)
-    monkeypatch.setattr("sonarpost.runtime.store.REFUSED_BYTES", 3)
+    monkeypatch.setattr("sonarpost.runtime.transaction.REFUSED_KEPT", 5)
+    monkeypatch.setattr("sonarpost.runtime.transaction.REFUSED_BYTES", 3)
     for number in range(12):
         with store.transaction() as tx:
             tx.refuse("in", "k", b"%02d and more" % number, "no")
@@ -185,12 +186,21 @@ def test_each_number_of_an_origin_is_accepted_once_in_any_order(
     store.close()
 
 
-def test_what_is_marked_seen_is_not_accepted(store: Store) -> None:
+def test_what_was_refused_is_not_accepted_and_stays_refused(store: Store) -> None:
     with store.transaction() as tx:
-        assert tx.mark_seen(ORIGIN, 1)
-        assert not tx.mark_seen(ORIGIN, 1)
+        assert not tx.was_refused(ORIGIN, 1)
+        tx.mark_refused(ORIGIN, 1)
+        tx.mark_refused(ORIGIN, 1)
+        assert tx.was_refused(ORIGIN, 1)
         assert not tx.accept("k", b"x", ORIGIN, 1)
     assert store.inbox_depth() == 0
+
+
+def test_a_closed_store_says_so(tmp_path: Path) -> None:
+    store = Store(tmp_path / "s.db")
+    store.close()
+    with pytest.raises(HandoffError, match="closed"), store.transaction():
+        pass
 
 
 # Pieces
@@ -277,7 +287,7 @@ def test_accepting_a_record_forgets_its_pieces(store: Store) -> None:
 
 
 def test_only_the_pieces_touched_last_are_kept(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sonarpost.runtime.store.PARTIALS_KEPT", 3)
+    monkeypatch.setattr("sonarpost.runtime.transaction.PARTIALS_KEPT", 3)
     firsts = {seq: pieces(b"0123456789", 4, seq=seq) for seq in range(1, 5)}
     for seq in (1, 2, 3):
         assert add(store, firsts[seq][0]) == 4
@@ -438,7 +448,7 @@ def test_a_store_of_another_version_is_refused(tmp_path: Path) -> None:
     with sqlite3.connect(path) as db:
         db.execute("UPDATE meta SET value = ? WHERE name = 'version'", (b"2",))
     db.close()
-    with pytest.raises(HandoffError, match="store version 2, expected 1"):
+    with pytest.raises(HandoffError, match="store version b'2', expected 1"):
         Store(path)
 
 

@@ -14,7 +14,7 @@ import msgpack
 
 from sonarpost import wire
 from sonarpost.errors import PayloadError
-from sonarpost.runtime.store import Chunk, OutboxItem
+from sonarpost.runtime.transaction import Chunk, OutboxItem
 
 CHUNK_BYTES = 32 * 1024
 MAX_RECORD_BYTES = 8 * 1024 * 1024

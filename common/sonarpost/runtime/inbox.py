@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import queue
 import threading
@@ -14,12 +15,14 @@ from sonarpost import keys
 from sonarpost.errors import BadInputError, HandoffError, PayloadError
 from sonarpost.runtime.handoff import MAX_RECORD_BYTES, Reply, parse_chunk
 from sonarpost.runtime.logs import kv
-from sonarpost.runtime.store import Chunk, Store, Transaction
+from sonarpost.runtime.store import Store
+from sonarpost.runtime.transaction import Chunk, Transaction
 
 log = logging.getLogger(__name__)
 
 BATCH = 64
 QUEUE_LIMIT = 256
+RETRY_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,7 @@ class Inbox:
         self._arrivals: queue.Queue[_Arrival] = queue.Queue(QUEUE_LIMIT)
         self._stop = threading.Event()
         self._trouble = False
+        self._kept: list[_Arrival] = []
         self._thread = threading.Thread(target=self._run, name=f"inbox-{consumer}", daemon=True)
         self._thread.start()
         self._declared: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
@@ -109,6 +113,11 @@ class Inbox:
                 self._answer(batch, self._commit(batch))
 
     def _next_batch(self) -> list[_Arrival]:
+        if self._kept:
+            # What nobody sends again comes first, a moment after the trouble that kept it.
+            self._stop.wait(RETRY_S)
+            kept, self._kept = self._kept, []
+            return kept
         try:
             batch = [self._arrivals.get(timeout=0.2)]
         except queue.Empty:
@@ -129,6 +138,7 @@ class Inbox:
             if not self._trouble:
                 log.exception("Records cannot be stored, their senders keep them", extra=kv(error=str(error)))
             self._trouble = True
+            self._kept = [arrival for arrival in batch if arrival.query is None]
             return [Reply("later", reason=str(error)[:200])] * len(batch)
         if self._trouble:
             log.info("Records can be stored again")
@@ -140,30 +150,46 @@ class Inbox:
             return self._take_checked(tx, arrival.key, arrival.payload, None)
         try:
             chunk = parse_chunk(arrival.attached, arrival.payload, arrival.key + self._suffix)
-        except BadInputError as error:
+            return self._take_chunk(tx, arrival.key, chunk)
+        except PayloadError as error:
             self._on_refused(error)
             return Reply("refused", reason=str(error))
+
+    def _take_chunk(self, tx: Transaction, key: str, chunk: Chunk) -> Reply:
+        if tx.was_refused(chunk.origin, chunk.seq):
+            return Reply("refused", reason="refused before; the reason is in the consumer's log and store")
         if tx.was_seen(chunk.origin, chunk.seq):
             return Reply("stored")
         whole = tx.add_chunk(chunk)
         if isinstance(whole, int):
             return Reply("more", next_offset=whole)
-        return self._take_checked(tx, arrival.key, whole, chunk)
+        if hashlib.sha256(whole).digest() != chunk.sha256:
+            raise PayloadError(key + self._suffix, "sha256", chunk.sha256.hex(), "the digest of the record")
+        return self._take_checked(tx, key, whole, chunk)
 
     def _take_checked(self, tx: Transaction, key: str, payload: bytes, chunk: Chunk | None) -> Reply:
         try:
             self._check(key, payload)
+        except HandoffError:
+            raise
         except BadInputError as error:
             self._on_refused(error)
-            tx.refuse("in", key, payload, str(error))
-            if chunk is not None:
-                tx.mark_seen(chunk.origin, chunk.seq)
-            return Reply("refused", reason=str(error))
+            return self._refuse(tx, key, payload, chunk, str(error))
+        except Exception as error:
+            # A defect of ours must not stop the records behind this one, and must not lose this one either.
+            log.exception("Record not checked, it is kept apart", extra=kv(key=key))
+            return self._refuse(tx, key, payload, chunk, f"{type(error).__name__}: {error}")
         if chunk is None:
             tx.accept(key, payload)
         else:
             tx.accept(key, payload, chunk.origin, chunk.seq)
         return Reply("stored")
+
+    def _refuse(self, tx: Transaction, key: str, payload: bytes, chunk: Chunk | None, reason: str) -> Reply:
+        tx.refuse("in", key, payload, reason)
+        if chunk is not None:
+            tx.mark_refused(chunk.origin, chunk.seq)
+        return Reply("refused", reason=reason)
 
     def _answer(self, batch: list[_Arrival], replies: list[Reply]) -> None:
         for arrival, reply in zip(batch, replies, strict=True):

@@ -14,7 +14,8 @@ from sonarpost.errors import HandoffError, PayloadError
 from sonarpost.runtime import handoff
 from sonarpost.runtime.handoff import CHUNK_BYTES, Reply
 from sonarpost.runtime.logs import kv
-from sonarpost.runtime.store import OutboxItem, Store
+from sonarpost.runtime.store import Store
+from sonarpost.runtime.transaction import OutboxItem
 
 log = logging.getLogger(__name__)
 
@@ -130,6 +131,9 @@ class _Sender:
         self._in_flight: deque[_Asked] = deque()
         self._acknowledged: list[int] = []
         self._failures = 0
+        # One query at a time until the consumer has answered: of a whole window, one that comes up in the middle of it
+        # would take the last and not the first.
+        self._window = 1
         self._stop = threading.Event()
         self._wake = threading.Event()
         store.listen_outbox(self._wake)
@@ -152,6 +156,7 @@ class _Sender:
                     continue
                 self._settle(self._in_flight.popleft())
                 self._failures = 0
+                self._window = WINDOW
             except _NoAnswerError as error:
                 self._back_off(str(error))
             except HandoffError as error:
@@ -169,7 +174,7 @@ class _Sender:
                     self._active[item.seq] = _Transfer(item)
                     self._show(item)
         for transfer in sorted(self._active.values(), key=lambda t: (t.item.priority, t.item.seq)):
-            while transfer.wants_sending and len(self._in_flight) < WINDOW:
+            while transfer.wants_sending and len(self._in_flight) < self._window:
                 self._ask(transfer)
 
     def _show(self, item: OutboxItem) -> None:
@@ -214,6 +219,8 @@ class _Sender:
             self._reject(transfer, reply.reason)
         elif reply.status == "later":
             raise _NoAnswerError(f"the consumer cannot store: {reply.reason}")
+        elif reply.next_offset >= len(transfer.item.payload):
+            raise _NoAnswerError(f"a wrong reply: more from {reply.next_offset} of {len(transfer.item.payload)} bytes")
         else:
             transfer.has = reply.next_offset
             if reply.next_offset != asked.end:
@@ -258,6 +265,7 @@ class _Sender:
     def _back_off(self, reason: str) -> None:
         """Forget what is in flight and wait a little; everything is asked again."""
         self._in_flight.clear()
+        self._window = 1
         for transfer in self._active.values():
             transfer.rewind()
         if self._failures == len(BACK_OFF_S):

@@ -49,11 +49,12 @@ def write_picture(folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
     name = picture_name(image)
     tiff, sidecar = folder / f"{name}.tiff", folder / f"{name}.json"
     text = (json.dumps(side_car(image), indent=1) + "\n").encode()
-    if sidecar.is_file() and sidecar.read_bytes() == text and tiff.is_file():
+    picture = folder / f"{name}.png"
+    if sidecar.is_file() and sidecar.read_bytes() == text and tiff.is_file() and picture.is_file():
         return tiff, False
     folder.mkdir(parents=True, exist_ok=True)
     pixels = image.picture.to_array()
     write_tiff(tiff, pixels)
-    write_png(folder / f"{name}.png", pixels)
+    write_png(picture, pixels)
     write_atomically(sidecar, text)
     return tiff, True

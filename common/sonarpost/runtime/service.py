@@ -26,13 +26,15 @@ from sonarpost.runtime.inbox import Inbox
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.outbox import Outbox
 from sonarpost.runtime.session import open_with_retry
-from sonarpost.runtime.store import InboxItem, Store, Transaction
+from sonarpost.runtime.store import Store
+from sonarpost.runtime.transaction import InboxItem, Transaction
 
 log = logging.getLogger(__name__)
 
 C = TypeVar("C", bound=ServiceConfig)
 
 RETRY_AFTER_S = 1.0
+MAX_DETAIL = 2000
 
 
 class InterruptedByStopError(Exception):
@@ -40,9 +42,14 @@ class InterruptedByStopError(Exception):
 
 
 class Effects:
-    """What handling one record leads to; committed all together, or not at all."""
+    """What handling one record leads to; committed all together, or not at all.
 
-    def __init__(self) -> None:
+    Attributes:
+        payload: The record's bytes as they came, empty for effects that no record has led to.
+    """
+
+    def __init__(self, payload: bytes = b"") -> None:
+        self.payload = payload
         self._sends: list[tuple[str, str, Record, int]] = []
         self._state: dict[str, bytes | None] = {}
         self._apart: list[tuple[str, bytes, str]] = []
@@ -238,7 +245,7 @@ class Service(ABC, Generic[C]):
                 self.store.inbox_changed.wait(1.0)
 
     def _handle_item(self, item: InboxItem) -> None:
-        effects = Effects()
+        effects = Effects(item.payload)
         try:
             self.handle(item.key, wire.decode(self._record_type(item.key), item.payload, item.key), effects)
         except (OSError, HandoffError, InterruptedByStopError):
@@ -307,7 +314,7 @@ class Service(ABC, Generic[C]):
             time_utc_s=time.time(),
             started_utc_s=self.started_utc_s,
             state=state or ("degraded" if detail else "ok"),
-            detail=detail,
+            detail=detail[:MAX_DETAIL],
             counters=counters,
             gauges=gauges,
         )

@@ -8,25 +8,21 @@ acknowledged. Handling a record removes it from the inbox, adds what it leads to
 from __future__ import annotations
 
 import fcntl
-import hashlib
+import logging
 import sqlite3
 import threading
-import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
 from sonarpost.errors import HandoffError
+from sonarpost.runtime.transaction import InboxItem, OutboxItem, Transaction
+
+log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 1
-
-# Bounds on what strangers can make a store keep: whatever is beyond them, the oldest goes.
-REFUSED_KEPT = 1000
-REFUSED_BYTES = 256 * 1024
-PARTIALS_KEPT = 64
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
@@ -40,179 +36,19 @@ CREATE TABLE IF NOT EXISTS inbox (
     received_utc_s REAL NOT NULL);
 CREATE TABLE IF NOT EXISTS seen (origin BLOB NOT NULL, seq INTEGER NOT NULL, PRIMARY KEY (origin, seq)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS seen_upto (origin BLOB PRIMARY KEY, seq INTEGER NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS refused_before (
+    origin BLOB NOT NULL, seq INTEGER NOT NULL, PRIMARY KEY (origin, seq)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS partial (
-    origin BLOB NOT NULL, seq INTEGER NOT NULL, size INTEGER NOT NULL, sha256 BLOB NOT NULL, data BLOB NOT NULL,
-    touched_utc_s REAL NOT NULL, PRIMARY KEY (origin, seq));
+    id INTEGER PRIMARY KEY AUTOINCREMENT, origin BLOB NOT NULL, seq INTEGER NOT NULL, size INTEGER NOT NULL,
+    sha256 BLOB NOT NULL, has INTEGER NOT NULL, touched_ns INTEGER NOT NULL, UNIQUE (origin, seq));
+CREATE TABLE IF NOT EXISTS partial_piece (
+    partial INTEGER NOT NULL REFERENCES partial (id) ON DELETE CASCADE, start INTEGER NOT NULL, data BLOB NOT NULL,
+    PRIMARY KEY (partial, start));
 CREATE TABLE IF NOT EXISTS refused (
     id INTEGER PRIMARY KEY AUTOINCREMENT, direction TEXT NOT NULL, key TEXT NOT NULL, payload BLOB NOT NULL,
     reason TEXT NOT NULL, at_utc_s REAL NOT NULL);
 CREATE TABLE IF NOT EXISTS state (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
 """
-
-
-@dataclass(frozen=True, slots=True)
-class OutboxItem:
-    """A record that its consumer has not acknowledged yet."""
-
-    consumer: str
-    seq: int
-    key: str
-    encoding: str
-    priority: int
-    payload: bytes
-    sha256: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Chunk:
-    """A piece of a record on its way, as the hand-over query carries it."""
-
-    origin: bytes
-    seq: int
-    size: int
-    sha256: bytes
-    offset: int
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class InboxItem:
-    """A record that was accepted and not yet handled."""
-
-    id: int
-    key: str
-    payload: bytes
-
-
-class Transaction:
-    """The writes of one transaction; made by `Store.transaction`, atomic with everything else in it."""
-
-    def __init__(self, connection: sqlite3.Connection) -> None:
-        self._db = connection
-        self.wrote_outbox = False
-        self.wrote_inbox = False
-
-    def send(self, key: str, consumer: str, payload: bytes, *, encoding: str, priority: int = 4) -> int:
-        """Owe `payload` to `consumer` under `key`; return its sequence number (from 1, without gaps, a consumer).
-
-        Args:
-            key: Key expression the record is published on.
-            consumer: Name of the service that acknowledges it.
-            payload: The record's bytes.
-            encoding: Zenoh encoding of the payload.
-            priority: 1 (first) to 7 (last), as Zenoh's priorities.
-        """
-        row = self._db.execute(
-            "INSERT INTO outbox_next VALUES (?, 1) ON CONFLICT (consumer) DO UPDATE SET seq = seq + 1 RETURNING seq",
-            (consumer,),
-        ).fetchone()
-        seq = int(row[0])
-        self._db.execute(
-            "INSERT INTO outbox VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-            (consumer, seq, key, encoding, priority, payload, hashlib.sha256(payload).digest(), time.time()),
-        )
-        self.wrote_outbox = True
-        return seq
-
-    def acknowledged(self, consumer: str, seq: int) -> None:
-        """Forget what the consumer has committed."""
-        self._db.execute("DELETE FROM outbox WHERE consumer = ? AND seq = ?", (consumer, seq))
-
-    def rejected(self, item: OutboxItem, reason: str) -> None:
-        """Keep what the consumer refused apart, where a person can find it."""
-        self.refuse("out", item.key, item.payload, reason)
-        self.acknowledged(item.consumer, item.seq)
-
-    def accept(self, key: str, payload: bytes, origin: bytes | None = None, seq: int | None = None) -> bool:
-        """Put a record into the inbox; False when (origin, seq) was accepted before."""
-        if origin is not None and seq is not None and not self._first_time(origin, seq):
-            return False
-        self._db.execute(
-            "INSERT INTO inbox (key, payload, origin, seq, received_utc_s) VALUES (?, ?, ?, ?, ?)",
-            (key, payload, origin, seq, time.time()),
-        )
-        self.wrote_inbox = True
-        return True
-
-    def done(self, item: InboxItem) -> None:
-        """Remove a handled record from the inbox."""
-        self._db.execute("DELETE FROM inbox WHERE id = ?", (item.id,))
-
-    def refuse(self, direction: str, key: str, payload: bytes, reason: str) -> None:
-        """Keep a record that cannot be handled, with the reason: the latest 1000, of each at most 256 kB."""
-        row = self._db.execute(
-            "INSERT INTO refused (direction, key, payload, reason, at_utc_s) VALUES (?, ?, ?, ?, ?) RETURNING id",
-            (direction, key, payload[:REFUSED_BYTES], reason, time.time()),
-        ).fetchone()
-        self._db.execute("DELETE FROM refused WHERE id <= ?", (int(row[0]) - REFUSED_KEPT,))
-
-    def mark_seen(self, origin: bytes, seq: int) -> bool:
-        """Remember (origin, seq) without an inbox record; False when it was known."""
-        return self._first_time(origin, seq)
-
-    def _first_time(self, origin: bytes, seq: int) -> bool:
-        if self.was_seen(origin, seq):
-            return False
-        self._db.execute("INSERT INTO seen VALUES (?, ?)", (origin, seq))
-        self._db.execute("DELETE FROM partial WHERE origin = ? AND seq = ?", (origin, seq))
-        self._compact(origin)
-        return True
-
-    def was_seen(self, origin: bytes, seq: int) -> bool:
-        """Tell whether (origin, seq) was accepted before."""
-        if seq <= self._watermark(origin):
-            return True
-        return self._db.execute("SELECT 1 FROM seen WHERE origin = ? AND seq = ?", (origin, seq)).fetchone() is not None
-
-    def _watermark(self, origin: bytes) -> int:
-        row = self._db.execute("SELECT seq FROM seen_upto WHERE origin = ?", (origin,)).fetchone()
-        return int(row[0]) if row else 0
-
-    def _compact(self, origin: bytes) -> None:
-        """Fold the unbroken run of accepted numbers into one, so that memory of the past stays small."""
-        upto = before = self._watermark(origin)
-        while self._db.execute("SELECT 1 FROM seen WHERE origin = ? AND seq = ?", (origin, upto + 1)).fetchone():
-            upto += 1
-        if upto > before:
-            self._db.execute("INSERT OR REPLACE INTO seen_upto VALUES (?, ?)", (origin, upto))
-            self._db.execute("DELETE FROM seen WHERE origin = ? AND seq <= ?", (origin, upto))
-
-    def add_chunk(self, chunk: Chunk) -> bytes | int:
-        """Add one chunk of a large record; return the whole record's bytes, or the offset wanted next.
-
-        A chunk that does not continue what is there is not stored: the returned offset says where to go on, which
-        makes a transfer resumable over restarts of either side.
-        """
-        which = (chunk.origin, chunk.seq)
-        row = self._db.execute("SELECT size, sha256, data FROM partial WHERE origin = ? AND seq = ?", which).fetchone()
-        data = bytes(row[2]) if row and (row[0], row[1]) == (chunk.size, chunk.sha256) else b""
-        if chunk.offset == len(data):
-            data += chunk.data
-        if len(data) >= chunk.size:
-            self._db.execute("DELETE FROM partial WHERE origin = ? AND seq = ?", which)
-            return data if hashlib.sha256(data).digest() == chunk.sha256 else 0
-        self._db.execute(
-            "INSERT OR REPLACE INTO partial VALUES (?, ?, ?, ?, ?, ?)",
-            (*which, chunk.size, chunk.sha256, data, time.time()),
-        )
-        self._db.execute(
-            "DELETE FROM partial WHERE rowid NOT IN (SELECT rowid FROM partial ORDER BY touched_utc_s DESC LIMIT ?)",
-            (PARTIALS_KEPT,),
-        )
-        return len(data)
-
-    def put_state(self, name: str, value: bytes) -> None:
-        """Remember `value` under `name`."""
-        self._db.execute("INSERT OR REPLACE INTO state VALUES (?, ?)", (name, value))
-
-    def delete_state(self, name: str) -> None:
-        """Forget `name`."""
-        self._db.execute("DELETE FROM state WHERE name = ?", (name,))
-
-    def get_state(self, name: str) -> bytes | None:
-        """Return what is remembered under `name`, or None."""
-        row = self._db.execute("SELECT value FROM state WHERE name = ?", (name,)).fetchone()
-        return bytes(row[0]) if row else None
 
 
 class Store:
@@ -243,15 +79,16 @@ class Store:
             self._db = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=FULL")
+            self._db.execute("PRAGMA foreign_keys=ON")
             self._db.executescript(_SCHEMA)
         except sqlite3.Error as error:
             raise HandoffError(f"{self.path}: cannot be opened as a sonarpost store: {error}") from error
         with self.transaction():
             self.origin = self._meta("origin", uuid.uuid4().bytes)
-            version = int(self._meta("version", str(SCHEMA_VERSION).encode()))
-        if version != SCHEMA_VERSION:
+            version = self._meta("version", str(SCHEMA_VERSION).encode())
+        if version != str(SCHEMA_VERSION).encode():
             self._db.close()
-            raise HandoffError(f"{self.path}: store version {version}, expected {SCHEMA_VERSION}")
+            raise HandoffError(f"{self.path}: store version {version!r}, expected {SCHEMA_VERSION}")
 
     def _meta(self, name: str, initial: bytes) -> bytes:
         self._db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?)", (name, initial))
@@ -291,8 +128,12 @@ class Store:
         self._outbox_listeners.remove(event)
 
     def _roll_back(self) -> None:
-        if self._db.in_transaction:
-            self._db.execute("ROLLBACK")
+        try:
+            if self._db.in_transaction:
+                self._db.execute("ROLLBACK")
+        except sqlite3.ProgrammingError:
+            # The store is closed, and what was not committed is gone with it.
+            log.debug("Nothing to roll back: %s is closed", self.path)
 
     def _query(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[object, ...]]:
         with self._lock:
