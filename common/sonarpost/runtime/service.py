@@ -110,6 +110,7 @@ class Service(ABC, Generic[C]):
         self.config = config
         self.stopping = threading.Event()
         self.failed = False
+        self._stopped = False
         self.started_utc_s = time.time()
         self.store = Store(platform.state_dir / f"{self.NAME}.db")
         self._counters: Counter[str] = Counter()
@@ -180,7 +181,10 @@ class Service(ABC, Generic[C]):
         return True
 
     def stop(self) -> None:
-        """Stop everything and close the session; what is not finished is in the store."""
+        """Stop everything and close the session; what is not finished is in the store. A second call does nothing."""
+        if self._stopped:
+            return
+        self._stopped = True
         self.stopping.set()
         self.store.inbox_changed.set()
         if self._session is not None:
