@@ -16,6 +16,8 @@ from importlib.metadata import EntryPoint, entry_points
 
 from sonarpost.codec.huffman import HuffmanCodec
 from sonarpost.codec.interface import Codec, StreamHeader
+from sonarpost.codec.jpeg2000 import Jpeg2000Codec
+from sonarpost.codec.modern import ModernCodec, ModernFormat
 from sonarpost.codec.spiht import SpihtCodec
 from sonarpost.codec.tiles import TileDatabase
 from sonarpost.codec.vq import IndexPacking, VqCodec
@@ -68,6 +70,19 @@ def _create_vq(resources: CodecResources) -> Codec:
     return VqCodec(resources.tiles, packing)
 
 
+def _modern_spec(wanted: ModernFormat) -> CodecSpec:
+    summary = f"{wanted.name} at the best quality that fits, for comparison"
+    return CodecSpec(wanted.value, (wanted.codec_id,), lambda _: ModernCodec(wanted), summary)
+
+
+def _what_is_absent(name_or_id: str | int) -> str:
+    """Return what to install for a codec that is absent because its library is, as the end of a message."""
+    absent = (
+        wanted for wanted in ModernFormat if name_or_id in (wanted.value, wanted.codec_id) and not wanted.available
+    )
+    return "".join(f" ({wanted.value} needs {wanted.needs})" for wanted in absent)
+
+
 BUILTINS = (
     CodecSpec(
         "vq",
@@ -77,7 +92,10 @@ BUILTINS = (
         needs_tiles=True,
     ),
     CodecSpec("huffman", (0x01,), lambda _: HuffmanCodec(), "quantised grey levels in a Huffman code (in the paper)"),
+    CodecSpec("jpeg2000", (0x02,), lambda _: Jpeg2000Codec(), "JPEG 2000, raw codestream (in the paper)"),
+    CodecSpec("jpeg2000-packets", (0x03,), lambda _: Jpeg2000Codec(packets_only=True), "JPEG 2000 without its headers"),
     CodecSpec("spiht", (0x04,), lambda _: SpihtCodec(), "set partitioning of a 9/7 wavelet, embedded (in the paper)"),
+    *(_modern_spec(wanted) for wanted in ModernFormat if wanted.available),
 )
 
 
@@ -121,7 +139,9 @@ class CodecRegistry:
             ConfigError: No codec has this name; the message lists those there are.
         """
         if name not in self._by_name:
-            raise ConfigError("codec registry", "name", name, "one of " + ", ".join(self.names()))
+            raise ConfigError(
+                "codec registry", "name", name, "one of " + ", ".join(self.names()) + _what_is_absent(name)
+            )
         return self._by_name[name]
 
     def create(self, name: str, resources: CodecResources) -> Codec:
@@ -140,7 +160,7 @@ class CodecRegistry:
         """
         if codec_id not in self._by_id:
             known = ", ".join(f"{number:#04x} ({self._by_id[number].name})" for number in sorted(self._by_id))
-            raise StreamError("stream", "codec_id", f"{codec_id:#04x}", f"one of {known}")
+            raise StreamError("stream", "codec_id", f"{codec_id:#04x}", f"one of {known}{_what_is_absent(codec_id)}")
         return self._by_id[codec_id]
 
     def create_for_stream(self, stream: bytes, resources: CodecResources) -> Codec:
