@@ -1,0 +1,28 @@
+"""The parser of `sonarpost bench` and its three actions."""
+
+from __future__ import annotations
+
+import argparse
+
+from sonarpost.cli.bench.codecs import add_action as add_codecs
+from sonarpost.cli.bench.paper import add_action as add_paper
+from sonarpost.cli.bench.recognition import add_action as add_recognition
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "bench",
+        help="measure codecs on pictures, against the paper, and by what can be recognised",
+        description="Measure codecs on pictures, against the paper's figures, and by what can be recognised in them.",
+    )
+
+    def show_help(_: argparse.Namespace) -> int:
+        parser.print_help()
+        return 0
+
+    parser.set_defaults(run=show_help)
+    actions = parser.add_subparsers(metavar="ACTION")
+    add_codecs(actions)
+    add_paper(actions)
+    add_recognition(actions)
