@@ -1,9 +1,10 @@
 """Huffman coding of quantised grey levels, one of the four codecs the paper compares.
 
-The finer of two ways to quantise that the budget allows: up to 16 grey levels are chosen for the picture so that the
-squared error is least (by dynamic programming over its histogram); above that, levels are equally spaced, and with a
-spacing of 1 the picture is exact. Every pixel costs at least one bit. Where even two levels do not fit, the picture is
-first reduced to n/32 of its sides, n and the number of levels chosen for the least error after enlarging again.
+Up to 16 grey levels are chosen for the picture so that the squared error is least (by dynamic programming over its
+histogram); more are equally spaced, and with a spacing of 1 the picture is exact. Every pixel costs at least one bit,
+so for small budgets the picture is first reduced to n/32 of its sides. Of all n, each with as many levels as fit, the
+one with the least error after enlarging again is sent: a few levels in full resolution are often worse than many in
+less.
 
 Body, most significant bit first: n - 1 (u8); kind (u8); levels; code lengths; the pixels in raster order.
 
@@ -19,7 +20,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import islice, pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -131,8 +132,8 @@ class HuffmanCodec:
 
         Args:
             image: Shape (16..512, 16..512), uint8 or uint16 (uint16 is mapped to 8 bits by `to_uint8`).
-            budget_bytes: Most bytes of the whole stream; the finest quantisation that fits is used. None for
-                `levels` grey levels in full resolution.
+            budget_bytes: Most bytes of the whole stream; the number of levels and the resolution that show most within
+                it are used. None for `levels` grey levels in full resolution, as in the paper.
 
         Raises:
             StreamError: Size or dtype is not supported, or not even one level fits the budget.
@@ -143,7 +144,7 @@ class HuffmanCodec:
         if budget_bytes is None:
             return header + next(_chosen(grey, FULL_SCALE, [self.levels])).body()
         limit = 8 * (budget_bytes - len(header))
-        coded = _finest(grey, limit) or _reduced(grey, limit)
+        coded = _nearest(grey, limit)
         if coded is None:
             raise StreamError("codec huffman", "budget_bytes", budget_bytes, f"at least {len(header) + 3} B")
         return header + coded.body()
@@ -205,31 +206,29 @@ def _enlarge_mask(lost: Mask, shape: tuple[int, int]) -> Mask:
     return np.asarray(np.array(resized) > 0, dtype=np.bool_)
 
 
-def _finest(image: Image, limit_bits: int) -> _Coded | None:
-    """Return the finest quantisation in full resolution that fits, or None."""
-    for step in range(1, 16):
-        coded = _spaced(image, step)
-        if coded is not None and coded.bits <= limit_bits:
-            return coded
-    fitting = (c for c in _chosen(image, FULL_SCALE, range(MAX_CHOSEN_LEVELS, 1, -1)) if c.bits <= limit_bits)
-    return next(fitting, None)
+def _nearest(image: Image, limit_bits: int) -> _Coded | None:
+    """Return the quantised picture, reduced or not, that fits and is nearest to `image`, or None."""
+    best, least = None, 0
+    for coded in _finest_each(image, limit_bits):
+        rebuilt = _enlarge(coded.levels[coded.symbols].astype(np.uint8), image.shape)
+        error = int(((rebuilt.astype(np.int64) - image) ** 2).sum())
+        if best is None or error < least:
+            best, least = coded, error
+        if error == 0:
+            break
+    return best
 
 
-def _reduced(image: Image, limit_bits: int) -> _Coded | None:
-    """Return the reduced picture that fits and is nearest to `image` when enlarged again, or None."""
-    best, least = None, -1
+def _finest_each(image: Image, limit_bits: int) -> Iterator[_Coded]:
+    """Return the finest equally spaced levels that fit, then the finest chosen ones in each resolution."""
+    spaced = (_spaced(image, step) for step in range(1, MAX_CHOSEN_LEVELS))
+    yield from islice((coded for coded in spaced if coded is not None and coded.bits <= limit_bits), 1)
     for scale in range(FULL_SCALE, 0, -1):
         small = _reduce(image, scale)
         if small.size > limit_bits and scale > 1:
             continue  # a pixel takes a bit, unless all are equal: then any other scale shows the same
-        for coded in _chosen(small, scale, range(MAX_CHOSEN_LEVELS, 0, -1)):
-            if coded.bits <= limit_bits:
-                rebuilt = _enlarge(coded.levels[coded.symbols].astype(np.uint8), image.shape)
-                error = int(((rebuilt.astype(np.int64) - image) ** 2).sum())
-                if best is None or error < least:
-                    best, least = coded, error
-                break
-    return best
+        chosen = _chosen(small, scale, range(MAX_CHOSEN_LEVELS, 0, -1))
+        yield from islice((coded for coded in chosen if coded.bits <= limit_bits), 1)
 
 
 def _spaced(image: Image, step: int) -> _Coded | None:
@@ -249,43 +248,41 @@ def _spaced_levels(low: int, step: int, count: int) -> _Integers:
 
 def _chosen(image: Image, scale: int, counts: Iterable[int]) -> Iterator[_Coded]:
     """Quantise to so many levels with the least squared error, for each number in `counts`."""
-    histogram = np.bincount(image.ravel(), minlength=256).astype(np.float64)
-    starts = _least_error_starts(histogram)
-    weighted = histogram * np.arange(256)
-    distinct = int(np.count_nonzero(histogram))
+    greys, counted = np.unique(image, return_counts=True)
+    starts = _least_error_starts(greys.astype(np.float64), counted.astype(np.float64))
     for count in counts:
-        edges = [256]
-        for used in range(min(count, distinct), 0, -1):
+        edges = [len(greys)]
+        for used in range(min(count, len(greys)), 0, -1):
             edges.append(int(starts[used - 1, edges[-1]]))
         first = edges[:0:-1]
-        means = np.add.reduceat(weighted, first) / np.add.reduceat(histogram, first)
+        means = np.add.reduceat(greys * counted.astype(np.float64), first) / np.add.reduceat(counted, first)
         levels = np.floor(means + 0.5).astype(np.int64)
-        symbols = np.searchsorted(np.array(first), image, side="right") - 1
+        symbols = np.searchsorted(greys[first], image, side="right") - 1
         yield _coded(scale, bytes([scale - 1, len(levels) - 1, *levels.tolist()]), levels, symbols)
 
 
-def _least_error_starts(histogram: _Floats) -> _Integers:
-    """Return where the last group starts when the greys below `stop` are cut into `used` groups.
+def _least_error_starts(greys: _Floats, counted: _Floats) -> _Integers:
+    """Return where the last group starts when the first greys are cut into groups with the least squared error.
 
-    Dynamic programming; empty groups never pay while there are more distinct greys than groups.
+    Dynamic programming: the best cut into one group more ends with the group that adds least to a best cut before it.
 
     Args:
-        histogram: Shape (256,), float64.
+        greys: Shape (n,), float64: the picture's grey levels, rising.
+        counted: Shape (n,), float64: how many pixels have them.
 
     Returns:
-        Shape (16, 257): [used - 1, stop].
+        Shape (16, n + 1): [groups - 1, how many greys are cut].
     """
-    grey = np.arange(256, dtype=np.float64)
-    sums = [np.concatenate(([0.0], np.cumsum(histogram * grey**power))) for power in range(3)]
+    sums = [np.concatenate(([0.0], np.cumsum(counted * greys**power))) for power in range(3)]
     count, first, second = (total[None, :] - total[:, None] for total in sums)  # [start, stop]
     filled = count > 0
     cost = np.where(filled, second - first**2 / np.where(filled, count, 1.0), np.inf)
-    starts = np.zeros((MAX_CHOSEN_LEVELS, 257), dtype=np.int64)
+    starts = np.zeros((MAX_CHOSEN_LEVELS, len(greys) + 1), dtype=np.int64)
     least = cost[0]
-    for used in range(1, MAX_CHOSEN_LEVELS):
+    for groups in range(1, MAX_CHOSEN_LEVELS):
         total = least[:, None] + cost
-        starts[used] = np.argmin(total, axis=0)
-        least = np.min(total, axis=0)
+        starts[groups] = np.argmin(total, axis=0)
+        least = np.take_along_axis(total, starts[groups][None, :], axis=0)[0]
     return starts
 
 

@@ -5,7 +5,8 @@ Each is there where the installed Pillow offers it: WebP and AVIF in its usual w
 textured snippets even the lowest takes some hundred bytes, and a smaller budget is refused.
 
 The body of `avif` and `jpegxl` is the file or codestream as the library writes it. Of `webp` it is the VP8 key frame
-less its start code and size, which the decoder knows (RFC 6386, section 9.1): these and the RIFF container are 27 bytes.
+less its start code and size, which the decoder knows (RFC 6386, section 9.1); with the RIFF container that saves 27
+bytes.
 
 Libraries make room for a picture when they read its size, so the size is compared with the stream header's first.
 None of the three decodes in part: what is cut is refused.
