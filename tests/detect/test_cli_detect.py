@@ -77,11 +77,11 @@ def test_an_option_out_of_range_is_named(file, options):
         run(file, *options)
 
 
-def test_a_bad_file_and_a_folder_that_is_not_there_are_survey_errors(file, tmp_path):
+def test_a_bad_file_and_a_folder_that_is_not_there_are_errors_that_main_tells(file, tmp_path):
     (tmp_path / "bad.xtf").write_bytes(b"not a survey")
     with pytest.raises(SurveyFileError):
         run(tmp_path / "bad.xtf")
-    with pytest.raises(SurveyFileError):
+    with pytest.raises(FileNotFoundError):
         run(file, "--plot", tmp_path / "absent" / "out.png")
 
 

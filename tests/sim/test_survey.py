@@ -10,7 +10,7 @@ import pytest
 from scipy.ndimage import uniform_filter
 
 from sonarpost.cli.simulate import add_parser
-from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.errors import ConfigError
 from sonarpost.sim.seabed import Seabed, SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sim.survey_echo import SonarSettings, Track, echo_intensity, received
@@ -257,7 +257,7 @@ def test_the_command_writes_survey_and_truth(tmp_path, capsys):
 def test_the_command_refuses_what_cannot_be(tmp_path):
     with pytest.raises(ConfigError, match="pings"):
         run(str(tmp_path / "a.xtf"), "--pings", "0")
-    with pytest.raises(SurveyFileError):
+    with pytest.raises(FileNotFoundError):
         run(str(tmp_path / "absent" / "a.xtf"), "--pings", "2", "--samples", "64", "--targets", "0", "--clutter", "0")
     with pytest.raises(SystemExit):
         run(str(tmp_path / "a.xtf"), "--seabed", "cheese")

@@ -12,8 +12,9 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
-from sonarpost.errors import PayloadError, PortError
+from sonarpost.errors import FrameError, PayloadError, PortError
 from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.paper_format import parse_frame
 from sonarpost.link.paper_sender import plan_packets
 from sonarpost.messages import AcousticFrame, EncodedImage, Health, ReconstructedImage, Record, Snippet
 from sonarpost.modem.rates import RATES
@@ -44,6 +45,7 @@ class Watcher:
         encoded: By image identifier.
         vessel: Latest version of every picture on the vessel, by image identifier.
         shore: The same, as shown to shore subscribers.
+        accepted: Images of which op_modem has accepted a frame.
         health: Latest health by service.
     """
 
@@ -53,6 +55,7 @@ class Watcher:
         self.encoded: dict[str, EncodedImage] = {}
         self.vessel: dict[str, ReconstructedImage] = {}
         self.shore: dict[str, ReconstructedImage] = {}
+        self.accepted: set[str] = set()
         self.health: dict[str, Health] = {}
         self.packets_sent = 0
         self.changes = 0
@@ -65,6 +68,7 @@ class Watcher:
         self._subscribe(uuv, keys.contact_detected(UUV), Snippet, self._on_snippet)
         self._subscribe(uuv, keys.image_encoded(UUV), EncodedImage, self._on_encoded)
         self._subscribe(uuv, keys.acoustic_tx(UUV), AcousticFrame, self._on_sent)
+        self._subscribe(vessel, keys.acoustic_rx(VESSEL), AcousticFrame, self._on_heard)
         self._subscribe(vessel, keys.image_reconstructed(VESSEL), ReconstructedImage, self._on_vessel)
         self._subscribe(shore, keys.shore_image(VESSEL), ReconstructedImage, self._on_shore)
         for session, platform in ((uuv, UUV), (uuv, WATER), (vessel, VESSEL), (shore, SHORE)):
@@ -114,6 +118,12 @@ class Watcher:
             self._packets.add(packet)
             self.packets_sent += 1
             self.changes += 1
+
+    def _on_heard(self, frame: AcousticFrame) -> None:
+        try:
+            self.accepted.add(parse_frame(frame.data).image_id)
+        except FrameError as error:
+            log.warning("%s", error)
 
     def _on_vessel(self, image: ReconstructedImage) -> None:
         self._latest(self.vessel, image)
