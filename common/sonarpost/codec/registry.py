@@ -83,7 +83,20 @@ def _what_is_absent(name_or_id: str | int) -> str:
     return "".join(f" ({wanted.value} needs {wanted.needs})" for wanted in absent)
 
 
+def _create_emb(resources: CodecResources) -> Codec:
+    del resources  # its model comes with the package
+    from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415  it brings a compiler, which nobody else waits for
+
+    return EmbCodec()
+
+
 BUILTINS = (
+    CodecSpec(
+        "emb",
+        (0x20,),
+        _create_emb,
+        "embedded wavelet codec with learned contexts: a picture at every length, from 20 bytes up",
+    ),
     CodecSpec(
         "vq",
         tuple(packing.codec_id for packing in IndexPacking),

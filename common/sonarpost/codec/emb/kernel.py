@@ -1,0 +1,529 @@
+"""The coding loop: contexts, network, range coder; the same code writes, reads and lists training examples.
+
+Everything here is integer arithmetic on int32 and int64. See docs/codec.md for the format in words.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from sonarpost.codec.emb._jit import compiled
+from sonarpost.codec.emb.layout import (
+    BORDER,
+    CHILD,
+    HEIGHT,
+    HH,
+    HL,
+    LEVEL,
+    LH,
+    LL,
+    LOW,
+    OFFSET,
+    ORIENT,
+    PARENT,
+    SIBLING_1,
+    SIBLING_2,
+    STRIDE,
+    WIDTH,
+)
+
+I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
+U8 = npt.NDArray[np.uint8]
+
+WRITE, READ, LIST = 0, 1, 2
+NEAR, REFINE, FAR, ALL = 0, 1, 2, 3
+"""Passes: coefficients with something significant around them; those that are significant; the rest; NEAR and FAR."""
+
+FEATURES: Final = 44
+SIGN_FEATURES: Final = 14
+HIDDEN_1: Final = 32
+HIDDEN_2: Final = 16
+SIGN_HIDDEN: Final = 8
+CAP: Final = 48
+"""Largest magnitude that a context shows: 6 thresholds, in eighths."""
+LOGIT_LIMIT: Final = 3071
+"""Logits are 1/256; the table of probabilities runs from -LOGIT_LIMIT to LOGIT_LIMIT."""
+
+# The coder's state.
+CODER_LOW, CODER_RANGE, CODER_LENGTH, CODER_CODE, CODER_UNSURE, CODER_AT, CODER_STOP, CODER_EVENTS = range(8)
+CODER_GOOD_EVENTS, CODER_GOOD_LENGTH, CODER_COST, CODER_ROWS, CODER_SIGN_ROWS, CODER_LIMIT = range(8, 14)
+CODER_WORDS: Final = 14
+_TOP: Final = 1 << 32
+_BOTTOM: Final = 1 << 24
+
+
+@compiled
+def start_reading(coder: I64, data: U8) -> None:
+    """Load the first four bytes; bytes that are not there are unknown."""
+    coder[CODER_RANGE] = _TOP - 1
+    for _ in range(4):
+        _next_byte(coder, data)
+
+
+@compiled
+def _next_byte(coder: I64, data: U8) -> None:
+    at = coder[CODER_AT]
+    if at < data.shape[0]:
+        coder[CODER_CODE] = (coder[CODER_CODE] << 8) | data[at]
+        coder[CODER_UNSURE] <<= 8
+    else:
+        coder[CODER_CODE] <<= 8
+        coder[CODER_UNSURE] = (coder[CODER_UNSURE] << 8) | 255
+    coder[CODER_AT] = at + 1
+
+
+@compiled
+def _get(coder: I64, data: U8, chance: int) -> int:
+    """Read a decision whose chance of being 1 is `chance` / 65536; -1 where the bytes that are there do not tell."""
+    bound = (coder[CODER_RANGE] >> 16) * chance
+    code = coder[CODER_CODE]
+    if code >= bound:
+        bit = 0
+        coder[CODER_CODE] = code - bound
+        coder[CODER_RANGE] -= bound
+    elif code + coder[CODER_UNSURE] < bound:
+        bit = 1
+        coder[CODER_RANGE] = bound
+    else:
+        coder[CODER_STOP] = 1
+        return -1
+    while coder[CODER_RANGE] < _BOTTOM:
+        _next_byte(coder, data)
+        coder[CODER_RANGE] <<= 8
+    return bit
+
+
+@compiled
+def _put(coder: I64, data: U8, good: U8, bit: int, chance: int) -> None:
+    """Write a decision. Stops where no stream of CODER_LIMIT bytes could tell it from its opposite."""
+    bound = (coder[CODER_RANGE] >> 16) * chance
+    if bit:
+        coder[CODER_RANGE] = bound
+    else:
+        coder[CODER_LOW] += bound
+        coder[CODER_RANGE] -= bound
+    while coder[CODER_RANGE] < _BOTTOM:
+        length = coder[CODER_LENGTH]
+        if length >= coder[CODER_LIMIT]:
+            coder[CODER_STOP] = 1
+            return
+        if coder[CODER_LOW] >> 32:
+            _carry(data, length)
+        data[length] = (coder[CODER_LOW] >> 24) & 255
+        coder[CODER_LENGTH] = length + 1
+        coder[CODER_LOW] = (coder[CODER_LOW] & 0xFFFFFF) << 8
+        coder[CODER_RANGE] <<= 8
+    coder[CODER_EVENTS] += 1
+    _keep_if_whole(coder, data, good)
+
+
+@compiled
+def _carry(data: U8, length: int) -> None:
+    at = length - 1
+    while data[at] == 255:
+        data[at] = 0
+        at -= 1
+    data[at] += 1
+
+
+@compiled
+def _keep_if_whole(coder: I64, data: U8, good: U8) -> None:
+    """Keep the bytes of CODER_LIMIT length that tell everything so far, if there are such."""
+    length = coder[CODER_LENGTH]
+    left = coder[CODER_LIMIT] - length
+    if left > 4:
+        return
+    cell = 1 << (32 - 8 * left)
+    value = (coder[CODER_LOW] + cell - 1) // cell * cell
+    if value + cell > coder[CODER_LOW] + coder[CODER_RANGE]:
+        return
+    good[:length] = data[:length]
+    if value >> 32:
+        _carry(good, length)
+    for i in range(left):
+        good[length + i] = (value >> (24 - 8 * i)) & 255
+    coder[CODER_GOOD_EVENTS] = coder[CODER_EVENTS]
+    coder[CODER_GOOD_LENGTH] = length + left
+
+
+@compiled
+def finish_writing(coder: I64, data: U8, good: U8) -> None:
+    """Keep the shortest bytes that tell everything, where the budget was not used up."""
+    if coder[CODER_STOP]:
+        return
+    limit = coder[CODER_LIMIT]
+    coder[CODER_GOOD_EVENTS] = -1
+    for left in range(5):
+        coder[CODER_LIMIT] = min(coder[CODER_LENGTH] + left, limit)
+        if coder[CODER_GOOD_EVENTS] < coder[CODER_EVENTS]:
+            _keep_if_whole(coder, data, good)
+
+
+@compiled
+def code_plain(coder: I64, data: U8, good: U8, bit: int, chance: int, mode: int) -> int:
+    """Write or read one decision of known chance; returns it, or -1 at the end."""
+    if mode == READ:
+        return _get(coder, data, chance)
+    _put(coder, data, good, bit, chance)
+    return -1 if coder[CODER_STOP] else bit
+
+
+@compiled
+def _log2_eighths(value: int) -> int:
+    """8 log2(value) for value >= 1, linear between powers of two."""
+    power = 0
+    while value >> (power + 1):
+        power += 1
+    return 8 * power + ((value << 3) >> power) - 8
+
+
+@compiled
+def _box(seen: I32, at: int, stride: int) -> int:
+    """Sum of the eight neighbours."""
+    up, down = at - stride, at + stride
+    return (
+        seen[up - 1] + seen[up] + seen[up + 1] + seen[at - 1] + seen[at + 1] + seen[down - 1] + seen[down] + seen[down + 1]
+    )
+
+
+@compiled
+def _relative(bands: I32, row: int, y: int, x: int) -> int:
+    """Flat index of a cell, held inside the band; -1 where the band is empty."""
+    height, width = bands[row, HEIGHT], bands[row, WIDTH]
+    if height == 0 or width == 0:
+        return -1
+    return bands[row, OFFSET] + min(y, height - 1) * bands[row, STRIDE] + min(x, width - 1)
+
+
+@compiled
+def _is_near(seen: I32, bands: I32, row: int, y: int, x: int, at: int) -> bool:
+    """Whether anything around, above or beside a coefficient is significant, or the band is a coarse one."""
+    if bands[row, PARENT] < 0:
+        return True
+    if _box(seen, at, bands[row, STRIDE]) > 0:
+        return True
+    parent = _relative(bands, bands[row, PARENT], y >> 1, x >> 1)
+    if parent >= 0 and seen[parent] > 0:
+        return True
+    for column in (SIBLING_1, SIBLING_2):
+        sibling = bands[row, column]
+        if sibling >= 0 and seen[bands[sibling, OFFSET] + y * bands[sibling, STRIDE] + x] > 0:
+            return True
+    return False
+
+
+@compiled
+def _context(
+    f: I32, seen: I32, lows: I32, bands: I32, low_width: int, threshold: int, row: int, y: int, x: int, at: int
+) -> None:
+    """Fill in the features of one coefficient; those of its band stand already at the end (from 34 on)."""
+    stride = bands[row, STRIDE]
+    f[0], f[1] = seen[at - 1], seen[at - stride]
+    f[2], f[3] = seen[at - stride - 1], seen[at - stride + 1]
+    f[4], f[5] = seen[at + 1], seen[at + stride]
+    f[6], f[7] = seen[at + stride - 1], seen[at + stride + 1]
+    f[8], f[9] = seen[at - 2], seen[at - 2 * stride]
+    f[10], f[11] = seen[at + 2], seen[at + 2 * stride]
+    f[12] = seen[at]
+    ring = 0
+    for dy in range(-2, 3):
+        line = at + dy * stride
+        ring += seen[line - 2] + seen[line - 1] + seen[line] + seen[line + 1] + seen[line + 2]
+    f[13] = (ring - seen[at]) >> 2
+    for i in range(14, 34):
+        f[i] = 0
+    if bands[row, ORIENT] == LL:
+        f[31], f[32] = min(y, 8) * 4, min(x, 8) * 4
+        f[33] = 32 if y == 0 and x == 0 else 0
+        return
+    parent = bands[row, PARENT]
+    if parent >= 0:
+        cell = _relative(bands, parent, y >> 1, x >> 1)
+        if cell >= 0:
+            width = bands[parent, STRIDE]
+            f[14], f[15] = seen[cell], _box(seen, cell, width) >> 1
+            f[16], f[17] = seen[cell - 1] + seen[cell + 1], seen[cell - width] + seen[cell + width]
+            # The parent's neighbour on the side this coefficient lies on.
+            f[18] = seen[cell + (1 if x & 1 else -1)]
+            f[19] = seen[cell + (width if y & 1 else -width)]
+        grand = bands[parent, PARENT]
+        if grand >= 0:
+            cell = _relative(bands, grand, y >> 2, x >> 2)
+            if cell >= 0:
+                f[20], f[21] = seen[cell], _box(seen, cell, bands[grand, STRIDE]) >> 1
+    for k in range(2):
+        sibling = bands[row, SIBLING_1 + k]
+        if sibling >= 0:
+            cell = bands[sibling, OFFSET] + y * bands[sibling, STRIDE] + x
+            f[22 + 2 * k], f[23 + 2 * k] = seen[cell], _box(seen, cell, bands[sibling, STRIDE]) >> 1
+    child = bands[row, CHILD]
+    if child >= 0:
+        cell = bands[child, OFFSET] + 2 * y * bands[child, STRIDE] + 2 * x
+        below = cell + bands[child, STRIDE]
+        f[26] = (seen[cell] + seen[cell + 1] + seen[below] + seen[below + 1]) >> 1
+    low_stride = low_width + 2
+    here = bands[row, LOW] + (y + 1) * low_stride + x + 1
+    level = bands[row, LEVEL]
+    grey = max(lows[here] >> level, 256)  # 1/64 grey, at least 4
+    f[27] = min(_log2_eighths(grey), 120) - 80
+    across = abs(lows[here + 1] - lows[here - 1])
+    along = abs(lows[here + low_stride] - lows[here - low_stride])
+    f[28], f[29] = min(across * 4 // threshold, CAP), min(along * 4 // threshold, CAP)
+    bend = abs(4 * lows[here] - lows[here + 1] - lows[here - 1] - lows[here + low_stride] - lows[here - low_stride])
+    f[30] = min(bend * 2 // threshold, CAP)
+    around = lows[here + 1] + lows[here - 1] + lows[here + low_stride] + lows[here - low_stride]
+    f[31] = min(_log2_eighths(max(around >> (level + 2), 256)), 120) - 80
+
+
+@compiled
+def _logit(
+    f: I32, base: I32, w1: I32, w2: I32, b2: I32, w3: I32, b3: int, first: int, h1: I32, h2: I32
+) -> int:
+    """Run the network: features, two hidden layers, one output in 1/256."""
+    for j in range(h1.shape[0]):
+        h1[j] = base[j]
+    for i in range(first):
+        value = f[i]
+        if value != 0:
+            for j in range(h1.shape[0]):
+                h1[j] += value * w1[i, j]
+    for j in range(h2.shape[0]):
+        h2[j] = b2[j]
+    for i in range(h1.shape[0]):
+        value = min(max(h1[i] >> 6, 0), 4095)
+        if value != 0:
+            for j in range(h2.shape[0]):
+                h2[j] += value * w2[i, j]
+    total = np.int64(b3)
+    for i in range(h2.shape[0]):
+        total += np.int64(min(max(h2[i] >> 12, 0), 4095)) * w3[i]
+    return min(max(total >> 12, -LOGIT_LIMIT), LOGIT_LIMIT)
+
+
+@compiled
+def band_base(f: I32, w1: I32, b1: I32, first: int, base: I32) -> None:
+    """The part of the first layer that is the same for a whole band."""
+    for j in range(base.shape[0]):
+        base[j] = b1[j]
+    for i in range(first, f.shape[0]):
+        for j in range(base.shape[0]):
+            base[j] += f[i] * w1[i, j]
+
+
+@compiled
+def _clip(value: int, limit: int) -> int:
+    return min(max(value, -limit), limit)
+
+
+@compiled
+def _sign_context(
+    f: I32, signed: I32, lows: I32, bands: I32, low_width: int, threshold: int, row: int, y: int, x: int, at: int
+) -> None:
+    """Signed surroundings of a coefficient."""
+    stride = bands[row, STRIDE]
+    f[0], f[1] = signed[at - 1], signed[at + 1]
+    f[2], f[3] = signed[at - stride], signed[at + stride]
+    f[4], f[5] = signed[at - stride - 1] - signed[at - stride + 1], signed[at + stride + 1] - signed[at + stride - 1]
+    f[6] = 0
+    for i in range(7, 11):
+        f[i] = 0
+    if bands[row, ORIENT] == LL:
+        return
+    parent = bands[row, PARENT]
+    if parent >= 0:
+        cell = _relative(bands, parent, y >> 1, x >> 1)
+        if cell >= 0:
+            f[6] = signed[cell]
+    low_stride = low_width + 2
+    here = bands[row, LOW] + (y + 1) * low_stride + x + 1
+    middle = 2 * lows[here]
+    f[7] = _clip((lows[here + 1] - lows[here - 1]) * 4 // threshold, CAP)
+    f[8] = _clip((lows[here + low_stride] - lows[here - low_stride]) * 4 // threshold, CAP)
+    f[9] = _clip((lows[here + 1] + lows[here - 1] - middle) * 4 // threshold, CAP)
+    f[10] = _clip((lows[here + low_stride] + lows[here - low_stride] - middle) * 4 // threshold, CAP)
+
+
+@compiled
+def _sign_logit(f: I32, base: I32, w1: I32, w2: I32, orient: int, h: I32) -> int:
+    """An odd function of the features: with all signs turned the logit turns too. A small network a band orientation."""
+    total = np.int64(0)
+    for j in range(SIGN_HIDDEN):
+        forth = np.int64(base[j])
+        back = np.int64(base[j])
+        for i in range(11):
+            step = f[i] * w1[orient, i, j]
+            forth += step
+            back -= step
+        total += (min(max(forth >> 6, 0), 4095) - min(max(back >> 6, 0), 4095)) * w2[orient, j]
+    return min(max(total >> 12, -LOGIT_LIMIT), LOGIT_LIMIT)
+
+
+@compiled
+def refresh(values: I32, widths: I32, signs: I32, seen: I32, signed: I32, threshold: int) -> None:
+    """Express what is known of every coefficient in thresholds."""
+    for at in range(values.shape[0]):
+        if values[at] > 0:
+            seen[at] = min((values[at] + (widths[at] >> 1)) * 8 // threshold, CAP)
+            signed[at] = seen[at] * signs[at]
+
+
+@compiled
+def code_band(
+    mode: int,
+    kind: int,
+    plane: int,
+    threshold: int,
+    row: int,
+    low_width: int,
+    bands: I32,
+    targets: I32,
+    values: I32,
+    widths: I32,
+    signs: I32,
+    seen: I32,
+    signed: I32,
+    marks: I32,
+    lows: I32,
+    f: I32,
+    base_sig: I32,
+    base_ref: I32,
+    w1: I32,
+    w2: I32,
+    b2: I32,
+    w3: I32,
+    b3: I32,
+    sign_w1: I32,
+    sign_b1: I32,
+    sign_w2: I32,
+    chances: I32,
+    costs: I32,
+    gains: I32,
+    price: int,
+    coder: I64,
+    data: U8,
+    good: U8,
+    curve: I64,
+    rows: npt.NDArray[np.int16],
+    sign_rows: npt.NDArray[np.int16],
+) -> int:
+    """Code one pass over one band. Returns 0, or -1 at the end of the stream or of its budget.
+
+    Args:
+        mode: WRITE, READ or LIST.
+        kind: NEAR, REFINE, FAR or ALL.
+        plane: Number of the plane, from 1; `marks` keeps it for coefficients that were decided in this plane.
+        threshold: Of the plane, in coefficient units.
+        row: The band's row in `bands`.
+        low_width: Width of the low-pass picture of the band's level.
+        bands: The band table.
+        targets: The true coefficients (WRITE, LIST), flat.
+        values: Lower bound of every magnitude, 0 where not significant.
+        widths: How far above the lower bound the magnitude may lie.
+        signs: -1, 0 or 1.
+        seen: Magnitudes in eighths of the threshold, at most CAP.
+        signed: The same with the sign.
+        marks: See `plane`.
+        lows: Low-pass pictures known so far.
+        f: Features; those from 34 on are filled in.
+        base_sig: First-layer sums that are the band's, for significance.
+        base_ref: The same, for refinement.
+        w1, w2, b2, w3, b3: The network, first axis 0 for significance and 1 for refinement.
+        sign_w1, sign_b1, sign_w2: The networks for signs, first axis the band's orientation.
+        chances: Probability of 1, in 1/65536, by logit + LOGIT_LIMIT.
+        costs: Bits of a 1, in 1/256, by logit + LOGIT_LIMIT.
+        gains: Error that significance removes, in 1/256 of the squared threshold, by magnitude in 1/16 thresholds.
+        price: Least gain a bit must bring, in the same unit; 0 for all.
+        coder: The range coder's state.
+        data: The stream.
+        good: The best whole stream so far (WRITE).
+        curve: Squared error left, by bytes (WRITE).
+        rows: Examples (LIST).
+        sign_rows: Examples of signs (LIST).
+    """
+    height, width, stride = bands[row, HEIGHT], bands[row, WIDTH], bands[row, STRIDE]
+    orient, level = bands[row, ORIENT], bands[row, LEVEL]
+    h1, h2, h = np.zeros(HIDDEN_1, np.int32), np.zeros(HIDDEN_2, np.int32), np.zeros(SIGN_HIDDEN, np.int32)
+    fs = np.zeros(SIGN_FEATURES, np.int32)
+    for y in range(height):
+        for x in range(width):
+            at = bands[row, OFFSET] + y * stride + x
+            known = values[at] > 0
+            if marks[at] == plane or known != (kind == REFINE):
+                continue
+            if kind == NEAR and not _is_near(seen, bands, row, y, x, at):
+                continue
+            marks[at] = plane
+            _context(f, seen, lows, bands, low_width, threshold, row, y, x, at)
+            net = 1 if known else 0
+            magnitude = abs(targets[at])
+            bit = 1 if magnitude >= values[at] + threshold else 0
+            if mode == LIST:
+                share = 1
+                if kind == FAR or kind == ALL:
+                    share = 12 if level == 1 else 4 if level == 2 else 1
+                coder[CODER_CODE] = (coder[CODER_CODE] * 1103515245 + 12345) & 0x7FFFFFFF
+                if (coder[CODER_CODE] >> 12) % share == 0 and coder[CODER_ROWS] < rows.shape[0]:
+                    n = coder[CODER_ROWS]
+                    for i in range(FEATURES):
+                        rows[n, i] = f[i]
+                    rows[n, FEATURES], rows[n, FEATURES + 1], rows[n, FEATURES + 2] = bit, net, share
+                    coder[CODER_ROWS] = n + 1
+            else:
+                base = base_ref if known else base_sig
+                logit = _logit(f, base, w1[net], w2[net], b2[net], w3[net], b3[net], 34, h1, h2)
+                chance = chances[logit + LOGIT_LIMIT]
+                if mode == READ:
+                    bit = _get(coder, data, chance)
+                    if bit < 0:
+                        return -1
+                else:
+                    if bit and not known and price > 0:
+                        part = min(magnitude * 16 // threshold, 31)
+                        if gains[part] < (price * (costs[logit + LOGIT_LIMIT] + 256)) >> 8:
+                            bit = 0
+                    _put(coder, data, good, bit, chance)
+                    coder[CODER_COST] += costs[(logit if bit else -logit) + LOGIT_LIMIT]
+                    if coder[CODER_STOP]:
+                        return -1
+            before = values[at] + widths[at] * 7 // 16 if known else 0
+            if known:
+                values[at] += threshold * bit
+                widths[at] = threshold
+            elif bit:
+                if mode == LIST:
+                    sign = 1 if targets[at] > 0 else 0
+                    _sign_context(fs, signed, lows, bands, low_width, threshold, row, y, x, at)
+                    if coder[CODER_SIGN_ROWS] < sign_rows.shape[0]:
+                        n = coder[CODER_SIGN_ROWS]
+                        for i in range(SIGN_FEATURES):
+                            sign_rows[n, i] = fs[i]
+                        sign_rows[n, 11], sign_rows[n, 12], sign_rows[n, 13] = orient, sign, level
+                        coder[CODER_SIGN_ROWS] = n + 1
+                else:
+                    _sign_context(fs, signed, lows, bands, low_width, threshold, row, y, x, at)
+                    logit = _sign_logit(fs, sign_b1[orient], sign_w1, sign_w2, orient, h)
+                    if mode == READ:
+                        sign = _get(coder, data, chances[logit + LOGIT_LIMIT])
+                        if sign < 0:
+                            return -1
+                    else:
+                        sign = 1 if targets[at] > 0 else 0
+                        _put(coder, data, good, sign, chances[logit + LOGIT_LIMIT])
+                        coder[CODER_COST] += costs[(logit if sign else -logit) + LOGIT_LIMIT]
+                        if coder[CODER_STOP]:
+                            return -1
+                values[at], widths[at] = threshold, threshold
+                signs[at] = 1 if sign else -1
+            if values[at] > 0:
+                seen[at] = min((values[at] + (widths[at] >> 1)) * 8 // threshold, CAP)
+                signed[at] = seen[at] * signs[at]
+                if mode == WRITE:
+                    after = values[at] + widths[at] * 7 // 16
+                    curve[0] += np.int64(magnitude - after) ** 2 - np.int64(magnitude - before) ** 2
+            if mode == WRITE:
+                curve[min(1 + (coder[CODER_COST] >> 11), curve.shape[0] - 1)] = curve[0]
+    return 0

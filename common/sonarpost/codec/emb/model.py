@@ -1,0 +1,91 @@
+"""The trained model: integer weights of the networks, reconstruction points and tables.
+
+The file (`data/emb.npz`-like, but written bit by bit by `training/emb/export.py`) is a sequence of named int arrays; its
+sha256 is the model's identity.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+import numpy.typing as npt
+
+from sonarpost.codec.emb import kernel as k
+from sonarpost.errors import StreamError
+
+I32 = npt.NDArray[np.int32]
+MAGIC = b"SPEMB1\n"
+
+# Name, shape and type in the file, in order.
+ARRAYS: tuple[tuple[str, tuple[int, ...], str], ...] = (
+    ("w1", (2, k.FEATURES, k.HIDDEN_1), "<i2"),
+    ("b1", (2, k.HIDDEN_1), "<i4"),
+    ("w2", (2, k.HIDDEN_1, k.HIDDEN_2), "<i2"),
+    ("b2", (2, k.HIDDEN_2), "<i4"),
+    ("w3", (2, k.HIDDEN_2), "<i2"),
+    ("b3", (2,), "<i4"),
+    ("sign_w1", (4, 11, k.SIGN_HIDDEN), "<i2"),
+    ("sign_b1", (4, k.SIGN_HIDDEN), "<i4"),
+    ("sign_w2", (4, k.SIGN_HIDDEN), "<i2"),
+    ("chances", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
+    ("costs", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
+    ("centres", (5,), "<i2"),
+    ("gains", (32,), "<i2"),
+    ("mean_tree", (64,), "<u2"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Integer weights and tables, all int32; see `kernel.code_band` for what each is.
+
+    Attributes:
+        identity: Hex sha256 of the file.
+        centres: Where in its interval a coefficient most likely lies, in 1/256, by lower bound / width (0..4).
+        mean_tree: Probability of 1 of each decision of the mean level, by node of the binary tree.
+    """
+
+    identity: str
+    w1: I32
+    b1: I32
+    w2: I32
+    b2: I32
+    w3: I32
+    b3: I32
+    sign_w1: I32
+    sign_b1: I32
+    sign_w2: I32
+    chances: I32
+    costs: I32
+    centres: I32
+    gains: I32
+    mean_tree: I32
+
+
+def parse(raw: bytes, where: str = "emb model") -> Model:
+    """Read a model file.
+
+    Raises:
+        StreamError: It is not one, or its length is wrong.
+    """
+    if not raw.startswith(MAGIC):
+        raise StreamError(where, "magic", raw[: len(MAGIC)], repr(MAGIC))
+    expected = len(MAGIC) + sum(int(np.prod(shape)) * np.dtype(kind).itemsize for _, shape, kind in ARRAYS)
+    if len(raw) != expected:
+        raise StreamError(where, "length", len(raw), f"{expected} bytes")
+    arrays, at = {}, len(MAGIC)
+    for name, shape, kind in ARRAYS:
+        count = int(np.prod(shape))
+        arrays[name] = np.frombuffer(raw, kind, count, at).reshape(shape).astype(np.int32)
+        at += count * np.dtype(kind).itemsize
+    return Model(hashlib.sha256(raw).hexdigest(), **arrays)
+
+
+@cache
+def shipped() -> Model:
+    """Return the model that comes with the package."""
+    return parse(files("sonarpost.codec").joinpath("data", "emb.model").read_bytes())

@@ -1,0 +1,186 @@
+"""The embedded codec beyond the contract: every prefix, exact agreement, damage, other models."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonarpost.codec.emb import transform
+from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.codec.emb.layout import layout
+from sonarpost.codec.emb.model import parse, shipped
+from sonarpost.codec.interface import StreamHeader
+from sonarpost.codec.quality import psnr_db
+from sonarpost.errors import StreamError
+
+CODEC = EmbCodec()
+
+
+def contact(height_px: int = 80, width_px: int = 80, seed: int = 0) -> np.ndarray:
+    """Speckled slope with a highlight and a shadow."""
+    rng = np.random.default_rng(seed)
+    image = (50 + 30 * np.linspace(0, 1, width_px)) * rng.gamma(6, 1 / 6, (height_px, width_px))
+    image[height_px // 3 : height_px // 2, width_px // 4 : width_px // 2] *= 3
+    image[height_px // 3 : height_px // 2, width_px // 2 : width_px * 3 // 4] *= 0.1
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("budget", [6, 7, 22, 23, 64, 200, 512])
+def test_a_budget_is_used_and_never_exceeded(budget: int) -> None:
+    stream = CODEC.encode(contact(), budget)
+    assert len(stream) == budget
+
+
+def test_every_prefix_decodes_and_longer_ones_do_not_get_much_worse() -> None:
+    image = contact(64, 56)
+    stream = CODEC.encode(image, 160)
+    quality = []
+    for length in range(StreamHeader.unpack(stream).size, len(stream) + 1):
+        decoded = CODEC.decode(stream[:length])
+        if not decoded.missing.any():
+            quality.append(psnr_db(image, decoded.image))
+    assert len(quality) > 150
+    assert quality[-1] > quality[0] + 3
+    best = np.maximum.accumulate(quality)
+    assert np.all(best - quality < 0.35)
+
+
+def test_a_prefix_of_a_long_stream_decides_only_what_the_whole_confirms() -> None:
+    """Whatever follows a prefix, the decoder never had to take anything back: no decision came from bytes not there."""
+    stream = CODEC.encode(contact(48, 48), 120)
+    for length in range(8, 60, 5):
+        states = [_known(stream[:length] + tail) for tail in (b"", bytes(40), b"\xff" * 40, stream[length:])]
+        short = states[0]
+        significant = short[0] > 0
+        for values, signs in states[1:]:
+            assert np.all(values[significant] >= short[0][significant])
+            assert np.array_equal(signs[significant], short[1][significant])
+
+
+def _known(stream: bytes) -> tuple[np.ndarray, np.ndarray]:
+    state, _, _ = CODEC.read_state(stream)
+    return state.values, state.signs
+
+
+def test_more_bytes_are_a_better_picture() -> None:
+    image = contact()
+    quality = [psnr_db(image, CODEC.decode(CODEC.encode(image, n)).image) for n in (12, 22, 44, 88, 176, 352, 704)]
+    assert quality == sorted(quality)
+
+
+def test_the_whole_budget_reaches_far() -> None:
+    image = contact(32, 32)
+    stream = CODEC.encode(image, 4000)
+    assert len(stream) < 2000
+    assert psnr_db(image, CODEC.decode(stream).image) > 34
+
+
+@pytest.mark.parametrize("grey", [0, 3, 128, 255])
+def test_flat_pictures_cost_almost_nothing(grey: int) -> None:
+    image = np.full((80, 80), grey, np.uint8)
+    stream = CODEC.encode(image, 64)
+    assert len(stream) < 40
+    assert np.abs(CODEC.decode(stream).image.astype(int) - grey).max() <= 2
+
+
+@given(
+    height_px=st.integers(16, 60),
+    width_px=st.integers(16, 60),
+    seed=st.integers(0, 1000),
+    contrast=st.sampled_from([0, 1, 20, 255]),
+    budget=st.integers(10, 90),
+)
+@settings(max_examples=40, deadline=None)
+def test_any_picture_comes_back_near(height_px: int, width_px: int, seed: int, contrast: int, budget: int) -> None:
+    rng = np.random.default_rng(seed)
+    image = (rng.integers(0, contrast + 1, (height_px, width_px)) + rng.integers(0, 256 - contrast)).astype(np.uint8)
+    stream = CODEC.encode(image, budget)
+    assert len(stream) <= budget
+    decoded = CODEC.decode(stream)
+    assert not decoded.missing.any()
+    error = decoded.image.astype(float) - image
+    assert (error**2).mean() < 1.25 * image.astype(float).var() + 9
+
+
+def test_encoder_and_decoder_know_the_same() -> None:
+    """The decoder's picture is the encoder's, decision for decision: the encoder's own error estimate is the true one."""
+    image = contact()
+    result = CODEC.encode_with_estimate(image, 200)
+    error = CODEC.decode(result.stream).image.astype(float) - image
+    assert (error**2).mean() == pytest.approx(result.mean_square_error[-1], rel=0.08)
+
+
+def test_lost_bytes_end_the_picture_there() -> None:
+    stream = CODEC.encode(contact(), 100)
+    size = StreamHeader.unpack(stream).size
+    received = np.ones(100 - size, np.bool_)
+    received[40] = False
+    zeroed = bytearray(stream)
+    zeroed[size + 40] = 0
+    decoded = CODEC.decode(bytes(zeroed), received)
+    assert np.array_equal(decoded.image, CODEC.decode(stream[: size + 40]).image)
+    assert "57 of 97 bytes" in decoded.notes[0]
+    nothing = CODEC.decode(stream, np.zeros(97, np.bool_))
+    assert nothing.missing.all()
+    assert not nothing.image.any()
+    with pytest.raises(StreamError, match="received"):
+        CODEC.decode(stream, np.ones(5, np.bool_))
+
+
+def test_other_codecs_models_and_small_budgets_are_refused() -> None:
+    stream = bytearray(CODEC.encode(contact(), 40))
+    with pytest.raises(StreamError, match="codec_id"):
+        CODEC.decode(bytes([0x21]) + bytes(stream[1:]))
+    with pytest.raises(StreamError, match="another model"):
+        CODEC.decode(bytes([stream[0], stream[1] ^ 1]) + bytes(stream[2:]))
+    for budget in (-1, 0, 3, 5):
+        with pytest.raises(StreamError, match="budget_bytes"):
+            CODEC.encode(contact(), budget)
+
+
+def test_the_model_file_is_checked() -> None:
+    from importlib.resources import files
+
+    raw = files("sonarpost.codec").joinpath("data", "emb.model").read_bytes()
+    assert parse(raw).identity == hashlib.sha256(raw).hexdigest() == shipped().identity == CODEC.model_hash
+    with pytest.raises(StreamError, match="magic"):
+        parse(b"x" + raw)
+    with pytest.raises(StreamError, match="length"):
+        parse(raw[:-1])
+
+
+def test_weights_decide_the_bytes() -> None:
+    """A model with one weight changed is another code: the networks are really in use."""
+    model = shipped()
+    b3 = model.b3.copy()
+    b3[0] += 1 << 19
+    other = EmbCodec(replace(model, b3=b3))
+    assert other.encode(contact(), 64) != CODEC.encode(contact(), 64)
+
+
+def test_accumulators_hold_the_largest_sums() -> None:
+    model = shipped()
+    first = 274 * np.abs(model.w1.astype(np.int64)).sum(1) + np.abs(model.b1)
+    second = 4095 * np.abs(model.w2.astype(np.int64)).sum(1) + np.abs(model.b2)
+    assert max(first.max(), second.max()) < 2**31
+
+
+@pytest.mark.parametrize("size", [(16, 16), (17, 33), (80, 80), (140, 80), (16, 512), (301, 127)])
+def test_the_transform_is_undone(size: tuple[int, int]) -> None:
+    lay = layout(*size)
+    plane = np.random.default_rng(1).integers(-8000, 8000, size)
+    flat = transform.to_flat(transform.forward(plane, lay), lay)
+    back, _ = transform.inverse(transform.from_flat(flat, lay), lay)
+    assert np.abs(back - plane).max() <= 16  # a quarter of a grey value
+
+
+def test_the_cosine_matrix_is_the_cosine_transform() -> None:
+    for n in range(1, 11):
+        k, i = np.mgrid[:n, :n]
+        exact = np.cos(np.pi * (2 * i + 1) * k / (2 * n)) * np.sqrt(np.where(k == 0, 1, 2) / n)
+        assert np.array_equal(transform.cosine_matrix(n), np.rint(exact * 2**14))

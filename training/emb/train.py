@@ -1,0 +1,186 @@
+"""Train the context networks and write the model file.
+
+    python training/emb/train.py --pool /tmp/emb/pool.npz --out common/sonarpost/codec/data/emb.model
+
+Needs jax and optax (CPU), which the package itself does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from examples import list_examples
+
+from sonarpost.codec.emb import kernel as k
+from sonarpost.codec.emb.model import ARRAYS, MAGIC
+
+SEED = 7
+BATCH = 8192
+Params = dict[str, jax.Array]
+
+
+def layer(x: jax.Array) -> jax.Array:
+    return jnp.clip(x, 0, 15.99)
+
+
+def network(p: Params, x: jax.Array) -> jax.Array:
+    """Logit of a decision; the integer twin is `kernel._logit`."""
+    return layer(layer(x / 16 @ p["w1"] + p["b1"]) @ p["w2"] + p["b2"]) @ p["w3"] + p["b3"]
+
+
+def sign_network(p: Params, x: jax.Array) -> jax.Array:
+    """Logit of a positive sign, odd in x; the integer twin is `kernel._sign_logit`."""
+    z = x / 16 @ p["w1"]
+    return (layer(z + p["b1"]) - layer(p["b1"] - z)) @ p["w2"]
+
+
+def start(rng: np.random.Generator, features: int) -> Params:
+    """He-initialised weights."""
+    shapes = ((features, k.HIDDEN_1), (k.HIDDEN_1, k.HIDDEN_2), (k.HIDDEN_2,))
+    out: Params = {"b1": jnp.zeros(k.HIDDEN_1), "b2": jnp.zeros(k.HIDDEN_2), "b3": jnp.zeros(())}
+    for i, shape in enumerate(shapes):
+        scale = (1.0 if i else 0.5) * np.sqrt(2 / shape[0])
+        out[f"w{i + 1}"] = jnp.asarray(rng.normal(0, scale, shape) * (0.3 if i == 2 else 1))
+    return out
+
+
+def fit(
+    function: Callable[[Params, jax.Array], jax.Array],
+    params: Params,
+    rows: np.ndarray,
+    bits: np.ndarray,
+    weight: np.ndarray,
+    steps: int,
+    rng: np.random.Generator,
+    rate: float = 4e-3,
+) -> Params:
+    """Minimise the weighted code length; prints it in bits as it goes."""
+    optimiser = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.005))
+
+    def loss(p: Params, x: jax.Array, y: jax.Array, w: jax.Array) -> jax.Array:
+        return (optax.sigmoid_binary_cross_entropy(function(p, x), y) * w).sum() / w.sum() / np.log(2)
+
+    @jax.jit
+    def step(p, state, x, y, w):  # noqa: ANN001, ANN202
+        value, grad = jax.value_and_grad(loss)(p, x.astype(jnp.float32), y, w)
+        update, state = optimiser.update(grad, state)
+        p = optax.apply_updates(p, update)
+        return {n: jnp.clip(v, -7.9, 7.9) if n.startswith("w") else v for n, v in p.items()}, state, value
+
+    state, history, began = optimiser.init(params), [], time.time()
+    for i in range(steps):
+        pick = rng.integers(len(rows), size=BATCH)
+        params, state, value = step(params, state, rows[pick], bits[pick], weight[pick])
+        history.append(float(value))
+        if i % max(steps // 6, 1) == max(steps // 6, 1) - 1:
+            print(f"  {i + 1}: {np.mean(history[-300:]):.5f} bit, {time.time() - began:.0f} s", flush=True)
+    return params
+
+
+def integers(nets: list[Params], signs: list[Params]) -> dict[str, np.ndarray]:
+    """Round the weights; the accumulators must hold whatever the features are."""
+    scale = {"w1": 1 << 10, "b1": 1 << 14, "w2": 1 << 12, "b2": 1 << 20, "w3": 1 << 12, "b3": 1 << 20}
+    out = {name: np.stack([np.rint(np.asarray(p[name], np.float64) * s) for p in nets]) for name, s in scale.items()}
+    out["sign_w1"] = np.stack([np.rint(np.asarray(p["w1"], np.float64) * (1 << 10)) for p in signs])
+    out["sign_b1"] = np.stack([np.rint(np.asarray(p["b1"], np.float64) * (1 << 14)) for p in signs])
+    out["sign_w2"] = np.stack([np.rint(np.asarray(p["w2"], np.float64) * (1 << 12)) for p in signs])
+    reach = np.abs(out["w1"]).sum(1) * 250 + np.abs(out["b1"])
+    second = np.abs(out["w2"]).sum(1) * 4095 + np.abs(out["b2"])
+    if max(reach.max(), second.max()) >= 2**31:
+        raise SystemExit("a sum may exceed 32 bits")
+    return out
+
+
+def tables() -> dict[str, np.ndarray]:
+    """Probabilities, costs and gains."""
+    logit = np.arange(-k.LOGIT_LIMIT, k.LOGIT_LIMIT + 1) / 256
+    chance = 1 / (1 + np.exp(-logit))
+    whole = np.clip(np.rint(chance * 65536), 6, 65530)
+    size = (np.arange(32) + 0.5) / 16
+    guess = 1.42
+    gain = np.where(np.arange(32) >= 16, guess * (2 * size - guess), 0)
+    return {
+        "chances": whole,
+        "costs": np.rint(-256 * np.log2(whole / 65536)),
+        "gains": np.rint(256 * gain),
+    }
+
+
+def mean_tree(means: np.ndarray) -> np.ndarray:
+    """Chance of 1 at each node of the tree of a mean level's six bits, smoothed."""
+    counts = np.zeros((64, 2)) + 3.0
+    for level in np.minimum(means // 4, 63).astype(int):
+        node = 1
+        for place in range(5, -1, -1):
+            bit = level >> place & 1
+            counts[node, bit] += 1
+            node = 2 * node + bit
+    return np.rint(np.clip(counts[:, 1] / counts.sum(1), 0.02, 0.98) * 65536)
+
+
+def write_model(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write the arrays in the file's order and types."""
+    raw = bytearray(MAGIC)
+    for name, shape, kind in ARRAYS:
+        array = np.asarray(arrays[name])
+        whole = array.astype(kind)
+        if array.shape != shape or not np.array_equal(whole, array):
+            raise SystemExit(f"{name}: does not fit {shape} {kind}")
+        raw += whole.tobytes()
+    path.write_bytes(bytes(raw))
+
+
+def main() -> None:
+    """List, train, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--pool", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--pictures", type=int, default=1000)
+    parser.add_argument("--steps", type=int, default=5000)
+    args = parser.parse_args()
+    rng = np.random.default_rng(SEED)
+    pool = np.load(args.pool)
+    began = time.time()
+    parts = [
+        list_examples(pool[name][: int(args.pictures * share)], 7, rng, 16000 * pool[name][0].size // 6400)
+        for name, share in (("tp80", 1.0), ("tp140", 0.25), ("tp112", 0.25))
+    ]
+    rows = np.concatenate([p[0] for p in parts])
+    sign_rows = np.concatenate([p[1] for p in parts])
+    print(f"listed {len(rows)} decisions, {len(sign_rows)} signs, {time.time() - began:.0f} s; centres {parts[0][2]}")
+    f = k.FEATURES
+    # Every octave of rate counts alike: a plane has about three times the bits of the one before.
+    weight = (rows[:, f + 2] * 2.0 ** (0.1 * rows[:, 41])).astype(np.float32)
+    nets = []
+    for net, steps in ((0, args.steps), (1, args.steps // 3)):
+        mine = rows[:, f + 1] == net
+        nets.append(
+            fit(network, start(rng, f), rows[mine][:, :f], rows[mine, f].astype(np.float32), weight[mine], steps, rng)
+        )
+    signs = []
+    for orient in range(4):
+        mine = sign_rows[:, 11] == orient
+        first = {
+            "w1": jnp.asarray(rng.normal(0, 0.3, (11, k.SIGN_HIDDEN))),
+            "b1": jnp.zeros(k.SIGN_HIDDEN) + 0.2,
+            "w2": jnp.asarray(rng.normal(0, 0.1, k.SIGN_HIDDEN)),
+        }
+        plain = np.ones(int(mine.sum()), np.float32)
+        signs.append(
+            fit(sign_network, first, sign_rows[mine][:, :11], sign_rows[mine, 12].astype(np.float32), plain, 900, rng)
+        )
+    arrays = integers(nets, signs) | tables()
+    arrays["centres"] = np.rint(256 * parts[0][2])
+    arrays["mean_tree"] = mean_tree(np.concatenate([pool[n].mean((1, 2)) for n in ("tp80", "tp140", "tp112")]))
+    write_model(args.out, arrays)
+
+
+if __name__ == "__main__":
+    main()
