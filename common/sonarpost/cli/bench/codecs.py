@@ -126,8 +126,8 @@ def run(args: argparse.Namespace) -> int:
     budgets = parse_budgets(args.budgets)
     if args.plot is not None:
         new_figure(1, 1)  # an absent extra is said before the work, not after it
-    measured = chosen_pictures(args)
     tested = chosen_subjects(args)
+    measured = chosen_pictures(args)
     points = [point for subject in tested for point in measure(subject, measured.pictures, budgets, say)]
     weights = bootstrap_weights([picture.source for picture in measured.pictures])
     title = f"{len(measured.pictures)} pictures of {measured.origin}"

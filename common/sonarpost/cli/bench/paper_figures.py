@@ -128,14 +128,14 @@ def code_figure(figure: PaperFigure, tested: Sequence[Subject], picture: Image) 
     """Code one picture as a figure of the paper was; in words why not, where it cannot be."""
     subject = _subject(tested, figure.codec, figure.variant)
     if subject is None:
-        return f"codec {figure.codec} is not installed"
+        return f"codec {figure.codec} is not in this run"
     return code(subject, picture, [figure.paper_bytes])[0]
 
 
 def code_flagship(tested: Sequence[Subject], picture: Image, budget_bytes: int) -> Coded | str:
     """Code one picture with the flagship codec; in words why not, where it cannot be."""
     subject = _subject(tested, FLAGSHIP, "")
-    return f"codec {FLAGSHIP} is not installed" if subject is None else code(subject, picture, [budget_bytes])[0]
+    return f"codec {FLAGSHIP} is not in this run" if subject is None else code(subject, picture, [budget_bytes])[0]
 
 
 def _subject(tested: Sequence[Subject], codec: str, variant: str) -> Subject | None:

@@ -76,8 +76,8 @@ _TABLE2_NOTE = (
 )
 _FIG3_NOTE = (
     f"Databases of {TILE_PX} x {TILE_PX} px tiles built by Table IV (figure of merit below {FOM_BELOW:g}, distance "
-    f"above {DISTANCE_ABOVE:g}) from {{training}} simulated pictures, search wholly in the rotated space as in the paper, "
-    "tested on {test} others."
+    f"above {DISTANCE_ABOVE:g}) from {{training}} simulated pictures, search wholly in the rotated space as in the "
+    "paper, tested on {test} others."
 )
 _VQ_NOTE = (
     "The paper leaves edge pixels that fill no tile unsent (10 tiles of 20 x 20 px in this picture, 44 of 10 x 10 px) "
@@ -142,6 +142,7 @@ def _claims(points: Sequence[DimensionPoint]) -> list[str]:
     quality = (
         f'"No significant difference in the FOM": over all dimensions it spans {span:.2f} of 100 here; PSNR goes from '
         f"{first.psnr:.2f} to {last.psnr:.2f} dB. With few dimensions less of a tile's distance is seen, so fewer "
-        f"tiles come to lie beyond the threshold: the database itself is smaller ({first.tiles} tiles against {last.tiles})."
+        f"tiles come to lie beyond the threshold: the database itself is smaller ({first.tiles} tiles against "
+        f"{last.tiles})."
     )
     return [*lines, "", quality]

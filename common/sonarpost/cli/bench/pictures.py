@@ -87,9 +87,10 @@ def read_folder(folder: Path) -> PictureSet:
         except SurveyFileError as error:
             refused.append(str(error))
     if not pictures:
-        found = f"none ({len(refused)} refused, the first: {refused[0]})" if refused else "none"
         expected = f"at least one grey {', '.join(SUFFIXES)} of {MIN_SIDE_PX}..{MAX_SIDE_PX} px a side"
-        raise SurveyFileError(str(folder), "pictures", found, expected)
+        if refused:
+            expected += f" (the first refused is {refused[0]})"
+        raise SurveyFileError(str(folder), "pictures", f"none, {len(refused)} refused", expected)
     return PictureSet(str(folder), tuple(pictures), tuple(refused))
 
 
