@@ -73,6 +73,27 @@ def test_the_best_that_fits_is_sent(wanted: ModernFormat) -> None:
 
 
 @EVERY
+def test_a_budget_is_kept_to_the_byte(wanted: ModernFormat) -> None:
+    image = picture(48, 48)
+    for quality in (20, 49, 60):
+        length = len(ModernCodec(wanted, quality).encode(image))
+        assert len(ModernCodec(wanted).encode(image, length)) <= length
+        assert len(ModernCodec(wanted).encode(image, length - 1)) < length
+
+
+def test_no_quality_that_fits_is_much_better_than_the_one_sent() -> None:
+    if not ModernFormat.WEBP.available:
+        pytest.skip("no WebP in this Pillow")
+    image = picture(48, 64)
+    streams = [ModernCodec(ModernFormat.WEBP, quality).encode(image) for quality in range(100)]
+    reached = [psnr_db(image, ModernCodec(ModernFormat.WEBP).decode(stream).image) for stream in streams]
+    for budget in (400, 700, 1500):
+        best = max(db for db, stream in zip(reached, streams, strict=True) if len(stream) <= budget)
+        sent = ModernCodec(ModernFormat.WEBP).encode(image, budget)
+        assert psnr_db(image, ModernCodec(ModernFormat.WEBP).decode(sent).image) > best - 0.5
+
+
+@EVERY
 def test_a_budget_below_the_lowest_quality_is_refused(wanted: ModernFormat) -> None:
     for budget in (0, 22, 60):
         with pytest.raises(StreamError, match=f"codec {wanted.value}: budget_bytes"):
@@ -150,6 +171,8 @@ def test_a_gap_leaves_nothing_and_says_so(wanted: ModernFormat) -> None:
     stream = codec.encode(picture(48, 48))
     received = np.ones(len(body(stream)), np.bool_)
     assert np.array_equal(codec.decode(stream, received).image, codec.decode(stream).image)
+    with pytest.raises(StreamError):  # damage is no gap
+        codec.decode(stream[:-20], received[:-20])
     received[8:] = False
     decoded = codec.decode(stream, received)
     assert decoded.missing.all()
@@ -181,12 +204,12 @@ def test_an_absent_library_is_named(wanted: ModernFormat, monkeypatch: pytest.Mo
 def test_a_webp_body_is_the_file_without_27_bytes() -> None:
     if not ModernFormat.WEBP.available:
         pytest.skip("no WebP in this Pillow")
-    for size in ((80, 80), (49, 113)):
+    for quality in range(10, 90, 10):
         file = io.BytesIO()
-        Pillow.fromarray(picture(*size)).save(file, "WEBP", quality=30, method=6)
-        short = modern._key_frame(file.getvalue(), size)
-        assert modern._webp_file(short, size) == file.getvalue()
-        assert 0 <= len(file.getvalue()) - len(short) - 27 <= 1  # an odd frame is padded in the file
+        Pillow.fromarray(picture(49, 113)).save(file, "WEBP", quality=quality, method=6)
+        short = modern._key_frame(file.getvalue(), (49, 113))
+        assert modern._webp_file(short, (49, 113)) == file.getvalue()
+        assert len(file.getvalue()) - len(short) == 27
     with pytest.raises(ConfigError, match="one VP8 key frame"):
         modern._key_frame(b"RIFF" + bytes(60), (80, 80))
 
@@ -209,6 +232,13 @@ def test_the_sizes_in_jpeg_xl_streams_are_read() -> None:
         stream = bytes.fromhex((GOLDEN / f"{name}.hex").read_text())
         header = StreamHeader.unpack(stream)
         assert jpegxl_size(body(stream)) == (header.height_px, header.width_px)
+
+
+@pytest.mark.skipif(not ModernFormat.JPEGXL.available, reason="no pillow-jxl-plugin")
+def test_a_jpeg_xl_codestream_of_another_size_is_refused_before_it_is_decoded() -> None:
+    header = StreamHeader(0x05, 0, 80, 80).pack()
+    with pytest.raises(StreamError, match=r"size: got \(536870912, 80\)"):
+        ModernCodec(ModernFormat.JPEGXL).decode(header + size_header(1 << 29, 80) + bytes(40))
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff\x0a", b"\0" * 40, b"\0\0\0\x0cJXL \r\n\x87\n" + bytes(20)])
