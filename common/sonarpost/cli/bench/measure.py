@@ -150,15 +150,31 @@ def code(subject: Subject, picture: Image, budgets: Sequence[int]) -> list[Coded
     Returns:
         For each budget the coded picture, or in words why there is none.
     """
-    wanted: tuple[int | None, ...] = (None,) if subject.is_natural else tuple(budgets)
+    if subject.is_natural:
+        return [_code_once(subject.codec, picture, None)]
     if not subject.is_embedded:
-        return [_code_once(subject.codec, picture, budget) for budget in wanted]
+        return _code_each(subject.codec, picture, budgets)
     most = max(budgets)
     try:
         stream, encode_ms = _timed(lambda: subject.codec.encode(picture, most))
     except StreamError as error:
         return [_reason(error)] * len(budgets)
     return [_decoded(subject.codec, stream[:budget], budget, encode_ms) for budget in budgets]
+
+
+def _code_each(codec: Codec, picture: Image, budgets: Sequence[int]) -> list[Coded | str]:
+    """Code at each budget, the largest first: a picture that missed one budget misses every smaller one.
+
+    A budget is an upper bound, so a stream within the smaller would have been within the larger. Some codecs search
+    half a second in vain.
+    """
+    found: dict[int, Coded | str] = {}
+    missed: str | None = None
+    for budget in sorted(budgets, reverse=True):
+        found[budget] = _code_once(codec, picture, budget) if missed is None else missed
+        result = found[budget]
+        missed = result if isinstance(result, str) else None
+    return [found[budget] for budget in budgets]
 
 
 def _code_once(codec: Codec, picture: Image, budget: int | None) -> Coded | str:
