@@ -8,10 +8,10 @@ import sys
 from collections.abc import Sequence
 
 from sonarpost import __version__
-from sonarpost.cli import catalogue, demo, detect, encode, modem_emulator, run, simulate
+from sonarpost.cli import bench, catalogue, demo, detect, encode, modem_emulator, run, simulate
 from sonarpost.errors import SonarpostError
 
-COMMANDS = (demo, run, simulate, detect, encode, catalogue, modem_emulator)
+COMMANDS = (demo, run, simulate, detect, encode, catalogue, bench, modem_emulator)
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
 

@@ -134,7 +134,7 @@ class Water:
             self.config.range_loss and level_db < DETECTION_SNR_DB
         )
         if not sent.packet.frames:  # an acknowledgement or mini-packet is lost like a frame, and then not noticed
-            lost = lost or dice.happens(self._frame_loss(sent.packet.rate, level_db), "frame loss")
+            lost = lost or dice.happens(self._frame_loss(sent.packet.rate, level_db), "lost frame")
         end_s = start_s + sent.packet.airtime_s
         arrival = _Arrival(receiver, sent, start_s, end_s, range_m, level_db, lost)
         place.arrivals.append(arrival)
@@ -190,7 +190,7 @@ class Water:
             received, fate = data, Fate.DELIVERED
             if not data:
                 fate = Fate.EMPTY
-            elif outcome is not Outcome.ARRIVED or dice.happens(loss, "frame loss", number):
+            elif outcome is not Outcome.ARRIVED or dice.happens(loss, "lost frame", number):
                 received, fate = b"", Fate.LOST
             elif number == last and dice.happens(self.config.tail_damage, "tail damage"):
                 kind, fraction = self.config.tail_damage_kind, self.config.tail_fraction
