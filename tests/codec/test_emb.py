@@ -63,7 +63,7 @@ def test_a_prefix_of_a_long_stream_decides_only_what_the_whole_confirms() -> Non
 
 
 def _known(stream: bytes) -> tuple[np.ndarray, np.ndarray]:
-    state, _, _ = CODEC.read_state(stream)
+    state, _ = CODEC.read_state(stream)
     return state.values, state.signs
 
 
@@ -88,6 +88,14 @@ def test_flat_pictures_cost_almost_nothing(grey: int) -> None:
     assert np.abs(CODEC.decode(stream).image.astype(int) - grey).max() <= 2
 
 
+@pytest.mark.parametrize("size", [(80, 80), (512, 512), (300, 40)])
+def test_half_black_half_white(size: tuple[int, int]) -> None:
+    """The largest coefficients there are: they need planes above the usual first one."""
+    image = np.zeros(size, np.uint8)
+    image[:, size[1] // 2 :] = 255
+    assert psnr_db(image, CODEC.decode(CODEC.encode(image, 256)).image) > 26
+
+
 @given(
     height_px=st.integers(16, 60),
     width_px=st.integers(16, 60),
@@ -107,12 +115,18 @@ def test_any_picture_comes_back_near(height_px: int, width_px: int, seed: int, c
     assert (error**2).mean() < 1.25 * image.astype(float).var() + 9
 
 
-def test_encoder_and_decoder_know_the_same() -> None:
-    """The decoder's picture is the encoder's, decision for decision: the encoder's own error estimate is the true one."""
+def test_the_estimate_of_each_prefix_is_near_the_truth() -> None:
+    """Decision for decision the decoder knows what the encoder thought it would: else the errors would part."""
     image = contact()
     result = CODEC.encode_with_estimate(image, 200)
-    error = CODEC.decode(result.stream).image.astype(float) - image
-    assert (error**2).mean() == pytest.approx(result.mean_square_error[-1], rel=0.08)
+    assert result.mean_square_error.shape == (201,)
+    assert np.isinf(result.mean_square_error[:4]).all()
+    for length in (12, 30, 64, 120, 200):
+        plain = CODEC.decode_plain(result.stream[:length])
+        error = plain.plane / 64 + plain.mean - image
+        assert (error**2).mean() == pytest.approx(result.mean_square_error[length], rel=0.1)
+    known = result.mean_square_error[6:]
+    assert np.all(np.diff(known) < 0.01 * known[:-1])
 
 
 def test_lost_bytes_end_the_picture_there() -> None:

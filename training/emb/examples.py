@@ -6,9 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import kernel, transform
+from sonarpost.codec.emb.coder import Coder, State
 from sonarpost.codec.emb.layout import layout
-from sonarpost.codec.emb.model import ARRAYS, Model
-from sonarpost.codec.emb.planes import Coder, State, code_planes
+from sonarpost.codec.emb.model import ARRAYS, Model, model_of
+from sonarpost.codec.emb.planes import code_planes
+from sonarpost.codec.emb.side import Side
 
 Rows = npt.NDArray[np.int16]
 
@@ -16,15 +18,14 @@ Rows = npt.NDArray[np.int16]
 def blank_model() -> Model:
     """A model that knows nothing but where in its interval a coefficient lies."""
     zeros = {name: np.zeros(shape, np.int32) for name, shape, _ in ARRAYS}
-    zeros["centres"][:] = (104, 117, 122, 125, 127)
     zeros["centres"][:] = (104, 110, 118, 124, 126)
-    return Model("", **zeros)
+    return model_of(zeros)
 
 
 def list_examples(
     pictures: npt.NDArray[np.uint8], planes: int, rng: np.random.Generator, rows_a_picture: int
 ) -> tuple[Rows, Rows, npt.NDArray[np.float64]]:
-    """Return the decisions (contexts, bit, net, weight), the signs (contexts, orientation, sign, level), and the centres.
+    """Return decisions (contexts, bit, net, weight), signs (contexts, orientation, sign, level), the centres.
 
     Each picture is listed at a chance start step.
     """
@@ -36,15 +37,15 @@ def list_examples(
     centre = np.zeros((5, 2))
     for picture in pictures:
         lay = layout(*picture.shape)
-        mean = int(picture.mean() / 4 + 0.5) * 4
-        plane = (picture.astype(np.int64) - mean) * transform.UNIT
+        side = Side(int(picture.mean() / 4 + 0.5), int(rng.integers(8)))
+        plane = (picture.astype(np.int64) - side.mean) * transform.UNIT
         targets = transform.to_flat(transform.forward(plane, lay), lay)
         coder = Coder(kernel.LIST, np.zeros(0, np.uint8))
         coder.rows, coder.sign_rows = out[used:], signs[used_signs:]
         coder.words[kernel.CODER_CODE] = int(rng.integers(1 << 30))
         state = State(lay)
         depth = planes - int(rng.random() < 0.4)
-        code_planes(coder, state, model, targets, int(rng.integers(8)), mean, planes=depth)
+        code_planes(coder, state, model, targets, side, planes=depth)
         used += int(coder.words[kernel.CODER_ROWS])
         used_signs += int(coder.words[kernel.CODER_SIGN_ROWS])
         known = state.values > 0

@@ -2,7 +2,7 @@
 
     python training/emb/pool.py --data ../shared/data --out /tmp/emb/pool.npz
 
-Sources: surveys (file values, and the same mapped to grey as a snippet is), synthetic-aperture tiles, simulated surveys.
+Sources: surveys (file values, and the same mapped to grey as a snippet is), synthetic-aperture tiles, simulations.
 Highlight-and-shadow objects are painted into half of the pictures. The validation pictures come from parts of the same
 sources that no training picture touches: the last fifth of every recording, every sixth tile, other simulator seeds.
 """
@@ -114,21 +114,23 @@ def paint_objects(pictures: Floats, rng: np.random.Generator, share: float = 0.5
     """Multiply highlight-and-shadow pairs into a share of the pictures."""
     _, height, width = pictures.shape
     yy, xx = np.mgrid[:height, :width].astype(np.float64)
-    for picture in pictures:
+    for i in range(len(pictures)):
         if rng.random() > share:
             continue
-        picture *= rng.uniform(45, 110) / max(picture.mean(), 1)
+        pictures[i] *= rng.uniform(45, 110) / max(pictures[i].mean(), 1)
         for _ in range(rng.integers(1, 3)):
             row, column = rng.uniform(0.15, 0.85) * height, rng.uniform(0.15, 0.85) * width
             turn, long, wide = rng.uniform(0, np.pi), rng.uniform(2, 20), rng.uniform(1.5, 8)
             away = rng.choice((-1, 1)) * (rng.uniform(3, 16) + min(long, 8))
             boxy = bool(rng.random() < 0.5)
-            shadow = _blob(yy - row - rng.uniform(-4, 4), xx - column - away, turn, long * rng.uniform(0.8, 2), wide, boxy)
+            shadow = _blob(
+                yy - row - rng.uniform(-4, 4), xx - column - away, turn, long * rng.uniform(0.8, 2), wide, boxy
+            )
             light = _blob(yy - row, xx - column, turn + rng.normal(0, 0.2), long, wide, boxy)
             if rng.random() < 0.85:
-                picture *= 1 - shadow * rng.uniform(0.5, 0.95)
+                pictures[i] *= 1 - shadow * rng.uniform(0.5, 0.95)
             if rng.random() < 0.9:
-                picture *= 1 + light * rng.uniform(0.2, 4)
+                pictures[i] *= 1 + light * rng.uniform(0.2, 4)
     np.clip(pictures, 0, 255, out=pictures)
 
 

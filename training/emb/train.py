@@ -27,6 +27,7 @@ Params = dict[str, jax.Array]
 
 
 def layer(x: jax.Array) -> jax.Array:
+    """What a hidden unit can hold: 0..4095 in 1/256."""
     return jnp.clip(x, 0, 15.99)
 
 
@@ -179,6 +180,8 @@ def main() -> None:
     arrays = integers(nets, signs) | tables()
     arrays["centres"] = np.rint(256 * parts[0][2])
     arrays["mean_tree"] = mean_tree(np.concatenate([pool[n].mean((1, 2)) for n in ("tp80", "tp140", "tp112")]))
+    for name, shape, _ in ARRAYS:
+        arrays.setdefault(name, np.zeros(shape))  # the enhancer is trained later and does nothing until then
     write_model(args.out, arrays)
 
 

@@ -1,7 +1,7 @@
 """The embedded codec: a stream that is a picture at every length.
 
-Body: flags, start step and mean level, then the wavelet coefficients plane by plane, all through one range coder.
-Cut anywhere, it decodes to the picture that its bytes determine, and to nothing that they do not.
+Body: side information, then the wavelet coefficients plane by plane, all through one range coder. Cut anywhere, it
+decodes to the picture that its bytes determine, and to nothing that they do not.
 """
 
 from __future__ import annotations
@@ -12,20 +12,25 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb import kernel, transform
+from sonarpost.codec.emb import transform
+from sonarpost.codec.emb.coder import Coder, State
+from sonarpost.codec.emb.enhance import enhanced
+from sonarpost.codec.emb.grain import make_grain, measure_grain
 from sonarpost.codec.emb.layout import Layout, layout
 from sonarpost.codec.emb.model import Model, shipped
-from sonarpost.codec.emb.planes import STEPS, Coder, State, code_planes, known_plane
+from sonarpost.codec.emb.planes import code_planes, extra_planes, known_plane, situation
+from sonarpost.codec.emb.region import OUTSIDE, fill_unknown, weights
+from sonarpost.codec.emb.side import MEAN_STEP, Box, Side, read_side, write_side
 from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, check_image, model_tag, to_uint8
 from sonarpost.errors import StreamError
 
 CODEC_ID: Final = 0x20
 NAME: Final = "emb"
-MEAN_STEP: Final = 4
 MIN_BODY_BYTES: Final = 3
 MAX_BODY_BYTES: Final = 0xFFFF
 _TRY_STEPS: Final = (0, 2, 4, 6)
-_PRICES: Final = (20,)
+_PRICE: Final = 20
+"""Least error, in 1/256 of the squared threshold, that a bit must take away; see `kernel.code_band`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,21 +40,45 @@ class Encoded:
     Attributes:
         stream: Header and body.
         mean_square_error: Shape (len(stream) + 1,), float64: estimated mean squared error in grey values of the picture
-            that the first n bytes decode to. From the coefficients; clipping to 0..255 makes the true one a little
-            smaller. Infinite where there is no picture yet.
+            that the first n bytes decode to. From the coefficients: clipping to 0..255 and the enhancer make the true
+            one some per cent smaller; with a region of interest its error weighs 9/4. Infinite where there is no
+            picture yet.
     """
 
     stream: bytes
     mean_square_error: npt.NDArray[np.float64]
 
 
+@dataclass(frozen=True, eq=False)
+class Plain:
+    """A picture before the enhancer.
+
+    Attributes:
+        plane: Shape (height_px, width_px), int64, 1/64 grey, without the mean.
+        mean: Grey.
+        situation: See `planes.situation`.
+    """
+
+    plane: npt.NDArray[np.int64]
+    mean: int
+    situation: tuple[int, int, int]
+
+
 @dataclass(frozen=True)
 class EmbCodec:
-    """The embedded codec. Satisfies `sonarpost.codec.interface.Codec`."""
+    """The embedded codec. Satisfies `sonarpost.codec.interface.Codec`.
+
+    Attributes:
+        model: The networks; the one that comes with the package if not given.
+        grain: Whether streams say how strong the picture's texture is (4 bytes); see `decode_grain`.
+        steps: Start steps to try.
+        price: See `kernel.code_band`.
+    """
 
     model: Model = field(default_factory=shipped)
-    prices: tuple[int, ...] = _PRICES
+    grain: bool = False
     steps: tuple[int, ...] = _TRY_STEPS
+    price: int = _PRICE
 
     @property
     def name(self) -> str:
@@ -79,11 +108,28 @@ class EmbCodec:
         return self.encode_with_estimate(image, budget_bytes).stream
 
     def encode_with_estimate(
-        self, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], budget_bytes: int | None = None
+        self,
+        image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+        budget_bytes: int | None = None,
+        *,
+        box: Box | None = None,
+        known: Mask | None = None,
     ) -> Encoded:
-        """Encode like `encode`, and say what each prefix is worth (for the choice of what to protect how well)."""
+        """Encode, and say what each prefix is worth (for the choice of what to protect how well).
+
+        Args:
+            image: As `encode`.
+            budget_bytes: As `encode`.
+            box: Region of interest, which gets more of the bits; costs 2 bytes.
+            known: Same shape as the image, False where the survey has no data: what is there is not sent.
+
+        Raises:
+            StreamError: As `encode`, or `known` has another shape.
+        """
         check_image(image)
         picture = to_uint8(image)
+        if known is not None:
+            picture = fill_unknown(picture, known)
         height_px, width_px = (int(n) for n in picture.shape)
         header = StreamHeader(CODEC_ID, model_tag(CODEC_ID, self.model.identity), height_px, width_px)
         budget = max(64, height_px * width_px // 25) if budget_bytes is None else budget_bytes
@@ -91,26 +137,26 @@ class EmbCodec:
         if limit < MIN_BODY_BYTES:
             raise StreamError("codec emb", "budget_bytes", budget, f"at least {header.size + MIN_BODY_BYTES} B")
         lay = layout(height_px, width_px)
-        mean_index = min(max((int(picture.astype(np.int64).sum()) // picture.size + 2) // MEAN_STEP, 0), 63)
+        mean_index = min((int(picture.astype(np.int64).sum()) // picture.size + MEAN_STEP // 2) // MEAN_STEP, 63)
         plane = (picture.astype(np.int64) - mean_index * MEAN_STEP) * transform.UNIT
-        targets = transform.to_flat(transform.forward(plane, lay), lay)
-        written = [self._write(targets, lay, s, mean_index, p, limit) for p in self.prices for s in self.steps]
+        plain = transform.to_flat(transform.forward(plane, lay), lay)
+        targets = (plain.astype(np.int64) * weights(lay, box) // OUTSIDE).astype(np.int32)
+        grain = measure_grain(picture, lay) if self.grain else None
+        sides = [Side(mean_index, step, box, grain, extra_planes(targets, step)) for step in self.steps]
+        written = [self._write(targets, lay, side, limit) for side in sides]
         body, curve = min(written, key=lambda found: int(found[1][0]))
-        stream = header.pack() + body
-        return Encoded(stream, _estimate(curve, len(body), header.size, picture.size))
+        return Encoded(header.pack() + body, _estimate(curve, len(body), header.size, picture.size))
 
     def _write(
-        self, targets: npt.NDArray[np.int32], lay: Layout, step: int, mean_index: int, price: int, limit: int
+        self, targets: npt.NDArray[np.int32], lay: Layout, side: Side, limit: int
     ) -> tuple[bytes, npt.NDArray[np.int64]]:
-        """Encode with one choice of parameters: return the body, and the squared error that stays by bytes."""
+        """Encode with one start step: return the body, and the squared error that stays by bytes."""
         coder, state = Coder.writer(limit), State(lay)
         coder.curve[0] = int((targets.astype(np.int64) ** 2).sum())
-        _code_start(coder, self.model, step, mean_index)
-        coder.curve[1 + (int(coder.words[kernel.CODER_COST]) >> 11)] = coder.curve[0]
-        code_planes(coder, state, self.model, targets, step, mean_index * MEAN_STEP, price)
-        kernel.finish_writing(coder.words, coder.data, coder.good)
-        length = int(coder.words[kernel.CODER_GOOD_LENGTH])
-        return coder.good[:length].tobytes(), coder.curve
+        write_side(coder, self.model, side)
+        coder.record()
+        code_planes(coder, state, self.model, targets, side, self.price)
+        return coder.finish(), coder.curve
 
     def decode(self, stream: bytes, received: Mask | None = None) -> Decoded:
         """Rebuild the picture from as much of the stream as is there.
@@ -125,15 +171,46 @@ class EmbCodec:
         """
         header = self._check_header(stream)
         body, notes = _usable(stream[header.size :], received)
-        state, _, mean_index = self._read(body, layout(header.height_px, header.width_px))
-        if mean_index < 0:
+        state, side = self._read(body, layout(header.height_px, header.width_px))
+        if side.mean_index < 0:
             blank = np.zeros((header.height_px, header.width_px), np.uint8)
             return Decoded(blank, np.ones(blank.shape, np.bool_), (*notes, "too little arrived for any picture"))
-        picture = self._picture(state, mean_index)
+        picture = self._picture(state, side)
         return Decoded(picture, np.zeros(picture.shape, np.bool_), notes)
 
-    def read_state(self, stream: bytes) -> tuple[State, int, int]:
-        """Return what a stream says of the coefficients, the start step and the mean index (-1 where unknown).
+    def decode_grain(self, stream: bytes) -> npt.NDArray[np.int16]:
+        """Return the layer of invented speckle that the picture lacks, in grey to be added; see `grain.make_grain`.
+
+        Raises:
+            StreamError: As `decode`, or the stream carries no grain.
+        """
+        state, side = self.read_state(stream)
+        if side.grain is None:
+            raise StreamError("stream", "grain", None, "a stream made by a codec with grain on")
+        return make_grain(self._picture(state, side), state.lay, side.grain)
+
+    def decode_with_grain(self, stream: bytes) -> Image:
+        """Return the picture with grain at half strength: a view for the eye, not to be measured on.
+
+        Raises:
+            StreamError: As `decode_grain`.
+        """
+        layer = self.decode_grain(stream).astype(np.int32)
+        return np.clip(self.decode(stream).image + (layer >> 1), 0, 255).astype(np.uint8)
+
+    def decode_plain(self, stream: bytes) -> Plain:
+        """Return the picture as the coefficients say, before the enhancer: what that is trained on.
+
+        Raises:
+            StreamError: As `decode`, or the stream is too short for any picture.
+        """
+        state, side = self.read_state(stream)
+        if side.mean_index < 0:
+            raise StreamError("stream", "length", len(stream), "enough bytes for a mean level")
+        return self._plain(state, side)
+
+    def read_state(self, stream: bytes) -> tuple[State, Side]:
+        """Return what a stream says of the coefficients, and its side information.
 
         Raises:
             StreamError: As `decode`.
@@ -151,22 +228,25 @@ class EmbCodec:
             raise StreamError("stream", "model_tag", f"{header.model_tag:#04x}", expected)
         return header
 
-    def _read(self, body: bytes, lay: Layout) -> tuple[State, int, int]:
+    def _read(self, body: bytes, lay: Layout) -> tuple[State, Side]:
         coder, state = Coder.reader(body), State(lay)
-        step, mean_index = _code_start(coder, self.model, 0, 0)
-        if step >= 0:
-            code_planes(coder, state, self.model, np.zeros(lay.cells, np.int32), step, mean_index * MEAN_STEP)
-        return state, step, mean_index
+        side = read_side(coder, self.model)
+        if side.step >= 0:
+            code_planes(coder, state, self.model, np.zeros(lay.cells, np.int32), side)
+        return state, side
 
-    def _picture(self, state: State, mean_index: int) -> Image:
-        plane, _ = transform.inverse(known_plane(state, self.model), state.lay)
-        grey = (plane + transform.UNIT // 2) // transform.UNIT + mean_index * MEAN_STEP
+    def _plain(self, state: State, side: Side) -> Plain:
+        plane, _ = transform.inverse(known_plane(state, self.model, side.box), state.lay)
+        return Plain(plane, side.mean, situation(state, side.mean))
+
+    def _picture(self, state: State, side: Side) -> Image:
+        plain = self._plain(state, side)
+        plane = enhanced(plain.plane, plain.mean, plain.situation, self.model)
+        grey = (plane + transform.UNIT // 2) // transform.UNIT + plain.mean
         return np.clip(grey, 0, 255).astype(np.uint8)
 
 
-def _estimate(
-    curve: npt.NDArray[np.int64], body_bytes: int, header_bytes: int, pixels: int
-) -> npt.NDArray[np.float64]:
+def _estimate(curve: npt.NDArray[np.int64], body_bytes: int, header_bytes: int, pixels: int) -> npt.NDArray[np.float64]:
     """Mean squared error by stream length, from the coder's record of squared error by bytes begun."""
     out = np.full(header_bytes + body_bytes + 1, np.inf)
     last = np.inf
@@ -176,23 +256,6 @@ def _estimate(
             last = float(curve[n]) / transform.UNIT**2 / pixels
         out[header_bytes + n] = last
     return out
-
-
-def _code_start(coder: Coder, model: Model, step: int, mean_index: int) -> tuple[int, int]:
-    """Write or read mean level and start step. Returns (step, mean index), -1 for what the bytes do not tell."""
-    node = 1
-    for place in range(5, -1, -1):
-        bit = coder.plain(mean_index >> place & 1, int(model.mean_tree[node]))
-        if bit < 0:
-            return -1, -1
-        node = 2 * node + bit
-    found = 0
-    for place in (2, 1, 0):
-        bit = coder.plain(step >> place & 1)
-        if bit < 0:
-            return -1, node - 64
-        found = 2 * found + bit
-    return found, node - 64
 
 
 def _usable(body: bytes, received: Mask | None) -> tuple[bytes, tuple[str, ...]]:

@@ -1,6 +1,7 @@
 """The coding loop: contexts, network, range coder; the same code writes, reads and lists training examples.
 
-Everything here is integer arithmetic on int32 and int64. See docs/codec.md for the format in words.
+Everything here is integer arithmetic on int32 and int64. See docs/codec.md for the format in words. It is one long
+module because machine code that is kept on disk is compiled anew only when its own module changes (see `_jit`).
 """
 
 from __future__ import annotations
@@ -12,13 +13,9 @@ import numpy.typing as npt
 
 from sonarpost.codec.emb._jit import compiled
 from sonarpost.codec.emb.layout import (
-    BORDER,
     CHILD,
     HEIGHT,
-    HH,
-    HL,
     LEVEL,
-    LH,
     LL,
     LOW,
     OFFSET,
@@ -32,13 +29,16 @@ from sonarpost.codec.emb.layout import (
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
+I16 = npt.NDArray[np.int16]
 U8 = npt.NDArray[np.uint8]
 
 WRITE, READ, LIST = 0, 1, 2
-NEAR, REFINE, FAR, ALL = 0, 1, 2, 3
-"""Passes: coefficients with something significant around them; those that are significant; the rest; NEAR and FAR."""
+NEAR, REFINE, FAR = 0, 1, 2
+"""Passes: coefficients with something significant around them; those that are significant; the rest."""
 
 FEATURES: Final = 44
+BAND_FEATURES: Final = 34
+"""Features from this one on are the same for a whole band."""
 SIGN_FEATURES: Final = 14
 HIDDEN_1: Final = 32
 HIDDEN_2: Final = 16
@@ -173,20 +173,32 @@ def code_plain(coder: I64, data: U8, good: U8, bit: int, chance: int, mode: int)
 
 
 @compiled
+def _clip(value: int, limit: int) -> int:
+    return min(max(value, -limit), limit)
+
+
+@compiled
 def _log2_eighths(value: int) -> int:
     """8 log2(value) for value >= 1, linear between powers of two."""
     power = 0
     while value >> (power + 1):
         power += 1
-    return 8 * power + ((value << 3) >> power) - 8
+    return int(8 * power + ((value << 3) >> power) - 8)
 
 
 @compiled
 def _box(seen: I32, at: int, stride: int) -> int:
     """Sum of the eight neighbours."""
     up, down = at - stride, at + stride
-    return (
-        seen[up - 1] + seen[up] + seen[up + 1] + seen[at - 1] + seen[at + 1] + seen[down - 1] + seen[down] + seen[down + 1]
+    return int(
+        seen[up - 1]
+        + seen[up]
+        + seen[up + 1]
+        + seen[at - 1]
+        + seen[at + 1]
+        + seen[down - 1]
+        + seen[down]
+        + seen[down + 1]
     )
 
 
@@ -196,7 +208,7 @@ def _relative(bands: I32, row: int, y: int, x: int) -> int:
     height, width = bands[row, HEIGHT], bands[row, WIDTH]
     if height == 0 or width == 0:
         return -1
-    return bands[row, OFFSET] + min(y, height - 1) * bands[row, STRIDE] + min(x, width - 1)
+    return int(bands[row, OFFSET] + min(y, height - 1) * bands[row, STRIDE] + min(x, width - 1))
 
 
 @compiled
@@ -217,10 +229,10 @@ def _is_near(seen: I32, bands: I32, row: int, y: int, x: int, at: int) -> bool:
 
 
 @compiled
-def _context(
+def _context(  # noqa: PLR0915  a list of 34 features, one after the other
     f: I32, seen: I32, lows: I32, bands: I32, low_width: int, threshold: int, row: int, y: int, x: int, at: int
 ) -> None:
-    """Fill in the features of one coefficient; those of its band stand already at the end (from 34 on)."""
+    """Fill in the features of one coefficient; those of its band stand already at the end."""
     stride = bands[row, STRIDE]
     f[0], f[1] = seen[at - 1], seen[at - stride]
     f[2], f[3] = seen[at - stride - 1], seen[at - stride + 1]
@@ -234,7 +246,7 @@ def _context(
         line = at + dy * stride
         ring += seen[line - 2] + seen[line - 1] + seen[line] + seen[line + 1] + seen[line + 2]
     f[13] = (ring - seen[at]) >> 2
-    for i in range(14, 34):
+    for i in range(14, BAND_FEATURES):
         f[i] = 0
     if bands[row, ORIENT] == LL:
         f[31], f[32] = min(y, 8) * 4, min(x, 8) * 4
@@ -280,13 +292,11 @@ def _context(
 
 
 @compiled
-def _logit(
-    f: I32, base: I32, w1: I32, w2: I32, b2: I32, w3: I32, b3: int, first: int, h1: I32, h2: I32
-) -> int:
+def _logit(f: I32, base: I32, w1: I32, w2: I32, b2: I32, w3: I32, b3: int, h1: I32, h2: I32) -> int:
     """Run the network: features, two hidden layers, one output in 1/256."""
     for j in range(h1.shape[0]):
         h1[j] = base[j]
-    for i in range(first):
+    for i in range(BAND_FEATURES):
         value = f[i]
         if value != 0:
             for j in range(h1.shape[0]):
@@ -301,22 +311,17 @@ def _logit(
     total = np.int64(b3)
     for i in range(h2.shape[0]):
         total += np.int64(min(max(h2[i] >> 12, 0), 4095)) * w3[i]
-    return min(max(total >> 12, -LOGIT_LIMIT), LOGIT_LIMIT)
+    return _clip(int(total >> 12), LOGIT_LIMIT)
 
 
 @compiled
-def band_base(f: I32, w1: I32, b1: I32, first: int, base: I32) -> None:
+def band_base(f: I32, w1: I32, b1: I32, base: I32) -> None:
     """The part of the first layer that is the same for a whole band."""
     for j in range(base.shape[0]):
         base[j] = b1[j]
-    for i in range(first, f.shape[0]):
+    for i in range(BAND_FEATURES, f.shape[0]):
         for j in range(base.shape[0]):
             base[j] += f[i] * w1[i, j]
-
-
-@compiled
-def _clip(value: int, limit: int) -> int:
-    return min(max(value, -limit), limit)
 
 
 @compiled
@@ -348,18 +353,22 @@ def _sign_context(
 
 
 @compiled
-def _sign_logit(f: I32, base: I32, w1: I32, w2: I32, orient: int, h: I32) -> int:
-    """An odd function of the features: with all signs turned the logit turns too. A small network a band orientation."""
+def _active(total: int) -> int:
+    """The sign network's hidden unit: 1/256, never negative."""
+    return min(max(total >> 6, 0), 4095)
+
+
+@compiled
+def _sign_logit(f: I32, base: I32, w1: I32, w2: I32, orient: int) -> int:
+    """An odd function of the features: with all signs turned the logit turns. A small network a band orientation."""
     total = np.int64(0)
     for j in range(SIGN_HIDDEN):
-        forth = np.int64(base[j])
-        back = np.int64(base[j])
+        turn = np.int64(0)
         for i in range(11):
-            step = f[i] * w1[orient, i, j]
-            forth += step
-            back -= step
-        total += (min(max(forth >> 6, 0), 4095) - min(max(back >> 6, 0), 4095)) * w2[orient, j]
-    return min(max(total >> 12, -LOGIT_LIMIT), LOGIT_LIMIT)
+            turn += f[i] * w1[orient, i, j]
+        forth, back = base[j] + turn, base[j] - turn
+        total += (_active(forth) - _active(back)) * w2[orient, j]
+    return _clip(int(total >> 12), LOGIT_LIMIT)
 
 
 @compiled
@@ -372,158 +381,141 @@ def refresh(values: I32, widths: I32, signs: I32, seen: I32, signed: I32, thresh
 
 
 @compiled
-def code_band(
+def _list_decision(rows: I16, coder: I64, f: I32, bit: int, net: int, share: int) -> None:
+    """Note an example, one out of `share` by a chance that repeats."""
+    coder[CODER_CODE] = (coder[CODER_CODE] * 1103515245 + 12345) & 0x7FFFFFFF
+    n = coder[CODER_ROWS]
+    if (coder[CODER_CODE] >> 12) % share or n >= rows.shape[0]:
+        return
+    for i in range(FEATURES):
+        rows[n, i] = f[i]
+    rows[n, FEATURES], rows[n, FEATURES + 1], rows[n, FEATURES + 2] = bit, net, share
+    coder[CODER_ROWS] = n + 1
+
+
+@compiled
+def _list_sign(rows: I16, coder: I64, f: I32, orient: int, sign: int, level: int) -> None:
+    n = coder[CODER_SIGN_ROWS]
+    if n >= rows.shape[0]:
+        return
+    for i in range(SIGN_FEATURES):
+        rows[n, i] = f[i]
+    rows[n, 11], rows[n, 12], rows[n, 13] = orient, sign, level
+    coder[CODER_SIGN_ROWS] = n + 1
+
+
+@compiled
+def _transfer(mode: int, bit: int, logit: int, chances: I32, costs: I32, coder: I64, data: U8, good: U8) -> int:
+    """Write `bit`, or read one; returns it, or -1 at the end."""
+    chance = chances[logit + LOGIT_LIMIT]
+    if mode == READ:
+        return _get(coder, data, chance)
+    _put(coder, data, good, bit, chance)
+    coder[CODER_COST] += costs[(logit if bit else -logit) + LOGIT_LIMIT]
+    return -1 if coder[CODER_STOP] else bit
+
+
+@compiled
+def _is_worth(magnitude: int, threshold: int, logit: int, costs: I32, gains: I32, price: int) -> bool:
+    """Whether making a coefficient significant takes away enough error for its bits (its sign costs one more)."""
+    return bool(gains[min(magnitude * 16 // threshold, 31)] >= (price * (costs[logit + LOGIT_LIMIT] + 256)) >> 8)
+
+
+@compiled
+def code_band(  # noqa: C901, PLR0912  three modes and three passes share one loop, so that they cannot part
     mode: int,
     kind: int,
     plane: int,
     threshold: int,
     row: int,
     low_width: int,
+    price: int,
     bands: I32,
     targets: I32,
-    values: I32,
-    widths: I32,
-    signs: I32,
-    seen: I32,
-    signed: I32,
-    marks: I32,
     lows: I32,
     f: I32,
-    base_sig: I32,
-    base_ref: I32,
-    w1: I32,
-    w2: I32,
-    b2: I32,
-    w3: I32,
-    b3: I32,
-    sign_w1: I32,
-    sign_b1: I32,
-    sign_w2: I32,
-    chances: I32,
-    costs: I32,
-    gains: I32,
-    price: int,
-    coder: I64,
-    data: U8,
-    good: U8,
-    curve: I64,
-    rows: npt.NDArray[np.int16],
-    sign_rows: npt.NDArray[np.int16],
+    bases: I32,
+    known: tuple[I32, I32, I32, I32, I32, I32],
+    nets: tuple[I32, I32, I32, I32, I32],
+    sign_nets: tuple[I32, I32, I32],
+    tables: tuple[I32, I32, I32],
+    stream: tuple[I64, U8, U8, I64],
+    lists: tuple[I16, I16],
 ) -> int:
     """Code one pass over one band. Returns 0, or -1 at the end of the stream or of its budget.
 
     Args:
         mode: WRITE, READ or LIST.
-        kind: NEAR, REFINE, FAR or ALL.
-        plane: Number of the plane, from 1; `marks` keeps it for coefficients that were decided in this plane.
+        kind: NEAR, REFINE or FAR.
+        plane: Number of the plane, from 1.
         threshold: Of the plane, in coefficient units.
         row: The band's row in `bands`.
         low_width: Width of the low-pass picture of the band's level.
+        price: Least error that a bit must take away to be spent on significance (WRITE), in 1/256 of the squared
+            threshold; 0 to spend all.
         bands: The band table.
         targets: The true coefficients (WRITE, LIST), flat.
-        values: Lower bound of every magnitude, 0 where not significant.
-        widths: How far above the lower bound the magnitude may lie.
-        signs: -1, 0 or 1.
-        seen: Magnitudes in eighths of the threshold, at most CAP.
-        signed: The same with the sign.
-        marks: See `plane`.
         lows: Low-pass pictures known so far.
-        f: Features; those from 34 on are filled in.
-        base_sig: First-layer sums that are the band's, for significance.
-        base_ref: The same, for refinement.
-        w1, w2, b2, w3, b3: The network, first axis 0 for significance and 1 for refinement.
-        sign_w1, sign_b1, sign_w2: The networks for signs, first axis the band's orientation.
-        chances: Probability of 1, in 1/65536, by logit + LOGIT_LIMIT.
-        costs: Bits of a 1, in 1/256, by logit + LOGIT_LIMIT.
-        gains: Error that significance removes, in 1/256 of the squared threshold, by magnitude in 1/16 thresholds.
-        price: Least gain a bit must bring, in the same unit; 0 for all.
-        coder: The range coder's state.
-        data: The stream.
-        good: The best whole stream so far (WRITE).
-        curve: Squared error left, by bytes (WRITE).
-        rows: Examples (LIST).
-        sign_rows: Examples of signs (LIST).
+        f: Features; those from BAND_FEATURES on are filled in.
+        bases: Shape (2, HIDDEN_1): first-layer sums that are the band's; first axis as in `nets`.
+        known: Lower bounds of the magnitudes, 0 where not significant; how far above the magnitude may lie; signs;
+            magnitudes in eighths of the threshold, at most CAP; the same with sign; the plane that decided last.
+        nets: Weights w1, w2, b2, w3, b3; first axis 0 for significance and 1 for refinement.
+        sign_nets: Weights w1, b1, w2; first axis the band's orientation.
+        tables: By logit + LOGIT_LIMIT: probability of 1 in 1/65536, and bits of a 1 in 1/256. And the error that
+            significance takes away, in 1/256 of the squared threshold, by magnitude in 1/16 thresholds.
+        stream: The range coder's state, the bytes, the best whole stream so far (WRITE), squared error by bytes.
+        lists: Examples of decisions and of signs (LIST).
     """
-    height, width, stride = bands[row, HEIGHT], bands[row, WIDTH], bands[row, STRIDE]
-    orient, level = bands[row, ORIENT], bands[row, LEVEL]
-    h1, h2, h = np.zeros(HIDDEN_1, np.int32), np.zeros(HIDDEN_2, np.int32), np.zeros(SIGN_HIDDEN, np.int32)
-    fs = np.zeros(SIGN_FEATURES, np.int32)
-    for y in range(height):
-        for x in range(width):
+    values, widths, signs, seen, signed, marks = known
+    w1, w2, b2, w3, b3 = nets
+    sign_w1, sign_b1, sign_w2 = sign_nets
+    chances, costs, gains = tables
+    coder, data, good, curve = stream
+    stride, orient, level = bands[row, STRIDE], bands[row, ORIENT], bands[row, LEVEL]
+    h1, h2, fs = np.zeros(HIDDEN_1, np.int32), np.zeros(HIDDEN_2, np.int32), np.zeros(SIGN_FEATURES, np.int32)
+    share = 12 if level == 1 else 4 if level == 2 else 1
+    net = 1 if kind == REFINE else 0
+    for y in range(bands[row, HEIGHT]):
+        for x in range(bands[row, WIDTH]):
             at = bands[row, OFFSET] + y * stride + x
-            known = values[at] > 0
-            if marks[at] == plane or known != (kind == REFINE):
+            if marks[at] == plane or (values[at] > 0) != (kind == REFINE):
                 continue
             if kind == NEAR and not _is_near(seen, bands, row, y, x, at):
                 continue
             marks[at] = plane
             _context(f, seen, lows, bands, low_width, threshold, row, y, x, at)
-            net = 1 if known else 0
             magnitude = abs(targets[at])
             bit = 1 if magnitude >= values[at] + threshold else 0
             if mode == LIST:
-                share = 1
-                if kind == FAR or kind == ALL:
-                    share = 12 if level == 1 else 4 if level == 2 else 1
-                coder[CODER_CODE] = (coder[CODER_CODE] * 1103515245 + 12345) & 0x7FFFFFFF
-                if (coder[CODER_CODE] >> 12) % share == 0 and coder[CODER_ROWS] < rows.shape[0]:
-                    n = coder[CODER_ROWS]
-                    for i in range(FEATURES):
-                        rows[n, i] = f[i]
-                    rows[n, FEATURES], rows[n, FEATURES + 1], rows[n, FEATURES + 2] = bit, net, share
-                    coder[CODER_ROWS] = n + 1
+                _list_decision(lists[0], coder, f, bit, net, share if kind == FAR else 1)
             else:
-                base = base_ref if known else base_sig
-                logit = _logit(f, base, w1[net], w2[net], b2[net], w3[net], b3[net], 34, h1, h2)
-                chance = chances[logit + LOGIT_LIMIT]
-                if mode == READ:
-                    bit = _get(coder, data, chance)
-                    if bit < 0:
-                        return -1
-                else:
-                    if bit and not known and price > 0:
-                        part = min(magnitude * 16 // threshold, 31)
-                        if gains[part] < (price * (costs[logit + LOGIT_LIMIT] + 256)) >> 8:
-                            bit = 0
-                    _put(coder, data, good, bit, chance)
-                    coder[CODER_COST] += costs[(logit if bit else -logit) + LOGIT_LIMIT]
-                    if coder[CODER_STOP]:
-                        return -1
-            before = values[at] + widths[at] * 7 // 16 if known else 0
-            if known:
+                logit = _logit(f, bases[net], w1[net], w2[net], b2[net], w3[net], b3[net], h1, h2)
+                if mode == WRITE and bit and kind != REFINE:
+                    bit = 1 if _is_worth(magnitude, threshold, logit, costs, gains, price) else 0
+                bit = _transfer(mode, bit, logit, chances, costs, coder, data, good)
+                if bit < 0:
+                    return -1
+            before = values[at] + (widths[at] * 7 >> 4)
+            if kind == REFINE:
                 values[at] += threshold * bit
                 widths[at] = threshold
             elif bit:
+                sign = 1 if targets[at] > 0 else 0
+                _sign_context(fs, signed, lows, bands, low_width, threshold, row, y, x, at)
                 if mode == LIST:
-                    sign = 1 if targets[at] > 0 else 0
-                    _sign_context(fs, signed, lows, bands, low_width, threshold, row, y, x, at)
-                    if coder[CODER_SIGN_ROWS] < sign_rows.shape[0]:
-                        n = coder[CODER_SIGN_ROWS]
-                        for i in range(SIGN_FEATURES):
-                            sign_rows[n, i] = fs[i]
-                        sign_rows[n, 11], sign_rows[n, 12], sign_rows[n, 13] = orient, sign, level
-                        coder[CODER_SIGN_ROWS] = n + 1
+                    _list_sign(lists[1], coder, fs, orient, sign, level)
                 else:
-                    _sign_context(fs, signed, lows, bands, low_width, threshold, row, y, x, at)
-                    logit = _sign_logit(fs, sign_b1[orient], sign_w1, sign_w2, orient, h)
-                    if mode == READ:
-                        sign = _get(coder, data, chances[logit + LOGIT_LIMIT])
-                        if sign < 0:
-                            return -1
-                    else:
-                        sign = 1 if targets[at] > 0 else 0
-                        _put(coder, data, good, sign, chances[logit + LOGIT_LIMIT])
-                        coder[CODER_COST] += costs[(logit if sign else -logit) + LOGIT_LIMIT]
-                        if coder[CODER_STOP]:
-                            return -1
-                values[at], widths[at] = threshold, threshold
-                signs[at] = 1 if sign else -1
+                    logit = _sign_logit(fs, sign_b1[orient], sign_w1, sign_w2, orient)
+                    sign = _transfer(mode, sign, logit, chances, costs, coder, data, good)
+                    if sign < 0:
+                        return -1
+                values[at], widths[at], signs[at] = threshold, threshold, 2 * sign - 1
             if values[at] > 0:
                 seen[at] = min((values[at] + (widths[at] >> 1)) * 8 // threshold, CAP)
                 signed[at] = seen[at] * signs[at]
-                if mode == WRITE:
-                    after = values[at] + widths[at] * 7 // 16
-                    curve[0] += np.int64(magnitude - after) ** 2 - np.int64(magnitude - before) ** 2
+                after = values[at] + (widths[at] * 7 >> 4)
+                curve[0] += np.int64(magnitude - after) ** 2 - np.int64(magnitude - before) ** 2
             if mode == WRITE:
                 curve[min(1 + (coder[CODER_COST] >> 11), curve.shape[0] - 1)] = curve[0]
     return 0

@@ -21,9 +21,9 @@ LL, HL, LH, HH = 0, 1, 2, 3
 
 # Columns of the band table.
 OFFSET, STRIDE, HEIGHT, WIDTH, LEVEL, ORIENT, PARENT, SIBLING_1, SIBLING_2, CHILD, LOW = range(11)
-"""OFFSET: flat index of the band's cell (0, 0). LEVEL: 1 is the finest. PARENT, SIBLING_1, SIBLING_2, CHILD: rows of the
-table, -1 for none; a sibling is a band of the same level that is coded earlier. LOW: offset of the level's low-pass picture
-in the array of low-pass pictures; its stride is the next entry's business (`Layout.low_shapes`)."""
+"""OFFSET: flat index of the band's cell (0, 0). LEVEL: 1 is the finest. PARENT, SIBLING_1, SIBLING_2, CHILD: rows of
+the table, -1 for none; a sibling is a band of the same level that is coded earlier. LOW: where the level's low-pass
+picture begins in the array of low-pass pictures."""
 
 
 def level_count(height_px: int, width_px: int) -> int:
@@ -43,7 +43,7 @@ class Layout:
         bands: Shape (1 + 3 * levels, 11), int32: the table, in coding order (coarse to fine).
         cells: Length of the flat array of coefficients.
         position: Shape (height_px, width_px), int64: flat index of each cell of the transform's usual square layout.
-        sides: Shape (levels + 1, 2), int32: height and width of the low-pass picture at each level, 0 being the picture.
+        sides: Shape (levels + 1, 2), int32: height and width of the low-pass picture at each level; 0 is the picture.
         low_offsets: Shape (levels + 1,), int64: where each low-pass picture (with a border of one cell) begins.
         low_cells: Length of the array of low-pass pictures.
     """
@@ -71,7 +71,8 @@ def layout(height_px: int, width_px: int) -> Layout:
     for level in range(1, levels + 1):
         low_offsets[level] = low_cells
         low_cells += (sides[level][0] + 2) * (sides[level][1] + 2)
-    table, position, cells = [], np.zeros((height_px, width_px), np.int64), 0
+    table: list[tuple[int, ...]] = []
+    position, cells = np.zeros((height_px, width_px), np.int64), 0
     for level, orient in [(levels, LL), *((lv, o) for lv in range(levels, 0, -1) for o in (HL, LH, HH))]:
         low_h, low_w = sides[level]
         height, width = sides[level - 1]

@@ -1,7 +1,7 @@
 """The trained model: integer weights of the networks, reconstruction points and tables.
 
-The file (`data/emb.npz`-like, but written bit by bit by `training/emb/export.py`) is a sequence of named int arrays; its
-sha256 is the model's identity.
+The file, `data/emb.model`, is a magic word and then arrays of fixed shapes and types, little-endian, one after
+the other (`ARRAYS`). Its sha256 is the model's identity. `training/emb` makes it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import hashlib
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,11 @@ from sonarpost.errors import StreamError
 
 I32 = npt.NDArray[np.int32]
 MAGIC = b"SPEMB1\n"
+
+CHANNELS: Final = 24
+GLOBALS: Final = 3
+LAYERS: Final = ((4, CHANNELS), (CHANNELS, CHANNELS), (CHANNELS, CHANNELS), (CHANNELS, 4))
+"""Channels in and out of the enhancer's layers."""
 
 # Name, shape and type in the file, in order.
 ARRAYS: tuple[tuple[str, tuple[int, ...], str], ...] = (
@@ -36,6 +42,12 @@ ARRAYS: tuple[tuple[str, tuple[int, ...], str], ...] = (
     ("centres", (5,), "<i2"),
     ("gains", (32,), "<i2"),
     ("mean_tree", (64,), "<u2"),
+    ("situation", (GLOBALS, CHANNELS), "<i4"),
+    *(
+        (f"{kind}{i}", shape, number)
+        for i, (inputs, outputs) in enumerate(LAYERS)
+        for kind, shape, number in (("taps", (9, inputs, outputs), "<i2"), ("bias", (outputs,), "<i4"))
+    ),
 )
 
 
@@ -47,6 +59,8 @@ class Model:
         identity: Hex sha256 of the file.
         centres: Where in its interval a coefficient most likely lies, in 1/256, by lower bound / width (0..4).
         mean_tree: Probability of 1 of each decision of the mean level, by node of the binary tree.
+        situation: Shape (GLOBALS, CHANNELS): the enhancer's weights of the whole picture's features.
+        layers: Taps (9, in, out) and bias (out,) of the enhancer's layers.
     """
 
     identity: str
@@ -64,10 +78,12 @@ class Model:
     centres: I32
     gains: I32
     mean_tree: I32
+    situation: I32
+    layers: tuple[tuple[I32, I32], ...]
 
 
-def parse(raw: bytes, where: str = "emb model") -> Model:
-    """Read a model file.
+def read_arrays(raw: bytes, where: str = "emb model") -> dict[str, I32]:
+    """Read the arrays of a model file.
 
     Raises:
         StreamError: It is not one, or its length is wrong.
@@ -82,7 +98,23 @@ def parse(raw: bytes, where: str = "emb model") -> Model:
         count = int(np.prod(shape))
         arrays[name] = np.frombuffer(raw, kind, count, at).reshape(shape).astype(np.int32)
         at += count * np.dtype(kind).itemsize
-    return Model(hashlib.sha256(raw).hexdigest(), **arrays)
+    return arrays
+
+
+def model_of(arrays: dict[str, I32], identity: str = "") -> Model:
+    """Make a model of its arrays."""
+    plain = {name: array for name, array in arrays.items() if name[:4] not in ("taps", "bias")}
+    layers = tuple((arrays[f"taps{i}"], arrays[f"bias{i}"]) for i in range(len(LAYERS)))
+    return Model(identity=identity, layers=layers, **plain)
+
+
+def parse(raw: bytes, where: str = "emb model") -> Model:
+    """Read a model file.
+
+    Raises:
+        StreamError: It is not one, or its length is wrong.
+    """
+    return model_of(read_arrays(raw, where), hashlib.sha256(raw).hexdigest())
 
 
 @cache

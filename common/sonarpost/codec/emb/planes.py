@@ -2,85 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import kernel, transform
-from sonarpost.codec.emb.layout import HEIGHT, HH, HL, LEVEL, LH, LL, OFFSET, ORIENT, STRIDE, WIDTH, Layout
+from sonarpost.codec.emb.coder import Coder, State
+from sonarpost.codec.emb.layout import HEIGHT, HH, HL, LEVEL, LH, LL, OFFSET, ORIENT, STRIDE, WIDTH
 from sonarpost.codec.emb.model import Model
+from sonarpost.codec.emb.region import OUTSIDE, weights
+from sonarpost.codec.emb.side import MAX_EXTRA, Box, Side
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 
-# First threshold in coefficient units (1/64 grey) for each start step: 2880 grey, 2^(1/8) apart, each a multiple of 2^10.
+# First threshold in coefficient units (1/64 grey) for each start step: from 2880 grey down, 2^(1/8) apart, multiples of
+# 2^10 so that halving them ten times is exact.
 STEPS: Final = tuple(round(2880 * 64 / 1024 * 2 ** (-i / 8)) * 1024 for i in range(8))
 PLANES: Final = 10
 _FIRST_PLANE: Final = {1: 3, 2: 2, 3: 1}
-"""Plane from which a level is coded; its coefficients cannot be (or hardly ever are) larger than twice that threshold."""
-_CENTRE: Final = 16
-
-
-@dataclass
-class State:
-    """What is known of a picture's coefficients; flat arrays of `Layout.cells`, see `kernel.code_band`."""
-
-    lay: Layout
-    values: I32 = field(init=False)
-    widths: I32 = field(init=False)
-    signs: I32 = field(init=False)
-    seen: I32 = field(init=False)
-    signed: I32 = field(init=False)
-    marks: I32 = field(init=False)
-
-    def __post_init__(self) -> None:
-        for name in ("values", "widths", "signs", "seen", "signed", "marks"):
-            setattr(self, name, np.zeros(self.lay.cells, np.int32))
-
-
-@dataclass
-class Coder:
-    """The range coder and where it writes to or reads from."""
-
-    mode: int
-    data: npt.NDArray[np.uint8]
-    words: I64 = field(default_factory=lambda: np.zeros(kernel.CODER_WORDS, np.int64))
-    good: npt.NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
-    curve: I64 = field(default_factory=lambda: np.zeros(1, np.int64))
-    rows: npt.NDArray[np.int16] = field(default_factory=lambda: np.zeros((0, kernel.FEATURES + 3), np.int16))
-    sign_rows: npt.NDArray[np.int16] = field(default_factory=lambda: np.zeros((0, kernel.SIGN_FEATURES), np.int16))
-
-    @classmethod
-    def reader(cls, body: bytes) -> Coder:
-        """Read from a body."""
-        coder = cls(kernel.READ, np.frombuffer(body, np.uint8).copy())
-        kernel.start_reading(coder.words, coder.data)
-        return coder
-
-    @classmethod
-    def writer(cls, limit_bytes: int) -> Coder:
-        """Write a body of at most `limit_bytes`."""
-        coder = cls(kernel.WRITE, np.zeros(limit_bytes + 8, np.uint8))
-        coder.good = np.zeros(limit_bytes, np.uint8)
-        coder.curve = np.full(limit_bytes + 2, -1, np.int64)
-        coder.words[kernel.CODER_RANGE] = (1 << 32) - 1
-        coder.words[kernel.CODER_LIMIT] = limit_bytes
-        return coder
-
-    def plain(self, bit: int, chance: int = 32768) -> int:
-        """Write or read one decision; -1 at the end."""
-        if self.mode == kernel.LIST:
-            return bit
-        if self.mode == kernel.WRITE:
-            share = chance if bit else 65536 - chance
-            self.words[kernel.CODER_COST] += round(256 * (16 - np.log2(share)))
-        return int(kernel.code_plain(self.words, self.data, self.good, bit, chance, self.mode))
+"""Plane from which a level is coded; its coefficients are hardly ever larger than twice that threshold, and those that
+are count as that large."""
 
 
 def code_planes(
-    coder: Coder, state: State, model: Model, targets: I32, step: int, mean: int, price: int = 0, planes: int = PLANES
+    coder: Coder, state: State, model: Model, targets: I32, side: Side, price: int = 0, planes: int = PLANES
 ) -> None:
     """Write, read or list plane after plane until the coder stops.
 
@@ -89,43 +36,52 @@ def code_planes(
         state: What is known; brought forward.
         model: The networks.
         targets: True coefficients, flat, int32; anything where the coder reads.
-        step: Start step, index into STEPS.
-        mean: The picture's mean level in grey.
+        side: Start step, mean level and region of interest.
         price: See `kernel.code_band`.
-        planes: How many to code at most.
+        planes: How many to code at most, beside the extra ones.
     """
-    lay = state.lay
+    lay, mean = state.lay, side.mean
     features = np.zeros(kernel.FEATURES, np.int32)
     base = np.zeros((2, kernel.HIDDEN_1), np.int32)
-    counts = np.zeros(len(lay.bands), np.int64)
-    for plane in range(planes):
-        threshold = STEPS[step] >> plane
+    known = (state.values, state.widths, state.signs, state.seen, state.signed, state.marks)
+    nets = (model.w1, model.w2, model.b2, model.w3, model.b3)
+    sign_nets, tables = (model.sign_w1, model.sign_b1, model.sign_w2), (model.chances, model.costs, model.gains)
+    stream, lists = (coder.words, coder.data, coder.good, coder.curve), (coder.rows, coder.sign_rows)
+    for plane in range(-side.extra, planes):
+        threshold = (STEPS[side.step] << side.extra) >> (plane + side.extra)
+        state.threshold = threshold
         kernel.refresh(state.values, state.widths, state.signs, state.seen, state.signed, threshold)
-        rows = [i for i, band in enumerate(lay.bands) if plane >= _FIRST_PLANE.get(int(band[LEVEL]), 0)]
+        rows = [i for i, band in enumerate(lay.bands) if plane >= _FIRST_PLANE.get(int(band[LEVEL]), -side.extra)]
         finest = min(int(lay.bands[i][LEVEL]) for i in rows)
-        lows = low_pictures(state, model, mean, finest)
+        lows = low_pictures(state, model, side, finest)
         for kind in (kernel.NEAR, kernel.REFINE, kernel.FAR):
             for row in rows:
                 band = lay.bands[row]
                 if kind == kernel.FAR and row < 4:
                     continue  # coarse bands are all near
                 if row == 1 and kind != kernel.REFINE:
-                    lows = low_pictures(state, model, mean, finest)
-                _band_features(features, band, threshold, mean, _density(state, band, counts, row))
+                    lows = low_pictures(state, model, side, finest)
+                _band_features(features, band, threshold, mean, _density(state, band))
                 for net in (0, 1):
-                    kernel.band_base(features, model.w1[net], model.b1[net], 34, base[net])
+                    kernel.band_base(features, model.w1[net], model.b1[net], base[net])
+                low_width = int(lay.sides[band[LEVEL], 1])
                 end = kernel.code_band(
-                    coder.mode, kind, plane + 1, threshold, row, int(lay.sides[band[LEVEL], 1]), lay.bands, targets,
-                    state.values, state.widths, state.signs, state.seen, state.signed, state.marks, lows, features,
-                    base[0], base[1], model.w1, model.w2, model.b2, model.w3, model.b3, model.sign_w1, model.sign_b1,
-                    model.sign_w2, model.chances, model.costs, model.gains, price, coder.words, coder.data, coder.good,
-                    coder.curve, coder.rows, coder.sign_rows,
+                    coder.mode, kind, plane + side.extra + 1, threshold, row, low_width, price, lay.bands, targets, lows,
+                    features, base, known, nets, sign_nets, tables, stream, lists,
                 )  # fmt: skip
                 if end < 0:
                     return
 
 
-def _density(state: State, band: I32, counts: I64, row: int) -> int:
+def extra_planes(targets: I32, step: int) -> int:
+    """How many planes above the usual first one the largest coefficient needs."""
+    largest, extra = int(np.abs(targets).max()), 0
+    while extra < MAX_EXTRA and largest >= STEPS[step] << (extra + 1):
+        extra += 1
+    return extra
+
+
+def _density(state: State, band: I32) -> int:
     """Share of the band that is significant, 8 log2 of it per 1/1024, shifted to be about zero."""
     cells = int(band[HEIGHT]) * int(band[WIDTH])
     start = int(band[OFFSET]) - 2 * int(band[STRIDE]) - 2
@@ -147,25 +103,33 @@ def _band_features(features: I32, band: I32, threshold: int, mean: int, density:
         features[33 + min(level, 4)] = 32
     for column, kind in ((38, HL), (39, LH), (40, HH)):
         features[column] = 32 if orient == kind else 0
-    features[41] = _log2_eighths(threshold) - 104
+    features[41] = min(_log2_eighths(threshold) - 104, 36)
     features[42] = _log2_eighths(max(mean, 4)) - 48
     features[43] = density
 
 
-def low_pictures(state: State, model: Model, mean: int, down_to: int) -> I32:
+def low_pictures(state: State, model: Model, side: Side, down_to: int) -> I32:
     """The low-pass pictures of what is known so far, in 1/64 grey times 2^level."""
-    plane = known_plane(state, model)
+    plane = known_plane(state, model, side.box)
     _, lows = transform.inverse(plane, state.lay, down_to)
     for level in range(down_to, state.lay.levels + 1):
         at = int(state.lay.low_offsets[level])
         height, width = (int(n) + 2 for n in state.lay.sides[level])
-        lows[at : at + height * width] += mean * transform.UNIT << level
+        lows[at : at + height * width] += side.mean * transform.UNIT << level
     return lows
 
 
-def known_plane(state: State, model: Model) -> I64:
+def known_plane(state: State, model: Model, box: Box | None = None) -> I64:
     """Most likely value of every coefficient, in the transform's square layout."""
     size = np.minimum(state.values // np.maximum(state.widths, 1), 4)
     centre = model.centres[size]
     flat = state.signs * (state.values + ((state.widths * centre) >> 8))
+    if box is not None:
+        flat = (flat * OUTSIDE // weights(state.lay, box)).astype(np.int32)
     return transform.from_flat(flat, state.lay)
+
+
+def situation(state: State, mean: int) -> tuple[int, int, int]:
+    """How fine a picture is, how bright, and how much of it is known: the enhancer's features of the whole."""
+    share = 8192 * int(np.count_nonzero(state.values)) // (state.lay.height_px * state.lay.width_px)
+    return _log2_eighths(state.threshold) - 96, _log2_eighths(max(mean, 4)) - 48, _log2_eighths(share + 16) - 56

@@ -22,7 +22,7 @@ UNIT: Final = 64
 """Steps of a grey value."""
 FRACTION_BITS: Final = 14
 _ROUND: Final = 1 << (FRACTION_BITS - 1)
-# round(constant * 2^14)
+# The constants times 2^14, rounded.
 _ALPHA: Final = -25987
 _BETA: Final = -868
 _GAMMA: Final = 14466
@@ -33,7 +33,12 @@ _GAIN_INVERSE: Final = 14253
 
 # Strength in the picture of a coefficient's error, by level (the last for all above) and orientation LL, HL, LH, HH, in
 # 1/1024; coefficients are multiplied by it, so that one threshold is right for all.
-STRENGTHS: Final = ((1024, 1035, 1035, 1065), (1024, 1023, 1023, 990), (1024, 1071, 1071, 1065), (1243, 1097, 1097, 1109))
+STRENGTHS: Final = (
+    (1024, 1035, 1035, 1065),
+    (1024, 1023, 1023, 990),
+    (1024, 1071, 1071, 1065),
+    (1243, 1097, 1097, 1109),
+)
 
 
 @compiled
