@@ -174,6 +174,14 @@ def test_any_bytes_after_a_header_decode(seed: int, length: int) -> None:
     assert decoded.image.shape == (32, 48)
 
 
+@pytest.mark.parametrize("byte", [0, 255])
+def test_extreme_bodies_decode(byte: int) -> None:
+    head = CODEC.encode(speckled(32, 48), 40)[:4]
+    head = head[: StreamHeader.unpack(head).size]
+    for length in (1, 4, 5, 50, 400):
+        assert CODEC.decode(head + bytes([byte]) * length).image.shape == (32, 48)
+
+
 def golden_cases() -> dict[str, tuple[np.ndarray, int, EmbCodec]]:
     return {
         "80x80 at 64 B": (speckled(), 64, CODEC),

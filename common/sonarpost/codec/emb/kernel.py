@@ -62,6 +62,8 @@ def start_reading(coder: I64, data: U8) -> None:
     coder[CODER_RANGE] = _TOP - 1
     for _ in range(4):
         _next_byte(coder, data)
+    # No encoder writes a code that is not below the range; a damaged stream may.
+    coder[CODER_CODE] = min(coder[CODER_CODE], coder[CODER_RANGE] - 1)
 
 
 @compiled

@@ -49,7 +49,7 @@ def code_planes(
     stream, lists = (coder.words, coder.data, coder.good, coder.curve), (coder.rows, coder.sign_rows)
     for plane in range(-side.extra, planes):
         threshold = (STEPS[side.step] << side.extra) >> (plane + side.extra)
-        state.threshold = threshold
+        state.threshold, number = threshold, plane + side.extra + 1
         kernel.refresh(state.values, state.widths, state.signs, state.seen, state.signed, threshold)
         rows = [i for i, band in enumerate(lay.bands) if plane >= _FIRST_PLANE.get(int(band[LEVEL]), -side.extra)]
         finest = min(int(lay.bands[i][LEVEL]) for i in rows)
@@ -66,7 +66,7 @@ def code_planes(
                     kernel.band_base(features, model.w1[net], model.b1[net], base[net])
                 low_width = int(lay.sides[band[LEVEL], 1])
                 end = kernel.code_band(
-                    coder.mode, kind, plane + side.extra + 1, threshold, row, low_width, price, lay.bands, targets, lows,
+                    coder.mode, kind, number, threshold, row, low_width, price, lay.bands, targets, lows,
                     features, base, known, nets, sign_nets, tables, stream, lists,
                 )  # fmt: skip
                 if end < 0:
