@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.catalogue.build import (
-    GrowingTiles,
+from sonarpost.catalogue.build import build
+from sonarpost.catalogue.growing import GrowingTiles
+from sonarpost.catalogue.journal import MAGIC, EntryKind, Journal, JournalEntry
+from sonarpost.catalogue.plan import (
     Progress,
     Round,
     TrainingImage,
-    build,
     rms_distance,
     spread,
 )
-from sonarpost.catalogue.journal import MAGIC, Journal, JournalEntry
 from sonarpost.catalogue.refine import refine
 from sonarpost.codec.tiles import TileDatabase, cut_tiles
 from sonarpost.errors import CatalogueError, ConfigError
@@ -184,24 +184,24 @@ def test_a_killed_build_goes_on_to_the_same_catalogue(tmp_path: Path, killed_aft
 
 def test_a_journal_cut_anywhere_or_with_a_bad_byte_keeps_only_whole_records(tmp_path: Path) -> None:
     path = tmp_path / "journal"
-    entries = [JournalEntry(0, i, np.full((i, 16), i, np.uint8)) for i in range(4)]
+    entries = [JournalEntry(EntryKind.IMAGE, 0, i, bytes(32), np.full((i, 16), i, np.uint8)) for i in range(4)]
     with Journal(path, "plan", 16) as journal:
         for entry in entries:
             journal.append(entry)
     data = path.read_bytes()
-    ends = np.cumsum([len(MAGIC) + 32, *(14 + 16 * i for i in range(4))])
+    ends = np.cumsum([len(MAGIC) + 32, *(47 + 16 * i for i in range(4))])
     assert ends[-1] == len(data)
     for length in range(len(data) + 1):
         path.write_bytes(data[:length])
         with Journal(path, "plan", 16) as journal:
-            whole = [e.image_number for e in journal.entries]
+            whole = [e.image_number for e in journal.entries()]
         assert len(whole) == max(0, int((ends <= length).sum()) - 1)
     for position in range(int(ends[0]), len(data)):
         damaged = bytearray(data)
         damaged[position] ^= 0x40
         path.write_bytes(damaged)
         with Journal(path, "plan", 16) as journal:
-            assert len(journal.entries) == int((ends[1:] <= position).sum())
+            assert len(list(journal.entries())) == int((ends[1:] <= position).sum())
 
 
 def test_a_journal_of_another_build_or_no_journal_is_refused(tmp_path: Path) -> None:

@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.catalogue.build import Round
+from sonarpost.catalogue.plan import Round
 from sonarpost.catalogue.store import load, load_nominal
 from sonarpost.cli import catalogue, encode
+from sonarpost.cli.catalogue.build import parse_rounds
+from sonarpost.cli.catalogue.progress import ProgressDisplay
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import CatalogueError, ConfigError, SonarpostError, StreamError
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff
@@ -181,11 +183,11 @@ def test_a_stopped_build_is_resumed_only_when_asked(run: Run, folder: Path, tmp_
     expected = out.read_bytes()
     out.unlink()
 
-    def stop(progress: object) -> None:
+    def stop(display: ProgressDisplay, progress: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(catalogue, "_progress_to", lambda console: stop)
+        patch.setattr(ProgressDisplay, "build", stop)
         with pytest.raises(KeyboardInterrupt):
             run(*arguments)
     assert out.with_name("mine.tiles.journal").exists()
@@ -196,8 +198,8 @@ def test_a_stopped_build_is_resumed_only_when_asked(run: Run, folder: Path, tmp_
 
 
 def test_rounds_are_read_in_grey_levels() -> None:
-    assert catalogue.parse_rounds("39:16", 20) == (Round(39.0, 320.0, None),)
-    assert catalogue.parse_rounds("30:40.5:500, 60:8", 10) == (Round(30.0, 405.0, 500), Round(60.0, 80.0, None))
+    assert parse_rounds("39:16", 20) == (Round(39.0, 320.0, None),)
+    assert parse_rounds("30:40.5:500, 60:8", 10) == (Round(30.0, 405.0, 500), Round(60.0, 80.0, None))
     for wrong in ("", "39", "39:", "39:16:", "39:16:1.5", "39:-1", "nan:1", "39:16,", "39:16:5:5", "٣٩:16"):
         with pytest.raises(ConfigError, match="FOM:RMS"):
-            catalogue.parse_rounds(wrong, 10)
+            parse_rounds(wrong, 10)

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.catalogue.build import Round
 from sonarpost.catalogue.humminbird import humminbird_lines, read_channel
 from sonarpost.catalogue.nominal import RECIPES, Recipe, build_nominal, humminbird_images
+from sonarpost.catalogue.plan import Round
 from sonarpost.catalogue.store import to_bytes
 from sonarpost.catalogue.windows import Tone, WindowPlan, cut_around, cut_line, reduce_line, shuffled, stretch
 from sonarpost.errors import CatalogueError, SonarpostError

@@ -8,159 +8,40 @@ Distances here are Euclidean in **all** pixels of a tile, not in the principal c
 the finished database, so they cannot be known while it grows, and the threshold has a meaning in grey levels. The
 paper's 320 is for 400-pixel tiles: 16 grey levels RMS; `rms_distance` gives the same for any tile. The basis that the
 encoder searches in is computed once, at the end, from all tiles.
+
+Memory does not grow with the number of images: one image is held at a time, and what `GrowingTiles` and `refine_once`
+hold is proportional to the tiles.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.journal import Journal, JournalEntry
+from sonarpost.catalogue.growing import GrowingTiles
+from sonarpost.catalogue.journal import EntryKind, Journal, JournalEntry
+from sonarpost.catalogue.plan import (
+    MAX_TILES,
+    PassProgress,
+    Progress,
+    Round,
+    TrainingImage,
+    check_plan,
+    fingerprint,
+    images_hash,
+    pixels_hash,
+    spread,
+)
+from sonarpost.catalogue.refine import refine_once, without_doubles
 from sonarpost.codec.quality import FigureOfMerit, fom
-from sonarpost.codec.tiles import MAX_TILE_PX, MIN_TILE_PX, TileDatabase, Tiles, cut_tiles, join_tiles
-from sonarpost.errors import ConfigError
+from sonarpost.codec.tiles import TileDatabase, Tiles, cut_tiles, join_tiles
+from sonarpost.errors import CatalogueError
 
-MAX_TILES = 15_992
-"""The paper's database; index + 1 fits 14 bits with room to spare."""
-
-_CENTRE = 128
-_TILE_BLOCK = 4096
-
-
-def rms_distance(grey_levels: float, tile_px: int) -> float:
-    """Return the Euclidean distance of tiles that differ by `grey_levels` RMS (16 at 20 px is the paper's 320)."""
-    return grey_levels * tile_px
-
-
-@dataclass(frozen=True)
-class Round:
-    """One pass over the images.
-
-    Attributes:
-        fom_below: Images rebuilt with a figure of merit below this contribute tiles.
-        distance_above: Only tiles farther than this from their nearest tile are added.
-        max_images: How many images are looked at, spread evenly over the list; None for all.
-    """
-
-    fom_below: float
-    distance_above: float
-    max_images: int | None = None
-
-
-@dataclass(frozen=True)
-class TrainingImage:
-    """One image to learn from.
-
-    Attributes:
-        name: Names it in messages and in the journal.
-        load: Returns its pixels, shape (height, width), uint8.
-    """
-
-    name: str
-    load: Callable[[], npt.NDArray[np.uint8]]
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Told after every image: where the build stands. `fom` is NaN for the very first image."""
-
-    round_number: int
-    image_number: int
-    images_in_round: int
-    name: str
-    fom: float
-    added: int
-    tiles: int
-
-
-class GrowingTiles:
-    """Tiles that grow, with an exact nearest search over all pixels.
-
-    Pixels are held centred on 128 as float32: products of two tiles of at most 32 x 32 px then never exceed 2^24, so
-    every partial sum of the matrix product is an exact integer and the result does not depend on the machine.
-    """
-
-    def __init__(self, tile_px: int, capacity: int) -> None:
-        self.tile_px = tile_px
-        self.capacity = capacity
-        self._count = 0
-        self._centred = np.empty((min(capacity, 1024), tile_px * tile_px), dtype=np.float32)
-        self._norms = np.empty(self._centred.shape[0], dtype=np.float64)
-
-    def __len__(self) -> int:
-        return self._count
-
-    @property
-    def full(self) -> bool:
-        """Whether no further tile fits."""
-        return self._count >= self.capacity
-
-    def tiles(self) -> Tiles:
-        """Return the tiles, shape (n, pixels), uint8, in the order they were added."""
-        return (self._centred[: self._count] + _CENTRE).astype(np.uint8)
-
-    def tiles_at(self, index: npt.NDArray[np.int64]) -> Tiles:
-        """Return the tiles of these indices, shape (m, pixels), uint8."""
-        return (self._centred[index] + _CENTRE).astype(np.uint8)
-
-    def append(self, tiles: Tiles) -> None:
-        """Add tiles, shape (m, pixels), uint8. The caller keeps to the capacity."""
-        end = self._count + tiles.shape[0]
-        if end > self._centred.shape[0]:
-            size = min(max(end, 2 * self._centred.shape[0]), max(self.capacity, end))
-            self._centred = np.resize(self._centred, (size, self._centred.shape[1]))
-            self._norms = np.resize(self._norms, size)
-        self._centred[self._count : end] = _centred(tiles)
-        self._norms[self._count : end] = _squared_norms(self._centred[self._count : end])
-        self._count = end
-
-    def nearest(self, tiles: Tiles) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-        """Return index and squared distance of the nearest tile (the lowest index of equals) for each of `tiles`."""
-        queries = _centred(tiles)
-        rows = np.arange(tiles.shape[0])
-        best = np.zeros(tiles.shape[0], dtype=np.int64)
-        least = np.full(tiles.shape[0], np.inf)
-        for start in range(0, self._count, _TILE_BLOCK):
-            stop = min(start + _TILE_BLOCK, self._count)
-            scores = (queries @ self._centred[start:stop].T).astype(np.float64)
-            scores *= -2.0
-            scores += self._norms[start:stop]
-            candidate = np.argmin(scores, axis=1)
-            value = scores[rows, candidate]
-            better = value < least
-            best[better], least[better] = candidate[better] + start, value[better]
-        return best, least + _squared_norms(queries)
-
-    def add_far(self, tiles: Tiles, squared_distance: npt.NDArray[np.float64], above: float) -> Tiles:
-        """Add, in order, each tile farther than `above` from all tiles, those just added included.
-
-        Args:
-            tiles: Shape (m, pixels), uint8.
-            squared_distance: Shape (m,), squared distance of each to its nearest present tile.
-            above: Distance that must be exceeded; 0 still refuses exact duplicates.
-
-        Returns:
-            The added tiles, shape (0..m, pixels), uint8.
-        """
-        far = np.flatnonzero(squared_distance > above * above)
-        chosen: list[int] = []
-        pool = _centred(tiles[far])
-        norms = _squared_norms(pool)
-        least = squared_distance[far].copy()
-        for position in range(far.size):
-            if self._count + len(chosen) >= self.capacity:
-                break
-            if least[position] > above * above:
-                chosen.append(position)
-                to_others = norms + norms[position] - 2.0 * (pool @ pool[position]).astype(np.float64)
-                np.minimum(least, to_others, out=least)
-        added = np.ascontiguousarray(tiles[far[chosen]])
-        self.append(added)
-        return added
+Told = Callable[[Progress | PassProgress], None]
 
 
 def build(
@@ -171,9 +52,10 @@ def build(
     max_tiles: int = MAX_TILES,
     dims: int = 70,
     core: TileDatabase | None = None,
+    passes: int = 0,
     journal_path: Path | None = None,
     figure_of_merit: FigureOfMerit = fom,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Told | None = None,
 ) -> TileDatabase:
     """Build a database (module docstring). The same images in the same order give the same database.
 
@@ -181,49 +63,113 @@ def build(
         images: What to learn from, in order; the first one's tiles all go in unless `core` is given.
         tile_px: Side of a tile, 4..32 px.
         rounds: Passes over the images, in order.
-        max_tiles: The build ends when this many tiles are in.
+        max_tiles: Rounds end when this many tiles are in.
         dims: Dimensions of the encoder's search space, 1..70.
         core: A finished database to add to (Table IV's "database core is not empty").
-        journal_path: Where every image's tiles are written as soon as they are known. If the file exists, the build
-            goes on from it, so a build that was killed loses at most the image it was working on.
+        passes: Passes of refinement afterwards (module `refine`).
+        journal_path: Where every image's tiles, and every pass, are written as soon as they are known. If the file
+            exists, the build goes on from it, so a build that was killed loses at most the image or pass it was
+            working on. Images whose pixels are no longer those the journal was written with are refused.
         figure_of_merit: Takes original and rebuilt picture; larger is better.
-        progress: Called after every image that was worked on in this run.
+        progress: Called after every image that was worked on in this run, and during refinement.
 
     Raises:
         ConfigError: No images, no rounds, or a number out of range.
-        CatalogueError: The journal belongs to another build, or cannot be read or written.
+        CatalogueError: The journal belongs to another build or to other pixels, or cannot be read or written.
     """
-    _check_plan(images, tile_px, rounds, max_tiles, core)
-    growing = GrowingTiles(tile_px, max_tiles)
-    if core is not None:
-        growing.append(core.tiles)
-    plan = _fingerprint(images, tile_px, rounds, max_tiles, core)
-    done: set[tuple[int, int]] = set()
+    check_plan(images, tile_px, rounds, max_tiles, core)
+    plan = fingerprint(images, tile_px, rounds, max_tiles, core)
     with Journal(journal_path, plan, tile_px * tile_px) as journal:
-        for entry in journal.entries:
-            growing.append(entry.tiles)
-            done.add((entry.round_number, entry.image_number))
-        for round_number, settings in enumerate(rounds):
-            chosen = spread(len(images), settings.max_images)
-            for image_number in chosen:
-                if growing.full or (round_number, image_number) in done:
+        work = _Build(images, tile_px, journal, progress or _untold)
+        work.start(GrowingTiles(tile_px, max_tiles), core)
+        work.run_rounds(rounds, figure_of_merit)
+        tiles = work.growing.tiles()
+        for number in range(1, passes + 1):
+            tiles = work.run_pass(tiles, number, passes)
+    return TileDatabase.from_tiles(tile_px, without_doubles(tiles) if passes else tiles, dims)
+
+
+def _untold(_: Progress | PassProgress) -> None:
+    """Stand in for a listener."""
+
+
+@dataclass
+class _Build:
+    """A build at work: what is done, and where it is written down."""
+
+    images: Sequence[TrainingImage]
+    tile_px: int
+    journal: Journal
+    told: Told
+    done: set[tuple[int, int]] = field(default_factory=set)
+    hashes: dict[int, bytes] = field(default_factory=dict)
+    growing: GrowingTiles = field(init=False)
+    _all_hash: bytes = b""
+
+    def start(self, growing: GrowingTiles, core: TileDatabase | None) -> None:
+        """Fill `growing` with the core and with what the journal holds, after a look at the images it came from."""
+        self.growing = growing
+        if core is not None:
+            growing.append(core.tiles)
+        for entry in self.journal.entries():
+            if entry.kind is EntryKind.IMAGE:
+                if entry.image_number >= len(self.images):
+                    expected = f"below {len(self.images)}, the number of images"
+                    raise CatalogueError(self.journal.name, "image", entry.image_number, expected)
+                self._load(entry.image_number, entry.pixels_hash)
+                growing.append(entry.tiles)
+                self.done.add((entry.number, entry.image_number))
+
+    def run_rounds(self, rounds: Sequence[Round], figure_of_merit: FigureOfMerit) -> None:
+        """Do what is not done yet of Table IV."""
+        for number, settings in enumerate(rounds):
+            chosen = spread(len(self.images), settings.max_images)
+            for position, image_number in enumerate(chosen, 1):
+                if self.growing.full or (number, image_number) in self.done:
                     continue
-                image = images[image_number].load()
-                merit, added = _learn(growing, image, settings, figure_of_merit)
-                journal.append(JournalEntry(round_number, image_number, added))
-                if progress is not None:
-                    counts = (added.shape[0], len(growing))
-                    progress(
-                        Progress(round_number, image_number, len(chosen), images[image_number].name, merit, *counts)
-                    )
-    return TileDatabase.from_tiles(tile_px, growing.tiles(), dims)
+                pixels = self._load(image_number)
+                merit, added = _learn(self.growing, pixels, settings, figure_of_merit)
+                record = JournalEntry(EntryKind.IMAGE, number, image_number, self.hashes[image_number], added)
+                self.journal.append(record)
+                where = (number, len(rounds), image_number, position, len(chosen), self.images[image_number].name)
+                self.told(Progress(*where, merit, added.shape[0], len(self.growing)))
 
+    def run_pass(self, tiles: Tiles, number: int, passes: int) -> Tiles:
+        """Do one pass of refinement, or take its result from the journal."""
+        for entry in self.journal.entries():
+            if (entry.kind, entry.number) == (EntryKind.PASS, number):
+                self._check_all(entry.pixels_hash)
+                return entry.tiles
+        count = len(self.images)
 
-def spread(available: int, wanted: int | None) -> tuple[int, ...]:
-    """Return at most `wanted` of the numbers 0..available-1, evenly spread, the first always among them."""
-    if wanted is None or wanted >= available:
-        return tuple(range(available))
-    return tuple(i * available // wanted for i in range(wanted))
+        def told(done: int) -> None:
+            self.told(PassProgress(number, passes, done, count, float("nan")))
+
+        refined = refine_once(tiles, self.tile_px, self.images, told)
+        self.journal.append(JournalEntry(EntryKind.PASS, number, 0, refined.images_hash, refined.tiles))
+        self.told(PassProgress(number, passes, count, count, refined.rms))
+        return refined.tiles
+
+    def _load(self, number: int, expected: bytes | None = None) -> npt.NDArray[np.uint8]:
+        """Return an image's pixels, if they are those that were met before.
+
+        Raises:
+            CatalogueError: They are others: what was learned from the image is not in it any more.
+        """
+        pixels = self.images[number].load()
+        met = pixels_hash(pixels)
+        known = self.hashes.setdefault(number, expected or met)
+        if met != known:
+            wanted = f"sha256 {known.hex()}, as when it was learned from (remove the journal to start anew)"
+            raise CatalogueError(self.images[number].name, "pixels", met.hex(), wanted)
+        return pixels
+
+    def _check_all(self, expected: bytes) -> None:
+        if not self._all_hash:
+            self._all_hash = images_hash(self.images)
+        if self._all_hash != expected:
+            what = "images as they were when the pass was done (remove the journal to start anew)"
+            raise CatalogueError(self.journal.name, "pass", self._all_hash.hex(), what)
 
 
 def _learn(
@@ -239,45 +185,3 @@ def _learn(
     if merit >= settings.fom_below:
         return merit, tiles[:0]
     return merit, growing.add_far(tiles, squared, settings.distance_above)
-
-
-def _centred(tiles: Tiles) -> npt.NDArray[np.float32]:
-    return tiles.astype(np.float32) - np.float32(_CENTRE)
-
-
-def _squared_norms(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-    wide = values.astype(np.float64)
-    return np.asarray(np.einsum("ij,ij->i", wide, wide), dtype=np.float64)
-
-
-def _check_plan(
-    images: Sequence[TrainingImage], tile_px: int, rounds: Sequence[Round], max_tiles: int, core: TileDatabase | None
-) -> None:
-    def refuse(field: str, value: object, expected: str) -> None:
-        raise ConfigError("catalogue build", field, value, expected)
-
-    if not images:
-        refuse("images", 0, "at least one image")
-    if not rounds:
-        refuse("rounds", 0, "at least one round")
-    if not MIN_TILE_PX <= tile_px <= MAX_TILE_PX:
-        refuse("tile_px", tile_px, f"{MIN_TILE_PX}..{MAX_TILE_PX} px")
-    for number, settings in enumerate(rounds):
-        if not settings.distance_above >= 0:
-            refuse(f"rounds[{number}].distance_above", settings.distance_above, "zero or more")
-        if settings.max_images is not None and settings.max_images < 1:
-            refuse(f"rounds[{number}].max_images", settings.max_images, "at least 1, or none for all")
-    if core is not None and core.tile_px != tile_px:
-        refuse("core.tile_px", core.tile_px, f"{tile_px}, the tile size of this build")
-    if max_tiles < (1 if core is None else len(core)):
-        refuse("max_tiles", max_tiles, "at least 1 and no fewer than the core has")
-
-
-def _fingerprint(
-    images: Sequence[TrainingImage], tile_px: int, rounds: Sequence[Round], max_tiles: int, core: TileDatabase | None
-) -> str:
-    """Everything a resumed build must have in common with the one it goes on with, as text."""
-    lines = [f"tile_px {tile_px}", f"max_tiles {max_tiles}", f"core {core.identity if core is not None else 'none'}"]
-    lines += [f"round {r.fom_below!r} {r.distance_above!r} {r.max_images!r}" for r in rounds]
-    lines += [f"image {image.name}" for image in images]
-    return "\n".join(lines)

@@ -7,13 +7,13 @@ Geological Survey). Nothing else. The simulated lines are made by the command `s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sonarpost.catalogue.build import Progress, Round, TrainingImage, build, rms_distance
+from sonarpost.catalogue.build import Told, build
 from sonarpost.catalogue.humminbird import humminbird_lines
-from sonarpost.catalogue.refine import refine
+from sonarpost.catalogue.plan import Round, TrainingImage, rms_distance
 from sonarpost.catalogue.store import Catalogue
 from sonarpost.catalogue.windows import WindowPlan, cut_line, shuffled
 
@@ -60,12 +60,13 @@ def humminbird_images(folder: Path) -> list[TrainingImage]:
 def build_nominal(
     recipe: Recipe,
     images: Sequence[TrainingImage],
-    progress: Callable[[Progress], None] | None = None,
+    progress: Told | None = None,
 ) -> Catalogue:
     """Build one of the shipped catalogues; the same images, in any order, give the same bytes."""
     images = shuffled(images)
-    grown = build(images, recipe.tile_px, recipe.rounds, max_tiles=recipe.max_tiles, progress=progress)
-    tiles = refine(grown, images, recipe.passes)
+    tiles = build(
+        images, recipe.tile_px, recipe.rounds, max_tiles=recipe.max_tiles, passes=recipe.passes, progress=progress
+    )
     rounds = "; ".join(
         f"fom<{r.fom_below:g} distance>{r.distance_above:g} images<={r.max_images}" for r in recipe.rounds
     )

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.build import TrainingImage
+from sonarpost.catalogue.plan import TrainingImage
 
 Picture = npt.NDArray[np.uint8]
 Line = npt.NDArray[np.float32]

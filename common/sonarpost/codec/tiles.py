@@ -9,8 +9,8 @@ integers that float64 holds exactly: they are the same, and so are the indices, 
 linear-algebra library. A stream encoded on one machine is byte for byte the stream of any other.
 
 The search is exact, yet most of its work is one matrix product in single precision: its result is only used to leave
-out tiles that cannot be among the nearest, by more than its rounding error can be (`NearestSearch`); the few that remain
-are compared in integers. The product itself is spared for tiles whose first coordinate alone is too far away.
+out tiles that cannot be among the nearest, by more than its rounding error can be (`NearestSearch`); the few that
+remain are compared in integers. The product itself is spared for tiles whose first coordinate alone is too far away.
 """
 
 from __future__ import annotations

@@ -1,0 +1,21 @@
+"""The actions of `sonarpost catalogue`."""
+
+from __future__ import annotations
+
+import argparse
+
+from sonarpost.cli.catalogue import adapt, build, diff, info, nominal
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command and its actions."""
+    parser = subparsers.add_parser("catalogue", help="build, compare and adapt tile catalogues")
+
+    def show_help(_: argparse.Namespace) -> int:
+        parser.print_help()
+        return 0
+
+    parser.set_defaults(run=show_help)
+    actions = parser.add_subparsers(metavar="ACTION")
+    for module in (build, info, diff, adapt, nominal):
+        module.add_action(actions)

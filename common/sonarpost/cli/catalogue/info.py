@@ -1,0 +1,46 @@
+"""`sonarpost catalogue info`: what a catalogue holds."""
+
+from __future__ import annotations
+
+import argparse
+
+from sonarpost.catalogue.store import Catalogue, open_catalogue
+from sonarpost.codec.vq import catalogue_tag
+
+
+def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action."""
+    parser = actions.add_parser("info", help="show what a catalogue holds")
+    parser.add_argument("catalogue", metavar="NAME_OR_FILE", help="nominal-10, nominal-20 or a file")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print what a catalogue holds; return 0.
+
+    Raises:
+        CatalogueError: It cannot be read.
+    """
+    show(open_catalogue(args.catalogue))
+    return 0
+
+
+def show(catalogue: Catalogue) -> None:
+    """Print size, identity and notes."""
+    tiles = catalogue.tiles
+    print_facts(
+        {
+            "tiles": f"{len(tiles)} of {tiles.tile_px} x {tiles.tile_px} px",
+            "dimensions": f"{tiles.dims} of {tiles.tile_px**2}",
+            "identity": tiles.identity,
+            "tag in streams": f"{catalogue_tag(tiles):#06x}",
+            **catalogue.notes,
+        }
+    )
+
+
+def print_facts(facts: dict[str, str]) -> None:
+    """Print names and values in two columns."""
+    width = max(len(name) for name in facts)
+    for name, value in facts.items():
+        print(f"{name:{width}}  {value}")

@@ -1,0 +1,72 @@
+"""`sonarpost catalogue nominal`: rebuild the shipped catalogues."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+from rich.console import Console
+
+from sonarpost.catalogue.nominal import RECIPES, Recipe, build_nominal, humminbird_images
+from sonarpost.catalogue.plan import TrainingImage
+from sonarpost.catalogue.store import load, save
+from sonarpost.catalogue.windows import Line, WindowPlan, cut_around, cut_line
+from sonarpost.cli.catalogue.progress import ProgressDisplay
+from sonarpost.sim.seabed import SeabedKind
+from sonarpost.sim.survey import SurveySpec, simulate_survey
+
+# A simulated ping is 10 cm of track and a sample 3 cm of range: averaging three samples makes pixels square.
+SIMULATED_REDUCTIONS = ((1, 1), (1, 2), (1, 3), (2, 3), (2, 6), (1, 4), (3, 6))
+SIMULATED_SURVEYS = tuple(
+    SurveySpec(seed=7000 + 10 * number + copy, seabed=kind, targets=12, clutter=12)
+    for number, kind in enumerate(SeabedKind)
+    for copy in range(2)
+)
+
+
+def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action."""
+    parser = actions.add_parser("nominal", help="rebuild the shipped catalogues: same input, same bytes")
+    parser.add_argument(
+        "--humminbird", type=Path, required=True, metavar="DIR", help="folder with the PyHum recording's channels"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the catalogues")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Rebuild the shipped catalogues; return 0.
+
+    Raises:
+        SonarpostError: The recording cannot be read or a catalogue not be written.
+    """
+    console = Console(stderr=True)
+    images = [*humminbird_images(args.humminbird), *simulated_images(console)]
+    console.print(f"{len(images)} training images")
+    for recipe in RECIPES:
+        _write(recipe, images, args.out, console)
+    return 0
+
+
+def simulated_images(console: Console) -> Iterator[TrainingImage]:
+    """Yield windows of simulated lines over every kind of bottom, and of the objects that lie there."""
+    bottom = WindowPlan(reductions=SIMULATED_REDUCTIONS, per_reduction=16, least_std=4.0)
+    objects = WindowPlan(reductions=SIMULATED_REDUCTIONS[:5], copies=2)
+    for spec in SIMULATED_SURVEYS:
+        simulated = simulate_survey(spec)
+        name = simulated.survey.line_name
+        console.print(f"{name}: simulated")
+        for side in simulated.survey.sides():
+            line: Line = simulated.survey.waterfall(side)
+            yield from cut_line(f"{name} {side.value}", line, bottom)
+            places = [(thing.ping, thing.sample_index) for thing in simulated.truth if thing.side is side]
+            yield from cut_around(f"{name} {side.value}", line, places, objects)
+
+
+def _write(recipe: Recipe, images: list[TrainingImage], folder: Path, console: Console) -> None:
+    path = folder / f"nominal-{recipe.tile_px}.tiles"
+    with ProgressDisplay(console) as display:
+        save(path, build_nominal(recipe, images, display.build))
+    tiles = load(path).tiles
+    console.print(f"{path}: {len(tiles)} tiles, identity {tiles.identity}")
