@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.catalogue.store import load_nominal
-from sonarpost.codec import tiles as module
-from sonarpost.codec.tiles import NearestSearch, TileDatabase, rounding_bound
+from sonarpost.codec import tile_search as module
+from sonarpost.codec.tile_search import NearestSearch, rounding_bound
+from sonarpost.codec.tiles import TileDatabase
 
 
 def plainly(vectors: np.ndarray, queries: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

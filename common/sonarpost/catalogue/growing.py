@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.tiles import BLOCK_TILES, NearestSearch, Tiles, empty_blocks, fill_blocks, squared_norms
+from sonarpost.codec.tile_search import BLOCK_TILES, NearestSearch, empty_blocks, fill_blocks, squared_norms
+from sonarpost.codec.tiles import Tiles
 
 _CENTRE = 128
 _QUERY_ROWS = 256
