@@ -2,16 +2,19 @@
 
 The rule:
 
-1. Every training tile is encoded with the base catalogue, and the uses of each base tile are counted. Base tiles are
+1. Each image is cut into tiles four times: from its corner and from half a tile further, as it is and mirrored (port
+   and starboard cast shadows to opposite sides). Without this a tile learned stands for too few pieces of bottom:
+   measured, it doubles the gain.
+2. Every training tile is encoded with the base catalogue, and the uses of each base tile are counted. Base tiles are
    given up from the least used (of equals the last) on; free places up to `max_tiles` are taken first. At least `keep`
    base tiles stay, the most used. All stay at their numbers, unchanged.
-2. New tiles are drawn from the training tiles in eight steps. In each, the squared distances of all training tiles to
+3. New tiles are drawn from the training tiles in eight steps. In each, the squared distances of all training tiles to
    their nearest tile so far are summed up in order, and the tiles are taken in which the sum passes equal steps: a
    tile is the likelier the worse it is rebuilt, and no chance is involved (k-means++ seeding, Arthur and
    Vassilvitskii, SODA 2007, with several tiles a step as in k-means||, Bahmani et al., VLDB 2012, and systematic
    sampling in place of random).
-3. New tiles (only these) are moved to the mean of the training tiles nearest to them, `passes` times.
-4. New tiles get the numbers of those given up; a new tile that came to equal another is dropped for the tile it would
+4. New tiles (only these) are moved to the mean of the training tiles nearest to them, `passes` times.
+5. New tiles get the numbers of those given up; a new tile that came to equal another is dropped for the tile it would
    have replaced. The basis is computed anew from all tiles.
 
 Images are loaded anew each time they are needed: besides tiles, only one number for each training tile is held.
@@ -70,7 +73,7 @@ def adapt(
     *,
     max_tiles: int = MAX_TILES,
     keep: int | None = None,
-    passes: int = 2,
+    passes: int = 4,
     told: Callable[[str, int, int], None] | None = None,
 ) -> Adapted:
     """Adapt a catalogue (module docstring). The same base and images in the same order give the same catalogue.
@@ -89,6 +92,7 @@ def adapt(
     keep = len(base) // 2 if keep is None else keep
     _check(base, images, max_tiles, keep)
     told = told or (lambda what, done, whole: None)
+    images = _views(images, base.tile_px)
     uses = _uses(base, images, told)
     free = max_tiles - len(base)
     by_use = np.lexsort((-np.arange(len(base)), uses))  # least used first, of equals the last
@@ -140,6 +144,20 @@ def _check(base: TileDatabase, images: Sequence[TrainingImage], max_tiles: int, 
         raise ConfigError(where, "max_tiles", max_tiles, f"at least {len(base)}, the tiles of the base")
     if not 0 <= keep <= len(base):
         raise ConfigError(where, "keep", keep, f"0..{len(base)}, the tiles of the base")
+
+
+def _views(images: Sequence[TrainingImage], tile_px: int) -> list[TrainingImage]:
+    """Return each image as it is cut: see the module's first rule. Too small to be shifted, it is left as it is."""
+
+    def view(image: TrainingImage, shift_px: int, step: int) -> TrainingImage:
+        def load() -> npt.NDArray[np.uint8]:
+            pixels = image.load()
+            first = shift_px if min(pixels.shape) > shift_px else 0
+            return np.ascontiguousarray(pixels[first:, first:][:, ::step])
+
+        return TrainingImage(image.name, load)
+
+    return [view(image, shift, step) for image in images for shift in (0, tile_px // 2) for step in (1, -1)]
 
 
 def _tiles_of(images: Sequence[TrainingImage], tile_px: int) -> int:
