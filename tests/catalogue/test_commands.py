@@ -203,3 +203,61 @@ def test_rounds_are_read_in_grey_levels() -> None:
     for wrong in ("", "39", "39:", "39:16:", "39:16:1.5", "39:-1", "nan:1", "39:16,", "39:16:5:5", "٣٩:16"):
         with pytest.raises(ConfigError, match="FOM:RMS"):
             parse_rounds(wrong, 10)
+
+
+def test_catalogues_are_compared(run: Run, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one, other = tmp_path / "one.tiles", tmp_path / "other.tiles"
+    assert run("catalogue", "build", "--images", folder / "a.tiff", "--tile", 8, "--out", one) == 0
+    assert run("catalogue", "build", "--images", folder / "b.png", "--tile", 8, "--out", other, "--core", one) == 0
+    capsys.readouterr()
+    assert run("catalogue", "diff", one, one) == 0
+    told = capsys.readouterr().out
+    assert "the same" in told
+    assert "principal angles up to 0.00 deg" in told
+    assert run("catalogue", "diff", one, other) == 1
+    told = capsys.readouterr().out
+    assert load(one).tiles.identity in told
+    assert load(other).tiles.identity in told
+    assert "only in A      0 tiles" in told
+    assert f"{len(load(one).tiles)} tiles have the same number in both" in told
+    with pytest.raises(CatalogueError, match="tile_px"):
+        run("catalogue", "diff", one, "nominal-10")
+
+
+def test_a_catalogue_is_adapted_to_a_folder(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for seed in range(8):
+        write_png(images / f"{seed}.png", snippet(seed))
+    base, out = tmp_path / "base.tiles", tmp_path / "out.tiles"
+    run("catalogue", "build", "--images", images / "0.png", "--tile", 8, "--out", base, "--max-tiles", 40)
+    (images / "broken.tif").write_bytes(b"II*\0")
+    capsys.readouterr()
+    assert run("catalogue", "adapt", base, "--images", images, "--out", out, "--keep", 10, "--max-tiles", 60) == 1
+    told = capsys.readouterr()
+    assert "broken.tif" in told.err
+    assert "6 to learn from, 2 held out" in told.out
+    assert "better in 2 of 2" in told.out
+    adapted, original = load(out), load(base)
+    assert adapted.notes["adapted from"].endswith(original.tiles.identity)
+    assert adapted.notes["held-out PSNR dB"] in told.out
+    assert len(adapted.tiles) == 60
+    assert (adapted.tiles.tiles[:40] == original.tiles.tiles).all(axis=1).sum() >= 10
+    with pytest.raises(ConfigError, match="keep"):
+        run("catalogue", "adapt", base, "--images", images, "--out", out, "--keep", 41)
+    with pytest.raises(ConfigError, match="at least 2"):
+        run("catalogue", "adapt", base, "--images", images / "0.png", "--out", out)
+
+
+def test_no_gain_is_told(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for number in range(2):
+        write_png(images / f"{number}.png", np.full((24, 24), 90, np.uint8))
+    base = tmp_path / "base.tiles"
+    run("catalogue", "build", "--images", images / "0.png", "--tile", 8, "--out", base)
+    capsys.readouterr()
+    assert run("catalogue", "adapt", base, "--images", images, "--out", tmp_path / "out.tiles") == 0
+    told = capsys.readouterr()
+    assert "no gain" in told.err
+    assert "99.00 before, 99.00 after; better in 0 of 1" in told.out
