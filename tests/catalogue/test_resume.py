@@ -163,7 +163,15 @@ def test_memory_follows_the_tiles_not_the_images(tmp_path: Path) -> None:
 def test_memory_stays_within_what_is_documented() -> None:
     peak_bytes(2, 100, 1)
     tiles = 6_000
-    assert peak_bytes(70, tiles, 1) < 16_000_000 + 40 * tiles * 100
+    assert peak_bytes(70, tiles, 1) < 16_000_000 + 40 * tiles * 100 + 100 * 100 * 100
+    large = image(0, 1200)
+    images = [TrainingImage("small", lambda: large[:100, :100]), TrainingImage("large", lambda: large)]
+    tracemalloc.start()
+    try:
+        assert len(build(images, 10, [Round(1e9, 300.0)], max_tiles=300, passes=1)) == 300
+        assert tracemalloc.get_traced_memory()[1] < 16_000_000 + 40 * 300 * 100 + 100 * large.size
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_picture_larger_than_any_snippet_is_searched_in_parts() -> None:

@@ -13,14 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image as Pillow
 
-from sonarpost.codec.huffman import (
-    MAX_CODE_BITS,
-    HuffmanCodec,
-    arrived_body,
-    canonical_codes,
-    code_lengths,
-)
-from sonarpost.codec.interface import StreamHeader
+from sonarpost.codec.huffman import HuffmanCodec
+from sonarpost.codec.huffman_code import MAX_CODE_BITS, canonical_codes, code_lengths
+from sonarpost.codec.interface import StreamHeader, arrived_body
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError, StreamError
 

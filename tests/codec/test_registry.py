@@ -7,6 +7,7 @@ from importlib.metadata import EntryPoint
 import numpy as np
 import pytest
 
+from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.registry import (
     BUILTINS,
     ENTRY_POINT_GROUP,
@@ -17,7 +18,7 @@ from sonarpost.codec.registry import (
     load_plugins,
 )
 from sonarpost.codec.tiles import TileDatabase
-from sonarpost.codec.vq import IndexPacking, VqCodec
+from sonarpost.codec.vq import IndexPacking, VqCodec, catalogue_tag
 from sonarpost.errors import ConfigError, StreamError
 
 TILES = TileDatabase.from_tiles(8, np.random.default_rng(0).integers(0, 256, (50, 64), dtype=np.uint8))
@@ -90,6 +91,24 @@ def test_a_name_or_id_is_taken_once(registry: CodecRegistry, name: str, ids: tup
     if 0x90 in ids:
         with pytest.raises(StreamError):
             registry.spec_for_id(0x90)  # a refused codec leaves nothing behind
+
+
+@pytest.mark.parametrize("codec_id", [0x0F, 0x20, 0x7F])
+def test_a_codec_with_a_catalogue_takes_an_id_whose_streams_can_name_it(registry: CodecRegistry, codec_id: int) -> None:
+    with pytest.raises(ConfigError, match=r"0x10\.\.0x1f or 0x80\.\.0xff"):
+        registry.register(CodecSpec("other", (0x90, codec_id), make_nothing, needs_tiles=True))
+    assert "other" not in registry.names()
+    with pytest.raises(StreamError):
+        registry.spec_for_id(0x90)
+    if codec_id != 0x20:  # emb's
+        registry.register(CodecSpec("other", (0x90, codec_id), make_nothing))
+
+
+@pytest.mark.parametrize("codec_id", [0x14, 0x1F, 0x80, 0xFF])
+def test_a_registered_codec_with_a_catalogue_finds_it_by_the_tag(registry: CodecRegistry, codec_id: int) -> None:
+    registry.register(CodecSpec("other", (codec_id,), make_nothing, needs_tiles=True))
+    header = StreamHeader(codec_id, catalogue_tag(TILES), 16, 24)
+    assert StreamHeader.unpack(header.pack()).model_tag == catalogue_tag(TILES)
 
 
 def test_a_plug_in_is_registered_like_a_codec_of_ours(registry: CodecRegistry) -> None:

@@ -15,7 +15,9 @@ from PIL import Image as Pillow
 from sonarpost.codec import spiht
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.spiht import MAX_PLANES, NATURAL_MAXLOOP, SpihtCodec
+from sonarpost.codec.spiht import NATURAL_MAXLOOP, SpihtCodec
+from sonarpost.codec.spiht_passes import MAX_PLANES, UNIT, PictureAnswers, StreamAnswers, run_passes
+from sonarpost.codec.spiht_wavelet import FRACTION_BITS, forest_of, inverse, transform
 from sonarpost.errors import ConfigError, StreamError
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "spiht"
@@ -51,18 +53,18 @@ def test_the_transform_of_any_size_is_undone_and_nearly_keeps_energy(
     size: tuple[int, int], seed: int, mean: int
 ) -> None:
     image = np.random.default_rng(seed).integers(0, 256, size, dtype=np.uint8)
-    forest = spiht._forest(*size)
-    flat = spiht._transform(image, mean, forest)
+    forest = forest_of(*size)
+    flat = transform(image, mean, forest)
     assert flat.shape == (image.size,)
-    assert np.array_equal(spiht._inverse(flat, mean, forest), image)
+    assert np.array_equal(inverse(flat, mean, forest), image)
     energy = ((image.astype(float) - mean) ** 2).sum()
-    assert 0.7 < ((flat / 2**spiht._FRACTION_BITS) ** 2).sum() / energy < 1.5
+    assert 0.7 < ((flat / 2**FRACTION_BITS) ** 2).sum() / energy < 1.5
 
 
 def test_a_smooth_slope_lies_in_the_coarse_coefficients() -> None:
     rows, columns = np.mgrid[:64, :64]
-    forest = spiht._forest(64, 64)
-    flat = np.abs(spiht._transform((rows + 2 * columns + 20).astype(np.uint8), 100, forest))
+    forest = forest_of(64, 64)
+    flat = np.abs(transform((rows + 2 * columns + 20).astype(np.uint8), 100, forest))
     fine = sum(h * w for _, h, w in forest.bands[-6:])  # the two finest levels, 94 % of all coefficients
     assert flat[-fine:].max() < flat.max() / 100
 
@@ -70,7 +72,7 @@ def test_a_smooth_slope_lies_in_the_coarse_coefficients() -> None:
 @given(size=SIZES)
 @settings(max_examples=30, deadline=None)
 def test_every_coefficient_hangs_in_one_tree(size: tuple[int, int]) -> None:
-    forest = spiht._forest(*size)
+    forest = forest_of(*size)
     assert forest.size == size[0] * size[1]
     seen = [child for children in forest.children for child in children]
     assert sorted(seen) == list(range(forest.roots, forest.size))
@@ -81,7 +83,7 @@ def test_every_coefficient_hangs_in_one_tree(size: tuple[int, int]) -> None:
 
 
 def test_children_lie_where_their_parent_does() -> None:
-    forest = spiht._forest(80, 80)
+    forest = forest_of(80, 80)
     band = {}
     for number, (start, h, w) in enumerate(forest.bands):
         for i in range(h * w):
@@ -99,14 +101,14 @@ def test_after_a_plane_no_coefficient_is_further_off_than_its_step(
     size: tuple[int, int], seed: int, phase: int, loops: int
 ) -> None:
     image = (np.random.default_rng(seed).rayleigh(40, size)).clip(0, 255).astype(np.uint8)
-    forest = spiht._forest(*size)
-    flat = spiht._transform(image, 100, forest)
-    picture_ = spiht._Picture(flat, phase, forest, None)
+    forest = forest_of(*size)
+    flat = transform(image, 100, forest)
+    picture_ = PictureAnswers(flat, phase, forest, None)
     planes = range(picture_.planes - 1, max(picture_.planes - 1 - loops, -1), -1)
-    spiht._run_passes(forest, planes, picture_.tests())
-    stream = spiht._Stream(bytes(picture_.bits), forest)
-    spiht._run_passes(forest, planes, stream.tests())
-    step = (4 + phase) * spiht._UNIT << planes[-1]
+    run_passes(forest, planes, picture_.tests())
+    stream = StreamAnswers(bytes(picture_.bits), forest)
+    run_passes(forest, planes, stream.tests())
+    step = (4 + phase) * UNIT << planes[-1]
     rebuilt = stream.coefficients(phase)
     assert (np.abs(rebuilt - flat) <= step).all()
     assert ((rebuilt == 0) == (np.abs(flat) < step)).all()
@@ -115,8 +117,8 @@ def test_after_a_plane_no_coefficient_is_further_off_than_its_step(
 
 def test_the_stream_is_embedded_to_the_byte() -> None:
     image = picture(80, 80)
-    forest = spiht._forest(80, 80)
-    flat = spiht._transform(image, 100, forest)
+    forest = forest_of(80, 80)
+    flat = transform(image, 100, forest)
     whole = spiht._write_body(flat, 12, 1, forest, MAX_PLANES, None)
     for length in (2, 3, 10, 57, 200, 1000):
         assert spiht._write_body(flat, 12, 1, forest, MAX_PLANES, length) == whole[:length]
@@ -140,10 +142,10 @@ def test_every_byte_of_the_budget_is_used_until_the_picture_is_exact_to_a_grey_l
 
 
 def test_the_phase_with_the_smallest_error_is_taken() -> None:
-    image, forest = picture(80, 80), spiht._forest(80, 80)
+    image, forest = picture(80, 80), forest_of(80, 80)
     codec = SpihtCodec()
     stream = codec.encode(image, 66)
-    flat = spiht._transform(image, 8 * (stream[2] >> 3) + 4, forest)
+    flat = transform(image, 8 * (stream[2] >> 3) + 4, forest)
     bodies = [spiht._write_body(flat, stream[2] >> 3, phase, forest, MAX_PLANES, 64) for phase in range(4)]
     errors = [-psnr_db(image, spiht._read_body(body, forest)) for body in bodies]
     assert stream[2:] == bodies[int(np.argmin(errors))]

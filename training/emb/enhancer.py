@@ -1,7 +1,7 @@
 """Train the decoder's enhancer on pictures that were coded and decoded, and write its weights.
 
     python training/emb/enhancer.py --pool /tmp/emb/pool.npz \
-        --model /tmp/emb/contexts.model --out common/sonarpost/codec/data/emb.model --minutes 8
+        --model /tmp/emb/contexts.model --out common/sonarpost/codec/data/emb.model --steps 12000
 
 Loss: squared error relative to that of the picture as decoded, minus a little of the multi-scale structural similarity.
 """
@@ -24,20 +24,23 @@ from sonarpost.codec.emb.model import CHANNELS, GLOBALS, LAYERS, Model, parse, r
 
 SEED = 11
 BATCH = 10
+LARGEST_BYTES = 640
 Params = dict[str, jax.Array]
 
 
-def coded(codec: EmbCodec, pictures: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Decode each picture at a chance budget: planes without enhancement (1/64 grey), means, situations."""
+def coded(codec: EmbCodec, pictures: np.ndarray, rng: np.random.Generator, prefixes: int) -> tuple[np.ndarray, ...]:
+    """Decode chance prefixes of each picture: planes without enhancement (1/64 grey), means, situations."""
     planes, means, situations = [], [], []
     for picture in pictures:
-        budget = int(np.exp(rng.uniform(np.log(16), np.log(640))) * picture.size / 6400) + 6
         one = EmbCodec(codec.model, steps=(int(rng.integers(8)),))
-        plain = one.decode_plain(one.encode(picture, budget))
-        planes.append(plain.plane)
-        means.append(plain.mean)
-        situations.append(plain.situation)
-    return np.stack(planes).astype(np.int32), np.array(means), np.array(situations)
+        stream = one.encode(picture, LARGEST_BYTES * picture.size // 6400 + 6)
+        for length in np.exp(rng.uniform(np.log(16), np.log(LARGEST_BYTES), prefixes)) * picture.size / 6400 + 6:
+            plain = one.decode_plain(stream[: int(length)])
+            low, high = -64 * plain.mean, 64 * (255 - plain.mean)
+            planes.append(np.clip(plain.plane, low, high).astype(np.int16))
+            means.append(plain.mean)
+            situations.append(plain.situation)
+    return np.stack(planes), np.array(means), np.array(situations)
 
 
 def start(rng: np.random.Generator) -> Params:
@@ -126,9 +129,11 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
     parser.add_argument("--pool", type=Path, required=True)
     parser.add_argument("--model", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--minutes", type=float, default=8)
+    parser.add_argument("--steps", type=int, default=12000)
+    parser.add_argument("--prefixes", type=int, default=3, help="decoded prefixes of each picture")
     parser.add_argument("--pictures", type=int, default=3000)
     parser.add_argument("--resume", action="store_true", help="begin with the enhancer of --model")
+    parser.add_argument("--rate", type=float, default=1.5e-3)
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--likeness", type=float, default=0.1, help="weight of structural similarity")
     args = parser.parse_args()
@@ -138,9 +143,8 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
     began = time.time()
     sets = {}
     for name, source in (("train", pool["tp80"][-args.pictures :]), ("check", pool["vp80"][:100])):
-        plane, mean, situation = coded(codec, source, rng)
-        low, high = -64 * mean[:, None, None], 64 * (255 - mean[:, None, None])
-        sets[name] = (source, np.clip(plane, low, high), mean, situation)
+        plane, mean, situation = coded(codec, source, rng, args.prefixes if name == "train" else 2)
+        sets[name] = (source.repeat(len(plane) // len(source), 0), plane, mean, situation)
     print(f"coded, {time.time() - began:.0f} s", flush=True)
     params = resumed(codec.model) if args.resume else start(rng)
 
@@ -171,9 +175,10 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
     check = jax.jit(parts)
     state = optimiser.init(params)
     pictures, planes, means, situations = sets["train"]
-    began, i, shown = time.time(), 0, 0.0
-    while (done := (time.time() - began) / (60 * args.minutes)) < 1:
-        state[1].hyperparams["learning_rate"] = jnp.asarray((1.5e-3 * (1 - done) ** 1.5 + 1e-5) * min(1, (i + 5) / 300))
+    began = time.time()
+    for i in range(args.steps):
+        rate = (args.rate * (1 - i / args.steps) ** 1.5 + 1e-5) * min(1, (i + 5) / 300)
+        state[1].hyperparams["learning_rate"] = jnp.asarray(rate)
         pick = rng.integers(len(pictures), size=BATCH)
         x, y = pictures[pick].astype(np.float32), planes[pick].astype(np.float32)
         turn = int(rng.integers(8))
@@ -184,12 +189,14 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
         if turn & 4:
             x, y = x.transpose(0, 2, 1), y.transpose(0, 2, 1)
         params, state, _ = step(params, state, x, y, means[pick], situations[pick])
-        i += 1
-        if time.time() - shown > 60:
-            shown = time.time()
-            _report(check, params, sets["check"], i, time.time() - began)
-    _report(check, params, sets["check"], i, time.time() - began)
-    arrays: dict[str, np.ndarray] = dict(read_arrays(args.model.read_bytes()))
+        if i % 250 == 249 or i == args.steps - 1:
+            _report(check, params, sets["check"], i + 1, time.time() - began)
+            write(args.out, args.model, params)
+
+
+def write(out: Path, model: Path, params: Params) -> None:
+    """Round the weights and write a model file with them and all else of another one."""
+    arrays: dict[str, np.ndarray] = dict(read_arrays(model.read_bytes()))
     arrays["situation"] = np.rint(np.asarray(params["s"], np.float64) * (1 << 14))
     for i in range(len(LAYERS)):
         taps = np.rint(np.asarray(params[f"w{i}"], np.float64) * (1 << 12))
@@ -197,11 +204,11 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
         if (np.abs(taps).sum((0, 1)) * 4095 + np.abs(bias)).max() >= 2**31:
             raise SystemExit("a sum may exceed 32 bits")
         arrays[f"taps{i}"], arrays[f"bias{i}"] = taps, bias
-    write_model(args.out, arrays)
+    write_model(out, arrays)
 
 
 def _report(check, params, group, i: int, seconds: float) -> None:  # noqa: ANN001
-    x, y, m, s = (np.asarray(a[:100], np.float32) for a in group)
+    x, y, m, s = (np.asarray(a[:200], np.float32) for a in group)
     before, after, like, liker = (np.asarray(v) for v in check(params, x, y, m, s))
     gain = 10 * np.log10(before / after)
     print(

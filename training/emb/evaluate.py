@@ -16,7 +16,7 @@ import numpy.typing as npt
 from PIL import Image
 from scipy.interpolate import PchipInterpolator
 
-from sonarpost.codec.quality import psnr_db, ssim
+from sonarpost.codec.quality import ms_ssim, psnr_db, ssim
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.errors import StreamError
 
@@ -56,7 +56,7 @@ def rate_difference(curve: Curve, other: Curve) -> float:
 
 
 def main() -> None:
-    """Print mean bytes, PSNR and SSIM of each codec and budget, and the rate differences."""
+    """Print mean bytes, PSNR, SSIM and MS-SSIM of each codec and budget, and the rate differences."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--codecs", nargs="+", default=["emb", "spiht", "jpeg2000-packets", "jpeg2000"])
@@ -76,7 +76,8 @@ def main() -> None:
             psnr = float(np.mean([psnr_db(p, d) for p, d in zip(pictures, decoded, strict=True)]))
             like = float(np.mean([ssim(p, d) for p, d in zip(pictures, decoded, strict=True)]))
             curves[name].append((length, psnr))
-            print(f"{name} {budget} B: {length:.1f} B, {psnr:.2f} dB, SSIM {like:.3f}", flush=True)
+            multi = float(np.mean([ms_ssim(p, d) for p, d in zip(pictures, decoded, strict=True)]))
+            print(f"{name} {budget} B: {length:.1f} B, {psnr:.2f} dB, SSIM {like:.3f}, MS-SSIM {multi:.3f}", flush=True)
     for name in args.codecs[1:]:
         if len(curves[name]) > 1:
             print(f"{args.codecs[0]} against {name}: {rate_difference(curves[args.codecs[0]], curves[name]):+.1f} %")

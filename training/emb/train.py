@@ -16,10 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from examples import list_examples
 
+from examples import blank_model, list_examples, measure_centres
 from sonarpost.codec.emb import kernel as k
-from sonarpost.codec.emb.model import ARRAYS, MAGIC
+from sonarpost.codec.emb.model import ARRAYS, MAGIC, model_of, parse, read_arrays
 
 SEED = 7
 BATCH = 8192
@@ -92,7 +92,7 @@ def integers(nets: list[Params], signs: list[Params]) -> dict[str, np.ndarray]:
     out["sign_w1"] = np.stack([np.rint(np.asarray(p["w1"], np.float64) * (1 << 10)) for p in signs])
     out["sign_b1"] = np.stack([np.rint(np.asarray(p["b1"], np.float64) * (1 << 14)) for p in signs])
     out["sign_w2"] = np.stack([np.rint(np.asarray(p["w2"], np.float64) * (1 << 12)) for p in signs])
-    reach = np.abs(out["w1"]).sum(1) * 250 + np.abs(out["b1"])
+    reach = np.abs(out["w1"]).sum(1) * 290 + np.abs(out["b1"])
     second = np.abs(out["w2"]).sum(1) * 4095 + np.abs(out["b2"])
     if max(reach.max(), second.max()) >= 2**31:
         raise SystemExit("a sum may exceed 32 bits")
@@ -100,17 +100,13 @@ def integers(nets: list[Params], signs: list[Params]) -> dict[str, np.ndarray]:
 
 
 def tables() -> dict[str, np.ndarray]:
-    """Probabilities, costs and gains."""
+    """Probabilities and costs."""
     logit = np.arange(-k.LOGIT_LIMIT, k.LOGIT_LIMIT + 1) / 256
     chance = 1 / (1 + np.exp(-logit))
     whole = np.clip(np.rint(chance * 65536), 6, 65530)
-    size = (np.arange(32) + 0.5) / 16
-    guess = 1.42
-    gain = np.where(np.arange(32) >= 16, guess * (2 * size - guess), 0)
     return {
         "chances": whole,
         "costs": np.rint(-256 * np.log2(whole / 65536)),
-        "gains": np.rint(256 * gain),
     }
 
 
@@ -145,20 +141,24 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--pictures", type=int, default=1000)
     parser.add_argument("--steps", type=int, default=5000)
+    parser.add_argument(
+        "--order", type=Path, help="model whose contexts order the coefficients, and whose enhancer is kept"
+    )
     args = parser.parse_args()
     rng = np.random.default_rng(SEED)
     pool = np.load(args.pool)
     began = time.time()
+    order = parse(args.order.read_bytes()) if args.order else blank_model()
     parts = [
-        list_examples(pool[name][: int(args.pictures * share)], 7, rng, 16000 * pool[name][0].size // 6400)
+        list_examples(order, pool[name][: int(args.pictures * share)], 7, rng, 16000 * pool[name][0].size // 6400)
         for name, share in (("tp80", 1.0), ("tp140", 0.25), ("tp112", 0.25))
     ]
     rows = np.concatenate([p[0] for p in parts])
     sign_rows = np.concatenate([p[1] for p in parts])
-    print(f"listed {len(rows)} decisions, {len(sign_rows)} signs, {time.time() - began:.0f} s; centres {parts[0][2]}")
+    print(f"listed {len(rows)} decisions, {len(sign_rows)} signs, {time.time() - began:.0f} s")
     f = k.FEATURES
     # Every octave of rate counts alike: a plane has about three times the bits of the one before.
-    weight = (rows[:, f + 2] * 2.0 ** (0.1 * rows[:, 41])).astype(np.float32)
+    weight = (rows[:, f + 2] * 2.0 ** (0.1 * rows[:, k.BAND_FEATURES + 7])).astype(np.float32)
     nets = []
     for net, steps in ((0, args.steps), (1, args.steps // 3)):
         mine = rows[:, f + 1] == net
@@ -178,10 +178,13 @@ def main() -> None:
             fit(sign_network, first, sign_rows[mine][:, :11], sign_rows[mine, 12].astype(np.float32), plain, 900, rng)
         )
     arrays = integers(nets, signs) | tables()
-    arrays["centres"] = np.rint(256 * parts[0][2])
     arrays["mean_tree"] = mean_tree(np.concatenate([pool[n].mean((1, 2)) for n in ("tp80", "tp140", "tp112")]))
+    kept = read_arrays(args.order.read_bytes()) if args.order else {}
     for name, shape, _ in ARRAYS:
-        arrays.setdefault(name, np.zeros(shape))  # the enhancer is trained later and does nothing until then
+        arrays.setdefault(name, kept.get(name, np.zeros(shape)))  # an enhancer of zeros does nothing
+    arrays["centres"] = order.centres
+    whole = model_of({name: np.asarray(array, np.int32) for name, array in arrays.items()})
+    arrays["centres"] = measure_centres(whole, pool["tp80"][-500:], rng)
     write_model(args.out, arrays)
 
 

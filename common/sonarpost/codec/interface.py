@@ -165,6 +165,32 @@ class Codec(Protocol):
         """
 
 
+def arrived_body(
+    stream: bytes, received: Mask | None, codec_id: int, name: str
+) -> tuple[StreamHeader, bytes, list[str]]:
+    """Return a stream's header, its body up to the first byte that did not arrive, and notes.
+
+    Shared by the codecs that cannot decode anything behind a gap.
+
+    Raises:
+        StreamError: The header is wrong, the stream is another codec's, or `received` has not one bool for each
+            body byte.
+    """
+    header = StreamHeader.unpack(stream)
+    if header.codec_id != codec_id:
+        raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", f"{codec_id:#04x} ({name})")
+    body = stream[header.size :]
+    if received is None:
+        return header, body, []
+    if received.shape != (len(body),) or received.dtype != np.bool_:
+        met = f"{received.dtype} {received.shape}"
+        raise StreamError("stream", "received", met, f"bool ({len(body)},), one for each body byte")
+    gaps = np.flatnonzero(~received)
+    if not len(gaps):
+        return header, body, []
+    return header, body[: gaps[0]], [f"body byte {gaps[0]} of {len(body)} did not arrive; what follows it is not used"]
+
+
 def model_tag(codec_id: int, model_hash: str) -> int:
     """Return the tag of a model hash that streams of a codec carry; 0 for codecs without a model."""
     return int(model_hash[: 2 * tag_length(codec_id)] or "0", 16)

@@ -26,8 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image as Pillow
 
-from sonarpost.codec.huffman import arrived_body
-from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, check_image, to_uint8
+from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, arrived_body, check_image, to_uint8
 from sonarpost.errors import ConfigError, StreamError
 
 RAW_CODEC_ID = 0x02

@@ -4,9 +4,10 @@ Each is there where the installed Pillow offers it: WebP and AVIF in its usual w
 `pillow-jxl-plugin`. They are made for pictures of many kilobytes. With a budget, the best quality that fits is sent; on
 textured snippets even the lowest takes some hundred bytes, and a smaller budget is refused.
 
-The body of `avif` and `jpegxl` is the file or codestream as the library writes it. Of `webp` it is the VP8 key frame
-less its start code and size, which the decoder knows (RFC 6386, section 9.1); with the RIFF container that saves 27
-bytes.
+The body of `jpegxl` is the codestream as the library writes it. Of `webp` it is the VP8 key frame less its start code
+and size, which the decoder knows (RFC 6386, section 9.1); with the RIFF container that saves 27 bytes. Of `avif` it is
+the AV1 sequence header and frame without the file around them, which saves 271 (`avif_file`); a body that is a whole
+file, as earlier releases sent it, is read too.
 
 Libraries make room for a picture when they read its size, so the size is compared with the stream header's first.
 None of the three decodes in part: what is cut is refused.
@@ -25,8 +26,8 @@ import numpy.typing as npt
 from PIL import Image as Pillow
 from PIL import features
 
-from sonarpost.codec.huffman import arrived_body
-from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, check_image, to_uint8
+from sonarpost.codec.avif_file import avif_file, check_frame, frame_of
+from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, arrived_body, check_image, to_uint8
 from sonarpost.errors import ConfigError, StreamError
 
 NATURAL_QUALITY = 30
@@ -170,6 +171,7 @@ def _encode(wanted: ModernFormat, grey: Image, quality: int) -> bytes:
             return _key_frame(file.getvalue(), grey.shape)
         case ModernFormat.AVIF:
             picture.save(file, "AVIF", quality=quality, subsampling="4:0:0", speed=4, max_threads=1)
+            return frame_of(file.getvalue(), grey.shape)
         case ModernFormat.JPEGXL:
             importlib.import_module("pillow_jxl")
             picture.save(file, "JXL", quality=quality, effort=7, num_threads=0)
@@ -185,6 +187,8 @@ def _decode(wanted: ModernFormat, body: bytes, shape: tuple[int, ...]) -> Image:
     file = body
     if wanted is ModernFormat.WEBP:
         file = _webp_file(body, shape)
+    elif wanted is ModernFormat.AVIF:
+        file = _avif_file(body, shape)
     elif wanted is ModernFormat.JPEGXL:
         importlib.import_module("pillow_jxl")
         _check_size(wanted, jpegxl_size(body), shape)
@@ -228,6 +232,22 @@ def _webp_file(body: bytes, shape: tuple[int, ...]) -> bytes:
     frame = body[:_KEY_FRAME_TAG] + _START_CODE + _vp8_size(shape) + body[_KEY_FRAME_TAG:]
     chunk = b"WEBPVP8 " + len(frame).to_bytes(4, "little") + frame
     return b"RIFF" + len(chunk).to_bytes(4, "little") + chunk
+
+
+def _avif_file(body: bytes, shape: tuple[int, ...]) -> bytes:
+    """Return the AVIF file around a body, or the body if it is one already.
+
+    Raises:
+        StreamError: It is neither, or a picture of another size.
+    """
+    frame = body
+    if body[4:8] == b"ftyp":
+        try:
+            frame = frame_of(body, shape)
+        except ConfigError as error:
+            raise StreamError("avif body", "file or its size", body[:32], f"a grey still of {shape}") from error
+    check_frame(frame, shape)
+    return avif_file(frame, shape)
 
 
 def jpegxl_size(codestream: bytes) -> tuple[int, int]:

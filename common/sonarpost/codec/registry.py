@@ -15,7 +15,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
 from sonarpost.codec.huffman import HuffmanCodec
-from sonarpost.codec.interface import Codec, StreamHeader
+from sonarpost.codec.interface import Codec, StreamHeader, tag_length
 from sonarpost.codec.jpeg2000 import Jpeg2000Codec
 from sonarpost.codec.modern import ModernCodec, ModernFormat
 from sonarpost.codec.spiht import SpihtCodec
@@ -24,6 +24,7 @@ from sonarpost.codec.vq import IndexPacking, VqCodec
 from sonarpost.errors import ConfigError, StreamError
 
 ENTRY_POINT_GROUP = "sonarpost.codecs"
+CATALOGUE_TAG_BYTES = 2
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class CodecSpec:
         codec_ids: Every id its streams may carry.
         create: Makes the codec; raises ConfigError where a resource it needs is absent.
         summary: One line for people.
-        needs_tiles: Whether `create` needs a tile database.
+        needs_tiles: Whether `create` needs a tile database. A receiver finds it by the two bytes of its identity that a
+            stream carries, so all ids must be of the class that carries two (`interface.tag_length`).
     """
 
     name: str
@@ -125,7 +127,8 @@ class CodecRegistry:
         """Add a codec.
 
         Raises:
-            ConfigError: Its name or one of its ids is taken, is outside 0..255, or it has no id.
+            ConfigError: Its name or one of its ids is taken, is outside 0..255, or it has no id; or it needs tiles and
+                streams with one of its ids could not say which.
         """
         where = f"codec {spec.name}"
         if spec.name in self._by_name:
@@ -135,6 +138,9 @@ class CodecRegistry:
         for codec_id in spec.codec_ids:
             if not 0 <= codec_id <= 0xFF:
                 raise ConfigError(where, "codec_ids", codec_id, "0..255")
+            if spec.needs_tiles and tag_length(codec_id) != CATALOGUE_TAG_BYTES:
+                expected = "0x10..0x1f or 0x80..0xff, whose streams say in two bytes which catalogue they need"
+                raise ConfigError(where, "codec_ids", f"{codec_id:#04x}", expected)
             if codec_id in self._by_id:
                 taken = self._by_id[codec_id].name
                 raise ConfigError(where, "codec_ids", f"{codec_id:#04x}", f"an id that is not taken (it is {taken}'s)")

@@ -30,9 +30,10 @@ class State:
     seen: I32 = field(init=False)
     signed: I32 = field(init=False)
     marks: I32 = field(init=False)
+    odds: I32 = field(init=False)
 
     def __post_init__(self) -> None:
-        for name in ("values", "widths", "signs", "seen", "signed", "marks"):
+        for name in ("values", "widths", "signs", "seen", "signed", "marks", "odds"):
             setattr(self, name, np.zeros(self.lay.cells, np.int32))
 
 

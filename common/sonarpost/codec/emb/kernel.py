@@ -14,10 +14,12 @@ import numpy.typing as npt
 from sonarpost.codec.emb._jit import compiled
 from sonarpost.codec.emb.layout import (
     CHILD,
+    COUSIN_1,
     HEIGHT,
     LEVEL,
     LL,
     LOW,
+    NEXT_1,
     OFFSET,
     ORIENT,
     PARENT,
@@ -33,11 +35,11 @@ I16 = npt.NDArray[np.int16]
 U8 = npt.NDArray[np.uint8]
 
 WRITE, READ, LIST = 0, 1, 2
-NEAR, REFINE, FAR = 0, 1, 2
-"""Passes: coefficients with something significant around them; those that are significant; the rest."""
+NEAR, REFINE, ALL = 0, 1, 2
+"""Kinds of pass: coefficients with something significant around them; those that are significant; all that are not."""
 
-FEATURES: Final = 44
-BAND_FEATURES: Final = 34
+FEATURES: Final = 50
+BAND_FEATURES: Final = 40
 """Features from this one on are the same for a whole band."""
 SIGN_FEATURES: Final = 14
 HIDDEN_1: Final = 32
@@ -47,6 +49,14 @@ CAP: Final = 48
 """Largest magnitude that a context shows: 6 thresholds, in eighths."""
 LOGIT_LIMIT: Final = 3071
 """Logits are 1/256; the table of probabilities runs from -LOGIT_LIMIT to LOGIT_LIMIT."""
+CENTRE_COLUMNS: Final = 24
+"""Columns of the table of centres: logits from -9 up, in halves."""
+_CENTRE_SHIFT: Final = 2304
+_LIVE_LIMIT: Final = 1 << 34
+# A coefficient whose logit was so far below a pass's least when last looked at is not looked at again in that pass:
+# one that this plane has looked at already, and one that it has not (its chance grows as the threshold is halved).
+_SKIP_NEAR: Final = 384
+_SKIP_FAR: Final = 896
 
 # The coder's state.
 CODER_LOW, CODER_RANGE, CODER_LENGTH, CODER_CODE, CODER_UNSURE, CODER_AT, CODER_STOP, CODER_EVENTS = range(8)
@@ -231,7 +241,7 @@ def _is_near(seen: I32, bands: I32, row: int, y: int, x: int, at: int) -> bool:
 
 
 @compiled
-def _context(  # noqa: PLR0915  a list of 34 features, one after the other
+def _context(  # noqa: C901, PLR0912, PLR0915  a list of 40 features, one after the other
     f: I32, seen: I32, lows: I32, bands: I32, low_width: int, threshold: int, row: int, y: int, x: int, at: int
 ) -> None:
     """Fill in the features of one coefficient; those of its band stand already at the end."""
@@ -274,6 +284,16 @@ def _context(  # noqa: PLR0915  a list of 34 features, one after the other
         if sibling >= 0:
             cell = bands[sibling, OFFSET] + y * bands[sibling, STRIDE] + x
             f[22 + 2 * k], f[23 + 2 * k] = seen[cell], _box(seen, cell, bands[sibling, STRIDE]) >> 1
+        following = bands[row, NEXT_1 + k]
+        if following >= 0:
+            cell = _relative(bands, following, y, x)
+            if cell >= 0:
+                f[34 + 2 * k], f[35 + 2 * k] = seen[cell], _box(seen, cell, bands[following, STRIDE]) >> 1
+        cousin = bands[row, COUSIN_1 + k]
+        if cousin >= 0:
+            cell = _relative(bands, cousin, y >> 1, x >> 1)
+            if cell >= 0:
+                f[38 + k] = (seen[cell] + _box(seen, cell, bands[cousin, STRIDE])) >> 1
     child = bands[row, CHILD]
     if child >= 0:
         cell = bands[child, OFFSET] + 2 * y * bands[child, STRIDE] + 2 * x
@@ -294,8 +314,8 @@ def _context(  # noqa: PLR0915  a list of 34 features, one after the other
 
 
 @compiled
-def _logit(f: I32, base: I32, w1: I32, w2: I32, b2: I32, w3: I32, b3: int, h1: I32, h2: I32) -> int:
-    """Run the network: features, two hidden layers, one output in 1/256."""
+def _logit(f: I32, base: I32, w1: I32, w2: I32, b2: I32, live: I64, h1: I32, h2: I32) -> int:
+    """Run the network: features, two hidden layers, one output in 1/256. Leaves the last hidden layer in `h2`."""
     for j in range(h1.shape[0]):
         h1[j] = base[j]
     for i in range(BAND_FEATURES):
@@ -310,10 +330,23 @@ def _logit(f: I32, base: I32, w1: I32, w2: I32, b2: I32, w3: I32, b3: int, h1: I
         if value != 0:
             for j in range(h2.shape[0]):
                 h2[j] += value * w2[i, j]
-    total = np.int64(b3)
+    total = np.int64(live[HIDDEN_2]) * 256
     for i in range(h2.shape[0]):
-        total += np.int64(min(max(h2[i] >> 12, 0), 4095)) * w3[i]
-    return _clip(int(total >> 12), LOGIT_LIMIT)
+        h2[i] = min(max(h2[i] >> 12, 0), 4095)
+        total += np.int64(h2[i]) * live[i]
+    return _clip(int(total >> 28), LOGIT_LIMIT)
+
+
+@compiled
+def _learn(live: I64, h2: I32, bit: int, chance: int) -> None:
+    """Move the last layer's weights down the gradient of the decision's code length, at a rate of 1/256.
+
+    In units: the error is 1/2^16, hidden units 1/2^8, weights 1/2^28.
+    """
+    error = np.int64((bit << 16) - chance)
+    for i in range(h2.shape[0]):
+        live[i] = min(max(live[i] + ((error * h2[i]) >> 4), -_LIVE_LIMIT), _LIVE_LIMIT)
+    live[HIDDEN_2] = min(max(live[HIDDEN_2] + (error << 4), -_LIVE_LIMIT), _LIVE_LIMIT)
 
 
 @compiled
@@ -374,6 +407,21 @@ def _sign_logit(f: I32, base: I32, w1: I32, w2: I32, orient: int) -> int:
 
 
 @compiled
+def _guess(value: int, width: int, odds: int, centres: I32) -> int:
+    """Mean magnitude of significant coefficients that were as likely: the unlikely lie low in their interval."""
+    size = min(value // width, 4) - 1
+    column = min(max((odds + _CENTRE_SHIFT) >> 7, 0), CENTRE_COLUMNS - 1)
+    return int(value + (width * centres[size, column] >> 8))
+
+
+@compiled
+def most_likely(values: I32, widths: I32, signs: I32, odds: I32, centres: I32, out: I32) -> None:
+    """Write the mean value of every coefficient, as far as it is known."""
+    for at in range(values.shape[0]):
+        out[at] = signs[at] * _guess(values[at], widths[at], odds[at], centres) if values[at] > 0 else 0
+
+
+@compiled
 def refresh(values: I32, widths: I32, signs: I32, seen: I32, signed: I32, threshold: int) -> None:
     """Express what is known of every coefficient in thresholds."""
     for at in range(values.shape[0]):
@@ -418,13 +466,14 @@ def _transfer(mode: int, bit: int, logit: int, chances: I32, costs: I32, coder: 
 
 
 @compiled
-def _is_worth(magnitude: int, threshold: int, logit: int, costs: I32, gains: I32, price: int) -> bool:
+def _is_worth(magnitude: int, threshold: int, guess: int, cost: int, price: int) -> bool:
     """Whether making a coefficient significant takes away enough error for its bits (its sign costs one more)."""
-    return bool(gains[min(magnitude * 16 // threshold, 31)] >= (price * (costs[logit + LOGIT_LIMIT] + 256)) >> 8)
+    size, shown = magnitude * 16 // threshold, guess * 16 // threshold
+    return bool(shown * (2 * size - shown) >= (price * (cost + 256)) >> 8)
 
 
 @compiled
-def code_band(  # noqa: C901, PLR0912  three modes and three passes share one loop, so that they cannot part
+def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes share one loop, so that they cannot part
     mode: int,
     kind: int,
     plane: int,
@@ -432,13 +481,14 @@ def code_band(  # noqa: C901, PLR0912  three modes and three passes share one lo
     row: int,
     low_width: int,
     price: int,
+    bar: int,
     bands: I32,
     targets: I32,
     lows: I32,
     f: I32,
     bases: I32,
-    known: tuple[I32, I32, I32, I32, I32, I32],
-    nets: tuple[I32, I32, I32, I32, I32],
+    known: tuple[I32, I32, I32, I32, I32, I32, I32],
+    nets: tuple[I32, I32, I32, I64],
     sign_nets: tuple[I32, I32, I32],
     tables: tuple[I32, I32, I32],
     stream: tuple[I64, U8, U8, I64],
@@ -448,31 +498,34 @@ def code_band(  # noqa: C901, PLR0912  three modes and three passes share one lo
 
     Args:
         mode: WRITE, READ or LIST.
-        kind: NEAR, REFINE or FAR.
+        kind: NEAR, REFINE or ALL.
         plane: Number of the plane, from 1.
         threshold: Of the plane, in coefficient units.
         row: The band's row in `bands`.
         low_width: Width of the low-pass picture of the band's level.
         price: Least error that a bit must take away to be spent on significance (WRITE), in 1/256 of the squared
             threshold; 0 to spend all.
+        bar: Least logit that the pass takes.
         bands: The band table.
         targets: The true coefficients (WRITE, LIST), flat.
         lows: Low-pass pictures known so far.
         f: Features; those from BAND_FEATURES on are filled in.
         bases: Shape (2, HIDDEN_1): first-layer sums that are the band's; first axis as in `nets`.
         known: Lower bounds of the magnitudes, 0 where not significant; how far above the magnitude may lie; signs;
-            magnitudes in eighths of the threshold, at most CAP; the same with sign; the plane that decided last.
-        nets: Weights w1, w2, b2, w3, b3; first axis 0 for significance and 1 for refinement.
+            magnitudes in eighths of the threshold, at most CAP; the same with sign; the plane that decided last, or
+            minus the plane that looked last; the logit of the last decision or look.
+        nets: Weights w1, w2, b2, and the last layer's w3 and b3 as they have been learned in this picture, 1/2^28
+            (see `_learn`); first axis 0 for significance and 1 for refinement.
         sign_nets: Weights w1, b1, w2; first axis the band's orientation.
-        tables: By logit + LOGIT_LIMIT: probability of 1 in 1/65536, and bits of a 1 in 1/256. And the error that
-            significance takes away, in 1/256 of the squared threshold, by magnitude in 1/16 thresholds.
+        tables: By logit + LOGIT_LIMIT: probability of 1 in 1/65536, and bits of a 1 in 1/256. And where in its
+            interval a coefficient lies, in 1/256, see `_guess`.
         stream: The range coder's state, the bytes, the best whole stream so far (WRITE), squared error by bytes.
         lists: Examples of decisions and of signs (LIST).
     """
-    values, widths, signs, seen, signed, marks = known
-    w1, w2, b2, w3, b3 = nets
+    values, widths, signs, seen, signed, marks, odds = known
+    w1, w2, b2, live = nets
     sign_w1, sign_b1, sign_w2 = sign_nets
-    chances, costs, gains = tables
+    chances, costs, centres = tables
     coder, data, good, curve = stream
     stride, orient, level = bands[row, STRIDE], bands[row, ORIENT], bands[row, LEVEL]
     h1, h2, fs = np.zeros(HIDDEN_1, np.int32), np.zeros(HIDDEN_2, np.int32), np.zeros(SIGN_FEATURES, np.int32)
@@ -483,22 +536,31 @@ def code_band(  # noqa: C901, PLR0912  three modes and three passes share one lo
             at = bands[row, OFFSET] + y * stride + x
             if marks[at] == plane or (values[at] > 0) != (kind == REFINE):
                 continue
-            if kind == NEAR and not _is_near(seen, bands, row, y, x, at):
+            near = kind == REFINE or _is_near(seen, bands, row, y, x, at)
+            if kind == NEAR and not near:
                 continue
-            marks[at] = plane
-            _context(f, seen, lows, bands, low_width, threshold, row, y, x, at)
+            if kind == ALL and odds[at] < bar - (_SKIP_NEAR if marks[at] == -plane else _SKIP_FAR):
+                continue
             magnitude = abs(targets[at])
             bit = 1 if magnitude >= values[at] + threshold else 0
+            _context(f, seen, lows, bands, low_width, threshold, row, y, x, at)
+            logit = _logit(f, bases[net], w1[net], w2[net], b2[net], live[net], h1, h2)
+            if logit < bar:
+                marks[at], odds[at] = -plane, logit
+                continue
+            marks[at] = plane
             if mode == LIST:
-                _list_decision(lists[0], coder, f, bit, net, share if kind == FAR else 1)
+                _list_decision(lists[0], coder, f, bit, net, 1 if near else share)
             else:
-                logit = _logit(f, bases[net], w1[net], w2[net], b2[net], w3[net], b3[net], h1, h2)
                 if mode == WRITE and bit and kind != REFINE:
-                    bit = 1 if _is_worth(magnitude, threshold, logit, costs, gains, price) else 0
+                    guess = _guess(threshold, threshold, logit, centres)
+                    bit = 1 if _is_worth(magnitude, threshold, guess, costs[logit + LOGIT_LIMIT], price) else 0
                 bit = _transfer(mode, bit, logit, chances, costs, coder, data, good)
                 if bit < 0:
                     return -1
-            before = values[at] + (widths[at] * 7 >> 4)
+                _learn(live[net], h2, bit, chances[logit + LOGIT_LIMIT])
+            before = _guess(values[at], widths[at], odds[at], centres) if values[at] > 0 else 0
+            odds[at] = logit
             if kind == REFINE:
                 values[at] += threshold * bit
                 widths[at] = threshold
@@ -508,15 +570,15 @@ def code_band(  # noqa: C901, PLR0912  three modes and three passes share one lo
                 if mode == LIST:
                     _list_sign(lists[1], coder, fs, orient, sign, level)
                 else:
-                    logit = _sign_logit(fs, sign_b1[orient], sign_w1, sign_w2, orient)
-                    sign = _transfer(mode, sign, logit, chances, costs, coder, data, good)
+                    slope = _sign_logit(fs, sign_b1[orient], sign_w1, sign_w2, orient)
+                    sign = _transfer(mode, sign, slope, chances, costs, coder, data, good)
                     if sign < 0:
                         return -1
                 values[at], widths[at], signs[at] = threshold, threshold, 2 * sign - 1
             if values[at] > 0:
                 seen[at] = min((values[at] + (widths[at] >> 1)) * 8 // threshold, CAP)
                 signed[at] = seen[at] * signs[at]
-                after = values[at] + (widths[at] * 7 >> 4)
+                after = _guess(values[at], widths[at], odds[at], centres)
                 curve[0] += np.int64(magnitude - after) ** 2 - np.int64(magnitude - before) ** 2
             if mode == WRITE:
                 curve[min(1 + (coder[CODER_COST] >> 11), curve.shape[0] - 1)] = curve[0]

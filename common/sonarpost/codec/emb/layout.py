@@ -20,7 +20,23 @@ BORDER: Final = 2
 LL, HL, LH, HH = 0, 1, 2, 3
 
 # Columns of the band table.
-OFFSET, STRIDE, HEIGHT, WIDTH, LEVEL, ORIENT, PARENT, SIBLING_1, SIBLING_2, CHILD, LOW = range(11)
+(
+    OFFSET,
+    STRIDE,
+    HEIGHT,
+    WIDTH,
+    LEVEL,
+    ORIENT,
+    PARENT,
+    SIBLING_1,
+    SIBLING_2,
+    CHILD,
+    LOW,
+    NEXT_1,
+    NEXT_2,
+    COUSIN_1,
+    COUSIN_2,
+) = range(15)
 """OFFSET: flat index of the band's cell (0, 0). LEVEL: 1 is the finest. PARENT, SIBLING_1, SIBLING_2, CHILD: rows of
 the table, -1 for none; a sibling is a band of the same level that is coded earlier. LOW: where the level's low-pass
 picture begins in the array of low-pass pictures."""
@@ -87,8 +103,11 @@ def layout(height_px: int, width_px: int) -> Layout:
         child = -1 if orient == LL or level == 1 else number + 3
         first = -1 if orient in (LL, HL) else number - (orient - 1)
         second = number - 1 if orient == HH else -1
+        following = (-1, -1) if orient == LL else ((number + 1, number + 2), (number + 1, -1), (-1, -1))[orient - 1]
+        cousins = (-1, -1) if parent < 0 else tuple(parent - orient + o for o in (HL, LH, HH) if o != orient)
+        low = int(low_offsets[level])
         table.append(
-            (offset, stride, rows, columns, level, orient, parent, first, second, child, int(low_offsets[level]))
+            (offset, stride, rows, columns, level, orient, parent, first, second, child, low, *following, *cousins)
         )
         position[top : top + rows, left : left + columns] = (
             offset + np.arange(rows)[:, None] * stride + np.arange(columns)

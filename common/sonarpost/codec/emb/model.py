@@ -23,7 +23,7 @@ MAGIC = b"SPEMB1\n"
 
 CHANNELS: Final = 24
 GLOBALS: Final = 3
-LAYERS: Final = ((4, CHANNELS), (CHANNELS, CHANNELS), (CHANNELS, CHANNELS), (CHANNELS, 4))
+LAYERS: Final = ((4, CHANNELS), *((CHANNELS, CHANNELS),) * 2, (CHANNELS, 4))
 """Channels in and out of the enhancer's layers."""
 
 # Name, shape and type in the file, in order.
@@ -39,8 +39,7 @@ ARRAYS: tuple[tuple[str, tuple[int, ...], str], ...] = (
     ("sign_w2", (4, k.SIGN_HIDDEN), "<i2"),
     ("chances", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
     ("costs", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
-    ("centres", (5,), "<i2"),
-    ("gains", (32,), "<i2"),
+    ("centres", (4, k.CENTRE_COLUMNS), "<i2"),
     ("mean_tree", (64,), "<u2"),
     ("situation", (GLOBALS, CHANNELS), "<i4"),
     *(
@@ -57,7 +56,8 @@ class Model:
 
     Attributes:
         identity: Hex sha256 of the file.
-        centres: Where in its interval a coefficient most likely lies, in 1/256, by lower bound / width (0..4).
+        centres: Where in its interval a coefficient lies on the mean, in 1/256; by lower bound / width (1..4) and the
+            logit of its last decision.
         mean_tree: Probability of 1 of each decision of the mean level, by node of the binary tree.
         situation: Shape (GLOBALS, CHANNELS): the enhancer's weights of the whole picture's features.
         layers: Taps (9, in, out) and bias (out,) of the enhancer's layers.
@@ -76,7 +76,6 @@ class Model:
     chances: I32
     costs: I32
     centres: I32
-    gains: I32
     mean_tree: I32
     situation: I32
     layers: tuple[tuple[I32, I32], ...]

@@ -21,6 +21,11 @@ I64 = npt.NDArray[np.int64]
 # 2^10 so that halving them ten times is exact.
 STEPS: Final = tuple(round(2880 * 64 / 1024 * 2 ** (-i / 8)) * 1024 for i in range(8))
 PLANES: Final = 10
+NO_BAR: Final = -kernel.LOGIT_LIMIT - 1
+PASSES: Final = ((kernel.NEAR, -560), (kernel.ALL, -930), (kernel.REFINE, NO_BAR), (kernel.ALL, NO_BAR))
+"""Passes of a plane, and the least logit of significance (1/256) that each takes: a bit spent on a likely coefficient
+takes away more error, so those come first. A refinement is worth about as much as significance with a chance of
+1/40."""
 _FIRST_PLANE: Final = {1: 3, 2: 2, 3: 1}
 """Plane from which a level is coded; its coefficients are hardly ever larger than twice that threshold, and those that
 are count as that large."""
@@ -43,9 +48,9 @@ def code_planes(
     lay, mean = state.lay, side.mean
     features = np.zeros(kernel.FEATURES, np.int32)
     base = np.zeros((2, kernel.HIDDEN_1), np.int32)
-    known = (state.values, state.widths, state.signs, state.seen, state.signed, state.marks)
-    nets = (model.w1, model.w2, model.b2, model.w3, model.b3)
-    sign_nets, tables = (model.sign_w1, model.sign_b1, model.sign_w2), (model.chances, model.costs, model.gains)
+    known = (state.values, state.widths, state.signs, state.seen, state.signed, state.marks, state.odds)
+    nets = (model.w1, model.w2, model.b2, _last_layer(model))
+    sign_nets, tables = (model.sign_w1, model.sign_b1, model.sign_w2), (model.chances, model.costs, model.centres)
     stream, lists = (coder.words, coder.data, coder.good, coder.curve), (coder.rows, coder.sign_rows)
     for plane in range(-side.extra, planes):
         threshold = (STEPS[side.step] << side.extra) >> (plane + side.extra)
@@ -54,11 +59,9 @@ def code_planes(
         rows = [i for i, band in enumerate(lay.bands) if plane >= _FIRST_PLANE.get(int(band[LEVEL]), -side.extra)]
         finest = min(int(lay.bands[i][LEVEL]) for i in rows)
         lows = low_pictures(state, model, side, finest)
-        for kind in (kernel.NEAR, kernel.REFINE, kernel.FAR):
+        for kind, bar in PASSES:
             for row in rows:
                 band = lay.bands[row]
-                if kind == kernel.FAR and row < 4:
-                    continue  # coarse bands are all near
                 if row == 1 and kind != kernel.REFINE:
                     lows = low_pictures(state, model, side, finest)
                 _band_features(features, band, threshold, mean, _density(state, band))
@@ -66,11 +69,16 @@ def code_planes(
                     kernel.band_base(features, model.w1[net], model.b1[net], base[net])
                 low_width = int(lay.sides[band[LEVEL], 1])
                 end = kernel.code_band(
-                    coder.mode, kind, number, threshold, row, low_width, price, lay.bands, targets, lows,
+                    coder.mode, kind, number, threshold, row, low_width, price, bar, lay.bands, targets, lows,
                     features, base, known, nets, sign_nets, tables, stream, lists,
                 )  # fmt: skip
                 if end < 0:
                     return
+
+
+def _last_layer(model: Model) -> I64:
+    """The last layer's weights and bias, 1/2^28: what the kernel goes on learning."""
+    return np.concatenate([model.w3.astype(np.int64) << 16, model.b3[:, None].astype(np.int64) << 8], 1)
 
 
 def extra_planes(targets: I32, step: int) -> int:
@@ -98,14 +106,15 @@ def _log2_eighths(value: int) -> int:
 
 def _band_features(features: I32, band: I32, threshold: int, mean: int, density: int) -> None:
     level, orient = int(band[LEVEL]), int(band[ORIENT])
-    features[34:] = 0
+    here = features[kernel.BAND_FEATURES :]
+    here[:] = 0
     if orient != LL:
-        features[33 + min(level, 4)] = 32
-    for column, kind in ((38, HL), (39, LH), (40, HH)):
-        features[column] = 32 if orient == kind else 0
-    features[41] = min(_log2_eighths(threshold) - 104, 36)
-    features[42] = _log2_eighths(max(mean, 4)) - 48
-    features[43] = density
+        here[min(level, 4) - 1] = 32
+    for column, kind in ((4, HL), (5, LH), (6, HH)):
+        here[column] = 32 if orient == kind else 0
+    here[7] = min(_log2_eighths(threshold) - 104, 36)
+    here[8] = _log2_eighths(max(mean, 4)) - 48
+    here[9] = density
 
 
 def low_pictures(state: State, model: Model, side: Side, down_to: int) -> I32:
@@ -121,9 +130,8 @@ def low_pictures(state: State, model: Model, side: Side, down_to: int) -> I32:
 
 def known_plane(state: State, model: Model, box: Box | None = None) -> I64:
     """Most likely value of every coefficient, in the transform's square layout."""
-    size = np.minimum(state.values // np.maximum(state.widths, 1), 4)
-    centre = model.centres[size]
-    flat = state.signs * (state.values + ((state.widths * centre) >> 8))
+    flat = np.zeros(state.lay.cells, np.int32)
+    kernel.most_likely(state.values, state.widths, state.signs, state.odds, model.centres, flat)
     if box is not None:
         flat = (flat * OUTSIDE // weights(state.lay, box)).astype(np.int32)
     return transform.from_flat(flat, state.lay)

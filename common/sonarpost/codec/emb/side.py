@@ -12,6 +12,7 @@ from sonarpost.errors import StreamError
 MEAN_STEP: Final = 4
 GRAIN_BANDS: Final = 8
 _RARE: Final = 1024  # chance of 1, in 1/65536, of a flag that is seldom set
+_ODD_STEP: Final = 4096  # chance of an odd start step, in 1/65536: the encoder usually tries the even ones
 SIXTEENTHS: Final = 16
 MAX_EXTRA: Final = 6
 
@@ -95,10 +96,11 @@ def read_side(coder: Coder, model: Model) -> Side:
 
 
 def _code(coder: Coder, model: Model, side: Side | None) -> Side:
-    mean_index = step = -1
+    mean_index = -1
     try:
         mean_index = _mean(coder, model, side.mean_index if side else 0)
-        found = _number(coder, 3, side.step if side else 0)
+        step = side.step if side else 0
+        found = 2 * _number(coder, 2, step >> 1) + _bit(coder, step & 1, _ODD_STEP)
         extra = 0
         while extra < MAX_EXTRA and _bit(coder, int(side is not None and extra < side.extra), _RARE):
             extra += 1
@@ -111,10 +113,9 @@ def _code(coder: Coder, model: Model, side: Side | None) -> Side:
         if _bit(coder, int(side is not None and side.grain is not None), _RARE):
             given = side.grain if side and side.grain else (0,) * GRAIN_BANDS
             grain = tuple(_number(coder, 4, n) for n in given)
-        step = found
-        return Side(mean_index, step, box, grain, extra)
+        return Side(mean_index, found, box, grain, extra)
     except _EndOfStreamError:
-        return Side(mean_index, step)
+        return Side(mean_index, -1)
 
 
 def _bit(coder: Coder, bit: int, chance: int = 32768) -> int:

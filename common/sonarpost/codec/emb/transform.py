@@ -230,6 +230,15 @@ def to_flat(plane: Plane, lay: Layout) -> npt.NDArray[np.int32]:
 
 def from_flat(flat: npt.NDArray[np.int32], lay: Layout) -> Plane:
     """Undo `to_flat`."""
-    strengths = _strength_map(lay)
-    plain = (flat.astype(np.int64) * 1024 + (strengths >> 1)) // strengths
-    return plain[lay.position]
+    out = np.zeros(lay.position.shape, np.int64)
+    _place(flat, _strength_map(lay), lay.position, out)
+    return out
+
+
+@compiled
+def _place(flat: npt.NDArray[np.int32], strengths: Plane, position: Plane, out: Plane) -> None:
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            at = position[y, x]
+            value = np.int64(flat[at])
+            out[y, x] = (value * 1024 + (strengths[at] >> 1)) // strengths[at] if value != 0 else 0

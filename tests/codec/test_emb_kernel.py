@@ -1,0 +1,132 @@
+"""The compiled coding loop's parts against plain arithmetic written here a second time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sonarpost.codec.emb import kernel
+from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.codec.emb.coder import State
+from sonarpost.codec.emb.layout import COUSIN_1, HEIGHT, LEVEL, LL, NEXT_1, ORIENT, PARENT, SIBLING_1, WIDTH, layout
+from sonarpost.codec.emb.model import shipped
+from sonarpost.codec.emb.planes import PASSES, known_plane
+from sonarpost.codec.emb.transform import STRENGTHS
+
+MODEL = shipped()
+
+
+def picture(seed: int = 5) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    image = rng.integers(30, 120, (48, 64))
+    image[16:24, 16:32] += 100
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def plain_logit(features: list[int], net: int, last: list[int]) -> tuple[int, list[int]]:
+    """The network in Python's whole numbers, which have no limit: shows that no sum of the compiled one wraps."""
+    w1, b1, w2, b2 = (getattr(MODEL, name)[net].tolist() for name in ("w1", "b1", "w2", "b2"))
+    first = [b1[j] + sum(f * w1[i][j] for i, f in enumerate(features)) for j in range(kernel.HIDDEN_1)]
+    first = [min(max(v >> 6, 0), 4095) for v in first]
+    second = [b2[j] + sum(v * w2[i][j] for i, v in enumerate(first)) for j in range(kernel.HIDDEN_2)]
+    second = [min(max(v >> 12, 0), 4095) for v in second]
+    total = 256 * last[-1] + sum(v * w for v, w in zip(second, last[:-1], strict=True))
+    return min(max(total >> 28, -kernel.LOGIT_LIMIT), kernel.LOGIT_LIMIT), second
+
+
+@pytest.mark.parametrize("net", [0, 1])
+@pytest.mark.parametrize("reach", [5, 48, 288])
+def test_the_network_and_its_learning_are_the_plain_sums(net: int, reach: int) -> None:
+    rng = np.random.default_rng(reach + net)
+    live = np.concatenate([MODEL.w3[net].astype(np.int64) << 16, [int(MODEL.b3[net]) << 8]])
+    last = live.tolist()
+    h1, h2 = np.zeros(kernel.HIDDEN_1, np.int32), np.zeros(kernel.HIDDEN_2, np.int32)
+    base = np.zeros(kernel.HIDDEN_1, np.int32)
+    moved = []
+    for _ in range(60):
+        f = rng.integers(-reach // 4, reach + 1, kernel.FEATURES).astype(np.int32)
+        kernel.band_base(f, MODEL.w1[net], MODEL.b1[net], base)
+        got = kernel._logit(f, base, MODEL.w1[net], MODEL.w2[net], MODEL.b2[net], live, h1, h2)
+        expected, hidden = plain_logit(f.tolist(), net, last)
+        assert got == expected
+        assert h2.tolist() == hidden
+        bit, chance = int(rng.integers(2)), int(MODEL.chances[got + kernel.LOGIT_LIMIT])
+        kernel._learn(live, h2, bit, chance)
+        error = (bit << 16) - chance
+        steps = [*(error * v >> 4 for v in hidden), error << 4]
+        last = [min(max(w + s, -(1 << 34)), 1 << 34) for w, s in zip(last, steps, strict=True)]
+        assert live.tolist() == last
+        moved.append(max(map(abs, steps)))
+    assert max(moved) > 0
+
+
+def test_learning_makes_what_happened_likelier() -> None:
+    live = np.concatenate([MODEL.w3[0].astype(np.int64) << 16, [int(MODEL.b3[0]) << 8]])
+    h1, h2 = np.zeros(kernel.HIDDEN_1, np.int32), np.zeros(kernel.HIDDEN_2, np.int32)
+    f, base = np.full(kernel.FEATURES, 6, np.int32), np.zeros(kernel.HIDDEN_1, np.int32)
+    kernel.band_base(f, MODEL.w1[0], MODEL.b1[0], base)
+    logits = []
+    for _ in range(40):
+        logits.append(kernel._logit(f, base, MODEL.w1[0], MODEL.w2[0], MODEL.b2[0], live, h1, h2))
+        kernel._learn(live, h2, 1, int(MODEL.chances[logits[-1] + kernel.LOGIT_LIMIT]))
+    assert logits == sorted(logits)
+    assert logits[-1] > logits[0]
+
+
+def test_what_one_picture_taught_does_not_reach_the_next() -> None:
+    """Each stream stands by itself: else a lost picture would spoil all after it."""
+    codec, before = EmbCodec(), (MODEL.w3.copy(), MODEL.b3.copy())
+    first = codec.encode(picture(), 120)
+    codec.decode(codec.encode(picture(9), 300))
+    assert codec.encode(picture(), 120) == first
+    assert np.array_equal(MODEL.w3, before[0])
+    assert np.array_equal(MODEL.b3, before[1])
+
+
+def test_reconstruction_points_follow_table_size_and_chance() -> None:
+    lay = layout(16, 16)
+    state = State(lay)
+    cell = int(lay.bands[2, 0])
+    for size in (1, 2, 3, 4, 9):
+        for odds in (-kernel.LOGIT_LIMIT, -900, -300, 0, kernel.LOGIT_LIMIT):
+            state.values[cell], state.widths[cell], state.signs[cell] = size * 4096, 4096, -1
+            state.odds[cell] = odds
+            column = min(max((odds + 2304) // 128, 0), kernel.CENTRE_COLUMNS - 1)
+            expected = -(size * 4096 + (4096 * int(MODEL.centres[min(size, 4) - 1, column]) >> 8))
+            strength = STRENGTHS[3][int(lay.bands[2, ORIENT])]
+            assert known_plane(state, MODEL)[lay.position == cell] == (expected * 1024 + strength // 2) // strength
+    assert np.all((MODEL.centres > 0) & (MODEL.centres < 160))
+    # The unlikely lie low in their interval.
+    assert MODEL.centres[0, 8] < MODEL.centres[0, 16] - 30
+
+
+def test_the_last_pass_takes_all_that_the_others_left() -> None:
+    kinds, bars = zip(*PASSES, strict=True)
+    assert kinds[-1] == kernel.ALL
+    assert bars[-1] < -kernel.LOGIT_LIMIT
+    assert dict(zip(kinds, bars, strict=True))[kernel.REFINE] < -kernel.LOGIT_LIMIT
+    taken = [bar for kind, bar in PASSES if kind != kernel.REFINE]
+    assert taken == sorted(taken, reverse=True)
+
+
+@pytest.mark.parametrize("size", [(16, 16), (80, 80), (17, 33), (16, 512), (301, 127)])
+def test_bands_know_their_relatives(size: tuple[int, int]) -> None:
+    bands = layout(*size).bands
+    for number, band in enumerate(bands):
+        if band[ORIENT] == LL:
+            assert (band[[NEXT_1, NEXT_1 + 1, COUSIN_1, COUSIN_1 + 1]] == -1).all()
+            continue
+        earlier = {int(n) for n in band[[SIBLING_1, SIBLING_1 + 1]] if n >= 0}
+        later = {int(n) for n in band[[NEXT_1, NEXT_1 + 1]] if n >= 0}
+        same_level = {n for n in range(1, len(bands)) if bands[n, LEVEL] == band[LEVEL]}
+        assert earlier | later | {number} == same_level
+        assert all(n < number for n in earlier)
+        assert all(n > number for n in later)
+        cousins = {int(n) for n in band[[COUSIN_1, COUSIN_1 + 1]] if n >= 0}
+        if band[PARENT] < 0:
+            assert not cousins
+        else:
+            above = {n for n in range(1, len(bands)) if bands[n, LEVEL] == band[LEVEL] + 1}
+            assert cousins | {int(band[PARENT])} == above
+        assert band[HEIGHT] >= 0
+        assert band[WIDTH] >= 0
