@@ -8,7 +8,7 @@ from collections.abc import Callable
 from itertools import count
 
 from sonarpost.modem import nmea
-from sonarpost.modem.events import Event
+from sonarpost.modem.events import Event, FrameHeard
 from sonarpost.modem.micromodem import MicroModem
 from sonarpost.modem.rates import RATES
 from sonarpost.modem.sentences import Cycle
@@ -43,6 +43,7 @@ class FakeModem:
         self.now = 0.0
         self.settings = {"SRC": "0", "CST": "0", "RXP": "0"}
         self.events: list[Event] = []
+        self.frames_heard: list[FrameHeard] = []
         self.heard: list[nmea.Sentence] = []
         self.on_air: list[tuple[bytes, ...]] = []
         self.dead = False
@@ -61,11 +62,16 @@ class FakeModem:
         sentence = nmea.Sentence(kind, tuple(str(f) for f in fields))
         self._seen[kind] += 1
         if not self.dead and kind not in self.silent_kinds and not self.loses(sentence, self._seen[kind]):
-            self.events += self.driver.receive(sentence.encode(), self.now)
+            self._note(self.driver.receive(sentence.encode(), self.now))
 
     def raw(self, data: bytes) -> None:
         """Send any bytes to the driver now."""
-        self.events += self.driver.receive(data, self.now)
+        self._note(self.driver.receive(data, self.now))
+
+    def _note(self, events: list[Event]) -> None:
+        """Keep the events; a frame's first news apart from the packets' story."""
+        self.frames_heard += [event for event in events if isinstance(event, FrameHeard)]
+        self.events += [event for event in events if not isinstance(event, FrameHeard)]
 
     def later(self, delay_s: float, action: Callable[[], None]) -> None:
         heapq.heappush(self._due, (self.now + delay_s, next(self._order), action))
@@ -85,7 +91,7 @@ class FakeModem:
                 heapq.heappop(self._due)[2]()
                 self._take()
             before = self.driver.next_wakeup()
-            self.events += self.driver.poll(self.now)
+            self._note(self.driver.poll(self.now))
             after = self.driver.next_wakeup()
             assert after is None or after > self.now or before != after or self._due, (
                 "the driver asks to be polled for nothing"

@@ -221,11 +221,11 @@ def test_clock_is_set_once_and_confirmed() -> None:
 def test_what_the_driver_does_not_know_is_passed_on() -> None:
     modem = started()
     modem.run(5.0)
-    modem.say("CAMPR", 1, 3, "0.1234")
+    modem.say("CATOA", "120000.1234", 1)
     modem.say("CACFG", "BW", 2)
     modem.raw(b"$CATXF,28*00\r\nnoise\r\n")
     modem.say("CAREV", "000000")
-    assert [event.sentence.kind for event in modem.of(OtherSentence)] == ["CAMPR", "CACFG"]
+    assert [event.sentence.kind for event in modem.of(OtherSentence)] == ["CATOA", "CACFG"]
     assert [event.error.field for event in modem.of(SentenceRejected)] == ["checksum", "", "fields"]
 
 

@@ -26,8 +26,9 @@ from sonarpost.sim.acoustic_world import AcousticWorld, ModemPlace
 from sonarpost.sim.micromodem import Micromodem
 from sonarpost.sim.micromodem_config import ModemConfig, Report
 from sonarpost.sim.serial_pace import SerialPace
+from sonarpost.sim.water_config import WaterConfig
 from sonarpost.sim.water_physics import Position
-from sonarpost.sim.water_records import Transmission, WaterConfig
+from sonarpost.sim.water_records import Transmission
 
 START_UTC_S = datetime(2016, 10, 12, 9, 0, 0, tzinfo=UTC).timestamp()
 RANGE_M = 150.0
@@ -80,13 +81,13 @@ class Bench:
         return [line for line in shown if not line.startswith("CAREV")]
 
 
-def cst(clock: str, rate: int, *, kind: int = 3, frames: int, bad: int = 0, mode: int = 0, version: int = 8) -> str:
+def cst(clock: str, rate: int, *, kind: int = 3, frames: int, bad: int = 0, mode: int = 0) -> str:
     """The statistics of a packet from 1 to 2 at 150 m; the levels follow the range and the first packet's draw."""
     psk = kind == 3
     error = 3 if bad and psk else 0
-    snr = "15.4,12.35,-100,-12.35,-01" if psk else "15.4,-100,-100,-100,195"
-    head = f"CACST,{version},{mode},{clock},00,25072,40,0131,0141,07,00,00,00,00,{rate},001,002"
-    return f"{head},{error},{kind},{frames},{bad},141,{snr},0.00,51,25000,5000,0,-1,-1,00"
+    snr = "15.4,12.41,-100,-12.41,-01" if psk else "15.4,-100,-100,-100,195"
+    head = f"CACST,6,{mode},{clock},05,25158,40,0131,0141,07,00,00,00,00,{rate},001,002"
+    return f"{head},{error},{kind},{frames},{bad},141,{snr},0.00,51,25000,5000"
 
 
 def test_a_whole_cycle_at_rate_1_on_both_sides():
@@ -110,7 +111,7 @@ def test_a_whole_cycle_at_rate_1_on_both_sides():
     bench.advance(7.1)
     assert bench.lines(1) == [
         "CATXF,65",
-        "CAXST,7,20161012,090001.000000,0,0,200,5000,25000,1,1,2,0,3,2,3,65,25000",
+        "CAXST,6,20161012,090001.000000,0,0,200,5000,25000,1,1,2,0,3,2,3,65",
     ]
     bench.advance(7.19)
     assert bench.lines(2) == []
@@ -125,21 +126,201 @@ def test_a_whole_cycle_at_rate_1_on_both_sides():
 
 def test_a_whole_cycle_at_rate_0_has_two_statistics_on_each_side():
     bench = Bench()
-    bench.say(1, ("CCCYC", 0, 1, 2, 0, 0, 1), ("CCTXD", 1, 2, 0, "48656C6C6F"))
-    assert bench.lines(1) == ["CACYC,0,1,2,0,0,1", "CADRQ,090001,1,2,0,32,1", "CATXD,1,2,0,5", "CATXP,5"]
+    bench.say(1, ("CCCYC", 0, 1, 2, 0, 0, 1))
+    assert bench.lines(1) == ["CACYC,0,1,2,0,0,1", "CATXP,0"]
+    bench.say(1, ("CCTXD", 1, 2, 0, "00"))
+    assert bench.lines(1) == ["CAERR,090001,NMEA,3,CCTXD bad moment"], "the header is still on the air"
+    bench.advance(2.0)
+    xst = "CAXST,6,20161012,09000{}00000,0,0,200,5000,25000,0,1,2,0,1,{}"
+    assert bench.lines(1) == ["CATXF,0", xst.format("1.0", "0,2,0"), "CADRQ,090001,1,2,0,32,1"]
+    assert bench.lines(2) == ["CARXP,0", "CACYC,0,1,2,0,0,1", cst("20161012090001.100000", 0, kind=2, frames=0)]
+    bench.say(1, ("CCTXD", 1, 2, 0, "48656C6C6F"))
+    assert bench.lines(1) == ["CATXD,1,2,0,5", "CATXP,5"]
     bench.advance(6.0)
+    assert bench.lines(1) == ["CATXF,5", xst.format("2.0", "1,1,5")]
+    heard = bench.lines(2)
+    assert heard[:2] == ["CARXP,0", "CARXD,1,2,0,1,48656C6C6F"]
+    assert heard[2].split(",")[14:20] == ["0", "001", "002", "0", "1", "1"]
+    assert len(heard) == 3
+
+
+def test_data_at_rate_0_without_its_header_is_not_understood():
+    bench = Bench(modems=3)
+    bench.say(1, ("CCCYC", 0, 1, 2, 0, 0, 1))
+    bench.say(3, ("CCMUC", 3, 15, "1"))  # collides with the header at 2
+    bench.advance(2.0)
+    bench.say(1, ("CCTXD", 1, 2, 0, "AA"))
+    bench.clear()
+    bench.advance(8.0)
+    assert [line.split(",")[:2] for line in bench.lines(2)] == [
+        ["CARXP", "0"],
+        ["CAMSG", "PACKET_TIMEOUT"],
+        ["CACST", "6"],
+    ]
+    assert bench.reports[-1].untold == "cycle header missed"
+
+
+def test_a_header_that_nothing_follows_is_given_up():
+    bench = Bench()
+    bench.say(1, ("CCCYC", 0, 1, 2, 0, 0, 1))
+    bench.advance(13.9)
+    assert bench.lines(2)[3:] == [], "ten seconds for the cycle, two for the host's data"
+    bench.advance(14.1)
+    assert bench.lines(2) == ["CAMSG,PACKET_TIMEOUT,0"]
+
+
+@pytest.mark.parametrize("rate", [0, 1, 5])
+def test_polling_another_modem_for_data(rate: int):
+    bench = Bench(modems=3)
+    poll = f"CACYC,0,2,1,{rate},1,1"
+    bench.say(1, ("CCCYC", 0, 2, 1, rate, 1, 1))
+    bench.advance(2.2)
+    assert [line.split(",")[0] for line in bench.lines(1)] == ["CACYC", "CATXP", "CATXF", "CAXST"]
+    for n in (2, 3):
+        told = bench.lines(n)
+        assert told[:2] == ["CARXP,0", poll]
+        assert told[2].startswith("CACST,6,0,")
+        assert told[3:] == ([f"CADRQ,090002,2,1,1,{RATES[rate].frame_bytes},1"] if n == 2 else [])
+    bench.say(2, ("CCTXD", 2, 1, 1, "CAFE"))
+    bench.advance(15.0)
+    assert [line.split(",")[0] for line in bench.lines(2)][:4] == ["CATXD", "CATXP", "CATXF", "CAXST"]
+    for n in (1, 3):
+        told = bench.lines(n)
+        expected = [f"CARXP,{int(rate > 0)}"] + ([poll] if rate else []) + ["CARXD,2,1,1,1,CAFE"]
+        assert told[: len(expected)] == expected
+        assert told[len(expected)].startswith("CACST,6,0,")
+    assert bench.transmissions[-1].packet.acked_frames == (1,)
+
+
+def test_a_polled_host_without_data_and_a_poll_that_nobody_answers():
+    bench = Bench()
+    bench.say(1, ("CCCYC", 0, 2, 1, 1, 0, 3))
+    bench.advance(2.2)
+    bench.say(2, ("CCTXD", 2, 1, 0, ""))
+    bench.clear()
+    bench.advance(12.0)
+    assert [line.split(",")[0] for line in bench.lines(1)] == ["CARXP", "CACYC", "CACST"]
+    bench.say(1, ("CCCYC", 0, 9, 1, 1, 0, 1))
+    bench.clear()
+    bench.advance(30.0)
+    assert [line for line in bench.lines(1) if line.startswith("CAMSG")] == ["CAMSG,PACKET_TIMEOUT,1"]
+
+
+def test_text_travels_as_text():
+    bench = Bench()
+    bench.say(1, ("CCCYC", 0, 1, 2, 1, 0, 2), ("CCTXA", 1, 2, 0, "hello", " sea"), ("CCTXD", 1, 2, 0, "00FF"))
+    assert "CATXA,1,2,0,10" in bench.lines(1)
+    bench.advance(9.0)
+    assert bench.lines(2)[2:4] == ["CARXA,1,2,0,1,hello, sea", "CARXD,1,2,0,2,00FF"]
+    bench.say(2, ("CCCFG", "RXA", 0))
+    bench.say(1, ("CCCYC", 0, 1, 2, 1, 0, 1), ("CCTXA", 1, 2, 0, "unheard"))
+    bench.clear()
+    bench.advance(20.0)
+    assert not [line for line in bench.lines(2) if line.startswith("CARX") and "P" not in line[:6]]
+    assert bench.reports[-1].untold == "RXA is off"
+
+
+@pytest.mark.parametrize(("size", "groups"), [(22, [22]), (90, [90]), (150, [90, 60]), (282, [90, 64, 64, 64])])
+def test_flexible_data(size: int, groups: list[int]):
+    bench = Bench()
+    data = bytes(range(256))[:size] + bytes(max(0, size - 256))
+    bench.say(2, ("CCTDP", 1, 1, 0, 0, data.hex()))
+    assert bench.lines(2) == [f"CATDP,0,1,1,1,0,0,{size}", f"CATXP,{size}"]
+    bench.advance(15.0)
+    told = bench.lines(1)
+    assert told[0] == "CARXP,1"
+    fields = told[1].split(",")
+    assert fields[:6] == ["CARDP", "2", "1", "1", "0", "0"]
+    parts = (fields[6] + (";" + fields[7] if fields[7] else "")).split(";")
+    assert [(int(crc), int(count)) for crc, count in zip(parts[::3], parts[1::3], strict=True)] == [
+        (1, n) for n in groups
+    ]
+    assert bytes.fromhex("".join(parts[2::3])) == data
+    assert told[2].split(",")[18] == "5"
+    assert [line.split(",")[0] for line in bench.lines(2)] == ["CATXF", "CAXST"]
+
+
+def test_flexible_data_is_refused_where_there_is_none():
+    bench = Bench(generation=1)
+    bench.say(1, ("CCTDP", 2, 1, 0, 0, "AA"), ("CCTMQ", 0))
+    assert bench.lines(1) == ["CAERR,090001,NMEA,2,unknown CCTDP", "CAERR,090001,NMEA,2,unknown CCTMQ"]
+    bench = Bench()
+    for bad in ((2, 2, 0, 0, "AA"), (2, 1, 0, 0, ""), (2, 1, 0, 0, "AA" * 283)):
+        bench.say(1, ("CCTDP", *bad))
+    assert [line.split(",")[4] for line in bench.lines(1)] == ["CCTDP bad rate", "CCTDP bad length", "CCTDP bad length"]
+
+
+def test_lost_flexible_data_is_told_as_bad():
+    bench = Bench(frame_loss=1.0)
+    bench.say(1, ("CCTDP", 2, 1, 0, 0, "AABB"))
+    bench.advance(15.0)
+    told = bench.lines(2)
+    assert told[1] == "CARDP,1,2,1,0,0,0;2;0000,"
+    assert told[2].split(",")[2] == "1"
+
+
+@pytest.mark.parametrize("kind", ["PDT", "PNT"])
+def test_ranging_to_transponders(kind: str):
+    places = {1: ModemPlace(ModemConfig(1, utc_at_zero_s=START_UTC_S)), 2: ModemPlace(ModemConfig(2), Position(50.0))}
+    transponders = {"A": Position(300.0), "B": Position(0.0, 600.0), "C": Position(5000.0), "D": Position(30.0)}
+    world = AcousticWorld(WaterConfig(), places, transponders=transponders)
+    world.advance(1.0)
+    for number in places:
+        world.take_outputs(number)
+    beacons = ("1", "1", "1", "0") if kind == "PDT" else ("25000", "26000", "27000", "0")
+    command = ("CCPDT", 1, 2, 0, 0, 1383, *beacons) if kind == "PDT" else ("CCPNT", 26000, 5, 5, 1383, *beacons, 1)
+    for _ in range(2):
+        world.receive(1, nmea.format(str(command[0]), *command[1:]), 1.0)
+    world.advance(2.38)
+    told = b"".join(output.data for output in world.take_outputs(1))
+    assert told == nmea.format(f"SN{kind}", *command[1:]) + nmea.format(
+        "CAERR", "090001", "CYCLE", 4, f"CC{kind} while busy"
+    )
+    world.advance(2.3831)
+    told = b"".join(output.data for output in world.take_outputs(1))
+    assert told == nmea.format("SNTTA", "0.2000", "0.4000", "", "", "090001.0000"), "C is too far, D was not asked"
+    assert world.take_outputs(2) == [], "a ping is no packet"
+
+
+def test_the_clock_shows_the_second_to_come_and_runs_from_the_pulse():
+    bench = Bench()
+    bench.advance(5.07)
+    bench.say(1, ("CCTMS", "2016-10-12T09:00:06Z", 0), ("CCTMQ", 0))
     assert bench.lines(1) == [
-        "CATXF,5",
-        "CAXST,7,20161012,090001.000000,0,0,200,5000,25000,0,1,2,0,1,0,2,0,25000",
-        "CAXST,7,20161012,090001.000000,0,0,200,5000,25000,0,1,2,0,1,1,1,5,25000",
+        "CATMG,2016-10-12T09:00:06Z,USER_CMD,RTC",
+        "CATMS,0,2016-10-12T09:00:06Z",
+        "CATMQ,2016-10-12T09:00:06Z,USER_CMD,RTC",
     ]
-    assert bench.lines(2) == [
-        "CARXP,0",
-        "CACYC,0,1,2,0,0,1",
-        cst("20161012090001.100000", 0, kind=2, frames=0),
-        "CARXD,1,2,0,1,48656C6C6F",
-        cst("20161012090001.100000", 0, kind=1, frames=1),
-    ]
+    for now, second in ((6.99, "06"), (7.01, "07")):
+        bench.advance(now)
+        bench.say(1, ("CCTMQ", 0))
+        assert bench.lines(1) == [f"CATMQ,2016-10-12T09:00:{second}Z,USER_CMD,RTC"]
+    bench.say(1, ("CCCLK", 2016, 10, 12, 9, 0, 60), ("CCTMQ", 0))
+    assert bench.lines(1) == ["CACLK,2016,10,12,9,0,60", "CATMQ,2016-10-12T09:01:00Z,USER_CMD,RTC"]
+    bench.say(1, ("CCCYC", 0, 1, 2, 4, 0, 1), ("CCTXD", 1, 2, 0, "AA"))
+    bench.clear()
+    bench.advance(20.0)
+    assert bench.lines(1)[1].split(",")[4] == "1"
+
+
+def test_extra_lines_come_before_the_statistics_where_a_host_wants_them():
+    bench = Bench()
+    bench.say(2, ("CCCFG", "TOA", 1), ("CCCFG", "DQF", 1))
+    bench.say(1, ("CCCYC", 0, 1, 2, 0, 0, 1))
+    bench.advance(2.0)
+    bench.say(1, ("CCTXD", 1, 2, 0, "AA"))
+    bench.clear()
+    bench.advance(8.0)
+    assert [line.split(",")[0] for line in bench.lines(2)] == ["CARXP", "CARXD", "CATOA", "CADQF", "CACST"]
+
+
+def test_the_newest_layout_of_statistics():
+    bench = Bench(statistics_version=8)
+    bench.say(1, ("CCCYC", 0, 1, 2, 4, 0, 1), ("CCTXD", 1, 2, 0, "AA"))
+    bench.advance(9.0)
+    assert bench.lines(1)[-1] == "CAXST,7,20161012,090001.000000,0,0,200,5000,25000,4,1,2,0,1,1,3,1,25000"
+    told = bench.lines(2)[-1].split(",")
+    assert (told[1], told[30:]) == ("8", ["5000", "0", "-1", "-1", "00"])
 
 
 @pytest.mark.parametrize("rate", [1, 2, 3, 4, 5, 6])
@@ -160,11 +341,11 @@ def test_a_full_packet_at_every_rate(rate: int):
     assert heard[-1] == cst("20161012090001.100000", rate, frames=shape.frames)
 
 
-def test_the_first_generation_writes_shorter_statistics_and_a_longer_version():
+def test_the_first_generation_has_a_longer_version_and_a_shorter_clock_status():
     bench = Bench(generation=1)
     bench.say(1, ("CCCYC", 0, 1, 2, 4, 0, 1), ("CCTXD", 1, 2, 0, "AA"))
-    bench.advance(11.0)
-    assert b"CAREV,090010,AUV,0.93.0.09" in bench.told[1]
+    bench.advance(14.3)
+    assert b"CAREV,090014,AUV,0.93.0.09" in bench.told[1]
     assert bench.lines(1)[-1] == "CAXST,6,20161012,090001.000000,0,0,200,5000,25000,4,1,2,0,1,1,3,1"
     fields = bench.lines(2)[-1].split(",")
     assert (fields[1], fields[4], len(fields)) == ("6", "0", 31)
@@ -196,7 +377,7 @@ def test_a_collision_ends_in_a_packet_timeout():
     bench.advance(9.0)
     heard = bench.lines(2)
     assert heard[:2] == ["CARXP,1", "CAMSG,PACKET_TIMEOUT,1"]
-    assert heard[2].startswith("CACST,8,2,20161012090001.1")
+    assert heard[2].startswith("CACST,6,2,20161012090001.1")
     assert heard[2].split(",")[14:21] == ["1", "000", "000", "2", "3", "0", "0"]
     assert len(heard) == 3
     at_2 = [r for r in bench.reports if r.arrival.receiver == 2]
@@ -219,11 +400,12 @@ def test_an_acknowledgement_comes_back_for_the_good_frames():
     bench.say(1, ("CCCYC", 0, 1, 2, 4, 1, 2), ("CCTXD", 1, 2, 1, "AA"), ("CCTXD", 1, 2, 1, "BB"))
     bench.clear()
     bench.advance(9.0)
-    assert [line.split(",")[0] for line in bench.lines(2)] == ["CARXP", "CACYC", "CARXD", "CARXD", "CACST"]
+    heard = [line.split(",")[0] for line in bench.lines(2)]
+    assert heard == ["CARXP", "CACYC", "CARXD", "CARXD", "CACST", "CATXP", "CATXF"]
     told = bench.lines(1)
     assert told[0] == "CATXF,2"
     assert told[2:5] == ["CARXP,0", "CAACK,2,1,1,1", "CAACK,2,1,2,1"]
-    assert told[5].startswith("CACST,8,0,")
+    assert told[5].startswith("CACST,6,0,")
     ack = bench.transmissions[1]
     # 1.0 start, 3.2 air time, 0.1 travel, 0.2 turnaround
     assert ack.started_s == pytest.approx(4.5)
@@ -284,7 +466,7 @@ def test_a_cycle_without_data_is_still_ended():
     bench = Bench()
     bench.say(1, ("CCCYC", 0, 1, 2, 1, 0, 3), ("CCTXD", 1, 2, 0, ""))
     bench.advance(9.0)
-    assert [line.split(",")[:2] for line in bench.lines(1)[-3:]] == [["CATXP", "0"], ["CATXF", "0"], ["CAXST", "7"]]
+    assert [line.split(",")[:2] for line in bench.lines(1)[-3:]] == [["CATXP", "0"], ["CATXF", "0"], ["CAXST", "6"]]
     assert [line.split(",")[0] for line in bench.lines(2)] == ["CARXP", "CACYC", "CACST"]
 
 
@@ -365,10 +547,10 @@ def test_the_known_start_up_query_has_the_known_answer():
 def test_the_clock_is_set_echoed_and_used():
     bench = Bench()
     bench.say(1, ("CCCLK", 2025, 6, 6, 23, 1, 23))
-    assert bench.lines(1) == ["CACLK,2025,6,6,23,1,23"]
+    assert bench.lines(1) == ["CATMG,2025-06-06T23:01:23Z,USER_CMD,RTC", "CACLK,2025,6,6,23,1,23"]
     bench.advance(3.5)
     bench.say(1, ("CCCLQ", 0), ("CCTMQ", 0))
-    assert bench.lines(1) == ["CACLK,2025,6,6,23,1,25", "CATMQ,2025-06-06T23:01:25Z,RTC,RTC"]
+    assert bench.lines(1) == ["CACLK,2025,6,6,23,1,25", "CATMQ,2025-06-06T23:01:25Z,USER_CMD,RTC"]
     bench.say(1, ("CCTMS", "2019-12-02T03:02:59Z", 0), ("CCCYC", 0, 1, 2, 4, 0, 1))
     assert bench.lines(1) == ["CATMS,0,2019-12-02T03:02:59Z", "CACYC,0,1,2,4,0,1", "CADRQ,030259,1,2,0,256,1"]
     for bad in (("CCCLK", 2025, 2, 30, 0, 0, 0), ("CCCLK", 0, 1, 1, 0, 0, 0), ("CCTMS", "yesterday", 0)):
@@ -397,6 +579,18 @@ def test_a_reboot_is_deaf_and_ends_with_init():
     assert bench.lines(2) == ["CACFG,SRC,7"]
 
 
+def test_what_began_before_a_reboot_is_not_heard_after_it():
+    bench = Bench()
+    bench.say(1, ("CCCYC", 0, 1, 2, 4, 1, 1), ("CCTXD", 1, 2, 1, "AA"))
+    bench.advance(2.0)
+    bench.say(2, ("CCMSC", 2, 2, 0))
+    bench.clear()
+    bench.advance(20.0)
+    assert bench.lines(2) == []
+    assert bench.reports[-1].untold == "rebooting"
+    assert len(bench.transmissions) == 1, "what was not heard is not acknowledged"
+
+
 def test_a_reboot_in_the_middle_of_a_packet_lets_the_packet_end():
     bench = Bench()
     bench.say(1, ("CCCYC", 0, 1, 2, 1, 0, 1), ("CCTXD", 1, 2, 0, "AA"), ("CCMSC", 1, 1, 0))
@@ -420,15 +614,21 @@ def test_a_ping_measures_the_travel_time_and_a_mini_packet_carries_13_bits():
     bench = Bench()
     bench.say(1, ("CCMPC", 1, 2))
     bench.advance(5.0)
-    assert [line for line in bench.lines(2) if not line.startswith("CACST")] == ["CARXP,0", "CAMPA,1,2"]
+    assert [line for line in bench.lines(2) if not line.startswith("CACST")] == [
+        "CARXP,0",
+        "CAMPA,1,2",
+        "CATXP,0",
+        "CATXF,0",
+    ]
     told = bench.lines(1)
-    assert [line for line in told if not line.startswith("CACST")] == ["CAMPC,1,2", "CARXP,0", "CAMPR,2,1,0.1000"]
+    sent = ["CATXP,0", "CATXF,0", "CARXP,0"]
+    assert [line for line in told if not line.startswith("CACST")] == ["CAMPC,1,2", *sent, "CAMPR,2,1,0.1000"]
     bench.say(1, ("CCMUC", 1, 2, "1a2b"))
     bench.advance(9.0)
     assert "CAMUA,1,2,1A2B" in bench.lines(2)
     assert [line for line in bench.lines(1) if not line.startswith("CACST")] == [
         "CAMUC,1,2,1A2B",
-        "CARXP,0",
+        *sent,
         "CAMUR,2,1",
     ]
 
@@ -443,7 +643,7 @@ def test_a_ping_measures_the_travel_time_and_a_mini_packet_carries_13_bits():
         (b"$CCCYC,0,1,2,9,0,1\r\n", "NMEA,3,CCCYC bad rate"),
         (b"$CCCYC,0,1,2,1,0,4\r\n", "NMEA,3,CCCYC bad frames"),
         (b"$CCCYC,0,1,2,1,0,0\r\n", "NMEA,3,CCCYC bad frames"),
-        (b"$CCCYC,0,5,2,1,0,1\r\n", "NMEA,3,CCCYC bad source"),
+        (b"$CCMPC,5,2\r\n", "NMEA,3,CCMPC bad source"),
         (b"$CCCYC,0,1,128,1,0,1\r\n", "NMEA,3,CCCYC bad destination"),
         (b"$CCCYC\r\n", "NMEA,3,CCCYC bad rate"),
         (b"$CCCFG,SRC,128\r\n", "NMEA,3,CCCFG bad SRC"),
@@ -478,10 +678,10 @@ def test_settings_cannot_grow_without_end():
     assert len(modem.settings.items()) == 512
 
 
+KINDS = ["CCCFG", "CCCFQ", "CCMSC", "CCCLK", "CCCLQ", "CCTMS", "CCTMQ", "CCCYC",
+         "CCTXD", "CCTXA", "CCMPC", "CCMUC", "CCTDP", "CCPDT", "CCPNT", "CCALQ"]  # fmt: skip
 SENTENCES = st.tuples(
-    st.sampled_from(
-        ["CCCFG", "CCCFQ", "CCMSC", "CCCLK", "CCCLQ", "CCTMS", "CCTMQ", "CCCYC", "CCTXD", "CCMPC", "CCMUC"]
-    ),
+    st.sampled_from(KINDS),
     st.lists(
         st.one_of(st.integers(-2, 130).map(str), st.sampled_from(["", "SRC", "ALL", "DTO", "AABB", "1e5", "٣"[:0]])),
         max_size=8,

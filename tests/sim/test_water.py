@@ -13,16 +13,9 @@ from sonarpost.modem.rates import RATES
 from sonarpost.sim.clock import TimeScale
 from sonarpost.sim.water import Water
 from sonarpost.sim.water_chance import Dice, TailDamage, damage_tail
-from sonarpost.sim.water_physics import Position, frame_error_rate, snr_db
-from sonarpost.sim.water_records import (
-    ArrivalEnded,
-    ArrivalStarted,
-    Fate,
-    Outcome,
-    Packet,
-    PacketKind,
-    WaterConfig,
-)
+from sonarpost.sim.water_config import WaterConfig
+from sonarpost.sim.water_physics import Position, frame_error_rate
+from sonarpost.sim.water_records import ArrivalEnded, ArrivalStarted, Fate, Outcome, Packet, PacketKind
 
 PINNED_UNIFORM = 0.13411210046500488
 PINNED_NOISE = "daef2330"
@@ -231,23 +224,6 @@ def test_range_loss_follows_the_published_error_rates():
         rates = [frame_error_rate(rate, level / 10) for level in range(-150, 150)]
         assert all(a >= b for a, b in itertools.pairwise(rates))
         assert (rates[0], rates[-1]) == (1.0, 0.0)
-
-
-@pytest.mark.parametrize(("range_m", "arrives"), [(60.0, True), (100.0, True), (170.0, False), (300.0, False)])
-def test_range_loss_makes_the_sea_trial(range_m: float, arrives: bool):
-    sea = water(0.0, range_m, range_loss=True, snr_at_1m_db=37.0)
-    delivered = 0
-    for n in range(40):
-        sea.transmit(1, packet(b"a" * 64, b"b" * 64), now=10.0 * n)
-        delivered += sum(fate is Fate.DELIVERED for a in ended(sea.poll(10.0 * n + 9)) for fate in fates(a))
-    assert (delivered > 72) if arrives else (delivered < 8)
-
-
-def test_snr_falls_with_range():
-    levels = [snr_db(range_m, 60.0) for range_m in (0.0, 1.0, 10.0, 100.0, 1000.0)]
-    assert levels[0] == levels[1] == pytest.approx(60.0, abs=0.01)
-    assert levels[3] == pytest.approx(60 - 40 - 0.55)
-    assert levels[1:] == sorted(levels[1:], reverse=True)
 
 
 @pytest.mark.parametrize(

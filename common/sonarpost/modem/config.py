@@ -31,6 +31,7 @@ class MicroModemConfig:
         request_timeout_s: Wait for the request of the next frame.
         start_timeout_s: Wait between the last frame's data and the start of the transmission.
         statistics_timeout_s: Wait for the statistics at the end of a transmission or reception.
+        poll_wait_s: What a polled modem's host may take to fill its packet.
         ack_wait_s: Wait for acknowledgements: the way there and back at the longest range and their own packet.
         dump_quiet_s: While the modem dumps its configuration, the wait for an answer goes on until this long
             after the last line of it, but
@@ -51,6 +52,7 @@ class MicroModemConfig:
     request_timeout_s: float = 5.0
     start_timeout_s: float = 5.0
     statistics_timeout_s: float = 3.0
+    poll_wait_s: float = 20.0
     ack_wait_s: float = 20.0
     dump_quiet_s: float = 2.0
     dump_limit_s: float = 30.0

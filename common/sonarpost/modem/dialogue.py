@@ -10,6 +10,7 @@ from enum import Enum, auto
 from sonarpost.modem.config import MicroModemConfig
 from sonarpost.modem.nmea import Sentence
 from sonarpost.modem.settings import ClockSetting, Setting, SettingQuery
+from sonarpost.modem.short_sentences import TimeSetting
 
 _OPTIONAL_TRIES = 2
 
@@ -48,11 +49,15 @@ def query_command(name: str, value: int) -> Command:
     return Command(SettingQuery(name).sentence(), Setting(name, str(value)).sentence("CACFG"))
 
 
-def clock_command(utc: datetime) -> Command:
-    """Return the command that sets the modem's clock; the modem echoes the six values.
+def clock_command(utc: datetime, generation: int | None) -> Command:
+    """Return the command that sets the modem's clock, in the words of its generation; the modem echoes the time.
 
-    It is sent once only: a second time, the time in it would be past.
+    It is sent once only: a second time, the time in it would be past. A modem of unknown generation understands the
+    older command.
     """
+    if generation == 2:
+        time = TimeSetting(utc)
+        return Command(time.sentence(), time.sentence("CATMS"), required=False, tries=1)
     clock = ClockSetting(utc)
     return Command(clock.sentence(), clock.sentence("CACLK"), required=False, tries=1)
 

@@ -10,6 +10,7 @@ from sonarpost.errors import SentenceError
 from sonarpost.modem.nmea import Sentence
 from sonarpost.modem.sentences import ModemMessage
 from sonarpost.modem.settings import ModemComplaint
+from sonarpost.modem.short_sentences import ReceivedFlexibleData
 from sonarpost.modem.statistics import LinkStatistics, TransmitStatistics
 
 
@@ -26,6 +27,8 @@ class FailureReason(StrEnum):
     REBOOTED = "the modem restarted in the middle of the cycle"
     PORT_LOST = "the port to the modem went away"
     QUEUE_FULL = "too many packets wait already"
+    NO_ANSWER = "the far side did not answer"
+    REFUSED = "the modem does not understand the command"
     WAITED_TOO_LONG = "the modem or the water was not free in time"
 
 
@@ -101,7 +104,7 @@ class SentenceRejected:
 
 @dataclass(frozen=True, slots=True)
 class OtherSentence:
-    """A valid sentence that the driver has no use for (pings, mini-packets, a setting nobody asked for)."""
+    """A valid sentence that the driver has no use for (a setting nobody asked for, ranging, debugging)."""
 
     sentence: Sentence
 
@@ -178,6 +181,16 @@ class FrameReceived:
 
 
 @dataclass(frozen=True, slots=True)
+class FrameHeard:
+    """A good frame has arrived, of a packet that may not be over: what must not be lost is kept now.
+
+    The same frame comes again as `FrameReceived`, with its packet.
+    """
+
+    frame: FrameReceived
+
+
+@dataclass(frozen=True, slots=True)
 class PacketReceived:
     """The end of a packet; its `FrameReceived` events came just before.
 
@@ -218,6 +231,97 @@ class StatisticsReceived:
     statistics: LinkStatistics
 
 
+@dataclass(frozen=True, slots=True)
+class RequestDone:
+    """A ping or mini-packet was answered, flexible data has gone, or a polled modem has sent its packet.
+
+    Attributes:
+        request_id: What `ping`, `send_mini`, `send_flexible` or `request_packet` returned.
+        kind: "ping", "mini-packet", "flexible data" or "poll".
+        far: The other modem's address.
+    """
+
+    request_id: int
+    kind: str
+    far: int
+
+
+@dataclass(frozen=True, slots=True)
+class RequestFailed:
+    """The same did not come to its end; it may have gone into the water all the same."""
+
+    request_id: int
+    kind: str
+    far: int
+    reason: FailureReason
+
+
+@dataclass(frozen=True, slots=True)
+class PingHeard:
+    """Somebody pings `dest`; its modem answers by itself."""
+
+    src: int
+    dest: int
+
+
+@dataclass(frozen=True, slots=True)
+class PingAnswered:
+    """`src` has answered a ping; `travel_s` is the sound's time one way, None where the modem does not tell it."""
+
+    src: int
+    dest: int
+    travel_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class MiniPacketReceived:
+    """A user mini-packet of 13 bits."""
+
+    src: int
+    dest: int
+    bits: int
+
+
+@dataclass(frozen=True, slots=True)
+class MiniPacketAnswered:
+    """`src` has a mini-packet."""
+
+    src: int
+    dest: int
+
+
+@dataclass(frozen=True, slots=True)
+class FlexibleDataReceived:
+    """A packet of the flexible data protocol.
+
+    Attributes:
+        packet: What came, frame by frame.
+        received_s: Clock of the driver when it came.
+    """
+
+    packet: ReceivedFlexibleData
+    received_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Polled:
+    """Another modem asks this one for a packet; what it was given is told by `PacketSent` or `PacketFailed`.
+
+    Attributes:
+        dest: Where the packet shall go.
+        rate: Rate number.
+        frames: How many frames at most.
+        frame_bytes: How many bytes in each at most.
+        ack: Whether acknowledgements shall be asked for.
+    """
+
+    dest: int
+    rate: int
+    frames: int
+    frame_bytes: int
+    ack: bool
+
+
 Event = (
     ModemReady
     | ModemUnresponsive
@@ -231,7 +335,16 @@ Event = (
     | PacketSent
     | PacketFailed
     | FrameReceived
+    | FrameHeard
     | PacketReceived
     | FrameAcknowledged
     | StatisticsReceived
+    | RequestDone
+    | RequestFailed
+    | PingHeard
+    | PingAnswered
+    | MiniPacketReceived
+    | MiniPacketAnswered
+    | FlexibleDataReceived
+    | Polled
 )

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import Event, ModemSaid, SentenceRejected, StatisticsReceived
+from sonarpost.modem.events import Event, FrameHeard, ModemSaid, SentenceRejected, StatisticsReceived
 from sonarpost.modem.nmea import Sentence
 from sonarpost.modem.receive import Reception
 from sonarpost.modem.sentences import Cycle, ModemMessage, ReceivedData
 from sonarpost.modem.statistics import LinkStatistics
 
-_MINI_PACKETS = frozenset({2, 4})
+_NO_CYCLE = frozenset({2, 4, 5})
+"""Packet types that carry no frames of a cycle: mini-packets and flexible data."""
 
 
 class Listener:
@@ -47,8 +48,8 @@ class Listener:
         events: list[Event] = []
         if self.reception is not None and not self.reception.belongs(data):
             events = self.flush()
-        self._open(now).on_frame(data, now)
-        return events
+        frame = self._open(now).on_frame(data, now)
+        return [*events, FrameHeard(frame)]
 
     def on_message(self, message: ModemMessage, now: float) -> list[Event]:
         """A damaged frame, the end of waiting, or something else the modem says."""
@@ -105,4 +106,4 @@ class Listener:
 
 def _damaged_data(statistics: LinkStatistics) -> bool:
     """Tell whether statistics alone show a data packet of which nothing was readable."""
-    return bool(statistics.nbad) and statistics.packet_type not in _MINI_PACKETS
+    return bool(statistics.nbad) and statistics.packet_type not in _NO_CYCLE

@@ -9,72 +9,35 @@ failed, and the modem is asked for its address before the next one goes.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime
-from typing import ClassVar
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.config import MicroModemConfig
 from sonarpost.modem.events import (
     Event,
     FailureReason,
-    FrameAcknowledged,
-    ModemComplained,
-    OtherSentence,
-    PacketFailed,
+    Polled,
     SentenceRejected,
 )
-from sonarpost.modem.listener import Listener
-from sonarpost.modem.nmea import LineAssembler, Sentence
-from sonarpost.modem.sentences import (
-    Acknowledgement,
-    Cycle,
-    DataAccepted,
-    DataRequest,
-    ModemMessage,
-    ReceivedData,
-    ReceptionStarted,
-    TransmitData,
-    TransmitMark,
+from sonarpost.modem.machine import Machine
+from sonarpost.modem.requests import (
+    RequestKind,
+    flexible_command,
+    mini_command,
+    ping_command,
+    poll_command,
 )
-from sonarpost.modem.settings import ModemComplaint, Revision
-from sonarpost.modem.statistics import TransmitStatistics
-from sonarpost.modem.supervisor import Phase, Supervisor
-from sonarpost.modem.transmit import Packet, TransmitCycle, check_packet
+from sonarpost.modem.supervisor import Phase
+from sonarpost.modem.transmit import Packet, check_packet
 
 
-class MicroModem:
+class MicroModem(Machine):
     """Drives one modem: configures it, sends packets one at a time, hands over what arrives.
 
     Args:
         config: Address, settings and time-outs.
         where: Names the port in errors.
     """
-
-    def __init__(self, config: MicroModemConfig, where: str = "modem port") -> None:
-        self.config = config
-        self._lines = LineAssembler(where, learn_checksums=True)
-        self._supervisor = Supervisor(config, self._send)
-        self._listener = Listener(config)
-        self._cycle: TransmitCycle | None = None
-        self._queue: deque[Packet] = deque()
-        self._next_id = 1
-        self._out = bytearray()
-        self._events: list[Event] = []
-        self._events_since_s = 0.0
-        # Until when a transmission that is not this driver's keeps the modem busy.
-        self._foreign_until_s: float | None = None
-
-    @property
-    def phase(self) -> Phase:
-        """What the driver does with its modem."""
-        return self._supervisor.phase
-
-    @property
-    def ready(self) -> bool:
-        """Whether the modem is configured and, as far as is known, answers."""
-        return self.phase in {Phase.CHECKING, Phase.READY}
 
     @property
     def firmware(self) -> str | None:
@@ -83,8 +46,13 @@ class MicroModem:
 
     @property
     def queued(self) -> int:
-        """How many packets wait or are on their way."""
-        return len(self._queue) + (self._cycle is not None)
+        """How many packets and requests wait or are on their way."""
+        return len(self._queue) + (not self._idle)
+
+    @property
+    def generation(self) -> int | None:
+        """1 or 2, None while the modem has not told its version."""
+        return self._supervisor.generation
 
     @property
     def receiving(self) -> bool:
@@ -127,13 +95,62 @@ class MicroModem:
         """
         check_packet(destination, rate, frames)
         packet = Packet(self._next_id, destination, rate, tuple(bytes(f) for f in frames), ack, now)
-        self._next_id += 1
-        if len(self._queue) >= self.config.queued_packets:
-            self._events.append(packet.failed(FailureReason.QUEUE_FULL))
-        else:
-            self._queue.append(packet)
-        self._advance(now)
+        self._enqueue(packet, now)
         return packet.packet_id
+
+    def ping(self, destination: int, now: float) -> int:
+        """Queue a ping; its `PingAnswered` tells the travel time, its `RequestDone` or `RequestFailed` the end.
+
+        Raises:
+            FrameError: An address outside 0..127.
+        """
+        return self._request(RequestKind.PING, destination, ping_command(self.config.address, destination), now)
+
+    def send_mini(self, destination: int, bits: int, now: float) -> int:
+        """Queue a user mini-packet of 13 bits; its end is a `RequestDone` or `RequestFailed`.
+
+        Raises:
+            FrameError: An address outside 0..127, or more than 13 bits.
+        """
+        command = mini_command(self.config.address, destination, bits)
+        return self._request(RequestKind.MINI_PACKET, destination, command, now)
+
+    def send_flexible(self, destination: int, rate: int, data: bytes, now: float) -> int:
+        """Queue a packet of the flexible data protocol (Micro-Modem 2); its end is a `RequestDone` or `RequestFailed`.
+
+        Raises:
+            FrameError: An address outside 0..127, a rate other than 1, 3 or 5, no data or more than 2048 bytes.
+        """
+        command = flexible_command(destination, rate, data)
+        return self._request(RequestKind.FLEXIBLE_DATA, destination, command, now, rate)
+
+    def request_packet(
+        self, source: int, rate: int, frames: int | None = None, *, ack: bool = False, now: float
+    ) -> int:
+        """Queue a poll: another modem is asked to send a packet here.
+
+        What it sends comes as any packet does; the `RequestDone` follows it.
+
+        Args:
+            source: The modem that shall send.
+            rate: Rate number, 0..6.
+            frames: How many frames at most, None for all that the rate has.
+            ack: Let it ask for acknowledgements.
+            now: Time on the driver's clock.
+
+        Raises:
+            FrameError: An address outside 0..127, an unknown rate, or a number of frames it does not have.
+        """
+        command = poll_command(source, self.config.address, rate, frames, ack=ack)
+        return self._request(RequestKind.POLL, source, command, now, rate)
+
+    def answer_polls(self, uplink: Callable[[Polled], Sequence[bytes]] | None) -> None:
+        """Give the function that is asked for frames when another modem polls this one.
+
+        It is called inside `receive` and must not call back. No frames are a right answer: the modem then has nothing
+        to send. Frames that do not fit what was asked for raise `FrameError` out of `receive`.
+        """
+        self._uplink = uplink
 
     def set_clock(self, utc: datetime, now: float) -> bool:
         """Set the modem's clock, if it is free at this moment; tell whether the command was sent.
@@ -154,11 +171,7 @@ class MicroModem:
             if isinstance(item, SentenceError):
                 self._events.append(SentenceRejected(item))
                 continue
-            self._supervisor.heard(now)
-            try:
-                self._HANDLERS.get(item.kind, MicroModem._on_other)(self, item, now)
-            except SentenceError as error:
-                self._events.append(SentenceRejected(error))
+            self._take(item, now)
             self._advance(now)
         return self._take_events()
 
@@ -172,9 +185,9 @@ class MicroModem:
         times_s = [self._events_since_s if self._events else None]
         times_s += [packet.queued_s + self.config.patience_s for packet in self._queue]
         if self.phase is not Phase.CLOSED:
-            busy_s = None if self._cycle is None else self._cycle.deadline_s
+            busy_s = self._requester.deadline_s if self._cycle is None else self._cycle.deadline_s
             # In the middle of a cycle the modem is not asked whether it is there: the cycle will tell.
-            idle_s = None if self._cycle is not None and self.phase is Phase.READY else self._supervisor.deadline_s
+            idle_s = None if not self._idle and self.phase is Phase.READY else self._supervisor.deadline_s
             times_s += [busy_s, idle_s, self._listener.deadline_s, self._foreign_until_s]
         return min((time_s for time_s in times_s if time_s is not None), default=None)
 
@@ -183,155 +196,3 @@ class MicroModem:
         data = bytes(self._out)
         self._out.clear()
         return data
-
-    # What the time brings.
-
-    def _advance(self, now: float) -> None:
-        self._events_since_s = now
-        while self._queue and now >= self._queue[0].queued_s + self.config.patience_s:
-            self._events.append(self._queue.popleft().failed(FailureReason.WAITED_TOO_LONG))
-        if self.phase is Phase.CLOSED:
-            return
-        self._events += self._listener.poll(now)
-        if self._foreign_until_s is not None and now >= self._foreign_until_s:
-            self._foreign_until_s = None
-        self._advance_cycle(now)
-        self._events += self._supervisor.poll(now, may_check=self._cycle is None)
-        self._start_next(now)
-
-    def _advance_cycle(self, now: float) -> None:
-        if self._cycle is None:
-            return
-        self._cycle.poll(now)
-        if self._cycle.result is not None:
-            self._events.append(self._cycle.result)
-            if isinstance(self._cycle.result, PacketFailed):
-                self._supervisor.check(now)
-            self._cycle = None
-
-    def _start_next(self, now: float) -> None:
-        water_free = self._listener.reception is None and self._foreign_until_s is None
-        if self._queue and water_free and self._cycle is None and self.phase is Phase.READY:
-            self._cycle = TransmitCycle(self._queue.popleft(), self.config, self._send, now)
-
-    def _abort(self, reason: FailureReason) -> None:
-        """The modem no longer knows what it was doing; what has been received is handed over."""
-        if self._cycle is not None:
-            self._events.append(self._cycle.abort(reason))
-            self._cycle = None
-        self._events += self._listener.flush()
-        self._foreign_until_s = None
-
-    def _send(self, sentence: Sentence) -> None:
-        self._out += sentence.encode()
-
-    def _take_events(self) -> list[Event]:
-        events, self._events = self._events, []
-        return events
-
-    # What the modem says.
-
-    def _on_other(self, sentence: Sentence, now: float) -> None:
-        self._events.append(OtherSentence(sentence))
-
-    def _on_revision(self, sentence: Sentence, now: float) -> None:
-        revision = Revision.parse(sentence)
-        if revision.rebooted:
-            self._abort(FailureReason.REBOOTED)
-        self._events += self._supervisor.on_revision(revision, now)
-
-    def _on_setting(self, sentence: Sentence, now: float) -> None:
-        was_ready = self.ready
-        self._events += self._supervisor.on_setting(sentence, now)
-        if was_ready and not self.ready:
-            self._abort(FailureReason.REBOOTED)
-
-    def _on_clock(self, sentence: Sentence, now: float) -> None:
-        self._events += self._supervisor.on_clock(sentence, now)
-
-    def _on_cycle(self, sentence: Sentence, now: float) -> None:
-        cycle = Cycle.parse(sentence)
-        if self._cycle is not None and self._cycle.owns(cycle):
-            self._cycle.on_echo(now)
-        elif cycle.src != self.config.address:
-            self._events += self._listener.on_cycle(cycle, now)
-        else:
-            self._events.append(OtherSentence(sentence))
-
-    def _on_request(self, sentence: Sentence, now: float) -> None:
-        request = DataRequest.parse(sentence)
-        if self._cycle is not None and request.dest == self._cycle.packet.dest:
-            self._cycle.on_request(request, now)
-        else:
-            # A cycle that was given up, or one that another modem asked for: without an answer the modem would wait.
-            self._send(TransmitData(request.src, request.dest, request.ack, b"").sentence())
-
-    def _on_data_accepted(self, sentence: Sentence, now: float) -> None:
-        accepted = DataAccepted.parse(sentence)
-        if self._cycle is not None:
-            self._cycle.on_data_accepted(accepted, now)
-
-    def _on_transmission(self, sentence: Sentence, now: float) -> None:
-        mark = TransmitMark.parse(sentence)
-        if self._cycle is not None:
-            self._cycle.on_transmission(mark, now)
-        else:
-            self._foreign_until_s = None if mark.ends else now + self.config.on_air_limit_s(None)
-
-    def _on_transmit_statistics(self, sentence: Sentence, now: float) -> None:
-        statistics: TransmitStatistics | None = None
-        try:
-            statistics = TransmitStatistics.parse(sentence)
-        except SentenceError as error:
-            # Unreadable, they still tell that the transmission is over.
-            self._events.append(SentenceRejected(error))
-        if self._cycle is not None:
-            self._cycle.on_statistics(statistics, now)
-        else:
-            self._events.append(OtherSentence(sentence))
-
-    def _on_reception_started(self, sentence: Sentence, now: float) -> None:
-        ReceptionStarted.parse(sentence)
-        self._events += self._listener.on_start(now)
-
-    def _on_frame(self, sentence: Sentence, now: float) -> None:
-        self._events += self._listener.on_frame(ReceivedData.parse(sentence), now)
-
-    def _on_message(self, sentence: Sentence, now: float) -> None:
-        self._events += self._listener.on_message(ModemMessage.parse(sentence), now)
-
-    def _on_link_statistics(self, sentence: Sentence, now: float) -> None:
-        self._events += self._listener.on_statistics(sentence, now)
-
-    def _on_acknowledgement(self, sentence: Sentence, now: float) -> None:
-        acknowledgement = Acknowledgement.parse(sentence)
-        self._listener.on_acknowledgement(now)
-        if self._cycle is not None:
-            self._cycle.on_acknowledgement(acknowledgement, now)
-        if acknowledgement.good:
-            a = acknowledgement
-            self._events.append(FrameAcknowledged(a.src, a.dest, a.frame_number))
-
-    def _on_complaint(self, sentence: Sentence, now: float) -> None:
-        complaint = ModemComplaint.parse(sentence)
-        self._events.append(ModemComplained(complaint))
-        if self._cycle is not None:
-            self._cycle.on_complaint(complaint)
-
-    _HANDLERS: ClassVar[Mapping[str, Callable[[MicroModem, Sentence, float], None]]] = {
-        "CAREV": _on_revision,
-        "CACFG": _on_setting,
-        "CACLK": _on_clock,
-        "CACYC": _on_cycle,
-        "CADRQ": _on_request,
-        "CATXD": _on_data_accepted,
-        "CATXP": _on_transmission,
-        "CATXF": _on_transmission,
-        "CAXST": _on_transmit_statistics,
-        "CARXP": _on_reception_started,
-        "CARXD": _on_frame,
-        "CAMSG": _on_message,
-        "CACST": _on_link_statistics,
-        "CAACK": _on_acknowledgement,
-        "CAERR": _on_complaint,
-    }

@@ -40,6 +40,11 @@ class Sentence:
         return format(self.kind, *self.fields)
 
 
+def is_text(data: bytes) -> bool:
+    """Return whether bytes can stand in a sentence as they are: printable ASCII without `$` and `*`."""
+    return _BODY.fullmatch(data) is not None
+
+
 def checksum(body: bytes) -> int:
     """Return the XOR of the bytes between `$` and `*`, 0..255."""
     value = 0

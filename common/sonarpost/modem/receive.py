@@ -60,12 +60,13 @@ class Reception:
         first = self._frames[0] if self._frames else self._cycle
         return first is None or (first.src, first.dest) == (data.src, data.dest)
 
-    def on_frame(self, data: ReceivedData, now: float) -> None:
-        """A good frame."""
+    def on_frame(self, data: ReceivedData, now: float) -> FrameReceived:
+        """A good frame; return it as it is known so far."""
         rate = None if self._cycle is None else self._cycle.rate
         frame = FrameReceived(data.src, data.dest, data.ack, data.frame_number, data.data, now, rate, None)
         self._frames.append(frame)
         self._extend(now)
+        return frame
 
     def on_bad_frame(self, now: float) -> None:
         """A damaged frame."""

@@ -163,7 +163,10 @@ class ReceptionStarted:
 
 @dataclass(frozen=True, slots=True)
 class ReceivedData:
-    """`CARXD,src,dest,ack,frame,hex`: one good frame of the packet that arrives."""
+    """`CARXD,src,dest,ack,frame,hex`: one good frame of the packet that arrives.
+
+    A frame that was given to the far modem as text comes as `CARXA`, with the text instead of the hex.
+    """
 
     src: int
     dest: int
@@ -173,14 +176,17 @@ class ReceivedData:
 
     @classmethod
     def parse(cls, sentence: Sentence) -> ReceivedData:
-        """Read `CARXD`."""
-        read = FieldReader(sentence, ("CARXD",), 4)
+        """Read `CARXD` or `CARXA`."""
+        read = FieldReader(sentence, ("CARXA", "CARXD"), 4)
+        is_text = sentence.kind == "CARXA"
+        # Text may hold commas, which no other field does.
+        data = ",".join(sentence.fields[4:]).encode("ascii") if is_text else read.data(4, "data")
         return cls(
             read.address(0, "src"),
             read.address(1, "dest"),
             read.flag(2, "ack"),
             read.integer(3, "frame", 1, _MAX_FRAME_NUMBER),
-            read.data(4, "data"),
+            data,
         )
 
     def sentence(self) -> Sentence:

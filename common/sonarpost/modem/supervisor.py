@@ -19,6 +19,7 @@ from sonarpost.modem.events import (
 )
 from sonarpost.modem.nmea import Sentence
 from sonarpost.modem.settings import ClockSetting, Revision, Setting
+from sonarpost.modem.short_sentences import TimeSetting
 
 
 class Phase(Enum):
@@ -55,6 +56,12 @@ class Supervisor:
             return self._alive_s + self._config.keepalive_s
         return self._dialogue.deadline_s
 
+    @property
+    def generation(self) -> int | None:
+        """1 or 2: the version of a Micro-Modem 1 has four parts, that of a 2 three; None while it is not known."""
+        parts = len(self.firmware.split(".")) if self.firmware else 0
+        return {3: 2, 4: 1}.get(parts)
+
     def open(self, now: float) -> None:
         """The port is open: whatever the modem knew is set anew."""
         self._alive_s = now
@@ -78,7 +85,7 @@ class Supervisor:
 
     def set_clock(self, utc: datetime, now: float) -> None:
         """Send the time."""
-        self.check(now, clock_command(utc))
+        self.check(now, clock_command(utc, self.generation))
 
     def on_revision(self, revision: Revision, now: float) -> list[Event]:
         """The modem tells its firmware, and perhaps that it has restarted."""
@@ -109,9 +116,10 @@ class Supervisor:
         Raises:
             SentenceError: It is no time.
         """
-        clock = ClockSetting.parse(sentence)
+        is_old = sentence.kind == "CACLK"
+        utc = ClockSetting.parse(sentence).utc if is_old else TimeSetting.parse(sentence).utc
         if self._dialogue.receive(sentence, now):
-            return [ClockConfirmed(clock.utc)]
+            return [ClockConfirmed(utc)]
         return [OtherSentence(sentence)]
 
     def poll(self, now: float, *, may_check: bool) -> list[Event]:

@@ -87,18 +87,27 @@ class Stage(Enum):
 class TransmitCycle:
     """Takes one packet through the modem. When `result` is set the cycle is over, whatever was lost on the way.
 
+    The host's own command starts it or, with `polled`, that of another modem which asks for data.
+
     A later sentence stands for the earlier ones that must have gone before it: a lost echo does no harm. A cycle
     command without an answer is sent again, a frame when the modem asks again, and every wait has its end.
     """
 
-    def __init__(self, packet: Packet, config: MicroModemConfig, send: Callable[[Sentence], None], now: float) -> None:
+    def __init__(
+        self,
+        packet: Packet,
+        config: MicroModemConfig,
+        send: Callable[[Sentence], None],
+        now: float,
+        polled: Cycle | None = None,
+    ) -> None:
         self.packet = packet
         self.result: PacketSent | PacketFailed | None = None
         self.stage = Stage.ECHO
         self.deadline_s = now
         self._config = config
         self._send = send
-        self._cycle = Cycle(config.address, packet.dest, packet.rate, packet.ack, len(packet.frames))
+        self._cycle = polled or Cycle(config.address, packet.dest, packet.rate, packet.ack, len(packet.frames))
         self._started_s = now
         self._attempt = 0
         self._frame_number = 0
@@ -106,7 +115,10 @@ class TransmitCycle:
         self._acknowledged: set[int] = set()
         self._on_air = False
         self._statistics: TransmitStatistics | None = None
-        self.poll(now)
+        if polled is None:
+            self.poll(now)
+        else:
+            self._wait(Stage.REQUEST, now, config.request_timeout_s)
 
     def owns(self, cycle: Cycle) -> bool:
         """Tell whether a `CACYC` is the echo of this cycle's command."""
@@ -121,7 +133,9 @@ class TransmitCycle:
 
     def on_request(self, request: DataRequest, now: float) -> None:
         """The modem asks for a frame: answer, again if it asks again."""
-        if self.stage not in {Stage.ECHO, Stage.REQUEST, Stage.DATA_ECHO}:
+        # A modem that was polled for more frames than there are asks on when all have been given.
+        asking = self.stage is Stage.ON_AIR and not self._on_air
+        if not asking and self.stage not in {Stage.ECHO, Stage.REQUEST, Stage.DATA_ECHO}:
             return
         number = request.frame_number
         frame = self._frame(number)
@@ -147,6 +161,8 @@ class TransmitCycle:
 
     def on_transmission(self, mark: TransmitMark, now: float) -> None:
         """The modem starts or ends to transmit: the packet, or at rate 0 before any data its announcement."""
+        if self._given and mark.nbytes == 0 and any(self.packet.frames):
+            return  # an answer that the modem gives by itself
         if not self._given:
             on_air_s = self._config.on_air_limit_s(self.packet.rate)
             self.deadline_s = max(self.deadline_s, now + self._config.request_timeout_s + on_air_s)

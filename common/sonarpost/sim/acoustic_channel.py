@@ -162,7 +162,7 @@ class AcousticChannel:
             number: ModemPlace(replace(template, address=site.address), site.position)
             for number, site in enumerate(self.config.sites, start=1)
         }
-        return AcousticWorld(self.config.water, places, self.config.serial_baud)
+        return AcousticWorld(self.config.water, places, self.config.serial_baud, self.config.transponders)
 
     def _settings(self) -> dict[str, object]:
         water = asdict(self.config.water) | {"tail_damage_kind": self.config.water.tail_damage_kind.value}

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
+from types import MappingProxyType
 
 from sonarpost.sim.micromodem import Micromodem
 from sonarpost.sim.micromodem_config import ModemConfig, Output, Report
 from sonarpost.sim.serial_pace import SerialPace
 from sonarpost.sim.water import Water
+from sonarpost.sim.water_config import WaterConfig
 from sonarpost.sim.water_physics import Position
-from sonarpost.sim.water_records import ArrivalStarted, Transmission, WaterConfig
+from sonarpost.sim.water_records import ArrivalStarted, Transmission
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +46,24 @@ class AcousticWorld:
         water: What the water does.
         modems: Each modem by its number.
         serial_baud: Speed of the serial lines, or None for lines without delay.
+        transponders: Where the transponders for ranging are, by their letters A to D.
     """
 
-    def __init__(self, water: WaterConfig, modems: Mapping[int, ModemPlace], serial_baud: float | None = None) -> None:
+    def __init__(
+        self,
+        water: WaterConfig,
+        modems: Mapping[int, ModemPlace],
+        serial_baud: float | None = None,
+        transponders: Mapping[str, Position] = MappingProxyType({}),
+    ) -> None:
         self.now = 0.0
         self.water = Water(water, {number: place.position for number, place in modems.items()})
         self._ports = {
-            number: _Port(Micromodem(place.config), SerialPace(serial_baud), SerialPace(serial_baud))
+            number: _Port(
+                Micromodem(place.config, travel_times=partial(self.water.travel_times_s, number, transponders)),
+                SerialPace(serial_baud),
+                SerialPace(serial_baud),
+            )
             for number, place in modems.items()
         }
         # What the modems say when they are switched on belongs to this moment, not to the first event.

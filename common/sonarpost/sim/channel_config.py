@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 from sonarpost.sim.micromodem_config import ModemConfig
+from sonarpost.sim.water_config import WaterConfig
 from sonarpost.sim.water_physics import Position
-from sonarpost.sim.water_records import WaterConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,7 @@ class ChannelConfig:
         time_scale: Simulated seconds a real second, 0.01..10000.
         serial_baud: Speed of the serial lines, or None for lines without delay.
         log_path: Where to append the log, or None.
+        transponders: Where the transponders for ranging are, by their letters A to D.
 
     Raises:
         ValueError: A value outside its bounds.
@@ -48,6 +51,7 @@ class ChannelConfig:
     time_scale: float = 1.0
     serial_baud: float | None = None
     log_path: Path | None = None
+    transponders: Mapping[str, Position] = field(default_factory=lambda: MappingProxyType({}))
 
     def __post_init__(self) -> None:
         addresses = [site.address for site in self.sites]
@@ -59,6 +63,8 @@ class ChannelConfig:
             raise ValueError(
                 f"tcp_ports: got {len(self.tcp_ports)}, expected one for each of {len(self.sites)} modems, or pty_dir"
             )
+        if unknown := set(self.transponders) - set("ABCD"):
+            raise ValueError(f"transponders: got {sorted(unknown)}, expected letters A to D")
         if not 0.01 <= self.time_scale <= 10_000:
             raise ValueError(f"time_scale: got {self.time_scale!r}, expected 0.01..10000")
         if self.serial_baud is not None and not 0 < self.serial_baud < math.inf:

@@ -7,12 +7,15 @@ Choices where hardware documents are silent, and where hosts should not lean on 
 
 - Data, acknowledgements included, is shown to the host whatever its destination (`promiscuous`), as the hosts' own
   filters suggest the hardware does; switched off, only packets for `SRC` or a broadcast address are.
-  Only the addressed modem acknowledges, so a broadcast is never acknowledged.
+  Only the addressed modem acknowledges, so a broadcast is never acknowledged. What asks for an acknowledgement is the
+  flag that came with a frame's data, not the one of the cycle command.
 - A cycle whose host does not answer within `DTO` seconds is abandoned: nothing is sent.
 - A cycle without any data is still transmitted (header only), so that a host never waits in vain for `CATXF`.
-- `CCCYC` for another modem's turn (polling) is refused. A command during a cycle is refused as busy.
+- A command during a cycle is refused as busy.
 - While rebooting, the modem takes nothing from the host and hears nothing; a packet on the air is finished first.
-- Acknowledgements and mini-packets have no `CATXP`, `CATXF` and `CAXST`.
+- Every packet has `CATXP` and `CATXF` (0 bytes for acknowledgements and mini-packets), as hosts wait for the end of an
+  automatic answer; `CAXST` is for data, cycle headers and flexible data.
+- `CAREV` comes when nothing has happened for its period: a host takes it as the end of whatever it was doing.
 - A sentence that does not parse, or that no modem knows, is answered with `CAERR,hhmmss,NMEA,number,text`.
 """
 
@@ -22,13 +25,14 @@ import math
 import re
 from collections import deque
 from collections.abc import Callable
+from datetime import datetime
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem import nmea
 from sonarpost.sim import micromodem_commands as commands
 from sonarpost.sim.micromodem_config import VERSIONS, ModemConfig, Output, Report
-from sonarpost.sim.micromodem_hearing import Listener, hear, packet_type
-from sonarpost.sim.micromodem_sentences import PacketType
+from sonarpost.sim.micromodem_hearing import Listener
+from sonarpost.sim.micromodem_navigation import Navigator, TravelTimes
 from sonarpost.sim.micromodem_settings import ModemClock, Settings
 from sonarpost.sim.micromodem_transmitter import BusyError, Transmitter
 from sonarpost.sim.water_records import ArrivalEnded, ArrivalStarted, Packet
@@ -43,34 +47,48 @@ class Micromodem:
     Args:
         config: How it is built.
         now: Simulated time at which it is switched on; it says `CAREV,…,INIT`.
+        travel_times: One-way travel times to transponders; none by default.
     """
 
-    def __init__(self, config: ModemConfig, now: float = 0.0) -> None:
+    def __init__(self, config: ModemConfig, now: float = 0.0, travel_times: TravelTimes = dict) -> None:
         self.config = config
         self.settings = Settings(config.address, config.data_timeout_s)
         self.clock = ModemClock(config.utc_at_zero_s)
-        self._listener = Listener(
-            self.settings, self.clock, config.generation, config.promiscuous, config.broadcast_addresses
-        )
-        self._transmitter = Transmitter(config, self.settings, self.clock, self._write)
+        self._listener = Listener(config, self.settings, self.clock)
+        self._transmitter = Transmitter(config, self.settings, self.clock, self._write, self._listener.expect)
+        self._navigator = Navigator(self.settings, self.clock, self._transmitter, travel_times, self._write)
         self._lines = nmea.LineAssembler("host")
         self._outputs: deque[Output] = deque()
         self._rebooted_at_s: float | None = None
         self._next_revision_s = now
-        self._handlers: dict[str, Callable[[nmea.Sentence, float], None]] = {
+        self._handlers = self._first_generation()
+        if config.generation > 1:
+            self._handlers |= self._second_generation()
+        self._say_revision("INIT", now)
+
+    def _first_generation(self) -> dict[str, Callable[[nmea.Sentence, float], None]]:
+        return {
+            "CCALQ": self._on_ask_level,
             "CCCFG": self._on_configure,
             "CCCFQ": self._on_query,
             "CCMSC": self._on_sleep,
             "CCCLK": self._on_set_clock,
             "CCCLQ": self._on_ask_clock,
-            "CCTMS": self._on_set_time,
-            "CCTMQ": self._on_ask_time,
             "CCCYC": self._transmitter.start_cycle,
             "CCTXD": self._transmitter.fill_frame,
+            "CCTXA": self._transmitter.fill_frame,
             "CCMPC": self._transmitter.send_mini,
             "CCMUC": self._transmitter.send_mini,
+            "CCPDT": self._navigator.start,
+            "CCPNT": self._navigator.start,
         }
-        self._say_revision("INIT", now)
+
+    def _second_generation(self) -> dict[str, Callable[[nmea.Sentence, float], None]]:
+        return {
+            "CCTMS": self._on_set_time,
+            "CCTMQ": self._on_ask_time,
+            "CCTDP": self._transmitter.send_flexible,
+        }
 
     @property
     def address(self) -> int:
@@ -89,6 +107,11 @@ class Micromodem:
             if not self.rebooting:
                 self._take(item, now)
 
+    @property
+    def busy(self) -> bool:
+        """Whether a cycle, a transmission, a reception or a ranging is not over."""
+        return self._transmitter.busy or self._listener.busy or self._navigator.busy
+
     def poll(self, now: float) -> None:
         """Do what is due at `now`: end of a transmission, data timeout, automatic answers, revision, reboot."""
         if self._rebooted_at_s is not None:
@@ -96,22 +119,28 @@ class Micromodem:
                 return
             self._rebooted_at_s = None
             self._say_revision("INIT", now)
+        was_busy = self.busy
         self._transmitter.poll(now)
-        if self._next_revision_s <= now:
+        for line in self._listener.poll(now):
+            self._write(line)
+        self._navigator.poll(now)
+        if was_busy or self.busy:
+            self._next_revision_s = max(self._next_revision_s, now + self.config.revision_period_s)
+        elif self._next_revision_s <= now:
             self._say_revision("AUV", now)
 
     def next_deadline_s(self) -> float:
         """Return the simulated time at which `poll` has something to do."""
         if self._rebooted_at_s is not None:
             return self._rebooted_at_s
-        transmitter_s = self._transmitter.next_deadline_s()
-        return self._next_revision_s if transmitter_s is None else min(self._next_revision_s, transmitter_s)
+        times_s = (self._transmitter.next_deadline_s(), self._listener.deadline_s, self._navigator.deadline_s)
+        return min([self._next_revision_s, *(time_s for time_s in times_s if time_s is not None)])
 
     def packet_started(self, arrival: ArrivalStarted) -> None:
         """The water says that a packet begins to arrive."""
-        if not self.rebooting and self.settings.on("RXP"):
-            packet = arrival.transmission.packet
-            self._say("CARXP", 1 if packet_type(packet) is PacketType.PSK else 0)
+        if not self.rebooting:
+            for line in self._listener.begin(arrival.transmission.packet):
+                self._write(line)
 
     def packet_ended(self, arrival: ArrivalEnded) -> Report:
         """The water says that a packet has passed; return what the host learns of it.
@@ -120,13 +149,16 @@ class Micromodem:
         """
         if self.rebooting:
             return Report(arrival, self.address, "rebooting")
-        hearing = hear(arrival, self._listener)
+        if self.busy:
+            self._next_revision_s = max(self._next_revision_s, arrival.at_s + self.config.revision_period_s)
+        hearing = self._listener.hear(arrival)
         untold = hearing.untold if hearing.lines else (hearing.untold or "statistics are off")
         report = Report(arrival, self.address, untold)
         last = len(hearing.lines) - 1
         for index, line in enumerate(hearing.lines):
             self._outputs.append(Output(line, report if index == last and untold is None else None))
-        self._transmitter.answer(arrival, hearing.good_frames)
+        if not hearing.missed:
+            self._transmitter.answer(arrival, hearing.good_frames)
         return report
 
     def packets_to_transmit(self) -> list[Packet]:
@@ -188,9 +220,17 @@ class Micromodem:
 
     def _on_query(self, sentence: nmea.Sentence, _now: float) -> None:
         name = commands.field(sentence, 0, "name")
-        asked = self.settings.items() if name.upper() in {"ALL", "TOP"} else [self.settings.query(name)]
-        for known, value in asked:
-            self._say("CACFG", known, value)
+        everything = name.upper() in {"ALL", "TOP"}
+        known = self.settings.items() if everything else self.settings.group(name)
+        texts = [(stored, str(value)) for stored, value in known]
+        if self.config.generation > 1:
+            version = ("info.firmware_version", VERSIONS[2])
+            texts += [version] if everything or version[0] == name or version[0].startswith(f"{name}.") else []
+        if not texts:
+            stored, number = self.settings.query(name)
+            texts = [(stored, str(number))]
+        for stored, value in texts:
+            self._say("CACFG", stored, value)
 
     def _on_sleep(self, sentence: nmea.Sentence, now: float) -> None:
         for index, name in enumerate(("source", "destination")):
@@ -198,10 +238,12 @@ class Micromodem:
         commands.integer(sentence, 2, "minutes", 0, 0)
         self._rebooted_at_s = max(now + self.config.reboot_s, self._transmitter.quiet_at_s(now))
         self._transmitter.abandon()
+        self._listener.forget()
+        self._navigator.forget()
         self._lines.reset()
 
     def _on_set_clock(self, sentence: nmea.Sentence, now: float) -> None:
-        self.clock.set(commands.calendar_fields(sentence), now)
+        self._set_clock(commands.calendar_fields(sentence), now)
         self._say("CACLK", *sentence.fields[:6])
 
     def _on_ask_clock(self, _sentence: nmea.Sentence, now: float) -> None:
@@ -209,8 +251,17 @@ class Micromodem:
         self._say("CACLK", date.year, date.month, date.day, date.hour, date.minute, date.second)
 
     def _on_set_time(self, sentence: nmea.Sentence, now: float) -> None:
-        self.clock.set(commands.iso_time(sentence), now)
+        self._set_clock(commands.iso_time(sentence), now)
         self._say("CATMS", 0, self.clock.iso(now))
 
     def _on_ask_time(self, _sentence: nmea.Sentence, now: float) -> None:
-        self._say("CATMQ", self.clock.iso(now), "RTC", "RTC")
+        self._say("CATMQ", self.clock.iso(now), self.clock.source, "RTC")
+
+    def _on_ask_level(self, _sentence: nmea.Sentence, _now: float) -> None:
+        self._say("CAALQ", 0, 11 if self.config.generation > 1 else 6)
+
+    def _set_clock(self, date: datetime, now: float) -> None:
+        source = self.clock.source
+        self.clock.set(date, now)
+        if self.config.generation > 1 and self.clock.source != source:
+            self._say("CATMG", self.clock.iso(now), self.clock.source, "RTC")

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.nmea import Sentence
 from sonarpost.modem.rates import RATES
 
 MOST_ADDRESS = 127
+FLEXIBLE_RATES = (1, 3, 5)
+FLEXIBLE_MINI_BYTES = 90
+"""What the mini-frame of a flexible data packet holds; data frames of the rate's size hold the rest."""
 
 _INTEGER = re.compile(r"-?[0-9]{1,10}")
 _HEX = re.compile(r"(?:[0-9A-Fa-f]{2})*")
@@ -40,6 +43,30 @@ class FillFrame:
     destination: int
     ack_requested: bool
     data: bytes
+    is_text: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Flexible:
+    """`CCTDP`: a packet of the flexible data protocol, data and all."""
+
+    destination: int
+    rate: int
+    ack_requested: bool
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Ranging:
+    """`CCPDT` or `CCPNT`: ask transponders for their travel times.
+
+    Attributes:
+        timeout_s: How long answers are waited for.
+        beacons: Letters of the transponders that are asked.
+    """
+
+    timeout_s: float
+    beacons: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,20 +119,75 @@ def start_cycle(sentence: Sentence) -> StartCycle:
 
 
 def fill_frame(sentence: Sentence) -> FillFrame:
-    """Read `$CCTXD,source,destination,ack,hex`.
+    """Read `$CCTXD,source,destination,ack,hex` or `$CCTXA,source,destination,ack,text`.
 
     Raises:
         SentenceError: A field that is absent, out of bounds or not hex.
     """
-    data = field(sentence, 3, "data")
-    if not _HEX.fullmatch(data):
-        raise SentenceError(sentence.kind, "data", data, "pairs of hex digits")
+    is_text = sentence.kind == "CCTXA"
+    # Text may hold commas, which no other field does.
+    field(sentence, 3, "data")
+    text = ",".join(sentence.fields[3:]).encode("ascii")
     return FillFrame(
         integer(sentence, 0, "source", 0, MOST_ADDRESS),
         integer(sentence, 1, "destination", 0, MOST_ADDRESS),
         bool(integer(sentence, 2, "ack", 0, 1)),
-        bytes.fromhex(data),
+        text if is_text else hexadecimal(sentence, 3, "data"),
+        is_text,
     )
+
+
+def flexible(sentence: Sentence) -> Flexible:
+    """Read `$CCTDP,destination,rate,ack,reserved,hex`.
+
+    Raises:
+        SentenceError: A field that is absent, out of bounds or not hex, no data, a rate the protocol does not have, or
+            more data than that holds.
+    """
+    rate = integer(sentence, 1, "rate", 0, max(RATES))
+    if rate not in FLEXIBLE_RATES:
+        raise SentenceError(sentence.kind, "rate", rate, f"one of {FLEXIBLE_RATES}")
+    data = hexadecimal(sentence, 4, "data")
+    most = FLEXIBLE_MINI_BYTES + RATES[rate].packet_bytes
+    if not 1 <= len(data) <= most:
+        raise SentenceError(sentence.kind, "length", len(data), f"1..{most} bytes")
+    destination = integer(sentence, 0, "destination", 0, MOST_ADDRESS)
+    return Flexible(destination, rate, bool(integer(sentence, 2, "ack", 0, 1)), data)
+
+
+def ranging(sentence: Sentence) -> Ranging:
+    """Read a request for travel times.
+
+    `$CCPDT,group,channel,0,0,timeout_ms,A,B,C,D` asks the REMUS transponders whose flag is 1,
+    `$CCPNT,transmit_hz,transmit_ms,receive_ms,timeout_ms,A_hz,B_hz,C_hz,D_hz,flag` the narrow-band ones whose
+    frequency is not 0.
+
+    Raises:
+        SentenceError: A field that is absent or out of bounds.
+    """
+    remus = sentence.kind == "CCPDT"
+    if remus:
+        integer(sentence, 0, "group", 1, 1)
+        integer(sentence, 1, "channel", 1, 4)
+    else:
+        for index, name in enumerate(("transmit frequency", "transmit length", "receive length")):
+            integer(sentence, index, name, 0, 100_000)
+    timeout_ms = integer(sentence, 4 if remus else 3, "timeout", 0, 60_000)
+    first, most = (5, 1) if remus else (4, 100_000)
+    asked = [integer(sentence, first + place, f"beacon {letter}", 0, most) for place, letter in enumerate("ABCD")]
+    return Ranging(timeout_ms / 1000, "".join(letter for letter, on in zip("ABCD", asked, strict=True) if on))
+
+
+def hexadecimal(sentence: Sentence, index: int, name: str) -> bytes:
+    """Return field `index` as bytes.
+
+    Raises:
+        SentenceError: The field is absent or not pairs of hex digits.
+    """
+    text = field(sentence, index, name)
+    if not _HEX.fullmatch(text):
+        raise SentenceError(sentence.kind, name, text, "pairs of hex digits")
+    return bytes.fromhex(text)
 
 
 def mini(sentence: Sentence) -> Mini:
@@ -125,16 +207,19 @@ def mini(sentence: Sentence) -> Mini:
 
 
 def calendar_fields(sentence: Sentence) -> datetime:
-    """Read `$CCCLK,year,month,day,hour,minute,second` (UTC).
+    """Read `$CCCLK,year,month,day,hour,minute,second` (UTC); a host that counts on from 59 may say second 60.
 
     Raises:
         SentenceError: A field that is absent, or no such date or time.
     """
     names = ("year", "month", "day", "hour", "minute", "second")
-    year, month, day, hour, minute, second = (integer(sentence, i, name, 0, 9999) for i, name in enumerate(names))
+    most = (9999, 12, 31, 23, 59, 60)
+    year, month, day, hour, minute, second = (
+        integer(sentence, i, name, 0, high) for i, (name, high) in enumerate(zip(names, most, strict=True))
+    )
     try:
-        return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
-    except ValueError as error:
+        return datetime(year, month, day, hour, minute, tzinfo=UTC) + timedelta(seconds=second)
+    except (ValueError, OverflowError) as error:
         raise SentenceError(sentence.kind, "date", ",".join(sentence.fields), "a date and time") from error
 
 

@@ -20,11 +20,12 @@ class ModemConfig:
 
     Attributes:
         address: Initial `SRC`, 0..127.
-        generation: 1 or 2: version strings and the statistics' layout.
+        generation: 1 or 2: version strings, and whether there is a flexible data protocol.
+        statistics_version: Layout of `CACST`: 6, which every known host reads, or 8 of the newest firmware.
         utc_at_zero_s: What the modem's clock reads (seconds since 1970, UTC) at simulated time zero.
         airtimes_s: Air times by rate number, instead of the nominal ones.
         data_timeout_s: Initial `DTO`, whole seconds.
-        revision_period_s: Between two `CAREV,…,AUV`.
+        revision_period_s: Idle time before and between `CAREV,…,AUV`.
         reboot_s: From `CCMSC` to `CAREV,…,INIT`.
         mini_airtime_s: Air time of an acknowledgement, a ping or a mini-packet.
         turnaround_s: From the end of a packet to the automatic answer.
@@ -37,6 +38,7 @@ class ModemConfig:
 
     address: int
     generation: int = 2
+    statistics_version: int = 6
     utc_at_zero_s: float = 0.0
     airtimes_s: Mapping[int, float] = field(default_factory=lambda: MappingProxyType({}))
     data_timeout_s: int = 2
@@ -50,6 +52,8 @@ class ModemConfig:
     def __post_init__(self) -> None:
         if self.generation not in VERSIONS:
             raise ValueError(f"generation: got {self.generation!r}, expected 1 or 2")
+        if self.statistics_version not in {6, 8}:
+            raise ValueError(f"statistics_version: got {self.statistics_version!r}, expected 6 or 8")
         times = {**{f"airtimes_s of rate {rate}": time_s for rate, time_s in self.airtimes_s.items()}}
         times |= {name: getattr(self, name) for name in ("revision_period_s", "mini_airtime_s")}
         for name, time_s in times.items():

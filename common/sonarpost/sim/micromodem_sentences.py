@@ -1,7 +1,8 @@
 """The long sentences of the emulated modem: receive and transmit statistics.
 
-Field lists as the fact sheet of the modem gives them. The second generation writes version 8 of `CACST` (four fields
-after the bandwidth) and version 7 of `CAXST` (the actual carrier last), the first generation version 6 of both.
+Field lists as public descriptions and drivers of the modem give them. Version 6 of both sentences is what every known
+host reads; Goby takes a later one for an older one. Version 8 of `CACST` has four fields more after the bandwidth, and
+version 7 of `CAXST`, which goes with it, the actual carrier last.
 Levels are plausible, not physical: they follow range and packet, and nothing should be calibrated on them.
 """
 
@@ -37,6 +38,7 @@ class PacketType(IntEnum):
     FSK = 1
     FSK_MINI = 2
     PSK = 3
+    FLEXIBLE = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +48,7 @@ class Heard:
     Attributes:
         mode: How the reception ended.
         arrived: Date and time at which the packet's first sound arrived.
-        clock_set: Whether a host has set the modem's clock.
+        clock: Status of the modem's clock.
         rate: Rate number.
         source: Address, 0 when the header was not understood.
         destination: Address, 0 when the header was not understood.
@@ -59,7 +61,7 @@ class Heard:
 
     mode: ReceiveMode
     arrived: datetime
-    clock_set: bool
+    clock: str
     rate: int
     source: int
     destination: int
@@ -76,7 +78,7 @@ class Sent:
 
     Attributes:
         started: Date and time at which the transmission began.
-        clock_set: Whether a host has set the modem's clock.
+        clock: Status of the modem's clock.
         rate: Rate number.
         source: Address.
         destination: Address.
@@ -88,7 +90,7 @@ class Sent:
     """
 
     started: datetime
-    clock_set: bool
+    clock: str
     rate: int
     source: int
     destination: int
@@ -99,18 +101,17 @@ class Sent:
     data_bytes: int
 
 
-def receive_statistics(heard: Heard, generation: int) -> bytes:
-    """Return the `CACST` sentence for one packet."""
+def receive_statistics(heard: Heard, version: int) -> bytes:
+    """Return the `CACST` sentence for one packet, in the layout of `version` (6 or 8)."""
     level_db = _SOURCE_LEVEL_DB - 20 * math.log10(max(1.0, heard.range_m))
     out_db = min(heard.snr_db - 3.0, _BEST_OUTPUT_SNR_DB)
-    psk = heard.packet_type is PacketType.PSK
+    psk = heard.packet_type in {PacketType.PSK, PacketType.FLEXIBLE}
     psk_error = {ReceiveMode.GOOD: 0, ReceiveMode.BAD_CRC: 3, ReceiveMode.TIMEOUT: 2}[heard.mode] if psk else 0
-    clock = int(heard.clock_set)
     fields: Sequence[str | int] = (
-        8 if generation == 2 else 6,
+        version,
         heard.mode.value,
         heard.arrived.strftime("%Y%m%d%H%M%S.%f"),
-        f"{clock:02d}" if generation == 2 else clock,
+        heard.clock,
         max(1, min(32767, round(32767 * 10 ** ((heard.snr_db - 20) / 40)))),
         max(0, min(99, round(heard.snr_db + 25))),
         f"{max(0, min(9999, round(100 + 2 * heard.snr_db))):04d}",
@@ -138,17 +139,17 @@ def receive_statistics(heard: Heard, generation: int) -> bytes:
         CARRIER_HZ,
         BANDWIDTH_HZ,
     )
-    return nmea.format("CACST", *fields, *((0, -1, -1, "00") if generation == 2 else ()))
+    return nmea.format("CACST", *fields, *((0, -1, -1, "00") if version == 8 else ()))
 
 
-def transmit_statistics(sent: Sent, generation: int) -> bytes:
-    """Return the `CAXST` sentence for one packet."""
+def transmit_statistics(sent: Sent, version: int) -> bytes:
+    """Return the `CAXST` sentence for one packet, in the layout that goes with `version` (6 or 8) of `CACST`."""
     return nmea.format(
         "CAXST",
-        7 if generation == 2 else 6,
+        7 if version == 8 else 6,
         sent.started.strftime("%Y%m%d"),
         sent.started.strftime("%H%M%S.%f"),
-        int(sent.clock_set),
+        sent.clock,
         0,
         PROBE_SYMBOLS,
         BANDWIDTH_HZ,
@@ -161,5 +162,5 @@ def transmit_statistics(sent: Sent, generation: int) -> bytes:
         sent.frames_sent,
         sent.packet_type.value,
         sent.data_bytes,
-        *((CARRIER_HZ,) if generation == 2 else ()),
+        *((CARRIER_HZ,) if version == 8 else ()),
     )

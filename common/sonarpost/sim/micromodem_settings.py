@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from datetime import UTC, datetime, timedelta
 
@@ -14,14 +15,15 @@ _FACTORY = {
     "CPR": 1, "CRL": 50, "CST": 1, "CTO": 10, "DBG": 0, "DGM": 0, "DOP": 0, "DQF": 0, "DTH": 108, "DTO": 2,
     "DTP": 90, "ECD": 50, "EFB": 10, "EFF": 20, "FC0": 25000, "FMD": 1, "FML": 200, "GPS": 0, "HFC": 0, "IRE": 0,
     "MCM": 1, "MFC": 0, "MFD": 0, "MOD": 0, "MPR": 1, "MSE": 0, "MVM": 1, "NDT": 150, "NPT": 50, "NRL": 25,
-    "NRV": 150, "PAD": 2, "PCM": 0, "POW": -100, "PRL": 50, "PTH": 50, "PTO": 14, "REV": 1, "RXA": 0, "RXD": 1,
+    "NRV": 150, "PAD": 2, "PCM": 0, "POW": -100, "PRL": 50, "PTH": 50, "PTO": 14, "REV": 1, "RXA": 1, "RXD": 1,
     "RXP": 1, "SCG": 0, "SGP": 0, "SHF": 0, "SNR": 0, "SNV": 0, "SRC": 0, "TAT": 50, "TOA": 0, "TXD": 0,
     "TXF": 1, "TXP": 1, "XST": 1,
 }  # fmt: skip
 # What the emulator acts on, with the values it accepts; every other name is stored and given back.
 _BOUNDS = {
-    "SRC": (0, 127), "DTO": (1, 100_000), "CST": (0, 1), "XST": (0, 1), "RXP": (0, 1), "RXD": (0, 1), "TXP": (0, 1),
-    "TXF": (0, 1), "REV": (0, 1),
+    "SRC": (0, 127), "DTO": (1, 100_000), "CTO": (1, 100_000), "TAT": (0, 60_000), "CST": (0, 1), "XST": (0, 1),
+    "RXP": (0, 1), "RXA": (0, 1), "RXD": (0, 1), "TXP": (0, 1), "TXF": (0, 1), "REV": (0, 1), "TOA": (0, 1),
+    "DQF": (0, 1),
 }  # fmt: skip
 
 
@@ -49,6 +51,10 @@ class Settings:
     def items(self) -> list[tuple[str, int]]:
         """Return every name and value in alphabetical order."""
         return sorted(self._values.items())
+
+    def group(self, name: str) -> list[tuple[str, int]]:
+        """Return the settings with dotted names that begin with `name.`, in alphabetical order."""
+        return [(stored, value) for stored, value in self.items() if stored.startswith(f"{name}.")]
 
     def query(self, name: str) -> tuple[str, int]:
         """Return one name, as stored, and its value.
@@ -94,28 +100,51 @@ class Settings:
 class ModemClock:
     """The modem's calendar clock over simulated seconds, to the microsecond.
 
+    The clock has a pulse at every true second. A host that sets it names the second to come, shortly after the one
+    before: the clock shows that second at once and runs from the next pulse on.
+
     Args:
-        utc_at_zero_s: Seconds since 1970 (UTC) when simulated time is zero.
+        utc_at_zero_s: Seconds since 1970 (UTC), on the true clock, when simulated time is zero.
     """
 
     def __init__(self, utc_at_zero_s: float) -> None:
+        self._true_at_zero_s = utc_at_zero_s
         self._at_zero = datetime.fromtimestamp(utc_at_zero_s, UTC)
+        self._held_until_s = -math.inf
         self.was_set = False
 
     def at(self, now: float) -> datetime:
         """Return the date and time at simulated second `now`."""
-        return self._at_zero + timedelta(seconds=now)
+        return self._at_zero + timedelta(seconds=max(now, self._held_until_s))
 
     def set(self, date: datetime, now: float) -> None:
-        """Make the clock read `date` (UTC) at `now`.
+        """Make the clock read `date` (UTC) from `now` to the next pulse, and run from there.
 
         Raises:
             SentenceError: A year that leaves no room to count on.
         """
         if not 1970 <= date.year <= 2199:
             raise SentenceError("clock", "year", date.year, "1970..2199")
-        self._at_zero = date - timedelta(seconds=now)
+        true_s = self._true_at_zero_s + now
+        # A microsecond of grace: on the pulse is on the pulse, whatever the sum above was rounded to.
+        self._held_until_s = now + max(0.0, math.ceil(true_s - 1e-6) - true_s)
+        self._at_zero = date - timedelta(seconds=self._held_until_s)
         self.was_set = True
+
+    @property
+    def source(self) -> str:
+        """Where the time comes from, as `CATMQ` and `CATMG` name it."""
+        return "USER_CMD" if self.was_set else "RTC"
+
+    def status(self, generation: int) -> str:
+        """Return the clock's status as statistics carry it.
+
+        On a Micro-Modem 2 bits 0-1 are the source of the time (1 own clock, 2 a host's command) and bits 2-4 that of
+        the pulse (1 own clock); on a 1, whether a host has set it.
+        """
+        if generation == 1:
+            return str(int(self.was_set))
+        return f"{(2 if self.was_set else 1) | 1 << 2:02d}"
 
     def hhmmss(self, now: float) -> str:
         """Return the time of day as most sentences carry it."""

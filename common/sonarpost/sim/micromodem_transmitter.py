@@ -1,6 +1,8 @@
 """The sending half of the emulated modem: cycles that a host fills, mini-packets, and automatic answers.
 
 One packet is in the water at a time. What the host asks for while an automatic answer is on the air waits for its end.
+A cycle at rate 0, and a poll of another modem, put a header into the water first; the modem asks its host for data when
+that has gone, or waits for the other modem's data.
 """
 
 from __future__ import annotations
@@ -15,11 +17,12 @@ from sonarpost.modem.rates import RATES
 from sonarpost.sim import micromodem_commands as commands
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.micromodem_hearing import packet_type
-from sonarpost.sim.micromodem_sentences import PacketType, Sent, transmit_statistics
+from sonarpost.sim.micromodem_sentences import Sent, transmit_statistics
 from sonarpost.sim.micromodem_settings import ModemClock, Settings
 from sonarpost.sim.water_records import ArrivalEnded, Outcome, Packet, PacketKind
 
-_ASKED_BY_HOST = frozenset({PacketKind.DATA, PacketKind.PING, PacketKind.MINI})
+_ANSWERS = frozenset({PacketKind.ACK, PacketKind.PING_REPLY, PacketKind.MINI_REPLY})
+_WITH_STATISTICS = frozenset({PacketKind.DATA, PacketKind.CYCLE, PacketKind.FLEXIBLE})
 
 
 class BusyError(SentenceError):
@@ -28,11 +31,11 @@ class BusyError(SentenceError):
 
 @dataclass(slots=True)
 class _Cycle:
-    """A packet that is being filled."""
+    """A packet that is being filled; `deadline_s` is None until its header has gone."""
 
     request: commands.StartCycle
-    deadline_s: float
-    frames: list[bytes] = field(default_factory=list)
+    deadline_s: float | None = None
+    frames: list[commands.FillFrame] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,19 +55,32 @@ class Transmitter:
         settings: The modem's.
         clock: The modem's.
         write: Takes each sentence for the host.
+        expect: Told of the header of a poll when it has gone: data from another modem should follow.
     """
 
     def __init__(
-        self, config: ModemConfig, settings: Settings, clock: ModemClock, write: Callable[[bytes], None]
+        self,
+        config: ModemConfig,
+        settings: Settings,
+        clock: ModemClock,
+        write: Callable[[bytes], None],
+        expect: Callable[[Packet, float], None],
     ) -> None:
         self._config = config
         self._settings = settings
         self._clock = clock
         self._write = write
+        self._expect = expect
         self._packets: deque[Packet] = deque()
         self._cycle: _Cycle | None = None
         self._sending: _Sending | None = None
         self._waiting: deque[tuple[float, Packet]] = deque()
+        self._flexible_packets = 0
+
+    @property
+    def busy(self) -> bool:
+        """Whether a cycle is being filled, or a packet is in the water or waits to be."""
+        return self._cycle is not None or self._sending is not None or bool(self._waiting)
 
     def packets_to_transmit(self) -> list[Packet]:
         """Return, once, the packets that go into the water now."""
@@ -83,7 +99,7 @@ class Transmitter:
             times_s.append(self._sending.ended_s)
         elif self._waiting:
             times_s.append(self._waiting[0][0])
-        if self._cycle:
+        if self._cycle and self._cycle.deadline_s is not None:
             times_s.append(self._cycle.deadline_s)
         return min(times_s, default=None)
 
@@ -92,12 +108,14 @@ class Transmitter:
         if self._sending and self._sending.ended_s <= now:
             sending, self._sending = self._sending, None
             self._tell_sent(sending)
-        if self._cycle and self._cycle.deadline_s <= now:
-            frame = len(self._cycle.frames) + 1
+            if sending.packet.kind is PacketKind.CYCLE:
+                self._header_gone(sending.packet, now)
+        cycle = self._cycle
+        if cycle and cycle.deadline_s is not None and cycle.deadline_s <= now:
             self._cycle = None
-            self._say("CAERR", self._clock.hhmmss(now), "DATA_TIMEOUT", frame)
+            self._say("CAERR", self._clock.hhmmss(now), "DATA_TIMEOUT", len(cycle.frames) + 1)
         if self._waiting and self._waiting[0][0] <= now and not self._sending:
-            self._send(self._waiting.popleft()[1], now)
+            self.send_when_free(self._waiting.popleft()[1], now)
 
     def abandon(self) -> None:
         """Forget everything (the modem reboots)."""
@@ -106,42 +124,75 @@ class Transmitter:
         self._waiting.clear()
         self._packets.clear()
 
-    def start_cycle(self, sentence: nmea.Sentence, now: float) -> None:
-        """Act on `CCCYC`.
+    def check_free(self, sentence: nmea.Sentence) -> None:
+        """Refuse a command of the host's while the one before it is not over.
 
         Raises:
-            SentenceError: It does not parse, or is another modem's turn.
+            BusyError: It is not.
+        """
+        pending = [packet for _, packet in self._waiting]
+        if self._sending:
+            pending.append(self._sending.packet)
+        if self._cycle or any(packet.kind not in _ANSWERS for packet in pending):
+            raise BusyError(sentence.kind, "moment", "", "the end of the cycle before it")
+
+    def start_cycle(self, sentence: nmea.Sentence, now: float) -> None:
+        """Act on `CCCYC`: fill a packet, or poll another modem for one.
+
+        Raises:
+            SentenceError: It does not parse.
             BusyError: A cycle or transmission of the host's is not over.
         """
         request = commands.start_cycle(sentence)
-        self._check_free(sentence, request.source)
+        self.check_free(sentence)
         ends = (request.command, request.source, request.destination)
         self._say("CACYC", *ends, request.rate, int(request.ack_requested), request.frames)
-        self._cycle = _Cycle(request, now)
+        if request.source == self._settings["SRC"]:
+            self._cycle = _Cycle(request)
+            if request.rate != 0:
+                self._ask_frame(self._cycle, now)
+                return
+        header = Packet(
+            PacketKind.CYCLE,
+            request.source,
+            request.destination,
+            request.rate,
+            self._config.mini_airtime_s,
+            ack_requested=request.ack_requested,
+            announced_frames=request.frames,
+        )
+        self.send_when_free(header, now)
+
+    def polled(self, header: Packet, now: float) -> None:
+        """Another modem asks for data of this one: ask the host for it, unless that is sending already."""
+        if self._cycle is not None:
+            return
+        ends = (0, header.source, header.destination, header.rate)
+        self._cycle = _Cycle(commands.StartCycle(*ends, header.ack_requested, header.announced_frames))
         self._ask_frame(self._cycle, now)
 
     def fill_frame(self, sentence: nmea.Sentence, now: float) -> None:
-        """Act on `CCTXD`: ask for the next frame, or transmit.
+        """Act on `CCTXD` and `CCTXA`: ask for the next frame, or transmit.
 
         Raises:
             SentenceError: It does not parse, nobody asked for data, or it is longer than a frame.
         """
         filled = commands.fill_frame(sentence)
         cycle = self._cycle
-        if cycle is None:
+        if cycle is None or cycle.deadline_s is None:
             raise SentenceError(sentence.kind, "moment", "", "a data request before it")
         most = RATES[cycle.request.rate].frame_bytes
         if len(filled.data) > most:
             raise SentenceError(sentence.kind, "length", len(filled.data), f"at most {most} bytes")
         # The cycle's own addresses count, as they are what goes into the packet's header.
         ends = (cycle.request.source, cycle.request.destination, int(filled.ack_requested))
-        self._say("CATXD", *ends, len(filled.data))
-        cycle.frames.append(filled.data)
+        self._say("CA" + sentence.kind[2:], *ends, len(filled.data))
+        cycle.frames.append(filled)
         if filled.data and len(cycle.frames) < cycle.request.frames:
             self._ask_frame(cycle, now)
             return
         self._cycle = None
-        self._send_when_free(self._data_packet(cycle), now)
+        self.send_when_free(self._data_packet(cycle), now)
 
     def send_mini(self, sentence: nmea.Sentence, now: float) -> None:
         """Act on `CCMPC` and `CCMUC`.
@@ -151,28 +202,65 @@ class Transmitter:
             BusyError: A cycle or transmission of the host's is not over.
         """
         asked = commands.mini(sentence)
-        self._check_free(sentence, asked.source)
+        if asked.source != self._settings["SRC"]:
+            raise SentenceError(sentence.kind, "source", asked.source, f"own address {self._settings['SRC']}")
+        self.check_free(sentence)
         is_ping = sentence.kind == "CCMPC"
         bits = () if is_ping else (f"{asked.bits:04X}",)
         self._say("CA" + sentence.kind[2:], asked.source, asked.destination, *bits)
         kind = PacketKind.PING if is_ping else PacketKind.MINI
         airtime_s = self._config.mini_airtime_s
-        packet = Packet(kind, asked.source, asked.destination, 0, airtime_s, mini=asked.bits)
-        self._send_when_free(packet, now)
+        self.send_when_free(Packet(kind, asked.source, asked.destination, 0, airtime_s, mini=asked.bits), now)
+
+    def send_flexible(self, sentence: nmea.Sentence, now: float) -> None:
+        """Act on `CCTDP`.
+
+        Raises:
+            SentenceError: It does not parse.
+            BusyError: A cycle or transmission of the host's is not over.
+        """
+        asked = commands.flexible(sentence)
+        self.check_free(sentence)
+        self._flexible_packets += 1
+        ends = (asked.destination, asked.rate, int(asked.ack_requested), 0)
+        self._say("CATDP", 0, self._flexible_packets, *ends, len(asked.data))
+        rate = RATES[asked.rate]
+        rest = asked.data[commands.FLEXIBLE_MINI_BYTES :]
+        frames = [asked.data[: commands.FLEXIBLE_MINI_BYTES]]
+        frames += [rest[at : at + rate.frame_bytes] for at in range(0, len(rest), rate.frame_bytes)]
+        airtime_s = self._config.mini_airtime_s + self._config.airtime_s(asked.rate) * (len(frames) - 1) / rate.frames
+        own, ack = self._settings["SRC"], asked.ack_requested
+        packet = Packet(PacketKind.FLEXIBLE, own, asked.destination, asked.rate, airtime_s, tuple(frames), ack)
+        self.send_when_free(packet, now)
+
+    def send_when_free(self, packet: Packet, now: float) -> None:
+        """Put a packet into the water, after what is in it now."""
+        if self._sending:
+            self._waiting.appendleft((now, packet))
+            return
+        self._sending = _Sending(packet, now, now + packet.airtime_s)
+        self._packets.append(packet)
+        if self._settings.on("TXP") and packet.kind is not PacketKind.NAVIGATION:
+            self._say("CATXP", sum(map(len, packet.frames)))
 
     def answer(self, arrival: ArrivalEnded, good_frames: tuple[int, ...]) -> None:
-        """Plan the automatic answer to a packet that arrived whole and was meant for this modem, if it wants one."""
+        """Plan the automatic answer to a packet that was heard whole and was meant for this modem, if it wants one."""
         packet = arrival.transmission.packet
-        addressed = packet.destination == self._settings["SRC"]
-        if not (arrival.detected and addressed and arrival.outcome is Outcome.ARRIVED):
+        if arrival.outcome is not Outcome.ARRIVED:
             return
-        ends = (packet.destination, packet.source, 0, self._config.mini_airtime_s)
+        own = self._settings["SRC"]
+        if packet.kind is PacketKind.CYCLE and packet.source == own:
+            self.polled(packet, arrival.at_s)
+        if packet.destination != own:
+            return
+        ends = (own, packet.source, 0, self._config.mini_airtime_s)
+        acked = tuple(number for number in good_frames if number in packet.ack_frames)
         if packet.kind is PacketKind.PING:
             answer = Packet(PacketKind.PING_REPLY, *ends)
         elif packet.kind is PacketKind.MINI:
             answer = Packet(PacketKind.MINI_REPLY, *ends)
-        elif packet.kind is PacketKind.DATA and packet.ack_requested and good_frames:
-            answer = Packet(PacketKind.ACK, *ends, acked_frames=good_frames)
+        elif packet.kind is PacketKind.DATA and acked:
+            answer = Packet(PacketKind.ACK, *ends, acked_frames=acked)
         else:
             return
         self._waiting.append((arrival.at_s + self._config.turnaround_s, answer))
@@ -180,14 +268,11 @@ class Transmitter:
     def _say(self, kind: str, *fields: str | int) -> None:
         self._write(nmea.format(kind, *fields))
 
-    def _check_free(self, sentence: nmea.Sentence, source: int) -> None:
-        if source != self._settings["SRC"]:
-            raise SentenceError(sentence.kind, "source", source, f"own address {self._settings['SRC']}")
-        pending = [packet for _, packet in self._waiting]
-        if self._sending:
-            pending.append(self._sending.packet)
-        if self._cycle or any(packet.kind in _ASKED_BY_HOST for packet in pending):
-            raise BusyError(sentence.kind, "moment", "", "the end of the cycle before it")
+    def _header_gone(self, header: Packet, now: float) -> None:
+        if header.source != self._settings["SRC"]:
+            self._expect(header, now)
+        elif self._cycle is not None and self._cycle.deadline_s is None:
+            self._ask_frame(self._cycle, now)
 
     def _ask_frame(self, cycle: _Cycle, now: float) -> None:
         request = cycle.request
@@ -203,52 +288,39 @@ class Transmitter:
         )
 
     def _data_packet(self, cycle: _Cycle) -> Packet:
-        request = cycle.request
-        frames = cycle.frames + [b""] * (request.frames - len(cycle.frames))
+        request, filled = cycle.request, list(enumerate(cycle.frames, start=1))
+        empty = (b"",) * (request.frames - len(cycle.frames))
         return Packet(
             PacketKind.DATA,
             request.source,
             request.destination,
             request.rate,
             self._config.airtime_s(request.rate),
-            tuple(frames),
+            tuple(frame.data for frame in cycle.frames) + empty,
             request.ack_requested,
+            ack_frames=tuple(number for number, frame in filled if frame.ack_requested and frame.data),
+            ascii_frames=tuple(number for number, frame in filled if frame.is_text),
         )
-
-    def _send_when_free(self, packet: Packet, now: float) -> None:
-        if self._sending:
-            self._waiting.append((now, packet))
-        else:
-            self._send(packet, now)
-
-    def _send(self, packet: Packet, now: float) -> None:
-        self._sending = _Sending(packet, now, now + packet.airtime_s)
-        self._packets.append(packet)
-        if packet.kind is PacketKind.DATA and self._settings.on("TXP"):
-            self._say("CATXP", sum(map(len, packet.frames)))
 
     def _tell_sent(self, sending: _Sending) -> None:
         packet = sending.packet
-        if packet.kind is not PacketKind.DATA:
+        if packet.kind is PacketKind.NAVIGATION:
             return
         total = sum(map(len, packet.frames))
         if self._settings.on("TXF"):
             self._say("CATXF", total)
-        if not self._settings.on("XST"):
+        if packet.kind not in _WITH_STATISTICS or not self._settings.on("XST"):
             return
-        # At rate 0 the cycle header is a mini-packet of its own, so it has statistics of its own.
-        header = [(PacketType.FSK_MINI, 0, 0)] if packet.rate == 0 else []
-        for kind, sent, size in [*header, (packet_type(packet), sum(map(bool, packet.frames)), total)]:
-            statistics = Sent(
-                started=self._clock.at(sending.started_s),
-                clock_set=self._clock.was_set,
-                rate=packet.rate,
-                source=packet.source,
-                destination=packet.destination,
-                ack_requested=packet.ack_requested,
-                frames_expected=len(packet.frames),
-                frames_sent=sent,
-                packet_type=kind,
-                data_bytes=size,
-            )
-            self._write(transmit_statistics(statistics, self._config.generation))
+        statistics = Sent(
+            started=self._clock.at(sending.started_s),
+            clock=str(int(self._clock.was_set)),
+            rate=packet.rate,
+            source=packet.source,
+            destination=packet.destination,
+            ack_requested=packet.ack_requested,
+            frames_expected=max(len(packet.frames), packet.announced_frames),
+            frames_sent=sum(map(bool, packet.frames)),
+            packet_type=packet_type(packet),
+            data_bytes=total,
+        )
+        self._write(transmit_statistics(statistics, self._config.statistics_version))

@@ -12,7 +12,9 @@ Pure: packets and `now` in, events out. The rules, all of them:
   noticed), and the tail of the last non-empty frame may be damaged and still pass for good.
 - With `range_loss`, the frame error rate that belongs to the rate and the signal-to-noise ratio is added, and below
   `DETECTION_SNR_DB` nothing is detected.
-- Draws depend on (seed, transmitter, its packet number, receiver, frame) alone, so a run can be repeated.
+- With burst fading, each frame counts at the time of its middle, and a packet is detected by its beginning.
+- Draws depend on (seed, transmitter, its packet number, receiver, frame) alone, fades on (seed, path, time), so a run
+  can be repeated.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from sonarpost.sim.water_chance import Dice, damage_tail
-from sonarpost.sim.water_physics import Position, frame_error_rate, snr_db
+from sonarpost.sim.water_config import WaterConfig
+from sonarpost.sim.water_fading import Fading
+from sonarpost.sim.water_physics import Position, frame_error_rate, transmission_loss_db
 from sonarpost.sim.water_records import (
     ArrivalEnded,
     ArrivalStarted,
@@ -31,13 +35,10 @@ from sonarpost.sim.water_records import (
     Outcome,
     Packet,
     Transmission,
-    WaterConfig,
 )
 
 DETECTION_SNR_DB = -12.0
 """With `range_loss`, packets weaker than this are not noticed at all."""
-
-_SNR_SPREAD_DB = 1.0
 
 
 @dataclass(slots=True)
@@ -79,6 +80,9 @@ class Water:
         # (time, 0 for an end and 1 for a start, order, arrival): ends come first, since touching is not overlapping
         self._events: list[tuple[float, int, int, _Arrival]] = []
         self._order = 0
+        self._fading = Fading(config.seed, config.mean_clear_s, config.mean_fade_s)
+        self._reference_snr_db = config.reference_snr_db
+        self._absorption_db_per_km = config.absorption_db_per_km
 
     @property
     def in_flight(self) -> int:
@@ -88,6 +92,11 @@ class Water:
     def move(self, modem: int, position: Position) -> None:
         """Put a modem elsewhere; packets already on their way keep their travel time."""
         self._places[modem].position = position
+
+    def travel_times_s(self, modem: int, places: Mapping[str, Position]) -> dict[str, float]:
+        """Return how long sound takes, in seconds, from a modem to places that are no modems, by their names."""
+        here = self._places[modem].position
+        return {name: here.range_m(place) / self.config.sound_speed_m_per_s for name, place in places.items()}
 
     def next_event_s(self) -> float | None:
         """Return the simulated time of the next event, or None while the water is quiet."""
@@ -129,12 +138,13 @@ class Water:
         range_m = origin.range_m(place.position)
         start_s = sent.started_s + range_m / self.config.sound_speed_m_per_s
         dice = Dice(self.config.seed, sent.transmitter, sent.number, receiver)
-        level_db = snr_db(range_m, self.config.snr_at_1m_db) + _SNR_SPREAD_DB * (2 * dice.uniform("snr") - 1)
+        level_db = self.snr_db(range_m) + self.config.snr_spread_db * (2 * dice.uniform("snr") - 1)
+        detectable_db = level_db - self._fade_db(sent.transmitter, receiver, start_s)
         lost = dice.happens(self.config.packet_loss, "packet loss") or (
-            self.config.range_loss and level_db < DETECTION_SNR_DB
+            self.config.range_loss and detectable_db < DETECTION_SNR_DB
         )
         if not sent.packet.frames:  # an acknowledgement or mini-packet is lost like a frame, and then not noticed
-            lost = lost or dice.happens(self._frame_loss(sent.packet.rate, level_db), "lost frame")
+            lost = lost or dice.happens(self._frame_loss(sent, receiver, level_db, start_s), "lost frame")
         end_s = start_s + sent.packet.airtime_s
         arrival = _Arrival(receiver, sent, start_s, end_s, range_m, level_db, lost)
         place.arrivals.append(arrival)
@@ -142,9 +152,21 @@ class Water:
             self._order += 1
             heapq.heappush(self._events, (at_s, is_start, self._order, arrival))
 
-    def _frame_loss(self, rate: int, level_db: float) -> float:
-        by_range = frame_error_rate(rate, level_db) if self.config.range_loss else 0.0
-        return 1.0 - (1.0 - self.config.frame_loss) * (1.0 - by_range)
+    def snr_db(self, range_m: float) -> float:
+        """Return the mean signal-to-noise ratio at a range, dB."""
+        loss_db = transmission_loss_db(range_m, self._absorption_db_per_km, self.config.spreading_db_per_decade)
+        return self._reference_snr_db - loss_db
+
+    def _fade_db(self, transmitter: int, receiver: int, at_s: float) -> float:
+        return self.config.fade_depth_db if self._fading.faded(transmitter, receiver, at_s) else 0.0
+
+    def _frame_loss(self, sent: Transmission, receiver: int, level_db: float, at_s: float) -> float:
+        """Return the chance that what arrives at `at_s` is lost, whatever of the three causes it is."""
+        faded = self._fading.faded(sent.transmitter, receiver, at_s)
+        level_db -= self.config.fade_depth_db if faded else 0.0
+        by_range = frame_error_rate(sent.packet.rate, level_db) if self.config.range_loss else 0.0
+        by_fade = self.config.fade_loss if faded else 0.0
+        return 1.0 - (1.0 - self.config.frame_loss) * (1.0 - by_range) * (1.0 - by_fade)
 
     def _detect(self, arrival: _Arrival, at_s: float) -> bool:
         place = self._places[arrival.receiver]
@@ -183,11 +205,13 @@ class Water:
     def _frames(self, arrival: _Arrival, outcome: Outcome) -> tuple[FrameArrival, ...]:
         sent = arrival.transmission
         dice = Dice(self.config.seed, sent.transmitter, sent.number, arrival.receiver)
-        loss = self._frame_loss(sent.packet.rate, arrival.snr_db)
+        frame_s = sent.packet.airtime_s / max(1, len(sent.packet.frames))
         last = max((n for n, data in enumerate(sent.packet.frames, start=1) if data), default=0)
         arrivals = []
         for number, data in enumerate(sent.packet.frames, start=1):
             received, fate = data, Fate.DELIVERED
+            middle_s = arrival.start_s + (number - 0.5) * frame_s
+            loss = self._frame_loss(sent, arrival.receiver, arrival.snr_db, middle_s)
             if not data:
                 fate = Fate.EMPTY
             elif outcome is not Outcome.ARRIVED or dice.happens(loss, "lost frame", number):

@@ -20,6 +20,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,8 @@ from typing import IO
 from sonarpost.errors import PortError
 from sonarpost.sim.micromodem_config import Report
 from sonarpost.sim.water_records import Fate, FrameArrival
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,12 +85,25 @@ class WaterLog:
         record = {"event": event, "time_s": round(time_s, 6), "real_time_utc_s": round(real_time_utc_s, 6), **fields}
         line = json.dumps(record) + "\n"
         try:
-            for place in (self._file, self._echo):
-                if place is not None:
-                    place.write(line)
-                    place.flush()
+            if self._file is not None:
+                self._file.write(line)
+                self._file.flush()
         except OSError as error:
             raise PortError(f"the log cannot be written: {error}") from error
+        self._show(line)
+
+    def _show(self, line: str) -> None:
+        if self._echo is None:
+            return
+        try:
+            self._echo.write(line)
+            self._echo.flush()
+        except BrokenPipeError:
+            # Whoever watched has left; the modems are there for their hosts.
+            log.info("Nobody reads the log's second place any more")
+            self._echo = None
+        except OSError as error:
+            raise PortError(f"the log cannot be shown: {error}") from error
 
     def packet(self, report: Report, not_heard_because: str | None, real_time_utc_s: float) -> None:
         """Write what became of a packet at a receiver, and count it."""

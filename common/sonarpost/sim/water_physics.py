@@ -1,7 +1,7 @@
 """Range, travel time, signal-to-noise ratio and frame error rate in the simulated water.
 
-Deliberately small: straight rays at one sound speed, spherical spreading and absorption at 25 kHz. Multipath,
-Doppler, noise that changes with time, and shadow zones are not modelled.
+The sonar equation, with straight rays at one sound speed: SNR = SL - TL - NL - 10 log10(bandwidth), TL spreading and
+absorption. Multipath, Doppler and shadow zones are not modelled; docs/channel-model.md says what stands for them.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
 
-ABSORPTION_DB_PER_KM = 5.5
-"""Sea water at 25 kHz, about 10 degrees C (Thorp's formula gives 5 to 6 dB/km there)."""
+SPHERICAL_DB_PER_DECADE = 20.0
 
 _ERROR_RATES: Mapping[int, tuple[tuple[float, float], ...]] = MappingProxyType(
     {
@@ -44,13 +43,52 @@ class Position:
         return math.dist((self.east_m, self.north_m, self.depth_m), (other.east_m, other.north_m, other.depth_m))
 
 
-def snr_db(range_m: float, snr_at_1m_db: float) -> float:
-    """Return the signal-to-noise ratio in dB at `range_m` metres.
+def absorption_db_per_km(
+    frequency_hz: float, temperature_c: float = 10.0, salinity_psu: float = 35.0, depth_m: float = 0.0, ph: float = 8.0
+) -> float:
+    """Return the absorption of sound in sea water, dB/km.
 
-    Formula: SNR(r) = SNR(1 m) - 20 log10(r) - absorption x r; ranges below 1 m count as 1 m.
+    Formula: Ainslie and McColm, "A simplified formula for viscous and chemical absorption in sea water", JASA 103
+    (1998): boric acid, magnesium sulphate and water, within 10 % of Francois and Garrison from 100 Hz to 1 MHz.
+    """
+    f, z, t = frequency_hz / 1000.0, depth_m / 1000.0, temperature_c
+    f1 = 0.78 * math.sqrt(salinity_psu / 35.0) * math.exp(t / 26.0)
+    f2 = 42.0 * math.exp(t / 17.0)
+    boric_acid = 0.106 * f1 * f**2 / (f**2 + f1**2) * math.exp((ph - 8.0) / 0.56)
+    magnesium = 0.52 * (1.0 + t / 43.0) * (salinity_psu / 35.0) * f2 * f**2 / (f**2 + f2**2) * math.exp(-z / 6.0)
+    return boric_acid + magnesium + 0.00049 * f**2 * math.exp(-(t / 27.0 + z / 17.0))
+
+
+def noise_db_per_hz(frequency_hz: float, wind_m_per_s: float = 5.0, shipping: float = 0.5) -> float:
+    """Return the spectrum level of ambient noise, dB re 1 uPa^2/Hz: turbulence, ships, wind and thermal noise.
+
+    Formula: Wenz's curves as Coates, "Underwater acoustic systems" (1990), and Stojanovic, "On the relationship between
+    capacity and distance in an underwater acoustic communication channel" (WUWNet 2006), give them.
+
+    Args:
+        frequency_hz: Of the carrier.
+        wind_m_per_s: Speed of the wind.
+        shipping: 0 (none) to 1 (heavy).
+    """
+    f = frequency_hz / 1000.0
+    sources_db = (
+        17.0 - 30.0 * math.log10(f),
+        40.0 + 20.0 * (shipping - 0.5) + 26.0 * math.log10(f) - 60.0 * math.log10(f + 0.03),
+        50.0 + 7.5 * math.sqrt(wind_m_per_s) + 20.0 * math.log10(f) - 40.0 * math.log10(f + 0.4),
+        -15.0 + 20.0 * math.log10(f),
+    )
+    return 10.0 * math.log10(sum(10.0 ** (level_db / 10.0) for level_db in sources_db))
+
+
+def transmission_loss_db(
+    range_m: float, absorption_db_per_km: float, spreading_db_per_decade: float = SPHERICAL_DB_PER_DECADE
+) -> float:
+    """Return the loss from 1 m to `range_m`, dB; ranges below 1 m count as 1 m.
+
+    Formula: TL = k log10(r) + a r, with k 20 for spherical, 10 for cylindrical and 15 for practical spreading.
     """
     distance_m = max(1.0, range_m)
-    return snr_at_1m_db - 20.0 * math.log10(distance_m) - ABSORPTION_DB_PER_KM * distance_m / 1000.0
+    return spreading_db_per_decade * math.log10(distance_m) + absorption_db_per_km * distance_m / 1000.0
 
 
 def frame_error_rate(rate: int, snr: float) -> float:

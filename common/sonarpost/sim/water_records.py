@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from sonarpost.sim.water_chance import TailDamage
-
 
 class PacketKind(Enum):
     """What a packet carries."""
@@ -17,6 +15,9 @@ class PacketKind(Enum):
     PING_REPLY = "ping-reply"
     MINI = "mini"
     MINI_REPLY = "mini-reply"
+    CYCLE = "cycle"
+    FLEXIBLE = "flexible"
+    NAVIGATION = "navigation"
 
 
 class Fate(Enum):
@@ -48,9 +49,12 @@ class Packet:
         rate: Rate number, 0..6.
         airtime_s: How long it occupies the water.
         frames: Frames in order; an empty one was announced and not filled.
-        ack_requested: Whether the sender asks for acknowledgement.
+        ack_requested: What the cycle command said of acknowledgement.
+        ack_frames: Numbers, from 1, of the frames whose data came with a request for acknowledgement.
+        ascii_frames: Numbers, from 1, of the frames that were given as text.
         acked_frames: Numbers an ACK packet acknowledges, from 1.
         mini: The 13 bits of a user mini-packet.
+        announced_frames: Frames that a CYCLE packet announces, or asks for.
     """
 
     kind: PacketKind
@@ -60,8 +64,11 @@ class Packet:
     airtime_s: float
     frames: tuple[bytes, ...] = ()
     ack_requested: bool = False
+    ack_frames: tuple[int, ...] = ()
+    ascii_frames: tuple[int, ...] = ()
     acked_frames: tuple[int, ...] = ()
     mini: int = 0
+    announced_frames: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,43 +126,3 @@ class ArrivalEnded:
     range_m: float
     snr_db: float
     delay_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class WaterConfig:
-    """What the water does to packets.
-
-    Attributes:
-        seed: Seed of every draw.
-        sound_speed_m_per_s: Above zero.
-        frame_loss: Chance, 0..1, that a non-empty frame is lost on its own.
-        packet_loss: Chance, 0..1, that a packet is not detected at all.
-        tail_damage: Chance, 0..1, that the tail of the last non-empty frame is damaged and delivered.
-        tail_damage_kind: What stands in a damaged tail.
-        tail_fraction: Longest damaged tail as a part of its frame, above 0 and at most 1.
-        snr_at_1m_db: Signal-to-noise ratio one metre from a transmitter. The default gives 20 dB at 100 m.
-        range_loss: Whether frames are also lost by their signal-to-noise ratio. With `snr_at_1m_db` of 37, rate 1
-            fails beyond some 130 m, as in the paper's sea trial.
-
-    Raises:
-        ValueError: A value outside its bounds.
-    """
-
-    seed: int = 0
-    sound_speed_m_per_s: float = 1500.0
-    frame_loss: float = 0.0
-    packet_loss: float = 0.0
-    tail_damage: float = 0.0
-    tail_damage_kind: TailDamage = TailDamage.EITHER
-    tail_fraction: float = 0.5
-    snr_at_1m_db: float = 60.0
-    range_loss: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("frame_loss", "packet_loss", "tail_damage"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected 0..1")
-        if not 0.0 < self.tail_fraction <= 1.0:
-            raise ValueError(f"tail_fraction: got {self.tail_fraction!r}, expected above 0 and at most 1")
-        if not 0.0 < self.sound_speed_m_per_s < float("inf"):
-            raise ValueError(f"sound_speed_m_per_s: got {self.sound_speed_m_per_s!r}, expected above 0")

@@ -1,0 +1,214 @@
+"""From waiting pictures to blocks: previews for all of a group, then its detail, in layers or whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from typing import Final
+
+from sonarpost.link import fec
+from sonarpost.link.v1_blocks import Picture, SendBlock, fitted_stops, layer_objects, preview_object
+from sonarpost.link.v1_config import SenderConfig
+from sonarpost.link.v1_frame import SymbolKind
+from sonarpost.link.v1_gain import GroupGain
+from sonarpost.link.v1_layers import Layering
+from sonarpost.link.v1_objects import CHECK_BYTES, Pieces
+from sonarpost.link.v1_plan import arrivals, plan_layers, plan_whole, preview_frames, symbols_to_send
+from sonarpost.link.v1_preview import entry_shape
+
+TakeNumber = Callable[[], int]
+_PREVIEW_URGENCY: Final = 2.0
+_PREVIEW_SHARE: Final = 0.6
+"""Most of a group's frames that previews take."""
+
+
+@lru_cache(maxsize=64)
+def group_limit(config: SenderConfig, symbol_bytes: int) -> int:
+    """Return how many pictures a group may have so that no block needs more than 255 symbols."""
+    shape = entry_shape(symbol_bytes)
+    most = config.group_size
+    while most > 1 and (
+        _planned_previews(config, shape.source_symbols(most), most) >= fec.MAX_SYMBOLS
+        or (not config.feedback and most * config.frames_per_picture > fec.MAX_SYMBOLS)
+    ):
+        most -= 1
+    return most
+
+
+def numbers_needed(pictures: Sequence[Picture], config: SenderConfig, symbol_bytes: int) -> int:
+    """Return how many blocks a group makes at most."""
+    if not config.feedback:
+        return 2
+    total = sum(min(len(p.stream), config.stream_bytes) + 8 for p in pictures)
+    return 3 + total // (config.block_symbols * symbol_bytes)
+
+
+def _planned_previews(config: SenderConfig, source: int, pictures: int) -> int:
+    if config.feedback:
+        return symbols_to_send(source, config.worst, config.caution)
+    limit = round(_PREVIEW_SHARE * config.frames_per_picture * pictures)
+    return max(preview_frames(source, channel.spread(config.depth + 1), limit=limit) for channel in config.channels)
+
+
+def make_group(
+    pictures: Sequence[Picture], config: SenderConfig, symbol_bytes: int, take_number: TakeNumber, now: float
+) -> list[SendBlock]:
+    """Return the blocks of a group: previews first."""
+    shape = entry_shape(symbol_bytes)
+    numbers = tuple(p.number for p in pictures)
+    planned = min(_planned_previews(config, shape.source_symbols(len(pictures)), len(pictures)), fec.MAX_SYMBOLS)
+    previews = SendBlock(
+        kind=SymbolKind.PREVIEW,
+        number=take_number(),
+        symbol_bytes=symbol_bytes,
+        objects=(preview_object(pictures, symbol_bytes),),
+        layering=None,
+        contacts=numbers,
+        urgency=_PREVIEW_URGENCY,
+        planned=planned,
+        asked_at=now,
+    )
+    for picture in pictures:
+        picture.sent = min(shape.prefix_bytes, len(picture.stream))
+    if config.feedback:
+        return [previews, *whole_blocks(pictures, config, symbol_bytes, take_number, now)]
+    frames = min(round(config.frames_per_picture * len(pictures)) - planned, fec.MAX_SYMBOLS)
+    return [previews, *_layered(pictures, config, symbol_bytes, frames, take_number, now)]
+
+
+def _layered(
+    pictures: Sequence[Picture],
+    config: SenderConfig,
+    symbol_bytes: int,
+    frames: int,
+    take_number: TakeNumber,
+    now: float,
+) -> Iterator[SendBlock]:
+    starts = [p.sent for p in pictures]
+    gain = GroupGain.of([p.curve for p in pictures], starts)
+    if frames < 1 or gain.total_bytes == 0:
+        return
+    # Lengths of 128 bytes and more take two bytes; most pieces are shorter or longer together.
+    guess = Pieces(
+        tuple(p.piece(s, min(s + 128, len(p.stream))) for p, s in zip(pictures, starts, strict=True)), final=True
+    )
+    first, later = guess.overhead_bytes(), 1 + len(pictures) + CHECK_BYTES
+    arrive = arrivals(frames, config.planned_channels, config.depth)
+    plan = plan_layers(gain, symbol_bytes, arrive, first, later)
+    whole = plan_whole(gain, symbol_bytes, arrive, first)
+    if plan is None or (whole is not None and whole[1] >= plan.expected_db):
+        if whole is not None:
+            stops = fitted_stops(
+                pictures, starts, gain.stops(whole[0] * symbol_bytes - first), whole[0] * symbol_bytes, None
+            )
+            yield _whole_block(pictures, stops, whole[0], symbol_bytes, take_number(), frames, now, final=True)
+        return
+    if plan.expected_db <= 0:
+        return
+    layer_stops = _layer_stops(pictures, starts, gain, plan.layering, symbol_bytes, first, later)
+    yield SendBlock(
+        kind=SymbolKind.LAYERED,
+        number=take_number(),
+        symbol_bytes=symbol_bytes,
+        objects=layer_objects(pictures, plan.layering, symbol_bytes, starts, layer_stops),
+        layering=plan.layering,
+        contacts=tuple(p.number for p in pictures),
+        urgency=1.0,
+        planned=frames,
+        asked_at=now,
+    )
+    for picture, stop in zip(pictures, layer_stops[-1], strict=True):
+        picture.sent = stop
+
+
+def _layer_stops(
+    pictures: Sequence[Picture],
+    starts: Sequence[int],
+    gain: GroupGain,
+    layering: Layering,
+    symbol_bytes: int,
+    first: int,
+    later: int,
+) -> list[list[int]]:
+    stops: list[list[int]] = []
+    below: Pieces | None = None
+    begins, total = list(starts), 0
+    for length in layering.lengths(symbol_bytes):
+        total += length - (later if stops else first)
+        ends = fitted_stops(pictures, begins, gain.stops(total), length, below)
+        below = Pieces(tuple(p.piece(a, b) for p, a, b in zip(pictures, begins, ends, strict=True)), final=False)
+        stops.append(ends)
+        begins = ends
+    return stops
+
+
+def whole_blocks(
+    pictures: Sequence[Picture],
+    config: SenderConfig,
+    symbol_bytes: int,
+    take_number: TakeNumber,
+    now: float,
+    upto: int | None = None,
+) -> Iterator[SendBlock]:
+    """Yield blocks without layers that take pictures from what was sent to `upto` bytes (the configured length)."""
+    goal = config.stream_bytes if upto is None else upto
+    rest = [p for p in pictures if p.sent < min(len(p.stream), goal)]
+    while rest:
+        run, room = _run_that_fits(rest, goal, config.block_symbols * symbol_bytes)
+        starts = [p.sent for p in run]
+        stops = [min(len(p.stream), goal) for p in run]
+        if len(run) == 1:
+            stops = fitted_stops(run, starts, stops, min(room, config.block_symbols * symbol_bytes), None)
+        source = -(-_object_bytes(run, starts, stops) // symbol_bytes)
+        stops = fitted_stops(run, starts, stops, source * symbol_bytes, None)
+        final = all(b >= min(len(p.stream), goal) for p, b in zip(run, stops, strict=True))
+        planned = symbols_to_send(source, config.worst, config.caution)
+        yield _whole_block(run, stops, source, symbol_bytes, take_number(), planned, now, final=final)
+        rest = [p for p in rest if p.sent < min(len(p.stream), goal)]
+
+
+def _whole_block(
+    run: Sequence[Picture],
+    stops: Sequence[int],
+    source: int,
+    symbol_bytes: int,
+    number: int,
+    planned: int,
+    now: float,
+    *,
+    final: bool,
+) -> SendBlock:
+    """Return a block without layers of the pictures from what was sent to their stops, and note that it is."""
+    pieces = Pieces(tuple(p.piece(p.sent, stop) for p, stop in zip(run, stops, strict=True)), final)
+    for picture, stop in zip(run, stops, strict=True):
+        picture.sent = stop
+    return SendBlock(
+        kind=SymbolKind.OBJECT,
+        number=number,
+        symbol_bytes=symbol_bytes,
+        objects=(pieces.pack(source * symbol_bytes),),
+        layering=None,
+        contacts=tuple(p.number for p in run),
+        urgency=1.0,
+        planned=planned,
+        asked_at=now,
+    )
+
+
+def _object_bytes(run: Sequence[Picture], starts: Sequence[int], stops: Sequence[int]) -> int:
+    pieces = Pieces(tuple(p.piece(a, b) for p, a, b in zip(run, starts, stops, strict=True)), final=True)
+    return pieces.overhead_bytes() + sum(stops) - sum(starts)
+
+
+def _run_that_fits(rest: Sequence[Picture], goal: int, room: int) -> tuple[list[Picture], int]:
+    """Return pictures from the front whose rest fits one block (at least one), shared out evenly over the blocks."""
+    sizes = [min(len(p.stream), goal) - p.sent + 5 for p in rest]
+    blocks = -(-(sum(sizes) + 16) // room)
+    share = min(room, -(-sum(sizes) // blocks) + 16)
+    run, used = [rest[0]], sizes[0] + 16
+    for picture, size in zip(rest[1:], sizes[1:], strict=True):
+        if used + size > share + size // 2 or used + size > room:
+            break
+        run.append(picture)
+        used += size
+    return run, room

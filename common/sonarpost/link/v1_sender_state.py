@@ -1,0 +1,197 @@
+"""The v1 sender as plain maps and back, so that a service can save it and another process go on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from sonarpost.errors import BadInputError, FrameError
+from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.v1_blocks import Picture, SendBlock
+from sonarpost.link.v1_frame import BLOCKS, Segment, SymbolKind
+from sonarpost.link.v1_layers import Layering
+from sonarpost.link.v1_messages import MessageQueue, WaitingMessage
+from sonarpost.link.v1_objects import MAX_STREAM_BYTES
+from sonarpost.link.v1_preview import MAX_NUMBER
+from sonarpost.link.v1_reports import LossMeter, ReportBook
+from sonarpost.link.v1_sender import Sender
+from sonarpost.link.v1_state import read_field, read_list, read_number, read_time
+
+_FORMAT = 1
+_WHERE = "sender state"
+_MANY = 2**62
+
+
+def export_sender(sender: Sender) -> dict[str, object]:
+    """Return the whole state as maps, lists, numbers, strings and bytes (msgpack can hold it)."""
+    pictures = {p.number: p for p in (*sender.kept.values(), *sender.waiting)}
+    return {
+        "format": _FORMAT,
+        "pictures": [_export_picture(p) for p in pictures.values()],
+        "waiting": [p.number for p in sender.waiting],
+        "blocks": [_export_block(b) for b in sender.blocks],
+        "messages": [
+            [m.number, m.data, m.priority, m.expires_at, m.copies, m.after_frame, m.rises_at]
+            for m in sender.messages.waiting
+        ],
+        "next_message": sender.messages.next_number,
+        "reports": [[s.kind, s.data] for s in sender.reports],
+        "next_block": sender.next_block,
+        "frames_sent": sender.frames_sent,
+        "announced": sorted(sender.announced),
+        "receivers": [[receiver, float(at)] for receiver, at in sender.book.receivers.items()],
+        "meters": [
+            [receiver, m.loss, None if m.told is None else list(m.told)] for receiver, m in sender.book.meters.items()
+        ],
+    }
+
+
+def restore_sender(sender: Sender, state: Mapping[str, object]) -> None:
+    """Replace the whole state of a sender by one that `export_sender` returned; the configuration stays.
+
+    Raises:
+        FrameError: The state is not one that it made; the sender is then as before.
+    """
+    if state.get("format") != _FORMAT:
+        raise FrameError(_WHERE, "format", state.get("format"), str(_FORMAT))
+    try:
+        pictures = [_import_picture(entry) for entry in read_list(state, "pictures")]
+        blocks = [_import_block(entry) for entry in read_list(state, "blocks")]
+        messages = [_import_message(entry) for entry in read_list(state, "messages")]
+        reports = [_import_report(entry) for entry in read_list(state, "reports")]
+        queue = MessageQueue(messages, read_number(state, "next_message", 0, 255))
+        receivers = dict(_import_receiver(entry) for entry in read_list(state, "receivers"))
+        meters = dict(_import_meter(entry) for entry in read_list(state, "meters"))
+        next_block = read_number(state, "next_block", 0, BLOCKS - 1)
+        frames_sent = read_number(state, "frames_sent", 0, _MANY)
+        announced = {n for n in read_list(state, "announced") if isinstance(n, int)}
+        by_number = {p.number: p for p in pictures}
+        waiting = [by_number.get(n) if isinstance(n, int) else None for n in read_list(state, "waiting")]
+    except BadInputError as error:
+        raise FrameError(_WHERE, error.field, error.value, error.expected) from error
+    if None in waiting:
+        raise FrameError(_WHERE, "waiting", state.get("waiting"), "numbers of pictures in the state")
+    sender.kept = by_number
+    sender.waiting = [p for p in waiting if p is not None]
+    sender.blocks, sender.messages, sender.reports = blocks, queue, reports
+    sender.book = ReportBook(receivers, meters)
+    sender.next_block, sender.frames_sent, sender.announced = next_block, frames_sent, announced
+
+
+def _export_picture(picture: Picture) -> dict[str, object]:
+    return {
+        "number": picture.number,
+        "contact": picture.contact.pack(),
+        "stream": picture.stream,
+        "curve": picture.curve.astype("<f8").tobytes(),
+        "added_at": float(picture.added_at),
+        "sent": picture.sent,
+    }
+
+
+def _import_picture(entry: object) -> Picture:
+    stream, raw = read_field(entry, "stream", bytes), read_field(entry, "curve", bytes)
+    if not 1 <= len(stream) <= MAX_STREAM_BYTES or len(raw) != 8 * (len(stream) + 1):
+        raise FrameError(_WHERE, "curve", f"{len(raw)} bytes", "8 for each length of a stream of 1..65535 bytes")
+    curve = np.frombuffer(raw, "<f8").astype(np.float64)
+    if not np.isfinite(curve).all():
+        raise FrameError(_WHERE, "curve", "not finite", "finite values in dB")
+    return Picture(
+        number=read_number(entry, "number", 1, MAX_NUMBER),
+        contact=ContactSummary.unpack(read_field(entry, "contact", bytes)),
+        stream=stream,
+        curve=curve,
+        added_at=read_time(entry, "added_at"),
+        sent=read_number(entry, "sent", 0, len(stream)),
+    )
+
+
+def _export_block(block: SendBlock) -> dict[str, object]:
+    return {
+        "kind": int(block.kind),
+        "number": block.number,
+        "symbol_bytes": block.symbol_bytes,
+        "objects": list(block.objects),
+        "layering": b"" if block.layering is None else block.layering.pack(),
+        "contacts": list(block.contacts),
+        "urgency": float(block.urgency),
+        "planned": block.planned,
+        "sent": block.sent,
+        "reported": block.reported,
+        "asked_at": float(block.asked_at),
+        "needs": [list(item) for item in block.needs.items()],
+    }
+
+
+def _import_block(entry: object) -> SendBlock:
+    kind = read_number(entry, "kind", 0, 3)
+    packed = read_field(entry, "layering", bytes)
+    if kind not in tuple(SymbolKind) or len(packed) != (4 if kind == SymbolKind.LAYERED else 0):
+        raise FrameError(_WHERE, "layering", packed, "four bytes of a layered block, none of others")
+    layering = Layering.unpack(packed) if packed else None
+    symbol_bytes = read_number(entry, "symbol_bytes", 1, 255)
+    objects = tuple(data for data in read_list(entry, "objects") if isinstance(data, bytes))
+    lengths = tuple(len(data) for data in objects)
+    fits = len(lengths) == 1 and lengths[0] and not lengths[0] % symbol_bytes and lengths[0] <= 255 * symbol_bytes
+    if not (lengths == layering.lengths(symbol_bytes) if layering else fits):
+        raise FrameError(_WHERE, "objects", lengths, "whole symbols of one object, or each layer's object")
+    return SendBlock(
+        kind=SymbolKind(kind),
+        number=read_number(entry, "number", 0, BLOCKS - 1),
+        symbol_bytes=symbol_bytes,
+        objects=objects,
+        layering=layering,
+        contacts=tuple(n for n in read_list(entry, "contacts") if isinstance(n, int)),
+        urgency=max(read_time(entry, "urgency"), 1e-3),
+        planned=read_number(entry, "planned", 0, _MANY),
+        sent=read_number(entry, "sent", 0, _MANY),
+        reported=read_field(entry, "reported", bool),
+        asked_at=read_time(entry, "asked_at"),
+        needs=dict(_import_need(e) for e in read_list(entry, "needs")),
+    )
+
+
+def _import_message(entry: object) -> WaitingMessage:
+    match entry:
+        case [int(number), bytes(data), int(priority), float(expires_at), int(often), int(after), float(rises_at)] if (
+            0 <= number <= 255 and data
+        ):
+            return WaitingMessage(number, data, priority, expires_at, often, after, rises_at)
+        case _:
+            raise FrameError(_WHERE, "messages", entry, "[number, bytes, priority, time, copies, frame, time]")
+
+
+def _import_report(entry: object) -> Segment:
+    match entry:
+        case [int(kind), bytes(data)] if 1 <= kind < 32 and len(data) <= 255:
+            return Segment(kind, data)
+        case _:
+            raise FrameError(_WHERE, "reports", entry, "[kind, bytes]")
+
+
+def _import_receiver(entry: object) -> tuple[int, float]:
+    match entry:
+        case [int(receiver), float(at)] if math.isfinite(at):
+            return receiver, at
+        case _:
+            raise FrameError(_WHERE, "receivers", entry, "[address, time]")
+
+
+def _import_meter(entry: object) -> tuple[int, LossMeter]:
+    match entry:
+        case [int(receiver), None, None]:
+            return receiver, LossMeter()
+        case [int(receiver), (None | float()) as loss, [int(sent), int(arrived)]] if loss is None or 0 <= loss <= 1:
+            return receiver, LossMeter(loss, (sent, arrived))
+        case _:
+            raise FrameError(_WHERE, "meters", entry, "[address, share, [frames sent, frames arrived]]")
+
+
+def _import_need(entry: object) -> tuple[int, int]:
+    match entry:
+        case [int(receiver), int(need)] if 0 <= need <= 255:
+            return receiver, need
+        case _:
+            raise FrameError(_WHERE, "needs", entry, "[address, symbols]")

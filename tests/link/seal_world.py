@@ -1,0 +1,32 @@
+"""A vehicle and a vessel with one key, for the tests of seals."""
+
+from __future__ import annotations
+
+import hashlib
+
+from sonarpost.link.seal import AcousticSeal
+from sonarpost.link.seal_key import Direction, SealKey, SealSettings
+
+VEHICLE, VESSEL = 3, 1
+
+
+def key(name: str) -> SealKey:
+    return SealKey(hashlib.sha256(name.encode()).digest())
+
+
+def vehicle_seal(
+    settings: SealSettings | None = None, *, name: str = "fleet", address: int = VEHICLE, first_counter: int = 0
+) -> AcousticSeal:
+    seal = AcousticSeal(key(name), address, Direction.FROM_VEHICLE, settings, first_counter=first_counter)
+    seal.grant(seal.settings.lifetime_frames)
+    return seal
+
+
+def vessel_seal(settings: SealSettings | None = None, *, name: str = "fleet", address: int = VESSEL) -> AcousticSeal:
+    return AcousticSeal(key(name), address, Direction.TO_VEHICLE, settings)
+
+
+def skip(seal: AcousticSeal, frames: int) -> None:
+    """Let so many frames be lost."""
+    for _ in range(frames):
+        seal.seal(b"\x80lost")

@@ -1,0 +1,143 @@
+"""Bytes inside messages: golden vectors, round trips, hostile bytes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonarpost.errors import FrameError
+from sonarpost.link import downlink as dl
+from sonarpost.link.v1_frame import Segment, SegmentKind, pack_segments, parse_frame
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "acoustic-v1" / "messages.json"
+SAMPLES: dict[str, dl.Content] = {
+    "refine-192": dl.Refine(0x01020304, 1_790_000_000, 7, 192),
+    "refine-all": dl.Refine(0xFFFFFFFF, 1_790_000_001, 65535),
+    "resend": dl.Resend(0, 0, 1),
+    "revisit": dl.Revisit(5, 1_790_000_002, -41.5251234, 170.6712345),
+    "decision": dl.Judgement(6, 1_790_000_003, 300, 4, "not_mine_like", 0.5, "Manta"),
+    "decision-bare": dl.Judgement(7, 4_294_967_295, 300, 300, "unsure"),
+    "confirmation": dl.Confirmation(((1, dl.Outcome.TAKEN), (2**32 - 1, dl.Outcome.UNKNOWN_IMAGE))),
+    "data": dl.Data(b"\x00status"),
+}
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_golden_bytes(name: str) -> None:
+    vectors = json.loads(GOLDEN.read_text())
+    packed = bytes.fromhex(vectors[name]["hex"])
+    assert dl.pack(SAMPLES[name]) == packed
+    assert dl.pack(dl.unpack(packed)) == packed
+    assert json.loads(json.dumps(asdict(dl.unpack(packed)), default=bytes.hex)) == vectors[name]["fields"]
+
+
+numbers = st.integers(1, 65535)
+heads = {"token": st.integers(0, 2**32 - 1), "issued_utc_s": st.integers(0, 2**32 - 1)}
+orders = st.one_of(
+    st.builds(dl.Refine, **heads, number=numbers, stream_bytes=st.integers(0, 65535)),
+    st.builds(dl.Resend, **heads, number=numbers),
+    st.builds(
+        dl.Revisit,
+        **heads,
+        lat_deg=st.integers(-900_000_000, 900_000_000).map(lambda n: n / 1e7),
+        lon_deg=st.integers(-1_800_000_000, 1_800_000_000).map(lambda n: n / 1e7),
+    ),
+    st.builds(
+        dl.Judgement,
+        **heads,
+        number=numbers,
+        version=st.integers(1, 255),
+        verdict=st.sampled_from(["mine_like", "not_mine_like", "unsure"]),
+        confidence=st.none() | st.integers(0, 254).map(lambda n: n / 254),
+        mlo_class=st.text(st.characters(codec="ascii"), max_size=13),
+    ),
+)
+
+
+@given(orders)
+def test_every_order_fits_a_frame_of_32_bytes_and_comes_back(order: dl.DownlinkOrder) -> None:
+    message = Segment(SegmentKind.MESSAGE, b"\x05" + dl.pack(order))
+    (segment,) = parse_frame(pack_segments([message], 32))
+    assert isinstance(segment, Segment)
+    assert dl.unpack(segment.data[1:]) == order
+
+
+@given(st.text(max_size=60), st.integers(14, 60))
+def test_a_class_is_cut_between_characters(text: str, room_bytes: int) -> None:
+    packed = dl.pack(dl.Judgement(1, 2, 3, 1, "unsure", None, text), room_bytes)
+    found = dl.unpack(packed)
+    assert isinstance(found, dl.Judgement)
+    assert len(packed) <= room_bytes
+    assert text.startswith(found.mlo_class)
+    lost = text[len(found.mlo_class) :]
+    assert not lost or len(packed) + len(lost[0].encode()) > room_bytes
+
+
+@given(st.binary(max_size=40))
+def test_hostile_bytes_parse_or_are_refused_by_name(data: bytes) -> None:
+    try:
+        content = dl.unpack(data, "modem 3")
+    except FrameError as error:
+        where = error.where
+    else:
+        where = "modem 3"
+        assert dl.unpack(dl.pack(content, 60)) == content
+    assert where == "modem 3"
+
+
+@pytest.mark.parametrize(
+    ("packed", "field"),
+    [
+        (b"", "kind"),
+        (b"\x07", "kind"),
+        (b"\x01\0\0", "length"),
+        (bytes(9), "kind"),
+        (b"\x01" + bytes(8) + b"\0\1\0", "length"),
+        (b"\x01" + bytes(12), "number"),
+        (b"\x03" + bytes(8) + b"\x7f" * 8, "lat_deg"),
+        (b"\x04" + bytes(8) + b"\0\1\1\3\xff", "verdict"),
+        (b"\x04" + bytes(8) + b"\0\1\0\0\xff", "version"),
+        (b"\x04" + bytes(8) + b"\0\1\1\0\xff\xc3", "mlo_class"),
+        (b"\x08" + bytes(4), "length"),
+        (b"\x08" + bytes(4) + b"\x09", "outcome"),
+        (b"\x10", "data"),
+    ],
+)
+def test_wrong_messages_name_the_field(packed: bytes, field: str) -> None:
+    with pytest.raises(FrameError) as caught:
+        dl.unpack(packed)
+    assert caught.value.field == field
+
+
+def test_confirmations_fill_messages() -> None:
+    outcomes = [(token, dl.Outcome.TAKEN) for token in range(12)]
+    made = dl.confirmations(outcomes)
+    assert [len(each.outcomes) for each in made] == [5, 5, 2]
+    assert [pair for each in made for pair in each.outcomes] == outcomes
+    assert max(len(dl.pack(each)) for each in made) <= dl.SMALLEST_ROOM_BYTES
+
+
+def test_tokens_are_of_a_record_and_an_attempt() -> None:
+    assert dl.token_of("c-1", "command") == dl.token_of("c-1", "command")
+    assert len({dl.token_of("c-1", "command", n) for n in range(9)} | {dl.token_of("c-1", "decision")}) == 10
+    assert dl.record_id_of(1, 0xAB) == "a1-000000ab"
+
+
+def test_image_identifiers_and_contact_numbers() -> None:
+    for number in (1, 35, 36, 1000, 65535):
+        assert dl.number_of_image(dl.image_of_number(number)) == number
+    assert (dl.image_of_number(1), dl.image_of_number(65535)) == ("0001", "1EKF")
+    following = [dl.number_of_image(image_id) for image_id in ("1EKE", "1EKF", "1EKG", "1EKH")]
+    assert following == [65534, 65535, 1, 2]
+    assert 1 <= dl.number_of_image("0000") <= 65535
+    for wrong in ("", "000", "00a1", "00001", "-001", "0_01"):
+        with pytest.raises(FrameError):
+            dl.number_of_image(wrong)
+    for number in (0, 65536):
+        with pytest.raises(FrameError):
+            dl.image_of_number(number)

@@ -1,0 +1,327 @@
+"""The vehicle's acoustic queue: order, fairness, shares, lifetimes, saving and going on; on simulated time."""
+
+from __future__ import annotations
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonarpost.errors import ConfigError, FrameError
+from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.queue import AcousticQueue, PictureName, QueueConfig
+from sonarpost.link.queue_state import export_queue, restore_queue
+from sonarpost.link.v1_events import ContactUpdate, MessageReceived
+from sonarpost.link.v1_receiver import Receiver
+from sonarpost.modem.rates import RATES
+
+CONTACT = ContactSummary(height_px=80, width_px=80, lat_deg=56.4, lon_deg=-5.6, confidence=1.5)
+
+
+def stream(number: int, length: int = 300) -> bytes:
+    return np.random.default_rng(number).bytes(length)
+
+
+def filled(queue: AcousticQueue, pictures: int, now: float = 0.0) -> AcousticQueue:
+    for number in range(1, pictures + 1):
+        assert queue.add_picture(number, PictureName(f"{number:04d}", f"c{number}"), CONTACT, stream(number), now)
+    return queue
+
+
+def run(queue: AcousticQueue, seconds: float, *, now: float = 0.0, lost=lambda: False, receiver=None, reports=False):
+    """Send for so long; return events with times, and the time."""
+    receiver = receiver or Receiver()
+    found, end = [], now + seconds
+    while now < end:
+        packet = queue.next_packet(now)
+        now += RATES[queue.rate].airtime_s
+        for frame in packet:
+            if not lost():
+                found += receiver.accept(3, frame, now)
+        if reports and receiver.report_is_due(3, now) and (report := receiver.report(3, now)) and not lost():
+            queue.on_report(report, now, 1)
+    return found, now
+
+
+def losses(share: float, seed: int = 1):
+    rng = np.random.default_rng(seed)
+    return lambda: bool(rng.random() < share)
+
+
+def messages(events) -> list[bytes]:
+    return [e.data for e in events if isinstance(e, MessageReceived)]
+
+
+def test_every_contact_is_seen_before_the_detail_of_any():
+    queue = filled(AcousticQueue(QueueConfig(expected_loss=0.0)), 120)
+    receiver, now, first = Receiver(), 0.0, None
+    seen: set[int] = set()
+    while len(seen) < 120:
+        for frame in queue.next_packet(now):
+            for event in receiver.accept(3, frame, now):
+                assert isinstance(event, ContactUpdate)
+                if len(event.stream) > 40 and first is None:
+                    first = (event.number, len(seen))
+                seen.add(event.number)
+        now += 6.1
+        assert now < 6.1 * 60, "no more than a frame a contact"
+    assert first is None, f"detail of {first} before all contacts were seen"
+
+
+def test_messages_go_by_priority_and_an_urgent_one_waits_for_one_packet_at_most():
+    queue = filled(AcousticQueue(QueueConfig(expected_loss=0.0)), 20)
+    for n in range(200):
+        queue.add_message(f"m{n}", "status", b"%4d" % n * 10, 0.0, priority=5)
+    run(queue, 30.0)
+    queue.add_message("alarm", "safety", b"leak", 30.0, priority=1)
+    receiver = Receiver()
+    packet = queue.next_packet(30.0)
+    first = [e for frame in packet for e in receiver.accept(3, frame, 30.0)]
+    assert b"leak" in messages(first)
+
+
+def test_programs_of_one_priority_share_the_water_whatever_they_send():
+    queue = AcousticQueue(QueueConfig(expected_loss=0.0))
+    for n in range(600):
+        queue.add_message(f"m{n}", "chatty", b"C" * 50, 0.0, priority=4, lifetime_s=1e5)
+    for n in range(40):
+        queue.add_message(f"m{n}", "quiet", b"Q" * 20 + b"%2d" % n, 0.0, priority=4, lifetime_s=1e5)
+    events, _ = run(queue, 300.0)
+    sent = messages(events)
+    last_quiet = max(i for i, data in enumerate(sent) if data[:1] == b"Q")
+    assert sum(data[:1] == b"Q" for data in sent) == 40
+    before = sum(len(d) for d in sent[: last_quiet + 1] if d[:1] == b"C")
+    assert before <= 40 * 22 + 8 * 64, "half of the bytes, and what was loaded already"
+
+
+def test_pictures_keep_their_share_in_a_flood_and_a_flood_is_not_starved():
+    queue = filled(AcousticQueue(QueueConfig(expected_loss=0.0, picture_share=0.25)), 4)
+    for n in range(1500):
+        queue.add_message(f"m{n}", "flood", b"F" * 55, 0.0, priority=1, lifetime_s=1e5)
+    receiver, now, pictures, frames = Receiver(), 0.0, 0, 0
+    while queue.open_numbers():
+        for frame in queue.next_packet(now):
+            pictures += not messages(receiver.accept(3, frame, now))
+            frames += 1
+        now += 6.1
+        assert frames < 400
+    assert 0.15 < pictures / frames < 0.3
+
+
+def test_what_fills_only_gets_through_when_it_has_aged():
+    def frames_until_it_goes(priority: int) -> float:
+        queue = AcousticQueue(QueueConfig(expected_loss=0.0, aging_s=600.0))
+        queue.add_message("log", "logger", b"L" * 55, 0.0, priority=priority, lifetime_s=1e6)
+        now, n = 0.0, 0
+        receiver = Receiver()
+        while True:
+            n += 1
+            if n % 2:  # never idle, and no room left
+                queue.add_picture(n, PictureName("0001", "c"), CONTACT, stream(n), now)
+            for frame in queue.next_packet(now):
+                if messages(receiver.accept(3, frame, now)):
+                    return now
+            now += 6.1
+
+    assert frames_until_it_goes(5) < 10
+    assert 1100 < frames_until_it_goes(7) < 1400
+
+
+def test_what_has_expired_is_not_sent_and_counted():
+    queue = AcousticQueue(QueueConfig())
+    queue.add_message("old", "s", b"old", 0.0, lifetime_s=10.0)
+    assert not queue.add_message("older", "s", b"older", 0.0, lifetime_s=-1.0)
+    queue.add_message("new", "s", b"new", 0.0, lifetime_s=100.0)
+    events, _ = run(queue, 60.0, now=20.0)
+    assert messages(events) == [b"new"]
+    assert queue.messages.expired == 2
+    assert queue.is_idle
+
+
+def test_a_message_given_twice_goes_once_and_two_programs_may_use_one_name():
+    queue = AcousticQueue(QueueConfig(expected_loss=0.0))
+    assert queue.add_message("1", "a", b"one", 0.0)
+    assert not queue.add_message("1", "a", b"one", 0.0)
+    assert queue.add_message("1", "b", b"two", 0.0)
+    events, _ = run(queue, 30.0)
+    assert sorted(messages(events)) == [b"one", b"two"]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.5])
+def test_with_reports_everything_arrives_whatever_is_lost(share):
+    queue = filled(AcousticQueue(QueueConfig(expected_loss=0.3)), 12)
+    for n in range(60):
+        queue.add_message(f"m{n}", "s", b"%3d" % n * 5, 0.0, priority=4, lifetime_s=1e5)
+    receiver = Receiver()
+    run(queue, 6000.0, lost=losses(share), receiver=receiver, reports=True)
+    state = {c["number"]: c for s in receiver.snapshot()["sources"] for c in s["contacts"]}
+    assert set(state) == set(range(1, 13))
+    assert not queue.open_numbers()
+    if share >= 0.1:
+        assert abs(queue.loss - share) < 0.12
+        assert abs(queue.sender.config.worst.loss - share) < 0.15
+
+
+def test_a_receiver_that_falls_silent_stops_nothing():
+    queue = filled(AcousticQueue(QueueConfig(rates=(0, 1), first_rate=1, feedback_memory_s=300.0)), 30)
+    receiver = Receiver()
+    _, now = run(queue, 300.0, receiver=receiver, reports=True)
+    assert queue.sender.config.feedback
+    for number in range(31, 61):
+        queue.add_picture(number, PictureName(f"{number:04d}", "c"), CONTACT, stream(number), now)
+    _, now = run(queue, 12_000.0, now=now, receiver=receiver)
+    assert not queue.sender.config.feedback
+    assert queue.rate == 0
+    assert not queue.open_numbers()
+
+
+def test_the_rate_follows_the_loss():
+    queue = filled(AcousticQueue(QueueConfig(rates=(1, 5), first_rate=5, stream_bytes=4000)), 0)
+    receiver, now = Receiver(), 0.0
+    rates = []
+    lost = {1: losses(0.05), 5: losses(0.97)}
+    for n in range(1, 200):
+        if len(queue.open_numbers()) < 3:
+            queue.add_picture(n, PictureName("0001", "c"), CONTACT, stream(n, 2000), now)
+        for frame in queue.next_packet(now):
+            if not lost[queue.rate]():
+                receiver.accept(3, frame, now)
+        now += RATES[queue.rate].airtime_s
+        rates.append(queue.rate)
+        if n % 6 == 0 and (report := receiver.report(3, now)):
+            queue.on_report(report, now, 1)
+    assert rates[0] == 5
+    assert rates.count(1) > 150
+
+
+def test_expected_times_come_true():
+    queue = filled(AcousticQueue(QueueConfig(expected_loss=0.2)), 10)
+    queue.next_packet(0.0)
+    told = {e.name.image_id: e for e in queue.expected(0.0)}
+    assert set(told) == {f"{n:04d}" for n in range(1, 11)}
+    assert all(e.preview_at is not None and e.preview_at <= e.done_at and e.bytes_left > 0 for e in told.values())
+    now = 0.0
+    gone = {}
+    while queue.open_numbers():
+        queue.next_packet(now)
+        now += RATES[1].airtime_s
+        queue.sent(RATES[1].airtime_s)
+        for number in range(1, 11):
+            if number not in queue.open_numbers():
+                gone.setdefault(f"{number:04d}", now)
+    for image_id, at in gone.items():
+        assert abs(told[image_id].done_at - at) <= max(15.0, 0.35 * at)
+    assert queue.expected(now) == []
+
+
+def copy_of(queue: AcousticQueue, seal=None) -> AcousticQueue:
+    parts = {name: msgpack.packb(part) for name, part in export_queue(queue).items()}
+    again = AcousticQueue(queue.config, seal=seal)
+    restore_queue(again, {name: msgpack.unpackb(data, strict_map_key=False) for name, data in parts.items()})
+    return again
+
+
+@settings(max_examples=25)
+@given(st.data())
+def test_a_queue_that_was_saved_and_taken_up_sends_what_it_would_have_sent(data):
+    queue = filled(AcousticQueue(QueueConfig(rates=(0, 1), first_rate=1)), data.draw(st.integers(0, 30)))
+    for n in range(data.draw(st.integers(0, 20))):
+        priority = data.draw(st.integers(1, 7))
+        queue.add_message(f"m{n}", "ab"[n % 2], bytes([n + 1]) * (n + 1), 0.0, priority=priority)
+    receiver = Receiver()
+    _, now = run(queue, data.draw(st.floats(0, 400)), receiver=receiver, reports=data.draw(st.booleans()))
+    again = copy_of(queue)
+    assert export_queue(again) == export_queue(queue)
+    for _ in range(20):
+        now += 6.1
+        assert again.next_packet(now) == queue.next_packet(now)
+        assert again.expected(now) == queue.expected(now)
+
+
+def test_most_parts_do_not_change_with_a_packet():
+    queue = filled(AcousticQueue(QueueConfig()), 30)
+    queue.next_packet(0.0)
+    before = {name: msgpack.packb(part) for name, part in export_queue(queue).items()}
+    queue.next_packet(7.0)
+    after = {name: msgpack.packb(part) for name, part in export_queue(queue).items()}
+    changed = {name for name in after if before.get(name) != after[name]}
+    assert changed == {"core"}
+    assert len(after["core"]) < 10_000
+
+
+def test_a_state_that_is_none_is_refused():
+    good = export_queue(filled(AcousticQueue(QueueConfig()), 3))
+    core = dict(good["core"])
+    for bad in ({}, {"core": {**core, "format": 2}}, {**good, "core": {**core, "rate": 9}}, {"core": core}):
+        with pytest.raises(FrameError):
+            restore_queue(AcousticQueue(QueueConfig()), bad)
+
+
+def test_a_rate_that_is_no_longer_configured_is_left():
+    queue = filled(AcousticQueue(QueueConfig(rates=(5,), first_rate=5)), 5)
+    queue.next_packet(0.0)
+    again = AcousticQueue(QueueConfig(rates=(1,), first_rate=1))
+    restore_queue(again, export_queue(queue))
+    assert again.rate == 1
+    receiver = Receiver()
+    events, _ = run(again, 600.0, receiver=receiver)
+    assert {e.number for e in events if isinstance(e, ContactUpdate)} == {1, 2, 3, 4, 5}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"expected_loss": 1.0}, {"picture_share": -0.1}, {"aging_s": 0.0}, {"feedback": "perhaps"}, {"max_messages": 0}],
+)
+def test_values_out_of_range_are_named(wrong):
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        QueueConfig(**wrong)
+
+
+def test_a_rate_that_there_is_not_is_named():
+    with pytest.raises(ConfigError, match="rate"):
+        AcousticQueue(QueueConfig(rates=(1,), first_rate=4))
+
+
+def test_a_longer_stream_of_a_picture_that_has_gone_brings_only_what_is_new():
+    queue = AcousticQueue(QueueConfig(expected_loss=0.0))
+    name, whole = PictureName("0001", "c1"), stream(1, 1200)
+    receiver = Receiver()
+    queue.add_picture(1, name, CONTACT, whole[:300], 0.0)
+    _, now = run(queue, 200.0, receiver=receiver)
+    assert not queue.open_numbers()
+    assert not queue.refine(1, 1000, now), "there is no more"
+    before = queue.sender.frames_sent
+    assert queue.add_picture(1, name, CONTACT, whole, now)
+    events, now = run(queue, 600.0, now=now, receiver=receiver)
+    assert max(len(e.stream) for e in events if isinstance(e, ContactUpdate)) == 1200
+    assert queue.sender.frames_sent - before < 900 / 50 + 8
+
+
+def test_a_picture_that_is_given_again_goes_again_unless_it_waits():
+    queue = AcousticQueue(QueueConfig(expected_loss=0.0))
+    name = PictureName("0001", "c1")
+    assert queue.add_picture(1, name, CONTACT, stream(1), 0.0)
+    assert not queue.add_picture(1, name, CONTACT, stream(1), 0.0)
+    _, now = run(queue, 200.0)
+    assert queue.add_picture(1, name, CONTACT, stream(1), now)
+    events, _ = run(queue, 200.0, now=now)
+    assert [e.number for e in events if isinstance(e, ContactUpdate)]
+
+
+def test_a_picture_of_which_more_is_here_is_refined_at_once():
+    queue = AcousticQueue(QueueConfig(expected_loss=0.0, frames_per_picture=3.0))
+    queue.add_picture(1, PictureName("0001", "c1"), CONTACT, stream(1, 900), 0.0)
+    receiver = Receiver()
+    _, now = run(queue, 200.0, receiver=receiver)
+    assert queue.refine(1, 900, now)
+    events, _ = run(queue, 600.0, now=now, receiver=receiver)
+    assert max(len(e.stream) for e in events if isinstance(e, ContactUpdate)) == 900
+
+
+def test_a_longer_stream_that_does_not_continue_what_was_sent_is_not_mixed_with_it():
+    queue = AcousticQueue(QueueConfig(expected_loss=0.0))
+    queue.add_picture(1, PictureName("0001", "c1"), CONTACT, stream(1, 300), 0.0)
+    _, now = run(queue, 200.0)
+    assert not queue.add_picture(1, PictureName("0001", "c1"), CONTACT, stream(2, 600), now)
+    assert not queue.open_numbers()

@@ -1,0 +1,285 @@
+"""Seals of acoustic frames: what passes, what does not and why, restarts, the end of a key, the whole link."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import random
+import re
+
+import pytest
+from link.seal_world import VEHICLE, VESSEL, key, skip, vehicle_seal, vessel_seal
+from link.v1_world import contact, stream
+
+from sonarpost.errors import ConfigError, FrameError
+from sonarpost.link.bounds import Channel
+from sonarpost.link.seal import RESERVED, AcousticSeal, SealCounts
+from sonarpost.link.seal_key import Direction, SealSettings
+from sonarpost.link.seal_window import WINDOW, ReplayWindow
+from sonarpost.link.v1_config import SenderConfig
+from sonarpost.link.v1_events import ContactUpdate, FrameRefused, ReportReceived
+from sonarpost.link.v1_frame import Symbol, SymbolKind, checksum, pack_symbol, parse_frame
+from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.v1_sender import Sender
+
+ALL_SETTINGS = [
+    SealSettings(counter, tag, encrypt) for counter, tag, encrypt in itertools.product((1, 2), (4, 6, 8), (False, True))
+]
+COVERED = b"\x80 a frame after its checksum"
+
+
+def refusal(seal: AcousticSeal, sealed: bytes, source: int = VEHICLE) -> str:
+    """The field of the error with which a frame is refused."""
+    with pytest.raises(FrameError) as caught:
+        seal.open(source, sealed)
+    return caught.value.field
+
+
+@pytest.mark.parametrize("settings", ALL_SETTINGS, ids=str)
+def test_a_sealed_frame_opens_and_costs_what_it_says(settings: SealSettings) -> None:
+    vehicle, vessel = vehicle_seal(settings), vessel_seal(settings)
+    for covered in (COVERED, b"\x80", b"\x80" + bytes(300)):
+        sealed = vehicle.seal(covered)
+        assert len(sealed) == len(covered) + settings.counter_bytes + settings.tag_bytes == len(covered) + vehicle.size
+        assert sealed[0] == 0x80
+        assert (covered[1:] in sealed) == (not settings.encrypt or len(covered) == 1)
+        assert vessel.open(VEHICLE, sealed) == covered
+    assert (vehicle.counts, vessel.counts) == (SealCounts(sealed=3), SealCounts(genuine=3))
+
+
+@pytest.mark.parametrize("settings", [SealSettings(), SealSettings(encrypt=True)], ids=str)
+def test_every_bit_is_covered(settings: SealSettings) -> None:
+    sealed = vehicle_seal(settings).seal(COVERED)
+    vessel = vessel_seal(settings)
+    for bit in range(8 * len(sealed)):
+        damaged = bytearray(sealed)
+        damaged[bit // 8] ^= 1 << bit % 8
+        assert refusal(vessel, bytes(damaged)) == "tag"
+    assert vessel.counts.forged == 8 * len(sealed)
+    assert vessel.open(VEHICLE, sealed) == COVERED
+
+
+def test_who_may_have_sealed_it_matters() -> None:
+    sealed = vehicle_seal().seal(COVERED)
+    vessel = vessel_seal()
+    assert refusal(vessel, sealed, VEHICLE + 1) == "tag"  # another vehicle's
+    assert refusal(vessel_seal(name="another key"), sealed) == "tag"
+    assert refusal(vessel_seal(SealSettings(encrypt=True)), sealed) == "tag"
+    assert refusal(vessel_seal(SealSettings(tag_bytes=6)), sealed) == "tag"
+    own = AcousticSeal(key("fleet"), VEHICLE, Direction.TO_VEHICLE)
+    own.grant(10)
+    assert refusal(own, own.seal(COVERED)) == "tag"  # its own, come back
+    for source in (-1, 128, 2**40):
+        assert refusal(vessel, sealed, source) == "tag"
+    for short in (b"", b"\x80", sealed[: vessel.size]):
+        assert refusal(vessel, short) == "tag"
+    assert vessel.open(VEHICLE, sealed) == COVERED
+
+
+def test_a_replay_is_told_from_a_forgery_however_old() -> None:
+    vehicle, vessel = vehicle_seal(), vessel_seal()
+    recorded = [vehicle.seal(COVERED) for _ in range(3000)]
+    for sealed in recorded:
+        vessel.open(VEHICLE, sealed)
+    for sealed in recorded[::100] + recorded[-70:]:
+        assert refusal(vessel, sealed) == "counter"
+    assert refusal(vessel, COVERED + b"\x07guess") == "tag"
+    assert vessel.counts == SealCounts(genuine=3000, replayed=100, forged=1)
+
+
+def test_late_frames_pass_once_if_the_window_still_knows_them() -> None:
+    vehicle, vessel = vehicle_seal(), vessel_seal()
+    sealed = [vehicle.seal(bytes([0x80, n])) for n in range(WINDOW + 1)]
+    vessel.open(VEHICLE, sealed[WINDOW])
+    assert refusal(vessel, sealed[0]) == "counter"
+    for late in reversed(sealed[1:WINDOW]):
+        vessel.open(VEHICLE, late)
+        assert refusal(vessel, late) == "counter"
+    assert vessel.counts.genuine == WINDOW
+
+
+@pytest.mark.parametrize(("settings", "bridged"), [(SealSettings(), 191), (SealSettings(2), 65471)], ids=str)
+def test_losses_cost_nothing_up_to_a_bound_and_one_frame_beyond(settings: SealSettings, bridged: int) -> None:
+    assert bridged + 1 == settings.counter_step - WINDOW
+    vehicle, vessel = vehicle_seal(settings), vessel_seal(settings)
+    vessel.open(VEHICLE, vehicle.seal(COVERED))
+    skip(vehicle, bridged)
+    assert vessel.open(VEHICLE, vehicle.seal(COVERED)) == COVERED
+    skip(vehicle, bridged + 1)
+    first = vehicle.seal(COVERED)
+    assert refusal(vessel, first) == "counter"
+    assert refusal(vessel, first) == "counter"  # the same again confirms nothing
+    skip(vehicle, bridged)  # nor need the second be the very next
+    assert vessel.open(VEHICLE, vehicle.seal(COVERED)) == COVERED
+    assert vessel.open(VEHICLE, vehicle.seal(COVERED)) == COVERED
+    assert vessel.counts == SealCounts(genuine=4, unconfirmed=2)
+
+
+def test_a_receiver_without_memory_finds_any_counter_of_the_key() -> None:
+    last = SealSettings().lifetime_frames - 2
+    vehicle, vessel = vehicle_seal(first_counter=last), vessel_seal()
+    assert refusal(vessel, vehicle.seal(COVERED)) == "counter"
+    assert vessel.open(VEHICLE, vehicle.seal(COVERED)) == COVERED
+    with pytest.raises(FrameError, match="a new key after 1048576 frames"):
+        vehicle.seal(COVERED)
+    assert (vehicle.frames_left, vehicle.wanted_limit) == (0, None)
+
+
+def test_counters_are_used_once_whenever_the_sender_crashes() -> None:
+    durable, used = 0, []
+    for frames_until_crash in (0, 1, 31, 32, 33, 64, 65, 200, 0, 5):
+        seal = AcousticSeal(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=durable)
+        for _ in range(frames_until_crash):
+            if (limit := seal.wanted_limit) is not None:
+                durable = limit
+                seal.grant(limit)
+            used.append(seal.seal(COVERED)[-5:])
+        if (limit := seal.wanted_limit) is not None:
+            durable = limit  # crashed between writing it down and granting it
+    assert len(set(used)) == len(used)
+    vessel = vessel_seal()
+    for ending in used:
+        assert vessel.open(VEHICLE, COVERED + ending) == COVERED
+    assert RESERVED < WINDOW * 2
+
+
+def test_without_a_reservation_nothing_is_sealed() -> None:
+    seal = AcousticSeal(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
+    with pytest.raises(FrameError, match="a limit granted above it"):
+        seal.seal(COVERED)
+    seal.grant(1)
+    seal.seal(COVERED)
+    with pytest.raises(FrameError):
+        seal.seal(COVERED)
+    for wrong in (0, SealSettings().lifetime_frames + 1):
+        with pytest.raises(ConfigError, match="limit"):
+            seal.grant(wrong)
+
+
+def test_a_restarted_receiver_still_knows_what_it_took() -> None:
+    vehicle, before = vehicle_seal(), vessel_seal()
+    taken = [vehicle.seal(COVERED) for _ in range(50)]
+    for sealed in taken[::2]:
+        before.open(VEHICLE, sealed)
+    after = vessel_seal()
+    after.restore(before.snapshot())
+    assert after.snapshot() == before.snapshot()
+    for sealed in taken[::2]:
+        assert refusal(after, sealed) == "counter"
+    for sealed in taken[1:-2:2]:
+        after.open(VEHICLE, sealed)
+
+
+def test_a_restored_sender_goes_on_behind_its_reservation() -> None:
+    vehicle = AcousticSeal(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
+    vehicle.grant(64)
+    vessel = vessel_seal()
+    vessel.open(VEHICLE, vehicle.seal(COVERED))
+    older = vehicle.snapshot()
+    again = AcousticSeal(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=128)
+    again.restore(older)
+    assert again.wanted_limit == 128 + RESERVED
+    again.grant(128 + RESERVED)
+    vessel.open(VEHICLE, again.seal(COVERED))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"format": 2},
+        {"key": "00000000"},
+        {"limit": -1},
+        {"limit": 2**20 + 1},
+        {"limit": True},
+        {"windows": None},
+        {"windows": [[3, -1, bytes(8)]]},
+        {"windows": [[3, 2**20, bytes(8)]]},
+        {"windows": [[128, 5, bytes(8)]]},
+        {"windows": [[3, 5, bytes(9)]]},
+        {"counts": {}},
+        {"counts": {"sealed": -1}},
+    ],
+)
+def test_another_state_is_refused_and_changes_nothing(change: dict[str, object]) -> None:
+    vehicle, vessel = vehicle_seal(), vessel_seal()
+    vessel.open(VEHICLE, vehicle.seal(COVERED))
+    state = vessel.snapshot()
+    kept = copy.deepcopy(state)
+    with pytest.raises(FrameError, match="seal state"):
+        vessel.restore(state | change)
+    assert vessel.snapshot() == kept
+
+
+def test_memory_is_of_genuine_senders_only() -> None:
+    vessel = vessel_seal(SealSettings(2))
+    for source in range(128):
+        assert refusal(vessel, COVERED + b"\0\0fake", source) == "tag"
+    assert vessel.snapshot()["windows"] == []
+    window = ReplayWindow()
+    for counter in (0, 10**6, 10**9):
+        window.take(counter)
+        assert window.seen < 1 << WINDOW
+
+
+@pytest.mark.parametrize("wrong", [{"counter_bytes": 3}, {"counter_bytes": 0}, {"tag_bytes": 5}, {"tag_bytes": 16}])
+def test_settings_out_of_range_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        SealSettings(**wrong)  # type: ignore[arg-type]
+    for address, first in ((-1, 0), (128, 0), (1, -1), (1, 2**20 + 1)):
+        with pytest.raises(ConfigError, match="acoustic seal"):
+            AcousticSeal(key("fleet"), address, Direction.FROM_VEHICLE, first_counter=first)
+
+
+def test_damage_is_told_from_a_wrong_seal() -> None:
+    vehicle, vessel = vehicle_seal(), vessel_seal()
+    frame = pack_symbol(Symbol(SymbolKind.OBJECT, 1, 2, 3, bytes(54)), vehicle)
+    assert len(frame) == 64
+    damaged = bytes([*frame[:20], frame[20] ^ 1, *frame[21:]])
+    rewritten = checksum(damaged[2:]).to_bytes(2, "big") + damaged[2:]
+    for sent, field in ((damaged, "checksum"), (rewritten, "tag")):
+        with pytest.raises(FrameError) as caught:
+            parse_frame(sent, VEHICLE, vessel)
+        assert caught.value.field == field
+    assert vessel.counts == SealCounts(forged=1)
+    padded = frame + bytes(192)
+    assert parse_frame(padded, VEHICLE, vessel) == Symbol(SymbolKind.OBJECT, 1, 2, 3, bytes(54))
+    with pytest.raises(FrameError, match=re.escape("one not taken yet")):
+        parse_frame(frame, VEHICLE, vessel)
+
+
+@pytest.mark.parametrize("frame_bytes", [32, 64, 256])
+@pytest.mark.parametrize("settings", [SealSettings(), SealSettings(encrypt=True)], ids=str)
+def test_pictures_and_reports_travel_sealed(frame_bytes: int, settings: SealSettings) -> None:
+    up, down = vehicle_seal(settings), vessel_seal(settings)
+    down.grant(1000)
+    config = SenderConfig(frame_bytes=frame_bytes, channels=(Channel(0.2),), feedback=True, stream_bytes=200)
+    vehicle, hears = Sender(config, seal=up), Receiver(seal=up)
+    vessel, reports = Receiver(seal=down), Sender(SenderConfig(frame_bytes=32), seal=down)
+    pictures = {number: stream(number, 200) for number in range(1, 5)}
+    for number, data in pictures.items():
+        vehicle.add_picture(number, contact(number), data, 0.0)
+    vehicle.add_message(b"status", 0.0)
+    shown: dict[int, bytes] = {}
+    now, water = 0.0, random.Random(1)
+    while not vehicle.is_idle and now < 20_000:
+        now += 1
+        frame = vehicle.next_frame(now)
+        if frame is not None:
+            assert len(frame) == frame_bytes
+            if water.random() < 0.8:
+                events = vessel.accept(VEHICLE, frame, now)
+                assert not [e for e in events if isinstance(e, FrameRefused)]
+                shown |= {e.number: e.stream for e in events if isinstance(e, ContactUpdate)}
+                (again,) = vessel.accept(VEHICLE, frame, now)
+                assert isinstance(again, FrameRefused)
+                assert again.reason.field == "counter"
+        if vessel.report_is_due(VEHICLE, now):
+            told = vessel.report(VEHICLE, now)
+            assert told is not None
+            reports.add_report(told)
+            (report,) = hears.accept(VESSEL, reports.next_frame(now) or b"", now)
+            assert isinstance(report, ReportReceived)
+            vehicle.on_report(report.report, now)
+    assert vehicle.is_idle
+    assert shown == pictures
+    assert up.counts.sealed > down.counts.genuine == down.counts.replayed > 0

@@ -1,0 +1,105 @@
+"""The golden sealed frames, checked with another implementation: HKDF and CCM from hashes and AES blocks alone."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
+from link import seal_golden
+from link.v1_golden import FOLDER
+
+from sonarpost.link.seal import RESERVED, AcousticSeal
+from sonarpost.link.seal_key import Direction, SealSettings, parse_key
+from sonarpost.link.seal_window import WINDOW
+from sonarpost.link.v1_config import SenderConfig
+from sonarpost.link.v1_frame import Segment, SegmentKind, Symbol, checksum, parse_frame
+from sonarpost.link.v1_sender import Sender
+from sonarpost.modem.rates import RATES
+
+SEAL = AcousticSeal(parse_key(seal_golden.KEY, "golden"), 3, Direction.FROM_VEHICLE)
+GOLDEN: dict[str, Any] = json.loads((FOLDER / "sealed.json").read_text(encoding="utf-8"))
+
+
+def hkdf(secret: bytes, info: bytes, length: int) -> bytes:
+    """RFC 5869 for at most 32 bytes."""
+    drawn = hmac.digest(bytes(32), secret, "sha256")
+    return hmac.digest(drawn, info + b"\x01", hashlib.sha256)[:length]
+
+
+def ccm(key: bytes, nonce: bytes, head: bytes, data: bytes, tag_bytes: int) -> bytes:
+    """RFC 3610 with a length field of two bytes."""
+    block = Cipher(algorithms.AES(key), modes.ECB()).encryptor()
+
+    def exclusive_or(left: bytes, right: bytes) -> bytes:
+        return bytes(a ^ b for a, b in zip(left, right, strict=False))
+
+    def stream(number: int) -> bytes:
+        return block.update(bytes([1]) + nonce + number.to_bytes(2, "big"))
+
+    flags = 0x40 | (tag_bytes - 2) // 2 << 3 | 1
+    told = len(head).to_bytes(2, "big") + head
+    blocks = bytes([flags]) + nonce + len(data).to_bytes(2, "big")
+    blocks += told + bytes(-len(told) % 16) + data + bytes(-len(data) % 16)
+    state = bytes(16)
+    for at in range(0, len(blocks), 16):
+        state = block.update(exclusive_or(state, blocks[at : at + 16]))
+    hidden = b"".join(exclusive_or(data[at : at + 16], stream(1 + at // 16)) for at in range(0, len(data), 16))
+    return hidden + exclusive_or(state, stream(0))[:tag_bytes]
+
+
+def test_the_file_is_what_the_code_makes() -> None:
+    assert json.loads(json.dumps(seal_golden.make())) == GOLDEN
+    assert hkdf(bytes.fromhex(GOLDEN["key"]), b"sonarpost acoustic v1 fingerprint", 4).hex() == GOLDEN["fingerprint"]
+
+
+@pytest.mark.parametrize("case", GOLDEN["frames"], ids=str)
+def test_another_implementation_seals_the_same(case: dict[str, Any]) -> None:
+    frame = bytes.fromhex(case["frame"])
+    settings = SealSettings(case["counter_bytes"], case["tag_bytes"], case["encrypt"])
+    seal = AcousticSeal(parse_key(GOLDEN["key"], "golden"), 99, Direction(case["direction"]).opposite, settings)
+    # A receiver without memory takes a first frame only of a counter that is near; its neighbour's seal tells it that.
+    newest = max(0, case["counter"] - 1)
+    seal.restore(seal.snapshot() | {"windows": [[case["source"], newest, bytes(8)]]})
+    content = parse_frame(frame, case["source"], seal)
+    assert isinstance(content, Symbol) or content == (Segment(SegmentKind.MESSAGE, b"\x09go to 12"),)
+
+    way = bytes([case["direction"], case["source"], case["counter_bytes"], case["tag_bytes"], case["encrypt"]])
+    key = hkdf(bytes.fromhex(GOLDEN["key"]), b"sonarpost acoustic v1 seal" + way, 32)
+    plain = (
+        bytes([0x80 | content.head()[0]]) + content.head()[1:] + content.data
+        if isinstance(content, Symbol)
+        else (b"\xc1\x09\x09go to 12").ljust(len(frame) - 2 - settings.size, b"\0")
+    )
+    head, data = (plain[:1], plain[1:]) if settings.encrypt else (plain, b"")
+    made = ccm(key, case["counter"].to_bytes(13, "big"), head, data, settings.tag_bytes)
+    low = (case["counter"] % 256**settings.counter_bytes).to_bytes(settings.counter_bytes, "big")
+    covered = head + made[: len(data)] + low + made[len(data) :]
+    assert frame == checksum(covered).to_bytes(2, "big") + covered
+
+
+def test_the_page_has_the_numbers_of_the_code() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "wire-acoustic-v1.md").read_text(encoding="utf-8")
+    section = " ".join(page[page.index("## Authentication") : page.index("## What a receiver may show")].split())
+    one, two = SealSettings(), SealSettings(2)
+    assert f"{one.size} by default" in section
+    assert f"t = {one.tag_bytes} and c = {one.counter_bytes} unless said otherwise" in section
+    assert (one.lifetime_frames, two.lifetime_frames) == (2**20, 2**28) == (4096 * 256, 4096 * 256**2)
+    assert "after 2^20 frames" in section
+    assert "2^28 with c = 2" in section
+    assert f"So {256 - WINDOW - 1} frames ({65536 - WINDOW - 1:,} with c = 2)" in section
+    assert f"a frame may be {WINDOW - 1} late" in section
+    assert f"limit {RESERVED} ahead" in section
+    rate1, rate5 = (RATES[n].frames / RATES[n].airtime_s for n in (1, 5))
+    for frames_per_s, years, percent in ((rate1, 138, 0.06), (rate5, 26, 0.4)):
+        chance = 2.0 ** (1 - 8 * one.tag_bytes)
+        assert f"more than {years} years | below {percent} %" in section
+        assert years < 1 / (chance * frames_per_s) / (365.25 * 86400) < years + 1
+        assert 0.7 * percent < 100 * chance * frames_per_s * 30 * 86400 < percent
+    for frame_bytes in (32, 64, 256):
+        bare, sealed = (Sender(SenderConfig(frame_bytes=frame_bytes), seal=seal).symbol_bytes for seal in (None, SEAL))
+        assert f"{sealed} of {bare}" in section

@@ -1,0 +1,158 @@
+"""Whatever an attacker and the water do with recorded frames: nothing is taken twice, nothing foreign once."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from link.seal_world import VEHICLE, key, vehicle_seal, vessel_seal
+
+from sonarpost.errors import FrameError
+from sonarpost.link.seal import RESERVED, AcousticSeal
+from sonarpost.link.seal_key import Direction, SealSettings
+from sonarpost.link.seal_window import WINDOW, ReplayWindow
+
+NEAR = SealSettings().counter_step - WINDOW
+
+
+def offered(seal: AcousticSeal, source: int, sealed: bytes) -> tuple[bytes, str]:
+    """What a frame opens to, or the field of the error with which it is refused."""
+    try:
+        return seal.open(source, sealed), ""
+    except FrameError as error:
+        return b"", error.field
+
+
+class Attack(RuleBasedStateMachine):
+    """A vehicle, a vessel that may restart, and water in which everything is recorded and sent again."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.durable = 0
+        self.vehicle = self.start_vehicle()
+        self.vessel = vessel_seal()
+        self.recorded: list[tuple[int, bytes, bytes]] = []  # counter, plain, sealed
+        self.taken: set[int] = set()
+        self.newest = -1
+
+    def start_vehicle(self) -> AcousticSeal:
+        return AcousticSeal(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=self.durable)
+
+    def record(self, data: bytes) -> tuple[int, bytes, bytes]:
+        if (limit := self.vehicle.wanted_limit) is not None:
+            self.durable = limit
+            self.vehicle.grant(limit)
+        counter = self.vehicle.settings.lifetime_frames - self.vehicle.frames_left
+        covered = b"\x80" + data
+        self.recorded.append((counter, covered, self.vehicle.seal(covered)))
+        return self.recorded[-1]
+
+    def offer(self, counter: int, covered: bytes, sealed: bytes) -> bool:
+        opened, field = offered(self.vessel, VEHICLE, sealed)
+        assert field in {"", "counter"}
+        if field:
+            return False
+        assert opened == covered
+        assert counter not in self.taken
+        self.taken.add(counter)
+        self.newest = max(self.newest, counter)
+        return True
+
+    @rule(data=st.binary(max_size=8))
+    def a_frame_arrives(self, data: bytes) -> None:
+        frame = self.record(data)
+        gap = frame[0] - self.newest
+        assert self.offer(*frame) or gap > NEAR
+
+    @rule(lost=st.one_of(st.integers(1, 3), st.integers(NEAR - 3, NEAR + 3), st.integers(250, 1500)))
+    def frames_are_lost(self, lost: int) -> None:
+        for _ in range(lost):
+            self.record(b"")
+
+    @precondition(lambda self: self.recorded)
+    @rule(data=st.data())
+    def a_recorded_frame_comes(self, data: st.DataObject) -> None:
+        back = data.draw(st.one_of(st.integers(1, 80), st.integers(1, len(self.recorded))))
+        frame = self.recorded[-min(back, len(self.recorded))]
+        behind = self.newest - frame[0]
+        due = frame[0] not in self.taken and -NEAR <= behind < WINDOW
+        assert self.offer(*frame) == due or behind < -NEAR
+
+    @precondition(lambda self: self.recorded)
+    @rule(data=st.data(), at=st.integers(0, 12), bit=st.integers(0, 7))
+    def a_changed_frame_comes(self, data: st.DataObject, at: int, bit: int) -> None:
+        _, _, sealed = data.draw(st.sampled_from(self.recorded[-20:]))
+        forged = bytearray(sealed)
+        forged[at % len(forged)] ^= 1 << bit
+        before = self.vessel.snapshot()
+        assert offered(self.vessel, VEHICLE, bytes(forged)) == (b"", "tag")
+        assert self.vessel.snapshot()["windows"] == before["windows"]
+
+    @rule()
+    def the_vehicle_restarts(self) -> None:
+        self.vehicle = self.start_vehicle()
+
+    @rule()
+    def the_vessel_restarts(self) -> None:
+        state = self.vessel.snapshot()
+        self.vessel = vessel_seal()
+        self.vessel.restore(state)
+
+    @invariant()
+    def no_counter_is_sealed_twice(self) -> None:
+        last = [counter for counter, _, _ in self.recorded[-2 * RESERVED :]]
+        assert last == sorted(set(last))
+
+    @invariant()
+    def what_was_taken_is_counted(self) -> None:
+        assert self.vessel.counts.genuine == len(self.taken)
+
+    def teardown(self) -> None:
+        """After any attack two more frames are enough to be heard again."""
+        self.offer(*self.record(b"one"))
+        assert self.offer(*self.record(b"two"))
+
+
+Attack.TestCase.settings = settings(max_examples=80, stateful_step_count=30, deadline=None)
+TestAttack = Attack.TestCase
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.one_of(st.integers(-80, 80), st.integers(-80, 80), st.integers(100, 5000)), max_size=200))
+def test_the_window_agrees_with_a_set(steps: list[int]) -> None:
+    window, taken = ReplayWindow(), set[int]()
+    for step in steps:
+        counter = max(0, max(taken, default=-1) + step)
+        expected = counter > max(taken, default=-1) - WINDOW and counter not in taken
+        assert window.is_new(counter) == expected
+        if expected:
+            window.take(counter)
+            taken.add(counter)
+        assert window.newest == max(taken)
+        assert window.seen < 1 << WINDOW
+
+
+def test_a_leap_forgets_what_was_before_it() -> None:
+    window = ReplayWindow()
+    for counter in range(WINDOW):
+        window.take(counter)
+    window.take(2 * WINDOW)
+    assert not window.is_new(WINDOW)
+    assert all(window.is_new(counter) for counter in range(WINDOW + 1, 2 * WINDOW))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.integers(-1, 2**20), st.sampled_from([256, 65536]), st.data())
+def test_the_nearest_counter_is_the_one_sent(newest: int, step: int, data: st.DataObject) -> None:
+    sent = newest + data.draw(st.integers(1 - WINDOW, step - WINDOW))
+    assert ReplayWindow(newest).nearest(sent % step, step) == sent
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=300), st.integers(-5, 200), st.booleans())
+def test_any_bytes_are_refused(sealed: bytes, source: int, encrypt: bool) -> None:
+    chosen = SealSettings(encrypt=encrypt)
+    vessel = vessel_seal(chosen)
+    assert offered(vessel, source, sealed) == (b"", "tag")
+    assert vessel.counts.forged == 1
+    assert vessel.open(VEHICLE, vehicle_seal(chosen).seal(b"\x80ok")) == b"\x80ok"

@@ -1,0 +1,164 @@
+"""Frames of the v1 format: packing, padding, damage, tags."""
+
+from __future__ import annotations
+
+import hashlib
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonarpost.errors import FrameError
+from sonarpost.link.v1_frame import (
+    PADDED_LENGTHS,
+    Segment,
+    SegmentKind,
+    Symbol,
+    SymbolKind,
+    pack_segments,
+    pack_symbol,
+    parse_frame,
+    segments_room,
+)
+
+
+@st.composite
+def symbols(draw: st.DrawFn) -> Symbol:
+    kind = draw(st.sampled_from(SymbolKind))
+    parameter = draw(st.integers(0 if kind == SymbolKind.LAYERED else 1, 255))
+    length = draw(st.sampled_from([27, 59, 123, 251, draw(st.integers(1, 251))]))
+    data = draw(st.binary(min_size=length, max_size=length))
+    return Symbol(kind, draw(st.integers(0, 31)), draw(st.integers(0, 254)), parameter, data)
+
+
+@settings(max_examples=150, deadline=None)
+@given(symbols())
+def test_a_symbol_comes_back(symbol: Symbol) -> None:
+    frame = pack_symbol(symbol)
+    assert len(frame) == len(symbol.data) + 5
+    assert parse_frame(frame) == symbol
+
+
+@settings(max_examples=150, deadline=None)
+@given(symbols(), st.sampled_from([n for n in PADDED_LENGTHS if n >= 32]), st.integers(0, 300))
+def test_padding_is_recognised_whatever_the_symbol_ends_with(symbol: Symbol, length: int, padding: int) -> None:
+    data = symbol.data.ljust(length - 5, b"\0")[: length - 5]
+    whole = Symbol(symbol.kind, symbol.block, symbol.index, symbol.parameter, data)
+    assert parse_frame(pack_symbol(whole) + bytes(padding)) == whole
+
+
+def test_segments_share_a_frame_and_the_smallest_frame_holds_a_contact() -> None:
+    contact = Segment(SegmentKind.CONTACT, bytes(range(29)))
+    assert contact.size == segments_room(32) == 30
+    frame = pack_segments([contact], 32)
+    assert len(frame) == 32
+    assert parse_frame(frame) == (contact,)
+    message, symbol = Segment(SegmentKind.MESSAGE, b"\x07hello"), Segment(SegmentKind.SYMBOL, b"\x01\x02\x03abc")
+    listed = (message, contact, symbol, Segment(20, b""))
+    assert sum(s.size for s in listed) <= segments_room(64)
+    assert parse_frame(pack_segments(listed, 64) + bytes(100)) == listed
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.lists(
+        st.builds(Segment, st.sampled_from([1, 3, 4, 5, 6, 17, 31]), st.binary(max_size=30)), min_size=1, max_size=6
+    )
+)
+def test_segments_come_back(listed: list[Segment]) -> None:
+    assert parse_frame(pack_segments(listed, 256)) == tuple(listed)
+
+
+@settings(max_examples=100, deadline=None)
+@given(symbols(), st.data())
+def test_a_burst_of_up_to_sixteen_wrong_bits_never_passes(symbol: Symbol, data: st.DataObject) -> None:
+    frame = bytearray(pack_symbol(symbol))
+    start, length = data.draw(st.integers(0, 8 * len(frame) - 16)), data.draw(st.integers(1, 16))
+    pattern = data.draw(st.integers(0, 2 ** (length - 1) - 1)) << 1 | 1
+    value = int.from_bytes(frame, "big") ^ pattern << start
+    damaged = value.to_bytes(len(frame), "big")
+    if damaged.endswith(b"\0"):
+        return  # then shorter lengths are tried, which the guarantee does not cover
+    with pytest.raises(FrameError, match="checksum"):
+        parse_frame(damaged)
+
+
+@pytest.mark.parametrize("length", [0, 1, 4, 5])
+def test_too_short(length: int) -> None:
+    with pytest.raises(FrameError):
+        parse_frame(bytes(length))
+
+
+@pytest.mark.parametrize("frame", [bytes(64), b"\xff" * 64, b"T0000" + bytes(59)])
+def test_what_is_no_frame_is_refused(frame: bytes) -> None:
+    with pytest.raises(FrameError, match="checksum"):
+        parse_frame(frame)
+
+
+@pytest.mark.parametrize(
+    ("listed", "frame_bytes"),
+    [
+        ([], 64),
+        ([Segment(SegmentKind.CONTACT, b"short")], 64),
+        ([Segment(0, b"")], 64),
+        ([Segment(32, b"")], 64),
+        ([Segment(1, bytes(60))], 32),
+    ],
+)
+def test_segments_that_cannot_be_packed(listed: list[Segment], frame_bytes: int) -> None:
+    with pytest.raises(FrameError):
+        pack_segments(listed, frame_bytes)
+
+
+def with_checksum(covered: bytes) -> bytes:
+    from sonarpost.link.v1_frame import checksum
+
+    return checksum(covered).to_bytes(2, "big") + covered
+
+
+@pytest.mark.parametrize(
+    "covered",
+    [
+        b"\x00\xff\x05data",  # index 255
+        b"\x00\x00\x00data",  # k = 0
+        b"\x41\x09abc",  # a message longer than the frame
+        b"\x42abcde",  # a contact cut short
+        b"\x40aaaa",  # no segment
+        b"\x41\x01a\x40aa",  # a kind above 31
+    ],
+)
+def test_fields_without_meaning_are_refused(covered: bytes) -> None:
+    with pytest.raises(FrameError, match="acoustic frame"):
+        parse_frame(with_checksum(covered))
+
+
+class Keyed:
+    """A seal for tests: four bytes of a keyed hash."""
+
+    size = 4
+
+    def __init__(self, key: bytes) -> None:
+        self.key = key
+
+    def seal(self, covered: bytes) -> bytes:
+        return covered + hashlib.blake2s(covered, key=self.key, digest_size=4).digest()
+
+    def open(self, source: int, sealed: bytes, where: str) -> bytes:
+        if source != 3 or self.seal(sealed[:-4]) != sealed:
+            raise FrameError(where, "tag", sealed[-4:], "a tag made with the common key")
+        return sealed[:-4]
+
+
+def test_a_seal_lets_only_its_own_frames_pass() -> None:
+    seal, other = Keyed(b"one"), Keyed(b"two")
+    symbol = Symbol(SymbolKind.OBJECT, 3, 4, 5, bytes(55))
+    frame = pack_symbol(symbol, seal)
+    assert len(frame) == 64
+    assert parse_frame(frame, 3, seal) == symbol
+    for found, source, used in ((frame, 3, other), (frame, 4, seal), (pack_symbol(symbol), 3, seal), (frame, 3, None)):
+        with pytest.raises(FrameError, match="tag"):
+            parse_frame(found, source, used)
+    listed = [Segment(SegmentKind.MESSAGE, b"\x00go")]
+    sealed = pack_segments(listed, 64, seal)
+    assert len(sealed) == 64 == segments_room(64, seal) + 6
+    assert parse_frame(sealed, 3, seal) == tuple(listed)

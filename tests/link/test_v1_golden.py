@@ -1,0 +1,82 @@
+"""The golden files: what they say is what the code packs, parses and reports."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from link import v1_golden
+
+from sonarpost.errors import FrameError
+from sonarpost.link import fec
+from sonarpost.link.v1_frame import parse_frame
+from sonarpost.link.v1_layers import Layering, recover_layer, recover_layering
+from sonarpost.link.v1_objects import Message, Pieces, unpack_object
+from sonarpost.link.v1_preview import Preview
+from sonarpost.link.v1_receiver import Receiver
+
+
+def golden(name: str) -> Any:
+    return json.loads((v1_golden.FOLDER / f"{name}.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("name", ["frames", "codes", "objects"])
+def test_the_code_packs_what_the_files_say(name: str) -> None:
+    assert json.loads(json.dumps(v1_golden.MAKERS[name]())) == golden(name)
+
+
+def test_the_frames_parse() -> None:
+    read = golden("frames")
+    for entry in read["frames"]:
+        said = {key: value for key, value in entry.items() if key != "frame"}
+        assert v1_golden.describe_content(parse_frame(bytes.fromhex(entry["frame"]))) == said
+    for frame in read["refused"]:
+        with pytest.raises(FrameError):
+            parse_frame(bytes.fromhex(frame))
+
+
+def test_the_codes_recover() -> None:
+    read = golden("codes")
+    for block in read["blocks"]:
+        source = np.frombuffer(bytes.fromhex(block["source"]), np.uint8).reshape(block["k"], -1)
+        for index, symbol in block["symbols"]:
+            assert fec.encode(source, [index])[0].tobytes().hex() == symbol
+    layering = Layering.unpack(bytes.fromhex(read["layered"][0]["descriptor"]))
+    symbols = read["layered"][0]["symbols"]
+    assert recover_layering({i: told for i, told, _ in symbols}) == layering
+    found = recover_layer(layering, 0, {i: bytes.fromhex(data) for i, _, data in symbols})
+    assert found.hex() == read["layered"][0]["objects"][0]
+
+
+def test_the_objects_parse() -> None:
+    read = golden("objects")
+    for entry in read["previews"]:
+        preview = Preview.unpack(bytes.fromhex(entry["entry"]))
+        assert (preview.number, preview.prefix.hex(), preview.ended) == (
+            entry["number"],
+            entry["prefix"],
+            entry["ended"],
+        )
+        assert preview.link == entry["link"]
+    below: Pieces | None = None
+    for entry, follows in zip(read["pieces"], (False, True, False), strict=True):
+        pieces = unpack_object(bytes.fromhex(entry["object"]), below if follows else None)
+        assert isinstance(pieces, Pieces)
+        assert [[p.number, p.link, p.start, p.data.hex()] for p in pieces.pieces] == entry["pieces"]
+        assert pieces.final == entry["final"]
+        below = pieces
+    (entry,) = read["messages"]
+    assert unpack_object(bytes.fromhex(entry["object"])) == Message(entry["number"], bytes.fromhex(entry["data"]))
+
+
+def test_the_receiver_reports_what_the_file_says() -> None:
+    read, receiver = golden("exchange"), Receiver()
+    for step in read["steps"]:
+        events = receiver.accept(step["source"], bytes.fromhex(step["frame"]), step["at"])
+        assert [v1_golden.describe_event(e) for e in events] == step["events"], step["at"]
+    for source, report in read["reports"].items():
+        found = receiver.report(int(source), float(len(read["steps"])))
+        assert found is not None
+        assert found.pack().hex() == report

@@ -1,0 +1,387 @@
+"""The v1 sender and receiver over simulated water."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import msgpack
+import numpy as np
+import pytest
+from link.v1_world import VEHICLE, World, contact, stream
+
+from sonarpost.errors import ConfigError, FrameError, StreamError
+from sonarpost.link.bounds import Channel, erasure_bound_frames
+from sonarpost.link.v1_config import ReceiverConfig, SenderConfig
+from sonarpost.link.v1_events import ContactUpdate, FrameRefused
+from sonarpost.link.v1_feedback import Feedback, Request
+from sonarpost.link.v1_frame import Segment, SegmentKind, Symbol, SymbolKind, pack_segments, pack_symbol, parse_frame
+from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.v1_sender import Sender
+from sonarpost.link.v1_sender_state import export_sender, restore_sender
+
+SIZES = (32, 64, 256, 100)
+
+
+@pytest.mark.parametrize("frame_bytes", SIZES)
+def test_a_broadcast_without_loss_delivers_every_contact_and_costs_what_was_planned(frame_bytes: int) -> None:
+    world = World.make(0.0, frame_bytes=frame_bytes, frames_per_picture=6.0)
+    world.add(30, 700)
+    world.run()
+    assert set(world.latest) == set(range(1, 31))
+    assert all(e.complete and len(e.stream) > frame_bytes for e in world.latest.values())
+    assert world.frames == 6 * 30
+
+
+@pytest.mark.parametrize("frame_bytes", SIZES)
+@pytest.mark.parametrize("count", [1, 2, 7, 30])
+def test_a_broadcast_for_a_third_lost_shows_contacts_and_most_pictures(frame_bytes: int, count: int) -> None:
+    world = World.make(0.3, seed=count, frame_bytes=frame_bytes, frames_per_picture=8.0)
+    world.add(count, 900)
+    world.run()
+    assert len(world.latest) >= 0.96 * count - 0.5
+    if count == 30:
+        assert sum(e.complete for e in world.latest.values()) >= 24
+
+
+def test_previews_of_every_contact_go_before_the_detail_of_any() -> None:
+    sender = Sender(SenderConfig())
+    for number in range(1, 25):
+        sender.add_picture(number, contact(number), stream(number, 500), 0.0)
+    kinds = [parse_frame(frame) for _ in range(30) if (frame := sender.next_frame(0.0))]
+    first = [k.kind for k in kinds if isinstance(k, Symbol)]
+    assert set(first[:24]) == {SymbolKind.PREVIEW}
+    assert SymbolKind.OBJECT in first[24:]
+
+
+def test_receivers_with_good_and_bad_water_both_get_what_their_water_allows() -> None:
+    channels = (Channel(0.05), Channel(0.6))
+    config = SenderConfig(channels=channels, frames_per_picture=9.0)
+    sender, receivers = Sender(config), [Receiver(), Receiver()]
+    for number in range(1, 25):
+        sender.add_picture(number, contact(number), stream(number, 900), 0.0)
+    rng, kinds, got = np.random.default_rng(2), set(), [dict[int, int](), dict[int, int]()]
+    while (frame := sender.next_frame(0.0)) is not None:
+        parsed = parse_frame(frame)
+        assert isinstance(parsed, Symbol)
+        kinds.add(parsed.kind)
+        for receiver, channel, lengths in zip(receivers, channels, got, strict=True):
+            for event in receiver.accept(VEHICLE, frame, 0.0) if rng.random() >= channel.loss else []:
+                assert isinstance(event, ContactUpdate)
+                lengths[event.number] = len(event.stream)
+    assert kinds == {SymbolKind.PREVIEW, SymbolKind.LAYERED}
+    assert len(got[0]) == 24
+    assert len(got[1]) >= 22
+    assert sum(got[0].values()) > 1.5 * sum(got[1].values()) > 1.5 * 24 * 30
+
+
+def test_one_frame_shows_a_contact_and_a_coarse_picture() -> None:
+    sender, receiver = Sender(SenderConfig()), Receiver()
+    for number in range(1, 11):
+        sender.add_picture(number, contact(number), stream(number, 500), 0.0)
+    for number in range(1, 11):
+        frame = sender.next_frame(0.0)
+        assert frame is not None
+        (event,) = Receiver().accept(VEHICLE, frame, 0.0)
+        assert isinstance(event, ContactUpdate)
+        assert (event.number, event.stream) == (number, stream(number, 500)[:30])
+        assert receiver.accept(VEHICLE, frame, 0.0)
+
+
+@pytest.mark.parametrize(("loss", "limit"), [(0.1, 1.15), (0.5, 1.15)])
+def test_with_feedback_all_is_complete_close_to_the_erasure_bound(loss: float, limit: float) -> None:
+    ratios = []
+    for seed in range(3):
+        world = World.make(
+            loss, seed, channels=(Channel(loss),), feedback=True, stream_bytes=420, patience_s=600.0, frame_bytes=64
+        )
+        world.add(120, 500)
+        world.run()
+        assert len(world.latest) == 120
+        assert all(e.complete and len(e.stream) >= 420 for e in world.latest.values())
+        payload = sum(25 + len(e.stream) for e in world.latest.values())
+        ratios.append((world.frames + world.reports) / erasure_bound_frames(payload, 64, loss))
+    assert sum(ratios) / len(ratios) <= limit
+
+
+@pytest.mark.parametrize("frame_bytes", [32, 256])
+def test_feedback_completes_at_other_frame_sizes_and_with_bursts(frame_bytes: int) -> None:
+    world = World.make(0.5, 9, channels=(Channel(0.5, 4.0),), feedback=True, stream_bytes=300, frame_bytes=frame_bytes)
+    world.add(40, 300)
+    world.run()
+    assert all(world.latest[n].complete and world.latest[n].stream == world.sent[n] for n in range(1, 41))
+    assert world.sender.measured_loss == pytest.approx(0.5, abs=0.25)
+
+
+def test_messages_come_through_once_and_share_frames() -> None:
+    world = World.make(0.4, 5, channels=(Channel(0.4),))
+    world.add(4, 300)
+    small = [b"status %d" % n for n in range(8)]
+    for data in small:
+        world.sender.add_message(data, 0.0)
+    long = stream(99, 900)
+    world.sender.add_message(long, 0.0)
+    world.run()
+    assert sorted(world.messages) == sorted([*small, long])
+
+
+def test_several_messages_go_in_one_frame_and_contacts_fill_it() -> None:
+    sender = Sender(SenderConfig(frame_bytes=128, gather_s=100.0))
+    sender.add_picture(1, contact(1), stream(1, 300), 0.0)
+    for data in (b"one", b"two"):
+        sender.add_message(data, 0.0, times=1)
+    frame = sender.next_frame(0.0)
+    assert frame is not None
+    listed = parse_frame(frame)
+    assert isinstance(listed, tuple)
+    assert [s.kind for s in listed] == [SegmentKind.MESSAGE, SegmentKind.MESSAGE, SegmentKind.PREVIEW]
+    (event,) = [e for e in Receiver().accept(VEHICLE, frame, 0.0) if isinstance(e, ContactUpdate)]
+    assert stream(1, 300).startswith(event.stream)
+    assert len(event.stream) > 60
+
+
+def test_priorities_and_lifetimes() -> None:
+    sender = Sender(SenderConfig())
+    sender.add_picture(1, contact(1), stream(1, 300), 0.0)
+    sender.add_message(b"late", 0.0, priority=-1, times=1)
+    sender.add_message(b"expired", 0.0, lifetime_s=1.0)
+    sender.add_message(b"stop!", 0.0, priority=9, times=1)
+    frames = []
+    while (frame := sender.next_frame(5.0)) is not None:
+        frames.append(parse_frame(frame))
+    segments = [s for f in frames if isinstance(f, tuple) for s in f if s.kind == SegmentKind.MESSAGE]
+    assert [s.data[1:] for s in segments] == [b"stop!", b"late"]
+    assert isinstance(frames[0], tuple)
+
+
+def test_copies_of_a_message_are_apart() -> None:
+    sender = Sender(SenderConfig(channels=(Channel(0.3, 3.0),)))
+    for number in range(1, 11):
+        sender.add_picture(number, contact(number), stream(number, 600), 0.0)
+    sender.add_message(b"go", 0.0)
+    places = [n for n in range(60) if (f := sender.next_frame(0.0)) and isinstance(parse_frame(f), tuple)]
+    assert len(places) == 4
+    assert min(b - a for a, b in pairwise(places)) > 12
+
+
+def test_more_detail_than_planned_can_be_asked_for() -> None:
+    world = World.make(0.0, feedback=True, stream_bytes=100, channels=(Channel(0.0),))
+    world.add(3, 900)
+    world.run()
+    assert all(100 <= len(e.stream) < 200 and e.complete for e in world.latest.values())
+    world.sender.on_report(Request(2, 700), world.now)
+    world.run()
+    assert len(world.latest[2].stream) >= 700
+    assert world.latest[2].complete
+    assert not world.sender.refine(Request(2, 100), world.now)
+    with pytest.raises(FrameError, match="contact number"):
+        world.sender.refine(Request(77, 100), world.now)
+
+
+def test_a_minipacket_asks_for_symbols() -> None:
+    sender, receiver = Sender(SenderConfig(feedback=True, channels=(Channel(0.0),))), Receiver()
+    sender.add_picture(1, contact(1), stream(1, 400), 0.0)
+    frames = []
+    while (frame := sender.next_frame(1.0)) is not None:
+        frames.append(frame)
+    for frame in frames[:-2]:
+        receiver.accept(VEHICLE, frame, 1.0)
+    bits = receiver.mini_report(VEHICLE)
+    assert bits is not None
+    assert (bits >> 8, bits & 255) == (1, 2)
+    sender.on_mini(bits >> 8, bits & 255, 2.0)
+    events = [e for _ in range(2) if (f := sender.next_frame(2.0)) for e in receiver.accept(VEHICLE, f, 2.0)]
+    assert isinstance(events[-1], ContactUpdate)
+    assert events[-1].complete
+    assert receiver.mini_report(VEHICLE) is None
+
+
+def test_a_new_frame_size_keeps_what_fits_and_starts_again_what_does_not() -> None:
+    for before, after in ((64, 256), (256, 64), (64, 32)):
+        world = World.make(0.0, frame_bytes=before, feedback=True, stream_bytes=300, channels=(Channel(0.0),))
+        world.add(12, 300)
+        world.run(most_frames=20)
+        world.sender.resize(after)
+        world.run()
+        assert all(world.latest[n].stream == world.sent[n] for n in range(1, 13)), (before, after)
+
+
+def test_numbers_of_blocks_and_contacts_wrap() -> None:
+    world = World.make(0.2, 3, channels=(Channel(0.2),), group_pictures=2, frames_per_picture=9.0)
+    number = 65500
+    for _ in range(60):
+        world.add(2, 200, first=number)
+        number = 1 if number >= 65534 else number + 2
+        world.run()
+        world.now += 60.0
+    assert len(world.sent) == 120
+    assert len(world.latest) >= 116
+
+
+def test_a_vehicle_that_starts_anew_does_not_mix_pictures() -> None:
+    receiver = Receiver()
+    first, second = Sender(SenderConfig(channels=(Channel(0.0),))), Sender(SenderConfig(channels=(Channel(0.0),)))
+    for number in range(1, 6):
+        first.add_picture(number, contact(number), stream(number, 400), 0.0)
+        second.add_picture(number, contact(number + 100), stream(number + 100, 400), 0.0)
+    for _ in range(9):  # previews, and too little detail
+        frame = first.next_frame(0.0)
+        assert frame is not None
+        receiver.accept(VEHICLE, frame, 0.0)
+    latest: dict[int, ContactUpdate] = {}
+    while (frame := second.next_frame(1.0)) is not None:
+        for event in receiver.accept(VEHICLE, frame, 1.0):
+            if isinstance(event, ContactUpdate):
+                assert event.contact == contact(event.number + 100)
+                assert stream(event.number + 100, 400).startswith(event.stream)
+                latest[event.number] = event
+    assert len(latest) == 5
+    assert all(e.complete for e in latest.values())
+
+
+def test_vehicles_do_not_disturb_each_other() -> None:
+    receiver, senders = Receiver(), {}
+    for address in (3, 4, 5):
+        senders[address] = Sender(SenderConfig(channels=(Channel(0.0),)))
+        for number in (1, 2):
+            senders[address].add_picture(
+                number, contact(10 * address + number), stream(10 * address + number, 300), 0.0
+            )
+    latest = {}
+    for _ in range(40):
+        for address, sender in senders.items():
+            for event in receiver.accept(address, f, 0.0) if (f := sender.next_frame(0.0)) else []:
+                assert isinstance(event, ContactUpdate)
+                latest[event.source, event.number] = event
+    assert {k: v.contact for k, v in latest.items()} == {(a, n): contact(10 * a + n) for a in (3, 4, 5) for n in (1, 2)}
+    assert all(stream(10 * a + n, 300).startswith(e.stream) and e.complete for (a, n), e in latest.items())
+
+
+def test_the_sender_goes_on_after_a_restart_at_every_frame() -> None:
+    def add_all(sender: Sender) -> None:
+        for number in range(1, 6):
+            sender.add_picture(number, contact(number), stream(number, 300), 0.0)
+        sender.add_message(b"hello", 0.0)
+        sender.add_message(stream(7, 200), 0.0)
+
+    config = SenderConfig(feedback=True, channels=(Channel(0.3),))
+    steady, restarted = Sender(config), Sender(config)
+    add_all(steady)
+    add_all(restarted)
+    for step in range(90):
+        if step == 40:
+            for sender in (steady, restarted):
+                sender.on_feedback(Feedback(1, 30, (5, 2)), 40.0)
+        state = msgpack.unpackb(msgpack.packb(export_sender(restarted)))
+        restarted = Sender(config)
+        restore_sender(restarted, state)
+        assert restarted.next_frame(float(step)) == steady.next_frame(float(step))
+    assert export_sender(restarted) == export_sender(steady)
+
+
+@pytest.mark.parametrize(
+    "change", [{"format": 2}, {"pictures": [{}]}, {"blocks": 3}, {"waiting": [9]}, {"meters": [[1, 7.0, [1, 1]]]}]
+)
+def test_a_state_that_no_sender_made_is_refused(change: dict[str, object]) -> None:
+    sender = Sender(SenderConfig())
+    sender.add_picture(1, contact(1), stream(1, 50), 0.0)
+    state = {**export_sender(sender), **change}
+    before = export_sender(sender)
+    with pytest.raises(FrameError):
+        restore_sender(sender, state)
+    assert export_sender(sender) == before
+
+
+def test_what_the_sender_refuses() -> None:
+    sender = Sender(SenderConfig())
+    sender.add_picture(1, contact(1), b"x", 0.0)
+    with pytest.raises(FrameError, match="contact number"):
+        sender.add_picture(1, contact(1), b"x", 0.0)
+    with pytest.raises(FrameError, match="contact number"):
+        sender.add_picture(0, contact(1), b"x", 0.0)
+    with pytest.raises(StreamError):
+        sender.add_picture(2, contact(1), b"", 0.0)
+    for data in (b"", bytes(4097)):
+        with pytest.raises(FrameError, match="message"):
+            sender.add_message(data, 0.0)
+    for wrong in ({"frame_bytes": 31}, {"channels": ()}, {"depth": 9}, {"caution": float("nan")}):
+        with pytest.raises(ConfigError):
+            SenderConfig(**wrong)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError):
+        ReceiverConfig(max_sources=0)
+
+
+def test_memory_is_bounded() -> None:
+    receiver = Receiver(ReceiverConfig(max_sources=2, max_contacts=5))
+    for address in range(6):
+        sender = Sender(SenderConfig(channels=(Channel(0.0),)))
+        for number in range(1, 30):
+            sender.add_picture(number, contact(number), stream(number, 90), 0.0)
+        while (frame := sender.next_frame(0.0)) is not None:
+            receiver.accept(address, frame, 0.0)
+    state = receiver.snapshot()
+    sources = state["sources"]
+    assert isinstance(sources, list)
+    assert len(sources) == 2
+    assert all(len(s["contacts"]) <= 5 and len(s["blocks"]) <= 16 for s in sources)
+    assert receiver.counts.forgotten_sources == 4
+
+
+def test_old_blocks_and_contacts_are_forgotten() -> None:
+    config = ReceiverConfig(block_memory_s=10.0, contact_memory_s=100.0)
+    sender, receiver = Sender(SenderConfig()), Receiver(config)
+    sender.add_picture(1, contact(1), stream(1, 300), 0.0)
+    frame = sender.next_frame(0.0)
+    assert frame is not None
+    assert len(receiver.accept(VEHICLE, frame, 0.0)) == 1
+    assert receiver.accept(VEHICLE, frame, 50.0) == []  # known, though the block was forgotten
+    (event,) = receiver.accept(VEHICLE, frame, 200.0)
+    assert isinstance(event, ContactUpdate)
+    assert event.version == 1
+
+
+def test_unknown_segments_are_told_and_do_not_hide_the_others() -> None:
+    frame = pack_segments([Segment(25, b"new"), Segment(SegmentKind.MESSAGE, b"\x01hello")], 64)
+    refused, message = Receiver().accept(VEHICLE, frame, 0.0)
+    assert isinstance(refused, FrameRefused)
+    assert "segment kind" in str(refused.reason)
+    assert getattr(message, "data", None) == b"hello"
+
+
+def test_one_frame_that_passed_damaged_does_not_replace_a_block() -> None:
+    sender, receiver = Sender(SenderConfig(channels=(Channel(0.0),), frames_per_picture=20.0)), Receiver()
+    sender.add_picture(1, contact(1), stream(1, 900), 0.0)
+    frames = []
+    while (frame := sender.next_frame(0.0)) is not None:
+        frames.append(frame)
+    for frame in frames[:3]:
+        receiver.accept(VEHICLE, frame, 0.0)
+    other = parse_frame(frames[3])
+    assert isinstance(other, Symbol)
+    false = Symbol(other.kind, other.block, parse_frame(frames[1]).index, other.parameter, bytes(59))  # type: ignore[union-attr]
+    receiver.accept(VEHICLE, pack_symbol(false), 0.0)
+    events = [e for frame in frames[3:] for e in receiver.accept(VEHICLE, frame, 0.0)]
+    assert isinstance(events[-1], ContactUpdate)
+    assert events[-1].complete
+    assert stream(1, 900).startswith(events[-1].stream)
+
+
+def test_a_block_goes_on_until_every_receiver_has_it() -> None:
+    sender = Sender(SenderConfig(feedback=True, channels=(Channel(0.4),), stream_bytes=300))
+    receivers = {address: Receiver() for address in (1, 2, 9)}
+    latest: dict[tuple[int, int], ContactUpdate] = {}
+    for number in range(1, 21):
+        sender.add_picture(number, contact(number), stream(number, 300), 0.0)
+    rng, now = np.random.default_rng(4), 0.0
+    while not sender.is_idle and now < 20_000:
+        now += 1.0
+        frame = sender.next_frame(now)
+        for address, receiver in receivers.items():
+            for event in receiver.accept(VEHICLE, frame, now) if frame and rng.random() >= 0.4 else []:
+                assert isinstance(event, ContactUpdate)
+                latest[address, event.number] = event
+            report = receiver.report(VEHICLE, now) if receiver.report_is_due(VEHICLE, now) else None
+            if report is not None and rng.random() >= 0.4:
+                sender.on_report(report, now, receiver=address)
+    assert len(latest) == 60
+    assert all(e.complete and e.stream == stream(e.number, 300) for e in latest.values())
+    assert sender.measured_loss == pytest.approx(0.4, abs=0.2)

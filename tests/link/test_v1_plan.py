@@ -1,0 +1,152 @@
+"""What the planner chooses, against brute force and against what must hold."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import numpy as np
+import pytest
+
+from sonarpost.errors import ConfigError, StreamError
+from sonarpost.link.bounds import Channel
+from sonarpost.link.v1_gain import GroupGain, quality_curve
+from sonarpost.link.v1_plan import (
+    arrivals,
+    best_rate,
+    copies,
+    plan_layers,
+    plan_whole,
+    preview_frames,
+    symbols_to_send,
+)
+from sonarpost.modem.rates import RATES
+
+
+def curve(scale: float, length: int = 400) -> np.ndarray:
+    return quality_curve(length, 60.0**2 / (1 + np.arange(length + 1) * scale))
+
+
+def test_bytes_go_where_they_gain_most() -> None:
+    curves = [curve(0.1), curve(0.001), curve(0.03)]
+    gain = GroupGain.of(curves, [10, 10, 10])
+    for total in (0, 5, 60, 200, 700):
+        stops = gain.stops(total)
+        assert sum(stops) - 30 == min(total, gain.total_bytes)
+        found = sum(c[s] - c[10] for c, s in zip(curves, stops, strict=True))
+        best = (
+            max(
+                curves[0][10 + a] + curves[1][10 + b] + curves[2][10 + total - a - b] - sum(c[10] for c in curves)
+                for a in range(0, min(total, 390) + 1, 5)
+                for b in range(max(0, total - a - 390), min(total - a, 390) + 1, 5)
+            )
+            if total
+            else 0.0
+        )
+        assert found >= best - 0.02
+        assert gain.gains(np.array(total)) == pytest.approx(found, abs=0.05)
+
+
+def test_a_curve_with_steps_is_used_by_its_hull() -> None:
+    steps = quality_curve(100, np.repeat([4000.0, 3000.0, 1000.0, 900.0], [20, 30, 30, 21]))
+    gain = GroupGain.of([steps], [0])
+    slopes = np.diff(gain.gain_by_step) / np.diff(gain.bytes_by_step)
+    assert (np.diff(slopes) <= 1e-12).all()
+    assert gain.total_bytes == 80
+
+
+@pytest.mark.parametrize("error", [[1.0], [-1.0] * 11, [float("nan")] * 11])
+def test_estimates_that_make_no_sense_are_refused(error: list[float]) -> None:
+    with pytest.raises(StreamError, match="picture"):
+        quality_curve(10, error)
+    with pytest.raises(StreamError):
+        quality_curve(70000)
+
+
+def test_layers_are_used_where_it_is_uncertain_how_much_arrives() -> None:
+    gain = GroupGain.of([curve(0.05, 2000)], [0])
+    arrive = np.zeros(81)
+    arrive[[20, 60]] = 0.5
+    plan = plan_layers(gain, 59, arrive, 8, 6)
+    assert plan is not None
+    assert len(plan.layering.shares) > 1
+    assert plan.layering.needs[0] <= 20 < plan.layering.needs[-1] <= 60
+    sure = np.zeros(81)
+    sure[60] = 1.0
+    one = plan_layers(gain, 59, sure, 8, 6)
+    assert one is not None
+    assert one.layering.needs[-1] <= 60
+    assert one.expected_db > plan.expected_db
+
+
+def test_the_plan_is_the_best_of_all_on_a_small_case() -> None:
+    gain = GroupGain.of([curve(0.05, 800)], [0])
+    arrive = arrivals(12, (Channel(0.3), Channel(0.6)), 1)
+    plan = plan_layers(gain, 32, arrive, 8, 6)
+    at_least = np.cumsum(arrive[::-1])[::-1]
+    best = 0.0
+    for first, step, share in itertools.product(range(4, 13), range(1, 8), range(1, 16)):
+        if first + step <= 12:
+            low = first * 2 * share - 8
+            high = low + (first + step) * 2 * (16 - share) - 6
+            gains = gain.gains(np.array([low, high]))
+            if low > 0 and high > low:
+                best = max(best, float(gains[0] * at_least[first] + (gains[1] - gains[0]) * at_least[first + step]))
+    for first in range(4, 13):
+        best = max(best, float(gain.gains(np.array(first * 32 - 8)) * at_least[first]))
+    assert plan is not None
+    assert plan.expected_db >= best - 1e-9
+
+
+def test_without_layers_the_best_k_is_found() -> None:
+    gain = GroupGain.of([curve(0.05, 800)], [0])
+    arrive = arrivals(6, (Channel(0.3),), 1)
+    found = plan_whole(gain, 59, arrive, 12)
+    assert found is not None
+    at_least = np.cumsum(arrive[::-1])[::-1]
+    values = [float(gain.gains(np.array(k * 59 - 12)) * at_least[k]) for k in range(1, 7)]
+    assert found == (1 + int(np.argmax(values)), pytest.approx(max(values)))
+
+
+def test_too_few_frames_give_no_layers() -> None:
+    gain = GroupGain.of([curve(0.05)], [0])
+    assert plan_layers(gain, 59, arrivals(3, (Channel(0.1),), 1), 8, 6) is None
+    assert plan_layers(gain, 12, arrivals(30, (Channel(0.1),), 1), 8, 6) is None
+
+
+def test_planning_a_group_takes_less_than_fifty_milliseconds_a_picture() -> None:
+    curves = [curve(0.01 * (1 + n), 700) for n in range(24)]
+    arrive = arrivals(120, (Channel(0.3, 4.0),), 2)
+    plan_layers(GroupGain.of(curves[:2], [30] * 2), 59, arrive, 80, 29)
+    started = time.process_time()
+    assert plan_layers(GroupGain.of(curves, [30] * 24), 59, arrive, 80, 29) is not None
+    assert (time.process_time() - started) / 24 < 0.05
+
+
+def test_previews_get_more_frames_the_worse_the_water() -> None:
+    found = [preview_frames(24, Channel(loss)) for loss in (0.0, 0.1, 0.3, 0.5)]
+    assert found[0] == 24
+    assert found == sorted(found)
+    assert preview_frames(24, Channel(0.3, 8.0)) > found[2]
+    assert preview_frames(24, Channel(0.9), limit=30) == 30
+
+
+def test_copies() -> None:
+    assert [copies(Channel(loss)) for loss in (0.0, 0.1, 0.3, 0.5)] == [1, 2, 4, 7]
+    assert copies(Channel(0.95)) == 8
+
+
+def test_symbols_to_send() -> None:
+    assert symbols_to_send(0, Channel(0.5), 1.0) == 0
+    assert symbols_to_send(50, Channel(0.0), 2.0) == 50
+    assert symbols_to_send(50, Channel(0.5), 0.0) == 100
+    assert 50 <= symbols_to_send(50, Channel(0.5), 2.0) < 100 < symbols_to_send(50, Channel(0.5), -2.0)
+
+
+def test_the_rate_that_carries_most() -> None:
+    assert best_rate({0: 0.0, 1: 0.0, 5: 0.0}, RATES).number == 5
+    assert best_rate({0: 0.0, 1: 0.1, 5: 0.98}, RATES).number == 1
+    assert best_rate({0: 0.1, 1: 0.95, 5: 1.0}, RATES).number == 0
+    for measured in ({}, {9: 0.1}, {1: 1.5}):
+        with pytest.raises(ConfigError, match="rate choice"):
+            best_rate(measured, RATES)

@@ -1,0 +1,96 @@
+"""A sender, a receiver and water between them, for the tests of the v1 link."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.v1_config import ReceiverConfig, SenderConfig
+from sonarpost.link.v1_events import ContactUpdate, Event, FrameRefused, MessageReceived, ReportReceived
+from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.v1_sender import Sender
+
+VEHICLE = 3
+VESSEL = 1
+
+
+def contact(number: int) -> ContactSummary:
+    return ContactSummary(lat_deg=44.0 + number * 1e-4, lon_deg=-63.0, confidence=1.0).rounded()
+
+
+def stream(number: int, length: int) -> bytes:
+    return np.random.default_rng(number).integers(0, 256, length, dtype=np.uint8).tobytes()
+
+
+@dataclass
+class World:
+    """Sends frames of 1 s through water that loses those it says."""
+
+    sender: Sender
+    receiver: Receiver
+    passes: Callable[[], bool]
+    feedback: bool = False
+    now: float = 0.0
+    frames: int = 0
+    reports: int = 0
+    events: list[Event] = field(default_factory=list)
+    sent: dict[int, bytes] = field(default_factory=dict)
+
+    @classmethod
+    def make(cls, loss: float, seed: int = 0, *, receiver: ReceiverConfig | None = None, **config: object) -> World:
+        rng = np.random.default_rng(seed)
+        made = SenderConfig(**config)  # type: ignore[arg-type]
+        return cls(Sender(made), Receiver(receiver), lambda: bool(rng.random() >= loss), feedback=made.feedback)
+
+    def add(self, count: int, length: int, first: int = 1) -> None:
+        for number in range(first, first + count):
+            self.sent[number] = stream(number, length)
+            self.sender.add_picture(number, contact(number), self.sent[number], self.now)
+
+    def run(self, most_frames: int = 100_000) -> None:
+        back, vessel = Receiver(), Sender(SenderConfig(frame_bytes=32))
+        stop = self.now + most_frames
+        while not self.sender.is_idle and self.now < stop:
+            self.now += 1.0
+            frame = self.sender.next_frame(self.now)
+            if frame is not None:
+                assert len(frame) == self.sender.config.frame_bytes
+                self.frames += 1
+                if self.passes():
+                    self.take(frame)
+            if not (self.feedback and self.receiver.report_is_due(VEHICLE, self.now)):
+                continue
+            report = self.receiver.report(VEHICLE, self.now)
+            assert report is not None
+            vessel.add_report(report)
+            told = vessel.next_frame(self.now)
+            assert told is not None
+            assert len(told) == 32
+            self.reports += 1
+            if self.passes():
+                (event,) = back.accept(VESSEL, told, self.now)
+                assert isinstance(event, ReportReceived)
+                self.sender.on_report(event.report, self.now)
+
+    def take(self, frame: bytes) -> None:
+        found = self.receiver.accept(VEHICLE, frame, self.now)
+        for event in found:
+            assert not isinstance(event, FrameRefused), event.reason
+            if isinstance(event, ContactUpdate):
+                self.check(event)
+        self.events += found
+
+    def check(self, event: ContactUpdate) -> None:
+        assert self.sent[event.number].startswith(event.stream)
+        assert event.contact == contact(event.number)
+
+    @property
+    def latest(self) -> dict[int, ContactUpdate]:
+        return {e.number: e for e in self.events if isinstance(e, ContactUpdate)}
+
+    @property
+    def messages(self) -> list[bytes]:
+        return [e.data for e in self.events if isinstance(e, MessageReceived)]
