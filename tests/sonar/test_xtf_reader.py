@@ -135,7 +135,11 @@ def test_other_packets_are_skipped_and_counted(tmp_path, raw):
 def test_projected_metres_give_no_positions(tmp_path, raw):
     survey = read_bytes(tmp_path, put(raw, 164, "H", 0))
     assert all(p.lat_deg is None and p.lon_deg is None and p.heading_deg == 354.5 for p in survey)
-    assert survey.warnings == ("no positions: NavUnits is 0 (projected metres), expected 3",)
+    assert len(survey.warnings) == 1
+    assert "NavUnits is 0 (projected metres)" in survey.warnings[0]
+    survey = read_bytes(tmp_path, put(raw, 164, "H", 7))
+    assert all(p.lat_deg is None for p in survey)
+    assert survey.warnings == ("no positions: NavUnits is 7, expected 3 (degrees) or 0 (projected metres)",)
 
 
 @pytest.mark.parametrize("lat", [float("nan"), float("inf"), 90.5, -1e300])

@@ -22,14 +22,17 @@ _RISE: Final = 0.5
 """Where between the water's level and the bottom's, in decibels, the first return is taken to begin."""
 _MIN_CONTRAST: Final = 1.8
 _SMOOTHING_PINGS: Final = 5
+_STEP_BINS: Final = 10
+_MIN_STEP: Final = math.log(1.3)
 
 
 def track_bottom(survey: Survey, *, window_pings: int = 31) -> FloatArray:
     """Estimate the altitude of every ping from its first sustained rise of echo strength.
 
     Both sides are averaged by slant range (a rise on one only is an object, not the bottom). In each ping the first
-    place after the transmission's ringing is sought where the echo climbs out of the water's level and stays up;
-    the row of estimates is then cleaned by a median over `window_pings`.
+    place after the transmission's ringing is sought where the echo climbs out of the water's level and stays up.
+    Recorders that compress the echo leave little between the water's level and the far bottom's; there an earlier
+    and sharper step is taken instead. The row of estimates is then cleaned by a median over `window_pings`.
 
     Args:
         survey: Pings of any sample count and range.
@@ -49,6 +52,7 @@ def track_bottom(survey: Survey, *, window_pings: int = 31) -> FloatArray:
     echo = _common_range(survey, reach_m)
     echo = uniform_filter(echo, size=(_SMOOTHING_PINGS, 3), mode="nearest")
     first = _first_rise(echo, round(_RING_DOWN_M / reach_m * _BINS))
+    first = _with_local_steps(echo, first, round(_RING_DOWN_M / reach_m * _BINS))
     return _median_smoothed(first * reach_m / _BINS, window_pings)
 
 
@@ -61,13 +65,13 @@ def _common_range(survey: Survey, reach_m: float) -> FloatArray:
         for row, ping in enumerate(survey.pings):
             channel = ping.channel(side)
             if channel is not None:
-                image[row] = _resampled(channel.samples, channel.sample_spacing_m, centres_m)
+                image[row] = _resampled(channel.echo(), channel.sample_spacing_m, centres_m)
         mean = image.mean()
         total += image / mean if mean > 0 else image
     return total
 
 
-def _resampled(samples: npt.NDArray[np.unsignedinteger], spacing_m: float, centres_m: FloatArray) -> FloatArray:
+def _resampled(samples: npt.NDArray[np.float32], spacing_m: float, centres_m: FloatArray) -> FloatArray:
     """Average the samples that fall into each bin (or interpolate, where bins are finer); 0 beyond the last one."""
     cumulative = np.concatenate([[0.0], np.cumsum(samples, dtype=np.float64)])
     half_m = (centres_m[1] - centres_m[0]) / 2
@@ -98,6 +102,31 @@ def _first_rise(echo: FloatArray, skip: int) -> FloatArray:
     flat = (bottom <= _MIN_CONTRAST * water) | (bottom < 1e-4)
     first[flat[:, 0]] = np.nan
     return first
+
+
+def _with_local_steps(echo: FloatArray, first: FloatArray, skip: int) -> FloatArray:
+    """Replace estimates by an earlier step of the echo that is higher, or where there is none by the highest.
+
+    The step at a bin is the logarithm of the mean echo just after it over that just before it.
+    """
+    cumulative = np.cumsum(np.pad(echo, ((0, 0), (1, 0))), axis=1)
+    means = (cumulative[:, _STEP_BINS:] - cumulative[:, :-_STEP_BINS]) / _STEP_BINS
+    floor = np.maximum(np.percentile(echo, 70, axis=1, keepdims=True) / 100, 1e-4)
+    logs = np.log(means + floor)
+    step = np.full(echo.shape, -np.inf)
+    step[:, _STEP_BINS : echo.shape[1] - _STEP_BINS + 1] = logs[:, _STEP_BINS:] - logs[:, :-_STEP_BINS]
+    step[:, : skip + _STEP_BINS] = -np.inf  # its near half would be the ringing
+    bins = np.arange(echo.shape[1])
+    known = np.isfinite(first)
+    place = np.where(known, first, echo.shape[1]).astype(np.intp)
+    # A gradual rise is found by its level some bins into its step: look around for how high that step is.
+    near = np.abs(bins - place[:, None]) <= _STEP_BINS
+    own = np.where(near & known[:, None], step, -np.inf).max(axis=1)
+    earlier = np.where(bins < (place - 2 * _STEP_BINS)[:, None], step, -np.inf)
+    best = earlier.argmax(axis=1)
+    height = earlier.max(axis=1)
+    better = height >= np.maximum(own, _MIN_STEP)
+    return np.where(better, best.astype(np.float64), first)
 
 
 def _median_smoothed(values: FloatArray, window: int) -> FloatArray:

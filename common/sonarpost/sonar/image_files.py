@@ -76,6 +76,15 @@ def write_tiff(path: Path, image: GreyImage, description: str | None = None) -> 
         SurveyFileError: Another shape or depth, or a description that is not ASCII.
         OSError: The file cannot be written.
     """
+    write_atomically(path, tiff_bytes(path, image, description))
+
+
+def tiff_bytes(path: Path, image: GreyImage, description: str | None = None) -> bytes:
+    """Return what `write_tiff` writes; the path is for errors only.
+
+    Raises:
+        SurveyFileError: Another shape or depth, or a description that is not ASCII.
+    """
     _check_writable(path, image)
     if description is not None and not description.isascii():
         raise SurveyFileError(str(path), "description", description, "ASCII text")
@@ -91,7 +100,7 @@ def write_tiff(path: Path, image: GreyImage, description: str | None = None) -> 
         metadata=None,
         description=description,
     )
-    write_atomically(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def write_png(path: Path, image: GreyImage) -> None:
@@ -105,10 +114,19 @@ def write_png(path: Path, image: GreyImage) -> None:
         SurveyFileError: Another shape or depth.
         OSError: The file cannot be written.
     """
+    write_atomically(path, png_bytes(path, image))
+
+
+def png_bytes(path: Path, image: GreyImage) -> bytes:
+    """Return what `write_png` writes; the path is for errors only.
+
+    Raises:
+        SurveyFileError: Another shape or depth.
+    """
     _check_writable(path, image)
     buffer = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(image)).save(buffer, format="PNG")
-    write_atomically(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def _check_writable(path: Path, image: GreyImage) -> None:

@@ -1,20 +1,28 @@
 """Which reader opens which survey file.
 
-A reader is a function from a path to a `Survey`; it raises `SurveyFileError` and nothing else for a bad file. A new
-format is one `register_reader` call beside the reader.
+A reader is a function from a path and options to an open `SurveySource`; it raises `SurveyFileError` and nothing else
+for a bad file. Packages of others add formats by entry points of the group `sonarpost.survey_readers`: the name is
+the suffix without its dot, the object the reader (docs/surveys.md shows one whole).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
 from sonarpost.errors import SurveyFileError
+from sonarpost.sonar.humminbird import HumminbirdSource
+from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.source import SurveySource, gather
 from sonarpost.sonar.survey import Survey
-from sonarpost.sonar.xtf_reader import read_xtf
+from sonarpost.sonar.waterfall import WaterfallSource
+from sonarpost.sonar.xtf_reader import XtfSource
 
-SurveyReader = Callable[[Path], Survey]
+SurveyReader = Callable[[Path, SurveyOptions], SurveySource]
 
+ENTRY_POINTS = "sonarpost.survey_readers"
 _READERS: dict[str, SurveyReader] = {}
 
 
@@ -22,8 +30,8 @@ def register_reader(suffixes: Iterable[str], reader: SurveyReader) -> None:
     """Let `reader` open files of these suffixes.
 
     Args:
-        suffixes: File suffixes with the dot, in any case.
-        reader: The function that reads them.
+        suffixes: Ends of file names, each with its dot first, in any case; of several that fit the longest counts.
+        reader: The function or class that opens them.
 
     Raises:
         ValueError: A suffix has no dot, or another reader has it.
@@ -37,27 +45,66 @@ def register_reader(suffixes: Iterable[str], reader: SurveyReader) -> None:
 
 
 def supported_suffixes() -> tuple[str, ...]:
-    """Return the suffixes that have a reader, lower case, sorted."""
-    return tuple(sorted(_READERS))
+    """Return the suffixes that have a reader, plug-ins' included, lower case, sorted."""
+    return tuple(sorted({*_READERS, *_plug_ins()}))
 
 
-def read_survey(path: Path) -> Survey:
-    """Read a survey file of any supported format, chosen by its suffix.
+def open_survey(path: Path, options: SurveyOptions | None = None) -> SurveySource:
+    """Open a survey file of any supported format, chosen by its suffix, to be read ping by ping.
 
     Args:
         path: The file.
+        options: What the file does not say.
+
+    Returns:
+        The open recording; a context manager.
 
     Raises:
         SurveyFileError: No reader for the suffix, or the reader refuses the file.
     """
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        expected = "one of " + ", ".join(supported_suffixes())
-        raise SurveyFileError(str(path), "suffix", path.suffix, expected)
-    return reader(path)
+    return _reader(path)(path, options or SurveyOptions())
 
 
-register_reader((".xtf",), read_xtf)
+def read_survey(path: Path, options: SurveyOptions | None = None) -> Survey:
+    """Read a survey file of any supported format into memory.
 
-SUPPORTED_SUFFIXES: tuple[str, ...] = supported_suffixes()
-"""Suffixes of the readers that come with the package; `supported_suffixes()` also has those registered later."""
+    Raises:
+        SurveyFileError: No reader for the suffix, the reader refuses the file, or it holds over 1 GiB of samples.
+    """
+    with open_survey(path, options) as source:
+        return gather(source)
+
+
+def _reader(path: Path) -> SurveyReader:
+    name = path.name.lower()
+    fitting = [suffix for suffix in supported_suffixes() if name.endswith(suffix)]
+    if not fitting:
+        raise SurveyFileError(str(path), "suffix", path.suffix, "one of " + ", ".join(supported_suffixes()))
+    suffix = max(fitting, key=len)
+    # What comes with the package goes first: an installed plug-in changes nothing that worked without it.
+    return _READERS[suffix] if suffix in _READERS else _loaded(path, _plug_ins()[suffix])
+
+
+def _loaded(path: Path, point: EntryPoint) -> SurveyReader:
+    try:
+        reader: SurveyReader = point.load()
+    except Exception as error:  # importing a stranger's module may raise anything
+        value = f"{point.value}: {type(error).__name__}: {error}"
+        raise SurveyFileError(str(path), f"survey reader {point.name}", value, "a plug-in that loads") from error
+    if not callable(reader):
+        raise SurveyFileError(str(path), f"survey reader {point.name}", point.value, "something to call")
+    return reader
+
+
+@cache
+def _plug_ins() -> dict[str, EntryPoint]:
+    """Return suffix to entry point; nothing of a plug-in is imported before its suffix is met."""
+    return {f".{point.name.lower()}": point for point in entry_points(group=ENTRY_POINTS)}
+
+
+register_reader((".xtf",), XtfSource)
+register_reader((".dat",), HumminbirdSource)
+register_reader((".waterfall.toml",), WaterfallSource)
+
+SUPPORTED_SUFFIXES: tuple[str, ...] = (".xtf",)
+"""Formats of one file each, which a folder can be watched for; the others are whole only when several files are."""

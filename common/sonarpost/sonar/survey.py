@@ -6,12 +6,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 Samples = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.uint32]
 FloatImage = npt.NDArray[np.float32]
+
+MAX_SLANT_RANGE_M: Final = 10_000.0
+"""No side-scan sonar reaches farther; a larger value in a file is damage."""
 
 
 class Side(StrEnum):
@@ -31,17 +35,23 @@ class ChannelPing:
             both sides, whatever order the file uses.
         slant_range_m: Slant range of the last sample's far edge, in metres.
         frequency_hz: Sonar frequency where the file gives it.
+        scale: Echo strength is `samples` times this: a recorder's gain or weight that changes from ping to ping.
     """
 
     side: Side
     samples: Samples
     slant_range_m: float
     frequency_hz: float | None = None
+    scale: float = 1.0
 
     @property
     def sample_spacing_m(self) -> float:
         """Slant range covered by one sample, in metres."""
         return self.slant_range_m / len(self.samples)
+
+    def echo(self) -> FloatImage:
+        """Return echo strength, shape (n,), float32: the samples with the recorder's weight applied."""
+        return self.samples.astype(np.float32) * np.float32(self.scale)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,15 +101,15 @@ class Survey:
     def waterfall(self, side: Side) -> FloatImage:
         """Return one side as an image, shape (pings, samples), float32 in the file's units.
 
-        Row i is `pings[i]`; column 0 is nearest the vehicle. A ping without that channel, and samples beyond a
-        shorter ping, are NaN.
+        A recorder's weight is applied. Row i is `pings[i]`; column 0 is nearest the vehicle. A ping without that
+        channel, and samples beyond a shorter ping, are NaN.
         """
         width = max((c.samples.shape[0] for p in self.pings for c in p.channels if c.side is side), default=0)
         image = np.full((len(self.pings), width), np.nan, dtype=np.float32)
         for row, ping in enumerate(self.pings):
             channel = ping.channel(side)
             if channel is not None:
-                image[row, : channel.samples.shape[0]] = channel.samples
+                image[row, : channel.samples.shape[0]] = channel.echo()
         return image
 
     def __iter__(self) -> Iterator[Ping]:

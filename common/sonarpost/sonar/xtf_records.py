@@ -1,0 +1,278 @@
+"""The records of an XTF file, parsed one at a time and held to what they declare.
+
+The structures are pyxtf's. Walking from record to record is our own (`xtf_reader`), because pyxtf's trusts the file:
+it loops for ever on a record of length zero, returns short sample arrays from a truncated packet, takes a channel's
+sample size from its place in the ping and not from its number, and unpickles any `.pyxtf_idx` file lying beside the
+survey.
+
+Field meanings are those of the XTF file format, revision 35 and later. Two conventions matter most:
+
+* A port channel is stored farthest sample first, so that port and starboard side by side make a picture. It is
+  turned round here: index 0 is nearest the vehicle on both sides.
+* Speed is in knots, slant range in metres, frequency in kHz.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Final
+
+import numpy as np
+from pyxtf import XTFAttitudeData, XTFChanInfo, XTFFileHeader, XTFPingChanHeader, XTFPingHeader
+
+from sonarpost.sonar.open_file import OpenFile, Walk
+from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Samples, Side
+
+FILE_MAGIC: Final = 0x7B
+MAX_CHANNELS: Final = 64
+HEADER_BYTES: Final = ctypes.sizeof(XTFFileHeader)
+
+_CHAN_INFO_BYTES: Final = ctypes.sizeof(XTFChanInfo)
+_CHAN_INFO_OFFSET: Final = 256
+_PING_BYTES: Final = ctypes.sizeof(XTFPingHeader)
+_PING_CHAN_BYTES: Final = ctypes.sizeof(XTFPingChanHeader)
+_SIDES: Final = {1: Side.PORT, 2: Side.STARBOARD}
+_CHANNEL_NAMES: Final = {0: "sub-bottom", 3: "bathymetry"}
+_SAMPLE_BYTES: Final = (1, 2, 4)
+_FORMAT_BYTES: Final = {2: 4, 3: 2, 8: 1}
+"""SampleFormat of the integer encodings and their sizes; 0 is a file older than the field."""
+_GROUND_RANGE: Final = 2
+_MAX_WEIGHT: Final = 31
+_DELAY_AGREEMENT: Final = 0.02
+"""How well slant range and time must agree before a delayed recording's samples are put in their places."""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """What the file header says of one channel."""
+
+    kind: int
+    bytes_per_sample: int
+    sample_format: int
+    legacy_samples: int
+    frequency_khz: float
+    corrections: int
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """An attitude packet: when, and what a motion sensor said."""
+
+    time_utc_s: float
+    pitch_deg: float
+    roll_deg: float
+    heading_deg: float
+
+
+def read_header(walk: Walk, file: OpenFile) -> tuple[XTFFileHeader, list[Channel]]:
+    """Read the file header with its channels.
+
+    Raises:
+        SurveyFileError: Not an XTF file, truncated, or absurd channel counts.
+    """
+    raw = walk.take(HEADER_BYTES, "file header")
+    header = XTFFileHeader.from_buffer_copy(raw)
+    if header.FileFormat != FILE_MAGIC:
+        raise file.error("FileFormat", hex(header.FileFormat), hex(FILE_MAGIC))
+    count = int(header.channel_count())
+    if not 1 <= count <= MAX_CHANNELS or not header.NumberOfSonarChannels:
+        expected = f"1 to {MAX_CHANNELS} channels, at least one of them sonar"
+        raise file.error("channel counts", (int(header.NumberOfSonarChannels), count), expected)
+    # The header holds six channels and grows by 1024 bytes for each further eight.
+    extra = math.ceil(max(count - 6, 0) / 8)
+    raw += walk.take(1024 * extra, "file header")
+    return header, [_channel(raw, index) for index in range(6 + 8 * extra)]
+
+
+def _channel(raw: bytes, index: int) -> Channel:
+    info = XTFChanInfo.from_buffer_copy(raw, _CHAN_INFO_OFFSET + index * _CHAN_INFO_BYTES)
+    return Channel(
+        kind=info.TypeOfChannel,
+        bytes_per_sample=info.BytesPerSample,
+        sample_format=info.SampleFormat,
+        legacy_samples=info.Reserved,
+        frequency_khz=info.Frequency,
+        corrections=info.CorrectionFlags,
+    )
+
+
+def attitude_of(raw: bytes) -> Attitude | None:
+    """Parse an attitude packet; None where it is too short or its clock was not set, or its angles are none."""
+    if len(raw) < ctypes.sizeof(XTFAttitudeData):
+        return None
+    data = XTFAttitudeData.from_buffer_copy(raw)
+    values = (float(data.Pitch), float(data.Roll), float(data.Heading))
+    try:
+        when = datetime(data.Year, data.Month, data.Day, data.Hour, data.Minute, data.Second, tzinfo=UTC)
+    except ValueError:
+        return None
+    if not (abs(values[0]) <= 90 and abs(values[1]) <= 180 and 0 <= values[2] < 360):  # NaN is none of these
+        return None
+    return Attitude(when.timestamp() + float(data.Millisecond) / 1000, *values)
+
+
+class PingParser:
+    """Parses sonar packets of one file; `notes` counts what was left out or put right."""
+
+    def __init__(self, file: OpenFile, channels: list[Channel], *, port_farthest_first: bool) -> None:
+        self._file = file
+        self._channels = channels
+        self._reverse = {Side.PORT: port_farthest_first, Side.STARBOARD: False}
+        self.notes: Counter[str] = Counter()
+
+    def head(self, raw: bytes, place: str) -> tuple[XTFPingHeader, float]:
+        """Parse a ping's header and its time, UTC seconds since 1970.
+
+        Raises:
+            SurveyFileError: Too short, or no date.
+        """
+        if len(raw) < _PING_BYTES:
+            raise self._file.error(f"{place}, NumBytesThisRecord", len(raw), f"at least {_PING_BYTES} for a ping")
+        head = XTFPingHeader.from_buffer_copy(raw)
+        return head, self._time(head, f"ping {head.PingNumber}, {place}")
+
+    def _time(self, head: XTFPingHeader, where: str) -> float:
+        stamp = (head.Year, head.Month, head.Day, head.Hour, head.Minute, head.Second)
+        expected = "a UTC date and time, hundredths 0 to 100"
+        if head.HSeconds > 100:
+            raise self._file.error(f"{where}, HSeconds", head.HSeconds, expected)
+        try:
+            whole = datetime(*stamp, tzinfo=UTC)
+        except ValueError as error:
+            raise self._file.error(f"{where}, date and time", stamp, expected) from error
+        return whole.timestamp() + float(head.HSeconds) / 100
+
+    def channels(self, raw: bytes, head: XTFPingHeader, place: str) -> Iterator[ChannelPing]:
+        """Yield the side-scan channels of a ping.
+
+        Raises:
+            SurveyFileError: A channel does not fit into the packet, or has samples that are no plain integers.
+        """
+        where = f"ping {head.PingNumber}, {place}"
+        count = int(head.NumChansToFollow)
+        offset = _PING_BYTES
+        for _ in range(count):
+            if offset + _PING_CHAN_BYTES > len(raw):
+                raise self._file.error(f"{where}, NumChansToFollow", count, "as many channels as the record holds")
+            channel_head = XTFPingChanHeader.from_buffer_copy(raw, offset)
+            offset += _PING_CHAN_BYTES
+            number = int(channel_head.ChannelNumber)
+            if number >= len(self._channels):
+                raise self._file.error(f"{where}, ChannelNumber", number, f"0 to {len(self._channels) - 1}")
+            info = self._channels[number]
+            bytes_per_sample = self._sample_bytes(info, number)
+            samples = int(channel_head.NumSamples) or info.legacy_samples
+            end = offset + samples * bytes_per_sample
+            if end > len(raw):
+                room = (len(raw) - offset) // bytes_per_sample
+                raise self._file.error(f"{where}, channel {number}, NumSamples", samples, f"at most {room}")
+            channel = self._channel_ping(channel_head, info, raw[offset:end], float(head.SoundVelocity))
+            offset = end
+            if channel is not None:
+                yield channel
+
+    def _sample_bytes(self, info: Channel, number: int) -> int:
+        size = info.bytes_per_sample
+        if size not in _SAMPLE_BYTES:
+            raise self._file.error(f"channel {number}, BytesPerSample", size, "1, 2 or 4")
+        # A side-scan channel must hold plain integers; what else flows past unused may hold anything of that size.
+        if info.kind in _SIDES and info.sample_format and _FORMAT_BYTES.get(info.sample_format) != size:
+            expected = f"0, or the unsigned integer of {size} bytes"
+            raise self._file.error(f"channel {number}, SampleFormat", info.sample_format, expected)
+        if info.kind in _SIDES and info.corrections == _GROUND_RANGE:
+            raise self._file.error(f"channel {number}, CorrectionFlags", info.corrections, "slant-range samples (1)")
+        return size
+
+    def _channel_ping(
+        self, head: XTFPingChanHeader, info: Channel, raw: bytes, sound_velocity_mps: float
+    ) -> ChannelPing | None:
+        side = _SIDES.get(info.kind)
+        if side is None:
+            name = _CHANNEL_NAMES.get(info.kind, f"type {info.kind}")
+            self.notes[f"skipped channel: {name}, not side-scan"] += 1
+            return None
+        slant_range_m = float(head.SlantRange)
+        if not raw or not 0 < slant_range_m <= MAX_SLANT_RANGE_M:  # NaN is not either
+            self.notes[f"skipped {side.value} channel: no samples or no slant range"] += 1
+            return None
+        samples = _samples(raw, info.bytes_per_sample, reverse=self._reverse[side])
+        if head.TimeDelay:
+            delayed = _delayed(samples, slant_range_m, head, sound_velocity_mps)
+            if delayed is None:
+                self.notes[f"skipped {side.value} channel: TimeDelay, SlantRange and TimeDuration disagree"] += 1
+                return None
+            self.notes["recording began after the transmission (TimeDelay): zeros stand for what was not recorded"] += 1
+            samples, slant_range_m = delayed
+        return ChannelPing(
+            side=side,
+            samples=samples,
+            slant_range_m=slant_range_m,
+            frequency_hz=_frequency_hz(float(head.Frequency) or info.frequency_khz),
+            scale=self._scale(int(head.Weight)),
+        )
+
+    def _scale(self, weight: int) -> float:
+        """Return the factor of a weight N: echo strength is the sample times 2^-N."""
+        if not -_MAX_WEIGHT <= weight <= _MAX_WEIGHT:
+            self.notes[f"sample weight beyond ±{_MAX_WEIGHT} is not applied"] += 1
+            return 1.0
+        return math.ldexp(1.0, -weight)
+
+
+def _samples(raw: bytes, bytes_per_sample: int, *, reverse: bool) -> Samples:
+    """Return little-endian unsigned integers in the machine's own order, turned round if asked."""
+    step = -1 if reverse else 1
+    if bytes_per_sample == 1:
+        return np.frombuffer(raw, dtype=np.uint8)[::step].copy()
+    if bytes_per_sample == 2:
+        return np.frombuffer(raw, dtype="<u2")[::step].astype(np.uint16)
+    return np.frombuffer(raw, dtype="<u4")[::step].astype(np.uint32)
+
+
+def _delayed(
+    samples: Samples, slant_range_m: float, head: XTFPingChanHeader, velocity_mps: float
+) -> tuple[Samples, float] | None:
+    """Put zeros where a recording that began late has no samples.
+
+    Recorders differ in whether SlantRange counts the delay. Time tells: range is half the speed of sound times time,
+    and the two readings are told apart to 2 %. XTF's SoundVelocity is halved already; some write it whole.
+
+    Returns:
+        Samples from the transmission on and the slant range of their end; None where neither reading agrees.
+    """
+    delay_s, duration_s = float(head.TimeDelay), float(head.TimeDuration)
+    if not (math.isfinite(delay_s) and math.isfinite(duration_s) and 0 < delay_s <= 10 and 0 < duration_s <= 10):
+        return None
+    speed_mps = velocity_mps if 600 < velocity_mps < 1000 else velocity_mps / 2
+    if not 600 < speed_mps < 1000:
+        return None
+    lead = round(delay_s / duration_s * samples.shape[0])
+    if lead > samples.shape[0] * 4:
+        return None
+    whole_m, recorded_m = speed_mps * (delay_s + duration_s), speed_mps * duration_s
+    padded: Samples = np.concatenate([np.zeros(lead, samples.dtype), samples])
+    if abs(slant_range_m - whole_m) <= _DELAY_AGREEMENT * whole_m:
+        return padded, slant_range_m
+    if abs(slant_range_m - recorded_m) <= _DELAY_AGREEMENT * recorded_m:
+        return padded, slant_range_m * (delay_s + duration_s) / duration_s
+    return None
+
+
+def text_of(raw: bytes) -> str:
+    """Decode a fixed-width text field: recorders pad with zeros or blanks and use their own code pages."""
+    return "".join(c for c in raw.decode("latin-1") if c.isprintable()).strip()
+
+
+def _frequency_hz(value_khz: float) -> float | None:
+    """Return the frequency in hertz; the field is in kHz, but some recorders write hertz.
+
+    Side-scan sonars work between about 50 kHz and 3 MHz, so the two readings cannot be confused.
+    """
+    if not math.isfinite(value_khz) or value_khz <= 0:
+        return None
+    return value_khz * 1000 if value_khz < 10_000 else value_khz

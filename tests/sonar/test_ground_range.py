@@ -1,0 +1,79 @@
+"""The water column out, the bottom over equal steps, beam and range evened."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonarpost.sonar.ground_range import beam_normalised, ground_range_image, range_normalised
+from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
+
+
+def survey_of(rows: np.ndarray, range_m: float = 50.0, scale: float = 1.0) -> Survey:
+    pings = tuple(Ping(i, i * 0.1, (ChannelPing(Side.PORT, row, range_m, scale=scale),)) for i, row in enumerate(rows))
+    return Survey(Path("x"), "x", "x", pings)
+
+
+def test_a_line_on_the_bottom_is_straight_whatever_the_altitude():
+    altitude_m = np.linspace(5, 15, 60)
+    centres_m = (np.arange(1000) + 0.5) * 0.05
+    ground_m = np.sqrt(np.maximum(centres_m**2 - altitude_m[:, None] ** 2, 0))
+    rows = np.where(np.abs(ground_m - 20) < 0.15, 200, 10).astype(np.uint8)
+    image = ground_range_image(survey_of(rows), Side.PORT, altitude_m, 0.1)
+    assert set(np.nanargmax(image, axis=1)) <= {198, 199, 200, 201}
+    # Nothing is known beyond the reach, which ends sooner the higher the sonar is.
+    ends = np.isfinite(image).sum(axis=1)
+    np.testing.assert_allclose(ends * 0.1, np.sqrt(50**2 - altitude_m**2), atol=0.11)
+
+
+def test_the_mean_echo_stays():
+    rows = np.random.default_rng(0).integers(0, 255, (4, 900), dtype=np.uint8)
+    image = ground_range_image(survey_of(rows, scale=0.5), Side.PORT, np.zeros(4), 0.5)
+    assert image.mean() == pytest.approx(rows.mean() / 2, rel=1e-3)
+
+
+def test_unknown_altitude_and_absent_side_are_nan():
+    rows = np.full((3, 100), 7, np.uint8)
+    image = ground_range_image(survey_of(rows), Side.PORT, np.array([5.0, np.nan, 5.0]), 0.5)
+    assert np.isnan(image[1]).all()
+    assert np.nanmax(np.abs(image[[0, 2]] - 7)) < 1e-4
+    assert ground_range_image(survey_of(rows), Side.STARBOARD, np.full(3, 5.0), 0.5).shape == (3, 0)
+
+
+@pytest.mark.parametrize("spacing", [0.0, -1.0, 1e-9, float("nan")])
+def test_absurd_steps_are_refused(spacing):
+    with pytest.raises(ValueError, match="spacing"):
+        ground_range_image(survey_of(np.ones((2, 9), np.uint8)), Side.PORT, np.ones(2), spacing)
+
+
+def test_another_number_of_altitudes_is_refused():
+    with pytest.raises(ValueError, match="one for each"):
+        ground_range_image(survey_of(np.ones((2, 9), np.uint8)), Side.PORT, np.ones(3), 1.0)
+
+
+def test_beam_pattern_is_evened_while_the_altitude_changes():
+    rng = np.random.default_rng(1)
+    altitude_m = np.linspace(5, 15, 400)
+    angle = np.arctan2((np.arange(300) + 0.5) * 0.1, altitude_m[:, None])
+    echo = (1 + np.cos(3 * angle) ** 2) * 50 * rng.rayleigh(0.8, angle.shape)
+    even = beam_normalised(echo.astype(np.float32), altitude_m, 0.1)
+    for low in (0.2, 0.5, 0.8, 1.1):
+        patch = even[(angle > low) & (angle < low + 0.1)]
+        assert patch.mean() == pytest.approx(1, abs=0.05)
+    # By columns alone it does not come out: the same column is seen at many angles.
+    by_column = range_normalised(echo.astype(np.float32), window_pings=799)
+    assert np.abs(by_column[:60, :60].mean(axis=0) - 1).max() > 0.15
+
+
+def test_range_normalising_keeps_gaps_and_objects():
+    image = np.tile(np.linspace(200, 20, 50, dtype=np.float32), (300, 1))
+    image[100:104, 20] *= 3
+    image[:, 40] = np.nan
+    image[7] = np.nan
+    even = range_normalised(image, window_pings=201)
+    assert np.isnan(even[:, 40]).all()
+    assert np.isnan(even[7]).all()
+    assert np.nanmedian(even) == pytest.approx(1, abs=1e-3)
+    assert even[101, 20] > 2.5

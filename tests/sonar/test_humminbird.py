@@ -1,0 +1,125 @@
+"""Humminbird recordings: headers of other models, one side, damage, the real one."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from PIL import Image
+from sonar.makers import make_humminbird, mercator, son_ping
+
+from sonarpost.errors import SurveyFileError
+from sonarpost.sonar.bottom_track import altitudes_m
+from sonarpost.sonar.geometry import along_track_m
+from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.survey import Side
+
+
+@pytest.fixture
+def recording(small_survey, tmp_path):
+    path = make_humminbird(small_survey(), tmp_path)
+    return path, path.with_suffix("") / "B002.SON", path.with_suffix("") / "B003.SON"
+
+
+def test_longer_headers_of_other_models_are_walked_by_their_tags(recording):
+    path, port, starboard = recording
+    extra = b"".join(struct.pack(">BI", tag, 7) for tag in range(0xA1, 0xB2)) + b"\x60\x01"
+    for side in (port, starboard):
+        side.write_bytes(son_ping(3, 500, b"\x01\x02\x03", extra) + son_ping(4, 600, b"\x04"))
+    survey = read_survey(path)
+    assert [ping.channel(Side.PORT).samples.tolist() for ping in survey] == [[1, 2, 3], [4]]
+
+
+def test_pings_of_one_side_only_stay_single(recording):
+    path, port, starboard = recording
+    port.write_bytes(son_ping(1, 0, b"a") + son_ping(3, 40, b"b") + son_ping(5, 80, b"c"))
+    starboard.write_bytes(son_ping(2, 0, b"d") + son_ping(6, 80, b"e"))
+    survey = read_survey(path)
+    assert [[c.side.value for c in ping.channels] for ping in survey] == [
+        ["port", "starboard"],
+        ["port"],
+        ["port", "starboard"],
+    ]
+    assert "only one side in 1 of 3 pings" in survey.warnings
+    starboard.unlink()
+    assert read_survey(path).sides() == (Side.PORT,)
+    port.unlink()
+    with pytest.raises(SurveyFileError, match="side-scan channels"):
+        read_survey(path)
+
+
+def test_depth_and_spacing_are_options(recording):
+    path, *_ = recording
+    plain = read_survey(path)
+    assert plain.pings[0].altitude_m is None
+    assert any("slant range is not recorded: 0.0191 m" in w for w in plain.warnings)
+    told = SurveyOptions(humminbird_sample_spacing_m=0.05, humminbird_depth_as_altitude=True)
+    survey = read_survey(path, told)
+    assert survey.pings[0].altitude_m == pytest.approx(6.2)
+    assert survey.pings[0].channels[0].slant_range_m == pytest.approx(2.0)
+    assert survey.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("damage", "field"),
+    [
+        (lambda raw: b"\x00" + raw[1:], "start"),
+        (lambda raw: raw[:4] + b"\x10" + raw[5:], "tag"),
+        (lambda raw: raw.replace(b"\xa0\x00\x00\x00\x28\x21", b"\xa0\x00\x00\x00\x00\x21", 1), "number of samples"),
+        (lambda raw: raw.replace(b"\xa0\x00\x00\x00\x28\x21", b"\xa0\xff\xff\xff\xff\x21", 1), "number of samples"),
+        (lambda raw: raw.replace(b"\xa0\x00\x00\x00\x28\x21", b"\xa0\x00\x00\x00\x28\x22", 1), "end of the header"),
+        (lambda raw: raw[:4] + b"\xa0\x00\x00\x00\x28\x21" + raw[10:], "fields"),
+        (lambda raw: raw[:4] + b"\x41\x00" * 500 + raw[4:], "header"),
+    ],
+)
+def test_a_bad_header_is_named(recording, damage, field):
+    path, port, _ = recording
+    port.write_bytes(damage(port.read_bytes()))
+    with pytest.raises(SurveyFileError, match=rf"B002.SON: ping 0.*{field}"):
+        read_survey(path)
+
+
+@pytest.mark.parametrize("dat", [b"", bytes(64), b"\xc1" + bytes(63), b"\xc1" * 70_000])
+def test_a_bad_dat_file(recording, dat):
+    path, *_ = recording
+    path.write_bytes(dat)
+    with pytest.raises(SurveyFileError, match=r"line\.DAT"):
+        read_survey(path)
+
+
+def test_a_position_without_a_fix_is_none(recording):
+    path, port, starboard = recording
+    for side in (port, starboard):
+        side.write_bytes(
+            b"".join(
+                son_ping(n, n * 40, b"a", east=east, north=north)
+                for n, (east, north) in enumerate([(0, 0), (2**31 - 1, 1), mercator(-36.5, 150.2)])
+            )
+        )
+    survey = read_survey(path)
+    assert [ping.lat_deg is None for ping in survey] == [True, True, False]
+    assert (survey.pings[2].lat_deg, survey.pings[2].lon_deg) == pytest.approx((-36.5, 150.2), abs=1e-5)
+
+
+@pytest.mark.realdata
+def test_the_real_recording(data_dir):
+    folder = data_dir / "surveys"
+    survey = read_survey(folder / "humminbird" / "test.DAT")
+    for side, name in ((Side.PORT, "B002_port"), (Side.STARBOARD, "B003_stbd")):
+        picture = np.asarray(Image.open(folder / "derived" / f"pyhum_{name}.png"))
+        np.testing.assert_array_equal(np.nan_to_num(survey.waterfall(side)), picture)
+    assert len(survey.warnings) == 2
+    # Positions, speeds and headings are recorded apart from each other, and agree.
+    times = np.array([ping.time_utc_s for ping in survey])
+    sailed_m = np.trapezoid([ping.speed_mps for ping in survey], times)
+    assert along_track_m(survey)[-1] == pytest.approx(sailed_m, rel=0.05)
+    # The first return, where it was read off the picture; the echo sounder agrees with it but in the last third.
+    altitude_m = altitudes_m(survey)
+    samples = altitude_m / survey.pings[0].channels[0].sample_spacing_m
+    assert samples[[0, 800, 1800, 2200, 2800, 3400]] == pytest.approx([96, 230, 257, 160, 57, 97], abs=12)
+    sounder = read_survey(folder / "humminbird" / "test.DAT", SurveyOptions(humminbird_depth_as_altitude=True))
+    depth_m = np.array([ping.altitude_m for ping in sounder])
+    assert np.median(np.abs(altitude_m[:2250] - depth_m[:2250])) < 0.4
+    assert np.median(np.abs(altitude_m[2600:] - depth_m[2600:])) > 1

@@ -1,0 +1,185 @@
+"""What every survey reader must do, whatever its format."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from sonar.makers import MAKERS
+
+from sonarpost.errors import SurveyFileError
+from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
+from sonarpost.sonar.options import Mounting, SurveyOptions
+from sonarpost.sonar.readers import open_survey, read_survey
+from sonarpost.sonar.survey import Side, Survey
+
+STORED = {
+    "xtf": lambda path: path,
+    "humminbird": lambda path: path.with_suffix("") / "B003.SON",
+    "waterfall": lambda path: path.with_name("line.csv"),
+}
+"""The file of each format that holds the pings' navigation."""
+
+pytestmark = pytest.mark.parametrize("kind", sorted(MAKERS))
+
+
+def test_samples_and_navigation_come_back(kind, small_survey, tmp_path):
+    written = small_survey()
+    read = read_survey(MAKERS[kind](written, tmp_path))
+    assert len(read.pings) == len(written.pings)
+    assert read.line_name == "line"
+    for got, want in zip(read, written, strict=True):
+        assert got.number == want.number
+        assert got.time_utc_s == pytest.approx(want.time_utc_s, abs=0.006)
+        for side in Side:
+            np.testing.assert_array_equal(got.channel(side).samples, want.channel(side).samples)
+            assert got.channel(side).slant_range_m > 0
+        off_m = offset_between_m(Position(want.lat_deg, want.lon_deg), Position(got.lat_deg, got.lon_deg))
+        assert np.hypot(*off_m) < 0.8  # whole metres of a Mercator map at worst
+        assert got.heading_deg == pytest.approx(want.heading_deg, abs=0.05)
+        assert got.speed_mps == pytest.approx(want.speed_mps, abs=0.05)
+
+
+def test_the_description_matches_and_a_walk_can_be_repeated(kind, small_survey, tmp_path):
+    with open_survey(MAKERS[kind](small_survey(), tmp_path)) as source:
+        first, second = list(source.pings()), list(source.pings())
+        assert source.info.ping_count == len(first) == 5
+        assert source.info.sides == tuple(Side)
+        together = list(zip(source.pings(), source.pings(), strict=True))  # two walks at a time
+    assert [p.number for p in first] == [p.number for p in second] == [p.number for p, _ in together]
+    assert all(a.number == b.number for a, b in together)
+
+
+def test_a_jump_and_time_that_goes_back_are_told(kind, small_survey, tmp_path):
+    pings = list(small_survey(pings=12).pings)
+    pings[4] = dataclasses.replace(pings[4], lat_deg=49.9)
+    if kind != "humminbird":  # its time is an unsigned number that both channels are paired by
+        pings[8] = dataclasses.replace(pings[8], time_utc_s=pings[8].time_utc_s - 30)
+    read = read_survey(MAKERS[kind](dataclasses.replace(small_survey(), pings=tuple(pings)), tmp_path))
+    assert [p.lat_deg is None for p in read] == [row == 4 for row in range(12)]
+    assert any("too far from the one before, in 1 of 12 pings, the first in row 4" in w for w in read.warnings)
+    assert any("time goes back in 1 of 12 pings, the first in row 8" in w for w in read.warnings) is (
+        kind != "humminbird"
+    )
+
+
+def test_a_new_place_is_believed_in_the_end(kind, small_survey, tmp_path):
+    pings = [
+        dataclasses.replace(p, lat_deg=p.lat_deg + (row >= 5)) for row, p in enumerate(small_survey(pings=15).pings)
+    ]
+    read = read_survey(MAKERS[kind](dataclasses.replace(small_survey(), pings=tuple(pings)), tmp_path))
+    assert [p.lat_deg is None for p in read] == [5 <= row < 9 for row in range(15)]
+
+
+def test_the_mounting_moves_every_position(kind, small_survey, tmp_path):
+    path = MAKERS[kind](small_survey(), tmp_path)
+    options = SurveyOptions(mounting=Mounting(forward_m=2, starboard_m=3, layback_m=42, heading_offset_deg=10))
+    for plain, moved in zip(read_survey(path), read_survey(path, options), strict=True):
+        assert moved.heading_deg == pytest.approx((plain.heading_deg + 10) % 360)
+        want = offset_position(Position(plain.lat_deg, plain.lon_deg), moved.heading_deg, -40)
+        want = offset_position(want, moved.heading_deg + 90, 3)
+        assert np.hypot(*offset_between_m(want, Position(moved.lat_deg, moved.lon_deg))) < 0.001
+
+
+def test_every_truncation_is_one_error_or_whole_pings(kind, small_survey, tmp_path):
+    path = MAKERS[kind](small_survey(), tmp_path)
+    stored = STORED[kind](path)
+    whole = stored.read_bytes()
+    for length in range(0, len(whole), max(len(whole) // 150, 1)):
+        stored.write_bytes(whole[:length])
+        try:
+            survey = read_survey(path)
+        except SurveyFileError:
+            continue
+        assert all(channel.samples.size == 40 for ping in survey for channel in ping.channels)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damage_reads_or_raises_one_error(kind, small_survey, tmp_path, data):
+    folder = tmp_path / "damaged"
+    if not folder.exists():
+        folder.mkdir()
+        MAKERS[kind](small_survey(), folder)
+        (tmp_path / "whole").write_bytes(STORED[kind](_path(kind, folder)).read_bytes())
+    raw = bytearray((tmp_path / "whole").read_bytes())
+    for _ in range(data.draw(st.integers(1, 5))):
+        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    path = _path(kind, folder)
+    STORED[kind](path).write_bytes(raw)
+    try:
+        survey = read_survey(path)
+    except SurveyFileError:
+        return
+    check(survey)
+
+
+def _path(kind: str, folder: Path) -> Path:
+    return folder / {"xtf": "line.xtf", "humminbird": "line.DAT", "waterfall": "line.waterfall.toml"}[kind]
+
+
+def check(survey: Survey) -> None:
+    for ping in survey:
+        assert (ping.lat_deg is None) == (ping.lon_deg is None)
+        assert ping.lat_deg is None or (abs(ping.lat_deg) <= 90 and abs(ping.lon_deg) <= 180)
+        assert ping.heading_deg is None or 0 <= ping.heading_deg < 360
+        assert ping.altitude_m is None or ping.altitude_m > 0
+        assert np.isfinite(ping.time_utc_s)
+        assert all(c.slant_range_m > 0 and c.samples.size for c in ping.channels)
+
+
+def test_a_file_that_is_written_to_while_it_is_read_is_an_error(kind, small_survey, tmp_path):
+    path = MAKERS[kind](small_survey(pings=30), tmp_path)
+    with open_survey(path) as source:
+        pings = source.pings()
+        next(pings)
+        with STORED[kind](path).open("ab") as file:
+            file.write(b"more")
+        os.utime(STORED[kind](path), ns=(1, 1))
+        with pytest.raises(SurveyFileError, match="changed while"):
+            list(pings)
+
+
+def test_a_file_that_is_replaced_while_it_is_read_stays_the_old_one(kind, small_survey, tmp_path):
+    path = MAKERS[kind](small_survey(), tmp_path)
+    with open_survey(path) as source:
+        before = [p.time_utc_s for p in source.pings()]
+        STORED[kind](path).unlink()
+        STORED[kind](path).write_bytes(b"something else")
+        assert [p.time_utc_s for p in source.pings()] == before
+
+
+def test_what_is_no_file(kind, small_survey, tmp_path):
+    path = MAKERS[kind](small_survey(), tmp_path)
+    stored = STORED[kind](path)
+    stored.unlink()
+    if kind != "humminbird":  # a recording of one side is one
+        with pytest.raises(SurveyFileError, match="No such file"):
+            open_survey(path)
+    os.mkfifo(stored)
+    with pytest.raises(SurveyFileError, match="not a regular file"):
+        open_survey(path)
+
+
+def test_memory_does_not_grow_with_the_file(kind, small_survey, tmp_path):
+    """The walk of a file ten times as long takes no more memory; pictures of a waterfall are held, and left out."""
+    if kind == "waterfall":
+        pytest.skip("its pictures are decoded whole, up to image_files.MAX_PIXELS")
+    peaks = []
+    for number, pings in enumerate((300, 3000)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        path = MAKERS[kind](small_survey(pings=pings, samples=1000), folder)
+        tracemalloc.start()
+        with open_survey(path) as source:
+            assert sum(1 for _ in source.pings()) == pings
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.2 * peaks[0] + 100_000
+    assert peaks[1] < 3_000_000

@@ -1,0 +1,114 @@
+"""Surveys as pictures and a table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sonar.makers import make_waterfall
+
+from sonarpost.errors import SurveyFileError
+from sonarpost.sonar.readers import open_survey, read_survey
+from sonarpost.sonar.survey import Side
+
+
+def replaced(path, old: str, new: str):
+    path.write_text(path.read_text().replace(old, new))
+
+
+def test_tiff_of_16_bits(small_survey, tmp_path):
+    survey = small_survey(np.uint16)
+    read = read_survey(make_waterfall(survey, tmp_path, tiff=True))
+    np.testing.assert_array_equal(read.waterfall(Side.PORT), survey.waterfall(Side.PORT))
+    assert (read.sonar_id, read.line_name, read.warnings) == ("HDS", "line", ())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ('port_order = "farthest_first"\n', "", "port_order"),
+        ('positions = "degrees"', 'positions = "metres"', "projected_crs"),
+        ('positions = "degrees"', 'positions = "degree"', "positions"),
+        ('positions = "degrees"', "", "positions"),
+        ("sonar_id", "sonarid", "sonarid"),
+        ("line.csv", "absent.csv", "No such file"),
+        ("line.port.png", "absent.png", "not a regular file"),
+        ("sonar_id =", "sonar_id", "TOML"),
+        ('positions = "degrees"\n', 'positions = "degrees"\n[columns]\nlat = "a"\n', "columns"),
+        ('positions = "degrees"\n', 'positions = "degrees"\n[columns]\nlat_deg = "y"\n', "no 'y'"),
+    ],
+)
+def test_a_bad_description_is_named(small_survey, tmp_path, old, new, field):
+    path = make_waterfall(small_survey(), tmp_path)
+    replaced(path, old, new)
+    with pytest.raises(SurveyFileError, match=field):
+        open_survey(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ("25.0", "-25.0", "ping 0, slant_range_m"),
+        ("25.0", "nan", "ping 0, slant_range_m"),
+        ("25.0", "far", "ping 0, slant_range_m"),
+        ("1378847588.13", "yesterday", "ping 0, time_utc"),
+        ("1378847588.13", "nan", "ping 0, time_utc"),
+        ("1378847588.13", "1e300", "ping 0, time_utc"),
+        ("slant_range_m", "range", "no 'slant_range_m'"),
+        ("354.5", "35\x00", "heading_deg"),
+        ("354.5", '3"5', "heading_deg"),
+        ("354.5", "354,5", "fields"),
+        ("354.5", "9" * 70_000, "line|field"),
+    ],
+)
+def test_a_bad_table_is_named(small_survey, tmp_path, old, new, field):
+    path = make_waterfall(small_survey(), tmp_path)
+    replaced(tmp_path / "line.csv", old, new)
+    with pytest.raises(SurveyFileError, match=field):
+        open_survey(path)
+
+
+def test_a_table_of_another_length_than_the_pictures(small_survey, tmp_path):
+    path = make_waterfall(small_survey(), tmp_path)
+    lines = (tmp_path / "line.csv").read_text().splitlines(keepends=True)
+    for changed in (lines[:-1], [*lines, lines[-1]]):
+        (tmp_path / "line.csv").write_text("".join(changed))
+        with pytest.raises(SurveyFileError, match=r"lines|row"):
+            read_survey(path)
+
+
+def test_nan_navigation_is_unknown_and_a_wild_value_is_told(small_survey, tmp_path):
+    path = make_waterfall(small_survey(), tmp_path)
+    table = tmp_path / "line.csv"
+    lines = table.read_text().splitlines()
+    lines[1] = lines[1].replace("354.5", "nan").replace("48.44545", "inf").replace("6.25", "")
+    lines[2] = lines[2].replace("354.5", "400")
+    table.write_text("\n".join(lines))
+    survey = read_survey(path)
+    first = survey.pings[0]
+    assert (first.heading_deg, first.lat_deg, first.lon_deg, first.altitude_m) == (None,) * 4
+    assert survey.pings[1].heading_deg is None
+    assert survey.warnings == (
+        "no position fix in 1 of 5 pings, the first in row 0",
+        "heading_deg out of range in 1 of 5 pings, the first in row 1",
+    )
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", ["scotsman-iver2", "000_1236"])
+def test_derived_pictures_read_as_the_recordings_they_are_of(data_dir, tmp_path, name):
+    derived = data_dir / "surveys" / "derived"
+    path = tmp_path / "line.waterfall.toml"
+    path.write_text(
+        f'port = "{derived}/{name}.xtf.port.png"\nstarboard = "{derived}/{name}.xtf.stbd.png"\n'
+        f'navigation = "{derived}/{name}.xtf.nav.csv"\n'
+        'port_order = "farthest_first"\npositions = "degrees"\nknots = true\nzero_is_unknown = true\n'
+        '[columns]\nlat_deg = "y_or_lat"\nlon_deg = "x_or_lon"\ntime_utc = "utc"\nslant_range_m = "slant_range"\n'
+        'heading_deg = "heading"\naltitude_m = "alt"\nspeed_mps = "speed"\n'
+    )
+    pictures, recording = read_survey(path), read_survey(data_dir / "surveys" / f"{name}.xtf")
+    for got, want in zip(pictures, recording, strict=True):
+        for side in Side:
+            np.testing.assert_array_equal(got.channel(side).samples, want.channel(side).samples)
+        assert (got.lat_deg, got.lon_deg) == (want.lat_deg, want.lon_deg)
+        assert got.time_utc_s == pytest.approx(want.time_utc_s, abs=0.001)
+        assert (got.speed_mps or 0) == pytest.approx(want.speed_mps or 0, abs=0.006)
