@@ -65,6 +65,10 @@ class CatalogueError(BadInputError):
     """A tile catalogue cannot be read, or is not the one the other end used."""
 
 
+class KeptFileError(BadInputError):
+    """A record that c2 keeps as a file cannot be read back, or is not what its place promises."""
+
+
 class PortError(SonarpostError):
     """A serial port or socket cannot be opened, or went away."""
 

@@ -36,6 +36,10 @@ RecordId = Annotated[str, Field(pattern=r"^[!-~]{1,64}$")]
 Channel = Literal["port", "starboard"]
 Verdict = Literal["mine_like", "not_mine_like", "unsure"]
 CommandKind = Literal["refine", "resend", "revisit"]
+TaskingKind = Literal["advice", "command"]
+DeliveryState = Literal["waiting", "delivered", "refused"]
+DownlinkKind = Literal["refine", "resend", "revisit", "decision"]
+DownlinkStep = Literal["asked", "sent", "confirmed", "refused", "expired"]
 ServiceState = Literal["starting", "ok", "degraded", "stopping"]
 
 
@@ -250,6 +254,107 @@ class ReconstructedImage(Record):
         return bits[: shape[0] * shape[1]].reshape(shape).astype(np.bool_)
 
 
+class OutgoingMessage(Record):
+    """Anything else a vehicle's program wants sent by sound: vehicle status, a position.
+
+    Attributes:
+        message_id: The same one given again is the same message and is sent once.
+        source: The program; programs of one priority share the water evenly.
+        priority: 1 first to 7 last. Up to 5 goes before pictures, below that into what frames leave free.
+        lifetime_s: For how long after `created_utc_s` it is worth sending.
+        data: Goes through the water as it is.
+    """
+
+    TYPE: ClassVar[str] = "outgoing_message"
+
+    message_id: RecordId
+    source: Annotated[str, Field(min_length=1, max_length=40)]
+    priority: Annotated[int, Field(ge=1, le=7)]
+    lifetime_s: Annotated[float, Field(gt=0, le=604800)]
+    created_utc_s: Time
+    data: Annotated[bytes, Field(min_length=1, max_length=1024)]
+
+
+class QueuedImage(Record):
+    """One picture in the acoustic queue.
+
+    Attributes:
+        bytes_left: Of frames still to be sent for it, redundancy included, by the plan so far.
+        preview_utc_s: When its record and coarse picture are expected to have gone; None where they have.
+        expected_utc_s: When all of it that is planned is expected to have gone.
+    """
+
+    TYPE: ClassVar[str] = "queued_image"
+
+    image_id: ImageId
+    contact_id: Annotated[str, Field(min_length=1, max_length=120)]
+    bytes_left: Count
+    preview_utc_s: Time | None
+    expected_utc_s: Time
+
+
+class QueueState(Record):
+    """What waits in a vehicle's acoustic queue, and when it is expected to have gone.
+
+    Attributes:
+        rate: Micro-Modem rate in use.
+        frame_loss: Share of frames lost, as the receiver's reports tell; None while it is not known.
+        packet_interval_s: Time from one packet to the next, with what medium access costs.
+        images: Those that have not gone, the first to be finished first; at most 500.
+    """
+
+    TYPE: ClassVar[str] = "queue_state"
+
+    platform_id: PlatformId
+    time_utc_s: Time
+    rate: Annotated[int, Field(ge=0, le=6)]
+    frame_loss: Fraction | None
+    packet_interval_s: Annotated[float, Field(ge=0, le=86400)]
+    messages_waiting: Count
+    message_bytes: Count
+    images_waiting: Count
+    images: Annotated[tuple[QueuedImage, ...], Field(max_length=500)]
+
+
+class ReceivedMessage(Record):
+    """A message of a vehicle, as it came out of the water.
+
+    Attributes:
+        data: As its source on the vehicle gave it.
+    """
+
+    TYPE: ClassVar[str] = "received_message"
+
+    vessel_id: PlatformId
+    vehicle_id: PlatformId
+    received_utc_s: Time
+    data: Annotated[bytes, Field(min_length=1, max_length=4096)]
+
+
+class DownlinkState(Record):
+    """How far a command or decision has come on its way to a vehicle.
+
+    Attributes:
+        record_id: Its `command_id` or `decision_id`.
+        state: asked: on the vessel's disk. sent: in the water, perhaps heard. confirmed: on the vehicle's disk.
+            refused: the vehicle cannot do it. expired: nobody has confirmed it in time.
+        times_sent: How often it has gone into the water.
+        reason: With `refused`: the vehicle's.
+    """
+
+    TYPE: ClassVar[str] = "downlink_state"
+
+    vessel_id: PlatformId
+    vehicle_id: PlatformId
+    kind: DownlinkKind
+    record_id: RecordId
+    state: DownlinkStep
+    times_sent: Count
+    expires_utc_s: Time
+    changed_utc_s: Time
+    reason: Text = ""
+
+
 class Decision(Record):
     """What an operator decided about one picture."""
 
@@ -296,6 +401,37 @@ class Command(Record):
         if degrees is None and info.data.get("kind") == "revisit":
             raise ValueError("where to revisit")
         return degrees
+
+
+class Advice(Record):
+    """What an expert ashore thinks of one picture, for the operator on the vessel."""
+
+    TYPE: ClassVar[str] = "advice"
+
+    advice_id: RecordId
+    vessel_id: PlatformId
+    vehicle_id: PlatformId
+    image_id: ImageId
+    image_version: Ordinal
+    verdict: Verdict | None = None
+    confidence: Fraction | None = None
+    mlo_class: Annotated[str, Field(max_length=60)] | None = None
+    remark: Text = ""
+    author: Annotated[str, Field(min_length=1, max_length=120)]
+    advised_utc_s: Time
+
+
+class TaskingState(Record):
+    """How far advice or a command from the shore has come; `delivered`: it is on the vessel's disk."""
+
+    TYPE: ClassVar[str] = "tasking_state"
+
+    vessel_id: PlatformId
+    kind: TaskingKind
+    record_id: RecordId
+    state: DeliveryState
+    reason: Text = ""
+    changed_utc_s: Time
 
 
 class Relayed(Record):

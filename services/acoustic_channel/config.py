@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -13,8 +14,9 @@ from sonarpost.runtime.config import ServiceConfig
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.water_chance import TailDamage
+from sonarpost.sim.water_config import WaterConfig
+from sonarpost.sim.water_file import make_water
 from sonarpost.sim.water_physics import Position
-from sonarpost.sim.water_records import WaterConfig
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 
@@ -35,6 +37,25 @@ class ModemTable(ServiceConfig):
     depth_m: float = 0.0
 
 
+class TransponderTable(ServiceConfig):
+    """One transponder: `[[acoustic_channel.transponder]]`.
+
+    Attributes:
+        letter: A to D.
+        east_m: Position.
+        north_m: Position.
+        depth_m: Position, down.
+    """
+
+    letter: Literal["A", "B", "C", "D"]
+    east_m: float = 0.0
+    north_m: float = 0.0
+    depth_m: float = 0.0
+
+
+_OF_WATER = tuple(field.name for field in fields(WaterConfig))
+
+
 class AcousticChannelConfig(ServiceConfig):
     """The `[acoustic_channel]` table.
 
@@ -46,6 +67,7 @@ class AcousticChannelConfig(ServiceConfig):
         log: File for the record of every packet; none by default.
         seed: Seed of every draw.
         time_scale: Simulated seconds a real second.
+        preset: A set of the water's parameters; what is given besides goes over it.
         sound_speed_m_per_s: Speed of sound.
         frame_loss: Chance that a frame is lost on its own.
         packet_loss: Chance that a whole packet is not detected.
@@ -54,8 +76,24 @@ class AcousticChannelConfig(ServiceConfig):
         tail_fraction: Longest damaged tail as a part of its frame.
         snr_at_1m_db: Signal-to-noise ratio one metre from a transmitter.
         range_loss: Whether frames are also lost by their signal-to-noise ratio.
+        source_level_db: With it the signal-to-noise ratio follows from noise and bandwidth, not from `snr_at_1m_db`.
+        excess_loss_db: What else the signal loses.
+        carrier_hz: Carrier, for absorption and noise.
+        bandwidth_hz: Bandwidth, for noise.
+        spreading_db_per_decade: 20 spherical, 15 practical, 10 cylindrical.
+        temperature_c: Of the water.
+        salinity_psu: Of the water.
+        wind_m_per_s: For noise.
+        shipping: For noise, 0 none to 1 heavy.
+        snr_spread_db: Each packet's ratio is up to this above or below the mean.
+        mean_clear_s: Burst fading: mean time that a path is clear.
+        mean_fade_s: Mean time of a fade; 0 for no fading.
+        fade_loss: Chance that a frame is lost in a fade.
+        fade_depth_db: What a fade takes from the signal-to-noise ratio.
         airtime_s: Air times by rate number, instead of the nominal ones.
         generation: Of the emulated Micro-Modem, 1 or 2.
+        statistics_version: Layout of `CACST`, 6 or 8.
+        transponder: Transponders for ranging, at most one of each letter.
         promiscuous: Whether hosts are shown data meant for other modems.
         serial_baud: Speed of the serial lines, 0 for lines without delay.
     """
@@ -70,7 +108,8 @@ class AcousticChannelConfig(ServiceConfig):
     log: Path | None = None
     seed: int = 0
     time_scale: Annotated[float, Field(ge=0.01, le=10_000)] = 1.0
-    sound_speed_m_per_s: Annotated[float, Field(gt=0, le=10_000)] = 1500.0
+    preset: Literal["still", "sea-trial"] = "still"
+    sound_speed_m_per_s: Annotated[float, Field(ge=1, le=10_000)] = 1500.0
     frame_loss: Probability = 0.0
     packet_loss: Probability = 0.0
     tail_damage: Probability = 0.0
@@ -78,8 +117,24 @@ class AcousticChannelConfig(ServiceConfig):
     tail_fraction: Annotated[float, Field(gt=0, le=1)] = 0.5
     snr_at_1m_db: Annotated[float, Field(ge=-100, le=200)] = 60.0
     range_loss: bool = False
+    source_level_db: Annotated[float, Field(ge=0, le=260)] | None = None
+    excess_loss_db: Annotated[float, Field(ge=-50, le=200)] = 0.0
+    carrier_hz: Annotated[float, Field(ge=100, le=1e6)] = 25_000.0
+    bandwidth_hz: Annotated[float, Field(ge=1, le=1e6)] = 5_000.0
+    spreading_db_per_decade: Annotated[float, Field(ge=0, le=60)] = 20.0
+    temperature_c: Annotated[float, Field(ge=-2, le=40)] = 10.0
+    salinity_psu: Annotated[float, Field(ge=0, le=50)] = 35.0
+    wind_m_per_s: Annotated[float, Field(ge=0, le=60)] = 5.0
+    shipping: Probability = 0.5
+    snr_spread_db: Annotated[float, Field(ge=0, le=40)] = 1.0
+    mean_clear_s: Annotated[float, Field(ge=0.01, le=1e9)] = 60.0
+    mean_fade_s: Annotated[float, Field(ge=0, le=1e9)] = 0.0
+    fade_loss: Probability = 1.0
+    fade_depth_db: Annotated[float, Field(ge=0, le=100)] = 0.0
     airtime_s: Mapping[Annotated[int, Field(ge=min(RATES), le=max(RATES))], Annotated[float, Field(gt=0, le=600)]] = {}
     generation: Annotated[int, Field(ge=1, le=2)] = 2
+    statistics_version: Literal[6, 8] = 6
+    transponder: Annotated[tuple[TransponderTable, ...], Field(max_length=4)] = ()
     promiscuous: bool = True
     serial_baud: Annotated[float, Field(ge=0, le=10_000_000)] = 0.0
 
@@ -94,19 +149,20 @@ class AcousticChannelConfig(ServiceConfig):
         Raises:
             ValueError: Values that do not go together, such as two modems of one address.
         """
-        water = WaterConfig(
-            seed=self.seed,
-            sound_speed_m_per_s=self.sound_speed_m_per_s,
-            frame_loss=self.frame_loss,
-            packet_loss=self.packet_loss,
-            tail_damage=self.tail_damage,
-            tail_damage_kind=self.tail_damage_kind,
-            tail_fraction=self.tail_fraction,
-            snr_at_1m_db=self.snr_at_1m_db,
-            range_loss=self.range_loss,
-        )
+        given = {
+            name: value
+            for name in _OF_WATER
+            if name in self.model_fields_set and (value := getattr(self, name)) is not None
+        }
+        if "tail_damage_kind" in given:
+            given["tail_damage_kind"] = self.tail_damage_kind.value
+        water = make_water(given | {"preset": self.preset}, "acoustic_channel")
         template = ModemConfig(
-            address=0, generation=self.generation, airtimes_s=self.airtime_s, promiscuous=self.promiscuous
+            address=0,
+            generation=self.generation,
+            statistics_version=self.statistics_version,
+            airtimes_s=self.airtime_s,
+            promiscuous=self.promiscuous,
         )
         return ChannelConfig(
             sites=tuple(ModemSite(m.address, Position(m.east_m, m.north_m, m.depth_m)) for m in self.modem),
@@ -118,4 +174,5 @@ class AcousticChannelConfig(ServiceConfig):
             time_scale=self.time_scale,
             serial_baud=self.serial_baud or None,
             log_path=self.log,
+            transponders={t.letter: Position(t.east_m, t.north_m, t.depth_m) for t in self.transponder},
         )

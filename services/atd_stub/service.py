@@ -131,6 +131,16 @@ class AtdStubService(Service[AtdStubConfig]):
         effects.count("contacts_detected", len(found))
         self.commit(effects)
         log.info("File processed", extra=kv(file=path.name, contacts=len(found), seconds=seconds))
+        for snippet in found:
+            log.info(
+                "Contact detected",
+                extra=kv(
+                    vehicle=self.platform.id,
+                    contact_id=snippet.contact.contact_id,
+                    file=path.name,
+                    confidence=snippet.contact.atd_confidence,
+                ),
+            )
 
     def _snippets(self, path: Path, content: str) -> tuple[Snippet, ...]:
         if self.config.mode == "snippets":

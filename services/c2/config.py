@@ -1,15 +1,27 @@
 """Configuration of c2: the `[c2]` table."""
 
 from pathlib import Path
+from typing import Annotated
 
+from pydantic import Field
+
+from sonarpost.keys import SHORE
+from sonarpost.messages import PlatformId
 from sonarpost.runtime.config import ServiceConfig
 
 
 class C2Config(ServiceConfig):
-    """Where accepted pictures and decisions are kept.
+    """Where accepted pictures and decisions are kept, and for how long.
 
     Attributes:
-        out_dir: Folder of the accepted records, one folder a vessel in it.
+        site: Name of this site in keys; relays name it in their upstreams.
+        out_dir: Folder of the accepted records, one folder a vessel in it, and their index.
+        retain_days: Pictures accepted longer ago are removed; None keeps them.
+        max_bytes: Most that pictures may take; beyond it exported ones are removed first, then the oldest. None for no
+            limit. Decisions are never removed.
     """
 
+    site: PlatformId = SHORE
     out_dir: Path = Path("out")
+    retain_days: Annotated[float, Field(gt=0, le=36500)] | None = None
+    max_bytes: Annotated[int, Field(ge=0)] | None = None

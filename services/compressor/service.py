@@ -1,4 +1,4 @@
-"""Turns snippets into codec streams and gives each the four-character identifier it has on the acoustic link."""
+"""Turns snippets into codec streams, each with the identifier it has on the acoustic link, and gives them again."""
 
 from __future__ import annotations
 
@@ -7,19 +7,23 @@ import time
 from collections.abc import Mapping
 
 from services.compressor.config import CompressorConfig
-from sonarpost import keys
+from services.compressor.kept import KeptPictures
+from sonarpost import keys, wire
 from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.interface import Codec
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.link.paper_format import format_image_id
-from sonarpost.messages import EncodedImage, Record, Snippet
+from sonarpost.link.v1_objects import MAX_STREAM_BYTES
+from sonarpost.link.v1_preview import MAX_NUMBER
+from sonarpost.messages import Command, EncodedImage, Record, Snippet
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects, Service
 
 log = logging.getLogger(__name__)
 
-IMAGE_IDS = 36**4
+IMAGE_IDS = MAX_NUMBER
+"""Identifiers count from 0001 as contacts do on the v1 link, so that both ends call a picture the same."""
 _NEXT_IMAGE = "next_image"
 
 
@@ -38,19 +42,24 @@ class CompressorService(Service[CompressorConfig]):
         tiles = open_catalogue(config.catalogue).tiles
         self._codec: Codec = default_registry().create(config.codec, CodecResources(tiles, config.packing))
         super().__init__(platform, config)
+        self._kept = KeptPictures(self.store, config.keep_pictures, config.keep_s)
         log.info("Codec ready", extra=kv(codec=self._codec.name, model=self._codec.model_hash[:16]))
 
     def consumes(self) -> Mapping[str, type[Record]]:
-        """Snippets of this vehicle."""
-        return {keys.contact_detected(self.platform.id): Snippet}
+        """Snippets of this vehicle, and what the vessel asks of pictures."""
+        commands = {keys.command(self.platform.id, kind): Command for kind in ("refine", "resend")}
+        return {keys.contact_detected(self.platform.id): Snippet, **commands}
 
     def handle(self, key: str, record: Record, effects: Effects) -> None:
-        """Encode a snippet and owe the stream to uuv_modem."""
+        """Encode a snippet, or a picture again, and owe the stream to uuv_modem."""
+        if isinstance(record, Command):
+            self._answer(record, effects)
+            return
         assert isinstance(record, Snippet)
         started = time.perf_counter()
         stream = self._codec.encode(record.picture.to_array(), self.config.budget_bytes or None)
         number = self._next_number()
-        effects.put_state(_NEXT_IMAGE, str((number + 1) % IMAGE_IDS).encode())
+        effects.put_state(_NEXT_IMAGE, str(number % IMAGE_IDS + 1).encode())
         image = EncodedImage(
             vehicle_id=self.platform.id,
             image_id=format_image_id(number),
@@ -63,18 +72,46 @@ class CompressorService(Service[CompressorConfig]):
             original_sha256=record.picture.sha256,
         )
         effects.send(keys.image_encoded(self.platform.id), "uuv_modem", image)
+        if self.config.keep_pictures:
+            self._kept.keep(effects, image.image_id, wire.encode(image), effects.payload, time.time())
         effects.count("images_encoded")
         effects.count("bytes_encoded", len(stream))
         log.info(
             "Picture encoded",
             extra=kv(
-                contact=record.contact.contact_id,
+                vehicle=image.vehicle_id,
+                contact_id=record.contact.contact_id,
                 image_id=image.image_id,
                 pixels=f"{image.height_px}x{image.width_px}",
                 bytes=len(stream),
                 encode_ms=round(1000 * (time.perf_counter() - started), 1),
             ),
         )
+
+    def _answer(self, command: Command, effects: Effects) -> None:
+        """Give a picture again; finer where that was asked for and the longer stream begins as the first did.
+
+        What a stream has more than the link has sent of it, the link sends by itself: this is for what it has not.
+        """
+        image_id = command.image_id or ""
+        found = self._kept.find(image_id)
+        if found is None:
+            effects.count("commands_unknown_image")
+            log.warning("Picture is not kept any more", extra=kv(image_id=image_id, kind=command.kind))
+            return
+        where = f"compressor.db: kept/{image_id}"
+        image = wire.decode(EncodedImage, found[0], where)
+        if command.kind == "refine":
+            snippet = wire.decode(Snippet, found[1], where)
+            finer = self._codec.encode(snippet.picture.to_array(), min(2 * len(image.stream), MAX_STREAM_BYTES))
+            # The last byte ends the entropy coder's number, so that of a shorter stream may be another.
+            if len(finer) > len(image.stream) and finer.startswith(image.stream[:-1]):
+                image = image.model_copy(update={"stream": finer})
+                self._kept.keep(effects, image_id, wire.encode(image), found[1], time.time())
+                effects.count("images_refined")
+        effects.send(keys.image_encoded(self.platform.id), "uuv_modem", image, priority=3)
+        effects.count("images_given_again")
+        log.info("Picture given again", extra=kv(image_id=image_id, kind=command.kind, bytes=len(image.stream)))
 
     def _next_number(self) -> int:
         """Return the next image number.
@@ -83,4 +120,5 @@ class CompressorService(Service[CompressorConfig]):
         the identifiers of its last mission, which the vessel still remembers.
         """
         kept = self.store.get_state(_NEXT_IMAGE)
-        return int(kept) if kept is not None else int.from_bytes(self.store.origin[:4], "big") % IMAGE_IDS
+        first = int.from_bytes(self.store.origin[:4], "big") if kept is None else int(kept)
+        return (first - 1) % IMAGE_IDS + 1

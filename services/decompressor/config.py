@@ -5,15 +5,17 @@ from typing import Annotated
 
 from pydantic import Field
 
+from services.decompressor.hearing import LinkName
 from sonarpost.messages import PlatformId
 from sonarpost.runtime.config import ServiceConfig
 
 
 class DecompressorConfig(ServiceConfig):
-    """How halves are paired, what they are decoded with, where pictures go.
+    """What is understood, how halves are paired, what they are decoded with, where pictures go.
 
     Attributes:
         out_dir: Folder of the pictures.
+        links: Wire formats that are understood; each frame tells which it is of.
         pairing_timeout_s: How long an image waits for what it lacks after its last frame.
         catalogues: Tile catalogues (nominal-10, nominal-20 or files) that vehicles may use.
         vehicles: Names of the vehicles by the modem addresses they send from; an address that is not listed gets
@@ -21,6 +23,7 @@ class DecompressorConfig(ServiceConfig):
     """
 
     out_dir: Path = Path("out")
+    links: Annotated[tuple[LinkName, ...], Field(min_length=1)] = ("v1", "paper")
     pairing_timeout_s: Annotated[float, Field(gt=0, le=86400)] = 120.0
     catalogues: Annotated[tuple[str, ...], Field(min_length=1)] = ("nominal-10", "nominal-20")
     vehicles: dict[Annotated[str, Field(pattern=r"^[0-9]{1,3}$")], PlatformId] = Field(default_factory=dict)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from sonarpost.catalogue.store import open_catalogue
-from sonarpost.codec.interface import Codec, Decoded, Mask
+from sonarpost.codec.interface import Codec, Decoded, Mask, StreamHeader
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.tiles import TileDatabase
 from sonarpost.codec.vq import catalogue_tag
-from sonarpost.errors import CatalogueError
+from sonarpost.errors import CatalogueError, StreamError
 from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.downlink import image_of_number
 from sonarpost.link.paper_events import ContactOnly, ImageReady
+from sonarpost.link.paper_format import HalfName
+from sonarpost.link.v1_events import ContactUpdate
 from sonarpost.messages import Contact, Raster, ReconstructedImage
 
 
@@ -45,61 +49,119 @@ class Decoder:
             CatalogueError: It was made with a catalogue that is not at hand.
             StreamError: It cannot be decoded.
         """
-        codec = self._codec(event)
+        codec = self._codec(event.header, event)
         decoded = codec.decode(event.stream, event.received_mask())
         notes = list(decoded.notes)
         if event.conflicts:
             notes.append(f"{event.conflicts} frames disagreed with others of this image")
         return self._record(event, vehicle_id, decoded, codec, notes)
 
+    def refined(self, event: ContactUpdate, vehicle_id: str) -> ReconstructedImage:
+        """Decode the beginning of a picture's stream, as far as it has arrived.
+
+        Nothing is filled in: what an embedded codec shows of each pixel is what the stream says of it so far.
+
+        Raises:
+            CatalogueError: It was made with a catalogue that is not at hand.
+            StreamError: It cannot be decoded.
+        """
+        if not _has_header(event.stream):
+            return self._without_picture(event, vehicle_id)
+        codec = self._codec(StreamHeader.unpack(event.stream), event)
+        decoded = codec.decode(event.stream)
+        return self._record(event, vehicle_id, decoded, codec, decoded.notes)
+
     def contact_only(self, event: ContactOnly, vehicle_id: str) -> ReconstructedImage:
         """Return the record of a contact whose picture did not arrive: all of it is missing."""
+        return self._without_picture(event, vehicle_id)
+
+    def _without_picture(self, event: ContactOnly | ContactUpdate, vehicle_id: str) -> ReconstructedImage:
         shape = (event.contact.height_px or 16, event.contact.width_px or 16)
         decoded = Decoded(np.zeros(shape, dtype=np.uint8), np.ones(shape, dtype=np.bool_))
         return self._record(event, vehicle_id, decoded, None, ["only the contact record arrived"])
 
-    def _codec(self, event: ImageReady) -> Codec:
+    def _codec(self, header: StreamHeader, event: ImageReady | ContactUpdate) -> Codec:
         registry, tiles = default_registry(), None
         # The tag of a codec without tiles is that of another kind of model, or of none.
-        if registry.spec_for_id(event.header.codec_id).needs_tiles:
-            tag = event.header.model_tag
+        if registry.spec_for_id(header.codec_id).needs_tiles:
+            tag = header.model_tag
             tiles = self._tiles.get(tag)
             if tiles is None:
                 own = ", ".join(f"{known:#06x}" for known in self._tiles)
-                where = f"image {event.image_id}"
+                where = f"image {image_id_of(event)}"
                 raise CatalogueError(where, "model_tag", f"{tag:#06x}", f"a catalogue at hand: {own}")
         return registry.create_for_stream(event.stream, CodecResources(tiles))
 
     def _record(
         self,
-        event: ImageReady | ContactOnly,
+        event: ImageReady | ContactOnly | ContactUpdate,
         vehicle_id: str,
         decoded: Decoded,
         codec: Codec | None,
         notes: Sequence[str],
     ) -> ReconstructedImage:
         picture = Raster.from_array(decoded.image)
+        amount = _amount_of(event)
         return ReconstructedImage(
             vessel_id=self._vessel_id,
             vehicle_id=vehicle_id,
-            image_id=event.image_id,
+            image_id=image_id_of(event),
             version=event.version,
             contact=contact_of(event, vehicle_id),
             codec=codec.name if codec else "",
             model=codec.model_hash if codec else "",
             picture=picture,
             picture_sha256=picture.sha256,
-            complete=isinstance(event, ImageReady) and event.complete and not decoded.missing.any(),
+            complete=amount.complete and not decoded.missing.any(),
             missing_fraction=float(decoded.missing.mean()),
             missing_mask=pack_mask(decoded.missing),
-            missing_halves=event.missing_halves if isinstance(event, ImageReady) else ("top", "bottom"),
-            bytes_received=sum(stop - start for start, stop in event.received) if isinstance(event, ImageReady) else 0,
-            bytes_total=len(event.body) if isinstance(event, ImageReady) else 0,
-            frames_received=event.frames if isinstance(event, ImageReady) else 0,
+            missing_halves=amount.missing_halves,
+            bytes_received=amount.bytes_received,
+            bytes_total=amount.bytes_total,
+            frames_received=amount.frames,
             first_frame_utc_s=event.first_at,
             last_frame_utc_s=event.last_at,
             notes=tuple(notes),
         )
+
+
+@dataclass(frozen=True)
+class _Amount:
+    """How much of a picture arrived, in the terms of its wire format."""
+
+    complete: bool
+    missing_halves: tuple[HalfName, ...]
+    bytes_received: int
+    bytes_total: int
+    frames: int
+
+
+def _amount_of(event: ImageReady | ContactOnly | ContactUpdate) -> _Amount:
+    match event:
+        case ImageReady():
+            received = sum(stop - start for start, stop in event.received)
+            return _Amount(event.complete, event.missing_halves, received, len(event.body), event.frames)
+        case ContactOnly():
+            return _Amount(complete=False, missing_halves=("top", "bottom"), bytes_received=0, bytes_total=0, frames=0)
+        case ContactUpdate():
+            # There are no halves, and a frame may be of many pictures. Where the stream ends is known when it is there.
+            halves: tuple[HalfName, ...] = () if _has_header(event.stream) else ("top", "bottom")
+            received = len(event.stream)
+            return _Amount(event.complete, halves, received, received if event.complete else 0, 0)
+
+
+def _has_header(stream: bytes) -> bool:
+    try:
+        StreamHeader.unpack(stream)
+    except StreamError:
+        # Either too short as yet, or of no codec: a stream of `MAX_SIZE` bytes and more must have one.
+        return len(stream) >= StreamHeader.MAX_SIZE
+    return True
+
+
+def image_id_of(event: ImageReady | ContactOnly | ContactUpdate) -> str:
+    """Return the identifier that a picture has on the vessel."""
+    return image_of_number(event.number) if isinstance(event, ContactUpdate) else event.image_id
 
 
 def pack_mask(missing: Mask) -> bytes:
@@ -107,7 +169,7 @@ def pack_mask(missing: Mask) -> bytes:
     return np.packbits(missing).tobytes() if missing.any() else b""
 
 
-def contact_of(event: ImageReady | ContactOnly, vehicle_id: str) -> Contact | None:
+def contact_of(event: ImageReady | ContactOnly | ContactUpdate, vehicle_id: str) -> Contact | None:
     """Return the contact as the vessel knows it, None when its record has not arrived.
 
     The vehicle's own contact identifier does not travel; on this side a contact is vehicle and image identifier.
@@ -116,7 +178,7 @@ def contact_of(event: ImageReady | ContactOnly, vehicle_id: str) -> Contact | No
     if summary is None:
         return None
     return Contact(
-        contact_id=f"{vehicle_id}/{event.image_id}",
+        contact_id=f"{vehicle_id}/{image_id_of(event)}",
         vehicle_id=vehicle_id,
         channel=summary.side.value if summary.side else None,
         time_utc_s=summary.time_utc_s,

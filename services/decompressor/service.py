@@ -1,4 +1,4 @@
-"""Pairs the halves that arrive by sound, decodes them, keeps the pictures and gives them on."""
+"""Puts together what arrives by sound, decodes it, keeps the pictures and gives them on as they refine."""
 
 from __future__ import annotations
 
@@ -7,26 +7,28 @@ import threading
 import time
 from collections.abc import Iterable, Mapping
 
-import msgpack
-
 from services.decompressor.config import DecompressorConfig
-from services.decompressor.decoder import Decoder
+from services.decompressor.decoder import Decoder, image_id_of
+from services.decompressor.hearing import Event, Hearing
 from sonarpost import keys
-from sonarpost.errors import BadInputError, HandoffError
-from sonarpost.link.paper_events import ContactOnly, Event, FrameRejected, ImageReady
-from sonarpost.link.paper_receiver import PairingReceiver
+from sonarpost.errors import BadInputError, ConfigError, HandoffError
+from sonarpost.link.paper_events import ContactOnly, FrameRejected, ImageReady
+from sonarpost.link.seal import AcousticSeal
+from sonarpost.link.seal_key import Direction
+from sonarpost.link.v1_events import ContactUpdate, FrameRefused
 from sonarpost.messages import AcousticFrame, ReconstructedImage, Record
 from sonarpost.runtime.config import PlatformConfig
-from sonarpost.runtime.logs import kv
+from sonarpost.runtime.logs import concerning, kv
 from sonarpost.runtime.picture_files import write_picture
 from sonarpost.runtime.service import RETRY_AFTER_S, Effects, Service
 from sonarpost.runtime.transaction import InboxItem
+from sonarpost.security.acoustic_key import read_key
 
 log = logging.getLogger(__name__)
 
-_RECEIVER = "receiver"
+Picture = ImageReady | ContactOnly | ContactUpdate
+
 POLL_S = 0.2
-MEMORY_S = 6 * 3600.0
 QUIET_S = 2.0
 """No image's time is up before frames have stopped coming for this long, twice the longest pause of a hand-over."""
 
@@ -39,6 +41,7 @@ class DecompressorService(Service[DecompressorConfig]):
 
     Raises:
         CatalogueError: A configured catalogue cannot be read.
+        ConfigError: The key file cannot be read or is not the owner's alone, or nothing could be understood with it.
     """
 
     NAME = "decompressor"
@@ -46,17 +49,23 @@ class DecompressorService(Service[DecompressorConfig]):
     def __init__(self, platform: PlatformConfig, config: DecompressorConfig) -> None:
         # Before the store is opened: what is wrong with the configuration leaves nothing open behind it.
         self._decoder = Decoder(platform.id, config.catalogues)
+        self._key = None if platform.acoustic_key_file is None else read_key(platform.acoustic_key_file)
+        if self._key is not None and "v1" not in config.links:
+            raise ConfigError(
+                "[decompressor]", "links", config.links, '"v1" among them where there is an acoustic_key_file'
+            )
         super().__init__(platform, config)
-        self._receiver = self._new_receiver()
+        self._hearing = self._new_hearing()
         self._pairing_problem = ""
         self._last_frame_s = time.monotonic()
         # One thread handles frames, another the waiting time; the receiver belongs to whoever holds the lock.
         self._lock = threading.Lock()
         self._in_step = False
 
-    def _new_receiver(self) -> PairingReceiver:
-        timeout_s = self.config.pairing_timeout_s
-        return PairingReceiver(timeout_s, memory_s=max(MEMORY_S, timeout_s))
+    def _new_hearing(self) -> Hearing:
+        # It seals nothing: its address, which counters belong to, is of no account.
+        seal = None if self._key is None else AcousticSeal(self._key, 0, Direction.TO_VEHICLE)
+        return Hearing(self.config.links, self.config.pairing_timeout_s, seal)
 
     def consumes(self) -> Mapping[str, type[Record]]:
         """Frames this vessel's modem received."""
@@ -72,7 +81,7 @@ class DecompressorService(Service[DecompressorConfig]):
         assert isinstance(record, AcousticFrame)
         self._last_frame_s = time.monotonic()
         self._load()
-        self._follow(self._receiver.accept(record.source, record.data, record.time_utc_s), effects)
+        self._follow(self._hearing.accept(record.source, record.data, record.time_utc_s), effects)
 
     def commit(self, effects: Effects, item: InboxItem | None = None) -> None:
         """Commit; only then does the receiver in memory stand for the one on the disk."""
@@ -86,10 +95,8 @@ class DecompressorService(Service[DecompressorConfig]):
     def _load(self) -> None:
         """Go back to the last committed state when memory may be ahead of it."""
         if not self._in_step:
-            kept = self.store.get_state(_RECEIVER)
-            self._receiver = self._new_receiver()
-            if kept is not None:
-                self._receiver.restore(msgpack.unpackb(kept, strict_map_key=False))
+            self._hearing = self._new_hearing()
+            self._hearing.restore({name: self.store.get_state(name) for name in Hearing.STATES})
         self._in_step = False
 
     def _watch_deadlines(self) -> None:
@@ -114,7 +121,7 @@ class DecompressorService(Service[DecompressorConfig]):
             return
         self._load()
         effects = Effects()
-        events = self._receiver.poll(time.time())
+        events = self._hearing.poll(time.time())
         if events:
             self._follow(events, effects)
             self.commit(effects)
@@ -123,24 +130,29 @@ class DecompressorService(Service[DecompressorConfig]):
 
     def _follow(self, events: Iterable[Event], effects: Effects) -> None:
         for event in events:
-            if isinstance(event, FrameRejected):
+            if isinstance(event, (FrameRejected, FrameRefused)):
                 effects.count("frames_rejected")
                 log.warning("Frame rejected", extra=kv(source=event.source, reason=str(event.reason)))
             else:
                 self._give_out(event, effects)
-        effects.put_state(_RECEIVER, msgpack.packb(self._receiver.snapshot()))
+        for name, state in self._hearing.changes().items():
+            effects.put_state(name, state)
 
-    def _give_out(self, event: ImageReady | ContactOnly, effects: Effects) -> None:
+    def _give_out(self, event: Picture, effects: Effects) -> None:
         vehicle = self.config.vehicles.get(str(event.source), f"modem-{event.source}")
+        with concerning(vehicle=vehicle, image_id=image_id_of(event)):
+            self._give_out_of(event, vehicle, effects)
+
+    def _give_out_of(self, event: Picture, vehicle: str, effects: Effects) -> None:
         try:
             image = self._decode(event, vehicle)
         except BadInputError as error:
-            log.error("Image cannot be decoded", extra=kv(image_id=event.image_id, reason=str(error)))
+            log.error("Image cannot be decoded", extra=kv(reason=str(error)))
             self._keep_apart_image(event, vehicle, str(error), effects)
             return
         except Exception as error:
             # A defect of ours would meet the same image again at every start.
-            log.exception("Image not decoded", extra=kv(image_id=event.image_id))
+            log.exception("Image not decoded")
             self._keep_apart_image(event, vehicle, f"{type(error).__name__}: {error}", effects)
             return
         path, _ = write_picture(self.config.out_dir, image)
@@ -150,8 +162,6 @@ class DecompressorService(Service[DecompressorConfig]):
         log.info(
             "Picture reconstructed",
             extra=kv(
-                vehicle=vehicle,
-                image_id=image.image_id,
                 version=image.version,
                 missing_percent=round(100 * image.missing_fraction, 1),
                 missing_halves=",".join(image.missing_halves),
@@ -159,16 +169,20 @@ class DecompressorService(Service[DecompressorConfig]):
             ),
         )
 
-    def _keep_apart_image(self, event: ImageReady | ContactOnly, vehicle: str, reason: str, effects: Effects) -> None:
+    def _keep_apart_image(self, event: Picture, vehicle: str, reason: str, effects: Effects) -> None:
         effects.count("images_undecodable")
-        body = event.stream if isinstance(event, ImageReady) else b""
-        effects.keep_apart(f"image {vehicle}/{event.image_id}", body, reason)
+        body = b"" if isinstance(event, ContactOnly) else event.stream
+        effects.keep_apart(f"image {vehicle}/{image_id_of(event)}", body, reason)
 
-    def _decode(self, event: ImageReady | ContactOnly, vehicle: str) -> ReconstructedImage:
-        if isinstance(event, ContactOnly):
-            return self._decoder.contact_only(event, vehicle)
-        return self._decoder.image(event, vehicle)
+    def _decode(self, event: Picture, vehicle: str) -> ReconstructedImage:
+        match event:
+            case ContactOnly():
+                return self._decoder.contact_only(event, vehicle)
+            case ImageReady():
+                return self._decoder.image(event, vehicle)
+            case ContactUpdate():
+                return self._decoder.refined(event, vehicle)
 
     def gauges(self) -> Mapping[str, float]:
-        """Return whether an image still waits for something."""
-        return {"images_waiting": float(self._receiver.next_deadline() is not None)}
+        """Return whether an image of the paper's format still waits for something."""
+        return {"images_waiting": float(self._hearing.paper.next_deadline() is not None)}

@@ -1,4 +1,4 @@
-"""Listens to the vessel's modem and hands every frame on."""
+"""Listens to the vessel's modem, hands every frame on, and speaks to the vehicles."""
 
 from __future__ import annotations
 
@@ -10,48 +10,61 @@ from collections.abc import Mapping
 
 from pydantic import ValidationError
 
+from services.op_modem.arriving import pack, unpack
 from services.op_modem.config import OpModemConfig
+from services.op_modem.orders_service import SpeakingService
 from sonarpost import keys
 from sonarpost.errors import HandoffError
-from sonarpost.messages import AcousticFrame, LinkQuality, Record
-from sonarpost.modem.events import Event, FrameReceived, PacketReceived
+from sonarpost.messages import AcousticFrame, LinkQuality
+from sonarpost.modem.events import Event, FrameHeard, FrameReceived, PacketFailed, PacketReceived, PacketSent
 from sonarpost.modem.rates import RATES
 from sonarpost.modem.statistics import LinkStatistics
+from sonarpost.runtime.concern import image_of_frame
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.logs import kv
-from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import Effects
 
 log = logging.getLogger(__name__)
 
 _PACKETS = "packets"
+_ARRIVING = "arriving"
 SAVE_AGAIN_S = 1.0
 MAX_UNSAVED = 10_000
 MAX_FRAMES = 8
 
 
-class OpModemService(ModemService[OpModemConfig]):
+class OpModemService(SpeakingService):
     """The vessel's end of the acoustic link.
 
     Every frame the modem delivers is taken, also one addressed to somebody else: a picture overheard is a picture.
-    The frames of a packet are committed together. While the disk refuses, they are kept in memory and saved later.
+    The frames of a packet are handed on together, with its statistics; until its end each is kept on the disk as it
+    comes. While the disk refuses, they are kept in memory and saved later.
+
+    With `link = "v1"` it also speaks: commands and decisions to vehicles, each until the vehicle has confirmed it or it
+    has expired, and reports of what is lacking. What it has heard and what it owes is kept in the transaction of
+    whatever changed it.
+
+    Raises:
+        ConfigError: The key file cannot be read or is not the owner's alone.
     """
 
     NAME = "op_modem"
 
     def __init__(self, platform: PlatformConfig, config: OpModemConfig) -> None:
         super().__init__(platform, config)
+        self._quality = LinkQuality()
         self._unsaved: deque[tuple[PacketReceived, float]] = deque()
         self._lock = threading.Lock()
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
-        """Refuse: nothing is sent to this service."""
-        raise NotImplementedError("op_modem consumes no records")
-
     def on_start(self) -> None:
-        """Open the port."""
+        """Hand on what a killed process had heard of a packet, and open the port."""
+        kept = self.store.get_state(_ARRIVING)
+        if (interrupted := unpack(kept) if kept is not None else None) is not None:
+            self._keep(*interrupted)
+            self._save()
         super().on_start()
         self.spawn(self._save_later, "save")
+        self.begin_speaking()
 
     def on_stop(self) -> None:
         """Close the port, and try once more to save what is not on the disk yet."""
@@ -61,17 +74,40 @@ class OpModemService(ModemService[OpModemConfig]):
             log.error("Packets are lost, the disk refused them to the end", extra=kv(packets=len(self._unsaved)))
 
     def on_modem_event(self, event: Event) -> None:
-        """Take a packet; its frames come with it."""
-        if isinstance(event, PacketReceived):
+        """Take a packet, whose frames come with it, and before its end each of them."""
+        if isinstance(event, (PacketSent, PacketFailed)):
+            self._packet_is_over(event)
+        elif isinstance(event, FrameHeard):
+            self._turn.heard(time.monotonic())
+            self._arriving.append(event.frame)
+            self._keep_arriving()
+        elif isinstance(event, PacketReceived):
+            self._turn.heard(time.monotonic())
             self.count("packets_received")
             self.count("frames_received", len(event.frames))
             self.count("frames_bad", event.bad_frames)
+            self._quality = quality_of(event.statistics) or self._quality
+            self._arriving = []
             self._keep(event, time.time())
             self._save()
 
     def gauges(self) -> Mapping[str, float]:
-        """Return how many packets are not on the disk yet."""
-        return {**super().gauges(), "unsaved": float(len(self._unsaved))}
+        """Return how many packets are not on the disk yet, and what the modem measured of the last one."""
+        measured = {"snr_in_db": self._quality.snr_in_db, "snr_out_db": self._quality.snr_out_db}
+        return {
+            **super().gauges(),
+            "unsaved": float(len(self._unsaved)),
+            **self._station_gauges(),
+            **{name: value for name, value in measured.items() if value is not None},
+        }
+
+    def _keep_arriving(self) -> None:
+        try:
+            with self.store.transaction() as tx:
+                tx.put_state(_ARRIVING, pack(self._arriving, time.time()))
+        except HandoffError as error:
+            # They are in memory, and come with their packet; a disk that is full is told then.
+            log.warning("Frames of an unfinished packet are not on the disk", extra=kv(error=str(error)))
 
     def _keep(self, packet: PacketReceived, heard_utc_s: float) -> None:
         with self._lock:
@@ -104,6 +140,24 @@ class OpModemService(ModemService[OpModemConfig]):
         number = int(self.store.get_state(_PACKETS) or b"0") + 1
         effects = Effects()
         key = keys.acoustic_rx(self.platform.id)
+        with self._station_lock:
+            changed = self._hear(packet, heard_utc_s, effects) if self._speaks else ()
+            self._commit_frames(packet, number, heard_utc_s, effects, key)
+        self._show(changed, heard_utc_s)
+        log.info(
+            "Packet received",
+            extra=kv(
+                source=packet.src,
+                rate=packet.rate,
+                frames=len(packet.frames),
+                bad=packet.bad_frames,
+                image_id=",".join(_images_of(packet)) or None,
+            ),
+        )
+
+    def _commit_frames(
+        self, packet: PacketReceived, number: int, heard_utc_s: float, effects: Effects, key: str
+    ) -> None:
         for frame in packet.frames:
             try:
                 effects.send(key, "decompressor", self._record(frame, packet, number, heard_utc_s))
@@ -114,11 +168,9 @@ class OpModemService(ModemService[OpModemConfig]):
                 effects.keep_apart(key, frame.data, reason)
                 effects.count("frames_refused")
         effects.put_state(_PACKETS, str(number).encode())
+        # The frames of the next packet may have begun to arrive.
+        effects.put_state(_ARRIVING, pack(self._arriving, heard_utc_s))
         self.commit(effects)
-        log.info(
-            "Packet received",
-            extra=kv(source=packet.src, rate=packet.rate, frames=len(packet.frames), bad=packet.bad_frames),
-        )
 
     def _record(self, frame: FrameReceived, packet: PacketReceived, number: int, heard_utc_s: float) -> AcousticFrame:
         return AcousticFrame(
@@ -134,6 +186,11 @@ class OpModemService(ModemService[OpModemConfig]):
             data=frame.data,
             quality=quality_of(packet.statistics),
         )
+
+
+def _images_of(packet: PacketReceived) -> list[str]:
+    """Return the images a packet's frames belong to, as far as their wire format says it."""
+    return sorted({image_id for frame in packet.frames if (image_id := image_of_frame(frame.data)) is not None})
 
 
 def quality_of(statistics: LinkStatistics | None) -> LinkQuality | None:

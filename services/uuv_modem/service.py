@@ -1,32 +1,45 @@
-"""Sends encoded images through the vehicle's modem, one half a packet, and remembers how far it has come."""
+"""Sends pictures and messages through the vehicle's modem, by the v1 link or as the paper does."""
 
 from __future__ import annotations
 
 import logging
 import queue
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import msgpack
 import zenoh
 
 from services.uuv_modem.config import UuvModemConfig
+from services.uuv_modem.line import VehicleLine
+from services.uuv_modem.line_runner import TAKEN, LineRunner
 from sonarpost import keys, wire
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_sender import Packet, plan_packets
-from sonarpost.messages import AcousticFrame, Contact, EncodedImage, Record
+from sonarpost.messages import (
+    AcousticFrame,
+    Contact,
+    EncodedImage,
+    OutgoingMessage,
+    QueuedImage,
+    QueueState,
+    Record,
+)
 from sonarpost.modem.events import Event, PacketFailed, PacketSent
 from sonarpost.modem.rates import RATES
 from sonarpost.runtime.config import PlatformConfig
+from sonarpost.runtime.inbox import NotNowError
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import Effects, InterruptedByStopError
+from sonarpost.runtime.transaction import InboxItem
 from sonarpost.sonar.survey import Side
 
 log = logging.getLogger(__name__)
 
 _PROGRESS = "progress"
 _WAIT_S = 0.2
+MAX_IMAGES_TOLD = 500
 _LAST_TIME_UTC_S = 0xFFFF_FFFE
 """The latest second the contact record of the link can name, in the year 2106."""
 
@@ -34,8 +47,9 @@ _LAST_TIME_UTC_S = 0xFFFF_FFFE
 class UuvModemService(ModemService[UuvModemConfig]):
     """The vehicle's end of the acoustic link.
 
-    An image leaves the inbox when its last packet has gone into the water. Which of its packets have gone is kept
-    after each, so that a restart sends at most one packet twice; the receiver knows repeated frames.
+    With `link = "v1"` accepted records go from the inbox to the queue, which `LineRunner` works off. With "paper" an
+    image leaves the inbox when its last packet has gone into the water. How far either has come is kept with every
+    packet, so that a restart sends at most one packet twice; the receiver knows repeated frames.
     """
 
     NAME = "uuv_modem"
@@ -44,18 +58,93 @@ class UuvModemService(ModemService[UuvModemConfig]):
         super().__init__(platform, config)
         self._outcomes: queue.Queue[PacketSent | PacketFailed] = queue.Queue()
         self._packet_number = 0
+        self._line: VehicleLine | None = None
+        self._line_trouble = ""
+        self._runner: LineRunner | None = None
+        if config.link == "v1":
+            try:
+                self._line, self._runner = self._new_line()
+            except BaseException:
+                self.store.close()
+                raise
+
+    def _new_line(self) -> tuple[VehicleLine, LineRunner]:
+        line = VehicleLine(self.platform, self.config, self.store, _summary_of_image, self.count)
+        runner = LineRunner(
+            line,
+            self.modem,
+            self.config,
+            self.config.new_medium(),
+            self.stopping,
+            show=self._show,
+            tell=self._tell_queue,
+            problem=self._line_problem,
+            count=self.count,
+        )
+        return line, runner
 
     def consumes(self) -> Mapping[str, type[Record]]:
-        """Encoded images of this vehicle."""
-        return {keys.image_encoded(self.platform.id): EncodedImage}
+        """Encoded images of this vehicle, and with v1 other traffic."""
+        images: dict[str, type[Record]] = {keys.image_encoded(self.platform.id): EncodedImage}
+        if self.config.link == "v1":
+            images[keys.message_outgoing(self.platform.id)] = OutgoingMessage
+        return images
 
-    def check(self, record: Record) -> None:
-        """Refuse an image that can never be sent, while its sender can still be told."""
-        assert isinstance(record, EncodedImage)
-        self._plan(record)
+    def check(self, key: str, record: Record) -> None:
+        """Refuse what can never be sent, while its sender can still be told."""
+        assert isinstance(record, (EncodedImage, OutgoingMessage))
+        if self._line is not None:
+            self._line.check(record)
+        elif isinstance(record, EncodedImage):
+            self._plan(record)
+
+    def admit(self, key: str) -> None:
+        """Leave messages with their programs while too many wait."""
+        if self._line is not None and key == keys.message_outgoing(self.platform.id) and not self._line.queue.has_room:
+            raise NotNowError(f"{key}: {self.config.max_messages} messages wait already")
+
+    def on_start(self) -> None:
+        """Open the port, and go on with what was under way."""
+        super().on_start()
+        if self._line is not None and self._runner is not None:
+            self._line.load(self.platform.id)
+            self.spawn(self._runner.run, "link")
+
+    def commit_all(self, handled: Sequence[tuple[Effects, InboxItem | None]]) -> int:
+        """As the base does, and wake the link."""
+        superseded = super().commit_all(handled)
+        if self._runner is not None:
+            self._runner.take(None)
+        return superseded
+
+    def gauges(self) -> Mapping[str, float]:
+        """Return what waits for the water."""
+        line = self._line
+        if line is None:
+            return super().gauges()
+        # Read while the link works on it: numbers of one moment or the next, never of a half-done change.
+        return {
+            **super().gauges(),
+            "messages_waiting": float(len(line.queue.messages.waiting)),
+            "messages_expired": float(line.queue.messages.expired),
+            "rate": float(line.queue.rate),
+            "frame_loss": line.queue.sender.config.worst.loss,
+        }
+
+    def trouble(self) -> str:
+        """Return what is wrong with the port, the modem or the link's disk."""
+        return super().trouble() or self._line_trouble
+
+    def _line_problem(self, detail: str) -> None:
+        if detail and detail != self._line_trouble:
+            log.error("The link waits", extra=kv(reason=detail))
+        self._line_trouble = detail
 
     def handle(self, key: str, record: Record, effects: Effects) -> None:
-        """Send an image, however long it takes."""
+        """Queue a record, or with the paper's link send an image, however long it takes."""
+        if self._line is not None:
+            effects.put_state(self._line.arrival_name(), effects.payload)
+            return
         assert isinstance(record, EncodedImage)
         packets = self._plan(record)
         done = self._packets_done(record, len(packets))
@@ -66,11 +155,14 @@ class UuvModemService(ModemService[UuvModemConfig]):
                 self._remember(record, number + 1)
         effects.delete_state(_PROGRESS)
         effects.count("images_sent")
-        log.info("Image sent", extra=kv(image_id=record.image_id, contact=record.contact.contact_id))
+        log.info("Image sent", extra=kv(image_id=record.image_id, contact_id=record.contact.contact_id))
 
     def on_modem_event(self, event: Event) -> None:
-        """Hand the fate of packets to the sending thread."""
-        if isinstance(event, (PacketSent, PacketFailed)):
+        """Hand the fate of packets, and with v1 what is heard, to the sending thread."""
+        if self._runner is not None:
+            if isinstance(event, TAKEN):
+                self._runner.take(event)
+        elif isinstance(event, (PacketSent, PacketFailed)):
             self._outcomes.put(event)
 
     def _plan(self, image: EncodedImage) -> tuple[Packet, ...]:
@@ -144,6 +236,42 @@ class UuvModemService(ModemService[UuvModemConfig]):
         except zenoh.ZError as error:
             # The frame has gone into the water; that nobody could watch must not send it again.
             log.warning("Frame not shown to observers", extra=kv(error=str(error)))
+
+    def _tell_queue(self, now_utc_s: float) -> None:
+        """Publish what waits and when it is expected to have gone."""
+        assert self._line is not None
+        waiting = self._line.queue
+        expected = waiting.expected(now_utc_s)
+        images = tuple(
+            QueuedImage(
+                image_id=each.name.image_id,
+                contact_id=each.name.contact_id,
+                bytes_left=each.bytes_left,
+                preview_utc_s=each.preview_at,
+                expected_utc_s=each.done_at,
+            )
+            for each in expected[:MAX_IMAGES_TOLD]
+        )
+        state = QueueState(
+            platform_id=self.platform.id,
+            time_utc_s=now_utc_s,
+            rate=waiting.rate,
+            frame_loss=waiting.loss,
+            packet_interval_s=min(waiting.packet_interval_s, 86400.0),
+            messages_waiting=len(waiting.messages.waiting),
+            message_bytes=waiting.messages.waiting_bytes,
+            images_waiting=len(expected),
+            images=images,
+        )
+        try:
+            key = keys.acoustic_queue(self.platform.id)
+            self.session.put(key, wire.encode(state), encoding=wire.encoding_of(QueueState))
+        except zenoh.ZError as error:
+            log.warning("State of the queue not published", extra=kv(error=str(error)))
+
+
+def _summary_of_image(image: EncodedImage) -> ContactSummary:
+    return summary_of(image.contact, image.height_px, image.width_px)
 
 
 def summary_of(contact: Contact, height_px: int, width_px: int) -> ContactSummary:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import signal
 import sys
 import threading
@@ -15,8 +16,9 @@ from sonarpost.modem.rates import RATES
 from sonarpost.sim.acoustic_channel import AcousticChannel
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite
 from sonarpost.sim.micromodem_config import ModemConfig
+from sonarpost.sim.water_config import WaterConfig
+from sonarpost.sim.water_file import PRESETS, make_water, read_water
 from sonarpost.sim.water_physics import Position
-from sonarpost.sim.water_records import WaterConfig
 
 WATCH_S = 0.2
 EXIT_FAILED = 1
@@ -34,15 +36,34 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--modems", type=int, default=2, metavar="N", help="how many, addresses from 1 (2)")
     ports = parser.add_mutually_exclusive_group()
-    ports.add_argument("--pty", type=Path, metavar="DIR", help="folder for the links modem-1, … (./modems)")
-    ports.add_argument("--tcp", type=int, nargs="+", metavar="PORT", help="TCP port of each modem, 0 for a free one")
+    ports.add_argument(
+        "--pty", type=Path, nargs="?", const=Path("modems"), metavar="DIR", help="links modem-1, … in DIR (./modems)"
+    )
+    ports.add_argument(
+        "--tcp", type=int, nargs="*", metavar="PORT", help="TCP port of each modem, 0 for a free one; none: all free"
+    )
+    parser.add_argument("--mm", type=int, choices=(1, 2), default=2, help="Micro-Modem 1 or 2 (2)")
+    parser.add_argument(
+        "--transponder",
+        action="append",
+        default=[],
+        metavar="LETTER=EAST,NORTH,DEPTH",
+        help="a ranging transponder A to D, metres from modem 1",
+    )
     parser.add_argument("--spacing", type=float, default=100.0, metavar="M", help="metres from modem to modem (100)")
-    parser.add_argument("--loss", type=float, default=0.0, metavar="P", help="chance that a frame is lost (0)")
-    parser.add_argument("--packet-loss", type=float, default=0.0, metavar="P", help="chance for a whole packet (0)")
-    parser.add_argument("--tail-damage", type=float, default=0.0, metavar="P", help="chance of a damaged tail (0)")
+    parser.add_argument("--preset", choices=list(PRESETS), help="a set of the water's parameters (still)")
+    parser.add_argument(
+        "--water", type=Path, metavar="FILE", help="TOML file of the water's parameters, over the preset"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="any parameter of the water, over the file"
+    )
+    parser.add_argument("--loss", type=float, metavar="P", help="chance that a frame is lost (0)")
+    parser.add_argument("--packet-loss", type=float, metavar="P", help="chance for a whole packet (0)")
+    parser.add_argument("--tail-damage", type=float, metavar="P", help="chance of a damaged tail (0)")
     parser.add_argument("--range-loss", action="store_true", help="lose frames by signal-to-noise ratio too")
-    parser.add_argument("--snr-at-1m", type=float, default=60.0, metavar="DB", help="signal-to-noise at 1 m (60)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of every draw (0)")
+    parser.add_argument("--snr-at-1m", type=float, metavar="DB", help="signal-to-noise at 1 m (60)")
+    parser.add_argument("--seed", type=int, metavar="N", help="seed of every draw (0)")
     parser.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="simulated seconds a second (1)")
     parser.add_argument(
         "--airtime", action="append", default=[], metavar="RATE=S", help="air time of a rate, instead of the nominal"
@@ -74,18 +95,37 @@ def _serve(parsed: argparse.Namespace, stopping: threading.Event) -> int:
     try:
         devices = channel.devices()
         listed = [{"address": device.address, "device": device.device} for device in devices]
-        print(json.dumps({"modems": listed}), flush=True)
+        _show(json.dumps({"modems": listed}))
         channel.start()
         if not parsed.json:
             for device in devices:
-                print(f"modem {device.modem}: address {device.address}, {device.device}", flush=True)
+                _show(f"modem {device.modem}: address {device.address}, {device.device}")
         while not stopping.wait(WATCH_S):
             if channel.failure is not None:
                 print(f"sonarpost: the emulator failed: {channel.failure}", file=sys.stderr)
                 return EXIT_FAILED
     finally:
         channel.stop()
+        _drop_unread()
     return 0
+
+
+def _show(line: str) -> None:
+    try:
+        print(line, flush=True)
+    except BrokenPipeError:
+        # The modems are there for their hosts, whether or not somebody still reads what is said here.
+        _drop_unread()
+
+
+def _drop_unread() -> None:
+    """Send what a reader who has left cannot take to nowhere, as Python would complain about it at its end."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 def _config(parsed: argparse.Namespace) -> ChannelConfig:
@@ -97,29 +137,49 @@ def _config(parsed: argparse.Namespace) -> ChannelConfig:
     if not 1 <= parsed.modems <= MOST_MODEMS:
         raise ConfigError("command line", "--modems", parsed.modems, f"1..{MOST_MODEMS}")
     try:
-        water = WaterConfig(
-            seed=parsed.seed,
-            frame_loss=parsed.loss,
-            packet_loss=parsed.packet_loss,
-            tail_damage=parsed.tail_damage,
-            snr_at_1m_db=parsed.snr_at_1m,
-            range_loss=parsed.range_loss,
-        )
+        water = _water(parsed)
         sites = tuple(ModemSite(n + 1, Position(east_m=n * parsed.spacing)) for n in range(parsed.modems))
         airtimes_s = dict(_airtime(text) for text in parsed.airtime)
         return ChannelConfig(
             sites=sites,
             water=water,
-            modem=ModemConfig(address=0, airtimes_s=airtimes_s),
-            pty_dir=None if parsed.tcp else parsed.pty or Path("modems"),
-            tcp_ports=tuple(parsed.tcp or ()),
+            modem=ModemConfig(address=0, generation=parsed.mm, airtimes_s=airtimes_s),
+            pty_dir=None if parsed.tcp is not None else parsed.pty or Path("modems"),
+            tcp_ports=tuple(parsed.tcp or (0,) * parsed.modems) if parsed.tcp is not None else (),
             time_scale=parsed.time_scale,
             serial_baud=parsed.baud,
             log_path=parsed.log,
+            transponders=dict(_transponder(text) for text in parsed.transponder),
         )
     except ValueError as error:
         name, _, rest = str(error).partition(": ")
         raise ConfigError("command line", name, rest, "a value within its bounds") from error
+
+
+def _water(parsed: argparse.Namespace) -> WaterConfig:
+    """Return the water of preset, file and options, the later over the earlier."""
+    options = {
+        "preset": parsed.preset,
+        "seed": parsed.seed,
+        "frame_loss": parsed.loss,
+        "packet_loss": parsed.packet_loss,
+        "tail_damage": parsed.tail_damage,
+        "snr_at_1m_db": parsed.snr_at_1m,
+        "range_loss": parsed.range_loss or None,
+    }
+    given = {name: value for name, value in options.items() if value is not None}
+    from_file = read_water(parsed.water) if parsed.water else {}
+    return make_water(from_file | given | dict(_parameter(text) for text in parsed.set), "command line")
+
+
+def _parameter(text: str) -> tuple[str, float | bool | str]:
+    name, _, value = text.partition("=")
+    if value in {"true", "false"}:
+        return name, value == "true"
+    try:
+        return name, int(value) if value.lstrip("-").isdigit() else float(value)
+    except ValueError:
+        return name, value
 
 
 def _airtime(text: str) -> tuple[int, float]:
@@ -129,3 +189,12 @@ def _airtime(text: str) -> tuple[int, float]:
     except ValueError as error:
         expected = f"RATE=SECONDS with a rate {min(RATES)}..{max(RATES)}"
         raise ConfigError("command line", "--airtime", text, expected) from error
+
+
+def _transponder(text: str) -> tuple[str, Position]:
+    letter, _, place = text.partition("=")
+    try:
+        east_m, north_m, depth_m = (float(metres) for metres in [*place.split(","), "0", "0"][:3])
+        return letter, Position(east_m, north_m, depth_m)
+    except ValueError as error:
+        raise ConfigError("command line", "--transponder", text, "LETTER=EAST[,NORTH[,DEPTH]] in metres") from error

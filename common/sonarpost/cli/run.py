@@ -33,4 +33,4 @@ def run_service(parsed: argparse.Namespace) -> int:
 def run_router(parsed: argparse.Namespace) -> int:
     """Run an embedded router."""
     logs.set_up("router")
-    return router.run(parsed.listen, parsed.connect)
+    return router.run_parsed(parsed)

@@ -35,6 +35,10 @@ SERVICES = (
 )
 
 
+# Tables inside a table that the environment can set key by key.
+TABLES_INSIDE = {("platform", "tls")}
+
+
 class ServiceConfig(BaseModel):
     """Base of every configuration table: unknown keys are errors."""
 
@@ -44,6 +48,22 @@ class ServiceConfig(BaseModel):
 C = TypeVar("C", bound=ServiceConfig)
 
 
+class TlsConfig(ServiceConfig):
+    """The `tls` key of `[platform]`: the host's own certificate, for routers reached by `tls/…`.
+
+    Attributes:
+        ca: Certificate of the fleet's authority (PEM).
+        certificate: This platform's certificate (PEM).
+        key: Its private key (PEM, no passphrase, readable by its owner only).
+        warn_days: From how many days before its end on health warns of it.
+    """
+
+    ca: Path
+    certificate: Path
+    key: Path
+    warn_days: Annotated[float, Field(ge=0, le=3650)] = 30.0
+
+
 class PlatformConfig(ServiceConfig):
     """The `[platform]` table.
 
@@ -51,12 +71,20 @@ class PlatformConfig(ServiceConfig):
         id: Name of the platform in key expressions, for example "uuv-1".
         router: Zenoh endpoints of the platform's router, tried in turn.
         state_dir: Folder of the services' durable stores.
+        tls: The host's own certificate; needed where `router` or `upstream` has a `tls/…` endpoint.
+        upstream: Endpoints of the routers that the platform's router links to. Services do not connect to them; the
+            relay tries them when the shore does not answer, to say why.
+        acoustic_key_file: Key that vehicles and vessel have in common; with it, only frames sealed with it are sent and
+            taken on the `v1` acoustic link.
         health_interval_s: How often a service publishes its health.
     """
 
     id: PlatformId
     router: Annotated[tuple[str, ...], Field(min_length=1)] = ("tcp/127.0.0.1:7447",)
+    tls: TlsConfig | None = None
+    upstream: tuple[str, ...] = ()
     state_dir: Path = Path("state")
+    acoustic_key_file: Path | None = None
     health_interval_s: Annotated[float, Field(ge=0.05, le=3600)] = 5.0
     log_level: Annotated[str, Field(pattern="^(debug|info|warning|error)$")] = "info"
     log_format: LogFormat = "text"
@@ -125,6 +153,23 @@ def _overrides(environment: Mapping[str, str]) -> dict[str, dict[str, object]]:
     return found
 
 
+def _with_extra(table: str, written: Mapping[str, object], extra: Mapping[str, object]) -> dict[str, object]:
+    """Return a table with its overrides; `SONARPOST_PLATFORM__TLS__KEY` is a key of the table inside `[platform]`."""
+    inside = {name: value for name, value in extra.items() if _outer(table, name)}
+    whole = {**written, **{name: value for name, value in extra.items() if name not in inside}}
+    for name, value in inside.items():
+        outer, _, inner = name.partition("__")
+        below = whole.get(outer, {})
+        if isinstance(below, dict):  # what is no table is refused below, with its own name
+            whole[outer] = {**below, inner: value}
+    return whole
+
+
+def _outer(table: str, name: str) -> bool:
+    outer, separator, inner = name.partition("__")
+    return bool(separator and inner) and (table, outer) in TABLES_INSIDE
+
+
 def _toml_value(text: str) -> object:
     try:
         parsed = tomllib.loads(f"value = {text}")
@@ -146,7 +191,7 @@ def _validated(
     extra = overrides.get(table, {})
     try:
         # As JSON, because pydantic's strictness (no "5" for 5, no true for 1) is made for the types that JSON has.
-        return model.model_validate_json(to_json({**written, **extra}), strict=True)
+        return model.model_validate_json(to_json(_with_extra(table, written, extra)), strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         names = [str(part) for part in first["loc"] if part != "[key]"]
@@ -154,13 +199,16 @@ def _validated(
         expected = expected_text(first["type"], first["msg"])
         if first["type"] == "extra_forbidden":
             value, expected = "an unknown key", _known_keys(model, names)
-        if names and names[0] in extra:
-            name = f"{ENVIRONMENT_PREFIX}{table.upper()}__{names[0].upper()}"
+        by_environment = next((n for n in ("__".join(names[:2]), *names[:1]) if n in extra), None)
+        if by_environment is not None:
+            name = f"{ENVIRONMENT_PREFIX}{table.upper()}__{by_environment.upper()}"
             raise ConfigError("environment", name, value, expected) from error
         raise source.error((table, *names), value, expected) from error
 
 
 def _known_keys(model: type[ServiceConfig], names: Sequence[str]) -> str:
+    if len(names) == 2 and names[0] == "tls":
+        return "one of: " + ", ".join(sorted(TlsConfig.model_fields))
     if len(names) != 1:
         return "a key that this table has"
     return "one of: " + ", ".join(sorted(model.model_fields)) if model.model_fields else "no keys in this table"

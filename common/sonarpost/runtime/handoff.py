@@ -14,7 +14,7 @@ import msgpack
 
 from sonarpost import wire
 from sonarpost.errors import PayloadError
-from sonarpost.runtime.transaction import Chunk, OutboxItem
+from sonarpost.runtime.transaction import Chunk, OutboxItem, consumer_of
 
 CHUNK_BYTES = 32 * 1024
 MAX_RECORD_BYTES = 8 * 1024 * 1024
@@ -59,22 +59,29 @@ class Reply:
         raise PayloadError(where, "status", status, "stored, more, refused or later")
 
 
-def attachment(origin: bytes, item: OutboxItem, offset: int = 0) -> bytes:
+def attachment(origin: bytes, item: OutboxItem, offset: int = 0, settled: int = 0) -> bytes:
     """Return the attachment that names a record and, in a hand-over query, a piece of it.
 
     Sequence numbers run per consumer, so a watcher of a key with two consumers needs the consumer's name as well.
+
+    Args:
+        origin: Identity of the queue, 16 bytes.
+        item: The record.
+        offset: Where the piece begins.
+        settled: The highest number with which, and with all below it, the producer is done; left out when 0.
     """
-    packed: bytes = msgpack.packb(
-        {
-            "v": HANDOFF_VERSION,
-            "origin": origin,
-            "consumer": item.consumer,
-            "seq": item.seq,
-            "size": len(item.payload),
-            "sha256": item.sha256,
-            "offset": offset,
-        }
-    )
+    fields = {
+        "v": HANDOFF_VERSION,
+        "origin": origin,
+        "consumer": consumer_of(item.consumer),
+        "seq": item.seq,
+        "size": len(item.payload),
+        "sha256": item.sha256,
+        "offset": offset,
+    }
+    if settled:
+        fields["settled"] = settled
+    packed: bytes = msgpack.packb(fields)
     return packed
 
 
@@ -92,11 +99,14 @@ def parse_chunk(attached: bytes, data: bytes, where: str) -> Chunk:
         sha256=_binary(fields, "sha256", 32, where),
         offset=_integer(fields, "offset", where),
         data=data,
+        settled=_integer(fields, "settled", where) if "settled" in fields else 0,
     )
     if chunk.size > MAX_RECORD_BYTES:
         raise PayloadError(where, "size", chunk.size, f"at most {MAX_RECORD_BYTES} bytes")
     if chunk.seq < 1:
         raise PayloadError(where, "seq", chunk.seq, "at least 1")
+    if chunk.settled >= chunk.seq:
+        raise PayloadError(where, "settled", chunk.settled, "a number below seq")
     if len(data) > CHUNK_BYTES or chunk.offset + len(data) > chunk.size:
         raise PayloadError(
             where, "payload", f"{len(data)} bytes", f"a piece of at most {CHUNK_BYTES} bytes inside size"

@@ -6,15 +6,16 @@ import hashlib
 import logging
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import zenoh
 
 from sonarpost import keys
 from sonarpost.errors import BadInputError, HandoffError, PayloadError
+from sonarpost.runtime.concern import concern_of_payload
 from sonarpost.runtime.handoff import MAX_RECORD_BYTES, Reply, parse_chunk
-from sonarpost.runtime.logs import kv
+from sonarpost.runtime.logs import concerning, kv
 from sonarpost.runtime.store import Store
 from sonarpost.runtime.transaction import Chunk, Transaction
 
@@ -23,6 +24,11 @@ log = logging.getLogger(__name__)
 BATCH = 64
 QUEUE_LIMIT = 256
 RETRY_S = 0.5
+MAX_REASON = 200
+
+
+class NotNowError(HandoffError):
+    """There is no room for this record at the moment; its sender keeps it, and other records may be taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +51,8 @@ class Inbox:
     Args:
         check: Called with (key, payload) before a record is stored; raises BadInputError to refuse it.
         on_refused: Called with every error that made a record be refused.
+        admit: Called with the key before anything of a record is stored; raises NotNowError where there is no room.
+        handed_only: Key expressions on which plain publications are not for this consumer.
     """
 
     def __init__(
@@ -55,11 +63,15 @@ class Inbox:
         key_expressions: tuple[str, ...],
         check: Callable[[str, bytes], None],
         on_refused: Callable[[BadInputError], None],
+        *,
+        admit: Callable[[str], None] = lambda _: None,
+        handed_only: Collection[str] = (),
     ) -> None:
         self._store = store
         self._suffix = "/handoff/" + consumer
         self._check = check
         self._on_refused = on_refused
+        self._admit = admit
         self._arrivals: queue.Queue[_Arrival] = queue.Queue(QUEUE_LIMIT)
         self._stop = threading.Event()
         self._trouble = False
@@ -69,7 +81,8 @@ class Inbox:
         self._declared: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         for key in key_expressions:
             self._declared.append(session.declare_queryable(keys.handoff(key, consumer), self._on_query))
-            self._declared.append(session.declare_subscriber(key, self._on_sample))
+            if key not in handed_only:
+                self._declared.append(session.declare_subscriber(key, self._on_sample))
 
     @property
     def in_trouble(self) -> bool:
@@ -139,7 +152,7 @@ class Inbox:
                 log.exception("Records cannot be stored, their senders keep them", extra=kv(error=str(error)))
             self._trouble = True
             self._kept = [arrival for arrival in batch if arrival.query is None]
-            return [Reply("later", reason=str(error)[:200])] * len(batch)
+            return [Reply("later", reason=str(error)[:MAX_REASON])] * len(batch)
         if self._trouble:
             log.info("Records can be stored again")
         self._trouble = False
@@ -147,19 +160,33 @@ class Inbox:
 
     def _take(self, tx: Transaction, arrival: _Arrival) -> Reply:
         if arrival.query is None:
-            return self._take_checked(tx, arrival.key, arrival.payload, None)
+            return self._take_publication(tx, arrival)
         try:
             chunk = parse_chunk(arrival.attached, arrival.payload, arrival.key + self._suffix)
             return self._take_chunk(tx, arrival.key, chunk)
+        except NotNowError as error:
+            return Reply("later", reason=str(error)[:MAX_REASON])
         except PayloadError as error:
             self._on_refused(error)
             return Reply("refused", reason=str(error))
 
+    def _take_publication(self, tx: Transaction, arrival: _Arrival) -> Reply:
+        try:
+            self._admit(arrival.key)
+        except NotNowError as error:
+            # Nobody sends it again, and to keep it would take the room that is not there.
+            self._on_refused(PayloadError(arrival.key, "payload", "a publication that cannot be stored", str(error)))
+            return Reply("later", reason=str(error)[:MAX_REASON])
+        return self._take_checked(tx, arrival.key, arrival.payload, None)
+
     def _take_chunk(self, tx: Transaction, key: str, chunk: Chunk) -> Reply:
+        if chunk.settled:
+            tx.settle_upto(chunk.origin, chunk.settled)
         if tx.was_refused(chunk.origin, chunk.seq):
             return Reply("refused", reason="refused before; the reason is in the consumer's log and store")
         if tx.was_seen(chunk.origin, chunk.seq):
             return Reply("stored")
+        self._admit(key)
         whole = tx.add_chunk(chunk)
         if isinstance(whole, int):
             return Reply("more", next_offset=whole)
@@ -168,6 +195,10 @@ class Inbox:
         return self._take_checked(tx, key, whole, chunk)
 
     def _take_checked(self, tx: Transaction, key: str, payload: bytes, chunk: Chunk | None) -> Reply:
+        with concerning(**concern_of_payload(payload, key)):
+            return self._checked(tx, key, payload, chunk)
+
+    def _checked(self, tx: Transaction, key: str, payload: bytes, chunk: Chunk | None) -> Reply:
         try:
             self._check(key, payload)
         except HandoffError:

@@ -5,7 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from datetime import UTC, datetime
+from types import MappingProxyType
 from typing import Literal
 
 LogFormat = Literal["text", "json"]
@@ -14,6 +18,29 @@ LogFormat = Literal["text", "json"]
 def kv(**fields: object) -> dict[str, object]:
     """Return the `extra` of a log call, so that fields stay apart from the sentence: log.info("…", extra=kv(…))."""
     return {"fields": fields}
+
+
+_concerned: ContextVar[Mapping[str, object]] = ContextVar("concerned", default=MappingProxyType({}))
+
+
+@contextmanager
+def concerning(**fields: object) -> Iterator[None]:
+    """Put these fields into every line that is logged inside, in this thread; None is not known and left out.
+
+    `vehicle` and `image_id` name a picture on every platform, `contact_id` a contact on the vehicle: whoever logs about
+    one of them need not know which it is.
+    """
+    known = {name: value for name, value in fields.items() if value is not None}
+    token = _concerned.set({**_concerned.get(), **known})
+    try:
+        yield
+    finally:
+        _concerned.reset(token)
+
+
+def fields_of(record: logging.LogRecord) -> dict[str, object]:
+    """Return the fields of a line: what it concerns first, then those of the call, which win."""
+    return {**_concerned.get(), **getattr(record, "fields", {})}
 
 
 def _time_text(record: logging.LogRecord) -> str:
@@ -29,8 +56,7 @@ class TextFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
-        fields = getattr(record, "fields", {})
-        pairs = "".join(f" {name}={_shown(value)}" for name, value in fields.items())
+        pairs = "".join(f" {name}={_shown(value)}" for name, value in fields_of(record).items())
         message = record.getMessage()
         if not message.isprintable():
             message = json.dumps(message)[1:-1]
@@ -56,7 +82,7 @@ class JsonFormatter(logging.Formatter):
             "service": self._service,
             "message": record.getMessage(),
         }
-        for name, value in getattr(record, "fields", {}).items():
+        for name, value in fields_of(record).items():
             event[f"{name}_" if name in event else name] = _jsonable(value)
         if record.exc_info:
             event["traceback"] = self.formatException(record.exc_info)

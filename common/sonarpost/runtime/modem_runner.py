@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from datetime import datetime
 
 from sonarpost.errors import PortError
-from sonarpost.modem.events import Event
+from sonarpost.modem.events import Event, Polled
 from sonarpost.modem.micromodem import MicroModem
 from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialLink
 
@@ -62,6 +62,12 @@ class ModemRunner:
         with self._lock:
             return self._driver.queued
 
+    @property
+    def receiving(self) -> bool:
+        """Whether a packet is arriving, as far as the driver knows."""
+        with self._lock:
+            return self._driver.receiving
+
     def start(self) -> None:
         """Open the port and begin; returns at once.
 
@@ -93,10 +99,47 @@ class ModemRunner:
         Raises:
             FrameError: An address, a rate or frames that the modem cannot send.
         """
+        return self._ask(lambda now: self._driver.send_packet(destination, rate, frames, ack=ack, now=now))
+
+    def ping(self, destination: int) -> int:
+        """Queue a ping, from any thread; see `MicroModem.ping`.
+
+        Raises:
+            FrameError: An address outside 0..127.
+        """
+        return self._ask(lambda now: self._driver.ping(destination, now))
+
+    def send_mini(self, destination: int, bits: int) -> int:
+        """Queue a user mini-packet, from any thread; see `MicroModem.send_mini`.
+
+        Raises:
+            FrameError: An address outside 0..127, or more than 13 bits.
+        """
+        return self._ask(lambda now: self._driver.send_mini(destination, bits, now))
+
+    def send_flexible(self, destination: int, rate: int, data: bytes) -> int:
+        """Queue flexible data, from any thread; see `MicroModem.send_flexible`.
+
+        Raises:
+            FrameError: What the modem cannot send.
+        """
+        return self._ask(lambda now: self._driver.send_flexible(destination, rate, data, now))
+
+    def request_packet(self, source: int, rate: int, frames: int | None = None, *, ack: bool = False) -> int:
+        """Queue a poll of another modem, from any thread; see `MicroModem.request_packet`.
+
+        Raises:
+            FrameError: What the modem cannot ask for.
+        """
+        return self._ask(lambda now: self._driver.request_packet(source, rate, frames, ack=ack, now=now))
+
+    def answer_polls(self, uplink: Callable[[Polled], Sequence[bytes]] | None) -> None:
+        """Give the function that is asked for frames when another modem polls; see `MicroModem.answer_polls`.
+
+        It is called in the runner's thread and must neither wait nor call the runner.
+        """
         with self._lock:
-            packet_id = self._driver.send_packet(destination, rate, frames, ack=ack, now=self._clock())
-        self._inputs.put(None)
-        return packet_id
+            self._driver.answer_polls(uplink)
 
     def set_clock(self, utc: datetime) -> bool:
         """Set the modem's clock if it is free at this moment, from any thread; see `MicroModem.set_clock`."""
@@ -104,6 +147,12 @@ class ModemRunner:
             sent = self._driver.set_clock(utc, self._clock())
         self._inputs.put(None)
         return sent
+
+    def _ask(self, queue_it: Callable[[float], int]) -> int:
+        with self._lock:
+            number = queue_it(self._clock())
+        self._inputs.put(None)
+        return number
 
     def _run(self) -> None:
         while not self._stopping.is_set():

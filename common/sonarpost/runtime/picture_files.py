@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.files import write_atomically
+from sonarpost.files import AtomicFiles
 from sonarpost.messages import ReconstructedImage
-from sonarpost.sonar.image_files import write_png, write_tiff
+from sonarpost.sonar.image_files import png_bytes, tiff_bytes
 
 
 def picture_name(image: ReconstructedImage) -> str:
@@ -46,15 +46,36 @@ def write_picture(folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
     Raises:
         OSError: The folder cannot be written (a full disk).
     """
+    files = AtomicFiles()
+    found = add_picture(files, folder, image)
+    files.commit()
+    return found
+
+
+def add_picture(files: AtomicFiles, folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
+    """Add a picture's files to others that are committed together; what is returned is as of `write_picture`.
+
+    Raises:
+        OSError: The folder cannot be written (a full disk); none of the three is added.
+    """
     name = picture_name(image)
     tiff, sidecar = folder / f"{name}.tiff", folder / f"{name}.json"
     text = (json.dumps(side_car(image), indent=1) + "\n").encode()
     picture = folder / f"{name}.png"
-    if sidecar.is_file() and sidecar.read_bytes() == text and tiff.is_file() and picture.is_file():
+    if (added := files.text_of(sidecar)) is not None:
+        known = added == text
+    else:
+        known = sidecar.is_file() and sidecar.read_bytes() == text and tiff.is_file() and picture.is_file()
+    if known:
         return tiff, False
     folder.mkdir(parents=True, exist_ok=True)
     pixels = image.picture.to_array()
-    write_tiff(tiff, pixels)
-    write_png(picture, pixels)
-    write_atomically(sidecar, text)
+    before = len(files)
+    try:
+        files.add(tiff, tiff_bytes(tiff, pixels))
+        files.add(picture, png_bytes(picture, pixels))
+        files.add(sidecar, text, last=True)
+    except BaseException:
+        files.drop_from(before)
+        raise
     return tiff, True

@@ -9,11 +9,14 @@ commits with `self.store.transaction()`.
 from __future__ import annotations
 
 import logging
+import os
+import shutil
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
 from typing import ClassVar, Generic, TypeVar
 
 import zenoh
@@ -21,13 +24,20 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.errors import BadInputError, HandoffError
 from sonarpost.messages import Health, Record, ServiceState
+from sonarpost.runtime.concern import concern_of_payload
 from sonarpost.runtime.config import PlatformConfig, ServiceConfig
+from sonarpost.runtime.effects import Effects
+from sonarpost.runtime.heartbeat import Heartbeat
 from sonarpost.runtime.inbox import Inbox
-from sonarpost.runtime.logs import kv
-from sonarpost.runtime.outbox import Outbox
+from sonarpost.runtime.logs import concerning, kv
+from sonarpost.runtime.outbox import Lane, Outbox
+from sonarpost.runtime.room import HANDLING_RESERVE_BYTES, Room
 from sonarpost.runtime.session import open_with_retry
 from sonarpost.runtime.store import Store
-from sonarpost.runtime.transaction import InboxItem, Transaction
+from sonarpost.runtime.tls import OwnTls
+from sonarpost.runtime.transaction import InboxItem, OutboxItem, Transaction
+
+__all__ = ["Effects", "InterruptedByStopError", "Service"]
 
 log = logging.getLogger(__name__)
 
@@ -41,57 +51,13 @@ class InterruptedByStopError(Exception):
     """Raised by `Service.handle` when the service stops before the record is handled; it stays in the inbox."""
 
 
-class Effects:
-    """What handling one record leads to; committed all together, or not at all.
-
-    Attributes:
-        payload: The record's bytes as they came, empty for effects that no record has led to.
-    """
-
-    def __init__(self, payload: bytes = b"") -> None:
-        self.payload = payload
-        self._sends: list[tuple[str, str, Record, int]] = []
-        self._state: dict[str, bytes | None] = {}
-        self._apart: list[tuple[str, bytes, str]] = []
-        self._counts: Counter[str] = Counter()
-
-    def send(self, key: str, consumer: str, record: Record, *, priority: int = 4) -> None:
-        """Owe `record` to the service named `consumer`, published on `key`."""
-        self._sends.append((key, consumer, record, priority))
-
-    def put_state(self, name: str, value: bytes) -> None:
-        """Remember `value` under `name`."""
-        self._state[name] = value
-
-    def delete_state(self, name: str) -> None:
-        """Forget `name`."""
-        self._state[name] = None
-
-    def keep_apart(self, key: str, payload: bytes, reason: str) -> None:
-        """Keep something that cannot be used, with the reason, in the store's `refused` table."""
-        self._apart.append((key, payload, reason))
-
-    def count(self, name: str, by: int = 1) -> None:
-        """Add to a health counter once the effects are committed."""
-        self._counts[name] += by
-
-    def write(self, tx: Transaction) -> None:
-        """Write everything into an open transaction."""
-        for key, consumer, record, priority in self._sends:
-            encoding = wire.encoding_of(type(record))
-            tx.send(key, consumer, wire.encode(record), encoding=encoding, priority=priority)
-        for name, value in self._state.items():
-            if value is None:
-                tx.delete_state(name)
-            else:
-                tx.put_state(name, value)
-        for key, payload, reason in self._apart:
-            tx.refuse("in", key, payload, reason)
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        """What `count` was called with."""
-        return self._counts
+def disk_gauges(folder: Path) -> dict[str, float]:
+    """Return how much is free on a folder's disk, nothing where that cannot be told at the moment."""
+    try:
+        return {"disk_free_bytes": float(shutil.disk_usage(folder).free)}
+    except OSError as error:
+        log.debug("Free space not told", extra=kv(folder=folder, error=str(error)))
+        return {}
 
 
 class Service(ABC, Generic[C]):
@@ -100,10 +66,13 @@ class Service(ABC, Generic[C]):
     Class attributes:
         NAME: Name in configurations, keys and hand-offs.
         PUBLISH: Whether records it owes are also published on their keys for watchers.
+        BATCH: How many records are handled with one write to the disk. Above 1, what `handle` does outside its effects
+            may be done again for a whole batch after a power cut.
     """
 
     NAME: ClassVar[str]
     PUBLISH: ClassVar[bool] = True
+    BATCH: ClassVar[int] = 1
 
     def __init__(self, platform: PlatformConfig, config: C) -> None:
         self.platform = platform
@@ -112,7 +81,9 @@ class Service(ABC, Generic[C]):
         self.failed = False
         self._stopped = False
         self.started_utc_s = time.time()
+        self._tls = OwnTls(platform.tls)
         self.store = Store(platform.state_dir / f"{self.NAME}.db")
+        self._room = Room(self.store, HANDLING_RESERVE_BYTES, "records wait with their senders")
         self._counters: Counter[str] = Counter()
         self._counter_lock = threading.Lock()
         self._problem = ""
@@ -121,6 +92,7 @@ class Service(ABC, Generic[C]):
         self._outbox: Outbox | None = None
         self._token: zenoh.LivelinessToken | None = None
         self._threads: list[threading.Thread] = []
+        self._heartbeat = Heartbeat.from_environment(os.environ, platform.state_dir, platform.health_interval_s)
 
     # What a service says of itself
 
@@ -138,8 +110,26 @@ class Service(ABC, Generic[C]):
             InterruptedByStopError: The service is stopping; the record is handled after the next start.
         """
 
-    def check(self, record: Record) -> None:
-        """Refuse a record before it is accepted, by raising BadInputError; by default none is."""
+    def check(self, key: str, record: Record) -> None:
+        """Refuse a record that came on `key` before it is accepted, by raising BadInputError; by default none is."""
+
+    def admit(self, key: str) -> None:
+        """Leave a record with its sender while there is no room for it, by raising NotNowError.
+
+        By default while there is not even the room to handle what is here already.
+        """
+        self._room.need()
+
+    def handed_only(self) -> Collection[str]:
+        """Return those of the consumed key expressions on which plain publications are for somebody else."""
+        return ()
+
+    def lane(self, queue: str) -> Lane:
+        """Return how a queue of the outbox is sent."""
+        return Lane(publish=self.PUBLISH)
+
+    def settled(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
+        """Act, within the transaction, on a record's consumer having taken it (None) or refused it for a reason."""
 
     def on_start(self) -> None:
         """Start the service's own sources; called when the session is open."""
@@ -155,6 +145,10 @@ class Service(ABC, Generic[C]):
         """Return what keeps the service from working at this moment, for the health record; empty when nothing."""
         return ""
 
+    def remark(self) -> str:
+        """Return what people should know of while the service does its work, for the health record."""
+        return ""
+
     # Life
 
     @property
@@ -166,14 +160,23 @@ class Service(ABC, Generic[C]):
     def start(self) -> bool:
         """Open the session and begin; False when stopped before a router was reached."""
         endpoints = self.platform.router
-        self._session = open_with_retry(endpoints, self.stopping)
+        self._session = open_with_retry(endpoints, self.stopping, self.platform.tls)
         if self._session is None:
             return False
         self._token = self._session.liveliness().declare_token(keys.alive(self.platform.id, self.NAME))
-        self._outbox = Outbox(self._session, self.store, publish=self.PUBLISH)
+        self._outbox = Outbox(self._session, self.store, lane=self.lane, settled=self.settled)
         wanted = self.consumes()
         if wanted:
-            self._inbox = Inbox(self._session, self.store, self.NAME, tuple(wanted), self._check_payload, self._refused)
+            self._inbox = Inbox(
+                self._session,
+                self.store,
+                self.NAME,
+                tuple(wanted),
+                self._check_payload,
+                self._refused,
+                admit=self.admit,
+                handed_only=self.handed_only(),
+            )
             self.spawn(self._work, "work")
         self.on_start()
         self.spawn(self._report, "health")
@@ -223,7 +226,7 @@ class Service(ABC, Generic[C]):
         raise BadInputError(key, "", key, "a key this service consumes: " + ", ".join(self.consumes()))
 
     def _check_payload(self, key: str, payload: bytes) -> None:
-        self.check(wire.decode(self._record_type(key), payload, key))
+        self.check(key, wire.decode(self._record_type(key), payload, key))
 
     def _refused(self, error: BadInputError) -> None:
         self.count("records_refused")
@@ -233,11 +236,11 @@ class Service(ABC, Generic[C]):
         while not self.stopping.is_set():
             self.store.inbox_changed.clear()
             try:
-                items = self.store.pending(limit=16)
-                for item in items:
+                items = self.store.pending(limit=max(16, self.BATCH))
+                for first in range(0, len(items), self.BATCH):
                     if self.stopping.is_set():
                         return
-                    self._handle_item(item)
+                    self._handle_batch(items[first : first + self.BATCH])
             except (OSError, HandoffError) as error:
                 self.problem(f"{type(error).__name__}: {error}")
                 self.stopping.wait(RETRY_AFTER_S)
@@ -248,7 +251,36 @@ class Service(ABC, Generic[C]):
             if not items:
                 self.store.inbox_changed.wait(1.0)
 
+    def _handle_batch(self, items: Sequence[InboxItem]) -> None:
+        if self.BATCH == 1:
+            for item in items:
+                self._handle_item(item)
+            return
+        handled: list[tuple[Effects, InboxItem]] = []
+        try:
+            for item in items:
+                effects = self._effects_of(item)
+                if effects is not None:
+                    handled.append((effects, item))
+        finally:
+            # What comes before a record that has to wait is done with.
+            if handled:
+                self.commit_all(handled)
+
     def _handle_item(self, item: InboxItem) -> None:
+        effects = self._effects_of(item)
+        if effects is not None:
+            self.commit(effects, item)
+
+    def _effects_of(self, item: InboxItem) -> Effects | None:
+        """Handle a record; return what follows, None where it cannot be handled and is kept apart.
+
+        Every line that is logged meanwhile says which contact it concerns.
+        """
+        with concerning(**concern_of_payload(item.payload, item.key)):
+            return self._handled(item)
+
+    def _handled(self, item: InboxItem) -> Effects | None:
         effects = Effects(item.payload)
         try:
             self.handle(item.key, wire.decode(self._record_type(item.key), item.payload, item.key), effects)
@@ -257,15 +289,15 @@ class Service(ABC, Generic[C]):
         except BadInputError as error:
             self._refused(error)
             self._keep_apart(item, str(error))
-            return
+            return None
         except Exception as error:
             # A defect of ours must not stop the records behind this one, and must not lose this one either.
             log.exception("Record not handled, it is kept apart", extra=kv(key=item.key))
             self.count("records_failed")
             self._keep_apart(item, f"{type(error).__name__}: {error}")
-            return
+            return None
         effects.count("records_handled")
-        self.commit(effects, item)
+        return effects
 
     def _keep_apart(self, item: InboxItem, reason: str) -> None:
         with self.store.transaction() as tx:
@@ -274,12 +306,31 @@ class Service(ABC, Generic[C]):
 
     def commit(self, effects: Effects, item: InboxItem | None = None) -> None:
         """Write effects, and the end of the record they come from, in one transaction."""
+        self.commit_all([(effects, item)])
+
+    def commit_all(self, handled: Sequence[tuple[Effects, InboxItem | None]]) -> int:
+        """Write the effects of several records, and the ends of these, in one transaction.
+
+        Returns:
+            How many records in the outbox were dropped for newer editions.
+        """
         with self.store.transaction() as tx:
-            effects.write(tx)
-            if item is not None:
-                tx.done(item)
+            for effects, item in handled:
+                effects.write(tx)
+                if item is not None:
+                    tx.done(item)
         with self._counter_lock:
-            self._counters.update(effects.counts)
+            for effects, _ in handled:
+                self._counters.update(effects.counts)
+        return tx.superseded
+
+    def answering(self, queue: str) -> bool:
+        """Tell whether the consumer of a queue answered what it was asked last."""
+        return self._outbox is not None and self._outbox.answering(queue)
+
+    def delivered_to(self, queue: str) -> int:
+        """Return how many records the consumer of a queue has acknowledged in this run."""
+        return 0 if self._outbox is None else self._outbox.delivered_to(queue)
 
     # Health
 
@@ -303,13 +354,17 @@ class Service(ABC, Generic[C]):
         detail = self._problem
         if self._inbox is not None and self._inbox.in_trouble:
             detail = detail or "records cannot be stored"
-        detail = detail or self.trouble()
+        now_utc_s = time.time()
+        detail = detail or self._room.trouble() or self.trouble() or self._tls.trouble(now_utc_s)
+        remarks = (self.remark(), self._tls.remark(now_utc_s))
         with self._counter_lock:
             counters = dict(self._counters)
         gauges = {
             "inbox": float(self.store.inbox_depth()),
             "outbox": float(self.store.outbox_depth()),
             "refused": float(self.store.refused_count()),
+            **disk_gauges(self.platform.state_dir),
+            **self._tls.gauges(now_utc_s),
             **self.gauges(),
         }
         return Health(
@@ -318,7 +373,7 @@ class Service(ABC, Generic[C]):
             time_utc_s=time.time(),
             started_utc_s=self.started_utc_s,
             state=state or ("degraded" if detail else "ok"),
-            detail=detail[:MAX_DETAIL],
+            detail="; ".join(text for text in (detail, *remarks) if text)[:MAX_DETAIL],
             counters=counters,
             gauges=gauges,
         )
@@ -330,6 +385,8 @@ class Service(ABC, Generic[C]):
     def _publish_health(self, state: ServiceState | None) -> None:
         try:
             record = self.health(state)
+            # Before the network is asked to take anything: a router that hangs does not make this service ill.
+            self._heartbeat.beat(record, time.monotonic())
             key = keys.health(self.platform.id, self.NAME)
             self.session.put(key, wire.encode(record), encoding=wire.encoding_of(Health))
         except (HandoffError, zenoh.ZError) as error:

@@ -9,33 +9,50 @@ from collections.abc import Sequence
 
 import zenoh
 
+from sonarpost.runtime.config import TlsConfig
 from sonarpost.runtime.logs import kv
+from sonarpost.runtime.reach import try_endpoint
 
 log = logging.getLogger(__name__)
 
 OPEN_TIMEOUT_MS = 1000
+WAIT_BEFORE_DROP_US = 50_000
 RETRY_S = (0.1, 0.2, 0.5, 1.0)
 
 
-def client_config(endpoints: Sequence[str]) -> zenoh.Config:
-    """Return the configuration of a service: a client of its platform's router."""
-    return _config("client", listen=(), connect=endpoints)
+def client_config(endpoints: Sequence[str], tls: TlsConfig | None = None) -> zenoh.Config:
+    """Return the configuration of a service: a client of its platform's router.
+
+    Args:
+        endpoints: The router's endpoints.
+        tls: The host's own certificate, for `tls/…` endpoints: both sides show one.
+    """
+    return _config("client", listen=(), connect=endpoints, tls=tls)
 
 
-def router_config(listen: Sequence[str], connect: Sequence[str] = ()) -> zenoh.Config:
-    """Return the configuration of an embedded router, linked to the routers it connects to."""
-    return _config("router", listen=listen, connect=connect)
+def router_config(listen: Sequence[str], connect: Sequence[str] = (), tls: TlsConfig | None = None) -> zenoh.Config:
+    """Return the configuration of an embedded router, linked to the routers it connects to.
+
+    It has no access control: whoever has a certificate of the fleet may do everything. `sonarpost pki router-config`
+    writes configurations with it.
+    """
+    return _config("router", listen=listen, connect=connect, tls=tls)
 
 
-def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.Config:
-    settings = {
+def _config(mode: str, listen: Sequence[str], connect: Sequence[str], tls: TlsConfig | None) -> zenoh.Config:
+    # Pictures are shown in bursts: one that finds the queue full waits for a moment before it is dropped.
+    drop = {"wait_before_drop": WAIT_BEFORE_DROP_US, "max_wait_before_drop_fragments": 2 * WAIT_BEFORE_DROP_US}
+    link: dict[str, object] = {"tx": {"lease": 3000, "queue": {"congestion_control": {"drop": drop}}}}
+    if tls is not None:
+        link["tls"] = tls_settings(tls)
+    settings: dict[str, object] = {
         "mode": mode,
         "listen": {"endpoints": list(listen)},
         "connect": {"endpoints": list(connect), "timeout_ms": OPEN_TIMEOUT_MS},
         # Endpoints are written down: discovery would join strangers, and its delay would slow every start.
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         # Shared memory would bypass the network link on one host and hide its behaviour.
-        "transport": {"shared_memory": {"enabled": False}, "link": {"tx": {"lease": 3000}}},
+        "transport": {"shared_memory": {"enabled": False}, "link": link},
     }
     if mode == "router":
         settings["connect"] = {
@@ -48,7 +65,23 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.C
     return zenoh.Config.from_json5(json.dumps(settings))
 
 
-def open_with_retry(endpoints: Sequence[str], stop: threading.Event) -> zenoh.Session | None:
+def tls_settings(tls: TlsConfig) -> dict[str, object]:
+    """Return Zenoh's `transport/link/tls` section: paths of files, never what is in them."""
+    settings: dict[str, object] = {
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+        "root_ca_certificate": str(tls.ca),
+    }
+    for side in ("listen", "connect"):
+        settings[f"{side}_certificate"] = str(tls.certificate)
+        settings[f"{side}_private_key"] = str(tls.key)
+    return settings
+
+
+def open_with_retry(
+    endpoints: Sequence[str], stop: threading.Event, tls: TlsConfig | None = None
+) -> zenoh.Session | None:
     """Open a client session, trying each endpoint in turn until one opens or `stop` is set (then None).
 
     The library's own endless retry cannot be interrupted by a signal and stays with the first endpoint, so the loop is
@@ -58,10 +91,12 @@ def open_with_retry(endpoints: Sequence[str], stop: threading.Event) -> zenoh.Se
     while not stop.is_set():
         endpoint = endpoints[attempt % len(endpoints)]
         try:
-            return zenoh.open(client_config([endpoint]))
+            return zenoh.open(client_config([endpoint], tls))
         except zenoh.ZError as error:
             if attempt == 0:
-                log.warning("Zenoh router not reached, trying again", extra=kv(router=endpoint, error=str(error)[:200]))
+                # Zenoh says "timeout" for a refused certificate, too.
+                reason = try_endpoint(endpoint, tls).text if endpoint.startswith("tls/") else str(error)[:200]
+                log.warning("Zenoh router not reached, trying again", extra=kv(router=endpoint, error=reason))
             attempt += 1
             stop.wait(RETRY_S[min(attempt // len(endpoints), len(RETRY_S) - 1)])
     return None

@@ -8,28 +8,31 @@ acknowledged. Handling a record removes it from the inbox, adds what it leads to
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import logging
 import sqlite3
 import threading
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
 from sonarpost.errors import HandoffError
-from sonarpost.runtime.transaction import InboxItem, OutboxItem, Transaction
+from sonarpost.runtime.transaction import QUEUE_MARK, InboxItem, OutboxItem, Transaction
 
 log = logging.getLogger(__name__)
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS outbox (
     consumer TEXT NOT NULL, seq INTEGER NOT NULL, key TEXT NOT NULL, encoding TEXT NOT NULL, priority INTEGER NOT NULL,
-    payload BLOB NOT NULL, sha256 BLOB NOT NULL, created_utc_s REAL NOT NULL, PRIMARY KEY (consumer, seq));
-CREATE INDEX IF NOT EXISTS outbox_order ON outbox (consumer, priority, seq);
+    payload BLOB NOT NULL, sha256 BLOB NOT NULL, created_utc_s REAL NOT NULL,
+    topic TEXT NOT NULL DEFAULT '', edition INTEGER NOT NULL DEFAULT 0, place INTEGER NOT NULL DEFAULT 0,
+    PRIMARY KEY (consumer, seq));
 CREATE TABLE IF NOT EXISTS outbox_next (consumer TEXT PRIMARY KEY, seq INTEGER NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS inbox (
     id INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT NOT NULL, payload BLOB NOT NULL, origin BLOB, seq INTEGER,
@@ -51,6 +54,35 @@ CREATE TABLE IF NOT EXISTS state (name TEXT PRIMARY KEY, value BLOB NOT NULL) WI
 """
 
 
+# Version 1 had no editions: what it owed keeps its order.
+_FROM_VERSION_1 = """
+ALTER TABLE outbox ADD COLUMN topic TEXT NOT NULL DEFAULT '';
+ALTER TABLE outbox ADD COLUMN edition INTEGER NOT NULL DEFAULT 0;
+ALTER TABLE outbox ADD COLUMN place INTEGER NOT NULL DEFAULT 0;
+UPDATE outbox SET place = seq;
+DROP INDEX IF EXISTS outbox_order;
+UPDATE meta SET value = CAST('2' AS BLOB) WHERE name = 'version';
+"""
+_INDEXES = """
+CREATE INDEX IF NOT EXISTS outbox_place ON outbox (consumer, priority, place, seq);
+CREATE INDEX IF NOT EXISTS outbox_topic ON outbox (consumer, topic, edition) WHERE topic <> '';
+"""
+_ITEM = "consumer, seq, key, encoding, priority, payload, sha256, place, created_utc_s"
+
+
+@dataclass(frozen=True, slots=True)
+class QueueDepth:
+    """What waits in one queue of the outbox.
+
+    Attributes:
+        oldest_utc_s: When the oldest record was queued; None where nothing waits.
+    """
+
+    records: int
+    size_bytes: int
+    oldest_utc_s: float | None
+
+
 class Store:
     """A service's durable store; safe to use from several threads (one writer at a time).
 
@@ -62,6 +94,7 @@ class Store:
         self.path = path
         self._lock = threading.RLock()
         self._outbox_listeners: list[threading.Event] = []
+        self._begun: set[tuple[str, int]] = set()
         self.inbox_changed = threading.Event()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -81,11 +114,16 @@ class Store:
             self._db.execute("PRAGMA synchronous=FULL")
             self._db.execute("PRAGMA foreign_keys=ON")
             self._db.executescript(_SCHEMA)
+            with self.transaction():
+                self.origin = self._meta("origin", uuid.uuid4().bytes)
+                version = self._meta("version", str(SCHEMA_VERSION).encode())
+            if version == b"1":
+                self._db.executescript(f"BEGIN IMMEDIATE; {_FROM_VERSION_1} COMMIT;")
+                version = str(SCHEMA_VERSION).encode()
+            if version == str(SCHEMA_VERSION).encode():
+                self._db.executescript(_INDEXES)
         except sqlite3.Error as error:
             raise HandoffError(f"{self.path}: cannot be opened as a sonarpost store: {error}") from error
-        with self.transaction():
-            self.origin = self._meta("origin", uuid.uuid4().bytes)
-            version = self._meta("version", str(SCHEMA_VERSION).encode())
         if version != str(SCHEMA_VERSION).encode():
             self._db.close()
             raise HandoffError(f"{self.path}: store version {version!r}, expected {SCHEMA_VERSION}")
@@ -103,7 +141,7 @@ class Store:
             HandoffError: The database refused (a full disk, for example); nothing of the block was kept.
         """
         with self._lock:
-            tx = Transaction(self._db)
+            tx = Transaction(self._db, self._begun)
             try:
                 self._db.execute("BEGIN IMMEDIATE")
                 yield tx
@@ -148,15 +186,66 @@ class Store:
 
     def owed(self, consumer: str, limit: int) -> tuple[OutboxItem, ...]:
         """Return what is owed to `consumer`, most urgent first, then oldest first."""
+        return self.owed_items(consumer, self.owed_numbers(consumer, limit))
+
+    def owed_numbers(self, queue: str, limit: int) -> tuple[int, ...]:
+        """Return the numbers of what is owed, most urgent first, then oldest first."""
         rows = self._query(
-            "SELECT consumer, seq, key, encoding, priority, payload, sha256 FROM outbox WHERE consumer = ?"
-            " ORDER BY priority, seq LIMIT ?",
-            (consumer, limit),
+            "SELECT seq FROM outbox WHERE consumer = ? ORDER BY priority, place, seq LIMIT ?", (queue, limit)
         )
+        return tuple(int(str(row[0])) for row in rows)
+
+    def owed_items(self, queue: str, numbers: Sequence[int]) -> tuple[OutboxItem, ...]:
+        """Return the records of these numbers that are still owed, in the order of the numbers."""
+        found = []
+        for number in numbers:
+            sql = f"SELECT {_ITEM} FROM outbox WHERE consumer = ? AND seq = ?"  # noqa: S608 constants
+            found += self._query(sql, (queue, number))
         return tuple(
-            OutboxItem(str(c), int(str(s)), str(k), str(e), int(str(p)), _bytes(d), _bytes(h))
-            for c, s, k, e, p, d, h in rows
+            OutboxItem(
+                str(c), int(str(s)), str(k), str(e), int(str(p)), _bytes(d), _bytes(h), int(str(at)), float(str(t))
+            )
+            for c, s, k, e, p, d, h, at, t in found
         )
+
+    def begin(self, queue: str, seq: int) -> bool:
+        """Say that a record is about to be sent, so that no newer edition replaces it; False when one already has."""
+        with self._lock:
+            if not self._query("SELECT 1 FROM outbox WHERE consumer = ? AND seq = ?", (queue, seq)):
+                return False
+            self._begun.add((queue, seq))
+            return True
+
+    def end(self, queue: str, seq: int) -> None:
+        """Take back what `begin` said."""
+        with self._lock:
+            self._begun.discard((queue, seq))
+
+    def settled_upto(self, queue: str) -> int:
+        """Return the highest number with which, and with all below it, the queue is done."""
+        first = self._query("SELECT MIN(seq) FROM outbox WHERE consumer = ?", (queue,))[0][0]
+        if first is not None:
+            return int(str(first)) - 1
+        rows = self._query("SELECT seq FROM outbox_next WHERE consumer = ?", (queue,))
+        return int(str(rows[0][0])) if rows else 0
+
+    def origin_of(self, queue: str) -> bytes:
+        """Return the 16 bytes by which a queue's consumer knows it.
+
+        A plain consumer's is the store's own; every `queue_of` has another, as its numbers begin at 1 again and might
+        come to a consumer that knows them from elsewhere (a site that was renamed).
+        """
+        if QUEUE_MARK not in queue:
+            return self.origin
+        return hashlib.sha256(self.origin + queue.encode()).digest()[:16]
+
+    def queue_depth(self, queue: str) -> QueueDepth:
+        """Return what waits in one queue."""
+        records, size, oldest = self._query(
+            "SELECT COUNT(*), COALESCE(SUM(LENGTH(payload)), 0), MIN(created_utc_s) FROM outbox WHERE consumer = ?",
+            (queue,),
+        )[0]
+        return QueueDepth(int(str(records)), int(str(size)), None if oldest is None else float(str(oldest)))
 
     def outbox_depth(self) -> int:
         """Return how many records are owed to all consumers."""
@@ -170,6 +259,11 @@ class Store:
         """Return how many records lie in the refused table."""
         return int(str(self._query("SELECT COUNT(*) FROM refused")[0][0]))
 
+    def reusable_bytes(self) -> int:
+        """Return how much lies free inside the file: it never becomes smaller."""
+        pages, size = self._query("PRAGMA freelist_count")[0][0], self._query("PRAGMA page_size")[0][0]
+        return int(str(pages)) * int(str(size))
+
     def pending(self, limit: int = 1, after_id: int = 0) -> tuple[InboxItem, ...]:
         """Return accepted records not handled yet, oldest first, with an id above `after_id`."""
         rows = self._query("SELECT id, key, payload FROM inbox WHERE id > ? ORDER BY id LIMIT ?", (after_id, limit))
@@ -179,6 +273,11 @@ class Store:
         """Return what is remembered under `name`, or None."""
         rows = self._query("SELECT value FROM state WHERE name = ?", (name,))
         return _bytes(rows[0][0]) if rows else None
+
+    def state_names(self, prefix: str) -> tuple[str, ...]:
+        """Return the names that begin with `prefix` under which something is remembered."""
+        rows = self._query("SELECT name FROM state WHERE name >= ? AND name < ?", (prefix, prefix + "\U0010ffff"))
+        return tuple(str(row[0]) for row in rows)
 
     def close(self) -> None:
         """Close the file."""

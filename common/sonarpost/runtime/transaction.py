@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import sqlite3
 import time
-from dataclasses import dataclass
+from collections.abc import Set
+from dataclasses import dataclass, field
 
 # Bounds on what strangers can make a store keep: whatever is beyond them, the oldest goes.
 REFUSED_KEPT = 1000
@@ -13,9 +14,34 @@ REFUSED_BYTES = 256 * 1024
 PARTIALS_KEPT = 64
 
 
+QUEUE_MARK = "@"
+
+
+def queue_of(consumer: str, place: str) -> str:
+    """Return the name of the queue for a consumer that is on several platforms, for example `c2@shore-2`.
+
+    Queues know nothing of each other: each has numbers and an origin of its own, and one that is not answered holds no
+    other back.
+    """
+    return f"{consumer}{QUEUE_MARK}{place}"
+
+
+def consumer_of(queue: str) -> str:
+    """Return the name by which a queue's consumer answers."""
+    return queue.partition(QUEUE_MARK)[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """What a record is an edition of: in a queue, a newer edition takes the place of older ones that have not begun."""
+
+    name: str
+    edition: int
+
+
 @dataclass(frozen=True, slots=True)
 class OutboxItem:
-    """A record that its consumer has not acknowledged yet."""
+    """A record that its consumer has not acknowledged yet; `consumer` is the name of the queue."""
 
     consumer: str
     seq: int
@@ -24,6 +50,8 @@ class OutboxItem:
     priority: int
     payload: bytes
     sha256: bytes
+    place: int = field(default=0, compare=False)
+    created_utc_s: float = field(default=0.0, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +64,7 @@ class Chunk:
     sha256: bytes
     offset: int
     data: bytes
+    settled: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,32 +79,98 @@ class InboxItem:
 class Transaction:
     """The writes of one transaction; made by `Store.transaction`, atomic with everything else in it."""
 
-    def __init__(self, connection: sqlite3.Connection) -> None:
+    def __init__(self, connection: sqlite3.Connection, begun: Set[tuple[str, int]] = frozenset()) -> None:
         self._db = connection
+        self._begun = begun
         self.wrote_outbox = False
         self.wrote_inbox = False
+        self.superseded = 0
 
-    def send(self, key: str, consumer: str, payload: bytes, *, encoding: str, priority: int = 4) -> int:
-        """Owe `payload` to `consumer` under `key`; return its sequence number (from 1, without gaps, a consumer).
+    def send(
+        self, key: str, consumer: str, payload: bytes, *, encoding: str, priority: int = 4, topic: Topic | None = None
+    ) -> int:
+        """Owe `payload` to `consumer` under `key`; return its sequence number (from 1, one after the other, a queue).
 
         Args:
             key: Key expression the record is published on.
-            consumer: Name of the service that acknowledges it.
+            consumer: Name of the service that acknowledges it, or of a queue for it (`queue_of`).
             payload: The record's bytes.
             encoding: Zenoh encoding of the payload.
             priority: 1 (first) to 7 (last), as Zenoh's priorities.
+            topic: Older editions in the queue whose transfer has not begun are dropped, and their place and priority
+                are this one's; where the queue has a newer edition, nothing is queued and 0 is returned.
         """
+        place = None
+        if topic is not None:
+            if self._has_newer(consumer, topic):
+                return 0
+            place, priority = self._supersede(consumer, topic, priority)
         row = self._db.execute(
             "INSERT INTO outbox_next VALUES (?, 1) ON CONFLICT (consumer) DO UPDATE SET seq = seq + 1 RETURNING seq",
             (consumer,),
         ).fetchone()
         seq = int(row[0])
+        named = ("", 0) if topic is None else (topic.name, topic.edition)
+        digest = hashlib.sha256(payload).digest()
         self._db.execute(
-            "INSERT INTO outbox VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-            (consumer, seq, key, encoding, priority, payload, hashlib.sha256(payload).digest(), time.time()),
+            "INSERT INTO outbox (consumer, seq, key, encoding, priority, payload, sha256, created_utc_s,"
+            " topic, edition, place) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            (consumer, seq, key, encoding, priority, payload, digest, time.time(), *named, place or seq),
         )
         self.wrote_outbox = True
         return seq
+
+    def _has_newer(self, queue: str, topic: Topic) -> bool:
+        found = self._db.execute(
+            "SELECT 1 FROM outbox WHERE consumer = ? AND topic = ? AND topic <> '' AND edition > ? LIMIT 1",
+            (queue, topic.name, topic.edition),
+        ).fetchone()
+        return found is not None
+
+    def _supersede(self, queue: str, topic: Topic, priority: int) -> tuple[int | None, int]:
+        """Drop older editions that have not begun; return the first place and the most urgent priority among them."""
+        rows = self._db.execute(
+            "SELECT seq, place, priority FROM outbox WHERE consumer = ? AND topic = ? AND topic <> '' AND edition < ?",
+            (queue, topic.name, topic.edition),
+        ).fetchall()
+        place: int | None = None
+        for seq, its_place, its_priority in rows:
+            # One on its way arrives: were it stopped for each newer one, nothing might ever arrive.
+            if (queue, seq) in self._begun:
+                continue
+            self.acknowledged(queue, seq)
+            self.superseded += 1
+            place = its_place if place is None else min(place, its_place)
+            priority = min(priority, its_priority)
+        return place, priority
+
+    def drop_oldest(self, queue: str, max_bytes: int, above_priority: int) -> int:
+        """Drop records until the queue holds `max_bytes`, the least urgent first, then the oldest; return how many.
+
+        What is as urgent as `above_priority` or more stays, and so does what is on its way.
+        """
+        total = int(
+            self._db.execute(
+                "SELECT COALESCE(SUM(LENGTH(payload)), 0) FROM outbox WHERE consumer = ?", (queue,)
+            ).fetchone()[0]
+        )
+        dropped = 0
+        rows = self._db.execute(
+            "SELECT seq, LENGTH(payload) FROM outbox WHERE consumer = ? AND priority > ? ORDER BY priority DESC, place",
+            (queue, above_priority),
+        ).fetchall()
+        for seq, size in rows:
+            if total <= max_bytes:
+                break
+            if (queue, seq) not in self._begun:
+                self.acknowledged(queue, seq)
+                total -= size
+                dropped += 1
+        return dropped
+
+    def drop_queue(self, queue: str) -> int:
+        """Drop everything a queue holds; return how many records that were."""
+        return self._db.execute("DELETE FROM outbox WHERE consumer = ?", (queue,)).rowcount
 
     def acknowledged(self, consumer: str, seq: int) -> None:
         """Forget what the consumer has committed."""
@@ -132,6 +227,15 @@ class Transaction:
         if seq <= self._watermark(origin):
             return True
         return self._db.execute("SELECT 1 FROM seen WHERE origin = ? AND seq = ?", (origin, seq)).fetchone() is not None
+
+    def settle_upto(self, origin: bytes, seq: int) -> None:
+        """Remember that the producer is done with all up to `seq`: what it dropped leaves gaps in its numbers."""
+        if seq <= self._watermark(origin):
+            return
+        self._db.execute("INSERT OR REPLACE INTO seen_upto VALUES (?, ?)", (origin, seq))
+        for table in ("seen", "refused_before", "partial"):
+            self._db.execute(f"DELETE FROM {table} WHERE origin = ? AND seq <= ?", (origin, seq))  # noqa: S608 constants
+        self._compact(origin)
 
     def _watermark(self, origin: bytes) -> int:
         row = self._db.execute("SELECT seq FROM seen_upto WHERE origin = ?", (origin,)).fetchone()

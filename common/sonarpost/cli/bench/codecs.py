@@ -11,12 +11,13 @@ from typing import Final, TypeVar
 from sonarpost.cli.bench.figures import SheetCell, new_figure, plot_rate_distortion, save_figure, write_sheet
 from sonarpost.cli.bench.measure import Subject, code, measure, subjects
 from sonarpost.cli.bench.pictures import BenchPicture, PictureSet, read_folder, simulated_pictures
-from sonarpost.cli.bench.report import json_line, rate_differences, result_rows, text
+from sonarpost.cli.bench.report import details, json_line, miss_lines, rate_differences, result_rows, text
 from sonarpost.cli.bench.sdvd import sdvd_crops
 from sonarpost.cli.bench.statistics import bootstrap_weights
 from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import ConfigError
+from sonarpost.files import write_atomically
 
 T = TypeVar("T")
 
@@ -38,6 +39,12 @@ def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     add_picture_arguments(parser)
     add_codec_arguments(parser)
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw rate-distortion curves (needs matplotlib)")
+    parser.add_argument(
+        "--details", type=Path, metavar="FILE.json", help="write everything measured: intervals, misses, variants"
+    )
+    parser.add_argument(
+        "--cut", action="store_true", help="emb and spiht: one stream for the largest budget, cut for the others"
+    )
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="draw pictures as each codec rebuilds them")
     parser.set_defaults(run=run)
 
@@ -90,14 +97,14 @@ def chosen_pictures(args: argparse.Namespace) -> PictureSet:
     return found
 
 
-def chosen_subjects(args: argparse.Namespace, *, all_packings: bool = True) -> list[Subject]:
+def chosen_subjects(args: argparse.Namespace, *, all_packings: bool = True, cut: bool = False) -> list[Subject]:
     """Return the codecs that the options ask for; say on stderr which cannot be made here.
 
     Raises:
         ConfigError: A codec asked for is unknown or cannot be made.
     """
     names = None if args.codecs is None else [name.strip() for name in args.codecs.split(",")]
-    found, absent = subjects(default_registry(), names, all_packings=all_packings)
+    found, absent = subjects(default_registry(), names, all_packings=all_packings, cut=cut)
     for line in absent:
         say(f"left out: {line}")
     return found
@@ -124,9 +131,10 @@ def run(args: argparse.Namespace) -> int:
         OSError: A file cannot be written.
     """
     budgets = parse_budgets(args.budgets)
+    _check_folders(args)
     if args.plot is not None:
         new_figure(1, 1)  # an absent extra is said before the work, not after it
-    tested = chosen_subjects(args)
+    tested = chosen_subjects(args, cut=args.cut)
     measured = chosen_pictures(args)
     points = [point for subject in tested for point in measure(subject, measured.pictures, budgets, say)]
     weights = bootstrap_weights([picture.source for picture in measured.pictures])
@@ -135,12 +143,24 @@ def run(args: argparse.Namespace) -> int:
         save_figure(plot_rate_distortion(points, title), args.plot)
     if args.sheet is not None:
         write_sheet(args.sheet, title, sheet_rows(tested, measured.pictures, budgets))
+    differences = rate_differences(points, weights)
+    if args.details is not None:
+        write_atomically(args.details, details(points, budgets, measured, weights, differences).encode())
     if args.json:
-        rows = result_rows(points, weights)
-        print(json_line(rows, len(measured.pictures), rate_differences(points, weights)))
+        print(json_line(result_rows(points, budgets), len(measured.pictures), differences))
+        for line in miss_lines(points):
+            say(line)
     else:
-        print(text(points, measured, weights))
+        print(text(points, measured, weights, differences))
     return 0
+
+
+def _check_folders(args: argparse.Namespace) -> None:
+    """Say that a file cannot be written before the work, not after it."""
+    for option in ("plot", "sheet", "details"):
+        path: Path | None = getattr(args, option)
+        if path is not None and not path.absolute().parent.is_dir():
+            raise ConfigError("bench", f"--{option}", str(path), "a file in a folder that exists")
 
 
 def sheet_rows(

@@ -1,12 +1,15 @@
-"""The parser of `sonarpost bench` and its three actions."""
+"""The parser of `sonarpost bench` and its actions."""
 
 from __future__ import annotations
 
 import argparse
 
 from sonarpost.cli.bench.codecs import add_action as add_codecs
+from sonarpost.cli.bench.link import add_action as add_link
+from sonarpost.cli.bench.mission import add_action as add_mission
 from sonarpost.cli.bench.paper import add_action as add_paper
 from sonarpost.cli.bench.recognition import add_action as add_recognition
+from sonarpost.cli.bench.sea_trial import add_action as add_sea_trial
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -26,3 +29,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_codecs(actions)
     add_paper(actions)
     add_recognition(actions)
+    add_link(actions)
+    add_sea_trial(actions)
+    add_mission(actions)

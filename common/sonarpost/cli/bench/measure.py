@@ -23,7 +23,7 @@ Values = npt.NDArray[np.float64]
 T = TypeVar("T")
 
 EMBEDDED: Final = ("emb", "spiht")
-"""Codecs whose stream may be cut anywhere: it is made once, for the largest budget, and cut for the others."""
+"""Codecs whose stream may be cut anywhere."""
 PSNR_LIMIT_DB: Final = 60.0
 """A picture rebuilt without error has an infinite PSNR, which no mean survives; it counts as this."""
 
@@ -35,7 +35,8 @@ class Subject:
     Attributes:
         codec: The codec.
         variant: What tells several of one name apart (for vq catalogue and packing); empty for the only one.
-        is_embedded: Whether one stream serves every budget.
+        is_embedded: Whether one stream, made for the largest budget, is cut for the others; else each budget has a
+            stream of its own.
         is_natural: Whether its size follows from the picture alone, so that it is one point, whatever the budgets.
     """
 
@@ -105,7 +106,7 @@ class Point:
 
 
 def subjects(
-    registry: CodecRegistry, names: Sequence[str] | None, *, all_packings: bool = True
+    registry: CodecRegistry, names: Sequence[str] | None, *, all_packings: bool = True, cut: bool = False
 ) -> tuple[list[Subject], list[str]]:
     """Make the codecs to measure.
 
@@ -113,6 +114,7 @@ def subjects(
         registry: Where they are from.
         names: Which; None for every one that can be made here.
         all_packings: Whether vq is measured with every packing of an index, or the tightest only.
+        cut: Whether codecs of `EMBEDDED` make one stream, cut for each budget.
 
     Returns:
         The codecs, and one line for each that cannot be made here (only with `names` None).
@@ -124,7 +126,7 @@ def subjects(
     absent: list[str] = []
     for name in registry.names() if names is None else dict.fromkeys(names):
         try:
-            found += _variants(registry, name, tuple(IndexPacking) if all_packings else (IndexPacking.BITS14,))
+            found += _variants(registry, name, tuple(IndexPacking) if all_packings else (IndexPacking.BITS14,), cut=cut)
         except ConfigError as error:
             if names is not None:
                 raise
@@ -132,9 +134,9 @@ def subjects(
     return found, absent
 
 
-def _variants(registry: CodecRegistry, name: str, packings: Sequence[IndexPacking]) -> list[Subject]:
+def _variants(registry: CodecRegistry, name: str, packings: Sequence[IndexPacking], *, cut: bool) -> list[Subject]:
     if not registry.spec(name).needs_tiles:
-        return [Subject(registry.create(name, CodecResources()), is_embedded=name in EMBEDDED)]
+        return [Subject(registry.create(name, CodecResources()), is_embedded=cut and name in EMBEDDED)]
     made = []
     for tile_px in NOMINAL_TILE_PX:
         tiles = load_nominal(tile_px).tiles
@@ -234,6 +236,42 @@ def measure(
     if progress is not None:
         progress(f"{subject.label}: {len(pictures)} pictures")
     return points
+
+
+def best_that_fit(variants: Sequence[Point], budgets: Sequence[int]) -> list[Point]:
+    """Return what a codec of natural sizes gives within each budget: of each picture the best variant that fits.
+
+    Args:
+        variants: Points of one codec, each of a natural size; at least one.
+        budgets: Most bytes of a stream.
+
+    Returns:
+        One point a budget; a picture that no variant squeezes into it is a miss.
+    """
+    lengths = np.stack([point.stream_bytes for point in variants])
+    quality = np.stack([point.psnr for point in variants])
+    others = [
+        np.stack(each) for each in zip(*((p.ssim, p.msssim, p.encode_ms, p.decode_ms) for p in variants), strict=True)
+    ]
+    pictures = np.arange(lengths.shape[1])
+    found = []
+    for budget in budgets:
+        fits = lengths <= budget  # False where a variant missed the picture
+        # Of equal quality the shortest, which is the first of the stably sorted.
+        order = np.argsort(np.where(fits, lengths, np.inf), axis=0, kind="stable")
+        ranked = np.where(fits, quality, -np.inf)[order, pictures]
+        chosen = order[np.argmax(ranked, axis=0), pictures]
+        some = np.asarray(fits.any(axis=0), dtype=np.bool_)
+        size, psnr, ssim_, msssim, encode_ms, decode_ms = (
+            np.where(some, measured[chosen, pictures], np.nan) for measured in (lengths, quality, *others)
+        )
+        subject = Subject(variants[0].subject.codec)
+        point = Point(subject, budget, size, psnr, ssim_, msssim, encode_ms, decode_ms)
+        missed = int(np.count_nonzero(~some))
+        if missed:
+            point.reasons[f"budget_bytes: expected at least {int(np.nanmin(lengths))}"] = missed
+        found.append(point)
+    return found
 
 
 def _empty(subject: Subject, budget: int | None, count: int) -> Point:

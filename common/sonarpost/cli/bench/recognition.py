@@ -5,15 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from sonarpost.cli.bench.codecs import add_codec_arguments, chosen_subjects, parse_budgets, say
-from sonarpost.cli.bench.grain import with_grain
+from sonarpost.cli.bench.grain import DEFAULT_STRENGTH, grainy_twin, with_grain
 from sonarpost.cli.bench.judge import Judge
 from sonarpost.cli.bench.measure import Subject, code
 from sonarpost.cli.bench.pictures import BenchPicture, simulated_pictures
@@ -26,6 +26,7 @@ from sonarpost.errors import ConfigError
 LEAST_AUC: Final = 0.93
 """A judge that tells originals apart worse than this is none."""
 EXIT_POOR_JUDGE: Final = 1
+MAX_STRENGTH: Final = 2.0
 _SIMULATED: Final = 240
 _SIMULATED_SEED: Final = 1  # not that of `bench codecs`
 
@@ -37,7 +38,8 @@ def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         help="targets against clutter, as a judge trained on originals sees decoded pictures",
         description="Train a judge on original pictures (SDVD's train split and simulated ones) and let it tell "
         "targets from clutter in decoded pictures of the test split. No survey line is judged by a judge that was "
-        "trained on it. Differences below about .03 are chance.",
+        "trained on it; intervals are of samples of survey lines. Of emb, streams that describe the bottom's grain, "
+        "within the same budget, are judged too, with the grain shown. Differences below about .03 are chance.",
     )
     parser.add_argument("--sdvd", type=Path, required=True, metavar="DIR", help="the SDVD data set's folder")
     parser.add_argument("--crop", type=int, default=80, metavar="PX", help="side of the crops (default: 80)")
@@ -47,6 +49,12 @@ def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     )
     parser.add_argument(
         "--least-auc", type=float, default=LEAST_AUC, metavar="AUC", help="refuse a judge below this (%(default)s)"
+    )
+    parser.add_argument(
+        "--grain-strength",
+        default=str(DEFAULT_STRENGTH),
+        metavar="S,S,…",
+        help="shares of the synthetic grain to be shown, 0..2 (default: %(default)s)",
     )
     parser.set_defaults(run=run)
 
@@ -59,23 +67,27 @@ class Verdict:
         label: Codec and variant; "original" for the originals.
         codec: Name in the registry; empty for the originals.
         budget_bytes: Most bytes of a stream; None for a natural size and for the originals.
-        grain: Whether the codec's synthetic grain was on.
+        grain: Share of the synthetic grain that was shown; None for the measured picture of a stream without.
         mean_bytes: Mean real length of a stream; NaN for the originals.
         pictures: How many pictures were judged.
         misses: How many the codec missed.
         area: Area under the ROC curve; None without both targets and others.
-        ci: Its 95 % bootstrap interval over source tiles.
+        ci: Its 95 % bootstrap interval over survey lines.
+        share: Of the area that the same pictures' originals have.
+        share_ci: Its 95 % interval over the same samples of survey lines.
     """
 
     label: str
     codec: str
     budget_bytes: int | None
-    grain: bool
+    grain: float | None
     mean_bytes: float
     pictures: int
     misses: int
     area: float | None
     ci: Interval | None
+    share: float | None
+    share_ci: Interval | None
 
 
 def run(args: argparse.Namespace) -> int:
@@ -87,18 +99,18 @@ def run(args: argparse.Namespace) -> int:
     budgets = parse_budgets(args.budgets)
     if not 0.0 <= args.least_auc <= 1.0:
         raise ConfigError("bench", "--least-auc", args.least_auc, "0..1")
+    strengths = _parse_strengths(args.grain_strength)
     tested = chosen_subjects(args, all_packings=False)
     training = sdvd_crops(args.sdvd, "train", args.crop).pictures
     test = sdvd_crops(args.sdvd, "test", args.crop).pictures
     simulated = simulated_pictures(args.simulated, _SIMULATED_SEED, args.crop).pictures if args.simulated else ()
     say(f"training on {len(training)} real and {len(simulated)} simulated pictures")
     judge = Judge(training, simulated, [picture.group for picture in test])
-    weights = bootstrap_weights([picture.source for picture in test])
-    originals = [picture.pixels for picture in test]
-    first = _verdict(judge, test, originals, weights, _Coding("original", "", None, grain=False))
+    court = _Court(judge, test, bootstrap_weights([picture.group for picture in test]))
+    first = court.verdict([picture.pixels for picture in test], _Coding("original", "", None, None))
     verdicts = [first]
     for subject in tested:
-        verdicts += _verdicts_of(judge, subject, test, budgets, weights)
+        verdicts += _verdicts_of(court, subject, budgets, strengths)
         say(f"{subject.label}: judged")
     print(_json_line(verdicts, len(test)) if args.json else _table(verdicts))
     if first.area is None or first.area < args.least_auc:
@@ -107,62 +119,116 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _parse_strengths(written: str) -> tuple[float, ...]:
+    """Read `0.5,1`; return the strengths in rising order, none twice."""
+    found = set()
+    for part in written.split(","):
+        try:
+            strength = float(part)
+        except ValueError:
+            strength = math.nan
+        if not 0.0 <= strength <= MAX_STRENGTH:
+            raise ConfigError("bench", "--grain-strength", part, f"numbers 0..{MAX_STRENGTH}, separated by commas")
+        found.add(strength)
+    return tuple(sorted(found))
+
+
 @dataclass(frozen=True)
 class _Coding:
     label: str
     codec: str
     budget_bytes: int | None
-    grain: bool
+    grain: float | None
 
 
-def _verdicts_of(
-    judge: Judge, subject: Subject, test: Sequence[BenchPicture], budgets: Sequence[int], weights: Values
-) -> list[Verdict]:
-    coded = [code(subject, picture.pixels, budgets) for picture in test]
+class _Court:
+    """The judge, the pictures of the test split, and the samples of survey lines that all verdicts share.
+
+    Args:
+        judge: Trained.
+        test: Original pictures.
+        weights: Bootstrap weights, shape (R, pictures).
+    """
+
+    def __init__(self, judge: Judge, test: Sequence[BenchPicture], weights: Values) -> None:
+        self.test = test
+        self._judge = judge
+        self._weights = weights
+        self._is_target = np.array([bool(picture.is_target) for picture in test])
+        self._of_originals = judge.scores([picture.pixels for picture in test], [picture.group for picture in test])
+
+    def verdict(self, pictures: Sequence[Image | None], coding: _Coding, lengths: Values | None = None) -> Verdict:
+        """Judge decoded pictures, one for each of the test split; None where there is none."""
+        shown = np.array([picture is not None for picture in pictures])
+        is_target = self._is_target[shown]
+        area, ci, share, share_ci = None, None, None, None
+        if is_target.any() and not is_target.all():
+            groups = [picture.group for picture, there in zip(self.test, shown, strict=True) if there]
+            scores = self._judge.scores([picture for picture in pictures if picture is not None], groups)
+            weights = self._weights[:, shown]
+            area, draws = float(auc(scores, is_target)[0]), auc(scores, is_target, weights)
+            best = self._of_originals[shown]
+            best_area, best_draws = float(auc(best, is_target)[0]), auc(best, is_target, weights)
+            ci = interval(draws)
+            if best_area > 0.0:
+                share = area / best_area
+                share_ci = interval(
+                    np.divide(draws, best_draws, out=np.full(draws.shape, np.nan), where=best_draws > 0)
+                )
+        count = int(np.count_nonzero(shown))
+        mean_bytes = math.nan if lengths is None or not count else float(lengths[shown].mean())
+        missed = len(self.test) - count
+        return Verdict(
+            coding.label,
+            coding.codec,
+            coding.budget_bytes,
+            coding.grain,
+            mean_bytes,
+            count,
+            missed,
+            area,
+            ci,
+            share,
+            share_ci,
+        )
+
+
+def _verdicts_of(court: _Court, subject: Subject, budgets: Sequence[int], strengths: Sequence[float]) -> list[Verdict]:
+    """Judge a codec's pictures at every budget; then those of streams that say how strong the grain is.
+
+    Such a stream is within the same budget: the grain's description is paid for by the picture.
+    """
     verdicts = []
-    for place in range(len(coded[0])):
-        results = [each[place] for each in coded]
-        budget = None if subject.is_natural else budgets[place]
-        plain: list[Image | None] = [None if isinstance(r, str) else r.rebuilt for r in results]
-        lengths = np.array([math.nan if isinstance(r, str) else float(len(r.stream)) for r in results])
-        coding = _Coding(subject.label, subject.codec.name, budget, grain=False)
-        verdicts.append(_verdict(judge, test, plain, weights, coding, lengths))
-        grainy = [None if isinstance(r, str) else with_grain(subject.codec, r.stream) for r in results]
-        if any(picture is not None for picture in grainy):
-            coding = _Coding(subject.label, subject.codec.name, budget, grain=True)
-            verdicts.append(_verdict(judge, test, grainy, weights, coding, lengths))
+    for coding, plain, _, lengths in _coded(court.test, subject, budgets):
+        verdicts.append(court.verdict(plain, coding, lengths))
+    twin = grainy_twin(subject.codec)
+    if twin is None:
+        return verdicts
+    grainy = replace(subject, codec=twin)
+    for coding, plain, streams, lengths in _coded(court.test, grainy, budgets):
+        for strength in strengths:
+            views = [
+                None if picture is None or stream is None else with_grain(twin, stream, picture, strength)
+                for picture, stream in zip(plain, streams, strict=True)
+            ]
+            verdicts.append(court.verdict(views, replace(coding, grain=strength), lengths))
     return verdicts
 
 
-def _verdict(
-    judge: Judge,
-    test: Sequence[BenchPicture],
-    pictures: Sequence[Image | None],
-    weights: Values,
-    coding: _Coding,
-    lengths: Values | None = None,
-) -> Verdict:
-    shown = np.array([picture is not None for picture in pictures])
-    is_target = np.array([bool(picture.is_target) for picture in test])[shown]
-    area, ci = None, None
-    if is_target.any() and not is_target.all():
-        groups = [picture.group for picture, there in zip(test, shown, strict=True) if there]
-        scores = judge.scores([picture for picture in pictures if picture is not None], groups)
-        area = float(auc(scores, is_target)[0])
-        ci = interval(auc(scores, is_target, weights[:, shown]))
-    mean_bytes = math.nan if lengths is None or not shown.any() else float(lengths[shown].mean())
-    count = int(np.count_nonzero(shown))
-    return Verdict(
-        coding.label,
-        coding.codec,
-        coding.budget_bytes,
-        coding.grain,
-        mean_bytes,
-        count,
-        len(test) - count,
-        area,
-        ci,
-    )
+def _coded(
+    test: Sequence[BenchPicture], subject: Subject, budgets: Sequence[int]
+) -> Iterator[tuple[_Coding, list[Image | None], list[bytes | None], Values]]:
+    """Yield for each budget: what it is, the decoded pictures, their streams and lengths (None, None, NaN: missed)."""
+    coded = [code(subject, picture.pixels, budgets) for picture in test]
+    for place in range(len(coded[0])):
+        results = [each[place] for each in coded]
+        budget = None if subject.is_natural else budgets[place]
+        yield (
+            _Coding(subject.label, subject.codec.name, budget, None),
+            [None if isinstance(r, str) else r.rebuilt for r in results],
+            [None if isinstance(r, str) else r.stream for r in results],
+            np.array([math.nan if isinstance(r, str) else float(len(r.stream)) for r in results]),
+        )
 
 
 def _json_line(verdicts: Sequence[Verdict], images: int) -> str:
@@ -177,7 +243,9 @@ def _json_line(verdicts: Sequence[Verdict], images: int) -> str:
             "n": v.pictures,
             "misses": v.misses,
             "auc": None if v.area is None else round(v.area, 4),
-            "ci": None if v.ci is None else [round(v.ci[0], 4), round(v.ci[1], 4)],
+            "ci": _rounded(v.ci),
+            "of_original": None if v.share is None else round(v.share, 4),
+            "of_original_ci": _rounded(v.share_ci),
         }
         for v in others
     ]
@@ -185,8 +253,12 @@ def _json_line(verdicts: Sequence[Verdict], images: int) -> str:
     return json.dumps({"images": images, "judge": original, "results": results}, allow_nan=False)
 
 
+def _rounded(found: Interval | None) -> list[float] | None:
+    return None if found is None else [round(found[0], 4), round(found[1], 4)]
+
+
 def _table(verdicts: Sequence[Verdict]) -> str:
-    head = ("codec", "budget", "grain", "n", "miss", "bytes", "AUC", "95 %")
+    head = ("codec", "budget", "grain", "n", "miss", "bytes", "AUC", "95 %", "of original", "95 %")
     return aligned([head, *(_table_row(verdict) for verdict in verdicts)])
 
 
@@ -194,10 +266,12 @@ def _table_row(v: Verdict) -> tuple[str, ...]:
     return (
         v.label,
         "own" if v.budget_bytes is None else str(v.budget_bytes),
-        "yes" if v.grain else "no",
+        "no" if v.grain is None else f"{v.grain:g}",
         str(v.pictures),
         str(v.misses),
         "-" if math.isnan(v.mean_bytes) else f"{v.mean_bytes:.1f}",
         "-" if v.area is None else f"{v.area:.3f}",
         "-" if v.ci is None else f"{v.ci[0]:.3f}..{v.ci[1]:.3f}",
+        "-" if v.share is None else f"{v.share:.3f}",
+        "-" if v.share_ci is None else f"{v.share_ci[0]:.3f}..{v.share_ci[1]:.3f}",
     )

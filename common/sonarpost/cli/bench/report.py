@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from sonarpost.cli.bench.curves import BD_RESAMPLES, LEAST_SHARE, RateDifference, curves, rate_difference
-from sonarpost.cli.bench.measure import Point
+from sonarpost.cli.bench.measure import Point, best_that_fit
 from sonarpost.cli.bench.pictures import PictureSet
 from sonarpost.cli.bench.statistics import Values, interval, mean_of_known, weighted_means
 
@@ -20,11 +20,46 @@ _METRICS: Final = ("psnr", "ssim", "msssim")
 _Json = dict[str, object]
 
 
-def result_rows(points: Sequence[Point], weights: Values) -> list[_Json]:
+def at_budgets(points: Sequence[Point], budgets: Sequence[int]) -> list[Point]:
+    """Return one point for each codec and budget: for vq, whose sizes are its own, the best variant that fits."""
+    found: list[Point] = []
+    for curve in curves(points).values():
+        natural = [point for point in curve if point.subject.is_natural]
+        found += best_that_fit(natural, budgets) if natural else curve
+    return found
+
+
+def result_rows(points: Sequence[Point], budgets: Sequence[int]) -> list[_Json]:
+    """Return the rows of the JSON object, one for each codec and budget.
+
+    All figures of a row are null where fewer than `LEAST_SHARE` of the pictures fitted: a mean over the easy pictures
+    is not comparable with one over all.
+    """
+    rows: list[_Json] = []
+    for point in at_budgets(points, budgets):
+        counts = point.hits.mean() >= LEAST_SHARE
+        figures = _figures(point)
+        shown = {name: value if counts else None for name, value in figures.items()}
+        rows.append({"codec": point.subject.codec.name, "budget": point.shown_budget, **shown})
+    return rows
+
+
+def _figures(point: Point) -> dict[str, float | None]:
+    return {
+        "bytes": _rounded(mean_of_known(point.stream_bytes), 2),
+        "psnr": _rounded(mean_of_known(point.psnr), 4),
+        "ssim": _rounded(mean_of_known(point.ssim), 5),
+        "msssim": _rounded(mean_of_known(point.msssim), 5),
+        "encode_ms": _rounded(_median(point.encode_ms), 3),
+        "decode_ms": _rounded(_median(point.decode_ms), 3),
+    }
+
+
+def detail_rows(points: Sequence[Point], weights: Values) -> list[_Json]:
     """Return one JSON object a point: means over the pictures that were coded, their number, the misses, intervals.
 
-    A figure of a point that missed every picture is null. `emb_gain` is the mean PSNR difference of emb over this
-    codec at the same budget on the pictures both coded, with its interval.
+    A figure of a point that missed every picture is null. `emb_gain` is the mean difference of emb over this codec in
+    each metric, at the same budget on the pictures both coded, with its interval.
     """
     reference = {p.budget_bytes: p for p in points if p.subject.codec.name == REFERENCE}
     return [_row(point, reference.get(point.budget_bytes), weights) for point in points]
@@ -34,12 +69,7 @@ def _row(point: Point, reference: Point | None, weights: Values) -> _Json:
     row: _Json = {
         "codec": point.subject.codec.name,
         "budget": point.shown_budget,
-        "bytes": _rounded(mean_of_known(point.stream_bytes), 2),
-        "psnr": _rounded(mean_of_known(point.psnr), 4),
-        "ssim": _rounded(mean_of_known(point.ssim), 5),
-        "msssim": _rounded(mean_of_known(point.msssim), 5),
-        "encode_ms": _rounded(_median(point.encode_ms), 3),
-        "decode_ms": _rounded(_median(point.decode_ms), 3),
+        **_figures(point),
         "n": int(point.hits.sum()),
         "misses": point.misses,
         "ci": {name: _ci(_metric(point, name), weights) for name in _METRICS},
@@ -49,9 +79,12 @@ def _row(point: Point, reference: Point | None, weights: Values) -> _Json:
     if point.reasons:
         row["miss_reasons"] = dict(point.reasons.most_common(3))
     if reference is not None and reference is not point:
-        gain = reference.psnr - point.psnr
-        row["emb_gain"] = {"psnr": _rounded(mean_of_known(gain), 4), "ci": _ci(gain, weights)}
+        row["emb_gain"] = {name: _gain(_metric(reference, name) - _metric(point, name), weights) for name in _METRICS}
     return row
+
+
+def _gain(difference: Values, weights: Values) -> _Json:
+    return {"mean": _rounded(mean_of_known(difference), 5), "ci": _ci(difference, weights)}
 
 
 def rate_differences(points: Sequence[Point], weights: Values) -> dict[str, dict[str, RateDifference]]:
@@ -76,14 +109,45 @@ def json_line(rows: list[_Json], pictures: int, differences: dict[str, dict[str,
     return json.dumps({"images": pictures, "results": rows, "bd_rate": compared}, allow_nan=False)
 
 
-def text(points: Sequence[Point], measured: PictureSet, weights: Values) -> str:
+def details(
+    points: Sequence[Point],
+    budgets: Sequence[int],
+    measured: PictureSet,
+    weights: Values,
+    differences: dict[str, dict[str, RateDifference]],
+) -> str:
+    """Return everything measured as a JSON object, for a file."""
+    natural = [point for point in points if point.subject.is_natural]
+    found = {
+        "pictures": len(measured.pictures),
+        "origin": measured.origin,
+        "refused": list(measured.refused),
+        "results": detail_rows(at_budgets(points, budgets), weights),
+        "natural_sizes": detail_rows(natural, weights),
+        "bd_rate": {
+            name: {
+                other: {"percent": d.percent, "ci": d.ci, "overlap_db": d.overlap, "pictures": d.pictures}
+                for other, d in compared.items()
+            }
+            for name, compared in differences.items()
+        },
+    }
+    return json.dumps(found, allow_nan=False, indent=1) + "\n"
+
+
+def text(
+    points: Sequence[Point],
+    measured: PictureSet,
+    weights: Values,
+    differences: dict[str, dict[str, RateDifference]],
+) -> str:
     """Return the whole report as text."""
-    rows = result_rows(points, weights)
+    rows = detail_rows(points, weights)
     parts = [
         f"{len(measured.pictures)} pictures of {measured.origin}, {len(measured.refused)} refused",
         _quality_table(points, rows),
         _miss_table(points),
-        _difference_table(rate_differences(points, weights)),
+        _difference_table(differences),
     ]
     return "\n\n".join(part for part in parts if part)
 
@@ -113,12 +177,17 @@ def _quality_table(points: Sequence[Point], rows: Sequence[_Json]) -> str:
     return aligned([head, *body]) + "\n" + note
 
 
-def _miss_table(points: Sequence[Point]) -> str:
-    lines = [
-        f"  {point.subject.label} at {point.shown_budget} B: {count} x {reason}"
+def miss_lines(points: Sequence[Point]) -> list[str]:
+    """Return one line for each point that missed pictures: how many, and the most frequent reason."""
+    return [
+        f"{point.subject.label} at {point.shown_budget} B: {count} x {reason}"
         for point in points
         for reason, count in point.reasons.most_common(1)
     ]
+
+
+def _miss_table(points: Sequence[Point]) -> str:
+    lines = [f"  {line}" for line in miss_lines(points)]
     return "\n".join(["Misses (most frequent reason):", *lines]) if lines else ""
 
 

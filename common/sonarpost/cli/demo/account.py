@@ -10,7 +10,10 @@ from pathlib import Path
 
 from sonarpost.cli.demo.settings import UUV_ADDRESS, ChainSettings
 from sonarpost.errors import FrameError
+from sonarpost.link.downlink import image_of_number
 from sonarpost.link.paper_format import ContactFrame, HalfFrame, parse_frame
+from sonarpost.link.v1_events import ContactUpdate
+from sonarpost.link.v1_receiver import Receiver
 
 
 @dataclass
@@ -21,8 +24,10 @@ class ChannelAccount:
         frames_sent: Frames with content that went into the water.
         frames_lost: Those of them that the receiving modem did not deliver whole.
         acoustic_s: Air time in simulated seconds.
-        halves_through: By image, the halves of which every frame sent at some time came through.
-        images_through: Images of which at least one frame came through.
+        packets: Packets that the vehicle sent.
+        images_through: Images of which enough came through to show something: with the paper's format one frame, with
+            v1 what a receiver of its own makes of the frames.
+        frames_through: By image and half, the paper's frames that came through.
     """
 
     frames_sent: int = 0
@@ -31,6 +36,7 @@ class ChannelAccount:
     acoustic_s: float = 0.0
     images_through: set[str] = field(default_factory=set)
     frames_through: Counter[tuple[str, str]] = field(default_factory=Counter)
+    _v1: Receiver = field(default_factory=Receiver)
 
     def add_frame(self, content: bytes, *, heard: bool) -> None:
         """Count one frame; `content` is what the receiver got."""
@@ -38,6 +44,9 @@ class ChannelAccount:
         if not heard:
             self.frames_lost += 1
             return
+        for event in self._v1.accept(UUV_ADDRESS, content, 0.0):
+            if isinstance(event, ContactUpdate):
+                self.images_through.add(image_of_number(event.number))
         try:
             frame = parse_frame(content)
         except FrameError:
@@ -62,7 +71,8 @@ def read_channel_log(path: Path) -> ChannelAccount:
             continue
         if entry["packet"] not in seen_packets:
             seen_packets.add(entry["packet"])
-            account.packets += 1
+            # At rate 0 a header goes before each packet, which takes its time and is no packet of pictures.
+            account.packets += entry["kind"] == "data"
             account.acoustic_s += entry["airtime_s"]
         for frame in entry["frames"]:
             if frame["fate"] != "empty":

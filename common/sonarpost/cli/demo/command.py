@@ -41,6 +41,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     source.add_argument("--survey", type=Path, metavar="FILE_OR_DIR", help="survey file, or a folder of them")
     source.add_argument("--images", type=Path, metavar="DIR", help="send the TIFF and PNG pictures of a folder instead")
     parser.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="(default %(default)s)")
+    parser.add_argument(
+        "--link",
+        choices=("v1", "paper"),
+        default="paper",
+        help="wire format: v1 with the codec emb, or the paper's with its tile codec (default %(default)s)",
+    )
     parser.add_argument("--rate", type=int, default=1, choices=sorted(RATES), help="Micro-Modem rate (default 1)")
     parser.add_argument("--loss", type=_probability, default=0.0, metavar="P", help="probability of losing a frame")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulated survey and the water")
@@ -77,6 +83,7 @@ def run(parsed: argparse.Namespace) -> int:
     settings = ChainSettings(
         folder=folder,
         mode="snippets" if parsed.images else "survey",
+        link=parsed.link,
         rate=parsed.rate,
         loss=parsed.loss,
         seed=parsed.seed,
@@ -189,6 +196,6 @@ def _follow(chain: Chain, watcher: Watcher, files: int, console: Console) -> Non
                     return
             elif quiet_since is None:
                 quiet_since = now
-            elif now - quiet_since > QUIET_S + airtime_s / chain.settings.time_scale:
+            elif now - quiet_since > QUIET_S + watcher.settled_s:
                 return
             time.sleep(0.1)

@@ -16,7 +16,7 @@ from sonarpost.cli.demo.sheet import SheetRow, write_sheet
 from sonarpost.cli.demo.watch import Watcher
 from sonarpost.codec.interface import Decoded
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.messages import EncodedImage
+from sonarpost.messages import EncodedImage, ReconstructedImage
 
 _COLUMNS: tuple[tuple[str, Literal["left", "right"]], ...] = (
     ("image", "left"),
@@ -45,20 +45,21 @@ def _as_sent(image: EncodedImage, settings: ChainSettings) -> Decoded:
 
 def _rows(watcher: Watcher, settings: ChainSettings) -> list[SheetRow]:
     rows = []
-    for image in watcher.encoded.values():
+    for image_id, image in watcher.encoded.items():
+        size = f"{image.height_px} x {image.width_px} px in {len(image.stream)} B"
         snippet = watcher.snippets.get(image.contact.contact_id)
-        vessel, shore = watcher.vessel.get(image.image_id), watcher.shore.get(image.image_id)
+        vessel, shore = watcher.vessel.get(image_id), watcher.shore.get(image_id)
         got = [
             (None, None)
-            if received is None or not received.frames_received
+            if received is None or not received.codec
             else (received.picture.to_array(), received.missing())
             for received in (vessel, shore)
         ]
         rows.append(
             SheetRow(
-                title=f"{image.image_id}  {image.contact.contact_id}",
-                detail=f"{_position(watcher, image)}   confidence {_confidence(image)}   "
-                f"{image.height_px} x {image.width_px} px in {len(image.stream)} B   {_completeness(watcher, image)}",
+                title=f"{image_id}  {image.contact.contact_id}",
+                detail=f"{_position(watcher, image_id, image)}   confidence {_confidence(image)}   "
+                f"{size}   {_completeness(watcher.shore.get(image_id))}",
                 pictures=(
                     snippet.picture.to_array() if snippet else None,
                     _as_sent(image, settings).image,
@@ -75,23 +76,24 @@ def _confidence(image: EncodedImage) -> str:
     return "-" if image.contact.atd_confidence is None else f"{image.contact.atd_confidence:.2f}"
 
 
-def _position(watcher: Watcher, image: EncodedImage) -> str:
+def _position(watcher: Watcher, image_id: str, image: EncodedImage) -> str:
     """Return the position as the shore knows it."""
     if image.contact.lat_deg is None:
         return "no fix"
-    received = watcher.shore.get(image.image_id)
+    received = watcher.shore.get(image_id)
     contact = received.contact if received else None
     if contact is None or contact.lat_deg is None or contact.lon_deg is None:
         return "position not received"
     return f"{contact.lat_deg:.6f} {contact.lon_deg:.6f}"
 
 
-def _completeness(watcher: Watcher, image: EncodedImage) -> str:
-    received = watcher.shore.get(image.image_id)
+def _completeness(received: ReconstructedImage | None) -> str:
     if received is None:
         return "not received"
     if received.complete:
         return "complete"
+    if received.codec and not received.missing_fraction:
+        return f"coarse: {received.bytes_received} B so far"
     halves = f" ({' and '.join(received.missing_halves)} half)" if received.missing_halves else ""
     return f"{100 * received.missing_fraction:.0f} % missing{halves}"
 
@@ -107,20 +109,28 @@ def _print_table(watcher: Watcher, settings: ChainSettings, console: Console) ->
     table = Table(title=f"pictures sent at rate {settings.rate}")
     for heading, justify in _COLUMNS:
         table.add_column(heading, justify=justify, no_wrap=True)
-    for image in watcher.encoded.values():
+    for image_id, image in watcher.encoded.items():
         contact = image.contact
-        vessel, shore = watcher.vessel.get(image.image_id), watcher.shore.get(image.image_id)
+        vessel, shore = watcher.vessel.get(image_id), watcher.shore.get(image_id)
         same = vessel is not None and shore is not None and vessel.picture_sha256 == shore.picture_sha256
         table.add_row(
-            image.image_id,
+            image_id,
             "-" if contact.ping_number is None else f"{contact.ping_number} {(contact.channel or '-')[:4]}",
             _confidence(image),
-            _position(watcher, image),
+            _position(watcher, image_id, image),
             str(len(image.stream)),
-            "-" if vessel is None else "complete" if vessel.complete else f"{100 * vessel.missing_fraction:.0f} % lost",
+            "-" if vessel is None else _on_the_vessel(vessel),
             "same" if same else "-" if shore is None else "other",
         )
     console.print(table)
+
+
+def _on_the_vessel(received: ReconstructedImage) -> str:
+    if received.complete:
+        return "complete"
+    if received.codec and not received.missing_fraction:
+        return f"{received.bytes_received} B"
+    return f"{100 * received.missing_fraction:.0f} % lost"
 
 
 def _print_summary(result: Result, sheet: Path, console: Console) -> None:

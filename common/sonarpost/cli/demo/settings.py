@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import socket
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from sonarpost.link.v1_frame import HEADER_BYTES
 from sonarpost.modem.rates import RATES
 
 UUV, VESSEL, SHORE, WATER = "uuv-1", "vessel-1", "shore-1", "water"
@@ -22,6 +24,7 @@ PLATFORM_OF = {
     "c2": SHORE,
 }
 HEALTH_INTERVAL_S = 0.25
+_PAPER_BYTES, _PAPER_HEADER_BYTES, _RECORD_BYTES, _MOST_STREAM_BYTES = 196, 13, 40, 2048
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,7 @@ class ChainSettings:
     Attributes:
         folder: Everything the chain writes lies here.
         mode: As of atd_stub.
+        link: Wire format through the water: "v1" with the codec emb, or the paper's with its tile codec.
         rate: Micro-Modem rate.
         loss: Probability that a frame is lost.
         seed: Of the water.
@@ -45,6 +49,7 @@ class ChainSettings:
 
     folder: Path
     mode: Literal["survey", "snippets"] = "survey"
+    link: Literal["v1", "paper"] = "paper"
     rate: int = 1
     loss: float = 0.0
     seed: int = 1
@@ -79,6 +84,33 @@ class ChainSettings:
     def pairing_timeout_s(self) -> float:
         """Real seconds after which an image waits no longer: a few packets, and what a loaded host may add."""
         return 4 * RATES[self.rate].airtime_s / self.time_scale + 3.0
+
+    @property
+    def stream_bytes(self) -> int:
+        """Bytes of a picture's stream with v1: what fits the packets that the paper's codec and format take.
+
+        Those are the packets of a picture of 80 x 140 px in 196 bytes, half by half; 40 bytes are the record's.
+        """
+        rate = RATES[self.rate]
+        frames_a_half = math.ceil(_PAPER_BYTES / 2 / (rate.frame_bytes - _PAPER_HEADER_BYTES))
+        packets = 2 * math.ceil(frames_a_half / rate.frames)
+        return min(packets * rate.frames * (rate.frame_bytes - HEADER_BYTES) - _RECORD_BYTES, _MOST_STREAM_BYTES)
+
+    @property
+    def report_s(self) -> float:
+        """Real seconds from one report of the vessel to the next, with v1."""
+        return 30.0 / self.time_scale + 0.5
+
+    @property
+    def reply_timeout_s(self) -> float:
+        """Real seconds that drivers wait for their modem, with v1: one that is receiving answers when it is done."""
+        return 5.0 / self.time_scale + 1.0
+
+    @property
+    def settled_s(self) -> float:
+        """Real seconds without any change after which pictures that lack something will not get it any more."""
+        airtime_s = RATES[self.rate].airtime_s / self.time_scale
+        return 3 * self.report_s + 4 * airtime_s if self.link == "v1" else airtime_s
 
     @property
     def ports_folder(self) -> Path:
@@ -132,10 +164,12 @@ def _service_table(settings: ChainSettings, service: str) -> str:
     tables = {
         "atd_stub": f'[atd_stub]\nmode = "{settings.mode}"\ninput_dir = "{settings.incoming}"\n'
         "poll_s = 0.2\nsettle_s = 0.5\n",
-        "compressor": f'[compressor]\ncatalogue = "{settings.catalogue}"\n',
+        "compressor": f'[compressor]\ncatalogue = "{settings.catalogue}"\n' + _codec(settings),
         "uuv_modem": modem.format(name="uuv_modem", port=settings.modem_port(UUV_ADDRESS), address=UUV_ADDRESS)
-        + f"destination = {VESSEL_ADDRESS}\nrate = {settings.rate}\n",
-        "op_modem": modem.format(name="op_modem", port=settings.modem_port(VESSEL_ADDRESS), address=VESSEL_ADDRESS),
+        + f"destination = {VESSEL_ADDRESS}\nrate = {settings.rate}\n"
+        + _vehicle_link(settings),
+        "op_modem": modem.format(name="op_modem", port=settings.modem_port(VESSEL_ADDRESS), address=VESSEL_ADDRESS)
+        + _vessel_link(settings),
         "decompressor": f'[decompressor]\nout_dir = "{settings.vessel_pictures}"\n'
         f"pairing_timeout_s = {settings.pairing_timeout_s:.3f}\ncatalogues = [{catalogues}]\n"
         f'vehicles = {{ {UUV_ADDRESS} = "{UUV}" }}\n',
@@ -147,3 +181,31 @@ def _service_table(settings: ChainSettings, service: str) -> str:
     }
     extra = "".join(f"{line}\n" for name, line in settings.extra if name == service)
     return tables[service] + extra
+
+
+def _codec(settings: ChainSettings) -> str:
+    return f'codec = "emb"\nbudget_bytes = {settings.stream_bytes}\n' if settings.link == "v1" else ""
+
+
+def _vehicle_link(settings: ChainSettings) -> str:
+    if settings.link == "paper":
+        return 'link = "paper"\n'
+    # Services keep real time: what takes seconds in the water takes so much less here, and the host its own time.
+    scale = settings.time_scale
+    return (
+        f'link = "v1"\nexpected_loss = {min(settings.loss, 0.9)}\nstream_bytes = {settings.stream_bytes}\n'
+        f"listen_every_s = {60 / scale:.3f}\nlisten_s = {10 / scale + 0.5:.3f}\nqueue_interval_s = 0.2\n"
+        f"gather_s = {20 / scale:.3f}\nretry_s = 0.2\nreply_timeout_s = {settings.reply_timeout_s:.3f}\n"
+    )
+
+
+def _vessel_link(settings: ChainSettings) -> str:
+    vehicles = f'vehicles = {{ {UUV_ADDRESS} = "{UUV}" }}\n'
+    if settings.link == "paper":
+        return 'link = "paper"\n' + vehicles
+    scale = settings.time_scale
+    return (
+        f'link = "v1"\n{vehicles}quiet_s = {2 / scale + 0.1:.3f}\npatience_s = {120 / scale + 1:.3f}\n'
+        f"retry_s = {60 / scale + 0.5:.3f}\nreport_s = {settings.report_s:.3f}\n"
+        f"reply_timeout_s = {settings.reply_timeout_s:.3f}\n"
+    )

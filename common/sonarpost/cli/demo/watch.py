@@ -14,9 +14,12 @@ from sonarpost import keys, wire
 from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
 from sonarpost.errors import FrameError, PayloadError, PortError
 from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.downlink import image_of_number, number_of_image
 from sonarpost.link.paper_format import parse_frame
 from sonarpost.link.paper_sender import plan_packets
-from sonarpost.messages import AcousticFrame, EncodedImage, Health, ReconstructedImage, Record, Snippet
+from sonarpost.link.v1_events import ContactUpdate
+from sonarpost.link.v1_receiver import Receiver
+from sonarpost.messages import AcousticFrame, EncodedImage, Health, QueueState, ReconstructedImage, Record, Snippet
 from sonarpost.modem.rates import RATES
 from sonarpost.runtime.session import open_with_retry
 
@@ -42,7 +45,7 @@ class Watcher:
 
     Attributes:
         snippets: By contact identifier.
-        encoded: By image identifier.
+        encoded: By the identifier that an image has on the vessel.
         vessel: Latest version of every picture on the vessel, by image identifier.
         shore: The same, as shown to shore subscribers.
         accepted: Images of which op_modem has accepted a frame.
@@ -57,6 +60,8 @@ class Watcher:
         self.shore: dict[str, ReconstructedImage] = {}
         self.accepted: set[str] = set()
         self.health: dict[str, Health] = {}
+        self.queue: QueueState | None = None
+        self._v1 = Receiver()
         self.packets_sent = 0
         self.changes = 0
         self._packets: set[tuple[float, int]] = set()
@@ -68,6 +73,7 @@ class Watcher:
         self._subscribe(uuv, keys.contact_detected(UUV), Snippet, self._on_snippet)
         self._subscribe(uuv, keys.image_encoded(UUV), EncodedImage, self._on_encoded)
         self._subscribe(uuv, keys.acoustic_tx(UUV), AcousticFrame, self._on_sent)
+        self._subscribe(uuv, keys.acoustic_queue(UUV), QueueState, self._on_queue)
         self._subscribe(vessel, keys.acoustic_rx(VESSEL), AcousticFrame, self._on_heard)
         self._subscribe(vessel, keys.image_reconstructed(VESSEL), ReconstructedImage, self._on_vessel)
         self._subscribe(shore, keys.shore_image(VESSEL), ReconstructedImage, self._on_shore)
@@ -109,8 +115,14 @@ class Watcher:
         self.snippets[snippet.contact.contact_id] = snippet
 
     def _on_encoded(self, image: EncodedImage) -> None:
-        self.changes += image.image_id not in self.encoded
-        self.encoded[image.image_id] = image
+        image_id = image.image_id
+        if self.settings.link == "v1":
+            image_id = image_of_number(number_of_image(image_id))
+        self.changes += image_id not in self.encoded
+        self.encoded[image_id] = image
+
+    def _on_queue(self, state: QueueState) -> None:
+        self.queue = state
 
     def _on_sent(self, frame: AcousticFrame) -> None:
         packet = (frame.time_utc_s, frame.packet)
@@ -120,6 +132,11 @@ class Watcher:
             self.changes += 1
 
     def _on_heard(self, frame: AcousticFrame) -> None:
+        if self.settings.link == "v1":
+            for event in self._v1.accept(frame.source, frame.data, frame.time_utc_s):
+                if isinstance(event, ContactUpdate):
+                    self.accepted.add(image_of_number(event.number))
+            return
         try:
             self.accepted.add(parse_frame(frame.data).image_id)
         except FrameError as error:
@@ -142,10 +159,13 @@ class Watcher:
 
     @property
     def packets_planned(self) -> int:
-        """Packets that the images encoded so far take, each with its contact record."""
+        """Packets that the images encoded so far take: with the paper's format by its rule, with v1 by the queue."""
         rate = RATES[self.settings.rate]
         with self._lock:
-            images = tuple(self.encoded.values())
+            images, queue = tuple(self.encoded.values()), self.queue
+        if self.settings.link == "v1":
+            left_bytes = sum(image.bytes_left for image in queue.images) if queue is not None else 0
+            return self.packets_sent + -(-left_bytes // rate.packet_bytes)
         contact = ContactSummary()
         return sum(len(plan_packets(i.image_id, i.stream, contact, rate.frames, rate.frame_bytes)) for i in images)
 
@@ -158,7 +178,7 @@ class Watcher:
         """
         with self._lock:
             health = dict(self.health)
-            contacts, encoded = len(self.snippets), len(self.encoded)
+            contacts, encoded, queue = len(self.snippets), len(self.encoded), self.queue
         for service, gauges in IDLE_GAUGES.items():
             report = health.get(service)
             if report is None or report.time_utc_s < since_utc_s:
@@ -172,7 +192,23 @@ class Watcher:
             return f"atd_stub: {dealt_with} of {files_expected} files"
         if encoded < contacts:
             return f"compressor: {encoded} of {contacts} contacts"
+        return self._queue_busy(queue, since_utc_s) if self.settings.link == "v1" else ""
+
+    @staticmethod
+    def _queue_busy(queue: QueueState | None, since_utc_s: float) -> str:
+        if queue is None or queue.time_utc_s < since_utc_s:
+            return "waiting for the vehicle's queue"
+        if queue.images_waiting or queue.messages_waiting:
+            return f"uuv_modem: {queue.images_waiting} pictures, {queue.messages_waiting} messages"
         return ""
+
+    @property
+    def settled_s(self) -> float:
+        """Real seconds without any change after which nothing more is to be expected."""
+        with self._lock:
+            whole = all(i in self.shore and self.shore[i].complete for i in self.encoded)
+        airtime_s = RATES[self.settings.rate].airtime_s / self.settings.time_scale
+        return airtime_s if whole else self.settings.settled_s
 
     def wait_until_started(self, check: Callable[[], None]) -> None:
         """Wait for the first health of every service.

@@ -1,0 +1,81 @@
+"""`sonarpost metrics`: the health of every platform on a router, for Prometheus to scrape."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import signal
+import threading
+from types import FrameType
+
+from prometheus_client import start_http_server
+
+from sonarpost.cli.fleet_options import add_router_options, router_of
+from sonarpost.errors import PortError
+from sonarpost.runtime import logs
+from sonarpost.runtime.fleet import Fleet, FleetWatcher
+from sonarpost.runtime.metrics import FleetCollector, registry_of
+
+log = logging.getLogger(__name__)
+
+DEFAULT_PORT = 9464
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser(
+        "metrics",
+        help="serve the fleet's health to Prometheus",
+        description="Serve http://ADDRESS:PORT/metrics with the health of every service of every platform on a router.",
+    )
+    add_router_options(parser)
+    parser.add_argument("--address", default="127.0.0.1", help="address to listen on (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="port to listen on (default: %(default)s)")
+    parser.add_argument(
+        "--stale-after", type=float, default=30.0, metavar="S", help="age at which values end (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--forget-after",
+        type=float,
+        default=3600.0,
+        metavar="S",
+        help="age at which a service that is gone is forgotten, its sonarpost_up too (default: %(default)s)",
+    )
+    parser.add_argument("--log-format", choices=("text", "json"), default="text")
+    parser.set_defaults(run=run)
+
+
+def run(parsed: argparse.Namespace) -> int:
+    """Serve until SIGTERM or SIGINT.
+
+    Raises:
+        ConfigError: The router's options are wrong.
+        PortError: The address cannot be listened on.
+    """
+    endpoints, tls = router_of(parsed)
+    logs.set_up("metrics", log_format=parsed.log_format)
+    stop = threading.Event()
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, on_signal)
+    watcher = FleetWatcher(endpoints, tls, Fleet(parsed.forget_after))
+    registry = registry_of(FleetCollector(watcher.state, parsed.stale_after))
+    try:
+        server, thread = start_http_server(parsed.port, parsed.address, registry)
+    except (OSError, OverflowError) as error:
+        raise PortError(f"{parsed.address}:{parsed.port}: {error}") from error
+    try:
+        with watcher:
+            log.info(
+                "Serving metrics",
+                extra=logs.kv(address=parsed.address, port=server.server_port, router=", ".join(endpoints)),
+            )
+            stop.wait()
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join(timeout=5.0)
+    return 0

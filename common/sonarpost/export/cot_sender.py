@@ -1,0 +1,261 @@
+"""Sends Cursor-on-Target events to a TAK endpoint: TCP or TLS (a stream of events) or UDP (one event a datagram).
+
+CoT has no acknowledgement. What can be known is done: a connection that its other end has closed is noticed before the
+next batch, a batch that was cut off is sent again from its first event (an event sent twice changes nothing, as the
+identifier is the same), and closing waits until the other end has read everything.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import select
+import socket
+import ssl
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Protocol
+from urllib.parse import urlsplit
+
+from sonarpost.errors import ConfigError, PortError
+
+MAX_DATAGRAM_BYTES: Final = 65_000
+RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
+_LINGER_S: Final = 2.0
+_EXPECTED: Final = "tcp://host:port, tls://host:port or udp://host:port"
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where events go; `scheme` is tcp, tls or udp."""
+
+    scheme: str
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.scheme}://{host}:{self.port}"
+
+
+def parse_endpoint(text: str) -> Endpoint:
+    """Return the endpoint of `tcp://host:port`, `tls://…` (or `ssl://…`) or `udp://…`; a multicast address is one too.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    try:
+        parts = urlsplit(text)
+        host, port = parts.hostname, parts.port
+    except ValueError as error:
+        raise ConfigError("CoT endpoint", "", text, _EXPECTED) from error
+    scheme = "tls" if parts.scheme == "ssl" else parts.scheme
+    extra = parts.path or parts.query or parts.fragment or parts.username
+    if scheme not in ("tcp", "tls", "udp") or not host or not port or extra:
+        raise ConfigError("CoT endpoint", "", text, _EXPECTED)
+    return Endpoint(scheme, host, port)
+
+
+@dataclass(frozen=True, slots=True)
+class TlsFiles:
+    """PEM files for `tls://`.
+
+    Attributes:
+        ca: Certificates that the server's must come from; None trusts those of the system.
+        certificate: Our own certificate, where the server asks for one.
+        key: Its private key, without a passphrase.
+    """
+
+    ca: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+
+    def context(self) -> ssl.SSLContext:
+        """Return a context that checks the server's certificate and name.
+
+        Raises:
+            ConfigError: A file is absent or of another kind.
+        """
+        try:
+            context = ssl.create_default_context(cafile=self.ca)
+            if self.certificate is not None:
+                # Without a callback an encrypted key would ask on the terminal.
+                context.load_cert_chain(self.certificate, self.key, password=lambda: b"")
+        except OSError as error:  # ssl.SSLError is one
+            files = ", ".join(str(p) for p in (self.ca, self.certificate, self.key) if p is not None)
+            raise ConfigError("CoT endpoint", "TLS", files, f"readable PEM files ({error})") from error
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        return context
+
+
+class Wait(Protocol):
+    """Waits for so many seconds; True when there is no sense in waiting longer (`threading.Event.wait` is one)."""
+
+    def __call__(self, timeout: float, /) -> bool:
+        """Wait."""
+
+
+def _sleep(timeout: float, /) -> bool:
+    time.sleep(timeout)
+    return False
+
+
+class CotSender:
+    """Sends batches of events, connecting as needed.
+
+    Args:
+        endpoint: As `parse_endpoint` takes it.
+        tls: Files for `tls://`.
+        timeout_s: For connecting and for each write.
+        multicast_ttl: Hops of a multicast datagram; 1 stays on the network.
+        clock: Seconds, monotonic.
+        wait: Called between attempts; True from it ends the trying.
+
+    Raises:
+        ConfigError: The endpoint or a file of `tls` is wrong.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        tls: TlsFiles | None = None,
+        *,
+        timeout_s: float = 5.0,
+        multicast_ttl: int = 1,
+        clock: Callable[[], float] = time.monotonic,
+        wait: Wait = _sleep,
+    ) -> None:
+        self.endpoint = parse_endpoint(endpoint)
+        self._tls = (tls or TlsFiles()).context() if self.endpoint.scheme == "tls" else None
+        self._timeout_s = timeout_s
+        self._multicast_ttl = multicast_ttl
+        self._clock = clock
+        self._wait = wait
+        self._socket: socket.socket | None = None
+        self.connections = 0
+
+    def __enter__(self) -> CotSender:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def send(self, events: Sequence[bytes], give_up_after_s: float = 60.0) -> None:
+        """Send a batch, connecting again and starting it anew as often as needed.
+
+        Args:
+            events: As `cot_event` makes them.
+            give_up_after_s: No new attempt is begun after this long.
+
+        Raises:
+            PortError: It could not be sent in time; names the endpoint and the last reason.
+        """
+        started_s = self._clock()
+        attempt = 0
+        while True:
+            try:
+                self._send_once(events)
+            except OSError as error:
+                self._drop()
+                pause_s = RETRY_S[min(attempt, len(RETRY_S) - 1)]
+                attempt += 1
+                if self._clock() + pause_s - started_s > give_up_after_s or self._wait(pause_s):
+                    raise PortError(f"{self.endpoint}: {len(events)} events not sent: {_reason(error)}") from error
+            else:
+                return
+
+    def close(self) -> None:
+        """End the connection when the other end has read what was sent, or after 2 s."""
+        if self._socket is None:
+            return
+        if self.endpoint.scheme != "udp":
+            # What fails here fails because the other end has gone already.
+            with contextlib.suppress(OSError):
+                self._finish(self._socket)
+        self._drop()
+
+    def _send_once(self, events: Sequence[bytes]) -> None:
+        if self._socket is not None and self.endpoint.scheme != "udp":
+            self._discard_input(self._socket)
+        if self._socket is None:
+            self._socket = self._connect()
+            self.connections += 1
+        if self.endpoint.scheme != "udp":
+            self._socket.sendall(b"".join(event + b"\n" for event in events))
+            return
+        for event in events:
+            if len(event) > MAX_DATAGRAM_BYTES:
+                raise PortError(f"{self.endpoint}: got an event of {len(event)} bytes, expected {MAX_DATAGRAM_BYTES}")
+            self._socket.send(event)
+
+    def _connect(self) -> socket.socket:
+        host, port = self.endpoint.host, self.endpoint.port
+        if self.endpoint.scheme == "udp":
+            return self._datagrams(host, port)
+        plain = socket.create_connection((host, port), self._timeout_s)
+        if self._tls is None:
+            return plain
+        try:
+            return self._tls.wrap_socket(plain, server_hostname=host)
+        except BaseException:
+            plain.close()
+            raise
+
+    def _datagrams(self, host: str, port: int) -> socket.socket:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        datagrams = socket.socket(family, socket.SOCK_DGRAM)
+        if ipaddress.ip_address(str(address[0]).partition("%")[0]).is_multicast:
+            level, option = (
+                (socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS)
+                if family == socket.AF_INET6
+                else (socket.IPPROTO_IP, socket.IP_MULTICAST_TTL)
+            )
+            datagrams.setsockopt(level, option, self._multicast_ttl)
+        try:
+            datagrams.connect(address)
+        except OSError:
+            datagrams.close()
+            raise
+        return datagrams
+
+    def _discard_input(self, connection: socket.socket) -> None:
+        """Read away what the server sends (everybody's events), and notice that it has closed.
+
+        Raises:
+            OSError: The connection is over.
+        """
+        connection.settimeout(0.0)
+        try:
+            while connection.recv(65536):
+                pass
+        except (BlockingIOError, ssl.SSLWantReadError):
+            connection.settimeout(self._timeout_s)
+        else:
+            raise ConnectionResetError("closed by the other end")
+
+    def _finish(self, connection: socket.socket) -> None:
+        """Say that nothing more comes, and read until the other end has said so too.
+
+        Closing with something unread would reset the connection and take from the other end what it has not read yet.
+        """
+        if isinstance(connection, ssl.SSLSocket):
+            connection.settimeout(0.0)
+            with contextlib.suppress(ssl.SSLError):
+                # Tells the end of the TLS stream; its answer is read below, like everything else.
+                connection.unwrap()
+        connection.shutdown(socket.SHUT_WR)
+        deadline_s = time.monotonic() + _LINGER_S
+        while (left_s := deadline_s - time.monotonic()) > 0 and select.select([connection], [], [], left_s)[0]:
+            if not connection.recv(65536):
+                return
+
+    def _drop(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or str(error) or type(error).__name__

@@ -1,0 +1,57 @@
+"""Which contact a record is about, for the log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from sonarpost import wire
+from sonarpost.errors import FrameError, PayloadError
+from sonarpost.link.paper_format import parse_frame
+from sonarpost.messages import AcousticFrame, Relayed
+
+
+def concern_of_payload(payload: bytes, where: str) -> dict[str, str]:
+    """Return `vehicle`, `image_id` and `contact_id` of a record, as far as it says them.
+
+    An envelope is looked into, and an acoustic frame tells its image where its wire format does. What cannot be read
+    concerns nobody: saying so is for whoever handles the record.
+
+    Args:
+        payload: A record as msgpack, or anything at all.
+        where: Key it came on.
+    """
+    try:
+        fields = wire.unpack_map(payload, where)
+    except PayloadError:
+        return {}
+    inside = fields.get("payload")
+    if fields.get("type") == Relayed.TYPE and isinstance(inside, bytes):
+        # One envelope deep: an envelope in an envelope is refused anyway.
+        return {} if _is_envelope(inside, where) else concern_of_payload(inside, where)
+    data = fields.get("data")
+    if fields.get("type") == AcousticFrame.TYPE and isinstance(data, bytes):
+        image_id = image_of_frame(data)
+        return {} if image_id is None else {"image_id": image_id}
+    contact = fields.get("contact")
+    about: Mapping[str, object] = contact if isinstance(contact, dict) else {}
+    found = {
+        "vehicle": fields.get("vehicle_id") or about.get("vehicle_id"),
+        "image_id": fields.get("image_id"),
+        "contact_id": about.get("contact_id"),
+    }
+    return {name: value for name, value in found.items() if isinstance(value, str)}
+
+
+def _is_envelope(payload: bytes, where: str) -> bool:
+    try:
+        return wire.unpack_map(payload, where).get("type") == Relayed.TYPE
+    except PayloadError:
+        return False
+
+
+def image_of_frame(data: bytes) -> str | None:
+    """Return the image a frame belongs to; None where its wire format does not say it in every frame."""
+    try:
+        return parse_frame(data).image_id
+    except FrameError:
+        return None

@@ -1,0 +1,192 @@
+"""Which piece of which record goes next to one consumer: pure, with the time as an argument.
+
+The most urgent record's pieces go first, then the oldest's. Urgent records (commands, decisions, advice) wait neither
+for the bandwidth limit nor behind a full window, only for the piece that is on its way. Pieces are as small as the
+limit makes necessary, so that this is short.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from sonarpost.runtime.handoff import CHUNK_BYTES
+from sonarpost.runtime.pacing import TokenBucket
+from sonarpost.runtime.transaction import OutboxItem
+
+WINDOW = 128
+"""Most queries in flight: twice what a consumer commits with one write, so that it never waits for the next."""
+WINDOW_BYTES = 8 * CHUNK_BYTES
+"""Most bytes in flight at first: on a link of 125 kB/s these take two seconds of a query's five."""
+MAX_WINDOW_BYTES = 64 * CHUNK_BYTES
+"""Most bytes in flight on a fast link, so that the consumer has the next records while it writes the last."""
+GROW_BELOW_S, SHRINK_ABOVE_S = 0.25, 1.0
+"""Answers that come sooner let the bytes in flight grow, later ones halve them."""
+PROBE_WINDOW = 8
+"""Most records looked at while nobody has answered yet."""
+KEPT_FOR_URGENT = 4
+URGENT_PRIORITY = 2
+PIECE_S = 0.5
+"""With a bandwidth limit, a piece takes this long."""
+MIN_PIECE_BYTES = 256
+OVERHEAD_BYTES = 320
+"""A query's attachment, key, headers of Zenoh, TCP and IP, and its reply, charged with every piece."""
+
+
+@dataclass(slots=True, eq=False)
+class Transfer:
+    """One record on its way: how much was asked, how much the consumer has, how often it was begun anew."""
+
+    item: OutboxItem
+    asked: int = 0
+    has: int = 0
+    begun: bool = False
+    attempt: int = 0
+
+    @property
+    def order(self) -> tuple[int, int, int]:
+        """What is lower goes first."""
+        return (self.item.priority, self.item.place, self.item.seq)
+
+    @property
+    def urgent(self) -> bool:
+        """Whether it waits for nothing but the piece that is on its way."""
+        return self.item.priority <= URGENT_PRIORITY
+
+    @property
+    def wants_sending(self) -> bool:
+        """Whether a piece of it is to be asked."""
+        return self.asked < len(self.item.payload) or self.asked == 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """Bytes `start` to `end` of a record, to be asked with one query."""
+
+    transfer: Transfer
+    start: int
+    end: int
+    attempt: int
+
+    @property
+    def size(self) -> int:
+        """Bytes of the record in it."""
+        return self.end - self.start
+
+
+def piece_bytes_for(bytes_per_s: float | None) -> int:
+    """Return how long pieces are at most: half a second of the limit, 256 B to 32 kB."""
+    if bytes_per_s is None:
+        return CHUNK_BYTES
+    return int(min(max(bytes_per_s * PIECE_S, MIN_PIECE_BYTES), CHUNK_BYTES))
+
+
+class Schedule:
+    """The transfers to one consumer.
+
+    Args:
+        bytes_per_s: Bandwidth limit, None for none.
+        now_s: Any clock that does not go back, the one later calls use.
+    """
+
+    def __init__(self, bytes_per_s: float | None, now_s: float) -> None:
+        self.piece_bytes = piece_bytes_for(bytes_per_s)
+        self.active: dict[int, Transfer] = {}
+        self.probing = True
+        self._in_flight = 0
+        self._bytes_in_flight = 0
+        self._bucket: TokenBucket | None = None
+        self._asked_s: dict[Piece, float] = {}
+        self._window_bytes = WINDOW_BYTES
+        if bytes_per_s is not None:
+            self._bucket = TokenBucket(bytes_per_s, self.piece_bytes + OVERHEAD_BYTES, now_s)
+            # What lies in the queues of a thin link must be through before a query's time is up.
+            self._window_bytes = int(min(WINDOW_BYTES, max(2 * bytes_per_s, 2 * self.piece_bytes)))
+        self._first_window_bytes = self._window_bytes
+
+    @property
+    def looks_at(self) -> int:
+        """Of how many records the schedule wants to know."""
+        return PROBE_WINDOW if self.probing else WINDOW
+
+    def put(self, items: Iterable[OutboxItem]) -> None:
+        """Take what is owed most urgently; what has not begun and is not among them makes room."""
+        wanted = {item.seq: item for item in items}
+        for seq in [seq for seq, t in self.active.items() if not t.begun and seq not in wanted]:
+            del self.active[seq]
+        for seq, item in wanted.items():
+            if seq not in self.active:
+                self.active[seq] = Transfer(item)
+
+    def next_piece(self, now_s: float) -> tuple[Piece | None, float | None]:
+        """Return the piece to ask now, or None and for how many seconds to wait (None: until something happens)."""
+        waiting = [transfer for transfer in self.active.values() if transfer.wants_sending]
+        if not waiting:
+            return None, None
+        transfer = min(waiting, key=lambda t: t.order)
+        start = transfer.asked
+        end = min(start + self.piece_bytes, len(transfer.item.payload))
+        piece = Piece(transfer, start, end, transfer.attempt)
+        if not self._has_room(piece):
+            return None, None
+        if self._bucket is not None and not transfer.urgent:
+            wait_s = self._bucket.wait_s(piece.size + OVERHEAD_BYTES, now_s)
+            if wait_s > 0:
+                return None, wait_s
+        return piece, 0.0
+
+    def _has_room(self, piece: Piece) -> bool:
+        if self.probing:
+            # One query at a time until the consumer has answered: of a whole window, one that comes up in the middle
+            # of it would take the last and not the first.
+            return self._in_flight == 0
+        if piece.transfer.urgent:
+            return self._in_flight < WINDOW
+        fits = self._in_flight == 0 or self._bytes_in_flight + piece.size <= self._window_bytes
+        return fits and self._in_flight < WINDOW - KEPT_FOR_URGENT
+
+    def asked(self, piece: Piece, now_s: float) -> None:
+        """Note that a piece was sent."""
+        piece.transfer.begun = True
+        piece.transfer.asked = max(piece.end, 1)
+        self._in_flight += 1
+        self._bytes_in_flight += piece.size
+        self._asked_s[piece] = now_s
+        if self._bucket is not None:
+            self._bucket.take(piece.size + OVERHEAD_BYTES, now_s)
+
+    def answered(self, piece: Piece, now_s: float) -> None:
+        """Note that a piece's query has ended, however it ended."""
+        self._in_flight -= 1
+        self._bytes_in_flight -= piece.size
+        took_s = now_s - self._asked_s.pop(piece)
+        if self._bucket is not None:
+            return
+        if took_s < GROW_BELOW_S:
+            self._window_bytes = min(MAX_WINDOW_BYTES, self._window_bytes + piece.size)
+        elif took_s > SHRINK_ABOVE_S:
+            self._window_bytes = max(self.piece_bytes, self._window_bytes // 2)
+
+    def go_on_from(self, piece: Piece, next_offset: int) -> None:
+        """Note what the consumer has of a record; where it did not take the piece, send on from there."""
+        transfer = piece.transfer
+        transfer.has = next_offset
+        # Pieces that were on their way behind one that was not taken are answered alike: one of the answers is enough.
+        if next_offset != piece.end and piece.attempt == transfer.attempt:
+            transfer.attempt += 1
+            transfer.asked = next_offset
+
+    def settled(self, transfer: Transfer) -> None:
+        """Forget a record that is done with."""
+        self.active.pop(transfer.item.seq, None)
+
+    def start_again(self) -> None:
+        """Nothing is in flight any more: ask again for everything that is not settled, one query at first."""
+        self._in_flight = 0
+        self._bytes_in_flight = 0
+        self._asked_s.clear()
+        self._window_bytes = self._first_window_bytes
+        self.probing = True
+        for transfer in self.active.values():
+            transfer.attempt += 1
+            transfer.asked = transfer.has

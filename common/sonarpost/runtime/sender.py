@@ -1,0 +1,315 @@
+"""One queue of an outbox on its way to its consumer: asks, reads the answers, forgets what is acknowledged."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import zenoh
+
+from sonarpost import keys
+from sonarpost.errors import HandoffError, PayloadError
+from sonarpost.runtime import handoff
+from sonarpost.runtime.concern import concern_of_payload
+from sonarpost.runtime.handoff import Reply
+from sonarpost.runtime.logs import kv
+from sonarpost.runtime.schedule import Piece, Schedule, Transfer
+from sonarpost.runtime.store import Store
+from sonarpost.runtime.transaction import OutboxItem, Transaction, consumer_of
+
+log = logging.getLogger(__name__)
+
+REPLY_TIMEOUT_S = 5.0
+BACK_OFF_S = (0.05, 0.1, 0.2, 0.5, 1.0)
+PRIORITIES = {
+    1: zenoh.Priority.REAL_TIME,
+    2: zenoh.Priority.INTERACTIVE_HIGH,
+    3: zenoh.Priority.INTERACTIVE_LOW,
+    4: zenoh.Priority.DATA_HIGH,
+    5: zenoh.Priority.DATA,
+    6: zenoh.Priority.DATA_LOW,
+    7: zenoh.Priority.BACKGROUND,
+}
+IDLE_S = 1.0
+# Replies come in batches, one write to the consumer's disk apart: looked for soon at first, then less often.
+POLL_S = (0.0005, 0.02)
+FORGET_AT = 64
+FORGET_AFTER_S = 0.2
+
+Settled = Callable[[Transaction, OutboxItem, str | None], None]
+"""Called in the transaction that forgets a record: the record, and the consumer's reason if it was refused."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """How a queue is sent.
+
+    Attributes:
+        session: Returns the session to send over, None while there is none; by default the outbox's own.
+        publish: Also publish each record on its key, once a run, for whoever watches.
+        bytes_per_s: Bandwidth limit, None for none.
+        held: Nothing is sent: the queue's consumer is not configured any more.
+    """
+
+    session: Callable[[], zenoh.Session | None] | None = None
+    publish: bool = True
+    bytes_per_s: float | None = None
+    held: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    piece: Piece
+    replies: zenoh.handlers.Handler[zenoh.Reply]
+
+
+class _NoAnswerError(Exception):
+    """The consumer is not there, or the link is down."""
+
+
+class Sender:
+    """Hands one queue over, with a few queries in flight, most urgent record first.
+
+    Attributes:
+        answering: Whether the consumer answered what it was asked last.
+        rejected: How many records the consumer has refused in this run.
+        delivered: How many it has acknowledged in this run.
+    """
+
+    def __init__(self, session: zenoh.Session, store: Store, queue: str, lane: Lane, settled: Settled | None) -> None:
+        self.answering = False
+        self.rejected = 0
+        self.delivered = 0
+        self._default_session = session
+        self._store = store
+        self._queue = queue
+        self._consumer = consumer_of(queue)
+        self._origin = store.origin_of(queue)
+        self._lane = lane
+        self._on_settled = settled
+        self._schedule = Schedule(lane.bytes_per_s, time.monotonic())
+        self._shown: set[int] = set()
+        self._in_flight: deque[_Asked] = deque()
+        self._acknowledged: dict[int, OutboxItem] = {}
+        self._first_acknowledged_s = 0.0
+        self._settled_upto = 0
+        self._failures = 0
+        self._stop = threading.Event()
+        self._wake = threading.Event()
+        self._wake.set()
+        store.listen_outbox(self._wake)
+        self._thread = threading.Thread(target=self._run, name=f"outbox-{queue}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop; a query that waits for its reply ends when the session closes."""
+        self._stop.set()
+        self._wake.set()
+        self._thread.join(timeout=0.5)
+        self._store.unlisten_outbox(self._wake)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self._step()
+            except (_NoAnswerError, HandoffError, zenoh.ZError) as error:
+                self._back_off(str(error))
+        try:
+            self._forget()
+        except HandoffError as error:
+            log.debug("Acknowledged records are asked again after the next start: %s", error)
+
+    def _step(self) -> None:
+        """Ask what may be asked, act on the replies that are there, and wait where there is nothing else to do."""
+        self._load()
+        wait_s = self._ask_all()
+        if self._act_on_replies():
+            return
+        forget_now = self._acknowledged and (
+            not self._in_flight or time.monotonic() - self._first_acknowledged_s > FORGET_AFTER_S
+        )
+        if forget_now:
+            self._forget()
+            return
+        if self._in_flight:
+            self._wait_for_reply(IDLE_S if wait_s is None else wait_s)
+        else:
+            self._wake.wait(IDLE_S if wait_s is None else wait_s)
+
+    def _load(self) -> None:
+        """Look which records are most urgent, when there are new ones or few are left."""
+        schedule = self._schedule
+        if not self._wake.is_set() and len(schedule.active) > schedule.looks_at // 2:
+            return
+        if len(self._acknowledged) >= FORGET_AT:
+            self._forget()
+        self._wake.clear()
+        numbers = self._store.owed_numbers(self._queue, schedule.looks_at + len(self._acknowledged))
+        wanted = [seq for seq in numbers if seq not in self._acknowledged][: schedule.looks_at]
+        known = {seq: schedule.active[seq].item for seq in wanted if seq in schedule.active}
+        loaded = {item.seq: item for item in self._store.owed_items(self._queue, [s for s in wanted if s not in known])}
+        schedule.put((known | loaded).values())
+        self._settled_upto = self._store.settled_upto(self._queue)
+        session = self._session()
+        if session is not None:
+            for item in loaded.values():
+                self._show(session, item)
+
+    def _session(self) -> zenoh.Session | None:
+        return self._default_session if self._lane.session is None else self._lane.session()
+
+    def _ask_all(self) -> float | None:
+        """Put queries in flight while there is room; return how long the bandwidth limit makes the next one wait."""
+        while not self._stop.is_set():
+            piece, wait_s = self._schedule.next_piece(time.monotonic())
+            if piece is None:
+                return wait_s
+            transfer = piece.transfer
+            if not transfer.begun and not self._store.begin(self._queue, transfer.item.seq):
+                self._schedule.settled(transfer)  # a newer edition has taken its place
+                continue
+            self._ask(piece)
+        return None
+
+    def _ask(self, piece: Piece) -> None:
+        session = self._session()
+        if session is None:
+            raise _NoAnswerError("its router has not been reached yet")
+        item = piece.transfer.item
+        self._show(session, item)
+        replies = session.get(
+            keys.handoff(item.key, self._consumer),
+            timeout=REPLY_TIMEOUT_S,
+            priority=PRIORITIES[item.priority],
+            # Waits for the link instead of dropping: a dropped query would cost its whole time-out.
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            payload=item.payload[piece.start : piece.end],
+            attachment=handoff.attachment(self._origin, item, piece.start, min(self._settled_upto, item.seq - 1)),
+        )
+        self._schedule.asked(piece, time.monotonic())
+        self._in_flight.append(_Asked(piece, replies))
+
+    def _show(self, session: zenoh.Session, item: OutboxItem) -> None:
+        """Publish a copy for watchers; they know it by (origin, seq) when it comes twice."""
+        if not self._lane.publish or item.seq in self._shown:
+            return
+        self._shown.add(item.seq)
+        session.put(
+            item.key,
+            item.payload,
+            encoding=item.encoding,
+            priority=PRIORITIES[item.priority],
+            attachment=handoff.attachment(self._origin, item),
+        )
+
+    def _act_on_replies(self) -> bool:
+        """Act on every reply that is there, oldest query first; tell whether there was one."""
+        some = False
+        while self._in_flight:
+            received = self._received(self._in_flight[0])
+            if received is None:
+                break
+            asked = self._in_flight.popleft()
+            self._schedule.answered(asked.piece, time.monotonic())
+            self._act(asked.piece, received)
+            some = True
+        return some
+
+    def _received(self, asked: _Asked) -> zenoh.Reply | None:
+        try:
+            return asked.replies.try_recv()
+        except zenoh.ZError as error:
+            raise _NoAnswerError("nobody answers") from error
+
+    def _wait_for_reply(self, longest_s: float) -> None:
+        """Wait for the oldest query's reply, for a new record, or for what the bandwidth limit allows next."""
+        ends_s = time.monotonic() + longest_s
+        poll_s = POLL_S[0]
+        while not self._wake.is_set() and not self._stop.is_set():
+            if self._act_on_replies() or time.monotonic() >= ends_s:
+                return
+            self._wake.wait(min(poll_s, max(ends_s - time.monotonic(), 0.0)))
+            poll_s = min(2 * poll_s, POLL_S[1])
+
+    def _act(self, piece: Piece, received: zenoh.Reply) -> None:
+        transfer = piece.transfer
+        if received.ok is None:
+            raise _NoAnswerError("no reply in time")
+        try:
+            reply = Reply.unpack(received.ok.payload.to_bytes(), transfer.item.key)
+        except PayloadError as error:
+            raise _NoAnswerError(str(error)) from error
+        if reply.status == "later":
+            raise _NoAnswerError(f"the consumer cannot store: {reply.reason}")
+        self._failures = 0
+        self.answering = True
+        self._schedule.probing = False
+        if transfer.item.seq not in self._schedule.active:
+            return
+        if reply.status == "stored":
+            self._stored(transfer)
+        elif reply.status == "refused":
+            self._refused(transfer, reply.reason)
+        elif reply.next_offset >= len(transfer.item.payload):
+            raise _NoAnswerError(f"a wrong reply: more from {reply.next_offset} of {len(transfer.item.payload)} bytes")
+        else:
+            self._schedule.go_on_from(piece, reply.next_offset)
+
+    def _stored(self, transfer: Transfer) -> None:
+        if not self._acknowledged:
+            self._first_acknowledged_s = time.monotonic()
+        self._acknowledged[transfer.item.seq] = transfer.item
+        self._schedule.settled(transfer)
+        self.delivered += 1
+
+    def _refused(self, transfer: Transfer, reason: str) -> None:
+        item = transfer.item
+        with self._store.transaction() as tx:
+            tx.rejected(item, reason)
+            if self._on_settled is not None:
+                self._on_settled(tx, item, reason)
+        about = concern_of_payload(item.payload, item.key)
+        log.error(
+            "A record was refused and is kept apart",
+            extra=kv(**about, consumer=self._queue, key=item.key, reason=reason),
+        )
+        self.rejected += 1
+        self._schedule.settled(transfer)
+        self._end(item.seq)
+
+    def _forget(self) -> None:
+        """Forget acknowledged records, many with one write; late or never is harmless, the consumer knows them."""
+        if not self._acknowledged:
+            return
+        with self._store.transaction() as tx:
+            for item in self._acknowledged.values():
+                tx.acknowledged(self._queue, item.seq)
+                if self._on_settled is not None:
+                    self._on_settled(tx, item, None)
+        for seq in self._acknowledged:
+            self._end(seq)
+        self._acknowledged.clear()
+
+    def _end(self, seq: int) -> None:
+        self._shown.discard(seq)
+        self._store.end(self._queue, seq)
+
+    def _back_off(self, reason: str) -> None:
+        """Forget what is in flight and wait a little; everything is asked again."""
+        self.answering = False
+        self._in_flight.clear()
+        self._schedule.start_again()
+        for transfer in self._schedule.active.values():
+            if transfer.begun and transfer.has == 0:
+                # Nobody is known to have anything of it: a newer edition may take its place again.
+                transfer.begun = False
+                self._store.end(self._queue, transfer.item.seq)
+        if self._failures == len(BACK_OFF_S):
+            log.warning("A consumer does not answer, records wait", extra=kv(consumer=self._queue, reason=reason))
+        wait_s = BACK_OFF_S[min(self._failures, len(BACK_OFF_S) - 1)]
+        self._failures += 1
+        self._stop.wait(wait_s)

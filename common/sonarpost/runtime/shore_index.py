@@ -1,0 +1,265 @@
+"""What a shore site has accepted, as a table that answers quickly: `index.db` beside the files that c2 keeps.
+
+The files are what counts and the index follows from them: whatever is missing in it is added from the side-cars when
+c2 starts. c2 writes it; commands read it, and mark what they have exported.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import Literal, TypeVar
+
+from sonarpost.errors import KeptFileError
+from sonarpost.messages import Decision, DeliveryState, TaskingKind
+
+FILE_NAME = "index.db"
+INDEX_VERSION = 1
+BUSY_S = 10.0
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS picture (
+    vessel_id TEXT NOT NULL, name TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
+    version INTEGER NOT NULL, first_frame_utc_s REAL NOT NULL, last_frame_utc_s REAL NOT NULL,
+    relayed_utc_s REAL, accepted_utc_s REAL NOT NULL, complete INTEGER NOT NULL, missing_fraction REAL NOT NULL,
+    height_px INTEGER NOT NULL, width_px INTEGER NOT NULL, codec TEXT NOT NULL, lat_deg REAL, lon_deg REAL,
+    atd_class TEXT, atd_confidence REAL, size_bytes INTEGER NOT NULL, exported_utc_s REAL, removed_utc_s REAL,
+    PRIMARY KEY (vessel_id, name)) WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS picture_age ON picture (accepted_utc_s) WHERE removed_utc_s IS NULL;
+CREATE TABLE IF NOT EXISTS decision (
+    vessel_id TEXT NOT NULL, decision_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
+    image_version INTEGER NOT NULL, verdict TEXT NOT NULL, confidence REAL, mlo_class TEXT, remark TEXT NOT NULL,
+    operator TEXT NOT NULL, decided_utc_s REAL NOT NULL, accepted_utc_s REAL NOT NULL,
+    PRIMARY KEY (vessel_id, decision_id)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS tasking (
+    vessel_id TEXT NOT NULL, kind TEXT NOT NULL, record_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT,
+    summary TEXT NOT NULL, author TEXT NOT NULL, issued_utc_s REAL NOT NULL, state TEXT NOT NULL, reason TEXT NOT NULL,
+    changed_utc_s REAL NOT NULL, PRIMARY KEY (vessel_id, kind, record_id)) WITHOUT ROWID;
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class PictureRow:
+    """One version of one picture.
+
+    Attributes:
+        name: File name without suffix, in the vessel's folder.
+        relayed_utc_s: When the vessel's relay took it, by the vessel's clock; None where only the files are known.
+        accepted_utc_s: When c2 wrote it, by the shore's clock.
+        size_bytes: Of its three files.
+        exported_utc_s: When it was last exported; None for never.
+        removed_utc_s: When retention removed its files; None while they are there.
+    """
+
+    vessel_id: str
+    name: str
+    vehicle_id: str
+    image_id: str
+    version: int
+    first_frame_utc_s: float
+    last_frame_utc_s: float
+    relayed_utc_s: float | None
+    accepted_utc_s: float
+    complete: bool
+    missing_fraction: float
+    height_px: int
+    width_px: int
+    codec: str
+    lat_deg: float | None
+    lon_deg: float | None
+    atd_class: str | None
+    atd_confidence: float | None
+    size_bytes: int
+    exported_utc_s: float | None = None
+    removed_utc_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DecisionRow:
+    """One decision, as its record has it."""
+
+    vessel_id: str
+    decision_id: str
+    vehicle_id: str
+    image_id: str
+    image_version: int
+    verdict: str
+    confidence: float | None
+    mlo_class: str | None
+    remark: str
+    operator: str
+    decided_utc_s: float
+    accepted_utc_s: float
+
+    @classmethod
+    def of(cls, decision: Decision, accepted_utc_s: float) -> DecisionRow:
+        """Make a row of a record."""
+        values = decision.model_dump(exclude={"accepted_utc_s"})
+        return cls(**{f.name: values[f.name] for f in fields(cls) if f.name in values}, accepted_utc_s=accepted_utc_s)
+
+
+@dataclass(frozen=True, slots=True)
+class TaskingRow:
+    """Advice or a command, and how far it has come."""
+
+    vessel_id: str
+    kind: TaskingKind
+    record_id: str
+    vehicle_id: str
+    image_id: str | None
+    summary: str
+    author: str
+    issued_utc_s: float
+    state: DeliveryState
+    reason: str
+    changed_utc_s: float
+
+
+Row = TypeVar("Row", PictureRow, DecisionRow, TaskingRow)
+_TABLES: dict[type, str] = {PictureRow: "picture", DecisionRow: "decision", TaskingRow: "tasking"}
+Mark = Literal["exported_utc_s", "removed_utc_s"]
+
+
+class ShoreIndex:
+    """The index of one `out_dir`; safe to use from several threads and, as SQLite is, from several processes.
+
+    Args:
+        out_dir: c2's folder.
+        writable: False opens what is there for reading only.
+
+    Raises:
+        KeptFileError: There is no index, or the file is none of this version.
+        OSError: It cannot be written.
+    """
+
+    def __init__(self, out_dir: Path, *, writable: bool = True) -> None:
+        self.path = out_dir / FILE_NAME
+        self._lock = threading.RLock()
+        if writable:
+            out_dir.mkdir(parents=True, exist_ok=True)
+        elif not self.path.is_file():
+            raise KeptFileError(str(self.path), "", "no such file", "the index that c2 keeps in its out_dir")
+        mode = "rwc" if writable else "ro"
+        try:
+            self._db = sqlite3.connect(
+                f"{self.path.absolute().as_uri()}?mode={mode}",
+                uri=True,
+                check_same_thread=False,
+                isolation_level=None,
+                timeout=BUSY_S,
+            )
+            self._open(writable=writable)
+        except sqlite3.DatabaseError as error:
+            if isinstance(error, sqlite3.OperationalError) and writable:
+                raise OSError(f"{self.path}: {error}") from error
+            raise KeptFileError(str(self.path), "", str(error), "the index that c2 keeps in its out_dir") from error
+
+    def _open(self, *, writable: bool) -> None:
+        version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
+        if version != INDEX_VERSION and not (writable and version == 0):
+            self._db.close()
+            raise KeptFileError(str(self.path), "user_version", version, str(INDEX_VERSION))
+        if writable:
+            self._db.execute("PRAGMA journal_mode=WAL")
+            # What a power cut takes from the index is in the files, and is added again at the next start.
+            self._db.execute("PRAGMA synchronous=NORMAL")
+            self._db.executescript(f"{_SCHEMA} PRAGMA user_version = {INDEX_VERSION};")
+
+    def close(self) -> None:
+        """Close the file."""
+        with self._lock:
+            self._db.close()
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        with self._lock:
+            try:
+                self._db.execute("BEGIN IMMEDIATE")
+                yield self._db
+                self._db.execute("COMMIT")
+            except BaseException as error:
+                if self._db.in_transaction:
+                    self._db.execute("ROLLBACK")
+                if isinstance(error, sqlite3.Error):
+                    raise OSError(f"{self.path}: {error}") from error
+                raise
+
+    def put(self, rows: Iterable[PictureRow | DecisionRow | TaskingRow]) -> None:
+        """Add rows, or replace those of the same names.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        with self._writing() as db:
+            for row in rows:
+                values = astuple(row)
+                marks = ", ".join("?" * len(values))
+                db.execute(f"INSERT OR REPLACE INTO {_TABLES[type(row)]} VALUES ({marks})", values)  # noqa: S608
+
+    def mark(self, what: Mark, pictures: Iterable[PictureRow], at_utc_s: float) -> None:
+        """Note that pictures were exported or removed.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        with self._writing() as db:
+            for row in pictures:
+                sql = f"UPDATE picture SET {what} = ? WHERE vessel_id = ? AND name = ?"  # noqa: S608 literals
+                db.execute(sql, (at_utc_s, row.vessel_id, row.name))
+
+    def pictures(self, *, removed: bool = False) -> list[PictureRow]:
+        """Return all versions of all pictures, oldest first; those that were removed only where asked for.
+
+        Raises:
+            OSError: The file cannot be read.
+        """
+        where = "" if removed else "WHERE removed_utc_s IS NULL"
+        rows = self._rows(PictureRow, f"{where} ORDER BY first_frame_utc_s, vessel_id, name")
+        return [_with_bool(row) for row in rows]
+
+    def decisions(self) -> list[DecisionRow]:
+        """Return all decisions, oldest first."""
+        return self._rows(DecisionRow, "ORDER BY decided_utc_s, vessel_id, decision_id")
+
+    def tasking(self) -> list[TaskingRow]:
+        """Return all advice and commands, oldest first."""
+        return self._rows(TaskingRow, "ORDER BY issued_utc_s, vessel_id, kind, record_id")
+
+    def has_picture(self, vessel_id: str, name: str) -> bool:
+        """Tell whether a picture's files are known and have not been removed."""
+        sql = "WHERE vessel_id = ? AND name = ? AND removed_utc_s IS NULL"
+        return bool(self._rows(PictureRow, sql, (vessel_id, name)))
+
+    def has_decision(self, vessel_id: str, decision_id: str) -> bool:
+        """Tell whether a decision is known."""
+        return bool(self._rows(DecisionRow, "WHERE vessel_id = ? AND decision_id = ?", (vessel_id, decision_id)))
+
+    def size_bytes(self) -> int:
+        """Return how much the pictures take that are there."""
+        with self._lock:
+            row = self._execute(
+                "SELECT COALESCE(SUM(size_bytes), 0) FROM picture WHERE removed_utc_s IS NULL"
+            ).fetchone()
+        return int(row[0])
+
+    def _rows(self, row_type: type[Row], rest: str, values: tuple[object, ...] = ()) -> list[Row]:
+        names = ", ".join(f.name for f in fields(row_type))
+        with self._lock:
+            found = self._execute(f"SELECT {names} FROM {_TABLES[row_type]} {rest}", values).fetchall()  # noqa: S608
+        return [row_type(*row) for row in found]
+
+    def _execute(self, sql: str, values: tuple[object, ...] = ()) -> sqlite3.Cursor:
+        try:
+            return self._db.execute(sql, values)
+        except sqlite3.Error as error:
+            raise OSError(f"{self.path}: {error}") from error
+
+
+def _with_bool(row: PictureRow) -> PictureRow:
+    """SQLite knows no truth values."""
+    values = {f.name: getattr(row, f.name) for f in fields(row)}
+    return PictureRow(**{**values, "complete": bool(row.complete)})

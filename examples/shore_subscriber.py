@@ -1,0 +1,20 @@
+"""Prints what the shore accepts and saves pictures as PGM: shore_subscriber.py tcp/127.0.0.1:7447 [FOLDER]."""
+
+import json
+import pathlib
+import sys
+
+import msgpack
+import zenoh
+
+folder = pathlib.Path(*sys.argv[2:3])
+config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": sys.argv[1:2]}}))
+with zenoh.open(config) as session, session.declare_subscriber("sonarpost/v1/shore/contact/**") as accepted:
+    for sample in accepted:
+        r = msgpack.unpackb(sample.payload.to_bytes())
+        print(r["type"], r["vehicle_id"], r["image_id"], r.get("verdict"), r.get("contact"), flush=True)
+        if p := r.get("picture"):
+            data = p["data"] if p["bits"] == 8 else bytes(p["data"][n ^ 1] for n in range(len(p["data"])))  # big endian
+            head = f"P5 {p['width_px']} {p['height_px']} {2 ** p['bits'] - 1}\n".encode()
+            name = f"{r['vehicle_id']}_{r['first_frame_utc_s']:.0f}_{r['image_id']}_v{r['version']}.pgm"
+            (folder / name).write_bytes(head + data)

@@ -1,0 +1,174 @@
+"""What c2 keeps: the files of every picture and decision, their index, and what retention takes away again."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Sequence
+
+from services.c2.config import C2Config
+from sonarpost import keys
+from sonarpost.errors import PayloadError
+from sonarpost.files import AtomicFiles
+from sonarpost.messages import Decision, ReconstructedImage
+from sonarpost.runtime.logs import kv
+from sonarpost.runtime.picture_files import add_picture, picture_name
+from sonarpost.runtime.shore_files import (
+    add_missing,
+    decision_file_name,
+    remove_files,
+    remove_unfinished,
+    row_of_image,
+    to_remove,
+)
+from sonarpost.runtime.shore_index import DecisionRow, PictureRow, ShoreIndex, TaskingRow
+
+log = logging.getLogger(__name__)
+
+
+class Archive:
+    """The files and the index of one `out_dir`; the index is opened when it is first needed.
+
+    What is kept is on the disk, and in its place, after `flush`: many records share the waiting for the disk.
+
+    Every method raises OSError where the folder cannot be written at the moment, and may be called again.
+    """
+
+    def __init__(self, config: C2Config) -> None:
+        self._config = config
+        self._out_dir = config.out_dir
+        self._index: ShoreIndex | None = None
+        self._lock = threading.RLock()
+        self._files = AtomicFiles()
+        self._images: list[tuple[ReconstructedImage, float]] = []
+        self._decisions: list[Decision] = []
+
+    def index(self) -> ShoreIndex:
+        """Return the open index, complete with whatever the files have and it had not."""
+        with self._lock:
+            if self._index is None:
+                index = ShoreIndex(self._out_dir)
+                try:
+                    remove_unfinished(self._out_dir)
+                    added = add_missing(self._out_dir, index)
+                except BaseException:
+                    index.close()
+                    raise
+                self._index = index
+                if added:
+                    log.info("Index completed from the files", extra=kv(file=index.path, rows=added))
+            return self._index
+
+    def keep_image(self, image: ReconstructedImage, relayed_utc_s: float) -> bool:
+        """Write a picture's files, to be flushed, and index it; tell whether it was new."""
+        index = self.index()
+        with self._lock:
+            path, new = add_picture(self._files, self._out_dir / image.vessel_id, image)
+            if new or not index.has_picture(image.vessel_id, picture_name(image)):
+                self._images.append((image, relayed_utc_s))
+        log.info(
+            "Picture accepted" if new else "Picture known already",
+            extra=kv(
+                vessel=image.vessel_id,
+                vehicle=image.vehicle_id,
+                image_id=image.image_id,
+                version=image.version,
+                on_the_way_s=round(time.time() - relayed_utc_s, 1),
+                file=path,
+            ),
+        )
+        return new
+
+    def keep_decision(self, decision: Decision) -> bool:
+        """Write a decision's file, to be flushed, and index it; tell whether it was new.
+
+        Raises:
+            PayloadError: Another decision has this identifier.
+        """
+        index = self.index()
+        folder = self._out_dir / decision.vessel_id / "decisions"
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / decision_file_name(decision.decision_id)
+        text = (json.dumps(decision.model_dump(), indent=1) + "\n").encode()
+        with self._lock:
+            kept = self._files.text_of(path) or (path.read_bytes() if path.is_file() else None)
+            if kept is not None and kept != text:
+                raise PayloadError(
+                    keys.contact_decision(decision.vessel_id),
+                    "decision_id",
+                    decision.decision_id,
+                    f"an identifier that no other decision has ({path})",
+                )
+            if kept is None:
+                self._files.add(path, text, last=True)
+            if kept is None or not index.has_decision(decision.vessel_id, decision.decision_id):
+                self._decisions.append(decision)
+        log.info(
+            "Decision accepted",
+            extra=kv(
+                vessel=decision.vessel_id,
+                vehicle=decision.vehicle_id,
+                image_id=decision.image_id,
+                verdict=decision.verdict,
+            ),
+        )
+        return kept is None
+
+    def flush(self) -> None:
+        """Bring to the disk, and into the index, what was kept since the last time.
+
+        Raises:
+            OSError: It cannot be; all of it is to be kept again.
+        """
+        with self._lock:
+            images, self._images = self._images, []
+            decisions, self._decisions = self._decisions, []
+            files, self._files = self._files, AtomicFiles()
+            files.commit()
+            rows: list[PictureRow | DecisionRow] = [row_of_image(self._out_dir, i, at) for i, at in images]
+            rows += [DecisionRow.of(decision, time.time()) for decision in decisions]
+            if rows:
+                self.index().put(rows)
+
+    def keep_tasking(self, rows: Sequence[TaskingRow]) -> None:
+        """Index advice and commands with their states."""
+        self.index().put(rows)
+
+    def apply_retention(self, now_utc_s: float) -> list[PictureRow]:
+        """Remove what is too old or too much; return what was removed."""
+        if self._config.retain_days is None and self._config.max_bytes is None:
+            return []
+        with self._lock:
+            index = self.index()
+            rows = to_remove(index.pictures(), now_utc_s, self._config.retain_days, self._config.max_bytes)
+            for row in rows:
+                remove_files(self._out_dir, row)
+            if rows:
+                index.mark("removed_utc_s", rows, now_utc_s)
+        for row in rows:
+            log.warning(
+                "Picture removed by retention",
+                extra=kv(
+                    vessel=row.vessel_id,
+                    vehicle=row.vehicle_id,
+                    image_id=row.image_id,
+                    version=row.version,
+                    exported=row.exported_utc_s is not None,
+                    file=row.name,
+                ),
+            )
+        return rows
+
+    def pictures_bytes(self) -> int:
+        """Return how much the kept pictures take, 0 while the index is not open."""
+        with self._lock:
+            return 0 if self._index is None else self._index.size_bytes()
+
+    def close(self) -> None:
+        """Close the index."""
+        with self._lock:
+            if self._index is not None:
+                self._index.close()
+                self._index = None

@@ -1,0 +1,136 @@
+"""How far advice and commands for vessels have come: remembered with the hand-off itself, shown afterwards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgpack
+
+from sonarpost import keys, wire
+from sonarpost.errors import PayloadError
+from sonarpost.messages import Advice, Command, DeliveryState, TaskingKind, TaskingState
+from sonarpost.runtime.shore_index import TaskingRow
+
+PREFIX = "tasking/"
+
+
+@dataclass(frozen=True, slots=True)
+class Tasking:
+    """One piece of advice or one command for a vessel, with its state."""
+
+    vessel_id: str
+    kind: TaskingKind
+    payload: bytes
+    state: DeliveryState = "waiting"
+    reason: str = ""
+    changed_utc_s: float = 0.0
+
+    @property
+    def record(self) -> Advice | Command:
+        """The record itself."""
+        if self.kind == "advice":
+            return wire.decode(Advice, self.payload, keys.advice(self.vessel_id))
+        return wire.decode(Command, self.payload, keys.command_all(self.vessel_id))
+
+    @property
+    def record_id(self) -> str:
+        """Identifier of the record."""
+        return kind_and_id(self.record)[1]
+
+    @property
+    def name(self) -> str:
+        """Under which the store remembers it."""
+        return name_of(self.vessel_id, self.kind, self.record_id)
+
+    @property
+    def key(self) -> str:
+        """Key on which the vessel's relay takes it."""
+        record = self.record
+        if isinstance(record, Advice):
+            return keys.advice(self.vessel_id)
+        return keys.command(self.vessel_id, record.kind)
+
+    def pack(self) -> bytes:
+        """Return it as bytes for the store."""
+        fields = (self.vessel_id, self.kind, self.payload, self.state, self.reason, self.changed_utc_s)
+        packed: bytes = msgpack.packb(fields)
+        return packed
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Tasking:
+        """Read what `pack` made."""
+        return cls(*msgpack.unpackb(data))
+
+    def state_record(self) -> TaskingState:
+        """Return what the shore's subscribers are shown."""
+        return TaskingState(
+            vessel_id=self.vessel_id,
+            kind=self.kind,
+            record_id=self.record_id,
+            state=self.state,
+            reason=self.reason[:2000],
+            changed_utc_s=self.changed_utc_s,
+        )
+
+    def row(self) -> TaskingRow:
+        """Return the index's row."""
+        record = self.record
+        if isinstance(record, Advice):
+            summary, author, issued_utc_s = _advice_summary(record), record.author, record.advised_utc_s
+        else:
+            summary, author, issued_utc_s = _command_summary(record), record.issued_by, record.issued_utc_s
+        return TaskingRow(
+            vessel_id=self.vessel_id,
+            kind=self.kind,
+            record_id=self.record_id,
+            vehicle_id=record.vehicle_id,
+            image_id=record.image_id,
+            summary=summary,
+            author=author,
+            issued_utc_s=issued_utc_s,
+            state=self.state,
+            reason=self.reason,
+            changed_utc_s=self.changed_utc_s,
+        )
+
+
+def name_of(vessel: str, kind: TaskingKind, record_id: str) -> str:
+    """Return the name under which the store remembers a record for a vessel."""
+    return f"{PREFIX}{vessel}/{kind}/{record_id}"
+
+
+def of_payload(vessel: str, key: str, payload: bytes) -> Tasking:
+    """Return the tasking that a record owed to a vessel's relay is.
+
+    Raises:
+        PayloadError: It is none.
+    """
+    kind: TaskingKind = "advice" if key == keys.advice(vessel) else "command"
+    return Tasking(vessel, kind, payload)
+
+
+def kind_and_id(record: Advice | Command) -> tuple[TaskingKind, str]:
+    """Return what kind of record this is, and its identifier."""
+    return ("advice", record.advice_id) if isinstance(record, Advice) else ("command", record.command_id)
+
+
+def refuse_another(known: Tasking, record: Advice | Command, key: str) -> None:
+    """Refuse a record whose identifier another one has.
+
+    Raises:
+        PayloadError: It is another one.
+    """
+    if known.record != record:
+        kind, record_id = kind_and_id(record)
+        raise PayloadError(key, f"{kind}_id", record_id, "an identifier that no other record for this vessel has")
+
+
+def _advice_summary(advice: Advice) -> str:
+    parts = [f"v{advice.image_version}", advice.verdict or "", advice.mlo_class or "", advice.remark]
+    return " ".join(part for part in parts if part)
+
+
+def _command_summary(command: Command) -> str:
+    if command.lat_deg is None or command.lon_deg is None:
+        return command.kind
+    return f"{command.kind} {command.lat_deg:.6f} {command.lon_deg:.6f}"

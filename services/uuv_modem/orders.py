@@ -1,0 +1,141 @@
+"""Orders that came by sound: each becomes a record for its consumers once, however often it came."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+from services.uuv_modem.config import UuvModemConfig
+from sonarpost import keys
+from sonarpost.errors import FrameError
+from sonarpost.link.downlink import (
+    DownlinkOrder,
+    Judgement,
+    Outcome,
+    Refine,
+    Resend,
+    Revisit,
+    image_of_number,
+    pack,
+    record_id_of,
+)
+from sonarpost.link.v1_state import read_list
+from sonarpost.messages import Command, CommandKind, Decision, Record
+
+_REMEMBERED: Final = 512
+_VESSEL_BY_SOUND: Final = "vessel"
+
+
+@dataclass(frozen=True, slots=True)
+class Handed:
+    """A record and whom it is for."""
+
+    key: str
+    record: Record
+    consumers: tuple[str, ...]
+
+
+@dataclass(eq=False)
+class OrderBook:
+    """The orders of late, and what became of them.
+
+    Attributes:
+        platform_id: The vehicle.
+        config: Who takes what.
+        known: Outcome by modem, token and content, oldest first.
+    """
+
+    platform_id: str
+    config: UuvModemConfig
+    known: dict[tuple[int, bytes], Outcome] = field(default_factory=dict)
+
+    def take(self, source: int, order: DownlinkOrder, image_id: str | None) -> tuple[Outcome, Handed | None]:
+        """Return what becomes of an order, and the record for its consumers if it is new.
+
+        Args:
+            source: Modem it came from.
+            order: The order.
+            image_id: The image it is about where the vehicle still knows it.
+        """
+        name = (source, pack(order, 255))
+        if name in self.known:
+            return self.known[name], None
+        handed = self._handed(source, order, image_id)
+        outcome = Outcome.TAKEN if handed.consumers else Outcome.UNSUPPORTED
+        self.known[name] = outcome
+        while len(self.known) > _REMEMBERED:
+            del self.known[next(iter(self.known))]
+        return outcome, handed if handed.consumers else None
+
+    def _handed(self, source: int, order: DownlinkOrder, image_id: str | None) -> Handed:
+        kind = kind_of(order)
+        consumers = {
+            "revisit": self.config.revisit_consumers,
+            "decision": self.config.decision_consumers,
+        }.get(kind, self.config.refine_consumers)
+        record_id = record_id_of(source, order.token)
+        record: Record
+        if isinstance(order, Judgement):
+            record = self._decision(record_id, order, image_id)
+        else:
+            record = self._command(record_id, source, order, image_id)
+        return Handed(keys.command(self.platform_id, kind), record, consumers)
+
+    def _command(self, record_id: str, source: int, order: Refine | Resend | Revisit, image_id: str | None) -> Command:
+        lat_deg = lon_deg = None
+        if isinstance(order, Revisit):
+            image_id, lat_deg, lon_deg = None, order.lat_deg, order.lon_deg
+        else:
+            image_id = image_id or image_of_number(order.number)
+        return Command(
+            command_id=record_id,
+            kind=_COMMANDS[type(order)],
+            vehicle_id=self.platform_id,
+            image_id=image_id,
+            lat_deg=lat_deg,
+            lon_deg=lon_deg,
+            issued_by=f"modem {source}",
+            issued_utc_s=float(order.issued_utc_s),
+        )
+
+    def _decision(self, record_id: str, order: Judgement, image_id: str | None) -> Decision:
+        return Decision(
+            decision_id=record_id,
+            vessel_id=_VESSEL_BY_SOUND,
+            vehicle_id=self.platform_id,
+            image_id=image_id or image_of_number(order.number),
+            image_version=order.version,
+            verdict=order.verdict,
+            confidence=order.confidence,
+            mlo_class=order.mlo_class or None,
+            operator="by sound",
+            decided_utc_s=float(order.issued_utc_s),
+        )
+
+    def export(self) -> dict[str, object]:
+        """Return the book as a map that msgpack can hold."""
+        return {"known": [[source, order, int(outcome)] for (source, order), outcome in self.known.items()]}
+
+    def restore(self, part: Mapping[str, object]) -> None:
+        """Take up what `export` returned.
+
+        Raises:
+            FrameError: It is no such map.
+        """
+        known: dict[tuple[int, bytes], Outcome] = {}
+        for entry in read_list(part, "known"):
+            match entry:
+                case [int(source), bytes(order), int(outcome)] if outcome in tuple(Outcome):
+                    known[source, order] = Outcome(outcome)
+                case _:
+                    raise FrameError("uuv_modem state", "orders", entry, "[modem, order, outcome]")
+        self.known = known
+
+
+_COMMANDS: Final[dict[type, CommandKind]] = {Refine: "refine", Resend: "resend", Revisit: "revisit"}
+
+
+def kind_of(order: DownlinkOrder) -> str:
+    """Return the last part of the key that an order is handed on with."""
+    return "decision" if isinstance(order, Judgement) else _COMMANDS[type(order)]
