@@ -1,0 +1,92 @@
+# sonarpost: one image for every service, and one for the embedded router.
+#
+#   docker build -t sonarpost:dev .                       every service: command = a service's name
+#   docker build -t sonarpost-router:dev --target router .  stands in for eclipse/zenoh where no registry is reached
+#
+# Works with BuildKit and with the builder before it. `make images` builds both, and the base too where no registry is
+# reached.
+ARG BASE=debian:13.7-slim
+
+# What every stage has: Debian's own Python, so that the virtual environment fits wherever it is copied.
+FROM ${BASE} AS python
+RUN apt-get update -q \
+    && apt-get install -q -y --no-install-recommends python3 \
+    && apt-get clean \
+    && rm -rf /var/lib/apt/lists/* /var/cache/debconf/*-old /var/log/apt /var/log/dpkg.log /var/log/alternatives.log
+
+# The run-time dependencies as a list of their own: only a change of these downloads anything again.
+FROM python AS requirements
+COPY pyproject.toml /src/
+RUN python3 -c "import tomllib; print(*tomllib.load(open('/src/pyproject.toml', 'rb'))['project']['dependencies'], sep='\n')" \
+    > /requirements.txt
+
+# Everything that is downloaded. A release of sonarpost that needs nothing new leaves this layer as it is.
+FROM python AS dependencies
+RUN apt-get update -q \
+    && apt-get install -q -y --no-install-recommends python3-venv binutils ca-certificates \
+    && rm -rf /var/lib/apt/lists/*
+# An index of one's own, or none at all with wheels in packaging/wheels; the certificate of a proxy in packaging/ca.
+ARG PIP_INDEX_URL
+ARG PIP_NO_INDEX
+ENV PIP_CERT=/etc/ssl/certs/ca-certificates.crt PIP_FIND_LINKS=/src/packaging/wheels PIP_DISABLE_PIP_VERSION_CHECK=1 \
+    PIP_NO_CACHE_DIR=1 PIP_NO_COMPILE=1
+COPY packaging/ca/ /usr/local/share/ca-certificates/
+COPY packaging/wheels/ /src/packaging/wheels/
+COPY packaging/trim.sh /src/packaging/
+COPY --from=requirements /requirements.txt /src/
+COPY requirements.lock /src/
+# Byte code is never checked against the source: the root file system may be read-only, and dates may change on the way
+# through layers.
+RUN update-ca-certificates \
+    && python3 -m venv /opt/build \
+    && grep -E '^(build|hatchling|editables)==' /src/requirements.lock > /src/build-requirements.txt \
+    && /opt/build/bin/pip install -r /src/build-requirements.txt \
+    && python3 -m venv /opt/sonarpost \
+    && /opt/sonarpost/bin/pip install --only-binary :all: -r /src/requirements.txt -c /src/requirements.lock \
+    && sh /src/packaging/trim.sh /opt/sonarpost \
+    && echo /opt/app > "$(echo /opt/sonarpost/lib/python3*/site-packages)/sonarpost-app.pth" \
+    && python3 -m compileall -q --invalidation-mode unchecked-hash /opt/sonarpost/lib
+
+FROM dependencies AS build
+COPY pyproject.toml README.md LICENSE NOTICE /src/
+COPY packaging/warm.py /src/packaging/
+COPY common/ /src/common/
+COPY services/ /src/services/
+# The codecs' machine code is made here, for any processor of this architecture, so that no service compiles at its start.
+# The compiler takes a source file's date for its identity: whole seconds survive the way into the next stage.
+RUN cd /src && /opt/build/bin/python -m build --wheel --no-isolation --outdir /dist . \
+    && /opt/build/bin/pip --python /opt/sonarpost/bin/python install --no-deps --no-index --target /opt/app /dist/*.whl \
+    && find /opt/app -exec touch -h -d @1700000000 {} + \
+    && python3 -m compileall -q --invalidation-mode unchecked-hash /opt/app \
+    && NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR=/opt/app/numba-cache /opt/sonarpost/bin/python -B packaging/warm.py
+
+FROM python AS runtime
+ENV PATH=/opt/app/bin:/opt/sonarpost/bin:$PATH \
+    PYTHONDONTWRITEBYTECODE=1 \
+    PYTHONUNBUFFERED=1 \
+    NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR=/tmp/numba-cache \
+    SONARPOST_HEARTBEAT=/tmp/heartbeat.json
+RUN groupadd --gid 10001 sonarpost \
+    && useradd --uid 10001 --gid 10001 --no-create-home --home-dir /var/lib/sonarpost --shell /usr/sbin/nologin sonarpost \
+    && install -d -o sonarpost -g sonarpost /var/lib/sonarpost /var/lib/sonarpost/state /var/lib/sonarpost/incoming \
+        /var/lib/sonarpost/pictures \
+    && install -d -m 0700 -o sonarpost -g sonarpost /var/lib/sonarpost/pki /var/lib/sonarpost/tls \
+        /var/lib/sonarpost/tls/shore /var/lib/sonarpost/tls/vessel
+COPY --from=dependencies /opt/sonarpost /opt/sonarpost
+COPY packaging/bin/ /usr/local/bin/
+COPY config/ /etc/sonarpost/
+COPY --from=build /opt/app /opt/app
+USER 10001:10001
+WORKDIR /var/lib/sonarpost
+ENTRYPOINT ["sonarpost-entrypoint"]
+CMD ["sonarpost", "--help"]
+HEALTHCHECK --interval=10s --timeout=5s --start-period=40s --retries=3 \
+    CMD ["python", "-m", "sonarpost.runtime.healthcheck"]
+
+FROM runtime AS router
+ENTRYPOINT ["python", "-m", "sonarpost.runtime.router"]
+CMD ["--listen", "tcp/0.0.0.0:7447"]
+HEALTHCHECK NONE
+
+# The last stage is what `docker build` makes when it is not told which.
+FROM runtime
