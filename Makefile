@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.ready
 
-.PHONY: setup demo test check fmt lock clean
+.PHONY: setup demo test test-long check fmt lock clean images test-compose
 
 setup: $(STAMP)
 
@@ -21,12 +21,24 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest $(ARGS)
 
+# Tests that take minutes each: long outages, processes killed at random for five minutes.
+test-long: setup
+	$(BIN)/python -m pytest -m long $(ARGS)
+
 check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python tests/check_wheel.py
+
+# The images that docker-compose.yml names; where no registry is reached they are made from Debian and PyPI alone.
+images:
+	packaging/images.sh
+
+# The whole chain in containers, built, started, disturbed and taken away again. Needs a container engine.
+test-compose: setup
+	PYTHON=$(BIN)/python packaging/test-compose.sh $(ARGS)
 
 fmt: setup
 	$(BIN)/ruff format .

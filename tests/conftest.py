@@ -29,7 +29,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def eventually(condition: Callable[[], bool], timeout_s: float = 15.0, what: str = "condition") -> None:
+def eventually(condition: Callable[[], bool], timeout_s: float = 40.0, what: str = "condition") -> None:
     """Wait until `condition()` holds; fail the test when it does not in time."""
     deadline = time.monotonic() + timeout_s
     while not condition():

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.files import write_atomically
+from sonarpost.files import AtomicFiles, write_atomically
 
 
 def leftovers(folder: Path) -> list[str]:
@@ -138,7 +138,7 @@ def test_a_reader_never_meets_half_a_file(tmp_path: Path) -> None:
 
 def test_a_killed_writer_leaves_a_whole_file(tmp_path: Path) -> None:
     script = (
-        "import sys, itertools; from pathlib import Path; from sonarpost.files import write_atomically\n"
+        "import sys, itertools; from pathlib import Path; from sonarpost.files import AtomicFiles, write_atomically\n"
         "for n in itertools.count(1):\n"
         "    write_atomically(Path(sys.argv[1]), str(n).encode() * 30000)\n"
         "    print(n, flush=True)\n"
@@ -157,3 +157,42 @@ def test_a_killed_writer_leaves_a_whole_file(tmp_path: Path) -> None:
     number = text[: len(text) // 30000]
     assert text == number * 30000
     assert int(number) >= written
+
+
+def test_files_of_a_batch_are_put_in_their_places_together_and_the_last_ones_last(tmp_path: Path) -> None:
+    files = AtomicFiles()
+    files.add(tmp_path / "b", b"2", last=True)
+    files.add(tmp_path / "a", b"1")
+    assert files.text_of(tmp_path / "b") == b"2"
+    assert [p.name for p in tmp_path.iterdir() if not p.name.startswith(".")] == []
+    files.commit()
+    assert sorted((p.name, p.read_bytes()) for p in tmp_path.iterdir()) == [("a", b"1"), ("b", b"2")]
+
+
+def test_of_a_batch_that_cannot_be_brought_to_the_disk_nothing_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a").write_bytes(b"before")
+    files = AtomicFiles()
+    files.add(tmp_path / "a", b"1")
+    files.add(tmp_path / "b", b"2", last=True)
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        files.commit()
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("a", b"before")]
+    assert len(files) == 0
+
+
+def test_the_end_of_a_batch_can_be_taken_back(tmp_path: Path) -> None:
+    files = AtomicFiles()
+    files.add(tmp_path / "a", b"1")
+    before = len(files)
+    files.add(tmp_path / "b", b"2", last=True)
+    files.drop_from(before)
+    assert files.text_of(tmp_path / "b") is None
+    files.commit()
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]

@@ -88,7 +88,8 @@ def test_old_handoff_messages_parse_for_ever_and_are_made_alike_today() -> None:
         assert (chunk.seq, chunk.size, chunk.offset) == (fields["seq"], fields["size"], fields["offset"])
         assert made["handoff-attachment"][name] == payload
         item = OutboxItem(fields["consumer"], chunk.seq, "k", "", 4, bytes(chunk.size), chunk.sha256)
-        assert attachment(chunk.origin, item, chunk.offset) == payload
+        assert chunk.settled == fields.get("settled", 0)
+        assert attachment(chunk.origin, item, chunk.offset, chunk.settled) == payload
 
 
 # Round trips

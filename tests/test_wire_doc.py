@@ -19,10 +19,11 @@ import zenoh
 from conftest import REPOSITORY, eventually
 from golden.zenoh.samples import RECORD_TYPES, SAMPLES
 
-from services.relay.service import PRIORITIES
+from services.c2.service import ADVICE_PRIORITY, COMMAND_PRIORITY
+from services.relay.service import DECISION_PRIORITY, DETAIL_PRIORITY, PREVIEW_PRIORITY
 from sonarpost import keys, wire
-from sonarpost.messages import Contact, Decision, ReconstructedImage, Record, Snippet
-from sonarpost.runtime import handoff, outbox, transaction
+from sonarpost.messages import Contact, Decision, Record, Snippet
+from sonarpost.runtime import handoff, outbox, schedule, transaction
 from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.handoff import Reply, attachment
 from sonarpost.runtime.service import Effects, Service
@@ -32,7 +33,13 @@ PlatformMaker = Callable[[str], PlatformConfig]
 TEXT = (REPOSITORY / "docs" / "wire-zenoh.md").read_text(encoding="utf-8")
 FIELDS = [(t, name) for t in RECORD_TYPES for name in t.model_fields]
 UNITS = {"mps": "m/s", "deg": "°", "db": "dB", "px": "px", "m": "m", "s": "s"}
-NAMED_OTHERWISE = {"bits": "bit", "bytes_received": "byte", "bytes_total": "byte"}
+NAMED_OTHERWISE = {
+    "bits": "bit",
+    "bytes_received": "byte",
+    "bytes_total": "byte",
+    "bytes_left": "byte",
+    "message_bytes": "byte",
+}
 
 
 def section(heading: str) -> str:
@@ -129,12 +136,16 @@ def test_every_key_is_in_the_table() -> None:
         "vessel": "{vessel}",
         "kind": "{kind}",
         "service": "{service}",
+        "site": "{site}",
+        "answerer": "{answerer}",
     }
     documented = set(table("Keys", 1))
     found = set()
     for name, function in inspect.getmembers(keys, inspect.isfunction):
-        if name.startswith("_") or function.__module__ != keys.__name__ or name == "handoff":
-            continue
+        if name.startswith(("_", "everything")) or function.__module__ != keys.__name__:
+            continue  # those of everything are for access control
+        if "key" in inspect.signature(function).parameters:
+            continue  # works on a key that another one has made
         sample = {parameter: f"x{parameter}" for parameter in inspect.signature(function).parameters}
         key = function(**sample)
         for parameter, value in sample.items():
@@ -155,11 +166,19 @@ def test_numbers_in_the_text_are_those_of_the_code() -> None:
     assert f"payloads up to {wire.MAX_PAYLOAD_BYTES}" in TEXT
     assert table("The attachment")["size"]["range"] == f"0 to {handoff.MAX_RECORD_BYTES}"
     assert f"{outbox.REPLY_TIMEOUT_S:g} s in sonarpost" in TEXT
-    assert f"sonarpost has {outbox.WINDOW} queries in flight" in TEXT
-    assert f"the first {outbox.WINDOW} and no" in TEXT
+    assert f"sonarpost has {outbox.WINDOW} queries and {schedule.WINDOW_BYTES} bytes in flight" in TEXT
+    assert f"the first {outbox.PROBE_WINDOW} and no" in TEXT
+    assert f"up to {schedule.MAX_WINDOW_BYTES} bytes while answers come within {schedule.GROW_BELOW_S:g} s" in TEXT
+    assert "half a second of it" in TEXT
+    assert schedule.PIECE_S == 0.5
+    assert f"Priorities 1 and\n   {schedule.URGENT_PRIORITY} wait" in TEXT
     assert f"those of the {transaction.PARTIALS_KEPT} records touched last" in TEXT
     assert f"(sonarpost: {outbox.BACK_OFF_S[0]} s, rising to {outbox.BACK_OFF_S[-1]:g} s)" in TEXT
-    assert f"{PRIORITIES[Decision]} decisions, {PRIORITIES[ReconstructedImage]} images" in TEXT
+    told = f"{DECISION_PRIORITY} decisions, {PREVIEW_PRIORITY} first versions of a picture, {DETAIL_PRIORITY} later"
+    assert told in TEXT
+    rows = table("Keys", 1)
+    assert rows["sonarpost/v1/{platform}/command/{kind}"]["priority"] == str(COMMAND_PRIORITY)
+    assert rows["sonarpost/v1/{vessel}/advice"]["priority"] == str(ADVICE_PRIORITY)
     assert "tcp/127.0.0.1:7447" in PlatformConfig(id="x").router
     assert f"({PlatformConfig(id='x').health_interval_s:g} s by default)" in TEXT
     assert str(36**4) in TEXT
@@ -167,8 +186,8 @@ def test_numbers_in_the_text_are_those_of_the_code() -> None:
 
 
 def test_attachment_and_reply_have_the_documented_fields() -> None:
-    item = OutboxItem("relay", 1, "k", "", 4, b"", bytes(32))
-    assert list(msgpack.unpackb(attachment(bytes(16), item))) == list(table("The attachment"))
+    item = OutboxItem("relay", 6, "k", "", 4, b"", bytes(32))
+    assert list(msgpack.unpackb(attachment(bytes(16), item, settled=5))) == list(table("The attachment"))
     assert list(msgpack.unpackb(Reply("stored").pack())) == list(table("The reply"))
 
 
@@ -384,7 +403,7 @@ def test_a_watcher_sees_the_first_window_while_the_consumer_is_away_and_the_rest
     producer.start()
     taker = DecisionTaker(platform("vessel-1"))
     try:
-        eventually(lambda: len(seen) == outbox.WINDOW)
+        eventually(lambda: len(seen) == outbox.PROBE_WINDOW)
         taker.start()
         eventually(lambda: len(seen) == 20)
         eventually(lambda: producer.store.outbox_depth() == 0)

@@ -84,40 +84,90 @@ class Halving:
         return Decoded(np.ascontiguousarray(image), np.zeros(image.shape, np.bool_))
 
 
+ROW_KEYS = {"codec", "budget", "bytes", "psnr", "ssim", "msssim", "encode_ms", "decode_ms"}
+
+
 def test_the_json_object_has_exactly_these_keys(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("codecs", "--images", folder, "--codecs", "spiht,vq", "--budgets", "128,44", "--json") == 0
+    assert run("codecs", "--images", folder, "--codecs", "spiht,vq", "--budgets", "128,16,44", "--json") == 0
     lines = capsys.readouterr().out.splitlines()
     found = json.loads(lines[-1])
     assert len(lines) == 1
     assert set(found) == {"images", "results", "bd_rate"}
     assert found["images"] == 3
     assert found["bd_rate"] == {}
-    needed = {"codec", "budget", "bytes", "psnr", "ssim", "msssim", "encode_ms", "decode_ms", "misses", "n", "ci"}
-    for row in found["results"]:
-        assert needed <= set(row)
-        assert row["n"] + row["misses"] == 3
-    assert [(r["codec"], r["budget"]) for r in found["results"] if r["codec"] == "spiht"] == [
-        ("spiht", 44),
-        ("spiht", 128),
+    assert all(set(row) == ROW_KEYS for row in found["results"])
+    assert [(r["codec"], r["budget"]) for r in found["results"]] == [
+        (codec, budget) for codec in ("spiht", "vq") for budget in (16, 44, 128)
     ]
-    assert len([r for r in found["results"] if r["codec"] == "vq"]) == 8
-    assert {r["variant"].split()[0] for r in found["results"] if r["codec"] == "vq"} == {"nominal-10", "nominal-20"}
+    for row in found["results"]:
+        if row["psnr"] is not None:
+            assert 0 < row["bytes"] <= row["budget"]
+            assert row["encode_ms"] > 0
+
+
+def test_a_row_without_most_pictures_has_no_figures_but_the_details_do(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_png(folder / "dark.png", np.zeros((40, 48), np.uint8))
+    monkeypatch.setattr("sonarpost.cli.bench.codecs.subjects", lambda *_, **__: ([Subject(Halving())], []))
+    file = tmp_path / "details.json"
+    assert run("codecs", "--images", folder, "--budgets", "60,900", "--json", "--details", file) == 0
+    said = capsys.readouterr()
+    rows = json.loads(said.out)["results"]
+    assert [row["psnr"] for row in rows] == [None, None]  # 3 of 4 pictures are fewer than nine tenths
+    assert "emb at 900 B: 1 x picture: expected a bright one" in said.err
+    found = json.loads(file.read_text())
+    assert [(row["n"], row["misses"]) for row in found["results"]] == [(3, 1), (3, 1)]
+    assert all(row["psnr"] > 0 and len(row["ci"]["psnr"]) == 2 for row in found["results"])
+    assert found["pictures"] == 4
+
+
+def test_of_vq_the_best_catalogue_that_fits_a_budget_counts(folder: Path, tmp_path: Path) -> None:
+    subjects, _ = measuring.subjects(measuring_registry(), ["vq"])
+    pictures = read_folder(folder).pictures
+    variants = [measure(subject, pictures, [])[0] for subject in subjects]
+    coarse = next(p for p in variants if p.subject.variant == "nominal-20 14bit")
+    fine = next(p for p in variants if p.subject.variant == "nominal-10 14bit")
+    budgets = [int(coarse.stream_bytes.min()) - 1, int(coarse.stream_bytes.max()), 4096]
+    none, small, large = measuring.best_that_fit(variants, budgets)
+    assert none.misses == len(pictures)
+    assert np.array_equal(small.stream_bytes, coarse.stream_bytes)
+    assert np.array_equal(large.psnr, np.maximum(coarse.psnr, fine.psnr))
+    assert (large.stream_bytes <= fine.stream_bytes).all()  # of the packings the tightest
+    assert sum(none.reasons.values()) == len(pictures)
 
 
 def test_bd_rate_of_the_flagship_against_every_other(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     subjects = [Subject(Halving()), *measuring.subjects(measuring_registry(), ["spiht", "vq"])[0]]
     monkeypatch.setattr("sonarpost.cli.bench.codecs.subjects", lambda *_, **__: (subjects, []))
-    assert run("codecs", "--images", folder, "--budgets", "24,44,88,192", "--json") == 0
+    file = tmp_path / "details.json"
+    assert run("codecs", "--images", folder, "--budgets", "24,44,88,192", "--json", "--details", file) == 0
     found = json.loads(capsys.readouterr().out)
     assert set(found["bd_rate"]) == {"emb"}
     assert set(found["bd_rate"]["emb"]) == {"spiht", "vq"}
     assert found["bd_rate"]["emb"]["spiht"] > 0  # block means are no match for a wavelet
-    gains = [row["emb_gain"]["psnr"] for row in found["results"] if row["codec"] == "spiht"]
+    details = json.loads(file.read_text())
+    assert details["bd_rate"]["emb"]["spiht"]["percent"] == pytest.approx(found["bd_rate"]["emb"]["spiht"], abs=0.01)
+    gains = [row["emb_gain"]["psnr"]["mean"] for row in details["results"] if row["codec"] == "spiht"]
     assert len(gains) == 4
     assert all(gain < 0 for gain in gains)
-    assert all("emb_gain" not in row for row in found["results"] if row["codec"] == "emb")
+    for row in details["results"]:
+        for name, gain in row.get("emb_gain", {}).items():
+            assert name in ("psnr", "ssim", "msssim")
+            assert gain["mean"] is None or gain["ci"][0] <= gain["mean"] <= gain["ci"][1]
+    assert all("emb_gain" not in row for row in details["results"] if row["codec"] == "emb")
+    assert len(details["natural_sizes"]) == 8
+
+
+@pytest.mark.parametrize("option", ["--plot", "--sheet", "--details"])
+def test_an_absent_folder_is_said_before_the_work(
+    folder: Path, tmp_path: Path, option: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sonarpost.cli.bench.codecs.measure", lambda *_: pytest.fail("measured"))
+    with pytest.raises(ConfigError, match=f"{option}.*a folder that exists"):
+        run("codecs", "--images", folder, "--codecs", "huffman", option, tmp_path / "absent" / "file.png")
 
 
 def measuring_registry():
@@ -345,16 +395,17 @@ def test_the_crops_are_those_of_the_published_table(data_dir: Path) -> None:
 
 def test_grain_is_shown_only_where_a_codec_offers_it() -> None:
     class Grainy(Halving):
-        def decode_with_grain(self, stream: bytes) -> np.ndarray:
+        def decode_grain(self, stream: bytes) -> np.ndarray:
             if len(stream) < 20:
                 raise StreamError("stream", "grain", stream, "grain in the stream")
-            return np.full((2, 2), 9, np.uint8)
+            return np.array([[-300, -3], [10, 300]], np.int16)
 
-    assert with_grain(Halving(), bytes(40)) is None
-    assert with_grain(Grainy(), bytes(10)) is None
-    grain = with_grain(Grainy(), bytes(40))
+    picture = np.full((2, 2), 100, np.uint8)
+    assert with_grain(Halving(), bytes(40), picture) is None
+    assert with_grain(Grainy(), bytes(10), picture) is None
+    grain = with_grain(Grainy(), bytes(40), picture)
     assert grain is not None
-    assert grain[0, 0] == 9
+    assert grain.tolist() == [[0, 98], [105, 250]]  # half of it, rounded down, clipped
 
 
 def test_bench_without_an_action_prints_its_help(capsys: pytest.CaptureFixture[str]) -> None:

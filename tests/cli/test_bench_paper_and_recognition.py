@@ -161,6 +161,40 @@ def test_recognition_of_decoded_pictures(data_set: Path, capsys: pytest.CaptureF
     assert "original" in capsys.readouterr().out
 
 
+def test_streams_with_grain_are_judged_within_the_same_budget(
+    data_set: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--sdvd", data_set, "--codecs", "emb", "--budgets", "64", "--simulated", "0", "--crop", "40"]
+    assert run("recognition", *options, "--grain-strength", "0,1", "--least-auc", "0", "--json") == 0
+    rows = json.loads(capsys.readouterr().out)["results"]
+    assert [row["grain"] for row in rows] == [None, 0.0, 1.0]
+    assert all(0 < row["bytes"] <= 64 for row in rows)
+    assert rows[1]["auc"] is not None
+    assert all(row["of_original_ci"][0] <= row["of_original"] <= row["of_original_ci"][1] for row in rows)
+
+
+def test_grain_is_added_at_the_strength_asked_for() -> None:
+    from sonarpost.cli.bench.grain import grainy_twin, with_grain
+    from sonarpost.codec.emb.codec import EmbCodec
+    from sonarpost.codec.spiht import SpihtCodec
+
+    plain, twin = EmbCodec(), grainy_twin(EmbCodec())
+    assert isinstance(twin, EmbCodec)
+    assert twin.grain
+    assert grainy_twin(SpihtCodec()) is None
+    image = np.clip(45 * np.random.default_rng(0).rayleigh(1.0, (48, 48)), 0, 255).astype(np.uint8)
+    stream = twin.encode(image, 64)
+    picture = twin.decode(stream).image
+    views = [with_grain(twin, stream, picture, strength) for strength in (0.0, 0.5, 1.0)]
+    assert all(view is not None for view in views)
+    assert np.array_equal(views[0], picture)
+    assert np.array_equal(views[1], twin.decode_with_grain(stream))
+    spreads = [float(np.std(view)) for view in views]
+    assert spreads[0] < spreads[1] < spreads[2]
+    assert with_grain(plain, plain.encode(image, 64), picture) is None
+    assert with_grain(SpihtCodec(), stream, picture) is None
+
+
 def test_a_poor_judge_is_said_to_be_one(
     data_set: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -175,6 +209,9 @@ def test_recognition_refuses_wrong_folders_and_thresholds(tmp_path: Path) -> Non
         run("recognition", "--sdvd", tmp_path)
     with pytest.raises(ConfigError, match="least-auc"):
         run("recognition", "--sdvd", tmp_path, "--least-auc", "1.5")
+    for strength in ("-1", "2.5", "half", "0.5,", "nan"):
+        with pytest.raises(ConfigError, match="grain-strength"):
+            run("recognition", "--sdvd", tmp_path, f"--grain-strength={strength}")
 
 
 def test_the_papers_own_numbers() -> None:

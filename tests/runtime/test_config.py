@@ -122,7 +122,7 @@ MISTAKES: dict[str, tuple[str, int | None, str, str]] = {
         '[platform]\nid = "a"\nnaem = 1\n',
         3,
         "platform.naem",
-        "one of: health_interval_s, id",
+        "health_interval_s, id, log_format",
     ),
     "wrong type": (PLATFORM + '[relay]\nrate = "1"\n', 4, "relay.rate", "got '1', expected a valid integer"),
     "truth for a number": (PLATFORM + "[relay]\nrate = true\n", 4, "relay.rate", "got True, expected a valid integer"),

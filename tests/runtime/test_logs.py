@@ -157,3 +157,18 @@ def test_logs_go_to_standard_error_in_the_chosen_form(
     assert (json.loads(first)["message"], json.loads(first)["n"]) == ("Shown", 1)
     assert second.endswith("DEBUG c2: Shown too")
     assert len(clean_root.handlers) == 1
+
+
+def test_what_a_line_concerns_is_in_both_formats() -> None:
+    with logs.concerning(vehicle="uuv-1", image_id=None):
+        with logs.concerning(image_id="00A7"):
+            assert text("Sent", bytes=3).endswith(": Sent vehicle=uuv-1 image_id=00A7 bytes=3")
+            assert event("Sent", image_id="00A8")["image_id"] == "00A8"  # the call knows better
+        assert text("Sent").endswith(": Sent vehicle=uuv-1")
+    assert text("Sent").endswith(": Sent")
+
+
+def test_what_a_line_concerns_ends_with_an_error() -> None:
+    with pytest.raises(ValueError, match="x"), logs.concerning(vehicle="uuv-1"):
+        raise ValueError("x")
+    assert text("Sent").endswith(": Sent")

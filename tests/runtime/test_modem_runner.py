@@ -17,15 +17,22 @@ from sonarpost.modem.events import (
     ClockConfirmed,
     Event,
     FailureReason,
+    FlexibleDataReceived,
     FrameReceived,
+    MiniPacketReceived,
     ModemReady,
     PacketFailed,
     PacketReceived,
     PacketSent,
+    PingAnswered,
+    RequestDone,
 )
 from sonarpost.modem.micromodem import MicroModem
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
+from sonarpost.sim.acoustic_channel import AcousticChannel
+from sonarpost.sim.channel_config import ChannelConfig, ModemSite
+from sonarpost.sim.water_physics import Position
 
 CONFIG = MicroModemConfig(address=3, settings=())
 
@@ -249,3 +256,39 @@ def test_timers_run_without_a_byte_from_the_port(tmp_path: Path) -> None:
     modem.unplug()
     assert [s.fields for s in modem.commands[:3]] == [("SRC", "3")] * 3
     assert events[0].attempts == 3
+
+
+def test_two_runners_ping_poll_and_exchange_small_things(tmp_path: Path) -> None:
+    sites = (ModemSite(1), ModemSite(2, Position(150.0)))
+    channel = AcousticChannel(ChannelConfig(sites, pty_dir=tmp_path / "modems", time_scale=50.0))
+    channel.start()
+    events: dict[int, list[Event]] = {1: [], 2: []}
+    runners = {
+        device.address: ModemRunner(
+            MicroModem(MicroModemConfig(device.address)), SerialLink(device.device), events[device.address].append
+        )
+        for device in channel.devices()
+    }
+    try:
+        for runner in runners.values():
+            runner.start()
+        runners[2].answer_polls(lambda polled: [b"polled"])
+        eventually(lambda: all(runner.ready for runner in runners.values()))
+        asked = [
+            runners[1].ping(2),
+            runners[1].send_mini(2, 0x123),
+            runners[1].send_flexible(2, 1, b"flexible"),
+            runners[1].request_packet(2, 1),
+        ]
+        eventually(lambda: len([e for e in events[1] if isinstance(e, RequestDone)]) == len(asked), 20.0)
+        assert [e.request_id for e in events[1] if isinstance(e, RequestDone)] == asked
+        assert [e.travel_s for e in events[1] if isinstance(e, PingAnswered)] == [0.1]
+        assert [e.data for e in events[1] if isinstance(e, FrameReceived)] == [b"polled"]
+        assert [e.bits for e in events[2] if isinstance(e, MiniPacketReceived)] == [0x123]
+        assert [e.packet.data for e in events[2] if isinstance(e, FlexibleDataReceived)] == [b"flexible"]
+        with pytest.raises(FrameError):
+            runners[1].send_mini(2, 0x2000)
+    finally:
+        for runner in runners.values():
+            runner.stop()
+        channel.stop()

@@ -446,9 +446,9 @@ def test_a_store_of_another_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "s.db"
     Store(path).close()
     with sqlite3.connect(path) as db:
-        db.execute("UPDATE meta SET value = ? WHERE name = 'version'", (b"2",))
+        db.execute("UPDATE meta SET value = ? WHERE name = 'version'", (b"99",))
     db.close()
-    with pytest.raises(HandoffError, match="store version b'2', expected 1"):
+    with pytest.raises(HandoffError, match="store version b'99', expected 2"):
         Store(path)
 
 

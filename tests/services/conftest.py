@@ -23,8 +23,8 @@ from sonarpost.runtime.service import Effects, Service
 from sonarpost.sim.acoustic_channel import AcousticChannel
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite
 from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.sim.water_config import WaterConfig
 from sonarpost.sim.water_physics import Position
-from sonarpost.sim.water_records import WaterConfig
 from sonarpost.sonar.xtf_writer import write_xtf
 
 PlatformMaker = Callable[[str], PlatformConfig]

@@ -30,8 +30,8 @@ from sonarpost.modem import nmea
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite
 from sonarpost.sim.micromodem_config import ModemConfig
+from sonarpost.sim.water_config import WaterConfig
 from sonarpost.sim.water_physics import Position
-from sonarpost.sim.water_records import WaterConfig
 
 SITES = (ModemSite(1), ModemSite(2, Position(150.0)))
 SCALE = 100.0
@@ -403,10 +403,31 @@ def test_the_command_offers_tcp_ports():
         assert process.wait(timeout=10) == 0
 
 
+@pytest.mark.parametrize("arguments", [(), ("--json",)])
+def test_the_command_goes_on_when_nobody_reads_its_output(arguments: tuple[str, ...]):
+    with run_command("--tcp", "--mm", "1", "--time-scale", "100", *arguments) as process:
+        assert process.stdout is not None
+        listed = json.loads(process.stdout.readline())
+        process.stdout.close()
+        host = Host(listed["modems"][0]["device"])
+        host.send(2, 1, [b"abc"])
+        eventually(lambda: (host.wait(0.05), any(s.kind == "CATXF" for s in host.told))[1], what="end of the packet")
+        eventually(lambda: (host.wait(0.05), "0.93.0.09" in str(host.told))[1], what="a Micro-Modem 1")
+        host.close()
+        assert process.poll() is None
+        process.terminate()
+        assert process.stderr is not None
+        assert (process.wait(timeout=10), process.stderr.read()) == (0, "")
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (("--modems", "0"), "--modems"),
+        (("--set", "snr_spread_db=-1"), "snr_spread_db"),
+        (("--set", "colour=blue"), "colour"),
+        (("--transponder", "A=far"), "--transponder"),
+        (("--transponder", "E=1"), "transponders"),
         (("--loss", "1.5"), "frame_loss"),
         (("--time-scale", "0"), "time_scale"),
         (("--modems", "3", "--tcp", "1", "2"), "tcp_ports"),

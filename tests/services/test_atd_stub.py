@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -49,8 +48,10 @@ def sent_picture(texture, put_file, compressor):
 
     def check():
         compressor.got.clear()
-        path = put_file("good.tiff", b"")
+        # Whole when it appears: an empty file would be taken as it is and set aside.
+        path = put_file(".good.tiff", b"")
         write_tiff(path, texture(seed=99))
+        path.rename(path.with_name("good.tiff"))
         eventually(lambda: [s.source for s in compressor.got] == ["good.tiff"], what="the picture after the bad one")
 
     return check
@@ -278,8 +279,9 @@ def test_a_folder_that_is_not_there_is_waited_for(begin, tmp_path, compressor, x
     eventually(lambda: service.health().state == "ok")
     (tmp_path / "disk" / "incoming" / "line.xtf").write_bytes(xtf(1))
     eventually(lambda: len(compressor.got) == 3)
-    shutil.rmtree(tmp_path / "disk")
-    (tmp_path / "disk").mkdir()
+    # Away at one stroke: the service makes its folder anew whenever it finds none.
+    (tmp_path / "disk").rename(tmp_path / "unmounted")
+    (tmp_path / "disk").mkdir(exist_ok=True)
     eventually((tmp_path / "disk" / "incoming").is_dir, what="the folder made anew")
     assert service.health().state == "ok"
 

@@ -13,6 +13,7 @@ from conftest import eventually
 from services.c2.config import C2Config
 from services.c2.service import C2Service
 from sonarpost import keys, wire
+from sonarpost.files import AtomicFiles
 from sonarpost.messages import Contact, Decision, Raster, ReconstructedImage, Relayed
 from sonarpost.sonar.image_files import read_image
 
@@ -92,7 +93,9 @@ def send(relay, *records, vessel="vessel-1"):
 
 
 def files(folder):
-    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+    """Everything but the index."""
+    found = (str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+    return sorted(name for name in found if not name.startswith("index.db"))
 
 
 def test_a_picture_is_kept_and_shown_for_msgpack_alone(begin, relay, image, out, watch, is_told):
@@ -139,10 +142,10 @@ def test_the_same_record_again_changes_no_file_and_is_shown_again(begin, relay, 
     service = begin()
     send(relay, image(), decision())
     eventually(lambda: len(decisions) == 1)
-    before = {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in out.rglob("*") if p.is_file()}
+    before = {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in out.rglob("*.[!d]*") if p.is_file()}
     send(relay, image(), decision())
     eventually(lambda: (len(pictures), len(decisions)) == (2, 2))
-    assert before == {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in out.rglob("*") if p.is_file()}
+    assert before == {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in out.rglob("*.[!d]*") if p.is_file()}
     eventually(lambda: service.health().counters.get("records_handled") == 4)
     counters = service.health().counters
     assert (counters["images_stored"], counters["images_repeated"]) == (1, 1)
@@ -283,3 +286,49 @@ def test_a_folder_that_takes_nothing_keeps_records_in_the_store(begin, relay, im
     eventually(lambda: len(seen) == 2)
     assert [msgpack.unpackb(s.payload.to_bytes())["image_id"] for s in seen] == ["AAAA", "BBBB"]
     eventually(lambda: service.health().state == "ok")
+
+
+def test_records_that_come_together_are_kept_with_one_wait_for_the_disk(begin, relay, image, out, watch, monkeypatch):
+    flushes = []
+    commit = AtomicFiles.commit
+    monkeypatch.setattr(AtomicFiles, "commit", lambda files: (flushes.append(len(files)), commit(files)))
+    seen = watch(keys.shore_image("vessel-1"))
+    twice = image("0007", seed=7)
+    send(relay, *(image(f"{n:04d}", seed=n) for n in range(40)), twice, decision("d1"), decision("d1"))
+    service = begin()
+    eventually(lambda: service.health().counters.get("records_handled") == 43)
+    counters = service.health().counters
+    assert (counters["images_stored"], counters["images_repeated"]) == (40, 1)
+    assert (counters["decisions_stored"], counters["decisions_repeated"]) == (1, 1)
+    assert len(files(out)) == 3 * 40 + 1
+    assert len(flushes) < 30, "far fewer than records"
+    eventually(lambda: len(seen) == 41)
+
+
+def test_of_a_batch_whose_files_cannot_be_written_nothing_is_lost(begin, relay, image, out, monkeypatch):
+    commit = AtomicFiles.commit
+    failures = []
+
+    def fails_twice(files):
+        if len(failures) < 2:
+            failures.append(len(files))
+            files.drop_from(0)
+            raise OSError(28, "No space left on device")
+        commit(files)
+
+    monkeypatch.setattr(AtomicFiles, "commit", fails_twice)
+    send(relay, *(image(f"{n:04d}", seed=n) for n in range(20)))
+    service = begin()
+    eventually(lambda: service.health().counters.get("images_stored") == 20)
+    assert len(failures) == 2
+    assert len(files(out)) == 3 * 20
+    assert service.health().counters["records_handled"] == 20
+
+
+def test_what_a_killed_c2_was_writing_is_removed_at_the_next_start(begin, relay, image, out):
+    for folder in (out / "vessel-1", out / "vessel-1" / "decisions"):
+        folder.mkdir(parents=True)
+        (folder / ".uuv-1_20231114T221320Z_AAAA_v1.tiff.k2j3h4.tmp").write_bytes(b"half")
+    begin()
+    send(relay, image(), decision())
+    eventually(lambda: [name.rpartition(".")[2] for name in files(out)] == ["json", "json", "png", "tiff"])

@@ -16,7 +16,7 @@ from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq import IndexPacking
 from sonarpost.errors import CatalogueError, ConfigError
 from sonarpost.link.paper_format import format_image_id, is_image_id
-from sonarpost.messages import Contact, EncodedImage, Raster, Snippet
+from sonarpost.messages import Command, Contact, EncodedImage, Raster, Snippet
 
 IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
 
@@ -148,9 +148,9 @@ def test_identifiers_go_on_over_restarts(begin, crew, atd, modem, snippet):
 def test_the_last_identifier_is_followed_by_the_first(begin, crew, platform, atd, modem, snippet):
     service = begin()
     with service.store.transaction() as tx:
-        tx.put_state("next_image", str(IMAGE_IDS - 1).encode())
+        tx.put_state("next_image", str(IMAGE_IDS).encode())
     atd.owe(IN, "compressor", snippet("a"), snippet("b"))
-    eventually(lambda: [i.image_id for i in modem.got] == ["ZZZZ", "0000"])
+    eventually(lambda: [i.image_id for i in modem.got] == ["1EKF", "0001"])
 
 
 def test_a_wiped_vehicle_does_not_begin_where_its_last_mission_did(crew, platform, tmp_path):
@@ -230,3 +230,62 @@ def test_the_contact_arrives_as_it_was(begin, atd, modem, texture):
     atd.owe(IN, "compressor", Snippet(contact=contact, picture=Raster.from_array(texture())))
     eventually(lambda: len(modem.got) == 1)
     assert modem.got[0].contact == contact
+
+
+def command(kind, image_id):
+    return Command(
+        command_id=f"{kind}-{image_id}",
+        kind=kind,
+        vehicle_id="uuv-1",
+        image_id=image_id,
+        issued_by="modem 1",
+        issued_utc_s=1476262800.0,
+    )
+
+
+def test_a_picture_that_is_asked_for_again_is_given_again_until_it_is_forgotten(begin, crew, atd, modem, snippet):
+    service = begin(keep_pictures=2)
+    uuv_modem = crew.neighbour("uuv-1", "orders")
+    atd.owe(IN, "compressor", *[snippet(f"c{n}") for n in range(3)])
+    eventually(lambda: len(modem.got) == 3)
+    first, _, third = modem.got
+    uuv_modem.owe(keys.command("uuv-1", "resend"), "compressor", command("resend", third.image_id))
+    uuv_modem.owe(keys.command("uuv-1", "resend"), "compressor", command("resend", first.image_id))
+    eventually(lambda: service.health().counters.get("commands_unknown_image") == 1)
+    eventually(lambda: len(modem.got) == 4)
+    assert modem.got[3] == third
+
+
+class Embedded:
+    """A codec whose shorter streams are the beginnings of longer ones, but for their last byte."""
+
+    name, model_hash = "embedded", ""
+
+    def encode(self, image, budget_bytes=None):
+        return b"\x04" + bytes(range(1, budget_bytes - 1)) + b"\xff"
+
+
+def test_a_picture_is_refined_where_a_longer_stream_begins_as_the_first_did(begin, crew, atd, modem, snippet):
+    service = begin(budget_bytes=100)
+    service._codec = Embedded()
+    uuv_modem = crew.neighbour("uuv-1", "orders")
+    atd.owe(IN, "compressor", snippet("c1", 64, 64))
+    eventually(lambda: len(modem.got) == 1)
+    uuv_modem.owe(keys.command("uuv-1", "refine"), "compressor", command("refine", modem.got[0].image_id))
+    eventually(lambda: len(modem.got) == 2)
+    short, long = (image.stream for image in modem.got)
+    assert modem.got[1].image_id == modem.got[0].image_id
+    assert (len(short), len(long)) == (100, 200)
+    assert long.startswith(short[:-1])
+    eventually(lambda: service.health().counters.get("images_refined") == 1)
+
+
+def test_where_no_longer_stream_continues_the_first_the_same_is_given_again(begin, crew, atd, modem, snippet):
+    service = begin()
+    uuv_modem = crew.neighbour("uuv-1", "orders")
+    atd.owe(IN, "compressor", snippet("c1"))
+    eventually(lambda: len(modem.got) == 1)
+    uuv_modem.owe(keys.command("uuv-1", "refine"), "compressor", command("refine", modem.got[0].image_id))
+    eventually(lambda: len(modem.got) == 2)
+    assert modem.got[1] == modem.got[0]
+    assert "images_refined" not in service.health().counters

@@ -349,7 +349,7 @@ def test_a_frame_whose_commit_failed_is_new_when_it_is_handled_again(platform, o
         effects = Effects()
         service.handle(IN, frame(data), effects)
         service.commit(effects)
-    assert (service._receiver.counts.frames, service._receiver.counts.duplicates) == (2, 0)
+    assert (service._hearing.paper.counts.frames, service._hearing.paper.counts.duplicates) == (2, 0)
     service.store.close()
 
 

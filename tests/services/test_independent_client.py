@@ -198,7 +198,7 @@ def test_rubbish_is_refused_and_logged_and_the_service_goes_on(
         assert health["gauges"]["refused"] == len(RUBBISH)
     finally:
         service.stop()
-    kept = sorted(path.name for path in (tmp_path / "out").rglob("*") if path.is_file())
+    kept = sorted(path.name for path in (tmp_path / "out").rglob("*.json"))
     assert kept == ["6431.json", "6432.json"]
     complaints = [vars(record)["fields"] for record in caplog.records if record.message == "Record refused"]
     assert [complaint["field"] for complaint in complaints] == [field for _, field in RUBBISH.values()]

@@ -74,6 +74,34 @@ def test_packets_are_numbered_on_after_a_restart(sea, begin, crew, decompressor)
     assert [f.packet for f in decompressor.got] == [1, 2, 3]
 
 
+def test_frames_of_a_packet_whose_end_a_killed_process_did_not_see_are_handed_on(sea, begin, crew, decompressor, cable):
+    sea.start()
+    line = cable(sea.port(sea.VESSEL))
+    service = begin(port=line.port)
+    eventually(lambda: service.health().state == "ok")
+    line.say(nmea.format("CARXP", 1) + nmea.format("CACYC", 0, 3, 1, 1, 0, 3))
+    for n, data in enumerate((b"first", b"second"), start=1):
+        line.say(nmea.format("CARXD", 3, 1, 0, n, data.hex()))
+    eventually(lambda: b"second" in (service.store.get_state("arriving") or b""), what="frames on the disk")
+    assert decompressor.got == []
+    killed = service.store.get_state("arriving")
+    crew.stop(service)  # which writes the packet down as it is, so the disk is put back as a kill leaves it
+    service = OpModemService(service.platform, service.config)
+    with service.store.transaction() as tx:
+        tx.put_state("arriving", killed)
+    crew.start(service)
+    eventually(lambda: [f.packet for f in decompressor.got] == [1, 1, 2, 2])
+    del decompressor.got[:2]
+    assert [(f.data, f.frame_number, f.rate, f.quality, f.frame_count) for f in decompressor.got] == [
+        (b"first", 1, 1, None, None),
+        (b"second", 2, 1, None, None),
+    ]
+    assert b"second" not in service.store.get_state("arriving")
+    line.say(sentences(1, b"after"))
+    eventually(lambda: len(decompressor.got) == 3)
+    assert decompressor.got[2].data == b"after"
+
+
 def test_frames_heard_while_nobody_takes_them_wait_over_a_restart(begin, crew):
     service = begin()
     service.on_modem_event(packet(frame(1, b"kept")))

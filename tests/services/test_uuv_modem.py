@@ -1,8 +1,10 @@
-"""uuv_modem: every frame of an image into the water, in order, once, whatever happens to the port or the process."""
+"""uuv_modem with the paper's link: every frame into the water, in order, once, whatever happens."""
 
 from __future__ import annotations
 
+import json
 import math
+import os
 
 import msgpack
 import pytest
@@ -23,6 +25,9 @@ from sonarpost.link.paper_sender import plan_packets
 from sonarpost.messages import AcousticFrame, Contact, EncodedImage
 from sonarpost.modem import nmea
 from sonarpost.modem.rates import RATES
+from sonarpost.sim.acoustic_channel import AcousticChannel
+from sonarpost.sim.channel_config import ChannelConfig, ModemSite
+from sonarpost.sim.water_physics import Position
 
 IN, TX, RX = keys.image_encoded("uuv-1"), keys.acoustic_tx("uuv-1"), keys.acoustic_rx("vessel-1")
 CONTACT = Contact(contact_id="c", vehicle_id="uuv-1", lat_deg=56.4, lon_deg=-5.6, atd_confidence=1.5, channel="port")
@@ -31,7 +36,7 @@ CONTACT = Contact(contact_id="c", vehicle_id="uuv-1", lat_deg=56.4, lon_deg=-5.6
 @pytest.fixture
 def begin(crew, platform, sea):
     def start(**options):
-        usual = {"port": sea.port(sea.VEHICLE), "rate": 1, "retry_s": 0.05}
+        usual = {"port": sea.port(sea.VEHICLE), "link": "paper", "rate": 1, "retry_s": 0.05}
         return crew.start(UuvModemService(platform("uuv-1"), UuvModemConfig(**(usual | options))))
 
     return start
@@ -169,7 +174,7 @@ def test_progress_counts_for_the_same_image_sent_the_same_way_only(platform, sea
     image = encoded()
     kept = {"image_id": "0001", "rate": 1, "of": 2, "done": 1}
     for changed, done in (({}, 1), ({"rate": 5}, 0), ({"of": 3}, 0), ({"image_id": "0002"}, 0)):
-        service = UuvModemService(platform("uuv-1"), UuvModemConfig(port=sea.port(sea.VEHICLE), rate=1))
+        service = UuvModemService(platform("uuv-1"), UuvModemConfig(port=sea.port(sea.VEHICLE), link="paper", rate=1))
         with service.store.transaction() as tx:
             tx.put_state("progress", msgpack.packb(kept | changed))
         assert service._packets_done(image, 2) == done, changed
@@ -295,3 +300,39 @@ def test_every_contact_that_can_be_has_a_record_on_the_link(contact, height_px, 
         assert record.time_utc_s is None
     else:
         assert abs(record.time_utc_s - contact.time_utc_s) <= 0.5
+
+
+def busy_fraction(log):
+    """Part of the time from the first packet's start to the last one's end in which a packet was in the water."""
+    lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    sent = [(line["transmitted_s"], line["airtime_s"]) for line in lines if line["event"] == "packet"]
+    end_s = max(start_s + airtime_s for start_s, airtime_s in sent)
+    return len(sent), sum(airtime_s for _, airtime_s in sent) / (end_s - min(start_s for start_s, _ in sent))
+
+
+def test_the_water_is_kept_busy_at_rate_5(tmp_path, crew, platform, compressor, encoded):
+    # In real time, as what is measured is what the host needs between packets. SONARPOST_BUSY_IMAGES=7 measures 21 full
+    # packets, SONARPOST_BUSY_BAUD=19200 a serial line that takes its time.
+    baud = float(os.environ.get("SONARPOST_BUSY_BAUD", "0")) or None
+    images = [encoded(f"{n:04d}", 420, 500) for n in range(int(os.environ.get("SONARPOST_BUSY_IMAGES", "1")))]
+    images.append(encoded("LAST"))
+    assert [len(packet) for packet in planned(images[0], 5)] == [1, 8, 8], "full packets, the hardest to fill"
+    log = tmp_path / "water.jsonl"
+    sites = (ModemSite(1), ModemSite(3, Position(150.0)))
+    ports = tmp_path / "ports"
+    channel = AcousticChannel(ChannelConfig(sites, pty_dir=ports, serial_baud=baud, log_path=log))
+    channel.start()
+    try:
+        service = crew.start(
+            UuvModemService(platform("uuv-1"), UuvModemConfig(port=str(ports / "modem-2"), link="paper", rate=5))
+        )
+        eventually(lambda: service.modem.ready)
+        compressor.owe(IN, "uuv_modem", *images)
+        eventually(lambda: service.health().counters.get("images_sent") == len(images), timeout_s=120.0)
+        crew.stop(service)
+    finally:
+        channel.stop()
+    packets, busy = busy_fraction(log)
+    print(f"{packets} packets, air time {100 * busy:.1f} % busy")
+    assert packets == sum(len(planned(image, 5)) for image in images)
+    assert baud or busy >= 0.95

@@ -42,6 +42,7 @@ def handoff_samples() -> dict[str, dict[str, bytes]]:
         "handoff-attachment": {
             "first-piece": attachment(bytes(range(16)), item),
             "second-piece": attachment(bytes(range(16)), large, 32768),
+            "after-dropped-ones": attachment(bytes(range(16)), item, 0, 5),
         },
         "handoff-reply": {
             "stored": Reply("stored").pack(),

@@ -10,17 +10,24 @@ from hypothesis import strategies as st
 
 from sonarpost.messages import (
     AcousticFrame,
+    Advice,
     Command,
     Contact,
     Decision,
+    DownlinkState,
     EncodedImage,
     Health,
     LinkQuality,
+    OutgoingMessage,
+    QueuedImage,
+    QueueState,
     Raster,
+    ReceivedMessage,
     ReconstructedImage,
     Record,
     Relayed,
     Snippet,
+    TaskingState,
 )
 
 BARE_CONTACT = Contact(contact_id="c1", vehicle_id="uuv-1")
@@ -99,7 +106,70 @@ DAMAGED_IMAGE = ReconstructedImage(
     notes=("1 frames disagreed with others of this image",),
 )
 
+PREVIEW_GONE = QueuedImage(
+    image_id="00A7", contact_id="c1", bytes_left=448, preview_utc_s=None, expected_utc_s=1476262900.5
+)
+NOTHING_GONE = QueuedImage(
+    image_id="00A8", contact_id="c2", bytes_left=640, preview_utc_s=1476262850.0, expected_utc_s=1476263000.0
+)
+
 SAMPLES: dict[str, Record] = {
+    "outgoing-message": OutgoingMessage(
+        message_id="status-17",
+        source="autonomy",
+        priority=3,
+        lifetime_s=600.0,
+        created_utc_s=1476262800.25,
+        data=b"\x01\x02battery 80",
+    ),
+    "received-message": ReceivedMessage(
+        vessel_id="vessel-1", vehicle_id="uuv-1", received_utc_s=1476262830.5, data=b"\x01\x02battery 80"
+    ),
+    "downlink-state-asked": DownlinkState(
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        kind="decision",
+        record_id="d-2016-10-12-1",
+        state="asked",
+        times_sent=0,
+        expires_utc_s=1476284500.0,
+        changed_utc_s=1476262903.0,
+    ),
+    "downlink-state-refused": DownlinkState(
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        kind="refine",
+        record_id="c-1",
+        state="refused",
+        times_sent=2,
+        expires_utc_s=1476284500.0,
+        changed_utc_s=1476262963.0,
+        reason="unknown image",
+    ),
+    "queued-image-nothing-gone": NOTHING_GONE,
+    "queued-image": PREVIEW_GONE,
+    "queue-state": QueueState(
+        platform_id="uuv-1",
+        time_utc_s=1476262801.0,
+        rate=1,
+        frame_loss=0.25,
+        packet_interval_s=6.5,
+        messages_waiting=2,
+        message_bytes=40,
+        images_waiting=2,
+        images=(PREVIEW_GONE, NOTHING_GONE),
+    ),
+    "queue-state-empty": QueueState(
+        platform_id="uuv-1",
+        time_utc_s=1476262801.0,
+        rate=4,
+        frame_loss=None,
+        packet_interval_s=3.5,
+        messages_waiting=0,
+        message_bytes=0,
+        images_waiting=0,
+        images=(),
+    ),
     "contact-full": FULL_CONTACT,
     "contact-bare": BARE_CONTACT,
     "raster-8-bits": RASTER_8,
@@ -184,6 +254,39 @@ SAMPLES: dict[str, Record] = {
         lon_deg=-70.6712,
         issued_by="op",
         issued_utc_s=1476262902.0,
+    ),
+    "advice-full": Advice(
+        advice_id="a-2016-10-12-1",
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        image_id="00A7",
+        image_version=2,
+        verdict="mine_like",
+        confidence=0.875,
+        mlo_class="sphere",
+        remark="the shadow has a clean edge — look again from the east",
+        author="expert",
+        advised_utc_s=1476263000.5,
+    ),
+    "advice-bare": Advice(
+        advice_id="a-2",
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        image_id="0001",
+        image_version=1,
+        author="expert",
+        advised_utc_s=0.0,
+    ),
+    "tasking-state-waiting": TaskingState(
+        vessel_id="vessel-1", kind="advice", record_id="a-2", state="waiting", changed_utc_s=1476263001.0
+    ),
+    "tasking-state-refused": TaskingState(
+        vessel_id="vessel-1",
+        kind="command",
+        record_id="c-9",
+        state="refused",
+        reason="sonarpost/v1/vessel-1/command/refine: no consumer",
+        changed_utc_s=1476263002.0,
     ),
     "relayed": Relayed(
         vessel_id="vessel-1",
@@ -375,6 +478,29 @@ STRATEGIES: dict[type[Record], st.SearchStrategy[Any]] = {
         operator=_text(1, 120),
         decided_utc_s=_time,
     ),
+    Advice: st.builds(
+        Advice,
+        advice_id=_record_id,
+        vessel_id=_name,
+        vehicle_id=_name,
+        image_id=_image_id,
+        image_version=_ordinal,
+        verdict=st.sampled_from([None, "mine_like", "not_mine_like", "unsure"]),
+        confidence=_maybe(_real(0, 1)),
+        mlo_class=_maybe(_text(0, 60)),
+        remark=_text(0, 2000),
+        author=_text(1, 120),
+        advised_utc_s=_time,
+    ),
+    TaskingState: st.builds(
+        TaskingState,
+        vessel_id=_name,
+        kind=st.sampled_from(["advice", "command"]),
+        record_id=_record_id,
+        state=st.sampled_from(["waiting", "delivered", "refused"]),
+        reason=_text(0, 2000),
+        changed_utc_s=_time,
+    ),
     Command: commands(),
     Relayed: st.builds(
         Relayed, vessel_id=_name, key=_text(1, 300), payload=st.binary(max_size=200), relayed_utc_s=_time
@@ -391,5 +517,54 @@ STRATEGIES: dict[type[Record], st.SearchStrategy[Any]] = {
         gauges=st.dictionaries(_text(0, 40), _finite, max_size=4),
     ),
 }
+
+STRATEGIES[OutgoingMessage] = st.builds(
+    OutgoingMessage,
+    message_id=_record_id,
+    source=_text(1, 40),
+    priority=st.integers(1, 7),
+    lifetime_s=_real(0, 604800, exclude_min=True),
+    created_utc_s=_time,
+    data=st.binary(min_size=1, max_size=100),
+)
+STRATEGIES[ReceivedMessage] = st.builds(
+    ReceivedMessage,
+    vessel_id=_name,
+    vehicle_id=_name,
+    received_utc_s=_time,
+    data=st.binary(min_size=1, max_size=100),
+)
+STRATEGIES[DownlinkState] = st.builds(
+    DownlinkState,
+    vessel_id=_name,
+    vehicle_id=_name,
+    kind=st.sampled_from(["refine", "resend", "revisit", "decision"]),
+    record_id=_record_id,
+    state=st.sampled_from(["asked", "sent", "confirmed", "refused", "expired"]),
+    times_sent=_count,
+    expires_utc_s=_time,
+    changed_utc_s=_time,
+    reason=_text(0, 2000),
+)
+STRATEGIES[QueuedImage] = st.builds(
+    QueuedImage,
+    image_id=_image_id,
+    contact_id=_text(1, 120),
+    bytes_left=_count,
+    preview_utc_s=_maybe(_time),
+    expected_utc_s=_time,
+)
+STRATEGIES[QueueState] = st.builds(
+    QueueState,
+    platform_id=_name,
+    time_utc_s=_time,
+    rate=st.integers(0, 6),
+    frame_loss=_maybe(_real(0, 1)),
+    packet_interval_s=_real(0, 86400),
+    messages_waiting=_count,
+    message_bytes=_count,
+    images_waiting=_count,
+    images=st.lists(STRATEGIES[QueuedImage], max_size=3).map(tuple),
+)
 
 any_record: st.SearchStrategy[Record] = st.one_of(*STRATEGIES.values())

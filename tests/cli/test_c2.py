@@ -1,0 +1,353 @@
+"""`sonarpost c2`: live lines, tables, files, exports, and what is handed in for a vessel."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from xml.etree import ElementTree as ET
+
+import pytest
+import zenoh
+from conftest import eventually, free_port
+
+from services.c2.archive import Archive
+from services.c2.config import C2Config
+from services.c2.service import C2Service
+from sonarpost import keys, wire
+from sonarpost.cli.c2.ls import join, select
+from sonarpost.cli.c2.options import printable, since_of
+from sonarpost.cli.main import main
+from sonarpost.errors import ConfigError
+from sonarpost.messages import Advice, Contact, Decision, Raster, ReconstructedImage, TaskingState
+from sonarpost.runtime.session import router_config
+
+FIRST_S = 1_700_000_000.0
+
+
+def image(image_id="AAAA", version=1, vehicle="uuv-1", vessel="vessel-1", first_frame_utc_s=FIRST_S):
+    picture = Raster(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
+    return ReconstructedImage(
+        vessel_id=vessel,
+        vehicle_id=vehicle,
+        image_id=image_id,
+        version=version,
+        contact=Contact(contact_id=f"{vehicle}/{image_id}", vehicle_id=vehicle, lat_deg=56.4, lon_deg=-5.6),
+        codec="vq",
+        model="",
+        picture=picture,
+        picture_sha256=picture.sha256,
+        complete=True,
+        missing_fraction=0.0,
+        missing_mask=b"",
+        missing_halves=(),
+        bytes_received=42,
+        bytes_total=42,
+        frames_received=2,
+        first_frame_utc_s=first_frame_utc_s,
+        last_frame_utc_s=first_frame_utc_s + 1,
+    )
+
+
+def decision(decision_id="d1", image_id="AAAA", decided_utc_s=FIRST_S + 60, verdict="mine_like", **changes):
+    fields = {
+        "decision_id": decision_id,
+        "vessel_id": "vessel-1",
+        "vehicle_id": "uuv-1",
+        "image_id": image_id,
+        "image_version": 1,
+        "verdict": verdict,
+        "operator": "op",
+        "decided_utc_s": decided_utc_s,
+    }
+    return Decision(**(fields | changes))
+
+
+@pytest.fixture
+def out(tmp_path):
+    """A folder as c2 keeps it: three pictures, one of them in two versions, and a decision."""
+    folder = tmp_path / "out"
+    archive = Archive(C2Config(out_dir=folder))
+    for record in (
+        image("AAAA", 1),
+        image("AAAA", 2),
+        image("BBBB"),
+        image("CCCC", vehicle="uuv-2", vessel="vessel-2"),
+    ):
+        archive.keep_image(record, 5.0)
+        archive.flush()
+    archive.keep_decision(decision())
+    archive.flush()
+    archive.close()
+    return folder
+
+
+def ls(capsys, out, *options):
+    assert main(["c2", "ls", "--out-dir", str(out), "--json", *options]) == 0
+    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+
+def test_ls_shows_the_newest_version_of_each_picture_with_its_decision(capsys, out):
+    rows = ls(capsys, out)
+    assert [(r["image_id"], r["version"], (r["decision"] or {}).get("verdict")) for r in rows] == [
+        ("AAAA", 2, "mine_like"),
+        ("BBBB", 1, None),
+        ("CCCC", 1, None),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--vessel", "vessel-2"], ["CCCC"]),
+        (["--vehicle", "uuv-1"], ["AAAA", "BBBB"]),
+        (["--undecided"], ["BBBB", "CCCC"]),
+        (["--all-versions", "--vessel", "vessel-1"], ["AAAA", "AAAA", "BBBB"]),
+        (["--since", "2099-01-01"], []),
+        (["--since", "2023-11-14T22:13:20"], ["AAAA", "BBBB", "CCCC"]),
+        (["--since", "1h"], []),
+    ],
+)
+def test_ls_filters(options, expected, capsys, out):
+    assert sorted(r["image_id"] for r in ls(capsys, out, *options)) == expected
+
+
+def test_ls_prints_a_table_for_people(capsys, out):
+    assert main(["c2", "ls", "--out-dir", str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "picture" in lines[0]
+    [line] = [line for line in lines if "uuv-1/AAAA" in line]
+    for part in ("vessel-1", "2023-11-14 22:13:20", "56.40000 -5.60000", "mine_like", "op", "0 %"):
+        assert part in line
+    assert lines[-1] == "3 pictures"
+
+
+def test_ls_without_an_index_says_which_file_it_wanted(capsys, tmp_path):
+    assert main(["c2", "ls", "--out-dir", str(tmp_path)]) == 2
+    assert f"{tmp_path / 'index.db'}: got 'no such file', expected the index" in capsys.readouterr().err
+
+
+def test_a_decision_is_about_the_picture_that_had_begun_to_arrive(tmp_path):
+    """A wiped vehicle begins its identifiers anew."""
+    archive = Archive(C2Config(out_dir=tmp_path))
+    archive.keep_image(image("AAAA", first_frame_utc_s=1000.0), 5.0)
+    archive.flush()
+    archive.keep_image(image("AAAA", first_frame_utc_s=2000.0), 5.0)
+    archive.flush()
+    for record in (decision("d1", decided_utc_s=1500.0), decision("d2", decided_utc_s=2500.0, verdict="unsure")):
+        archive.keep_decision(record)
+        archive.flush()
+    rows = join(archive.index().pictures(), archive.index().decisions())
+    archive.close()
+    assert [(r.picture.first_frame_utc_s, r.decision and r.decision.decision_id) for r in rows] == [
+        (1000.0, "d1"),
+        (2000.0, "d2"),
+    ]
+    assert len(select(rows)) == 2
+
+
+def test_get_copies_the_files_of_the_newest_version(capsys, out, tmp_path):
+    assert main(["c2", "get", "uuv-1/AAAA", "--out-dir", str(out), "--to", str(tmp_path / "here")]) == 0
+    names = sorted(p.name for p in (tmp_path / "here").iterdir())
+    assert names == [f"uuv-1_20231114T221320Z_AAAA_v2.{kind}" for kind in ("json", "png", "tiff")]
+    for name in names:
+        assert (tmp_path / "here" / name).read_bytes() == (out / "vessel-1" / name).read_bytes()
+    assert main(["c2", "get", "uuv-1/ZZZZ", "--out-dir", str(out)]) == 2
+    assert "a picture that `sonarpost c2 ls` shows" in capsys.readouterr().err
+
+
+def test_get_of_an_unreadable_file_copies_nothing(capsys, out, tmp_path):
+    next(out.glob("vessel-1/*AAAA_v2.png")).unlink()
+    assert main(["c2", "get", "uuv-1/AAAA", "--out-dir", str(out), "--to", str(tmp_path / "here")]) == 2
+    assert "a file that c2 keeps" in capsys.readouterr().err
+    assert not (tmp_path / "here").exists()
+
+
+def test_export_writes_every_format_and_notes_what_was_exported(capsys, out, tmp_path):
+    files = {name: tmp_path / f"contacts.{name}" for name in ("geojson", "kml", "kmz", "csv")}
+    options = [part for name, path in files.items() for part in (f"--{name}", str(path))]
+    assert main(["c2", "export", "--out-dir", str(out), "--vessel", "vessel-1", *options]) == 0
+    assert len(json.loads(files["geojson"].read_text())["features"]) == 2
+    assert files["kmz"].read_bytes().startswith(b"PK")
+    assert "2 contacts, 0 of them without a position" in capsys.readouterr().out
+    exported = {r["image_id"]: r["exported_utc_s"] is not None for r in ls(capsys, out, "--all-versions")}
+    assert exported == {"AAAA": True, "BBBB": True, "CCCC": False}
+
+
+def test_export_sends_cursor_on_target_events(capsys, out):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(20)
+        port = server.getsockname()[1]
+        heard = bytearray()
+
+        def listen():
+            connection, _ = server.accept()
+            with connection:
+                while piece := connection.recv(4096):
+                    heard.extend(piece)
+
+        listener = threading.Thread(target=listen)
+        listener.start()
+        assert (
+            main(["c2", "export", "--out-dir", str(out), "--vessel", "vessel-1", "--cot", f"tcp://127.0.0.1:{port}"])
+            == 0
+        )
+        listener.join(20)
+    events = [ET.fromstring(text + "</event>") for text in heard.decode().split("</event>")[:-1]]
+    assert sorted(event.attrib["type"][:3] for event in events) == ["a-s", "b-m"]
+    assert len({event.attrib["uid"] for event in events}) == 2
+    assert "2 events, 0 contacts without a position left out" in capsys.readouterr().out
+
+
+def test_export_to_an_endpoint_where_nobody_listens_is_an_error(capsys, out):
+    endpoint = f"tcp://127.0.0.1:{free_port()}"
+    assert main(["c2", "export", "--out-dir", str(out), "--cot", endpoint, "--cot-wait", "0.5"]) == 2
+    assert "tcp://127.0.0.1" in capsys.readouterr().err
+
+
+def test_export_of_nothing_is_an_error_and_of_something_broken_is_said(capsys, out, tmp_path):
+    assert main(["c2", "export", "--out-dir", str(out)]) == 2
+    assert "at least one of --geojson" in capsys.readouterr().err
+    (out / "vessel-1" / "broken.json").write_text("{")
+    assert main(["c2", "export", "--out-dir", str(out), "--csv", str(tmp_path / "c.csv")]) == 1
+    assert "left out: " in capsys.readouterr().err
+
+
+@pytest.fixture
+def c2(platform, tmp_path):
+    service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "live"))
+    assert service.start()
+    yield service
+    service.stop()
+
+
+def test_advice_is_on_c2s_disk_when_the_command_ends(capsys, c2, router, tmp_path):
+    arguments = ["c2", "advise", "uuv-1/AAAA", "--vessel", "vessel-1", "--version", "2", "--verdict", "mine_like"]
+    arguments += ["--confidence", "0.5", "--class", "sphere", "--remark", "look", "--author", "ann", "--id", "a-1"]
+    assert main([*arguments, "--router", router]) == 0
+    assert "advice a-1 for vessel-1 accepted" in capsys.readouterr().out
+    eventually(lambda: c2.gauges()["waiting_for_vessels"] == 1)
+    [item] = c2.store.owed("relay@vessel-1", 9)
+    advice = wire.decode(Advice, item.payload, item.key)
+    assert item.key == keys.advice("vessel-1")
+    assert (advice.image_id, advice.image_version, advice.verdict, advice.author) == ("AAAA", 2, "mine_like", "ann")
+    listing = ["c2", "ls", "--tasking", "--json", "--out-dir", str(tmp_path / "live")]
+    eventually(lambda: main(listing) == 0 and '"state": "waiting"' in capsys.readouterr().out)
+    # Another one under the same name is refused, and the person is told.
+    assert main([*arguments[:-4], "--author", "ann", "--remark", "other", "--id", "a-1", "--router", router]) == 2
+    assert "an identifier that no other record for this vessel has" in capsys.readouterr().err
+
+
+def test_a_command_is_owed_before_advice(capsys, c2, router):
+    assert main(["c2", "advise", "uuv-1/AAAA", "--vessel", "vessel-1", "--router", router]) == 0
+    assert main(["c2", "task", "uuv-1/AAAA", "--vessel", "vessel-1", "--kind", "refine", "--router", router]) == 0
+    eventually(lambda: c2.gauges()["waiting_for_vessels"] == 2)
+    assert [item.key for item in c2.store.owed("relay@vessel-1", 9)] == [
+        keys.command("vessel-1", "refine"),
+        keys.advice("vessel-1"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["advise", "uuv-1", "--vessel", "vessel-1"], "image_id"),
+        (["advise", "uuv-1/aaaa", "--vessel", "vessel-1"], "image_id"),
+        (["advise", "uuv-1/AAAA", "--vessel", "vessel-1", "--confidence", "2"], "confidence"),
+        (["task", "uuv-1", "--vessel", "vessel-1", "--kind", "revisit"], "where to revisit"),
+        (["task", "uuv-1", "--vessel", "vessel-1", "--kind", "refine"], "the image to refine"),
+    ],
+)
+def test_what_is_no_record_is_refused_before_anything_is_sent(arguments, said, capsys):
+    assert main(["c2", *arguments]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_without_c2_or_a_router_the_command_says_so(capsys, router):
+    common = ["c2", "advise", "uuv-1/AAAA", "--vessel", "vessel-1", "--timeout", "0.5"]
+    assert main([*common, "--router", router]) == 2
+    assert "not handed over to c2 within 0.5 s: nobody answers" in capsys.readouterr().err
+    assert main([*common, "--router", f"tcp/127.0.0.1:{free_port()}"]) == 2
+    assert "no router answered within 0.5 s" in capsys.readouterr().err
+
+
+@pytest.fixture
+def watching():
+    """Starts `sonarpost c2 watch` as a process; lines of both outputs come in as they are said."""
+    started = []
+
+    def start(*options):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "sonarpost.cli.main", "c2", "watch", *options],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        )
+        said, complaints = [], []
+        for stream, lines in ((process.stdout, said), (process.stderr, complaints)):
+            threading.Thread(target=lambda s=stream, to=lines: to.extend(iter(s.readline, "")), daemon=True).start()
+        started.append(process)
+        return process, said, complaints
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        process.stderr.close()
+
+
+def shown(session, record, key):
+    session.put(key, wire.encode(record))
+
+
+def test_watch_prints_a_line_each_and_ends_with_ctrl_c_whatever_happens_to_the_router(watching):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    hub = zenoh.open(router_config([endpoint]))
+    process, said, complaints = watching("--router", endpoint)
+    try:
+        eventually(lambda: any("watching shore" in line for line in complaints), timeout_s=30)
+        hub.put(keys.shore_image("vessel-1"), b"rubbish")
+        eventually(lambda: any("expected" in line for line in complaints))
+        shown(hub, image(), keys.shore_image("vessel-1"))
+        shown(hub, decision(remark="two\nlines \x1b[31m"), keys.shore_decision("vessel-1"))
+        state = TaskingState(
+            vessel_id="vessel-1", kind="advice", record_id="a", state="refused", reason="no", changed_utc_s=1
+        )
+        shown(hub, state, keys.tasking_state("vessel-1"))
+        eventually(lambda: len(said) == 3)
+        assert "vessel-1  picture   uuv-1/AAAA v1  30 x 20 px, complete, at 56.40000 -5.60000" in "".join(said)
+        assert "decision  uuv-1/AAAA v1  mine_like two?lines ?[31m (op)\n" in "".join(said)
+        assert "advice    a  refused: no\n" in "".join(said)
+        hub.close()
+        eventually(lambda: any("router not reached" in line for line in complaints))
+        hub = zenoh.open(router_config([endpoint]))
+        eventually(lambda: any("router back" in line for line in complaints), timeout_s=30)
+        eventually(lambda: shown(hub, image("ZZZZ"), keys.shore_image("vessel-1")) or len(said) > 3)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=10) == 0
+        assert not any("Traceback" in line for line in complaints)
+    finally:
+        hub.close()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [("90m", 1e6 - 5400), ("2h", 1e6 - 7200), ("1.5d", 1e6 - 129600), (None, 0)]
+)
+def test_since(text, expected):
+    assert since_of(text, 1e6) == expected
+
+
+@pytest.mark.parametrize("text", ["", "yesterday", "2h30m", "-1h", "12"])
+def test_since_that_is_no_time(text):
+    with pytest.raises(ConfigError, match="--since"):
+        since_of(text)
+
+
+def test_what_a_terminal_would_act_on_is_not_printed():
+    assert printable("a\x1b[2Jb\n\u202ec") == "a?[2Jb??c"

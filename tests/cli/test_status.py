@@ -1,0 +1,339 @@
+"""`sonarpost status`: what a terminal of 80 columns shows, what other programs get, and that it ends cleanly."""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import json
+import os
+import pty
+import re
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from conftest import eventually, free_port
+from rich.console import Console
+
+from sonarpost import keys, wire
+from sonarpost.cli.main import main
+from sonarpost.cli.status import show
+from sonarpost.cli.status.rows import age_text, bytes_text, is_well, rows_of
+from sonarpost.messages import Health
+from sonarpost.runtime.config import PlatformConfig
+from sonarpost.runtime.fleet import FleetState, Seen
+from sonarpost.runtime.session import router_config
+
+NAMES = ("uuv_modem", "acoustic_channel", "op_modem", "decompressor")
+
+
+def health(platform: str = "vessel-1", service: str = "op_modem", **changes: Any) -> Health:
+    fields: dict[str, Any] = {
+        "platform_id": platform,
+        "service": service,
+        "time_utc_s": 1476262800.0,
+        "started_utc_s": 1476262000.0,
+        "state": "ok",
+        "counters": {},
+        "gauges": {"inbox": 0.0, "outbox": 3.0, "refused": 0.0, "disk_free_bytes": 12.3e9},
+    }
+    return Health(**(fields | changes))
+
+
+def seen(record: Health | None, age_s: float | None = 1.2, *, alive: bool | None = True) -> Seen:
+    platform, service = (record.platform_id, record.service) if record else ("vessel-1", "relay")
+    return Seen(platform, service, record, age_s if record else None, alive)
+
+
+MODEM = health(
+    counters={"frames_received": 49, "frames_bad": 1},
+    gauges={"inbox": 0.0, "outbox": 3.0, "snr_in_db": 11.5, "modem_ready": 1.0, "disk_free_bytes": 0.5e9},
+)
+BROKEN = health(
+    "uuv-1", "uuv_modem", state="degraded", detail="/dev/ttyUSB0: not open yet", gauges={"modem_ready": 0.0}
+)
+FLEET = FleetState(
+    (
+        seen(health("uuv-1", "compressor")),
+        seen(BROKEN, 3.0),
+        seen(health(service="decompressor"), 200.0),
+        seen(MODEM),
+        seen(None),
+        seen(health("vessel-2", "relay", state="stopping"), 90_000.0, alive=False),
+        seen(health("vessel-2", "router"), 4.0, alive=False),
+    ),
+    connected=True,
+    rejected=2,
+)
+
+
+def on_terminal(state: FleetState, width: int = 80) -> list[str]:
+    console = Console(file=io.StringIO(), force_terminal=True, width=width, height=40, color_system=None)
+    console.print(show.table(state, rows_of(state, 15.0), "tcp/127.0.0.1:7447"))
+    assert isinstance(console.file, io.StringIO)
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]
+
+
+def test_eighty_columns_show_every_row_whole() -> None:
+    lines = on_terminal(FLEET)
+    assert max(len(line) for line in lines) <= 80
+    assert lines[0] == "tcp/127.0.0.1:7447: 5 of 7 services alive on 3 platforms, 2 records rejected"
+    rows = {tuple(line.split()[:2]) if line[:1].strip() else ("", line.split()[0]): line for line in lines[3:10]}
+    assert len(lines[3:10]) == len(rows) == 7
+    assert re.fullmatch(r"uuv-1 +compressor +ok +1 s +0 +3 +- +12 GB", rows["uuv-1", "compressor"])
+    assert re.fullmatch(r" +uuv_modem +degraded +3 s +- +- +no modem +-", rows["", "uuv_modem"])
+    assert re.fullmatch(
+        r"vessel-1 +decompressor +stale \(ok\) +3 min +0 +3 +- +12 GB", rows["vessel-1", "decompressor"]
+    )
+    assert re.fullmatch(r" +op_modem +ok +1 s +0 +3 +SNR 12 dB, loss 2 % +500 MB", rows["", "op_modem"])
+    assert re.fullmatch(r" +relay +not heard +- +- +- +- +-", rows["", "relay"])
+    assert re.fullmatch(r"vessel-2 +relay +stopped +1 d +0 +3 +- +12 GB", rows["vessel-2", "relay"])
+    assert re.fullmatch(r" +router +gone +4 s +0 +3 +- +12 GB", rows["", "router"])
+    assert lines[-1] == "! uuv-1/uuv_modem: /dev/ttyUSB0: not open yet"
+
+
+def test_long_names_are_folded_and_not_cut() -> None:
+    long = health("a" * 32, "b" * 40, detail="c" * 200)
+    lines = on_terminal(FleetState((seen(long),), connected=True, rejected=0))
+    assert max(len(line) for line in lines) <= 80
+    assert [sum(line.count(c) for line in lines[:-3]) >= n for c, n in (("a", 32), ("b", 40))] == [True, True]
+    assert "".join(lines).count("c") >= 200
+
+
+def test_old_data_looks_old() -> None:
+    def mood(state: Seen, *, connected: bool = True) -> tuple[str, str]:
+        (row,) = rows_of(FleetState((state,), connected, 0), 15.0)
+        return row.state, row.mood
+
+    assert mood(seen(health(), 14.9)) == ("ok", "good")
+    assert mood(seen(health(), 15.1)) == ("stale (ok)", "doubtful")
+    assert mood(seen(health(), 1.0, alive=None), connected=False) == ("ok?", "doubtful")
+    assert mood(seen(health(state="degraded"))) == ("degraded", "bad")
+    assert mood(seen(None)) == ("not heard", "doubtful")
+    assert mood(seen(health(), alive=False)) == ("gone", "gone")
+
+
+def test_well_is_everybody_and_somebody() -> None:
+    def well(*services: Seen, connected: bool = True) -> bool:
+        state = FleetState(services, connected, 0)
+        return is_well(rows_of(state, 15.0), state)
+
+    assert well(seen(health()))
+    assert not well()
+    assert not well(seen(health()), connected=False)
+    assert not well(seen(health()), seen(BROKEN))
+
+
+def test_plain_text_is_whole_and_has_no_control_characters() -> None:
+    hostile = health("uuv-1", "uuv_modem", state="degraded", detail="\x1b[2J\r\nall is well")
+    state = FleetState((seen(hostile), seen(health("a" * 32, "b" * 40))), connected=True, rejected=0)
+    text = show.plain(state, rows_of(state, 15.0), "tcp/127.0.0.1:7447")
+    assert text.replace("\n", "").isprintable()
+    assert len(text.splitlines()) == 5
+    assert ("a" * 32 + "  " + "b" * 40) in text
+    assert "\x1b" not in "".join(on_terminal(state)[3:])
+
+
+@pytest.mark.parametrize(
+    ("age_s", "text"), [(None, "-"), (0.0, "0 s"), (59.9, "59 s"), (60, "1 min"), (7199, "1 h"), (1e6, "11 d")]
+)
+def test_ages(age_s: float | None, text: str) -> None:
+    assert age_text(age_s) == text
+
+
+@pytest.mark.parametrize(
+    ("size", "text"), [(None, "-"), (0, "0 B"), (999, "999 B"), (3400, "3.4 kB"), (1.2e10, "12 GB"), (9e15, "9000 TB")]
+)
+def test_sizes(size: float | None, text: str) -> None:
+    assert bytes_text(size) == text
+
+
+class Platforms:
+    """Tells health and holds tokens as services do."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._records: list[Health] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._tell, daemon=True)
+        self._thread.start()
+
+    def run(self, record: Health) -> None:
+        key = keys.alive(record.platform_id, record.service)
+        self._tokens[key] = self._session.liveliness().declare_token(key)
+        self._records.append(record)
+
+    def end(self, record: Health) -> None:
+        self._records.remove(record)
+        self._tokens.pop(keys.alive(record.platform_id, record.service)).undeclare()
+
+    def _tell(self) -> None:
+        while not self._stop.wait(0.05):
+            for record in tuple(self._records):
+                self._session.put(keys.health(record.platform_id, record.service), wire.encode(record))
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+@pytest.fixture
+def platforms(client: zenoh.Session) -> Any:
+    platforms = Platforms(client)
+    yield platforms
+    platforms.close()
+
+
+def test_once_for_people_and_programs(router: str, platforms: Platforms, capsys: pytest.CaptureFixture[str]) -> None:
+    platforms.run(health())
+    assert main(["status", "--once", "--router", router]) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[1].split() == ["PLATFORM", "SERVICE", "STATE", "HEARD", "IN", "OUT", "LINK", "DISK"]
+    assert "\x1b" not in out
+    platforms.run(BROKEN)
+    assert main(["status", "--once", "--json", "--router", router]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["connected"] is True
+    services = {(s["platform"], s["service"]): s for s in told["services"]}
+    assert services["uuv-1", "uuv_modem"]["detail"] == BROKEN.detail
+    assert services["vessel-1", "op_modem"]["gauges"] == health().gauges
+    assert [s["well"] for s in services.values()] == [False, True]
+
+
+def test_once_ends_when_nobody_answers(capsys: pytest.CaptureFixture[str]) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    started = time.monotonic()
+    assert main(["status", "--once", "--wait", "0.3", "--router", endpoint]) == 1
+    assert time.monotonic() - started < 10
+    assert capsys.readouterr().out.splitlines()[0] == f"{endpoint}: not reached yet"
+
+
+def test_the_configuration_names_the_router(
+    tmp_path: Path, router: str, platforms: Platforms, capsys: pytest.CaptureFixture[str]
+) -> None:
+    platforms.run(health())
+    config = tmp_path / "shore.toml"
+    config.write_text(f'[platform]\nid = "shore-1"\nrouter = ["{router}"]\n')
+    assert main(["status", "--once", "--config", str(config)]) == 0
+    assert capsys.readouterr().out.startswith(f"{router}: 1 of 1 services alive on 1 platforms\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--interval", "0"], "--interval"),
+        (["--stale-after", "-1"], "--stale-after"),
+        (["--tls-ca", "ca.pem"], "--tls-ca, --tls-certificate and --tls-key together"),
+        (["--config", "nowhere.toml"], "nowhere.toml"),
+    ],
+)
+def test_wrong_options_are_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["status", "--once", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+class Terminal:
+    """`sonarpost status` in a terminal of 80 columns and 24 lines."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.master, slave = pty.openpty()
+        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+        environment = {**os.environ, "TERM": "xterm-256color"}
+        for name in ("COLUMNS", "LINES", "NO_COLOR"):
+            environment.pop(name, None)
+        command = [sys.executable, "-m", "sonarpost.cli.main", "status", *arguments]
+        self.process = subprocess.Popen(
+            command, stdin=slave, stdout=slave, stderr=slave, env=environment, start_new_session=True
+        )
+        os.close(slave)
+        self.text = ""
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        while True:
+            try:
+                data = os.read(self.master, 65536)
+            except OSError:  # the terminal's other end is closed: the process has ended
+                return
+            self.text += data.decode(errors="replace")
+
+    def screen(self) -> str:
+        """The last picture drawn: what follows the last jump home."""
+        return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.text.rpartition("\x1b[H")[2])
+
+    def wait(self) -> int:
+        status = self.process.wait(10)
+        self._thread.join(5)
+        os.close(self.master)
+        return status
+
+
+def ended_cleanly(terminal: Terminal) -> None:
+    assert "Traceback" not in terminal.text
+    # Back on the main screen, with a cursor.
+    assert terminal.text.rindex("\x1b[?1049l") > terminal.text.rindex("\x1b[?1049h")
+    assert terminal.text.rindex("\x1b[?25h") > terminal.text.rindex("\x1b[?25l")
+
+
+def test_the_terminal_is_put_right_at_sigterm() -> None:
+    terminal = Terminal("--router", f"tcp/127.0.0.1:{free_port()}", "--interval", "0.1")
+    try:
+        eventually(lambda: "not reached yet" in terminal.screen(), what="the first picture")
+    finally:
+        terminal.process.terminate()
+        status = terminal.wait()
+    assert status == 0
+    ended_cleanly(terminal)
+
+
+def test_the_live_table_follows_cuts_and_ends_at_ctrl_c() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    terminal = Terminal("--router", endpoint, "--interval", "0.1", "--stale-after", "2")
+    try:
+        eventually(lambda: "not reached yet" in terminal.screen(), what="the first picture")
+        session = zenoh.open(router_config([endpoint]))
+        platforms = Platforms(session)
+        platforms.run(health())
+        platforms.run(BROKEN)
+        eventually(lambda: "2 of 2 services alive" in terminal.screen() and "no modem" in terminal.screen())
+        platforms.end(BROKEN)
+        eventually(lambda: re.search(r"uuv_modem +gone", terminal.screen()) is not None, what="the end of a service")
+        platforms.close()
+        session.close()
+        eventually(lambda: "what is below is old" in terminal.screen(), what="the end of the router")
+        eventually(lambda: "stale (ok)" in terminal.screen(), what="stale health")
+        session = zenoh.open(router_config([endpoint]))
+        platforms = Platforms(session)
+        platforms.run(health())
+        eventually(lambda: "1 of 2 services alive" in terminal.screen(), what="the router's return")
+        platforms.close()
+        session.close()
+    finally:
+        terminal.process.send_signal(signal.SIGINT)
+        status = terminal.wait()
+    assert status == 0
+    ended_cleanly(terminal)
+
+
+def test_a_pipe_gets_lines(router: str, platforms: Platforms, platform: Callable[[str], PlatformConfig]) -> None:
+    platforms.run(health())
+    command = [sys.executable, "-m", "sonarpost.cli.main", "status", "--router", router, "--json", "--interval", "0.1"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        while not any(s["well"] for s in json.loads(process.stdout.readline())["services"]):
+            pass
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10) == 0

@@ -1,0 +1,44 @@
+"""docs/observability.md, the alert rules and the dashboard say what the code does."""
+
+from __future__ import annotations
+
+import json
+import re
+
+from cli.test_status import FLEET, on_terminal
+from conftest import REPOSITORY
+
+from sonarpost.runtime.metrics import FleetCollector
+
+DOCS = REPOSITORY / "docs"
+PAGE = (DOCS / "observability.md").read_text(encoding="utf-8")
+
+
+def test_the_table_in_the_page_is_what_a_terminal_shows() -> None:
+    (shown,) = re.findall(r"```text\n(tcp/.*?)```", PAGE, re.DOTALL)
+    assert shown.splitlines() == on_terminal(FLEET)
+
+
+def test_every_fixed_metric_is_in_the_page() -> None:
+    named = {
+        family.name + ("_total" if family.type == "counter" else "")
+        for family in FleetCollector(lambda: FLEET).collect()
+        if not any(sample.labels.get("service") for sample in family.samples)
+        or family.name in ("sonarpost_up", "sonarpost_state", "sonarpost_health_age_seconds")
+    }
+    assert named
+    assert {name for name in named if f"`{name}`" not in PAGE} == set()
+
+
+def test_rules_and_dashboard_ask_for_what_services_tell() -> None:
+    pages = "".join(path.read_text(encoding="utf-8") for path in (REPOSITORY / "services").glob("*/README.md"))
+    told = set(re.findall(r"`(\w+)`", pages))
+    fixed = set(re.findall(r"`(sonarpost_\w+)`", PAGE))
+    rules = (DOCS / "observability" / "alerts.yml").read_text(encoding="utf-8")
+    dashboard = json.loads((DOCS / "observability" / "dashboard.json").read_text(encoding="utf-8"))
+    asked = set(re.findall(r"\bsonarpost_\w+", rules))
+    for panel in dashboard["panels"]:
+        asked |= {name for target in panel["targets"] for name in re.findall(r"\bsonarpost_\w+", target["expr"])}
+    assert len(asked) > 10
+    unknown = {n for n in asked - fixed if n.removeprefix("sonarpost_").removesuffix("_total") not in told}
+    assert unknown == set()

@@ -1,0 +1,118 @@
+"""Accepted records for the tests of exports, written as c2 writes them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sonarpost.export.accepted import Accepted
+from sonarpost.export.cot import cot_events
+from sonarpost.export.csv_table import csv_bytes
+from sonarpost.export.geojson import geojson_bytes
+from sonarpost.export.kml import kml_bytes
+from sonarpost.messages import Contact, Decision, Raster, ReconstructedImage
+from sonarpost.runtime.picture_files import write_picture
+from sonarpost.runtime.shore_files import decision_file_name
+
+FIRST_UTC_S = 1476262801.25
+
+
+def image(image_id: str = "00A7", contact: dict[str, Any] | None = None, **changes: Any) -> ReconstructedImage:
+    pixels = np.arange(16 * 24, dtype=np.uint16).astype(np.uint8).reshape(16, 24)
+    picture = changes.pop("picture", None) or Raster.from_array(pixels)
+    vehicle_id = changes.get("vehicle_id", "uuv-1")
+    known = {
+        "lat_deg": 41.52513339,
+        "lon_deg": -70.67124561,
+        "position_sigma_m": 4.5,
+        "time_utc_s": 1476262790.5,
+        "depth_m": 12.25,
+        "altitude_m": 3.5,
+        "heading_deg": 30.0,
+        "channel": "starboard",
+        "ground_range_m": 20.5,
+        "atd_confidence": 1.75,
+        "pixel_along_m": 0.25,
+        "pixel_across_m": 0.125,
+    }
+    record = Contact(contact_id=f"{vehicle_id}/{image_id}", vehicle_id=vehicle_id, **(known | (contact or {})))
+    fields: dict[str, Any] = {
+        "vessel_id": "vessel-1",
+        "vehicle_id": vehicle_id,
+        "image_id": image_id,
+        "version": 1,
+        "contact": record,
+        "codec": "vq",
+        "model": "1f" * 32,
+        "picture": picture,
+        "picture_sha256": picture.sha256,
+        "complete": True,
+        "missing_fraction": 0.0,
+        "missing_mask": b"",
+        "missing_halves": (),
+        "bytes_received": 232,
+        "bytes_total": 232,
+        "frames_received": 6,
+        "first_frame_utc_s": FIRST_UTC_S,
+        "last_frame_utc_s": FIRST_UTC_S + 30,
+        "notes": (),
+    }
+    return ReconstructedImage(**(fields | changes))
+
+
+def decision(image_id: str = "00A7", **changes: Any) -> Decision:
+    fields: dict[str, Any] = {
+        "decision_id": "d-1",
+        "vessel_id": "vessel-1",
+        "vehicle_id": "uuv-1",
+        "image_id": image_id,
+        "image_version": 1,
+        "verdict": "mine_like",
+        "operator": "A. Operator",
+        "decided_utc_s": FIRST_UTC_S + 600,
+    }
+    return Decision(**(fields | changes))
+
+
+def keep(out_dir: Path, *records: ReconstructedImage | Decision) -> Path:
+    """Write records into c2's folder; `test_c2_writes_what_is_read` holds this to what c2 does."""
+    for record in records:
+        folder = out_dir / record.vessel_id
+        if isinstance(record, ReconstructedImage):
+            write_picture(folder, record)
+            continue
+        decisions = folder / "decisions"
+        decisions.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(record.model_dump(), indent=1) + "\n"
+        (decisions / decision_file_name(record.decision_id)).write_text(text)
+    return out_dir
+
+
+def mission(out_dir: Path) -> Path:
+    """Write one of every kind of contact; what the golden files show."""
+    return keep(
+        out_dir,
+        image("0001"),
+        image("0002", {"lat_deg": 41.5261}, version=2, notes=("a note",)),
+        decision("0002", decision_id="d-2", mlo_class="moored mine", confidence=0.8, remark='=1+1 <b>& "both"</b>'),
+        image("0003", {"lat_deg": 41.5271, "channel": "port"}),
+        decision("0003", decision_id="d-3a", verdict="mine_like"),
+        decision("0003", decision_id="d-3b", verdict="not_mine_like", decided_utc_s=FIRST_UTC_S + 700),
+        image("0004", {"lat_deg": 41.5281, "heading_deg": None}, missing_fraction=0.25, complete=False),
+        decision("0004", decision_id="d-4", verdict="unsure", operator="B. Operator"),
+        image("0005", {"lat_deg": None, "lon_deg": None, "position_sigma_m": None}),
+        image("0006", {"lat_deg": 41.5291}, codec="", model="", complete=False, missing_fraction=1.0),
+    )
+
+
+def golden_files(accepted: Accepted) -> dict[str, bytes]:
+    """Return every export that is text, by the name of its golden file."""
+    return {
+        "mission.geojson": geojson_bytes(accepted),
+        "mission.kml": kml_bytes(accepted),
+        "mission.csv": csv_bytes(accepted),
+        "mission.cot": b"\n".join(cot_events(accepted, FIRST_UTC_S + 3600)) + b"\n",
+    }

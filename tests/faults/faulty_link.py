@@ -1,0 +1,129 @@
+"""A TCP link between two routers that a test cuts, stalls, or makes thin."""
+
+from __future__ import annotations
+
+import contextlib
+import selectors
+import socket
+import struct
+import threading
+import time
+
+PIECE_BYTES = 4096
+POLL_S = 0.02
+_RESET_ON_CLOSE = struct.pack("ii", 1, 0)
+
+
+class FaultyLink:
+    """Forwards connections to a port of this host, in two directions: `up` to the target and `down` from it.
+
+    - `cut` resets every connection (RST) and refuses new ones until `mend`.
+    - `stall` is a black hole: nothing passes and nobody is told. What was on its way arrives after `mend`, as it does
+      when TCP sends it again, unless an end has given the connection up.
+
+    Args:
+        target_port: Where connections go.
+        bytes_per_s: Of each direction; None for no limit.
+    """
+
+    def __init__(self, target_port: int, bytes_per_s: float | None = None) -> None:
+        self._target_port = target_port
+        self._bytes_per_s = bytes_per_s
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = int(self._listener.getsockname()[1])
+        self._closing = threading.Event()
+        self._refusing = threading.Event()
+        self._stalled = {"up": threading.Event(), "down": threading.Event()}
+        self._sockets: set[socket.socket] = set()
+        self._lock = threading.Lock()
+        self.passed_bytes = {"up": 0, "down": 0}
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        """Reset every connection, and every new one at once."""
+        self._refusing.set()
+        self._reset_all()
+
+    def stall(self, *directions: str) -> None:
+        """Let nothing pass any more in these directions, by default in both."""
+        for direction in directions or ("up", "down"):
+            self._stalled[direction].set()
+
+    def mend(self) -> None:
+        """Let everything pass again."""
+        for stalled in self._stalled.values():
+            stalled.clear()
+        self._refusing.clear()
+
+    def lose_what_is_on_its_way(self) -> None:
+        """Reset every connection; new ones are taken."""
+        self._reset_all()
+
+    def close(self) -> None:
+        """End the link."""
+        self._closing.set()
+        self._listener.close()
+        self._reset_all()
+
+    def _reset_all(self) -> None:
+        with self._lock:
+            ends, self._sockets = self._sockets, set()
+        for end in ends:
+            with contextlib.suppress(OSError):
+                end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_ON_CLOSE)
+                end.shutdown(socket.SHUT_RDWR)
+
+    def _accept(self) -> None:
+        while not self._closing.is_set():
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            try:
+                if self._refusing.is_set():
+                    raise ConnectionRefusedError
+                far = socket.create_connection(("127.0.0.1", self._target_port), timeout=2)
+                far.settimeout(None)
+            except OSError:
+                near.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_ON_CLOSE)
+                near.close()
+                continue
+            with self._lock:
+                self._sockets |= {near, far}
+            pair = [
+                threading.Thread(target=self._pump, args=(near, far, "up"), daemon=True),
+                threading.Thread(target=self._pump, args=(far, near, "down"), daemon=True),
+            ]
+            for thread in pair:
+                thread.start()
+            threading.Thread(target=self._close_after, args=(pair, near, far), daemon=True).start()
+
+    def _close_after(self, pair: list[threading.Thread], near: socket.socket, far: socket.socket) -> None:
+        for thread in pair:
+            thread.join()
+        with self._lock:
+            self._sockets -= {near, far}
+        near.close()
+        far.close()
+
+    def _pump(self, source: socket.socket, target: socket.socket, direction: str) -> None:
+        with selectors.DefaultSelector() as selector:
+            selector.register(source, selectors.EVENT_READ)
+            try:
+                while not self._closing.is_set():
+                    if not selector.select(0.5):
+                        continue
+                    data = source.recv(PIECE_BYTES)
+                    while self._stalled[direction].is_set() and not self._closing.is_set():
+                        time.sleep(POLL_S)
+                    if not data:
+                        break
+                    target.sendall(data)
+                    self.passed_bytes[direction] += len(data)
+                    if self._bytes_per_s is not None:
+                        time.sleep(len(data) / self._bytes_per_s)
+            except OSError:
+                pass  # an end is gone; the other is told below
+        for end in (source, target):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)

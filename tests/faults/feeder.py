@@ -1,0 +1,58 @@
+"""The test's own outbox, and pictures for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from sonarpost import keys
+from sonarpost.messages import Raster, ReconstructedImage
+from sonarpost.runtime.config import ServiceConfig
+from sonarpost.runtime.service import Effects, Service
+
+VESSEL = "vessel-1"
+
+
+def make_image(
+    number: int, shape: tuple[int, int] = (24, 32), mission: int = 0, version: int = 1
+) -> ReconstructedImage:
+    """Return a picture of noise that no other number, mission or version has."""
+    rng = np.random.default_rng([mission, number, version])
+    raster = Raster.from_array(rng.integers(0, 256, shape, dtype=np.uint8))
+    return ReconstructedImage(
+        vessel_id=VESSEL,
+        vehicle_id=f"uuv-{number % 3 + 1}",
+        image_id=f"{number:04d}",
+        version=version,
+        contact=None,
+        codec="vq",
+        model="",
+        picture=raster,
+        picture_sha256=raster.sha256,
+        complete=True,
+        missing_fraction=0.0,
+        missing_mask=b"",
+        missing_halves=(),
+        bytes_received=232,
+        bytes_total=232,
+        frames_received=6,
+        first_frame_utc_s=1.0e9 + 86400.0 * mission + number,
+        last_frame_utc_s=1.0e9 + 86400.0 * mission + number,
+    )
+
+
+class Feeder(Service[ServiceConfig]):
+    """The test's own outbox, in the decompressor's place."""
+
+    NAME = "feeder"
+
+    def handle(self, key: str, record: object, effects: Effects) -> None:
+        raise AssertionError("the feeder takes nothing")
+
+    def owe(self, images: Iterable[ReconstructedImage]) -> None:
+        """Commit pictures for the relay."""
+        effects = Effects()
+        for image in images:
+            effects.send(keys.image_reconstructed(VESSEL), "relay", image, priority=5)
+        self.commit(effects)

@@ -1,0 +1,60 @@
+"""A disk of a few megabytes that a test fills."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+
+class SmallDisk:
+    """A tmpfs; mounting one needs root, and the test is skipped without.
+
+    Args:
+        folder: Where it is mounted.
+        size_kb: Its size at first.
+    """
+
+    def __init__(self, folder: Path, size_kb: int) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True)
+        if os.geteuid() != 0:
+            pytest.skip("a small disk (tmpfs) can be mounted by root only")
+        done = self._mount("-t", "tmpfs", "-o", f"size={size_kb}k", "tmpfs", str(folder))
+        if done.returncode:
+            pytest.skip(f"a small disk (tmpfs) cannot be mounted here: {done.stderr.strip()}")
+
+    def _mount(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(["mount", *arguments], capture_output=True, text=True, check=False)
+
+    def fill(self) -> None:
+        """Take all the space that is left."""
+        with (self.folder / "ballast").open("wb", buffering=0) as file:
+            for size in (65536, 4096):
+                try:
+                    while True:
+                        file.write(b"x" * size)
+                except OSError:
+                    continue
+
+    def empty(self) -> None:
+        """Give back what `fill` took."""
+        (self.folder / "ballast").unlink()
+
+    def grow(self, size_kb: int) -> None:
+        """Make the disk larger."""
+        done = self._mount("-o", f"remount,size={size_kb}k", str(self.folder))
+        assert done.returncode == 0, done.stderr
+
+    @property
+    def free_bytes(self) -> int:
+        """Free space."""
+        return shutil.disk_usage(self.folder).free
+
+    def close(self) -> None:
+        """Unmount."""
+        if self.folder.is_mount():
+            subprocess.run(["umount", "--lazy", str(self.folder)], check=True)

@@ -1,0 +1,218 @@
+"""A host's TLS files: what is wrong with them is said at the start, and never what is in them."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives import serialization
+
+from sonarpost.errors import ConfigError
+from sonarpost.runtime import config
+from sonarpost.runtime.config import ServiceConfig
+from sonarpost.runtime.tls import OwnTls
+from sonarpost.security import tls_files
+from sonarpost.security.fleet import Fleet
+from tests.security.conftest import tls_of
+
+DAY_S = 86400.0
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+    return Fleet.init(tmp_path_factory.mktemp("fleet") / "pki", "test")
+
+
+@pytest.fixture
+def folder(fleet: Fleet, tmp_path: Path) -> Path:
+    Fleet.index(fleet)
+    platform = f"vessel-{len(fleet.index().certificates)}"
+    return fleet.issue(platform, "vessel", out=tmp_path / "tls").folder
+
+
+def check(folder: Path, now_utc_s: float | None = None) -> tls_files.OwnCertificate:
+    tls = tls_of(folder)
+    return tls_files.check(tls.ca, tls.certificate, tls.key, time.time() if now_utc_s is None else now_utc_s)
+
+
+def test_good_files_say_whose_they_are(folder):
+    own = check(folder)
+    assert own.common_name.startswith("vessel-")
+    assert 364 < own.days_left(time.time()) <= 365
+    assert own.remarks == ()
+
+
+def missing(folder):
+    (folder / "key.pem").unlink()
+
+
+def open_key(folder):
+    (folder / "key.pem").chmod(0o604)
+
+
+def other_key(folder):
+    other = Fleet.init(folder / "x", "other").issue("vessel-1", "vessel").folder
+    (folder / "key.pem").write_bytes((other / "key.pem").read_bytes())
+
+
+def other_authority(folder):
+    other = Fleet.init(folder / "x", "other")
+    (folder / "ca.pem").write_bytes((other.folder / "ca.pem").read_bytes())
+
+
+def key_for_certificate(folder):
+    (folder / "certificate.pem").write_bytes((folder / "key.pem").read_bytes())
+
+
+def junk_certificate(folder):
+    (folder / "certificate.pem").write_bytes(b"junk")
+
+
+def junk_key(folder):
+    (folder / "key.pem").write_bytes(b"junk")
+
+
+def locked_key(folder):
+    key = serialization.load_pem_private_key((folder / "key.pem").read_bytes(), None)
+    protection = serialization.BestAvailableEncryption(b"secret words")
+    pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, protection)
+    (folder / "key.pem").write_bytes(pem)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "where", "words"),
+    [
+        (missing, "key", "No such file"),
+        (open_key, "key", "0604"),
+        (other_key, "key", "another certificate"),
+        (other_authority, "certificate", "issued by"),
+        (key_for_certificate, "certificate", "a private key"),
+        (junk_certificate, "certificate", "PEM certificates"),
+        (junk_key, "key", "PEM private key"),
+        (locked_key, "key", "passphrase"),
+    ],
+)
+def test_what_is_wrong_is_named_and_nothing_of_a_key_is_shown(folder, spoil, where, words):
+    secret = (folder / "key.pem").read_text().splitlines()[1]
+    spoil(folder)
+    with pytest.raises(ConfigError, match=words) as caught:
+        check(folder)
+    assert caught.value.where == f"platform.tls.{where}"
+    assert str(folder) in caught.value.field
+    assert secret not in str(caught.value)
+    assert secret not in repr(caught.value)
+
+
+def test_validity_counts(folder):
+    with pytest.raises(ConfigError, match="expired"):
+        check(folder, time.time() + 366 * DAY_S)
+    with pytest.raises(ConfigError, match="valid from"):
+        check(folder, time.time() - DAY_S)
+
+
+def test_a_key_its_group_may_read_is_remarked_on(folder):
+    (folder / "key.pem").chmod(0o640)
+    assert "0640" in check(folder).remarks[0]
+
+
+def test_a_key_written_where_its_path_belongs_is_not_repeated(folder):
+    secret = (folder / "key.pem").read_text()
+    with pytest.raises(ConfigError) as caught:
+        tls_files.check(folder / "ca.pem", folder / "certificate.pem", Path(secret), time.time())
+    assert secret.splitlines()[1] not in str(caught.value)
+
+
+def test_health_warns_before_the_end_and_says_when_it_has_come(fleet, tmp_path, caplog):
+    caplog.set_level(logging.WARNING)
+    folder = fleet.issue("vessel-90", "vessel", days=10, out=tmp_path / "tls").folder
+    own, now_utc_s = OwnTls(tls_of(folder)), time.time()
+    assert "The certificate ends soon" in caplog.text
+    assert "ends in 10.0 days" in own.remark(now_utc_s)
+    assert own.trouble(now_utc_s) == ""
+    assert own.remark(now_utc_s + 11 * DAY_S) == ""
+    assert "has expired" in own.trouble(now_utc_s + 11 * DAY_S)
+    assert own.gauges(now_utc_s)["certificate_days_left"] == pytest.approx(10, abs=0.01)
+    late = OwnTls(tls_of(folder).model_copy(update={"warn_days": 5.0}))
+    assert late.remark(now_utc_s) == ""
+    nothing = OwnTls(None)
+    assert (nothing.remark(now_utc_s), nothing.trouble(now_utc_s), nothing.gauges(now_utc_s)) == ("", "", {})
+
+
+# In the configuration
+
+
+def load(tmp_path: Path, text: str, **environment: str):
+    path = tmp_path / "vessel.toml"
+    path.write_text(text)
+    return config.load(path, "relay", ServiceConfig, environment)[0]
+
+
+FILES = 'tls = { ca = "a.pem", certificate = "b.pem", key = "c.pem" }'
+
+
+def test_the_files_are_named_in_the_platform_table(tmp_path):
+    platform = load(tmp_path, f'[platform]\nid = "vessel-1"\nupstream = ["tls/shore:7448"]\n{FILES}\n')
+    assert platform.tls is not None
+    assert [str(p) for p in (platform.tls.ca, platform.tls.certificate, platform.tls.key)] == [
+        "a.pem",
+        "b.pem",
+        "c.pem",
+    ]
+    assert platform.upstream == ("tls/shore:7448",)
+    assert load(tmp_path, '[platform]\nid = "vessel-1"\n').tls is None
+
+
+def test_the_environment_sets_them_one_by_one_or_whole(tmp_path):
+    one = load(tmp_path, f'[platform]\nid = "vessel-1"\n{FILES}\n', SONARPOST_PLATFORM__TLS__KEY="/run/key")
+    assert one.tls is not None
+    assert (str(one.tls.key), str(one.tls.ca)) == ("/run/key", "a.pem")
+    three = {f"SONARPOST_PLATFORM__TLS__{name}": f"/{name}" for name in ("CA", "CERTIFICATE", "KEY")}
+    all_of_them = load(tmp_path, '[platform]\nid = "vessel-1"\n', **three)
+    assert all_of_them.tls is not None
+    assert str(all_of_them.tls.certificate) == "/CERTIFICATE"
+    whole = load(
+        tmp_path,
+        f'[platform]\nid = "vessel-1"\n{FILES}\n',
+        SONARPOST_PLATFORM__TLS='{ ca = "x", certificate = "y", key = "z" }',
+    )
+    assert whole.tls is not None
+    assert str(whole.tls.key) == "z"
+
+
+@pytest.mark.parametrize(
+    ("text", "environment", "field"),
+    [
+        ('tls = { ca = "a" }', {}, "platform.tls.certificate"),
+        ('tls = { ca = "a", certificate = "b", key = "c", kee = "d" }', {}, "platform.tls.kee"),
+        ('tls = "a"', {}, "platform.tls"),
+        (FILES, {"SONARPOST_PLATFORM__TLS__KEE": "x"}, "SONARPOST_PLATFORM__TLS__KEE"),
+        (FILES, {"SONARPOST_PLATFORM__TLS": "x"}, "SONARPOST_PLATFORM__TLS"),
+    ],
+)
+def test_a_wrong_key_is_named(tmp_path, text, environment, field):
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, f'[platform]\nid = "vessel-1"\n{text}\n', **environment)
+    assert caught.value.field == field
+
+
+def test_a_service_with_wrong_files_ends_with_one_line(tmp_path, folder):
+    (folder / "key.pem").chmod(0o644)
+    path = tmp_path / "vessel.toml"
+    names = {"ca": "ca.pem", "certificate": "certificate.pem", "key": "key.pem"}
+    files = ", ".join(f'{name} = "{folder / file}"' for name, file in names.items())
+    path.write_text(f'[platform]\nid = "vessel-1"\nstate_dir = "{tmp_path}"\ntls = {{ {files} }}\n')
+    done = subprocess.run(
+        [sys.executable, "-m", "services.relay", "--config", str(path)],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 2
+    assert "platform.tls.key" in done.stderr
+    assert "0644" in done.stderr
+    assert (folder / "key.pem").read_text().splitlines()[1] not in done.stderr + done.stdout

@@ -1,0 +1,244 @@
+"""c2's index and retention: what is listed, what is removed and in which order, and that decisions never are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from conftest import eventually
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.c2.archive import Archive
+from services.c2.config import C2Config
+from sonarpost.errors import KeptFileError
+from sonarpost.messages import Decision, Raster, ReconstructedImage
+from sonarpost.runtime.shore_files import find_picture, to_remove
+from sonarpost.runtime.shore_index import FILE_NAME, PictureRow, ShoreIndex
+
+DAY_S = 86400.0
+
+
+def image(image_id="AAAA", version=1, vessel="vessel-1", first_frame_utc_s=1_700_000_000.0):
+    picture = Raster(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
+    return ReconstructedImage(
+        vessel_id=vessel,
+        vehicle_id="uuv-1",
+        image_id=image_id,
+        version=version,
+        contact=None,
+        codec="vq",
+        model="",
+        picture=picture,
+        picture_sha256=picture.sha256,
+        complete=True,
+        missing_fraction=0.0,
+        missing_mask=b"",
+        missing_halves=(),
+        bytes_received=42,
+        bytes_total=42,
+        frames_received=2,
+        first_frame_utc_s=first_frame_utc_s,
+        last_frame_utc_s=first_frame_utc_s + 1,
+    )
+
+
+def decision(decision_id="d1"):
+    return Decision(
+        decision_id=decision_id,
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        image_id="AAAA",
+        image_version=1,
+        verdict="mine_like",
+        operator="op",
+        decided_utc_s=1.0,
+    )
+
+
+def row(name, accepted_utc_s=0.0, size_bytes=100, exported_utc_s=None, **changes):
+    fields = {
+        "vessel_id": "vessel-1",
+        "name": name,
+        "vehicle_id": "uuv-1",
+        "image_id": "AAAA",
+        "version": 1,
+        "first_frame_utc_s": 0.0,
+        "last_frame_utc_s": 0.0,
+        "relayed_utc_s": None,
+        "accepted_utc_s": accepted_utc_s,
+        "complete": True,
+        "missing_fraction": 0.0,
+        "height_px": 1,
+        "width_px": 1,
+        "codec": "vq",
+        "lat_deg": None,
+        "lon_deg": None,
+        "atd_class": None,
+        "atd_confidence": None,
+        "size_bytes": size_bytes,
+        "exported_utc_s": exported_utc_s,
+    }
+    return PictureRow(**(fields | changes))
+
+
+@pytest.fixture
+def archive(tmp_path):
+    made = []
+
+    def open_(**options):
+        made.append(Archive(C2Config(out_dir=tmp_path / "out", **options)))
+        return made[-1]
+
+    yield open_
+    for each in made:
+        each.close()
+
+
+def pictures_in(folder):
+    return sorted(path.name for path in folder.glob("*/*.tiff"))
+
+
+def test_what_was_exported_goes_first_then_the_oldest():
+    rows = [row("a", 1), row("b", 2), row("c", 3, exported_utc_s=9.0), row("d", 4, exported_utc_s=9.0)]
+    assert [r.name for r in to_remove(rows, 10.0, None, 250)] == ["c", "d"]
+    assert [r.name for r in to_remove(rows, 10.0, None, 100)] == ["c", "d", "a"]
+    assert to_remove(rows, 10.0, None, 400) == []
+
+
+def test_what_is_too_old_goes_however_much_room_there_is():
+    rows = [row("old", 0.0), row("new", 5 * DAY_S)]
+    assert [r.name for r in to_remove(rows, 6 * DAY_S, 3.0, None)] == ["old"]
+    assert [r.name for r in to_remove(rows, 6 * DAY_S, 3.0, 10)] == ["old", "new"]
+
+
+@given(
+    st.lists(st.tuples(st.floats(0, 1e6), st.integers(0, 1000), st.booleans()), max_size=20),
+    st.none() | st.floats(0.001, 20),
+    st.none() | st.integers(0, 5000),
+)
+def test_what_is_left_is_within_the_limits_and_no_more_is_removed_than_needed(pictures, days, limit):
+    rows = [row(str(n), at, size, 1.0 if done else None) for n, (at, size, done) in enumerate(pictures)]
+    removed = to_remove(rows, 1e6, days, limit)
+    kept = [r for r in rows if r not in removed]
+    assert len(removed) == len(set(removed))
+    if days is not None:
+        assert all(1e6 - r.accepted_utc_s <= days * DAY_S for r in kept)
+    if limit is not None:
+        assert sum(r.size_bytes for r in kept) <= limit
+    if removed and limit is not None and (days is None or 1e6 - removed[-1].accepted_utc_s <= days * DAY_S):
+        assert sum(r.size_bytes for r in kept) + removed[-1].size_bytes > limit
+    if days is None and limit is None:
+        assert removed == []
+
+
+def test_files_go_and_decisions_stay(archive, tmp_path):
+    kept = archive(max_bytes=0)
+    kept.keep_image(image("AAAA"), 5.0)
+    kept.flush()
+    kept.keep_image(image("BBBB"), 5.0)
+    kept.flush()
+    kept.keep_decision(decision())
+    kept.flush()
+    removed = kept.apply_retention(1e9)
+    assert [r.image_id for r in removed] == ["AAAA", "BBBB"]
+    assert sorted(p.name for p in (tmp_path / "out").rglob("*") if p.is_file() and FILE_NAME not in p.name) == [
+        f"{b'd1'.hex()}.json"
+    ]
+    assert kept.pictures_bytes() == 0
+    assert len(kept.index().pictures(removed=True)) == 2
+    assert {r.removed_utc_s for r in kept.index().pictures(removed=True)} == {1e9}
+    assert len(kept.index().decisions()) == 1
+    assert kept.apply_retention(2e9) == []
+
+
+def test_without_limits_nothing_is_removed(archive, tmp_path):
+    kept = archive()
+    kept.keep_image(image(), 5.0)
+    kept.flush()
+    assert kept.apply_retention(1e12) == []
+    assert len(pictures_in(tmp_path / "out")) == 1
+
+
+def test_an_exported_picture_goes_before_an_older_one(archive):
+    kept = archive()
+    kept.keep_image(image("AAAA"), 5.0)
+    kept.flush()
+    kept.keep_image(image("BBBB"), 5.0)
+    kept.flush()
+    index = kept.index()
+    size = index.size_bytes()
+    index.mark("exported_utc_s", [r for r in index.pictures() if r.image_id == "BBBB"], 7.0)
+    limited = archive(max_bytes=size - 1)
+    assert [r.image_id for r in limited.apply_retention(1e10)] == ["BBBB"]
+
+
+def test_a_removed_picture_that_comes_again_is_kept_again(archive, tmp_path):
+    kept = archive(max_bytes=0)
+    assert kept.keep_image(image(), 5.0)
+    kept.flush()
+    kept.apply_retention(1.0)
+    assert kept.keep_image(image(), 5.0)
+    kept.flush()
+    assert len(kept.index().pictures()) == 1
+    assert not kept.keep_image(image(), 5.0)
+    kept.flush()
+
+
+def test_the_index_is_completed_from_the_files(archive, tmp_path):
+    first = archive()
+    first.keep_image(image("AAAA", 1), 5.0)
+    first.flush()
+    first.keep_image(image("AAAA", 2), 5.0)
+    first.flush()
+    first.keep_decision(decision())
+    first.flush()
+    before = [replace(r, relayed_utc_s=None, accepted_utc_s=0.0) for r in first.index().pictures()]
+    first.close()
+    for path in (tmp_path / "out").glob(f"{FILE_NAME}*"):
+        path.unlink()
+    (tmp_path / "out" / "vessel-1" / "broken.json").write_text("{")
+    again = archive()
+    assert [replace(r, accepted_utc_s=0.0) for r in again.index().pictures()] == before
+    assert [d.decision_id for d in again.index().decisions()] == ["d1"]
+
+
+def test_an_index_of_another_version_or_none_is_refused(tmp_path):
+    with pytest.raises(KeptFileError, match="no such file"):
+        ShoreIndex(tmp_path, writable=False)
+    (tmp_path / FILE_NAME).write_bytes(b"no database" * 100)
+    for writable in (True, False):
+        with pytest.raises(KeptFileError, match=r"index\.db"):
+            ShoreIndex(tmp_path, writable=writable)
+
+
+def test_a_picture_is_found_by_name_and_newest_version():
+    rows = [row("f1", version=1), row("f2", version=2), row("g", vessel_id="vessel-2", vehicle_id="uuv-2")]
+    assert find_picture(rows, "uuv-1/AAAA", None, None).name == "f2"
+    assert find_picture(rows, "uuv-1/AAAA", None, 1).name == "f1"
+    assert find_picture(rows, "g", None, None).name == "g"
+    with pytest.raises(KeptFileError, match="a picture that"):
+        find_picture(rows, "uuv-1/ZZZZ", None, None)
+    twice = [*rows, row("h", first_frame_utc_s=9.0)]
+    with pytest.raises(KeptFileError, match="one picture, with --vessel or by the name of its files"):
+        find_picture(twice, "uuv-1/AAAA", None, None)
+
+
+def test_the_service_removes_counts_and_logs(crew, platform, tmp_path, caplog):
+    from services.c2.service import C2Service
+    from sonarpost import keys, wire
+    from sonarpost.messages import Relayed
+
+    service = crew.start(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out", max_bytes=0)))
+    relay = crew.neighbour("vessel-1", "relay")
+    envelope = Relayed(
+        vessel_id="vessel-1",
+        key=keys.image_reconstructed("vessel-1"),
+        payload=wire.encode(image()),
+        relayed_utc_s=5.0,
+    )
+    relay.owe(keys.shore_inbox("vessel-1"), "c2", envelope)
+    eventually(lambda: service.health().counters.get("images_removed") == 1)
+    assert service.health().gauges["pictures_bytes"] == 0
+    assert pictures_in(tmp_path / "out") == []
+    assert "Picture removed by retention" in [record.message for record in caplog.records]

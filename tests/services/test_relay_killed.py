@@ -1,0 +1,86 @@
+"""relay killed (SIGKILL) again and again between two sites: every site has every record, once."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import time
+
+import msgpack
+import pytest
+from conftest import REPOSITORY, eventually
+
+from sonarpost import keys
+from sonarpost.messages import Decision, Relayed
+
+RECORDS = 400
+KILLS = 3
+
+
+@pytest.fixture
+def relay_process(router, tmp_path):
+    """Starts the relay as a process of its own, on a store that stays."""
+    config = tmp_path / "vessel.toml"
+    config.write_text(
+        f'[platform]\nid = "vessel-1"\nrouter = ["{router}"]\nstate_dir = "{tmp_path / "relay"}"\n'
+        '[[relay.upstreams]]\nsite = "shore"\n[[relay.upstreams]]\nsite = "shore-2"\n'
+    )
+    running = []
+
+    def start():
+        process = subprocess.Popen(
+            [sys.executable, "-m", "services.relay", "--config", str(config)],
+            cwd=REPOSITORY,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": str(REPOSITORY / "common")},
+        )
+        running.append(process)
+        return process
+
+    yield start
+    for process in running:
+        process.kill()
+        process.wait()
+
+
+def identifiers(neighbour):
+    return [msgpack.unpackb(envelope.payload)["decision_id"] for envelope in neighbour.got]
+
+
+def test_every_site_gets_every_record_once_however_often_the_relay_is_killed(crew, relay_process):
+    first = crew.neighbour("shore-1", "c2", {keys.shore_inbox_all("shore"): Relayed})
+    second = crew.neighbour("shore-2", "c2", {keys.shore_inbox_all("shore-2"): Relayed})
+    console = crew.neighbour("vessel-1", "console")
+    wanted = [f"d{n}" for n in range(RECORDS)]
+    console.owe(
+        keys.contact_decision("vessel-1"),
+        "relay",
+        *(
+            Decision(
+                decision_id=name,
+                vessel_id="vessel-1",
+                vehicle_id="uuv-1",
+                image_id="AAAA",
+                image_version=1,
+                verdict="unsure",
+                operator="op",
+                decided_utc_s=1.0,
+            )
+            for name in wanted
+        ),
+    )
+    rng = random.Random(7)
+    for kill in range(1, KILLS + 1):
+        process = relay_process()
+        # A little further each time, and then somewhere within the next batches.
+        eventually(lambda kill=kill: len(first.got) >= kill * RECORDS // (KILLS + 2), timeout_s=60)
+        time.sleep(rng.uniform(0, 0.02))
+        process.kill()
+        process.wait()
+    relay_process()
+    for site in (first, second):
+        eventually(lambda site=site: len(site.got) >= RECORDS, timeout_s=60)
+        assert sorted(identifiers(site)) == sorted(wanted)
+    eventually(lambda: console.store.outbox_depth() == 0)
