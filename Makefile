@@ -23,7 +23,7 @@ test: setup
 
 # Tests that take minutes each: long outages, processes killed at random for five minutes.
 test-long: setup
-	$(BIN)/python -m pytest -m long $(ARGS)
+	$(BIN)/python -m pytest -m long -o faulthandler_timeout=1800 $(ARGS)
 
 check: setup
 	$(BIN)/ruff format --check .

@@ -89,8 +89,8 @@ class SpeakingService(ModemService[OpModemConfig]):
             raise PayloadError(key, "kind", record.kind, "the kind in the key")
         if isinstance(record, Decision) and record.vessel_id != self.platform.id:
             raise PayloadError(key, "vessel_id", record.vessel_id, self.platform.id)
-        with self._station_lock:
-            self._station.check(record, key)
+        # Without the lock: this is called within a transaction, and who holds the lock may be waiting for one.
+        self._station.check(record, key)
 
     def handle(self, key: str, record: Record, effects: Effects) -> None:
         """Take an order; the same record once more changes nothing."""

@@ -282,6 +282,15 @@ def test_what_can_never_be_sent_is_refused(key, record, field, begin):
     assert caught.value.field == field
 
 
+def test_an_order_is_checked_while_the_station_is_busy(begin, console, states):
+    service = begin()
+    with service._station_lock:
+        # Taken into the inbox, within a transaction, while a thread that will want a transaction has the station.
+        console.owe(keys.command(VESSEL, "refine"), "op_modem", command())
+        eventually(lambda: service.store.inbox_depth() == 1, timeout_s=10, what="order in the inbox")
+    eventually(lambda: [state.state for state in states("c-1")] == ["asked"])
+
+
 def test_vehicles_without_a_name_can_be_told_too(begin):
     begin().check(keys.command(VESSEL, "refine"), command(vehicle_id="modem-5"))
 

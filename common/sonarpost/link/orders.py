@@ -84,7 +84,8 @@ class OrderBook:
     @property
     def open_orders(self) -> tuple[OpenOrder, ...]:
         """What is not confirmed, refused or expired, the oldest first."""
-        return tuple(order for order in self._orders.values() if order.state.is_open)
+        # A copy first, made in one go: others may ask how many there are while one is added.
+        return tuple(order for order in list(self._orders.values()) if order.state.is_open)
 
     def known(self, kind: str, record_id: str) -> OpenOrder | None:
         """Return the order that a record has led to, None for a new one."""

@@ -111,12 +111,15 @@ class Service(ABC, Generic[C]):
         """
 
     def check(self, key: str, record: Record) -> None:
-        """Refuse a record that came on `key` before it is accepted, by raising BadInputError; by default none is."""
+        """Refuse a record that came on `key` before it is accepted, by raising BadInputError; by default none is.
+
+        Called within a transaction: it must not wait for a lock whose holder may begin one.
+        """
 
     def admit(self, key: str) -> None:
         """Leave a record with its sender while there is no room for it, by raising NotNowError.
 
-        By default while there is not even the room to handle what is here already.
+        By default while there is not even the room to handle what is here already. Called as `check` is.
         """
         self._room.need()
 
