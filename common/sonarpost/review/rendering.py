@@ -1,0 +1,120 @@
+"""Pictures for the eye: layers, colour maps, masks, thumbnails. What is treated says so and is not measured on."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+from scipy.ndimage import median_filter
+
+Grey = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+
+THUMBNAIL_PX: Final = 96
+_HATCH_PX: Final = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One way of showing a picture.
+
+    Attributes:
+        name: In addresses.
+        measurable: Whether lengths may be taken on it.
+        synthesised: Whether it shows what was not received.
+        reason: Why it is not measured on.
+    """
+
+    name: str
+    measurable: bool
+    synthesised: bool
+    reason: str
+
+
+LAYERS: Final = (
+    Layer("raw", measurable=True, synthesised=False, reason=""),
+    Layer(
+        "enhanced",
+        measurable=False,
+        synthesised=True,
+        reason="speckle is smoothed and contrast is stretched for the eye: edges lie elsewhere than in what was received",
+    ),
+)
+
+# Anchors of grey 0, 64, 128, 192, 255 as red, green, blue; in between it is linear.
+_ANCHORS: Final = MappingProxyType(
+    {
+        "inverse": ((255, 255, 255), (191, 191, 191), (127, 127, 127), (63, 63, 63), (0, 0, 0)),
+        "copper": ((0, 0, 0), (79, 50, 32), (159, 100, 64), (239, 150, 95), (255, 220, 180)),
+        "amber": ((0, 0, 0), (80, 40, 0), (170, 95, 0), (250, 165, 25), (255, 240, 190)),
+        "bone": ((0, 0, 0), (56, 56, 78), (112, 124, 140), (170, 198, 198), (255, 255, 255)),
+    }
+)
+MAPS: Final = ("grey", *_ANCHORS)
+
+
+def eight_bits(pixels: Pixels) -> Grey:
+    """Return a picture with its most significant 8 bits, same shape."""
+    return pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)  # type: ignore[return-value]
+
+
+def enhanced(picture: Grey, missing: npt.NDArray[np.bool_]) -> Grey:
+    """Return a picture with speckle smoothed and contrast stretched between its 1st and 99th percentile.
+
+    Args:
+        picture: Shape (height_px, width_px).
+        missing: The same shape; pixels that stay black and do not count.
+    """
+    if missing.all():
+        return picture.copy()
+    smooth = median_filter(picture, size=3, mode="nearest").astype(np.float64)
+    low, high = np.percentile(smooth[~missing], (1, 99))
+    stretched = (smooth - low) / max(high - low, 1.0) * 255.0
+    stretched[missing] = 0
+    return stretched.clip(0, 255).round().astype(np.uint8)
+
+
+def shown(
+    picture: Grey, colour_map: str = "grey", low_percent: float = 0.0, high_percent: float = 100.0, gamma: float = 1.0
+) -> npt.NDArray[np.uint8]:
+    """Return a picture as it is shown: shape (height_px, width_px) for `grey`, else (height_px, width_px, 3).
+
+    Args:
+        picture: Shape (height_px, width_px).
+        colour_map: One of `MAPS`.
+        low_percent: Grey level, in percent of full scale, that is shown black.
+        high_percent: That is shown white; more than `low_percent`.
+        gamma: Exponent, below 1 brightens.
+    """
+    levels = np.linspace(0.0, 100.0, 256)
+    curve = ((levels - low_percent) / (high_percent - low_percent)).clip(0, 1) ** gamma
+    table = (255 * curve).round().astype(np.uint8)
+    grey = table[picture]
+    if colour_map == "grey":
+        return grey
+    anchors = np.array(_ANCHORS[colour_map], np.float64)
+    at = np.array([0, 64, 128, 192, 255])
+    colours = np.stack([np.interp(np.arange(256), at, anchors[:, channel]) for channel in range(3)], axis=1)
+    coloured: npt.NDArray[np.uint8] = colours.round().astype(np.uint8)[grey]
+    return coloured
+
+
+def thumbnail(picture: Grey, missing: npt.NDArray[np.bool_]) -> Grey:
+    """Return a small picture, at most 96 px a side, with a hatch where nothing was received."""
+    rows, columns = np.indices(picture.shape)
+    hatch = np.where((rows + columns) % _HATCH_PX < _HATCH_PX // 2, 160, 70).astype(np.uint8)
+    image = Image.fromarray(np.where(missing, hatch, picture).astype(np.uint8))
+    image.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX), Image.Resampling.BILINEAR)
+    return np.asarray(image, dtype=np.uint8)
+
+
+def png(pixels: npt.NDArray[np.uint8]) -> bytes:
+    """Return a PNG of a picture, shape (height_px, width_px) or (height_px, width_px, 3)."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=4)
+    return buffer.getvalue()
