@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image as Pillow
+from pictures import picture, sdvd_crops
 
 from sonarpost.codec.huffman import HuffmanCodec
 from sonarpost.codec.huffman_code import MAX_CODE_BITS, canonical_codes, code_lengths
@@ -21,16 +20,6 @@ from sonarpost.errors import ConfigError, StreamError
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "huffman"
 COUNTS = st.lists(st.integers(0, 5000), min_size=1, max_size=256).filter(any)
-
-
-def picture(height_px: int, width_px: int) -> np.ndarray:
-    """Texture with a highlight and its shadow, in integers."""
-    rows, columns = np.mgrid[:height_px, :width_px]
-    noise = ((rows * 7919 + columns * 104_729) * 2_654_435_761 >> 13) % 64
-    image = 50 + noise + (rows + columns) % 40
-    image[height_px // 3 : height_px // 2, width_px // 4 : width_px // 2] = 240
-    image[height_px // 3 : height_px // 2, width_px // 2 : width_px * 3 // 4] = 3
-    return image.astype(np.uint8)
 
 
 def body_of(codec: HuffmanCodec, image: np.ndarray, budget: int | None = None) -> bytes:
@@ -276,25 +265,6 @@ def test_any_body_is_a_picture_or_refused(body: bytes, size: tuple[int, int]) ->
         return
     assert decoded.image.shape == decoded.missing.shape == size
     assert not decoded.image[decoded.missing].any()
-
-
-def sdvd_crops(data_dir: Path) -> list[np.ndarray]:
-    """The middle 120 x 120 px of every test picture (or around its target), as 80 x 80 px."""
-    folder = data_dir / "snippets" / "sdvd"
-    crops = []
-    with (folder / "index.csv").open() as index:
-        for row in csv.DictReader(index):
-            if row["split"] == "test":
-                centre = (
-                    [128, 128]
-                    if not row["x0"]
-                    else [(int(row[f"{axis}0"]) + int(row[f"{axis}1"])) // 2 for axis in "xy"]
-                )
-                left, top = (min(max(value - 60, 0), 136) for value in centre)
-                with Pillow.open(folder / "test" / "images" / row["image"]) as picture_:
-                    crop = picture_.convert("L").crop((left, top, left + 120, top + 120))
-                crops.append(np.array(crop.resize((80, 80), Pillow.Resampling.LANCZOS)))
-    return crops
 
 
 @pytest.mark.realdata

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pictures import picture, sdvd_crops
 from PIL import Image as Pillow
 
 from sonarpost.codec import jpeg2000
@@ -21,16 +21,6 @@ from sonarpost.errors import ConfigError, StreamError
 GOLDEN = Path(__file__).parents[1] / "golden" / "jpeg2000"
 RAW, PACKETS = Jpeg2000Codec(), Jpeg2000Codec(packets_only=True)
 BOTH = pytest.mark.parametrize("codec", [RAW, PACKETS], ids=lambda codec: codec.name)
-
-
-def picture(height_px: int, width_px: int) -> np.ndarray:
-    """Texture with a highlight and its shadow, in integers."""
-    rows, columns = np.mgrid[:height_px, :width_px]
-    noise = ((rows * 7919 + columns * 104_729) * 2_654_435_761 >> 13) % 64
-    image = 50 + noise + (rows + columns) % 40
-    image[height_px // 3 : height_px // 2, width_px // 4 : width_px // 2] = 240
-    image[height_px // 3 : height_px // 2, width_px // 2 : width_px * 3 // 4] = 3
-    return image.astype(np.uint8)
 
 
 def body(stream: bytes) -> bytes:
@@ -223,25 +213,6 @@ def test_an_openjpeg_that_writes_other_parameters_is_named(monkeypatch: pytest.M
     monkeypatch.setattr(jpeg2000, "_LOWEST_STEPS", {3: 1, 4: 1, 5: 1, 6: 1})
     with pytest.raises(ConfigError, match="OpenJPEG"):
         RAW.encode(picture(80, 80))
-
-
-def sdvd_crops(data_dir: Path) -> list[np.ndarray]:
-    """The middle 120 x 120 px of every test picture (or around its target), as 80 x 80 px."""
-    folder = data_dir / "snippets" / "sdvd"
-    crops = []
-    with (folder / "index.csv").open() as index:
-        for row in csv.DictReader(index):
-            if row["split"] == "test":
-                centre = (
-                    [128, 128]
-                    if not row["x0"]
-                    else [(int(row[f"{axis}0"]) + int(row[f"{axis}1"])) // 2 for axis in "xy"]
-                )
-                left, top = (min(max(value - 60, 0), 136) for value in centre)
-                with Pillow.open(folder / "test" / "images" / row["image"]) as picture_:
-                    crop = picture_.convert("L").crop((left, top, left + 120, top + 120))
-                crops.append(np.array(crop.resize((80, 80), Pillow.Resampling.LANCZOS)))
-    return crops
 
 
 @pytest.mark.realdata

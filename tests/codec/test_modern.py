@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pictures import picture
 from PIL import Image as Pillow
 
 from sonarpost.codec import modern
@@ -27,16 +28,6 @@ def with_library(wanted: ModernFormat) -> object:
 
 
 EVERY = pytest.mark.parametrize("wanted", [with_library(wanted) for wanted in ModernFormat])
-
-
-def picture(height_px: int, width_px: int) -> np.ndarray:
-    """Texture with a highlight and its shadow, in integers."""
-    rows, columns = np.mgrid[:height_px, :width_px]
-    noise = ((rows * 7919 + columns * 104_729) * 2_654_435_761 >> 13) % 64
-    image = 50 + noise + (rows + columns) % 40
-    image[height_px // 3 : height_px // 2, width_px // 4 : width_px // 2] = 240
-    image[height_px // 3 : height_px // 2, width_px // 2 : width_px * 3 // 4] = 3
-    return image.astype(np.uint8)
 
 
 def body(stream: bytes) -> bytes:

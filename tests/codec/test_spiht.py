@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image as Pillow
+from pictures import picture, sdvd_crops
 
 from sonarpost.codec import spiht
 from sonarpost.codec.interface import StreamHeader
@@ -22,16 +21,6 @@ from sonarpost.errors import ConfigError, StreamError
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "spiht"
 SIZES = st.tuples(st.integers(16, 70), st.integers(16, 70))
-
-
-def picture(height_px: int, width_px: int) -> np.ndarray:
-    """Texture with a highlight and its shadow, in integers."""
-    rows, columns = np.mgrid[:height_px, :width_px]
-    noise = ((rows * 7919 + columns * 104_729) * 2_654_435_761 >> 13) % 64
-    image = 50 + noise + (rows + columns) % 40
-    image[height_px // 3 : height_px // 2, width_px // 4 : width_px // 2] = 240
-    image[height_px // 3 : height_px // 2, width_px // 2 : width_px * 3 // 4] = 3
-    return image.astype(np.uint8)
 
 
 @pytest.mark.parametrize("name", ["80x80-64", "49x113-343", "17x31-40", "17x31-None", "16x200-22"])
@@ -244,25 +233,6 @@ def test_a_snippet_is_encoded_within_200_ms() -> None:
             seconds.append(time.perf_counter() - start)
         # About 10 ms; the best of five, since other work may share the processor.
         assert min(seconds) < 0.2
-
-
-def sdvd_crops(data_dir: Path) -> list[np.ndarray]:
-    """The middle 120 x 120 px of every test picture (or around its target), as 80 x 80 px."""
-    folder = data_dir / "snippets" / "sdvd"
-    crops = []
-    with (folder / "index.csv").open() as index:
-        for row in csv.DictReader(index):
-            if row["split"] == "test":
-                centre = (
-                    [128, 128]
-                    if not row["x0"]
-                    else [(int(row[f"{axis}0"]) + int(row[f"{axis}1"])) // 2 for axis in "xy"]
-                )
-                left, top = (min(max(value - 60, 0), 136) for value in centre)
-                with Pillow.open(folder / "test" / "images" / row["image"]) as picture_:
-                    crop = picture_.convert("L").crop((left, top, left + 120, top + 120))
-                crops.append(np.array(crop.resize((80, 80), Pillow.Resampling.LANCZOS)))
-    return crops
 
 
 @pytest.mark.realdata
