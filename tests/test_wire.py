@@ -9,7 +9,7 @@ from typing import Any
 
 import msgpack
 import pytest
-from golden.zenoh.add_vectors import handoff_samples, plain
+from golden.zenoh.add_vectors import BATCH, batch_samples, handoff_samples, plain
 from golden.zenoh.samples import RECORD_TYPES, SAMPLES, STRATEGIES, any_record
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,6 +18,7 @@ from sonarpost import wire
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Contact, Health, Raster, Record
 from sonarpost.runtime.handoff import Reply, attachment, parse_chunk
+from sonarpost.runtime.handoff_batch import pack_replies, parse_query, unpack_replies
 from sonarpost.runtime.transaction import OutboxItem
 
 GOLDEN = Path(__file__).parent / "golden" / "zenoh"
@@ -76,7 +77,8 @@ def test_old_handoff_messages_parse_for_ever_and_are_made_alike_today() -> None:
         payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
         reply = Reply.unpack(payload, KEY)
         assert (reply.status, reply.next_offset, reply.reason) == (fields["status"], fields["next"], fields["reason"])
-        assert made["handoff-reply"][name] == payload == reply.pack()
+        assert reply.takes == fields.get("takes", 0)
+        assert made["handoff-reply"][name] == payload == reply.pack(reply.takes)
     for name, vector in vectors("handoff-attachment").items():
         payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
         size = min(32768, fields["size"] - fields["offset"])
@@ -90,6 +92,27 @@ def test_old_handoff_messages_parse_for_ever_and_are_made_alike_today() -> None:
         item = OutboxItem(fields["consumer"], chunk.seq, "k", "", 4, bytes(chunk.size), chunk.sha256)
         assert chunk.settled == fields.get("settled", 0)
         assert attachment(chunk.origin, item, chunk.offset, chunk.settled) == payload
+
+
+def test_old_queries_of_several_records_parse_for_ever_and_are_made_alike_today() -> None:
+    made = batch_samples()
+    sizes = [size for _, size in BATCH]
+    data = b"".join(bytes([number]) * size for number, size in enumerate(sizes))
+    for name, vector in vectors("handoff-batch-attachment").items():
+        payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
+        chunks = parse_query(payload, data, KEY)
+        assert isinstance(chunks, tuple)
+        assert [[c.seq, c.size, {"$hex": c.sha256.hex()}] for c in chunks] == fields["records"]
+        assert [c.data for c in chunks] == [bytes([number]) * size for number, size in enumerate(sizes)]
+        assert {c.settled for c in chunks} == {fields.get("settled", 0)}
+        assert {c.origin.hex() for c in chunks} == {fields["origin"]["$hex"]}
+        assert made["handoff-batch-attachment"][name] == payload
+    for name, vector in vectors("handoff-batch-reply").items():
+        payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
+        replies = unpack_replies(payload, len(fields["replies"]), KEY)
+        assert isinstance(replies, tuple)
+        assert [[reply.status, reply.reason] for reply in replies] == fields["replies"]
+        assert made["handoff-batch-reply"][name] == payload == pack_replies(replies)
 
 
 # Round trips

@@ -23,7 +23,7 @@ from services.c2.service import ADVICE_PRIORITY, COMMAND_PRIORITY
 from services.relay.service import DECISION_PRIORITY, DETAIL_PRIORITY, PREVIEW_PRIORITY
 from sonarpost import keys, wire
 from sonarpost.messages import Contact, Decision, Record, Snippet
-from sonarpost.runtime import handoff, outbox, schedule, transaction
+from sonarpost.runtime import handoff, handoff_batch, outbox, schedule, transaction
 from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.handoff import Reply, attachment
 from sonarpost.runtime.service import Effects, Service
@@ -166,6 +166,7 @@ def test_numbers_in_the_text_are_those_of_the_code() -> None:
     assert f"payloads up to {wire.MAX_PAYLOAD_BYTES}" in TEXT
     assert table("The attachment")["size"]["range"] == f"0 to {handoff.MAX_RECORD_BYTES}"
     assert f"{outbox.REPLY_TIMEOUT_S:g} s in sonarpost" in TEXT
+    assert f"at most {handoff_batch.MAX_RECORDS}, and at most {handoff.CHUNK_BYTES} bytes together" in TEXT
     assert f"sonarpost has {outbox.WINDOW} queries and {schedule.WINDOW_BYTES} bytes in flight" in TEXT
     assert f"the first {outbox.PROBE_WINDOW} and no" in TEXT
     assert f"up to {schedule.MAX_WINDOW_BYTES} bytes while answers come within {schedule.GROW_BELOW_S:g} s" in TEXT
@@ -188,7 +189,11 @@ def test_numbers_in_the_text_are_those_of_the_code() -> None:
 def test_attachment_and_reply_have_the_documented_fields() -> None:
     item = OutboxItem("relay", 6, "k", "", 4, b"", bytes(32))
     assert list(msgpack.unpackb(attachment(bytes(16), item, settled=5))) == list(table("The attachment"))
-    assert list(msgpack.unpackb(Reply("stored").pack())) == list(table("The reply"))
+    assert list(msgpack.unpackb(Reply("stored").pack(takes=2))) == list(table("The reply"))
+    several = handoff_batch.attachment(bytes(16), [item], settled=5)
+    assert list(msgpack.unpackb(several)) == list(table("Several records in one query"))
+    replies = handoff_batch.pack_replies([Reply("stored")])
+    assert list(msgpack.unpackb(replies)) == list(table("Several records in one query", 1))
 
 
 def test_the_example_of_an_error_is_one() -> None:
@@ -219,8 +224,8 @@ def test_the_hex_examples_are_the_bytes() -> None:
         "raster": wire.encode(SAMPLES["raster-16-bits"]),
         "decision": decision,
         "attachment": attachment(bytes(range(16)), item),
-        "reply": Reply("stored").pack(),
-        "more": Reply("more", 32768).pack(),
+        "reply": Reply("stored").pack(handoff_batch.MAX_RECORDS),
+        "more": Reply("more", 32768).pack(handoff_batch.MAX_RECORDS),
     }
     assert f"A decision, {len(decision)} bytes:" in TEXT
     assert f"with those {len(decision)} bytes" in TEXT

@@ -7,14 +7,14 @@ says what it has. `docs/wire-zenoh.md` describes the same for other languages.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import msgpack
 
 from sonarpost import wire
 from sonarpost.errors import PayloadError
-from sonarpost.runtime.transaction import Chunk, OutboxItem, consumer_of
+from sonarpost.runtime.items import Chunk, OutboxItem, consumer_of
 
 CHUNK_BYTES = 32 * 1024
 MAX_RECORD_BYTES = 8 * 1024 * 1024
@@ -31,15 +31,23 @@ class Reply:
         status: "stored": the whole record is on the consumer's disk. "more": send on from `next_offset`. "refused": the
             record is wrong and will never be taken, `reason` says why. "later": the consumer cannot store at the
             moment (a full disk), try again.
+        takes: How many records the consumer takes with one query (`handoff_batch`); 0 for one.
     """
 
     status: Status
     next_offset: int = 0
     reason: str = ""
+    takes: int = field(default=0, compare=False)
 
-    def pack(self) -> bytes:
-        """Return the reply as msgpack."""
+    def pack(self, takes: int = 0) -> bytes:
+        """Return the reply as msgpack.
+
+        Args:
+            takes: How many records the consumer takes with one query; left out when 0.
+        """
         fields = {"v": HANDOFF_VERSION, "status": self.status, "next": self.next_offset, "reason": self.reason}
+        if takes:
+            fields["takes"] = takes
         packed: bytes = msgpack.packb(fields)
         return packed
 
@@ -50,12 +58,14 @@ class Reply:
         Raises:
             PayloadError: Not a hand-off reply.
         """
-        fields = _versioned(payload, where)
+        fields = wire.unpack_map(payload, where)
+        _need_version(fields, where)
         status = fields.get("status")
-        next_offset = _integer(fields, "next", where)
+        next_offset = integer(fields, "next", where)
+        takes = integer(fields, "takes", where) if "takes" in fields else 0
         for known in ("stored", "more", "refused", "later"):
             if status == known:
-                return cls(known, next_offset, _reason(fields, where))
+                return cls(known, next_offset, _reason(fields, where), takes)
         raise PayloadError(where, "status", status, "stored, more, refused or later")
 
 
@@ -91,15 +101,24 @@ def parse_chunk(attached: bytes, data: bytes, where: str) -> Chunk:
     Raises:
         PayloadError: A field is missing, wrong or out of bounds.
     """
-    fields = _versioned(attached, where)
+    return parse_fields(wire.unpack_map(attached, where), data, where)
+
+
+def parse_fields(fields: dict[str, object], data: bytes, where: str) -> Chunk:
+    """Parse the unpacked attachment of a hand-over query of one piece.
+
+    Raises:
+        PayloadError: A field is missing, wrong or out of bounds.
+    """
+    _need_version(fields, where)
     chunk = Chunk(
-        origin=_binary(fields, "origin", 16, where),
-        seq=_integer(fields, "seq", where),
-        size=_integer(fields, "size", where),
-        sha256=_binary(fields, "sha256", 32, where),
-        offset=_integer(fields, "offset", where),
+        origin=binary(fields, "origin", 16, where),
+        seq=integer(fields, "seq", where),
+        size=integer(fields, "size", where),
+        sha256=binary(fields, "sha256", 32, where),
+        offset=integer(fields, "offset", where),
         data=data,
-        settled=_integer(fields, "settled", where) if "settled" in fields else 0,
+        settled=integer(fields, "settled", where) if "settled" in fields else 0,
     )
     if chunk.size > MAX_RECORD_BYTES:
         raise PayloadError(where, "size", chunk.size, f"at most {MAX_RECORD_BYTES} bytes")
@@ -114,14 +133,17 @@ def parse_chunk(attached: bytes, data: bytes, where: str) -> Chunk:
     return chunk
 
 
-def _versioned(payload: bytes, where: str) -> dict[str, object]:
-    fields = wire.unpack_map(payload, where)
-    if _integer(fields, "v", where) != HANDOFF_VERSION:
+def _need_version(fields: dict[str, object], where: str) -> None:
+    if integer(fields, "v", where) != HANDOFF_VERSION:
         raise PayloadError(where, "v", fields["v"], str(HANDOFF_VERSION))
-    return fields
 
 
-def _integer(fields: dict[str, object], name: str, where: str) -> int:
+def integer(fields: dict[str, object], name: str, where: str) -> int:
+    """Return a field that is a whole number from 0.
+
+    Raises:
+        PayloadError: It is missing or another thing.
+    """
     value = fields.get(name)
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 63:
         raise PayloadError(where, name, value, "a whole number from 0")
@@ -135,7 +157,12 @@ def _reason(fields: dict[str, object], where: str) -> str:
     return value
 
 
-def _binary(fields: dict[str, object], name: str, length: int, where: str) -> bytes:
+def binary(fields: dict[str, object], name: str, length: int, where: str) -> bytes:
+    """Return a field that is a certain number of bytes.
+
+    Raises:
+        PayloadError: It is missing or another thing.
+    """
     value = fields.get(name)
     if not isinstance(value, bytes) or len(value) != length:
         raise PayloadError(where, name, value, f"{length} bytes")

@@ -14,8 +14,9 @@ import zenoh
 from sonarpost import keys
 from sonarpost.errors import BadInputError, HandoffError, PayloadError
 from sonarpost.runtime.concern import concern_of_payload
-from sonarpost.runtime.handoff import MAX_RECORD_BYTES, Reply, parse_chunk
-from sonarpost.runtime.logs import concerning, kv
+from sonarpost.runtime.handoff import MAX_RECORD_BYTES, Reply
+from sonarpost.runtime.handoff_batch import MAX_RECORDS, pack_replies, parse_query
+from sonarpost.runtime.logs import concerning_later, kv
 from sonarpost.runtime.store import Store
 from sonarpost.runtime.transaction import Chunk, Transaction
 
@@ -25,6 +26,10 @@ BATCH = 64
 QUEUE_LIMIT = 256
 RETRY_S = 0.5
 MAX_REASON = 200
+
+
+Replies = Reply | list[Reply]
+"""What is answered: to a query of several records, for each of them."""
 
 
 class NotNowError(HandoffError):
@@ -76,6 +81,7 @@ class Inbox:
         self._stop = threading.Event()
         self._trouble = False
         self._kept: list[_Arrival] = []
+        self._no_room: dict[str, str | None] = {}
         self._thread = threading.Thread(target=self._run, name=f"inbox-{consumer}", daemon=True)
         self._thread.start()
         self._declared: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
@@ -142,8 +148,9 @@ class Inbox:
                 break
         return batch
 
-    def _commit(self, batch: list[_Arrival]) -> list[Reply]:
+    def _commit(self, batch: list[_Arrival]) -> list[Replies]:
         """Store a batch in one transaction, so that many records share one write to the disk."""
+        self._no_room.clear()
         try:
             with self._store.transaction() as tx:
                 replies = [self._take(tx, arrival) for arrival in batch]
@@ -152,41 +159,64 @@ class Inbox:
                 log.exception("Records cannot be stored, their senders keep them", extra=kv(error=str(error)))
             self._trouble = True
             self._kept = [arrival for arrival in batch if arrival.query is None]
-            return [Reply("later", reason=str(error)[:MAX_REASON])] * len(batch)
+            later: Replies = Reply("later", reason=str(error)[:MAX_REASON])
+            return [later] * len(batch)
         if self._trouble:
             log.info("Records can be stored again")
         self._trouble = False
         return replies
 
-    def _take(self, tx: Transaction, arrival: _Arrival) -> Reply:
+    def _take(self, tx: Transaction, arrival: _Arrival) -> Replies:
         if arrival.query is None:
             return self._take_publication(tx, arrival)
         try:
-            chunk = parse_chunk(arrival.attached, arrival.payload, arrival.key + self._suffix)
-            return self._take_chunk(tx, arrival.key, chunk)
+            asked = parse_query(arrival.attached, arrival.payload, arrival.key + self._suffix)
+        except PayloadError as error:
+            self._on_refused(error)
+            return Reply("refused", reason=str(error))
+        if isinstance(asked, Chunk):
+            return self._take_chunk(tx, arrival.key, asked)
+        return [self._take_chunk(tx, arrival.key, chunk) for chunk in asked]
+
+    def _take_chunk(self, tx: Transaction, key: str, chunk: Chunk) -> Reply:
+        try:
+            return self._taken(tx, key, chunk)
         except NotNowError as error:
             return Reply("later", reason=str(error)[:MAX_REASON])
         except PayloadError as error:
             self._on_refused(error)
             return Reply("refused", reason=str(error))
 
+    def _need_room(self, key: str) -> None:
+        """Ask once a batch whether there is room for what comes on a key."""
+        if key not in self._no_room:
+            try:
+                self._admit(key)
+            except NotNowError as error:
+                self._no_room[key] = str(error)
+            else:
+                self._no_room[key] = None
+        reason = self._no_room[key]
+        if reason is not None:
+            raise NotNowError(reason)
+
     def _take_publication(self, tx: Transaction, arrival: _Arrival) -> Reply:
         try:
-            self._admit(arrival.key)
+            self._need_room(arrival.key)
         except NotNowError as error:
             # Nobody sends it again, and to keep it would take the room that is not there.
             self._on_refused(PayloadError(arrival.key, "payload", "a publication that cannot be stored", str(error)))
             return Reply("later", reason=str(error)[:MAX_REASON])
         return self._take_checked(tx, arrival.key, arrival.payload, None)
 
-    def _take_chunk(self, tx: Transaction, key: str, chunk: Chunk) -> Reply:
+    def _taken(self, tx: Transaction, key: str, chunk: Chunk) -> Reply:
         if chunk.settled:
             tx.settle_upto(chunk.origin, chunk.settled)
         if tx.was_refused(chunk.origin, chunk.seq):
             return Reply("refused", reason="refused before; the reason is in the consumer's log and store")
         if tx.was_seen(chunk.origin, chunk.seq):
             return Reply("stored")
-        self._admit(key)
+        self._need_room(key)
         whole = tx.add_chunk(chunk)
         if isinstance(whole, int):
             return Reply("more", next_offset=whole)
@@ -195,7 +225,7 @@ class Inbox:
         return self._take_checked(tx, key, whole, chunk)
 
     def _take_checked(self, tx: Transaction, key: str, payload: bytes, chunk: Chunk | None) -> Reply:
-        with concerning(**concern_of_payload(payload, key)):
+        with concerning_later(lambda: concern_of_payload(payload, key)):
             return self._checked(tx, key, payload, chunk)
 
     def _checked(self, tx: Transaction, key: str, payload: bytes, chunk: Chunk | None) -> Reply:
@@ -222,13 +252,14 @@ class Inbox:
             tx.mark_refused(chunk.origin, chunk.seq)
         return Reply("refused", reason=reason)
 
-    def _answer(self, batch: list[_Arrival], replies: list[Reply]) -> None:
+    def _answer(self, batch: list[_Arrival], replies: list[Replies]) -> None:
         for arrival, reply in zip(batch, replies, strict=True):
             if arrival.query is None:
                 continue
+            packed = reply.pack(takes=MAX_RECORDS) if isinstance(reply, Reply) else pack_replies(reply)
             try:
                 with arrival.query as query:
-                    query.reply(query.key_expr, reply.pack())
+                    query.reply(query.key_expr, packed)
             except zenoh.ZError as error:
                 # The asker is gone or the link is down: it asks again, and (origin, seq) is known here.
                 log.debug("A reply could not be sent", extra=kv(key=arrival.key, error=str(error)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
@@ -36,6 +36,40 @@ def concerning(**fields: object) -> Iterator[None]:
         yield
     finally:
         _concerned.reset(token)
+
+
+@contextmanager
+def concerning_later(find: Callable[[], Mapping[str, object]]) -> Iterator[None]:
+    """As `concerning`, with fields that are looked for only if a line is logged inside."""
+    token = _concerned.set(_Sought(_concerned.get(), find))
+    try:
+        yield
+    finally:
+        _concerned.reset(token)
+
+
+class _Sought(Mapping[str, object]):
+    """Fields of which some are not looked for before somebody wants to know them."""
+
+    def __init__(self, outer: Mapping[str, object], find: Callable[[], Mapping[str, object]]) -> None:
+        self._outer = outer
+        self._find = find
+        self._found: dict[str, object] | None = None
+
+    def _fields(self) -> dict[str, object]:
+        if self._found is None:
+            inner = {name: value for name, value in self._find().items() if value is not None}
+            self._found = {**self._outer, **inner}
+        return self._found
+
+    def __getitem__(self, name: str) -> object:
+        return self._fields()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._fields())
+
+    def __len__(self) -> int:
+        return len(self._fields())
 
 
 def fields_of(record: logging.LogRecord) -> dict[str, object]:

@@ -7,12 +7,15 @@ limit makes necessary, so that this is short.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import islice
 
 from sonarpost.runtime.handoff import CHUNK_BYTES
+from sonarpost.runtime.handoff_batch import MAX_RECORDS, RECORD_OVERHEAD_BYTES
+from sonarpost.runtime.items import OutboxItem
 from sonarpost.runtime.pacing import TokenBucket
-from sonarpost.runtime.transaction import OutboxItem
 
 WINDOW = 128
 """Most queries in flight: twice what a consumer commits with one write, so that it never waits for the next."""
@@ -22,6 +25,8 @@ MAX_WINDOW_BYTES = 64 * CHUNK_BYTES
 """Most bytes in flight on a fast link, so that the consumer has the next records while it writes the last."""
 GROW_BELOW_S, SHRINK_ABOVE_S = 0.25, 1.0
 """Answers that come sooner let the bytes in flight grow, later ones halve them."""
+LOOKS_AT = 1024
+"""Most records looked at with a consumer that takes several with one query."""
 PROBE_WINDOW = 8
 """Most records looked at while nobody has answered yet."""
 KEPT_FOR_URGENT = 4
@@ -52,6 +57,11 @@ class Transfer:
     def urgent(self) -> bool:
         """Whether it waits for nothing but the piece that is on its way."""
         return self.item.priority <= URGENT_PRIORITY
+
+    @property
+    def fresh(self) -> bool:
+        """Whether nothing of it has been asked yet."""
+        return self.asked == 0 and self.has == 0
 
     @property
     def wants_sending(self) -> bool:
@@ -93,10 +103,14 @@ class Schedule:
         self.piece_bytes = piece_bytes_for(bytes_per_s)
         self.active: dict[int, Transfer] = {}
         self.probing = True
+        self.takes = 0
+        """How many records the consumer takes with one query."""
+        self._order: deque[Transfer] = deque()
+        self._order_stale = False
         self._in_flight = 0
         self._bytes_in_flight = 0
         self._bucket: TokenBucket | None = None
-        self._asked_s: dict[Piece, float] = {}
+        self._asked: dict[Piece, tuple[float, int]] = {}
         self._window_bytes = WINDOW_BYTES
         if bytes_per_s is not None:
             self._bucket = TokenBucket(bytes_per_s, self.piece_bytes + OVERHEAD_BYTES, now_s)
@@ -107,7 +121,9 @@ class Schedule:
     @property
     def looks_at(self) -> int:
         """Of how many records the schedule wants to know."""
-        return PROBE_WINDOW if self.probing else WINDOW
+        if self.probing:
+            return PROBE_WINDOW
+        return LOOKS_AT if self.takes > 1 else WINDOW
 
     def put(self, items: Iterable[OutboxItem]) -> None:
         """Take what is owed most urgently; what has not begun and is not among them makes room."""
@@ -117,13 +133,25 @@ class Schedule:
         for seq, item in wanted.items():
             if seq not in self.active:
                 self.active[seq] = Transfer(item)
+        self._order_stale = True
+
+    def _first_waiting(self) -> Transfer | None:
+        if self._order_stale:
+            waiting = (transfer for transfer in self.active.values() if transfer.wants_sending)
+            self._order = deque(sorted(waiting, key=lambda transfer: transfer.order))
+            self._order_stale = False
+        while self._order:
+            transfer = self._order[0]
+            if transfer.wants_sending and self.active.get(transfer.item.seq) is transfer:
+                return transfer
+            self._order.popleft()
+        return None
 
     def next_piece(self, now_s: float) -> tuple[Piece | None, float | None]:
         """Return the piece to ask now, or None and for how many seconds to wait (None: until something happens)."""
-        waiting = [transfer for transfer in self.active.values() if transfer.wants_sending]
-        if not waiting:
+        transfer = self._first_waiting()
+        if transfer is None:
             return None, None
-        transfer = min(waiting, key=lambda t: t.order)
         start = transfer.asked
         end = min(start + self.piece_bytes, len(transfer.item.payload))
         piece = Piece(transfer, start, end, transfer.attempt)
@@ -145,25 +173,52 @@ class Schedule:
         fits = self._in_flight == 0 or self._bytes_in_flight + piece.size <= self._window_bytes
         return fits and self._in_flight < WINDOW - KEPT_FOR_URGENT
 
-    def asked(self, piece: Piece, now_s: float) -> None:
-        """Note that a piece was sent."""
-        piece.transfer.begun = True
-        piece.transfer.asked = max(piece.end, 1)
+    def together_with(self, piece: Piece) -> list[Piece]:
+        """Return what goes with the same query as the piece that is next: whole small records behind it, in order.
+
+        All are of its key and priority, have not begun, and fit with it into one piece.
+        """
+        first = piece.transfer
+        pieces = [piece]
+        if min(self.takes, MAX_RECORDS) < 2 or self.probing or piece.size < len(first.item.payload) or not first.fresh:
+            return pieces
+        room = self.piece_bytes - piece.size
+        for transfer in islice(self._order, 1, None):
+            item = transfer.item
+            if not transfer.wants_sending or self.active.get(item.seq) is not transfer:
+                continue
+            room -= len(item.payload) + (0 if self._bucket is None else RECORD_OVERHEAD_BYTES)
+            alike = item.key == first.item.key and item.priority == first.item.priority and transfer.fresh
+            if room < 0 or not alike:
+                break
+            pieces.append(Piece(transfer, 0, len(item.payload), transfer.attempt))
+            if len(pieces) == min(self.takes, MAX_RECORDS):
+                break
+        return pieces
+
+    def asked(self, piece: Piece, now_s: float, *more: Piece) -> None:
+        """Note that a piece was sent, or that several records were, with one query."""
+        size = piece.size
+        for sent in (piece, *more):
+            sent.transfer.begun = True
+            sent.transfer.asked = max(sent.end, 1)
+        size += sum(sent.size for sent in more)
         self._in_flight += 1
-        self._bytes_in_flight += piece.size
-        self._asked_s[piece] = now_s
+        self._bytes_in_flight += size
+        self._asked[piece] = (now_s, size)
         if self._bucket is not None:
-            self._bucket.take(piece.size + OVERHEAD_BYTES, now_s)
+            self._bucket.take(size + OVERHEAD_BYTES + len(more) * RECORD_OVERHEAD_BYTES, now_s)
 
     def answered(self, piece: Piece, now_s: float) -> None:
-        """Note that a piece's query has ended, however it ended."""
+        """Note that a query has ended, however it ended; `piece` is the first that was in it."""
+        asked_s, size = self._asked.pop(piece)
         self._in_flight -= 1
-        self._bytes_in_flight -= piece.size
-        took_s = now_s - self._asked_s.pop(piece)
+        self._bytes_in_flight -= size
+        took_s = now_s - asked_s
         if self._bucket is not None:
             return
         if took_s < GROW_BELOW_S:
-            self._window_bytes = min(MAX_WINDOW_BYTES, self._window_bytes + piece.size)
+            self._window_bytes = min(MAX_WINDOW_BYTES, self._window_bytes + size)
         elif took_s > SHRINK_ABOVE_S:
             self._window_bytes = max(self.piece_bytes, self._window_bytes // 2)
 
@@ -175,6 +230,7 @@ class Schedule:
         if next_offset != piece.end and piece.attempt == transfer.attempt:
             transfer.attempt += 1
             transfer.asked = next_offset
+            self._order_stale = True
 
     def settled(self, transfer: Transfer) -> None:
         """Forget a record that is done with."""
@@ -184,7 +240,9 @@ class Schedule:
         """Nothing is in flight any more: ask again for everything that is not settled, one query at first."""
         self._in_flight = 0
         self._bytes_in_flight = 0
-        self._asked_s.clear()
+        self._asked.clear()
+        self._order_stale = True
+        self.takes = 0
         self._window_bytes = self._first_window_bytes
         self.probing = True
         for transfer in self.active.values():

@@ -6,18 +6,18 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import zenoh
 
 from sonarpost import keys
 from sonarpost.errors import HandoffError, PayloadError
-from sonarpost.runtime import handoff
+from sonarpost.runtime import handoff, handoff_batch
 from sonarpost.runtime.concern import concern_of_payload
 from sonarpost.runtime.handoff import Reply
 from sonarpost.runtime.logs import kv
-from sonarpost.runtime.schedule import Piece, Schedule, Transfer
+from sonarpost.runtime.schedule import MAX_WINDOW_BYTES, WINDOW, Piece, Schedule, Transfer
 from sonarpost.runtime.store import Store
 from sonarpost.runtime.transaction import OutboxItem, Transaction, consumer_of
 
@@ -37,7 +37,9 @@ PRIORITIES = {
 IDLE_S = 1.0
 # Replies come in batches, one write to the consumer's disk apart: looked for soon at first, then less often.
 POLL_S = (0.0005, 0.02)
-FORGET_AT = 64
+FORGET_AT = 256
+LOADED_BYTES = 2 * MAX_WINDOW_BYTES
+"""Most bytes of records that are held ready beyond the first 128."""
 FORGET_AFTER_S = 0.2
 
 Settled = Callable[[Transaction, OutboxItem, str | None], None]
@@ -63,7 +65,7 @@ class Lane:
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    piece: Piece
+    pieces: Sequence[Piece]
     replies: zenoh.handlers.Handler[zenoh.Reply]
 
 
@@ -98,6 +100,8 @@ class Sender:
         self._first_acknowledged_s = 0.0
         self._settled_upto = 0
         self._failures = 0
+        self._takes = 0
+        self._one_by_one = False
         self._stop = threading.Event()
         self._wake = threading.Event()
         self._wake.set()
@@ -148,8 +152,7 @@ class Sender:
         if len(self._acknowledged) >= FORGET_AT:
             self._forget()
         self._wake.clear()
-        numbers = self._store.owed_numbers(self._queue, schedule.looks_at + len(self._acknowledged))
-        wanted = [seq for seq in numbers if seq not in self._acknowledged][: schedule.looks_at]
+        wanted = self._most_urgent(schedule.looks_at)
         known = {seq: schedule.active[seq].item for seq in wanted if seq in schedule.active}
         loaded = {item.seq: item for item in self._store.owed_items(self._queue, [s for s in wanted if s not in known])}
         schedule.put((known | loaded).values())
@@ -158,6 +161,19 @@ class Sender:
         if session is not None:
             for item in loaded.values():
                 self._show(session, item)
+
+    def _most_urgent(self, count: int) -> list[int]:
+        """Return the numbers of so many records at most; of large ones fewer, not to hold them all in memory."""
+        wanted: list[int] = []
+        total = 0
+        for seq, size in self._store.owed_sizes(self._queue, count + len(self._acknowledged)).items():
+            if seq in self._acknowledged:
+                continue
+            total += size
+            if len(wanted) == count or (len(wanted) >= WINDOW and total > LOADED_BYTES):
+                break
+            wanted.append(seq)
+        return wanted
 
     def _session(self) -> zenoh.Session | None:
         return self._default_session if self._lane.session is None else self._lane.session()
@@ -168,30 +184,49 @@ class Sender:
             piece, wait_s = self._schedule.next_piece(time.monotonic())
             if piece is None:
                 return wait_s
-            transfer = piece.transfer
-            if not transfer.begun and not self._store.begin(self._queue, transfer.item.seq):
-                self._schedule.settled(transfer)  # a newer edition has taken its place
-                continue
-            self._ask(piece)
+            pieces = self._begun(self._schedule.together_with(piece))
+            if pieces:
+                self._ask(pieces)
         return None
 
-    def _ask(self, piece: Piece) -> None:
+    def _begun(self, pieces: Sequence[Piece]) -> list[Piece]:
+        """Let no newer edition take the place of these records any more; leave out those where one already has."""
+        new = [piece.transfer.item.seq for piece in pieces if not piece.transfer.begun]
+        there = self._store.begin_all(self._queue, new) if new else ()
+        begun = []
+        for piece in pieces:
+            if piece.transfer.begun or piece.transfer.item.seq in there:
+                begun.append(piece)
+            else:
+                self._schedule.settled(piece.transfer)
+        return begun
+
+    def _ask(self, pieces: Sequence[Piece]) -> None:
         session = self._session()
         if session is None:
             raise _NoAnswerError("its router has not been reached yet")
-        item = piece.transfer.item
-        self._show(session, item)
+        items = [piece.transfer.item for piece in pieces]
+        for item in items:
+            self._show(session, item)
+        settled = min(self._settled_upto, *(item.seq - 1 for item in items))
+        if len(pieces) == 1:
+            [piece] = pieces
+            payload = items[0].payload[piece.start : piece.end]
+            attachment = handoff.attachment(self._origin, items[0], piece.start, settled)
+        else:
+            payload = b"".join(item.payload for item in items)
+            attachment = handoff_batch.attachment(self._origin, items, settled)
         replies = session.get(
-            keys.handoff(item.key, self._consumer),
+            keys.handoff(items[0].key, self._consumer),
             timeout=REPLY_TIMEOUT_S,
-            priority=PRIORITIES[item.priority],
+            priority=PRIORITIES[items[0].priority],
             # Waits for the link instead of dropping: a dropped query would cost its whole time-out.
             congestion_control=zenoh.CongestionControl.BLOCK,
-            payload=item.payload[piece.start : piece.end],
-            attachment=handoff.attachment(self._origin, item, piece.start, min(self._settled_upto, item.seq - 1)),
+            payload=payload,
+            attachment=attachment,
         )
-        self._schedule.asked(piece, time.monotonic())
-        self._in_flight.append(_Asked(piece, replies))
+        self._schedule.asked(pieces[0], time.monotonic(), *pieces[1:])
+        self._in_flight.append(_Asked(pieces, replies))
 
     def _show(self, session: zenoh.Session, item: OutboxItem) -> None:
         """Publish a copy for watchers; they know it by (origin, seq) when it comes twice."""
@@ -214,8 +249,8 @@ class Sender:
             if received is None:
                 break
             asked = self._in_flight.popleft()
-            self._schedule.answered(asked.piece, time.monotonic())
-            self._act(asked.piece, received)
+            self._schedule.answered(asked.pieces[0], time.monotonic())
+            self._act(asked.pieces, received)
             some = True
         return some
 
@@ -235,19 +270,40 @@ class Sender:
             self._wake.wait(min(poll_s, max(ends_s - time.monotonic(), 0.0)))
             poll_s = min(2 * poll_s, POLL_S[1])
 
-    def _act(self, piece: Piece, received: zenoh.Reply) -> None:
-        transfer = piece.transfer
+    def _act(self, pieces: Sequence[Piece], received: zenoh.Reply) -> None:
         if received.ok is None:
             raise _NoAnswerError("no reply in time")
+        replies = self._replies(pieces, received.ok.payload.to_bytes())
+        for piece, reply in zip(pieces, replies, strict=True):
+            if reply.status != "later":
+                self._act_on(piece, reply)
+        for reply in replies:
+            if reply.status == "later":
+                raise _NoAnswerError(f"the consumer cannot store: {reply.reason}")
+
+    def _replies(self, pieces: Sequence[Piece], payload: bytes) -> Sequence[Reply]:
+        where = pieces[0].transfer.item.key
         try:
-            reply = Reply.unpack(received.ok.payload.to_bytes(), transfer.item.key)
+            if len(pieces) == 1:
+                reply = Reply.unpack(payload, where)
+                self._takes = reply.takes
+                return [reply]
+            replies = handoff_batch.unpack_replies(payload, len(pieces), where)
         except PayloadError as error:
             raise _NoAnswerError(str(error)) from error
-        if reply.status == "later":
-            raise _NoAnswerError(f"the consumer cannot store: {reply.reason}")
+        if isinstance(replies, Reply):
+            if replies.status != "later":
+                # Another consumer than the one that said it takes several: each is asked by itself.
+                self._one_by_one = True
+            raise _NoAnswerError(f"several records were not taken: {replies.status} {replies.reason}")
+        return replies
+
+    def _act_on(self, piece: Piece, reply: Reply) -> None:
+        transfer = piece.transfer
         self._failures = 0
         self.answering = True
         self._schedule.probing = False
+        self._schedule.takes = 0 if self._one_by_one else self._takes
         if transfer.item.seq not in self._schedule.active:
             return
         if reply.status == "stored":
@@ -286,17 +342,16 @@ class Sender:
         if not self._acknowledged:
             return
         with self._store.transaction() as tx:
-            for item in self._acknowledged.values():
-                tx.acknowledged(self._queue, item.seq)
-                if self._on_settled is not None:
+            tx.all_acknowledged(self._queue, self._acknowledged)
+            if self._on_settled is not None:
+                for item in self._acknowledged.values():
                     self._on_settled(tx, item, None)
-        for seq in self._acknowledged:
-            self._end(seq)
+        self._end(*self._acknowledged)
         self._acknowledged.clear()
 
-    def _end(self, seq: int) -> None:
-        self._shown.discard(seq)
-        self._store.end(self._queue, seq)
+    def _end(self, *numbers: int) -> None:
+        self._shown.difference_update(numbers)
+        self._store.end(self._queue, *numbers)
 
     def _back_off(self, reason: str) -> None:
         """Forget what is in flight and wait a little; everything is asked again."""

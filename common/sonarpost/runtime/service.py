@@ -29,7 +29,7 @@ from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.effects import Effects
 from sonarpost.runtime.heartbeat import Heartbeat
 from sonarpost.runtime.inbox import Inbox
-from sonarpost.runtime.logs import concerning, kv
+from sonarpost.runtime.logs import concerning_later, kv
 from sonarpost.runtime.outbox import Lane, Outbox
 from sonarpost.runtime.room import HANDLING_RESERVE_BYTES, Room
 from sonarpost.runtime.session import open_with_retry
@@ -45,6 +45,8 @@ C = TypeVar("C", bound=ServiceConfig)
 
 RETRY_AFTER_S = 1.0
 MAX_DETAIL = 2000
+TYPES_KEPT = 1000
+"""Of how many keys a service remembers what they carry."""
 
 
 class InterruptedByStopError(Exception):
@@ -68,11 +70,14 @@ class Service(ABC, Generic[C]):
         PUBLISH: Whether records it owes are also published on their keys for watchers.
         BATCH: How many records are handled with one write to the disk. Above 1, what `handle` does outside its effects
             may be done again for a whole batch after a power cut.
+        BATCH_BYTES: How many bytes of records at most, whatever their number; what is written lies in the write-ahead
+            log once more until then.
     """
 
     NAME: ClassVar[str]
     PUBLISH: ClassVar[bool] = True
     BATCH: ClassVar[int] = 1
+    BATCH_BYTES: ClassVar[int] = 2 * 1024 * 1024
 
     def __init__(self, platform: PlatformConfig, config: C) -> None:
         self.platform = platform
@@ -86,6 +91,7 @@ class Service(ABC, Generic[C]):
         self._room = Room(self.store, HANDLING_RESERVE_BYTES, "records wait with their senders")
         self._counters: Counter[str] = Counter()
         self._counter_lock = threading.Lock()
+        self._types: dict[str, type[Record]] = {}
         self._problem = ""
         self._session: zenoh.Session | None = None
         self._inbox: Inbox | None = None
@@ -223,6 +229,14 @@ class Service(ABC, Generic[C]):
     # Records
 
     def _record_type(self, key: str) -> type[Record]:
+        known = self._types.get(key)
+        if known is None:
+            known = self._types[key] = self._find_type(key)
+            if len(self._types) > TYPES_KEPT:
+                self._types.pop(next(iter(self._types)))
+        return known
+
+    def _find_type(self, key: str) -> type[Record]:
         for expression, record_type in self.consumes().items():
             if zenoh.KeyExpr(expression).intersects(key):
                 return record_type
@@ -239,7 +253,7 @@ class Service(ABC, Generic[C]):
         while not self.stopping.is_set():
             self.store.inbox_changed.clear()
             try:
-                items = self.store.pending(limit=max(16, self.BATCH))
+                items = self.store.pending(max(16, self.BATCH), max_bytes=self.BATCH_BYTES)
                 for first in range(0, len(items), self.BATCH):
                     if self.stopping.is_set():
                         return
@@ -280,7 +294,7 @@ class Service(ABC, Generic[C]):
 
         Every line that is logged meanwhile says which contact it concerns.
         """
-        with concerning(**concern_of_payload(item.payload, item.key)):
+        with concerning_later(lambda: concern_of_payload(item.payload, item.key)):
             return self._handled(item)
 
     def _handled(self, item: InboxItem) -> Effects | None:

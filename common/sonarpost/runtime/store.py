@@ -13,13 +13,14 @@ import logging
 import sqlite3
 import threading
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
 from sonarpost.errors import HandoffError
+from sonarpost.runtime import rows
 from sonarpost.runtime.transaction import QUEUE_MARK, InboxItem, OutboxItem, Transaction
 
 log = logging.getLogger(__name__)
@@ -145,6 +146,7 @@ class Store:
             try:
                 self._db.execute("BEGIN IMMEDIATE")
                 yield tx
+                tx.flush()
                 self._db.execute("COMMIT")
             except BaseException as error:
                 self._roll_back()
@@ -190,44 +192,55 @@ class Store:
 
     def owed_numbers(self, queue: str, limit: int) -> tuple[int, ...]:
         """Return the numbers of what is owed, most urgent first, then oldest first."""
-        rows = self._query(
+        found = self._query(
             "SELECT seq FROM outbox WHERE consumer = ? ORDER BY priority, place, seq LIMIT ?", (queue, limit)
         )
-        return tuple(int(str(row[0])) for row in rows)
+        return tuple(_int(row[0]) for row in found)
+
+    def owed_sizes(self, queue: str, limit: int) -> dict[int, int]:
+        """Return the numbers of what is owed and how many bytes each is, most urgent first, then oldest first."""
+        found = self._query(
+            "SELECT seq, LENGTH(payload) FROM outbox WHERE consumer = ? ORDER BY priority, place, seq LIMIT ?",
+            (queue, limit),
+        )
+        return {_int(seq): _int(size) for seq, size in found}
 
     def owed_items(self, queue: str, numbers: Sequence[int]) -> tuple[OutboxItem, ...]:
         """Return the records of these numbers that are still owed, in the order of the numbers."""
-        found = []
-        for number in numbers:
-            sql = f"SELECT {_ITEM} FROM outbox WHERE consumer = ? AND seq = ?"  # noqa: S608 constants
-            found += self._query(sql, (queue, number))
-        return tuple(
-            OutboxItem(
-                str(c), int(str(s)), str(k), str(e), int(str(p)), _bytes(d), _bytes(h), int(str(at)), float(str(t))
-            )
-            for c, s, k, e, p, d, h, at, t in found
-        )
+        sql = f"SELECT {_ITEM} FROM outbox WHERE consumer = ? AND seq BETWEEN ? AND ?"  # noqa: S608 constants
+        found = {}
+        for first, last in rows.runs(numbers):
+            for c, s, k, e, p, d, h, at, t in self._query(sql, (queue, first, last)):
+                seq = _int(s)
+                found[seq] = OutboxItem(
+                    str(c), seq, str(k), str(e), _int(p), _bytes(d), _bytes(h), _int(at), float(str(t))
+                )
+        return tuple(found[number] for number in numbers if number in found)
 
     def begin(self, queue: str, seq: int) -> bool:
         """Say that a record is about to be sent, so that no newer edition replaces it; False when one already has."""
-        with self._lock:
-            if not self._query("SELECT 1 FROM outbox WHERE consumer = ? AND seq = ?", (queue, seq)):
-                return False
-            self._begun.add((queue, seq))
-            return True
+        return bool(self.begin_all(queue, (seq,)))
 
-    def end(self, queue: str, seq: int) -> None:
+    def begin_all(self, queue: str, numbers: Sequence[int]) -> Set[int]:
+        """Say that records are about to be sent; return which of them are still owed."""
+        sql = "SELECT seq FROM outbox WHERE consumer = ? AND seq BETWEEN ? AND ?"
+        with self._lock:
+            there = {_int(row[0]) for run in rows.runs(numbers) for row in self._query(sql, (queue, *run))}
+            self._begun.update((queue, seq) for seq in there)
+        return there
+
+    def end(self, queue: str, *numbers: int) -> None:
         """Take back what `begin` said."""
         with self._lock:
-            self._begun.discard((queue, seq))
+            self._begun.difference_update([(queue, seq) for seq in numbers])
 
     def settled_upto(self, queue: str) -> int:
         """Return the highest number with which, and with all below it, the queue is done."""
         first = self._query("SELECT MIN(seq) FROM outbox WHERE consumer = ?", (queue,))[0][0]
         if first is not None:
             return int(str(first)) - 1
-        rows = self._query("SELECT seq FROM outbox_next WHERE consumer = ?", (queue,))
-        return int(str(rows[0][0])) if rows else 0
+        found = self._query("SELECT seq FROM outbox_next WHERE consumer = ?", (queue,))
+        return _int(found[0][0]) if found else 0
 
     def origin_of(self, queue: str) -> bytes:
         """Return the 16 bytes by which a queue's consumer knows it.
@@ -264,20 +277,37 @@ class Store:
         pages, size = self._query("PRAGMA freelist_count")[0][0], self._query("PRAGMA page_size")[0][0]
         return int(str(pages)) * int(str(size))
 
-    def pending(self, limit: int = 1, after_id: int = 0) -> tuple[InboxItem, ...]:
-        """Return accepted records not handled yet, oldest first, with an id above `after_id`."""
-        rows = self._query("SELECT id, key, payload FROM inbox WHERE id > ? ORDER BY id LIMIT ?", (after_id, limit))
-        return tuple(InboxItem(int(str(i)), str(k), _bytes(p)) for i, k, p in rows)
+    def pending(self, limit: int = 1, after_id: int = 0, max_bytes: int | None = None) -> tuple[InboxItem, ...]:
+        """Return accepted records not handled yet, oldest first, with an id above `after_id`.
+
+        Args:
+            limit: Most records.
+            after_id: Only later ones.
+            max_bytes: Most bytes of payload, but one record at least; no limit by default.
+        """
+        if max_bytes is not None:
+            limit = self._how_many_within(limit, after_id, max_bytes)
+        found = self._query("SELECT id, key, payload FROM inbox WHERE id > ? ORDER BY id LIMIT ?", (after_id, limit))
+        return tuple(InboxItem(_int(i), str(k), _bytes(p)) for i, k, p in found)
+
+    def _how_many_within(self, limit: int, after_id: int, max_bytes: int) -> int:
+        sizes = self._query("SELECT LENGTH(payload) FROM inbox WHERE id > ? ORDER BY id LIMIT ?", (after_id, limit))
+        total = 0
+        for count, (size,) in enumerate(sizes):
+            total += _int(size)
+            if total > max_bytes:
+                return max(count, 1)
+        return limit
 
     def get_state(self, name: str) -> bytes | None:
         """Return what is remembered under `name`, or None."""
-        rows = self._query("SELECT value FROM state WHERE name = ?", (name,))
-        return _bytes(rows[0][0]) if rows else None
+        found = self._query("SELECT value FROM state WHERE name = ?", (name,))
+        return _bytes(found[0][0]) if found else None
 
     def state_names(self, prefix: str) -> tuple[str, ...]:
         """Return the names that begin with `prefix` under which something is remembered."""
-        rows = self._query("SELECT name FROM state WHERE name >= ? AND name < ?", (prefix, prefix + "\U0010ffff"))
-        return tuple(str(row[0]) for row in rows)
+        found = self._query("SELECT name FROM state WHERE name >= ? AND name < ?", (prefix, prefix + "\U0010ffff"))
+        return tuple(str(row[0]) for row in found)
 
     def close(self) -> None:
         """Close the file."""
@@ -299,6 +329,11 @@ def _only_user(path: Path) -> IO[bytes]:
         file.close()
         raise HandoffError(f"{path}: in use by another process of this service") from error
     return file
+
+
+def _int(value: object) -> int:
+    assert isinstance(value, int)
+    return value
 
 
 def _bytes(value: object) -> bytes:

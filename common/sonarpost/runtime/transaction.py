@@ -5,79 +5,29 @@ from __future__ import annotations
 import hashlib
 import sqlite3
 import time
-from collections.abc import Set
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Set
+
+from sonarpost.runtime import rows
+from sonarpost.runtime.items import QUEUE_MARK, Chunk, InboxItem, OutboxItem, Topic, consumer_of, queue_of
+from sonarpost.runtime.seen import Seen
+
+__all__ = ["QUEUE_MARK", "Chunk", "InboxItem", "OutboxItem", "Topic", "Transaction", "consumer_of", "queue_of"]
 
 # Bounds on what strangers can make a store keep: whatever is beyond them, the oldest goes.
 REFUSED_KEPT = 1000
 REFUSED_BYTES = 256 * 1024
 PARTIALS_KEPT = 64
 
-
-QUEUE_MARK = "@"
-
-
-def queue_of(consumer: str, place: str) -> str:
-    """Return the name of the queue for a consumer that is on several platforms, for example `c2@shore-2`.
-
-    Queues know nothing of each other: each has numbers and an origin of its own, and one that is not answered holds no
-    other back.
-    """
-    return f"{consumer}{QUEUE_MARK}{place}"
-
-
-def consumer_of(queue: str) -> str:
-    """Return the name by which a queue's consumer answers."""
-    return queue.partition(QUEUE_MARK)[0]
-
-
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """What a record is an edition of: in a queue, a newer edition takes the place of older ones that have not begun."""
-
-    name: str
-    edition: int
-
-
-@dataclass(frozen=True, slots=True)
-class OutboxItem:
-    """A record that its consumer has not acknowledged yet; `consumer` is the name of the queue."""
-
-    consumer: str
-    seq: int
-    key: str
-    encoding: str
-    priority: int
-    payload: bytes
-    sha256: bytes
-    place: int = field(default=0, compare=False)
-    created_utc_s: float = field(default=0.0, compare=False)
-
-
-@dataclass(frozen=True, slots=True)
-class Chunk:
-    """A piece of a record on its way, as the hand-over query carries it."""
-
-    origin: bytes
-    seq: int
-    size: int
-    sha256: bytes
-    offset: int
-    data: bytes
-    settled: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class InboxItem:
-    """A record that was accepted and not yet handled."""
-
-    id: int
-    key: str
-    payload: bytes
+_OUTBOX = "consumer, seq, key, encoding, priority, payload, sha256, created_utc_s, topic, edition, place"
+_INBOX = "key, payload, origin, seq, received_utc_s"
 
 
 class Transaction:
-    """The writes of one transaction; made by `Store.transaction`, atomic with everything else in it."""
+    """The writes of one transaction; made by `Store.transaction`, atomic with everything else in it.
+
+    New records, and the ends of old ones, are collected and written together: before they matter to another statement,
+    or by `flush` at the end.
+    """
 
     def __init__(self, connection: sqlite3.Connection, begun: Set[tuple[str, int]] = frozenset()) -> None:
         self._db = connection
@@ -85,6 +35,31 @@ class Transaction:
         self.wrote_outbox = False
         self.wrote_inbox = False
         self.superseded = 0
+        self._seen: dict[bytes, Seen] = {}
+        self._numbers: dict[str, int] = {}
+        self._new_outbox: list[tuple[object, ...]] = []
+        self._new_topics: set[tuple[str, str]] = set()
+        self._new_inbox: list[tuple[object, ...]] = []
+        self._done: list[int] = []
+
+    def flush(self) -> None:
+        """Write what was collected; `Store.transaction` does before it commits."""
+        self._flush_outbox()
+        if self._new_inbox:
+            rows.insert(self._db, "inbox", _INBOX, self._new_inbox)
+            self._new_inbox.clear()
+        for first, last in rows.runs(self._done):
+            self._db.execute("DELETE FROM inbox WHERE id BETWEEN ? AND ?", (first, last))
+        self._done.clear()
+        for seen in self._seen.values():
+            seen.write()
+
+    def _flush_outbox(self) -> None:
+        if self._new_outbox:
+            rows.insert(self._db, "outbox", _OUTBOX, self._new_outbox)
+            self._db.executemany("INSERT OR REPLACE INTO outbox_next VALUES (?, ?)", self._numbers.items())
+            self._new_outbox.clear()
+            self._new_topics.clear()
 
     def send(
         self, key: str, consumer: str, payload: bytes, *, encoding: str, priority: int = 4, topic: Topic | None = None
@@ -101,40 +76,44 @@ class Transaction:
                 are this one's; where the queue has a newer edition, nothing is queued and 0 is returned.
         """
         place = None
-        if topic is not None:
-            if self._has_newer(consumer, topic):
+        name, edition = ("", 0) if topic is None else (topic.name, topic.edition)
+        if name:
+            others = self._editions(consumer, name)
+            if any(row[1] > edition for row in others):
                 return 0
-            place, priority = self._supersede(consumer, topic, priority)
-        row = self._db.execute(
-            "INSERT INTO outbox_next VALUES (?, 1) ON CONFLICT (consumer) DO UPDATE SET seq = seq + 1 RETURNING seq",
-            (consumer,),
-        ).fetchone()
-        seq = int(row[0])
-        named = ("", 0) if topic is None else (topic.name, topic.edition)
+            place, priority = self._supersede(consumer, [row for row in others if row[1] < edition], priority)
+        seq = self._next_number(consumer)
         digest = hashlib.sha256(payload).digest()
-        self._db.execute(
-            "INSERT INTO outbox (consumer, seq, key, encoding, priority, payload, sha256, created_utc_s,"
-            " topic, edition, place) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (consumer, seq, key, encoding, priority, payload, digest, time.time(), *named, place or seq),
+        self._new_outbox.append(
+            (consumer, seq, key, encoding, priority, payload, digest, time.time(), name, edition, place or seq)
         )
+        if name:
+            self._new_topics.add((consumer, name))
         self.wrote_outbox = True
         return seq
 
-    def _has_newer(self, queue: str, topic: Topic) -> bool:
-        found = self._db.execute(
-            "SELECT 1 FROM outbox WHERE consumer = ? AND topic = ? AND topic <> '' AND edition > ? LIMIT 1",
-            (queue, topic.name, topic.edition),
-        ).fetchone()
-        return found is not None
+    def _next_number(self, queue: str) -> int:
+        if queue not in self._numbers:
+            row = self._db.execute("SELECT seq FROM outbox_next WHERE consumer = ?", (queue,)).fetchone()
+            self._numbers[queue] = int(row[0]) if row else 0
+        self._numbers[queue] += 1
+        return self._numbers[queue]
 
-    def _supersede(self, queue: str, topic: Topic, priority: int) -> tuple[int | None, int]:
-        """Drop older editions that have not begun; return the first place and the most urgent priority among them."""
-        rows = self._db.execute(
-            "SELECT seq, place, priority FROM outbox WHERE consumer = ? AND topic = ? AND topic <> '' AND edition < ?",
-            (queue, topic.name, topic.edition),
+    def _editions(self, queue: str, topic: str) -> list[tuple[int, int, int, int]]:
+        """Return seq, edition, place and priority of what the queue has of a topic."""
+        if (queue, topic) in self._new_topics:
+            self._flush_outbox()
+        return self._db.execute(
+            "SELECT seq, edition, place, priority FROM outbox WHERE consumer = ? AND topic = ? AND topic <> ''",
+            (queue, topic),
         ).fetchall()
+
+    def _supersede(
+        self, queue: str, older: Iterable[tuple[int, int, int, int]], priority: int
+    ) -> tuple[int | None, int]:
+        """Drop older editions that have not begun; return the first place and the most urgent priority among them."""
         place: int | None = None
-        for seq, its_place, its_priority in rows:
+        for seq, _, its_place, its_priority in older:
             # One on its way arrives: were it stopped for each newer one, nothing might ever arrive.
             if (queue, seq) in self._begun:
                 continue
@@ -149,17 +128,18 @@ class Transaction:
 
         What is as urgent as `above_priority` or more stays, and so does what is on its way.
         """
+        self._flush_outbox()
         total = int(
             self._db.execute(
                 "SELECT COALESCE(SUM(LENGTH(payload)), 0) FROM outbox WHERE consumer = ?", (queue,)
             ).fetchone()[0]
         )
         dropped = 0
-        rows = self._db.execute(
+        found = self._db.execute(
             "SELECT seq, LENGTH(payload) FROM outbox WHERE consumer = ? AND priority > ? ORDER BY priority DESC, place",
             (queue, above_priority),
         ).fetchall()
-        for seq, size in rows:
+        for seq, size in found:
             if total <= max_bytes:
                 break
             if (queue, seq) not in self._begun:
@@ -170,11 +150,18 @@ class Transaction:
 
     def drop_queue(self, queue: str) -> int:
         """Drop everything a queue holds; return how many records that were."""
+        self._flush_outbox()
         return self._db.execute("DELETE FROM outbox WHERE consumer = ?", (queue,)).rowcount
 
     def acknowledged(self, consumer: str, seq: int) -> None:
         """Forget what the consumer has committed."""
-        self._db.execute("DELETE FROM outbox WHERE consumer = ? AND seq = ?", (consumer, seq))
+        self.all_acknowledged(consumer, (seq,))
+
+    def all_acknowledged(self, consumer: str, numbers: Iterable[int]) -> None:
+        """Forget several records that the consumer has committed."""
+        self._flush_outbox()
+        for first, last in rows.runs(numbers):
+            self._db.execute("DELETE FROM outbox WHERE consumer = ? AND seq BETWEEN ? AND ?", (consumer, first, last))
 
     def rejected(self, item: OutboxItem, reason: str) -> None:
         """Keep what the consumer refused apart, where a person can find it."""
@@ -185,16 +172,13 @@ class Transaction:
         """Put a record into the inbox; False when (origin, seq) was accepted before."""
         if origin is not None and seq is not None and not self._first_time(origin, seq):
             return False
-        self._db.execute(
-            "INSERT INTO inbox (key, payload, origin, seq, received_utc_s) VALUES (?, ?, ?, ?, ?)",
-            (key, payload, origin, seq, time.time()),
-        )
+        self._new_inbox.append((key, payload, origin, seq, time.time()))
         self.wrote_inbox = True
         return True
 
     def done(self, item: InboxItem) -> None:
         """Remove a handled record from the inbox."""
-        self._db.execute("DELETE FROM inbox WHERE id = ?", (item.id,))
+        self._done.append(item.id)
 
     def refuse(self, direction: str, key: str, payload: bytes, reason: str) -> None:
         """Keep a record that cannot be handled, with the reason: the latest 1000, of each at most 256 kB."""
@@ -207,48 +191,33 @@ class Transaction:
     def mark_refused(self, origin: bytes, seq: int) -> None:
         """Remember that (origin, seq) was refused, so that the same is answered when it is asked again."""
         if self._first_time(origin, seq):
-            self._db.execute("INSERT INTO refused_before VALUES (?, ?)", (origin, seq))
+            self._seen_of(origin).refuse(seq)
 
     def was_refused(self, origin: bytes, seq: int) -> bool:
         """Tell whether (origin, seq) was refused before."""
-        found = self._db.execute("SELECT 1 FROM refused_before WHERE origin = ? AND seq = ?", (origin, seq)).fetchone()
-        return found is not None
-
-    def _first_time(self, origin: bytes, seq: int) -> bool:
-        if self.was_seen(origin, seq):
-            return False
-        self._db.execute("INSERT INTO seen VALUES (?, ?)", (origin, seq))
-        self._forget_pieces(origin, seq)
-        self._compact(origin)
-        return True
+        return self._seen_of(origin).was_refused(seq)
 
     def was_seen(self, origin: bytes, seq: int) -> bool:
         """Tell whether (origin, seq) was accepted before."""
-        if seq <= self._watermark(origin):
-            return True
-        return self._db.execute("SELECT 1 FROM seen WHERE origin = ? AND seq = ?", (origin, seq)).fetchone() is not None
+        return self._seen_of(origin).has(seq)
 
     def settle_upto(self, origin: bytes, seq: int) -> None:
         """Remember that the producer is done with all up to `seq`: what it dropped leaves gaps in its numbers."""
-        if seq <= self._watermark(origin):
-            return
-        self._db.execute("INSERT OR REPLACE INTO seen_upto VALUES (?, ?)", (origin, seq))
-        for table in ("seen", "refused_before", "partial"):
-            self._db.execute(f"DELETE FROM {table} WHERE origin = ? AND seq <= ?", (origin, seq))  # noqa: S608 constants
-        self._compact(origin)
+        self._seen_of(origin).settle_upto(seq)
 
-    def _watermark(self, origin: bytes) -> int:
-        row = self._db.execute("SELECT seq FROM seen_upto WHERE origin = ?", (origin,)).fetchone()
-        return int(row[0]) if row else 0
+    def _seen_of(self, origin: bytes) -> Seen:
+        seen = self._seen.get(origin)
+        if seen is None:
+            seen = self._seen[origin] = Seen(self._db, origin)
+        return seen
 
-    def _compact(self, origin: bytes) -> None:
-        """Fold the unbroken run of accepted numbers into one, so that memory of the past stays small."""
-        upto = before = self._watermark(origin)
-        while self._db.execute("SELECT 1 FROM seen WHERE origin = ? AND seq = ?", (origin, upto + 1)).fetchone():
-            upto += 1
-        if upto > before:
-            self._db.execute("INSERT OR REPLACE INTO seen_upto VALUES (?, ?)", (origin, upto))
-            self._db.execute("DELETE FROM seen WHERE origin = ? AND seq <= ?", (origin, upto))
+    def _first_time(self, origin: bytes, seq: int) -> bool:
+        seen = self._seen_of(origin)
+        if seen.has(seq):
+            return False
+        seen.add(seq)
+        self._forget_pieces(origin, seq)
+        return True
 
     def add_chunk(self, chunk: Chunk) -> bytes | int:
         """Add one chunk of a large record; return the whole record's bytes, or the offset wanted next.
@@ -285,6 +254,7 @@ class Transaction:
             self._db.execute("UPDATE partial SET touched_ns = ? WHERE id = ?", (time.time_ns(), row[0]))
             return int(row[0]), int(row[1])
         self._forget_pieces(*which)
+        self._seen_of(chunk.origin).has_pieces = True
         inserted = self._db.execute(
             "INSERT INTO partial (origin, seq, size, sha256, has, touched_ns) VALUES (?, ?, ?, ?, 0, ?)",
             (*which, chunk.size, chunk.sha256, time.time_ns()),
@@ -296,7 +266,8 @@ class Transaction:
         return int(inserted.lastrowid or 0), 0
 
     def _forget_pieces(self, origin: bytes, seq: int) -> None:
-        self._db.execute("DELETE FROM partial WHERE origin = ? AND seq = ?", (origin, seq))
+        if self._seen_of(origin).has_pieces:
+            self._db.execute("DELETE FROM partial WHERE origin = ? AND seq = ?", (origin, seq))
 
     def put_state(self, name: str, value: bytes) -> None:
         """Remember `value` under `name`."""

@@ -13,12 +13,14 @@ from pathlib import Path
 
 import msgpack
 
+BATCH = ((7, 1), (9, 0), (2**40, 300))
 FOLDER = Path(__file__).resolve().parent
 sys.path.insert(0, str(FOLDER.parents[1]))
 
 from golden.zenoh.samples import SAMPLES  # noqa: E402  # the line above makes it importable
 
 from sonarpost import wire  # noqa: E402
+from sonarpost.runtime import handoff_batch  # noqa: E402
 from sonarpost.runtime.handoff import Reply, attachment  # noqa: E402
 from sonarpost.runtime.store import OutboxItem  # noqa: E402
 
@@ -49,7 +51,21 @@ def handoff_samples() -> dict[str, dict[str, bytes]]:
             "more": Reply("more", next_offset=65536).pack(),
             "refused": Reply("refused", reason="k: v: got 2, expected 1").pack(),
             "later": Reply("later", reason="disk is full").pack(),
+            "stored-takes-several": Reply("stored").pack(takes=128),
         },
+    }
+
+
+def batch_samples() -> dict[str, dict[str, bytes]]:
+    """Return attachments and replies of queries with several records, by file and name."""
+    items = [OutboxItem("c2", seq, "k", "", 4, b"\x80" * size, bytes.fromhex("11" * 32)) for seq, size in BATCH]
+    replies = [Reply("stored"), Reply("refused", reason="k: v: got 2, expected 1"), Reply("later", reason="full")]
+    return {
+        "handoff-batch-attachment": {
+            "three-records": handoff_batch.attachment(bytes(range(16)), items),
+            "after-dropped-ones": handoff_batch.attachment(bytes(range(16)), items, 6),
+        },
+        "handoff-batch-reply": {"one-of-each": handoff_batch.pack_replies(replies)},
     }
 
 
@@ -71,7 +87,7 @@ def main() -> None:
     added = 0
     for name, record in SAMPLES.items():
         added += add(FOLDER / f"{record.TYPE}.json", name, wire.encode(record))
-    for file, payloads in handoff_samples().items():
+    for file, payloads in (handoff_samples() | batch_samples()).items():
         for name, payload in payloads.items():
             added += add(FOLDER / f"{file}.json", name, payload)
     print(f"{added} vectors added")
