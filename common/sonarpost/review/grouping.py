@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -31,7 +32,7 @@ def reach_m(radius_m: float, *sigmas_m: float | None) -> float:
     Two standard deviations of the difference, at least `radius_m`, and at most four times that: positions that are
     hardly known must not make one object of a whole field.
     """
-    spread_m = 2.0 * sum((sigma_m or 0.0) ** 2 for sigma_m in sigmas_m) ** 0.5
+    spread_m = 2.0 * math.hypot(*(sigma_m or 0.0 for sigma_m in sigmas_m))
     return min(max(radius_m, spread_m), 4.0 * radius_m)
 
 

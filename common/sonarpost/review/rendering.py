@@ -42,7 +42,7 @@ LAYERS: Final = (
         "enhanced",
         measurable=False,
         synthesised=True,
-        reason="speckle is smoothed and contrast is stretched for the eye: edges lie elsewhere than in what was received",
+        reason="speckle is smoothed and contrast stretched for the eye: edges lie elsewhere than in what arrived",
     ),
 )
 
@@ -76,7 +76,8 @@ def enhanced(picture: Grey, missing: npt.NDArray[np.bool_]) -> Grey:
     low, high = np.percentile(smooth[~missing], (1, 99))
     stretched = (smooth - low) / max(high - low, 1.0) * 255.0
     stretched[missing] = 0
-    return stretched.clip(0, 255).round().astype(np.uint8)
+    treated: Grey = stretched.clip(0, 255).round().astype(np.uint8)
+    return treated
 
 
 def shown(

@@ -1,0 +1,1 @@
+"""The operator's console: see it, decide, ask for more."""

@@ -1,0 +1,149 @@
+"""The console's database: contacts, versions of their pictures, what people decided, and who did what.
+
+One SQLite file beside the service's store. What people do is never overwritten: an undone decision is a record more,
+and the audit refuses to be changed by the database's own rules.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sonarpost.errors import HandoffError
+
+VERSION = 1
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS contact (
+    id TEXT PRIMARY KEY, vessel_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
+    first_s INTEGER NOT NULL, name TEXT NOT NULL, revision INTEGER NOT NULL DEFAULT 0,
+    version INTEGER NOT NULL, versions INTEGER NOT NULL DEFAULT 0,
+    review TEXT NOT NULL DEFAULT 'unreviewed', mlo_class TEXT, confidence REAL, decided_by TEXT, decided_utc_s REAL,
+    effective TEXT, last_decision TEXT, remark TEXT NOT NULL DEFAULT '', advised INTEGER NOT NULL DEFAULT 0,
+    atd_class TEXT, atd_confidence REAL, lat_deg REAL, lon_deg REAL, position_sigma_m REAL, range_m REAL,
+    vehicle_lat_deg REAL, vehicle_lon_deg REAL, seen_utc_s REAL, first_frame_utc_s REAL NOT NULL,
+    last_frame_utc_s REAL NOT NULL, arrived_utc_s REAL NOT NULL, updated_utc_s REAL NOT NULL,
+    complete INTEGER NOT NULL, percent REAL NOT NULL, bytes_received INTEGER NOT NULL, bytes_total INTEGER NOT NULL,
+    has_picture INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL, group_id TEXT
+) WITHOUT ROWID;
+CREATE UNIQUE INDEX IF NOT EXISTS contact_image ON contact (vessel_id, vehicle_id, image_id, first_s);
+CREATE INDEX IF NOT EXISTS contact_updated ON contact (updated_utc_s, id);
+CREATE INDEX IF NOT EXISTS contact_arrived ON contact (arrived_utc_s, id);
+CREATE INDEX IF NOT EXISTS contact_confidence ON contact (atd_confidence, id);
+CREATE INDEX IF NOT EXISTS contact_vehicle ON contact (vehicle_id, id);
+CREATE INDEX IF NOT EXISTS contact_percent ON contact (percent, id);
+CREATE INDEX IF NOT EXISTS contact_review ON contact (review, id);
+CREATE INDEX IF NOT EXISTS contact_name ON contact (name, id);
+CREATE INDEX IF NOT EXISTS contact_range ON contact (range_m, id);
+CREATE INDEX IF NOT EXISTS contact_group ON contact (group_id);
+CREATE TABLE IF NOT EXISTS look_group (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, lat_deg REAL NOT NULL, lon_deg REAL NOT NULL, sigma_m REAL);
+CREATE INDEX IF NOT EXISTS look_group_place ON look_group (lat_deg, lon_deg);
+CREATE TABLE IF NOT EXISTS version (
+    contact_id TEXT NOT NULL, version INTEGER NOT NULL, received_utc_s REAL NOT NULL, rate INTEGER,
+    payload BLOB NOT NULL, PRIMARY KEY (contact_id, version)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS decision (
+    seq INTEGER PRIMARY KEY AUTOINCREMENT, decision_id TEXT NOT NULL UNIQUE, contact_id TEXT NOT NULL DEFAULT '',
+    vessel_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL, version INTEGER NOT NULL,
+    verdict TEXT NOT NULL, confidence REAL, mlo_class TEXT, remark TEXT NOT NULL, operator TEXT NOT NULL,
+    decided_utc_s REAL NOT NULL, sha256 TEXT, layer TEXT, undoes TEXT, undone INTEGER NOT NULL DEFAULT 0,
+    elsewhere INTEGER NOT NULL DEFAULT 0, shore TEXT NOT NULL, vehicle TEXT NOT NULL, reason TEXT NOT NULL DEFAULT '',
+    times_sent INTEGER NOT NULL DEFAULT 0, relayed_utc_s REAL, changed_utc_s REAL NOT NULL,
+    payload BLOB NOT NULL, sent INTEGER NOT NULL);
+CREATE INDEX IF NOT EXISTS decision_contact ON decision (contact_id, seq);
+CREATE INDEX IF NOT EXISTS decision_unsent ON decision (seq) WHERE sent = 0;
+CREATE INDEX IF NOT EXISTS decision_relayed ON decision (seq) WHERE shore = 'relay';
+CREATE TABLE IF NOT EXISTS request (
+    seq INTEGER PRIMARY KEY AUTOINCREMENT, command_id TEXT NOT NULL UNIQUE, contact_id TEXT NOT NULL,
+    vessel_id TEXT NOT NULL, kind TEXT NOT NULL, user TEXT NOT NULL, asked_utc_s REAL NOT NULL, airtime_s REAL,
+    state TEXT NOT NULL, times_sent INTEGER NOT NULL DEFAULT 0, reason TEXT NOT NULL DEFAULT '',
+    changed_utc_s REAL NOT NULL, payload BLOB NOT NULL, sent INTEGER NOT NULL);
+CREATE INDEX IF NOT EXISTS request_contact ON request (contact_id, seq);
+CREATE INDEX IF NOT EXISTS request_unsent ON request (seq) WHERE sent = 0;
+CREATE TABLE IF NOT EXISTS advice (
+    seq INTEGER PRIMARY KEY AUTOINCREMENT, advice_id TEXT NOT NULL UNIQUE, contact_id TEXT NOT NULL DEFAULT '',
+    vessel_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL, version INTEGER NOT NULL,
+    verdict TEXT, confidence REAL, mlo_class TEXT, remark TEXT NOT NULL, author TEXT NOT NULL,
+    advised_utc_s REAL NOT NULL, state TEXT, reason TEXT NOT NULL DEFAULT '', payload BLOB NOT NULL,
+    sent INTEGER NOT NULL);
+CREATE INDEX IF NOT EXISTS advice_contact ON advice (contact_id, seq);
+CREATE INDEX IF NOT EXISTS advice_unsent ON advice (seq) WHERE sent = 0;
+CREATE TABLE IF NOT EXISTS measurement (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, contact_id TEXT NOT NULL, utc_s REAL NOT NULL, body TEXT NOT NULL);
+CREATE INDEX IF NOT EXISTS measurement_contact ON measurement (contact_id, id);
+CREATE TABLE IF NOT EXISTS audit (
+    seq INTEGER PRIMARY KEY AUTOINCREMENT, contact_id TEXT NOT NULL, utc_s REAL NOT NULL, user TEXT NOT NULL,
+    role TEXT NOT NULL, address TEXT NOT NULL, action TEXT NOT NULL, version INTEGER, sha256 TEXT, layer TEXT,
+    detail TEXT NOT NULL);
+CREATE INDEX IF NOT EXISTS audit_contact ON audit (contact_id, seq);
+CREATE TRIGGER IF NOT EXISTS audit_is_not_changed BEFORE UPDATE ON audit
+    BEGIN SELECT RAISE(ABORT, 'the audit is only added to'); END;
+CREATE TRIGGER IF NOT EXISTS audit_is_not_deleted BEFORE DELETE ON audit
+    BEGIN SELECT RAISE(ABORT, 'the audit is only added to'); END;
+"""
+
+
+class Database:
+    """The file, for several threads; one transaction at a time.
+
+    Raises:
+        HandoffError: The file cannot be opened, or is of another version.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = threading.RLock()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._db = sqlite3.connect(path, check_same_thread=False, isolation_level=None, timeout=10)
+            self._db.row_factory = sqlite3.Row
+            self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.execute("PRAGMA synchronous=FULL")
+            version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
+            if version not in (0, VERSION):
+                self._db.close()
+                raise HandoffError(f"{path}: console database of version {version}, expected {VERSION}")
+            self._db.executescript(_SCHEMA)
+            self._db.execute(f"PRAGMA user_version={VERSION}")
+        except (OSError, sqlite3.Error) as error:
+            raise HandoffError(f"{path}: cannot be opened as the console's database: {error}") from error
+
+    @contextmanager
+    def reading(self) -> Iterator[sqlite3.Connection]:
+        """Open the connection for reading.
+
+        Raises:
+            HandoffError: The database cannot be read.
+        """
+        with self._lock:
+            try:
+                yield self._db
+            except sqlite3.Error as error:
+                raise HandoffError(f"{self.path}: {error}") from error
+
+    @contextmanager
+    def writing(self) -> Iterator[sqlite3.Connection]:
+        """Open a transaction: on the disk when the block ends, rolled back when it raises.
+
+        Raises:
+            HandoffError: The database refused (a full disk); nothing of the block was kept.
+        """
+        with self._lock:
+            try:
+                self._db.execute("BEGIN IMMEDIATE")
+                yield self._db
+                self._db.execute("COMMIT")
+            except BaseException as error:
+                if self._db.in_transaction:
+                    self._db.execute("ROLLBACK")
+                if isinstance(error, sqlite3.Error):
+                    raise HandoffError(f"{self.path}: {error}") from error
+                raise
+
+    def close(self) -> None:
+        """Close the file."""
+        with self._lock:
+            self._db.close()
