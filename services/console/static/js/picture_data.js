@@ -1,0 +1,96 @@
+// Pictures as the server has them, their masks, and what gain and colour map make of grey levels.
+
+async function grey(url) {
+  const response = await fetch(url, { credentials: "same-origin" });
+  if (!response.ok) throw new Error(`The picture did not come: the server answered ${response.status}.`);
+  const bitmap = await createImageBitmap(await response.blob(), { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+  const canvas = new OffscreenCanvas(bitmap.width, bitmap.height);
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.drawImage(bitmap, 0, 0);
+  const { data } = context.getImageData(0, 0, bitmap.width, bitmap.height);
+  const levels = new Uint8Array(bitmap.width * bitmap.height);
+  for (let i = 0; i < levels.length; i += 1) levels[i] = data[4 * i];
+  return { width: bitmap.width, height: bitmap.height, levels };
+}
+
+/**
+ * Load one layer of one version of a picture.
+ *
+ * Returns `{width, height, levels, missing, guessed}`: grey levels 0…255 and two masks, rows along-track, columns across-track.
+ */
+export async function loadPicture(pictureUrl, missingUrl, guessedUrl) {
+  const [picture, missing, guessed] = await Promise.all([grey(pictureUrl), grey(missingUrl), grey(guessedUrl)]);
+  return { ...picture, missing: missing.levels, guessed: guessed.levels };
+}
+
+const between = (value) => Math.max(0, Math.min(255, Math.round(value)));
+
+// Colour maps of sonar displays: (0…1) → red, green, blue in 0…255. All rise in lightness, so that brighter is stronger, but inverse.
+export const MAPS = {
+  grey: (v) => [255 * v, 255 * v, 255 * v],
+  inverse: (v) => [255 * (1 - v), 255 * (1 - v), 255 * (1 - v)],
+  copper: (v) => [255 * Math.min(1, 1.25 * v), 255 * 0.78 * v, 255 * 0.5 * v],
+  amber: (v) => [255 * Math.min(1, 1.35 * v), 255 * Math.min(1, v ** 1.25), 255 * Math.max(0, v * 2.2 - 1.35)],
+  bone: (v) => [255 * (v < 0.75 ? 0.875 * v : v * 1.375 - 0.375), 255 * (v < 0.375 ? 0.875 * v : 0.83 * v + 0.17 * v * v), 255 * Math.min(1, 0.12 * Math.sin(Math.PI * v) + v)],
+};
+
+/** Table of 256 colours for a map, with black point `low`, white point `high` (percent) and gamma. */
+export function table(map, low, high, gamma) {
+  const colours = new Uint8ClampedArray(256 * 3);
+  const black = low * 2.55;
+  const span = Math.max(1, (high - low) * 2.55);
+  for (let level = 0; level < 256; level += 1) {
+    const value = Math.max(0, Math.min(1, (level - black) / span)) ** (1 / gamma);
+    colours.set((MAPS[map] ?? MAPS.grey)(value).map(between), 3 * level);
+  }
+  return colours;
+}
+
+/** Colour a picture; what was never received is black, whatever the map. */
+export function coloured(picture, colours) {
+  const canvas = new OffscreenCanvas(picture.width, picture.height);
+  const image = new ImageData(picture.width, picture.height);
+  for (let i = 0; i < picture.levels.length; i += 1) {
+    const from = 3 * picture.levels[i];
+    const there = picture.missing[i] === 0;
+    image.data[4 * i] = there ? colours[from] : 0;
+    image.data[4 * i + 1] = there ? colours[from + 1] : 0;
+    image.data[4 * i + 2] = there ? colours[from + 2] : 0;
+    image.data[4 * i + 3] = 255;
+  }
+  canvas.getContext("2d").putImageData(image, 0, 0);
+  return canvas;
+}
+
+/** A mask as a canvas that is opaque where the mask is set; null where it is set nowhere. */
+export function maskCanvas(mask, width, height) {
+  if (!mask.some((value) => value > 0)) return null;
+  const canvas = new OffscreenCanvas(width, height);
+  const image = new ImageData(width, height);
+  for (let i = 0; i < mask.length; i += 1) image.data[4 * i + 3] = mask[i] > 0 ? 255 : 0;
+  canvas.getContext("2d").putImageData(image, 0, 0);
+  return canvas;
+}
+
+/** Grey levels between which 98 % of what was received lies, in percent: what "auto" gain takes. */
+export function autoRange(picture) {
+  const histogram = new Uint32Array(256);
+  let count = 0;
+  for (let i = 0; i < picture.levels.length; i += 1) {
+    if (picture.missing[i] === 0) {
+      histogram[picture.levels[i]] += 1;
+      count += 1;
+    }
+  }
+  const at = (share) => {
+    let sum = 0;
+    for (let level = 0; level < 256; level += 1) {
+      sum += histogram[level];
+      if (sum >= share * count) return level;
+    }
+    return 255;
+  };
+  if (count === 0) return [0, 100];
+  const [low, high] = [at(0.01), at(0.99)];
+  return high > low ? [low / 2.55, high / 2.55] : [0, 100];
+}
