@@ -7,6 +7,7 @@ from pydantic import Field
 
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX
 from sonarpost.runtime.config import ServiceConfig
+from sonarpost.sonar.options import ErrorBudget, Mounting, SurveyOptions
 
 SidePx = Annotated[int, Field(ge=MIN_SIDE_PX, le=MAX_SIDE_PX)]
 
@@ -20,11 +21,25 @@ class AtdStubConfig(ServiceConfig):
         input_dir: Folder that is polled.
         quarantine_dir: Where bad files are moved, each with its reason; by default `quarantine` in `input_dir`.
         poll_s: Time between two looks at the folder.
-        settle_s: A file counts when its size and date have not changed for this long.
+        settle_s: A file counts when its size and date have not changed for this long; at once with `NAME.done` beside.
+        needs_done: A file counts only when `NAME.done` lies beside it.
         confidence_threshold: Least ATD confidence (0 to 2) of a contact that is sent.
         max_contacts: Most contacts a survey file may give, most confident first; 0 for no limit.
+        max_on_the_way: Most pictures between this service and the water; what else was found waits here, and the most
+            confident goes first.
+        seam_pings: Last pings of a file that are kept, to be looked at together with the file that goes on there; and
+            what pieces of a long file have in common. Twice a snippet's height is enough.
+        seam_wait_s: How long a contact in the later half of these pings waits for the next file, which shows the rest
+            of it; 0 sends it as it is.
         snippet_height_px: Rows (along-track) of a snippet.
         snippet_width_px: Columns (across-track) of a snippet.
+        snippet_pixel_m: Side of a snippet's pixels on the ground; 0 for the sonar's own, ping by sample.
+        snippet_dir: Where every contact's picture is kept, with a text file beside it; by default nowhere.
+        projected_crs: Coordinate system of survey files in metres (`EPSG:32619`).
+        position_source: Which of a survey file's positions is taken, the sensor's or the ship's.
+        port_order: Order of the port samples in survey files.
+        mounting: Where the sonar is, seen from the position in the file: offsets, layback, heading.
+        errors: How good positions, headings and altitudes are, one standard deviation each.
     """
 
     mode: Literal["survey", "snippets"] = "survey"
@@ -32,7 +47,28 @@ class AtdStubConfig(ServiceConfig):
     quarantine_dir: Path | None = None
     poll_s: Annotated[float, Field(gt=0, le=3600)] = 1.0
     settle_s: Annotated[float, Field(ge=0, le=3600)] = 3.0
+    needs_done: bool = False
     confidence_threshold: Annotated[float, Field(ge=0, le=2)] = 1.0
     max_contacts: Annotated[int, Field(ge=0)] = 0
+    max_on_the_way: Annotated[int, Field(ge=1, le=100_000)] = 32
+    seam_pings: Annotated[int, Field(ge=0, le=900)] = 200
+    seam_wait_s: Annotated[float, Field(ge=0, le=86400)] = 0.0
     snippet_height_px: SidePx = 80
     snippet_width_px: SidePx = 140
+    snippet_pixel_m: Annotated[float, Field(ge=0, le=10)] = 0.0
+    snippet_dir: Path | None = None
+    projected_crs: str | None = None
+    position_source: Literal["sensor", "ship"] = "sensor"
+    port_order: Literal["farthest_first", "nearest_first"] = "farthest_first"
+    mounting: Mounting = Mounting()
+    errors: ErrorBudget = ErrorBudget()
+
+    def survey_options(self) -> SurveyOptions:
+        """Return how survey files are to be understood."""
+        return SurveyOptions(
+            projected_crs=self.projected_crs,
+            position_source=self.position_source,
+            port_order=self.port_order,
+            mounting=self.mounting,
+            errors=self.errors,
+        )

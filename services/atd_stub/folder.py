@@ -3,28 +3,33 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+
+DONE_SUFFIX = ".done"
 
 
 @dataclass(frozen=True, slots=True)
 class FileSeen:
-    """A file as one look at the folder found it."""
+    """A file as one look at the folder found it; `is_done` when its recorder has put `NAME.done` beside it."""
 
     path: Path
     size_bytes: int
     modified_ns: int
+    is_done: bool = field(default=False, compare=False)
 
 
 class SettledFiles:
     """Tells which files have stopped growing.
 
     Args:
-        settle_s: How long size and date must stay as they are.
+        settle_s: How long size and date must stay as they are; not at all where a file is done.
+        needs_done: Nothing counts that is not done.
     """
 
-    def __init__(self, settle_s: float) -> None:
+    def __init__(self, settle_s: float, *, needs_done: bool = False) -> None:
         self._settle_s = settle_s
+        self._needs_done = needs_done
         self._since: dict[FileSeen, float] = {}
 
     def look(self, files: tuple[FileSeen, ...], now: float) -> tuple[FileSeen, ...]:
@@ -35,7 +40,12 @@ class SettledFiles:
             now: Seconds on a clock that never goes back.
         """
         self._since = {seen: self._since.get(seen, now) for seen in files}
-        settled = (seen for seen, since in self._since.items() if now - since >= self._settle_s)
+        is_done = {seen.path: seen.is_done for seen in files}
+        settled = (
+            seen
+            for seen, since in self._since.items()
+            if is_done[seen.path] or (now - since >= self._settle_s and not self._needs_done)
+        )
         return tuple(sorted(settled, key=lambda seen: (seen.modified_ns, seen.path.name)))
 
 
@@ -46,7 +56,9 @@ def look_at(folder: Path, suffixes: tuple[str, ...]) -> tuple[FileSeen, ...]:
         OSError: The folder cannot be read.
     """
     found = []
-    for path in folder.iterdir():
+    listed = tuple(folder.iterdir())
+    names = {path.name for path in listed}
+    for path in listed:
         if path.name.startswith(".") or path.suffix.lower() not in suffixes:
             continue
         if not path.is_file():
@@ -55,7 +67,7 @@ def look_at(folder: Path, suffixes: tuple[str, ...]) -> tuple[FileSeen, ...]:
             status = path.stat()
         except FileNotFoundError:
             continue  # taken away since the folder was listed
-        found.append(FileSeen(path, status.st_size, status.st_mtime_ns))
+        found.append(FileSeen(path, status.st_size, status.st_mtime_ns, path.name + DONE_SUFFIX in names))
     return tuple(found)
 
 

@@ -1,4 +1,4 @@
-"""Polls a folder for files, finds what is worth sending in each, and hands it on."""
+"""Polls a folder for files, finds what is worth sending in each, and lets it go as the water takes it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ import msgpack
 from services.atd_stub import snippets
 from services.atd_stub.config import AtdStubConfig
 from services.atd_stub.folder import FileSeen, SettledFiles, content_hash, look_at, printable
-from sonarpost import keys
+from services.atd_stub.outgoing import Outgoing
+from services.atd_stub.seam_store import SeamStore
+from services.atd_stub.survey_walk import Finding
+from services.atd_stub.text_file import write_snippet
 from sonarpost.errors import HandoffError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.messages import Record, Snippet
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.transaction import OutboxItem, Transaction
 from sonarpost.sonar.readers import SUPPORTED_SUFFIXES
 
 log = logging.getLogger(__name__)
@@ -28,10 +32,11 @@ PICTURE_SUFFIXES = (".tif", ".tiff", ".png")
 
 
 class AtdStubService(Service[AtdStubConfig]):
-    """Processes every file once ever, known by its content.
+    """Processes every file once ever, known by its content, and sends the most confident contacts first.
 
     That a file was processed and the snippets found in it are committed together: a process killed while it works on
-    a file begins that file again and owes its snippets once.
+    a file begins that file again and owes its snippets once. A snippet is in one place of the store at any time: held
+    at a seam, in the pool, or owed to the compressor.
     """
 
     NAME = "atd_stub"
@@ -39,25 +44,54 @@ class AtdStubService(Service[AtdStubConfig]):
     def __init__(self, platform: PlatformConfig, config: AtdStubConfig) -> None:
         super().__init__(platform, config)
         self._suffixes = SUPPORTED_SUFFIXES if config.mode == "survey" else PICTURE_SUFFIXES
-        self._settled = SettledFiles(config.settle_s)
+        self._settled = SettledFiles(config.settle_s, needs_done=config.needs_done)
         self._dealt_with: set[FileSeen] = set()
         self._waiting = -1
+        self._outgoing = Outgoing(platform, self.store, config.max_on_the_way, self.commit)
+        self._seams = SeamStore(self.store)
 
     def handle(self, key: str, record: Record, effects: Effects) -> None:
         """Refuse: nothing is sent to this service."""
         raise NotImplementedError("atd_stub consumes no records")
 
     def on_start(self) -> None:
-        """Start to poll."""
+        """Watch what waits on the way to the water, and start to poll."""
+        self._outgoing.listen(self.session)
         self.spawn(self._poll, "poll")
+        self.spawn(lambda: self._outgoing.run(self.stopping), "release")
+
+    def on_stop(self) -> None:
+        """Let the threads look up."""
+        self._outgoing.wake()
 
     def gauges(self) -> Mapping[str, float]:
-        """Return how many files wait; -1 before the first look."""
-        return {"files_waiting": float(self._waiting)}
+        """Return how many files (-1 before the first look) and contacts wait."""
+        return {
+            "files_waiting": float(self._waiting),
+            "contacts_waiting": float(self._outgoing.waiting + self._seams.held),
+            "contacts_on_the_way": float(self._outgoing.on_the_way),
+        }
+
+    def trouble(self) -> str:
+        """Return what keeps contacts from being handed on."""
+        return self._outgoing.trouble
+
+    def remark(self) -> str:
+        """Say that contacts wait for the water."""
+        waiting = self._outgoing.waiting
+        return f"{waiting} contacts wait for room on the way to the water" if waiting else ""
+
+    def settled(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
+        """Count what the compressor has taken."""
+        if reason is None:
+            self._outgoing.taken()
+        else:
+            self._outgoing.wake()
 
     def _poll(self) -> None:
         while not self.stopping.is_set():
             try:
+                self._end_seams()
                 self._look()
             except (OSError, HandoffError) as error:
                 self.problem(f"{type(error).__name__}: {error}")
@@ -122,35 +156,59 @@ class AtdStubService(Service[AtdStubConfig]):
         self._hand_on(path, content, found, round(time.perf_counter() - started, 2))
         return True
 
-    def _hand_on(self, path: Path, content: str, found: tuple[Snippet, ...], seconds: float) -> None:
+    def _hand_on(self, path: Path, content: str, found: Finding, seconds: float) -> None:
         effects = Effects()
-        for snippet in found:
-            effects.send(keys.contact_detected(self.platform.id), "compressor", snippet)
-        effects.put_state(_state_name(content), msgpack.packb({"file": printable(path.name), "contacts": len(found)}))
+        effects.put_state(
+            _state_name(content), msgpack.packb({"file": printable(path.name), "contacts": found.contacts})
+        )
         effects.count("files_processed")
-        effects.count("contacts_detected", len(found))
-        self.commit(effects)
-        log.info("File processed", extra=kv(file=path.name, contacts=len(found), seconds=seconds))
-        for snippet in found:
+        effects.count("contacts_detected", found.contacts)
+        freed = self._seams.keep(effects, found.seam, joined=found.joined)
+        self._commit_contacts(effects, (*found.snippets, *freed))
+        log.info(
+            "File processed",
+            extra=kv(file=path.name, contacts=found.contacts, joined=found.joined, seconds=seconds),
+        )
+        for warning in found.warnings:
+            log.warning("Met in the survey", extra=kv(file=path.name, what=printable(warning)))
+
+    def _commit_contacts(self, effects: Effects, ready: tuple[Snippet, ...]) -> None:
+        """Commit effects, and contacts that are ready to go, whose files are written before."""
+        if self.config.snippet_dir is not None:
+            for snippet in ready:
+                write_snippet(self.config.snippet_dir, snippet)
+        self._outgoing.add(effects, ready)
+        self._seams.committed()
+        for snippet in ready:
             log.info(
                 "Contact detected",
                 extra=kv(
                     vehicle=self.platform.id,
                     contact_id=snippet.contact.contact_id,
-                    file=path.name,
+                    file=snippet.source,
                     confidence=snippet.contact.atd_confidence,
                 ),
             )
 
-    def _snippets(self, path: Path, content: str) -> tuple[Snippet, ...]:
+    def _end_seams(self) -> None:
+        """Let go what waited long enough for a file that has not come."""
+        effects = Effects()
+        freed = self._seams.end(effects, time.time(), self.config.seam_wait_s)
+        if freed:
+            log.info("No file goes on where the last one ended", extra=kv(contacts=len(freed)))
+            self._commit_contacts(effects, freed)
+
+    def _snippets(self, path: Path, content: str) -> Finding:
         if self.config.mode == "snippets":
             return snippets.from_picture(path, content, self.platform.id)
-        return snippets.from_survey(path, content, self.platform.id, self.config)
+        seams = self._seams.all()
+        return snippets.from_survey(path, content, self.platform.id, self.config, seams, time.time())
 
     def _meet_again(self, path: Path, content: str, kept: bytes) -> None:
         """Leave a file that was processed; put one that was refused aside again, where it will be found."""
-        reason = msgpack.unpackb(kept).get("refused")
-        log.info("File known already", extra=kv(file=path.name, refused=reason or "no"))
+        known = msgpack.unpackb(kept)
+        reason = known.get("refused")
+        log.info("File known already", extra=kv(file=path.name, processed_as=known.get("file"), refused=reason or "no"))
         if reason is not None:
             self._move_aside(path, content, reason)
 

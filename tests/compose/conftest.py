@@ -141,8 +141,8 @@ class Project:
         """Return how many survey files the vehicle has dealt with."""
         script = (
             "import sqlite3; db = sqlite3.connect('file:/var/lib/sonarpost/state/atd_stub.db?mode=ro', uri=True); "
-            "print(db.execute('SELECT COUNT(*) FROM state').fetchone()[0], "
-            "db.execute('SELECT COUNT(*) FROM outbox').fetchone()[0])"
+            "count = lambda kind: db.execute('SELECT COUNT(*) FROM state WHERE name LIKE ?', (kind,)).fetchone()[0]; "
+            "print(count('file:%'), count('pool:%') + db.execute('SELECT COUNT(*) FROM outbox').fetchone()[0])"
         )
         files, owed = self.inside("atd_stub", script).split()
         return int(files) if owed == "0" else 0
@@ -199,6 +199,7 @@ def project() -> Iterator[Project]:
             "SIM_SURVEYS": "1",
             "SIM_TIME_SCALE": "60.0",
             "HEALTH_INTERVAL_S": "1.0",
+            "SEAM_WAIT_S": "0.0",
             "HEALTH_CHECK_INTERVAL": "3s",
             "SHORE_PUBLISH": "127.0.0.1:",  # a free port of this host
         },

@@ -35,6 +35,8 @@ ONLY_COMPARED = {
         keys.command_all("x"),
     },
     "relay": {keys.command("x", "x")},
+    # It listens to them, where they are published.
+    "atd_stub": {keys.health("x", "x"), keys.acoustic_queue("x")},
     # It subscribes to two kinds, each by its name.
     "compressor": {keys.command("x", "x")},
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -18,6 +18,8 @@ from sonarpost.sonar.survey import Ping, Side, Survey
 
 MAX_HELD_BYTES: Final = 1 << 30
 """Of samples that a survey held in memory may have; a longer recording is read in blocks."""
+STRIP_BYTES: Final = 1 << 26
+"""Of samples that a strip holds: the detector needs about twenty times as much to work on it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,3 +182,66 @@ def blocks(source: SurveySource, length: int = 1000, overlap: int = 0) -> Iterat
         new, rest = ahead[:length], ahead[length:]
         before.extend(new)
         ahead = rest + list(islice(pings, length + overlap - len(rest))) if len(new) == length else []
+
+
+@dataclass(frozen=True, slots=True)
+class Strip:
+    """A piece of a stream of pings.
+
+    Attributes:
+        first_row: Place of its first ping in the stream.
+        pings: The pings; the last ones of a strip are the first ones of the next.
+        is_last: Nothing follows it.
+    """
+
+    first_row: int
+    pings: tuple[Ping, ...]
+    is_last: bool
+
+
+def strips(
+    pings: Iterable[Ping], length: int = 1000, overlap: int = 0, max_bytes: int = STRIP_BYTES
+) -> Iterator[Strip]:
+    """Cut a stream of pings, of one recording or of several that follow each other, into pieces that fit into memory.
+
+    What is left at the end and shorter than half a strip goes with the strip before it.
+
+    Args:
+        pings: The stream.
+        length: Pings of a strip, more than `overlap`; the last one may have up to half as many more, or fewer.
+        overlap: Pings that a strip has in common with the next.
+        max_bytes: Of samples that are held; strips of long pings are shorter.
+
+    Yields:
+        The strips in order; none for an empty stream.
+
+    Raises:
+        ValueError: A length not above the overlap, or an overlap below 0.
+        SurveyFileError: `max_bytes` do not hold twice the overlap.
+    """
+    if overlap < 0 or length <= overlap:
+        raise ValueError(f"strips of {length} with overlap {overlap}, expected more than the overlap, from 0")
+    held: list[Ping] = []
+    size = first_row = 0
+    for ping in pings:
+        if len(held) >= length + length // 2 or (size > max_bytes and len(held) > 2 * overlap + 1):
+            new = max(2 * len(held) // 3, overlap + 1)
+            yield Strip(first_row, tuple(held[:new]), is_last=False)
+            del held[: new - overlap]
+            first_row += new - overlap
+            size = sum(map(_size_bytes, held))
+        held.append(ping)
+        size += _size_bytes(ping)
+        if size > 2 * max_bytes:
+            # The row counts within the stream, which may have begun in another file.
+            where, value = (
+                f"survey, row {first_row + len(held) - 1}",
+                f"over {2 * max_bytes} bytes in {len(held)} pings",
+            )
+            raise SurveyFileError(where, "samples", value, "pings of fewer samples")
+    if held:
+        yield Strip(first_row, tuple(held), is_last=True)
+
+
+def _size_bytes(ping: Ping) -> int:
+    return sum(channel.samples.nbytes for channel in ping.channels)

@@ -30,7 +30,7 @@ R = TypeVar("R", bound=Record)
 CONNECT_S = 20.0
 # Gauges that are zero when a service has nothing left to do.
 IDLE_GAUGES: Mapping[str, tuple[str, ...]] = {
-    "atd_stub": ("files_waiting", "outbox"),
+    "atd_stub": ("files_waiting", "contacts_waiting", "outbox"),
     "compressor": ("inbox", "outbox"),
     "uuv_modem": ("inbox",),
     "op_modem": ("outbox", "unsaved"),
