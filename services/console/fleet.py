@@ -122,6 +122,19 @@ class FleetPanel:
         return [_service(seen) for seen in self.services.state(now).services]
 
 
+def frame_event(vehicle_id: str, frame: AcousticFrame) -> Json:
+    """Return what pages hear of a frame of a vehicle."""
+    quality = frame.quality
+    return {
+        "vehicle_id": vehicle_id,
+        "utc_s": frame.time_utc_s,
+        "rate": frame.rate,
+        "snr_in_db": quality and quality.snr_in_db,
+        "snr_out_db": quality and quality.snr_out_db,
+        "bytes": len(frame.data),
+    }
+
+
 def _loss(heard: _Heard) -> float | None:
     frames = sum(packet[1] for packet in heard.packets)
     return round(sum(packet[2] for packet in heard.packets) / frames, 3) if frames else None

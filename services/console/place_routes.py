@@ -9,6 +9,7 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
 from services.console.board import Board, NoSuchError
+from services.console.config import ConsoleConfig
 from services.console.rows import Json
 from services.console.web import Call, Gate, json_answer
 from sonarpost.review.local import LocalFrame, distance_m
@@ -74,9 +75,7 @@ def fleet(board: Board) -> Json:
     for name in sorted({*vehicles, *places}):
         place = places.get(name)
         lat, lon = (None, None) if place is None else (place["vehicle_lat_deg"], place["vehicle_lon_deg"])
-        range_m = None
-        if place is not None and config.vessel_lat_deg is not None and config.vessel_lon_deg is not None:
-            range_m = round(distance_m(config.vessel_lat_deg, config.vessel_lon_deg, lat, lon), 1)
+        range_m = None if place is None else _range_m(config, place["vehicle_lat_deg"], place["vehicle_lon_deg"])
         at = place and place["seen_utc_s"]
         found.append(
             {
@@ -90,6 +89,13 @@ def fleet(board: Board) -> Json:
             }
         )
     return {"now_utc_s": board.clock(), "services": [*board.fleet.service_list()], "vehicles": [*found]}
+
+
+def _range_m(config: ConsoleConfig, lat_deg: float, lon_deg: float) -> float | None:
+    """Return how far from the vessel a position is, None where the vessel's own is not configured."""
+    if config.vessel_lat_deg is None or config.vessel_lon_deg is None:
+        return None
+    return round(distance_m(config.vessel_lat_deg, config.vessel_lon_deg, lat_deg, lon_deg), 1)
 
 
 def _never_heard(name: str) -> Json:

@@ -32,6 +32,7 @@ SERVICES = (
     "decompressor",
     "relay",
     "c2",
+    "console",
 )
 
 
