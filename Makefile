@@ -18,8 +18,9 @@ $(STAMP): requirements.lock pyproject.toml
 demo: setup
 	$(BIN)/sonarpost demo $(ARGS)
 
+# Two at a time, a file's tests together and those of real processes one after the other (tests/conftest.py).
 test: setup
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 # Tests that take minutes each: long outages, processes killed at random for five minutes.
 test-long: setup

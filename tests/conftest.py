@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 import zenoh
 from hypothesis import settings
+from xdist.remote import Producer
+from xdist.scheduler import LoadFileScheduling
 
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.session import client_config, router_config
@@ -20,6 +22,20 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 # An example that waits for the disk of a loaded machine is slow, not wrong; pytest-timeout ends what hangs.
 settings.register_profile("sonarpost", deadline=None)
 settings.load_profile("sonarpost")
+
+
+class OneChainAtATime(LoadFileScheduling):
+    """Gives a file's tests to one worker, and those of many real processes to one, one after the other."""
+
+    PROCESSES = ("tests/chain/", "tests/faults/", "tests/compose/")
+
+    def _split_scope(self, nodeid: str) -> str:
+        return "processes" if nodeid.startswith(self.PROCESSES) else super()._split_scope(nodeid)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> OneChainAtATime:
+    """Schedule `make test`, which runs two tests at a time."""
+    return OneChainAtATime(config, log)
 
 
 def free_port() -> int:
