@@ -50,7 +50,7 @@ def unpack_map(payload: bytes, where: str) -> dict[str, object]:
         raise PayloadError(
             where, "payload", payload[:40], f"a msgpack map ({error or type(error).__name__})"
         ) from error
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+    if not isinstance(value, dict) or set(map(type, value)) - {str}:
         raise PayloadError(where, "payload", value, "a msgpack map with text keys")
     return value
 

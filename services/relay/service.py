@@ -47,6 +47,8 @@ class RelayService(Service[RelayConfig]):
         super().__init__(platform, config)
         upstreams = (Upstream(site, self._open_session) for site in config.sites())
         self._upstreams = {upstream.queue: upstream for upstream in upstreams}
+        # By queue: where the site takes what this vessel sends.
+        self._inboxes = {queue: keys.shore_inbox(platform.id, u.site) for queue, u in self._upstreams.items()}
         self._watch = ShoreWatch(platform.id, [self._site(u) for u in self._upstreams.values()], platform.tls)
         self._picture_room = Room(self.store, config.disk_reserve_bytes, "pictures wait with their senders")
 
@@ -120,9 +122,8 @@ class RelayService(Service[RelayConfig]):
         else:
             priority = PREVIEW_PRIORITY if record.version == 1 else DETAIL_PRIORITY
             topic = topic_of(record) if self.config.supersede else None
-        for upstream in self._upstreams.values():
-            inbox = keys.shore_inbox(vessel, upstream.site)
-            effects.send_payload(inbox, upstream.queue, payload, Relayed, priority=priority, topic=topic)
+        for queue, inbox in self._inboxes.items():
+            effects.send_payload(inbox, queue, payload, Relayed, priority=priority, topic=topic)
         effects.count(f"{record.TYPE}s_relayed")
         log.info("Owed to the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
 

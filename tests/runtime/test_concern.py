@@ -19,7 +19,7 @@ from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_sender import plan_packets
 from sonarpost.messages import AcousticFrame, Contact, Decision, Raster, Relayed, Snippet
 from sonarpost.runtime import logs
-from sonarpost.runtime.concern import concern_of_payload
+from sonarpost.runtime.concern import Concern, concern_of_payload
 from sonarpost.runtime.config import PlatformConfig
 
 CONTACT = Contact(contact_id="line-7", vehicle_id="uuv-1")
@@ -91,3 +91,13 @@ def test_a_refused_record_is_named_in_the_log(
         service.stop()
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "Record refused" in line]
     assert "vehicle=uuv-1 image_id=00A7" in line
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_a_record_concerns_what_its_payload_does(name: str) -> None:
+    payload = wire.encode(SAMPLES[name])
+    concern = Concern(payload, "k")
+    expected = concern_of_payload(payload, "k")
+    assert concern.fields() == expected
+    concern.record = SAMPLES[name]
+    assert concern.fields() == expected

@@ -172,3 +172,23 @@ def test_what_a_line_concerns_ends_with_an_error() -> None:
     with pytest.raises(ValueError, match="x"), logs.concerning(vehicle="uuv-1"):
         raise ValueError("x")
     assert text("Sent").endswith(": Sent")
+
+
+def test_what_a_line_concerns_is_looked_for_once_and_only_for_a_line() -> None:
+    looked = 0
+
+    def find() -> dict[str, object]:
+        nonlocal looked
+        looked += 1
+        return {"image_id": "00A7", "contact_id": None}
+
+    with logs.concerning(vehicle="uuv-1"), logs.concerning_later(find):
+        assert looked == 0
+        assert text("Sent").endswith(": Sent vehicle=uuv-1 image_id=00A7")
+        with logs.concerning(step=2):
+            assert event("Sent")["step"] == 2
+        assert looked == 1
+    assert text("Sent").endswith(": Sent")
+    with logs.concerning_later(find):
+        pass
+    assert looked == 1

@@ -241,3 +241,65 @@ def test_a_clock_that_goes_back_gives_nothing() -> None:
     bucket.take(10, 100.0)
     assert bucket.wait_s(10, 50.0) == pytest.approx(1.0)
     assert bucket.wait_s(10, 101.0) == pytest.approx(0.0)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 12_000), st.integers(2, 4), st.sampled_from("ab")), min_size=1, max_size=60),
+    st.integers(0, 40),
+    st.one_of(st.none(), st.floats(500, 100_000)),
+)
+@settings(max_examples=80)
+def test_records_go_together_in_order_alike_and_within_one_piece(
+    records: list[tuple[int, int, str]], takes: int, bytes_per_s: float | None
+) -> None:
+    items = [
+        OutboxItem("c2", seq, key, "", priority, bytes(size), bytes(32), place=seq)
+        for seq, (size, priority, key) in enumerate(records, 1)
+    ]
+    plan = schedule(*items, bytes_per_s=bytes_per_s)
+    plan.takes = takes
+    now_s = charged = 0.0
+    sent: list[Piece] = []
+    while plan.active:
+        piece, wait_s = plan.next_piece(now_s)
+        if piece is None:
+            assert wait_s is not None
+            now_s += wait_s
+            continue
+        pieces = plan.together_with(piece)
+        assert pieces[0] is piece
+        assert len(pieces) <= max(takes, 1)
+        if len(pieces) > 1:
+            assert sum(p.size for p in pieces) <= plan.piece_bytes
+            assert all(p.start == 0 and p.end == len(p.transfer.item.payload) for p in pieces)
+            assert len({(p.transfer.item.key, p.transfer.item.priority) for p in pieces}) == 1
+        plan.asked(piece, now_s, *pieces[1:])
+        plan.answered(piece, now_s)
+        size = sum(p.size for p in pieces) + OVERHEAD_BYTES
+        if bytes_per_s is not None and not piece.transfer.urgent:
+            assert charged <= bytes_per_s * now_s + plan.piece_bytes + OVERHEAD_BYTES + 1e-3 * (charged + 1)
+        charged += size
+        for done in pieces:
+            if done.end == len(done.transfer.item.payload):
+                plan.settled(done.transfer)
+            else:
+                plan.go_on_from(done, done.end)
+        sent += pieces
+    begun = list(dict.fromkeys(p.transfer.order for p in sent))
+    assert begun == sorted(begun)
+    assert sum(p.size for p in sent) == sum(len(i.payload) for i in items)
+
+
+def test_one_record_at_a_time_until_the_consumer_has_said_otherwise_again() -> None:
+    plan = schedule(item(1), item(2), item(3))
+    plan.takes = 3
+    first = ask(plan)
+    assert len(plan.together_with(first)) == 1, "it has begun"
+    plan.answered(first, 0.0)
+    piece, _ = plan.next_piece(0.0)
+    assert piece is not None
+    assert [p.transfer.item.seq for p in plan.together_with(piece)] == [2, 3]
+    plan.start_again()
+    piece, _ = plan.next_piece(0.0)
+    assert piece is not None
+    assert plan.together_with(piece) == [piece]

@@ -19,6 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.errors import HandoffError
+from sonarpost.runtime import rows
 from sonarpost.runtime.store import Store
 from sonarpost.runtime.transaction import Chunk, OutboxItem, Transaction
 
@@ -333,6 +334,7 @@ def test_records_are_on_the_disk_when_a_transaction_ends(store: Store) -> None:
 KILLED = """
 import itertools, sys
 from pathlib import Path
+from sonarpost.runtime import rows
 from sonarpost.runtime.store import Store
 store = Store(Path(sys.argv[1]))
 first = int(store.get_state("n") or b"0") + 1
@@ -479,3 +481,56 @@ def test_a_transaction_that_reads_sees_what_it_wrote(store: Store) -> None:
     with store.transaction() as tx:
         assert tx.get_state("a") is None
         assert not tx.was_seen(ORIGIN, 3)
+
+
+@given(st.sets(st.integers(-50, 50)))
+def test_runs_are_the_numbers_and_nothing_between(numbers: set[int]) -> None:
+    found = list(rows.runs(numbers))
+    assert [n for first, last in found for n in range(first, last + 1)] == sorted(numbers)
+    assert all(last + 1 < first for (_, last), (first, _) in itertools.pairwise(found))
+
+
+def test_many_records_in_one_transaction_keep_their_order_and_numbers(store: Store) -> None:
+    payloads = [str(n).encode() for n in range(3 * rows.ROWS_AT_ONCE + 5)]
+    with store.transaction() as tx:
+        numbers = [tx.send("k", "c", payload, encoding="") for payload in payloads]
+        for payload in payloads:
+            tx.accept("k", payload)
+    assert numbers == list(range(1, len(payloads) + 1))
+    assert [item.payload for item in store.owed("c", 1000)] == payloads
+    assert [item.payload for item in store.pending(1000)] == payloads
+    with store.transaction() as tx:
+        assert tx.send("k", "c", b"x", encoding="") == len(payloads) + 1
+        tx.all_acknowledged("c", [*range(1, 50), 60, len(payloads) + 1])
+        for done in store.pending(40):
+            tx.done(done)
+    assert [item.seq for item in store.owed("c", 1000)] == [*range(50, 60), *range(61, len(payloads) + 1)]
+    assert [item.payload for item in store.pending(1000)] == payloads[40:]
+
+
+def test_what_a_transaction_collected_is_gone_with_it(store: Store) -> None:
+    def fail() -> None:
+        with store.transaction() as tx:
+            tx.send("k", "c", b"x", encoding="")
+            tx.accept("k", b"x", ORIGIN, 1)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert store.outbox_depth() == store.inbox_depth() == 0
+    with store.transaction() as tx:
+        assert tx.send("k", "c", b"x", encoding="") == 1
+        assert not tx.was_seen(ORIGIN, 1)
+
+
+@pytest.mark.parametrize(("max_bytes", "count"), [(None, 4), (0, 1), (10, 1), (29, 2), (30, 3), (1000, 4)])
+def test_what_is_pending_is_given_up_to_so_many_bytes(store: Store, max_bytes: int | None, count: int) -> None:
+    with store.transaction() as tx:
+        for _ in range(4):
+            tx.accept("k", bytes(10))
+    assert len(store.pending(9, max_bytes=max_bytes)) == count
+    assert len(store.pending(1, max_bytes=max_bytes)) == 1
+
+
+def test_what_is_deleted_is_not_written_once_more(store: Store) -> None:
+    assert store._query("PRAGMA secure_delete") == [(0,)]

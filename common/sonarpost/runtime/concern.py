@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from sonarpost import wire
 from sonarpost.errors import FrameError, PayloadError
 from sonarpost.link.paper_format import parse_frame
-from sonarpost.messages import AcousticFrame, Relayed
+from sonarpost.messages import AcousticFrame, Record, Relayed
 
 
 def concern_of_payload(payload: bytes, where: str) -> dict[str, str]:
@@ -40,6 +40,31 @@ def concern_of_payload(payload: bytes, where: str) -> dict[str, str]:
         "contact_id": about.get("contact_id"),
     }
     return {name: value for name, value in found.items() if isinstance(value, str)}
+
+
+class Concern:
+    """Which contact a payload is about, looked for when somebody wants to know.
+
+    Attributes:
+        record: What the payload holds, as soon as that is known: it need not be read again then.
+    """
+
+    def __init__(self, payload: bytes, where: str) -> None:
+        self.record: Record | None = None
+        self._payload = payload
+        self._where = where
+
+    def fields(self) -> dict[str, str]:
+        """Return what `concern_of_payload` does."""
+        if self.record is None or isinstance(self.record, (Relayed, AcousticFrame)):
+            return concern_of_payload(self._payload, self._where)
+        about = getattr(self.record, "contact", None)
+        found = {
+            "vehicle": getattr(self.record, "vehicle_id", None) or getattr(about, "vehicle_id", None),
+            "image_id": getattr(self.record, "image_id", None),
+            "contact_id": getattr(about, "contact_id", None),
+        }
+        return {name: value for name, value in found.items() if value is not None}
 
 
 def _is_envelope(payload: bytes, where: str) -> bool:

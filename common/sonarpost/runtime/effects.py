@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 
 from sonarpost import wire
@@ -22,7 +21,7 @@ class Effects:
         self._sends: list[tuple[str, str, bytes, str, int, Topic | None]] = []
         self._state: dict[str, bytes | None] = {}
         self._apart: list[tuple[str, bytes, str]] = []
-        self._counts: Counter[str] = Counter()
+        self._counts: dict[str, int] = {}
 
     def send(self, key: str, consumer: str, record: Record, *, priority: int = 4, topic: Topic | None = None) -> None:
         """Owe `record` to the service named `consumer`, published on `key`; see `Transaction.send`."""
@@ -55,7 +54,7 @@ class Effects:
 
     def count(self, name: str, by: int = 1) -> None:
         """Add to a health counter once the effects are committed."""
-        self._counts[name] += by
+        self._counts[name] = self._counts.get(name, 0) + by
 
     def write(self, tx: Transaction) -> None:
         """Write everything into an open transaction."""

@@ -152,28 +152,28 @@ class Sender:
         if len(self._acknowledged) >= FORGET_AT:
             self._forget()
         self._wake.clear()
-        wanted = self._most_urgent(schedule.looks_at)
-        known = {seq: schedule.active[seq].item for seq in wanted if seq in schedule.active}
-        loaded = {item.seq: item for item in self._store.owed_items(self._queue, [s for s in wanted if s not in known])}
-        schedule.put((known | loaded).values())
+        numbers = self._store.owed_numbers(self._queue, schedule.looks_at + len(self._acknowledged))
+        known, loaded = self._items([seq for seq in numbers if seq not in self._acknowledged][: schedule.looks_at])
+        schedule.put([*known, *loaded])
         self._settled_upto = self._store.settled_upto(self._queue)
         session = self._session()
         if session is not None:
-            for item in loaded.values():
+            for item in loaded:
                 self._show(session, item)
 
-    def _most_urgent(self, count: int) -> list[int]:
-        """Return the numbers of so many records at most; of large ones fewer, not to hold them all in memory."""
-        wanted: list[int] = []
-        total = 0
-        for seq, size in self._store.owed_sizes(self._queue, count + len(self._acknowledged)).items():
-            if seq in self._acknowledged:
-                continue
-            total += size
-            if len(wanted) == count or (len(wanted) >= WINDOW and total > LOADED_BYTES):
+    def _items(self, wanted: Sequence[int]) -> tuple[list[OutboxItem], list[OutboxItem]]:
+        """Return records, known ones and such as are read now; of large ones fewer, not to hold them all in memory."""
+        active = self._schedule.active
+        known: list[OutboxItem] = []
+        loaded: list[OutboxItem] = []
+        for first in range(0, len(wanted), WINDOW):
+            some = wanted[first : first + WINDOW]
+            known += [active[seq].item for seq in some if seq in active]
+            loaded += self._store.owed_items(self._queue, [seq for seq in some if seq not in active])
+            total = sum(len(item.payload) for item in known) + sum(len(item.payload) for item in loaded)
+            if total > LOADED_BYTES:
                 break
-            wanted.append(seq)
-        return wanted
+        return known, loaded
 
     def _session(self) -> zenoh.Session | None:
         return self._default_session if self._lane.session is None else self._lane.session()

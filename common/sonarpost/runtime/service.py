@@ -24,7 +24,7 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.errors import BadInputError, HandoffError
 from sonarpost.messages import Health, Record, ServiceState
-from sonarpost.runtime.concern import concern_of_payload
+from sonarpost.runtime.concern import Concern
 from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.effects import Effects
 from sonarpost.runtime.heartbeat import Heartbeat
@@ -294,13 +294,15 @@ class Service(ABC, Generic[C]):
 
         Every line that is logged meanwhile says which contact it concerns.
         """
-        with concerning_later(lambda: concern_of_payload(item.payload, item.key)):
-            return self._handled(item)
+        about = Concern(item.payload, item.key)
+        with concerning_later(about.fields):
+            return self._handled(item, about)
 
-    def _handled(self, item: InboxItem) -> Effects | None:
+    def _handled(self, item: InboxItem, about: Concern) -> Effects | None:
         effects = Effects(item.payload)
         try:
-            self.handle(item.key, wire.decode(self._record_type(item.key), item.payload, item.key), effects)
+            about.record = record = wire.decode(self._record_type(item.key), item.payload, item.key)
+            self.handle(item.key, record, effects)
         except (OSError, HandoffError, InterruptedByStopError):
             raise
         except BadInputError as error:
@@ -338,7 +340,8 @@ class Service(ABC, Generic[C]):
                     tx.done(item)
         with self._counter_lock:
             for effects, _ in handled:
-                self._counters.update(effects.counts)
+                for name, by in effects.counts.items():
+                    self._counters[name] += by
         return tx.superseded
 
     def answering(self, queue: str) -> bool:
