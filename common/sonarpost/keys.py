@@ -52,6 +52,11 @@ def acoustic_queue(platform: str) -> str:
     return _of(platform, "acoustic/queue")
 
 
+def acoustic_queue_everywhere() -> str:
+    """What waits at every modem that is reached."""
+    return f"{ROOT}/*/acoustic/queue"
+
+
 def acoustic_downlink(vessel: str) -> str:
     """How far commands and decisions have come on their way to the vehicles."""
     return _of(vessel, "acoustic/downlink")
@@ -110,6 +115,16 @@ def shore_image(vessel: str, site: str = SHORE) -> str:
 def shore_decision(vessel: str, site: str = SHORE) -> str:
     """What a site's c2 has accepted of one vessel's decisions, for every shore subscriber."""
     return _of(site, f"contact/{_name('vessel', vessel)}/decision")
+
+
+def shore_image_all(site: str = SHORE) -> str:
+    """What a site's c2 has accepted of every vessel's pictures."""
+    return _of(site, "contact/*/image")
+
+
+def shore_decision_all(site: str = SHORE) -> str:
+    """What a site's c2 has accepted of every vessel's decisions."""
+    return _of(site, "contact/*/decision")
 
 
 def shore_contact_all(site: str = SHORE) -> str:

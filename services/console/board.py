@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 from services.console import asking, audit, contacts, decisions
+from services.console.arrivals import Arrivals, NoSuchError
 from services.console.asking import ID_COLUMN, Table
 from services.console.audit import OnScreen
-from services.console.config import ConsoleConfig
 from services.console.contacts import Filter
-from services.console.database import Database
 from services.console.decisions import Judgement
-from services.console.events import Hub
-from services.console.fleet import FleetPanel
+from services.console.measures import Line, measured
 from services.console.people import Actor
 from services.console.rows import (
     Json,
@@ -30,38 +26,17 @@ from services.console.rows import (
     version_of,
 )
 from sonarpost import wire
-from sonarpost.errors import BadInputError
 from sonarpost.messages import (
     Advice,
     Command,
     CommandKind,
     Decision,
-    DownlinkState,
     ReconstructedImage,
-    TaskingState,
 )
 from sonarpost.review.costs import request_cost
-from sonarpost.review.measuring import height_from_shadow, measure_length
-from sonarpost.review.rendering import LAYERS
 
-Measure = Literal["length", "width", "shadow"]
 FRAME_HEADER_BYTES = 13
 """Of a frame of the paper's format; v1's are shorter."""
-
-
-class NoSuchError(BadInputError):
-    """There is no such contact, version or file."""
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """A line somebody drew on a picture, to be measured."""
-
-    version: int
-    layer: str
-    kind: Measure
-    start: tuple[float, float]
-    end: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,114 +49,8 @@ class Unsent:
     record: Decision | Command | Advice
 
 
-class Board:
-    """The console's state.
-
-    Args:
-        config: Of the console.
-        database: Where everything is kept.
-        clock: UTC seconds.
-    """
-
-    def __init__(self, config: ConsoleConfig, database: Database, clock: Callable[[], float] = time.time) -> None:
-        self.config = config
-        self.database = database
-        self.hub = Hub()
-        self.fleet = FleetPanel(config.vehicle_stale_s)
-        self.clock = clock
-        self.on_unsent: Callable[[], None] = lambda: None
-
-    # What arrives
-
-    def take_image(self, image: ReconstructedImage) -> bool:
-        """Keep a version of a picture; tell whether it was new.
-
-        Raises:
-            HandoffError: It cannot be kept now.
-        """
-        now = self.clock()
-        rate = self.fleet.rate_of(image.vehicle_id, self.config.assumed_rate)
-        with self.database.writing() as db:
-            taken = contacts.take_image(db, image, rate, now, self.config.group_radius_m)
-            if taken is not None and taken[1]:
-                decisions.adopt(db, taken[0], now)
-        if taken is None:
-            return False
-        self._tell_contact(taken[0], new=taken[1])
-        return True
-
-    def take_decision(self, record: Decision) -> bool:
-        """Keep a decision made elsewhere; tell whether it was new."""
-        with self.database.writing() as db:
-            known = decisions.find(db, record.decision_id) is not None
-            contact_id = decisions.take(db, record, self.clock(), ashore=self.config.side == "shore")
-        if contact_id is not None:
-            self._tell_contact(contact_id)
-            self._tell_decision(record.decision_id)
-        return not known
-
-    def take_advice(self, record: Advice) -> None:
-        """Keep advice from ashore."""
-        with self.database.writing() as db:
-            contact_id = asking.take_advice(db, record)
-        if contact_id is not None:
-            self._tell_contact(contact_id)
-            self._tell("advice", contact_id, record.advice_id)
-
-    def take_downlink(self, state: DownlinkState) -> None:
-        """Note how far something has come on its way to a vehicle."""
-        with self.database.writing() as db:
-            if state.kind == "decision":
-                changed = decisions.downlink(db, state)
-                contact_id = None
-            else:
-                changed, contact_id = False, asking.downlink(db, state)
-        if changed:
-            self._tell_decision(state.record_id)
-        elif contact_id is not None:
-            self._tell("request", contact_id, state.record_id)
-            self._tell_contact(contact_id)
-
-    def take_tasking(self, state: TaskingState) -> None:
-        """Note how far advice or a command has come on its way to a vessel."""
-        with self.database.writing() as db:
-            changed = asking.tasking(db, state)
-        if changed is not None:
-            self._tell(changed[0], changed[1], state.record_id)
-
-    def settled(self, table: Table, record_id: str, consumer: str, reason: str | None) -> None:
-        """Note that a consumer has a record on its disk (None), or refused it for a reason."""
-        now = self.clock()
-        contact_id = None
-        with self.database.writing() as db:
-            if table == "decision":
-                if decisions.handed(db, record_id, consumer, reason, now):
-                    row = decisions.find(db, record_id)
-                    contact_id = row and str(row["contact_id"])
-            elif table == "request":
-                state = "refused" if reason is not None else "asked"
-                contact_id = asking.request_state(db, record_id, state, reason or "", None, now)
-            elif reason is not None:
-                db.execute(
-                    "UPDATE advice SET state = 'refused', reason = ? WHERE advice_id = ? AND state = 'waiting'",
-                    (reason, record_id),
-                )
-                row = db.execute("SELECT contact_id FROM advice WHERE advice_id = ?", (record_id,)).fetchone()
-                contact_id = row and str(row["contact_id"])
-        if contact_id:
-            self._tell(table, contact_id, record_id)
-            self._tell_contact(contact_id)
-
-    def all_ashore_before(self, utc_s: float) -> None:
-        """Note that decisions which the relay had before a time are ashore."""
-        with self.database.reading() as db:
-            waiting = db.execute("SELECT 1 FROM decision WHERE shore = 'relay' LIMIT 1").fetchone()
-        if waiting is None:
-            return
-        with self.database.writing() as db:
-            found = decisions.ashore_before(db, utc_s)
-        for decision_id in found:
-            self._tell_decision(decision_id)
+class Board(Arrivals):
+    """The console's state: what has arrived, what people see of it, and what they do."""
 
     # What people see
 
@@ -337,14 +206,11 @@ class Board:
         """Measure a line on a picture.
 
         Raises:
-            NoSuchError: There is no such contact, version or layer.
+            NoSuchError: There is no such contact or version.
             NotMeasurableError: It cannot be measured there.
         """
         image = self.image(contact_id, line.version)
-        layer = next((layer for layer in LAYERS if layer.name == line.layer), None)
-        if layer is None:
-            raise NoSuchError("picture", "layer", line.layer, " or ".join(layer.name for layer in LAYERS))
-        body = measured(image, line, layer.measurable, layer.reason)
+        body = measured(image, line)
         body |= {"user": actor.user, "utc_s": self.clock()}
         if not keep:
             return {"id": None, **body}
@@ -384,71 +250,3 @@ class Board:
                 f"UPDATE {item.table} SET sent = 1 WHERE {ID_COLUMN[item.table]} = ?",  # noqa: S608  constants only
                 (item.record_id,),
             )
-
-    # Telling the pages
-
-    def _row(self, contact_id: str) -> Json:
-        with self.database.reading() as db:
-            row = contacts.find_row(db, contact_id)
-        if row is None:
-            raise NoSuchError("contact", "id", contact_id, "a contact")
-        return contact_row(row)
-
-    def _tell_contact(self, contact_id: str, *, new: bool = False) -> None:
-        with self.database.reading() as db:
-            numbers = contacts.counts(db)
-        self.hub.publish("contact", {"contact": self._row(contact_id), "new": new, **numbers})
-
-    def _tell_decision(self, decision_id: str) -> None:
-        with self.database.reading() as db:
-            row = decisions.find(db, decision_id)
-        if row is not None and row["contact_id"]:
-            self.hub.publish("decision", {"id": row["contact_id"], "decision": decision_of(row)})
-
-    def _tell(self, table: Table, contact_id: str, record_id: str) -> None:
-        if table == "decision":
-            self._tell_decision(record_id)
-            return
-        with self.database.reading() as db:
-            row = db.execute(f"SELECT * FROM {table} WHERE {ID_COLUMN[table]} = ?", (record_id,)).fetchone()  # noqa: S608
-        body = request_of(row) if table == "request" else advice_of(row)
-        self.hub.publish(table, {"id": contact_id, table: body})
-
-
-def measured(image: ReconstructedImage, line: Line, measurable: bool, reason: str) -> Json:  # noqa: FBT001
-    """Return what a line on a picture measures.
-
-    Raises:
-        NotMeasurableError: It cannot be measured there.
-    """
-    from sonarpost.review.measuring import NotMeasurableError  # noqa: PLC0415
-
-    if not measurable:
-        raise NotMeasurableError("picture", "layer", line.layer, f"the raw picture: {reason}")
-    if not image.codec:
-        raise NotMeasurableError("picture", "version", line.version, "one of which something has arrived")
-    length = measure_length(image.contact, image.missing(), line.start, line.end)
-    body: Json = {
-        "kind": line.kind,
-        "version": line.version,
-        "layer": line.layer,
-        "from": list(line.start),
-        "to": list(line.end),
-        **asdict(length),
-        "height_m": None,
-        "height_sigma_m": None,
-        "height_inputs": None,
-        "note": "",
-    }
-    body = {("sigma_m" if name == "sigma_m" else name): value for name, value in body.items()}
-    if line.kind != "shadow" or image.contact is None:
-        return body
-    height = height_from_shadow(image.contact, length)
-    if height is None:
-        return {**body, "note": "no height: the vehicle's altitude or the object's range is not known"}
-    inputs = {
-        "shadow_m": length.value_m,
-        "altitude_m": height.altitude_m,
-        "slant_range_m": height.slant_range_m,
-    }
-    return {**body, "height_m": height.height_m, "height_sigma_m": height.sigma_m, "height_inputs": inputs}

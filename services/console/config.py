@@ -30,6 +30,7 @@ class ConsoleConfig(ServiceConfig):
         behind_proxy: Take the address of a browser from `X-Forwarded-For`.
         decision_consumers: On a vessel: services that are owed decisions.
         command_consumers: On a vessel: services that are owed requests.
+        vehicles: Names of the vehicles by the modem addresses they send from, as in `[op_modem]`.
         out_dir: Ashore: c2's folder, for what was accepted while the console was away; none by default.
         downlink_rate: Micro-Modem rate of the vessel, as in `[op_modem]`; for the cost of requests.
         assumed_rate: Rate of vehicles that were not heard yet.
@@ -54,6 +55,7 @@ class ConsoleConfig(ServiceConfig):
     behind_proxy: bool = False
     decision_consumers: tuple[ConsumerName, ...] = ("relay", "op_modem")
     command_consumers: tuple[ConsumerName, ...] = ("op_modem",)
+    vehicles: dict[Annotated[str, Field(pattern=r"^[0-9]{1,3}$")], PlatformId] = Field(default_factory=dict)
     out_dir: Path | None = None
     downlink_rate: Annotated[int, Field(ge=0, le=6)] = 0
     assumed_rate: Annotated[int, Field(ge=0, le=6)] | None = None
@@ -74,3 +76,7 @@ class ConsoleConfig(ServiceConfig):
         if (self.vessel_lat_deg is None) != (self.vessel_lon_deg is None):
             raise ValueError("vessel_lat_deg and vessel_lon_deg together")
         return self
+
+    def name_of(self, address: int) -> str:
+        """Return the name of the vehicle with a modem address."""
+        return self.vehicles.get(str(address), f"modem-{address}")

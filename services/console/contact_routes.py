@@ -12,10 +12,12 @@ from pydantic import Field
 from starlette.responses import Response
 from starlette.routing import Route
 
+from services.console.arrivals import NoSuchError
 from services.console.audit import OnScreen
-from services.console.board import Board, Line, NoSuchError
+from services.console.board import Board
 from services.console.contacts import REVIEWS, SORTS, Filter
 from services.console.decisions import Judgement
+from services.console.measures import Line
 from services.console.web import Body, Call, Gate, RefusedError, json_answer
 from sonarpost.messages import Advice, ReconstructedImage, Verdict
 from sonarpost.review import rendering

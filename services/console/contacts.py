@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Final
 
@@ -195,7 +195,7 @@ def list_contacts(db: sqlite3.Connection, wanted: Filter) -> Json:
     matching = db.execute(f"SELECT COUNT(*) FROM contact c WHERE {condition}", values).fetchone()[0]  # noqa: S608
     vehicles = [row[0] for row in db.execute("SELECT DISTINCT vehicle_id FROM contact ORDER BY vehicle_id")]
     return {
-        **counts(db),
+        **asdict(counts(db)),
         "matching": matching,
         "vehicles": vehicles,
         "offset": wanted.offset,
@@ -203,11 +203,19 @@ def list_contacts(db: sqlite3.Connection, wanted: Filter) -> Json:
     }
 
 
-def counts(db: sqlite3.Connection) -> Json:
-    """Return how many contacts there are, and how many nobody has decided on."""
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """How many contacts there are, and how many nobody has decided on."""
+
+    total: int
+    unreviewed: int
+
+
+def counts(db: sqlite3.Connection) -> Counts:
+    """Count the contacts."""
     total = db.execute("SELECT COUNT(*) FROM contact").fetchone()[0]
     unreviewed = db.execute("SELECT COUNT(*) FROM contact WHERE review = 'unreviewed'").fetchone()[0]
-    return {"total": total, "unreviewed": unreviewed}
+    return Counts(total, unreviewed)
 
 
 def find_row(db: sqlite3.Connection, contact_id: str) -> sqlite3.Row | None:

@@ -74,6 +74,12 @@ class Hub:
             wake()
 
     @property
+    def listeners(self) -> int:
+        """How many pages listen."""
+        with self._lock:
+            return len(self._listeners)
+
+    @property
     def last(self) -> int:
         """Number of the last event, 0 before the first."""
         with self._lock:

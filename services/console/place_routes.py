@@ -8,7 +8,8 @@ from pathlib import Path
 from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
-from services.console.board import Board, NoSuchError
+from services.console.arrivals import NoSuchError
+from services.console.board import Board
 from services.console.config import ConsoleConfig
 from services.console.rows import Json
 from services.console.web import Call, Gate, json_answer

@@ -14,7 +14,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from services.console.board import NoSuchError
+from services.console.arrivals import NoSuchError
 from services.console.decisions import ConflictError
 from services.console.people import Act, Actor, Side
 from services.console.rows import Json

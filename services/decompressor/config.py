@@ -9,6 +9,8 @@ from services.decompressor.hearing import LinkName
 from sonarpost.messages import PlatformId
 from sonarpost.runtime.config import ServiceConfig
 
+ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
+
 
 class DecompressorConfig(ServiceConfig):
     """What is understood, how halves are paired, what they are decoded with, where pictures go.
@@ -18,6 +20,7 @@ class DecompressorConfig(ServiceConfig):
         links: Wire formats that are understood; each frame tells which it is of.
         pairing_timeout_s: How long an image waits for what it lacks after its last frame.
         catalogues: Tile catalogues (nominal-10, nominal-20 or files) that vehicles may use.
+        picture_consumers: Services on the vessel that are owed every picture.
         vehicles: Names of the vehicles by the modem addresses they send from; an address that is not listed gets
             the name modem-{address}.
     """
@@ -26,4 +29,5 @@ class DecompressorConfig(ServiceConfig):
     links: Annotated[tuple[LinkName, ...], Field(min_length=1)] = ("v1", "paper")
     pairing_timeout_s: Annotated[float, Field(gt=0, le=86400)] = 120.0
     catalogues: Annotated[tuple[str, ...], Field(min_length=1)] = ("nominal-10", "nominal-20")
+    picture_consumers: tuple[ConsumerName, ...] = ("relay",)
     vehicles: dict[Annotated[str, Field(pattern=r"^[0-9]{1,3}$")], PlatformId] = Field(default_factory=dict)

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from services.decompressor.config import DecompressorConfig
 from services.decompressor.decoder import Decoder, image_id_of
 from services.decompressor.hearing import Event, Hearing
-from sonarpost import keys
+from sonarpost import keys, wire
 from sonarpost.errors import BadInputError, ConfigError, HandoffError
 from sonarpost.link.paper_events import ContactOnly, FrameRejected, ImageReady
 from sonarpost.link.seal import AcousticSeal
@@ -156,7 +156,9 @@ class DecompressorService(Service[DecompressorConfig]):
             self._keep_apart_image(event, vehicle, f"{type(error).__name__}: {error}", effects)
             return
         path, _ = write_picture(self.config.out_dir, image)
-        effects.send(keys.image_reconstructed(self.platform.id), "relay", image, priority=5)
+        payload, key = wire.encode(image), keys.image_reconstructed(self.platform.id)
+        for consumer in self.config.picture_consumers:
+            effects.send_payload(key, consumer, payload, ReconstructedImage, priority=5)
         effects.count("images_reconstructed")
         effects.count("images_complete", int(image.complete))
         log.info(
