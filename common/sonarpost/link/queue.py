@@ -32,6 +32,8 @@ _LEAST_CHANGE: Final = 0.02
 _SMOOTHING: Final = 0.2
 _SILENT_FRAMES: Final = 64
 """Without a report of so many frames, and for long, there is nobody who reports; a silent vehicle gets none."""
+_URGENT: Final = 2
+"""To this priority messages may be lost with a tenth of the usual probability."""
 _FRAMES_LOADED: Final = 8
 """Messages for so many frames are given to the sender at a time: what is behind them may still be overtaken."""
 
@@ -340,7 +342,7 @@ class AcousticQueue:
         """Give the sender the next messages; the rest waits here, where it can be overtaken."""
         room = _FRAMES_LOADED * self.sender.symbol_bytes
         loaded = sum(len(m.data) for m in self.sender.messages.waiting)
-        often = copies(self.sender.config.worst, self.config.message_missed)
+        worst, missed = self.sender.config.worst, self.config.message_missed
         while loaded < room and (chosen := self.messages.next(now, self.config.aging_s)) is not None:
             level = chosen.level(now, self.config.aging_s)
             self.messages.take(chosen)
@@ -350,7 +352,7 @@ class AcousticQueue:
                 now,
                 priority=priority,
                 lifetime_s=chosen.expires_at - now,
-                times=often,
+                times=copies(worst, missed / 10 if chosen.priority <= _URGENT else missed),
                 rises_at=chosen.added_at + (chosen.priority - FILLS_FROM + 1) * self.config.aging_s,
             )
             loaded += len(chosen.data)

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import Final
 
 from sonarpost.errors import FrameError
+from sonarpost.link.bounds import Channel
 from sonarpost.link.queue import AcousticQueue, PictureName
 from sonarpost.link.queue_messages import LEAST_URGENT, MessageStore, QueuedMessage
 from sonarpost.link.v1_preview import MAX_NUMBER
@@ -27,7 +28,7 @@ _CORE: Final = "core"
 _PICTURE: Final = "picture/"
 _BLOCK: Final = "block/"
 _MESSAGE: Final = "message/"
-_FIXED_OF_A_BLOCK: Final = ("kind", "number", "symbol_bytes", "objects", "layering", "contacts", "urgency")
+_FIXED_OF_A_BLOCK: Final = ("kind", "number", "symbol_bytes", "objects", "layering", "contacts", "urgency", "spans")
 
 Part = Mapping[str, object]
 
@@ -39,20 +40,21 @@ def export_queue(queue: AcousticQueue) -> dict[str, Part]:
     sent: list[object] = []
     for picture in _maps(sender.pop("pictures")):
         number = picture["number"]
-        sent.append([number, picture.pop("sent")])
+        sent.append([number, picture.pop("sent"), picture.pop("goal"), picture.pop("settled")])
         parts[f"{_PICTURE}{number}"] = picture
-    under_way: list[object] = []
-    for block in _maps(sender.pop("blocks")):
-        name = f"{_BLOCK}{block['number']}"
-        parts[name] = {key: block.pop(key) for key in _FIXED_OF_A_BLOCK}
-        under_way.append({"number": parts[name]["number"], **block})
+    blocks: dict[str, list[object]] = {"blocks": [], "past": []}
+    for kind, listed in blocks.items():
+        for block in _maps(sender.pop(kind)):
+            name = f"{_BLOCK}{block['number']}"
+            parts[name] = {key: block.pop(key) for key in _FIXED_OF_A_BLOCK}
+            listed.append({"number": parts[name]["number"], **block})
     for message in queue.messages.waiting.values():
         parts[f"{_MESSAGE}{message.key}"] = _export_message(message)
     parts[_CORE] = {
         "format": _FORMAT,
         "sender": sender,
         "sent": sent,
-        "blocks": under_way,
+        **blocks,
         "names": [[number, name.image_id, name.contact_id] for number, name in queue.names.items()],
         "next_key": queue.messages.next_key,
         "served": dict(queue.messages.served),
@@ -65,6 +67,7 @@ def export_queue(queue: AcousticQueue) -> dict[str, Part]:
         "last_report_at": None if queue.last_report_at is None else float(queue.last_report_at),
         "frames_at_report": queue.frames_at_report,
         "feedback": queue.sender.config.feedback,
+        "planned_loss": float(queue.sender.config.worst.loss),
     }
     return parts
 
@@ -85,21 +88,20 @@ def restore_queue(queue: AcousticQueue, parts: Mapping[str, Part]) -> None:
     core = parts.get(_CORE, {})
     if core.get("format") != _FORMAT:
         raise FrameError(_WHERE, "format", core.get("format"), str(_FORMAT))
-    sent = dict(_import_pair(entry) for entry in read_list(core, "sent"))
-    pictures = [
-        {**part, "sent": sent.get(read_number(part, "number", 1, MAX_NUMBER), 0)} for part in _ordered(parts, sent)
-    ]
-    blocks = []
-    for entry in read_list(core, "blocks"):
-        fixed = parts.get(f"{_BLOCK}{read_number(entry, 'number', 0, 255)}")
-        if fixed is None or not isinstance(entry, Mapping):
-            raise FrameError(_WHERE, "blocks", entry, "a block whose part is there")
-        blocks.append({**fixed, **entry})
+    progress = dict(_import_progress(entry) for entry in read_list(core, "sent"))
+    pictures = [{**part, **progress[read_number(part, "number", 1, MAX_NUMBER)]} for part in _ordered(parts, progress)]
+    blocks = {"blocks": _import_blocks(parts, read_list(core, "blocks"))}
+    if "past" in core:
+        blocks["past"] = _import_blocks(parts, read_list(core, "past"))
     rate = read_number(core, "rate", min(RATES), max(RATES))
     frame_bytes = RATES[rate].frame_bytes
     feedback = read_field(core, "feedback", bool)
-    queue.sender.config = replace(queue.sender.config, frame_bytes=frame_bytes, feedback=feedback)
-    restore_sender(queue.sender, {**read_map(core, "sender"), "pictures": pictures, "blocks": blocks})
+    planned_loss = read_time(core, "planned_loss") if "planned_loss" in core else queue.config.expected_loss
+    if not 0.0 <= planned_loss <= 0.95:
+        raise FrameError(_WHERE, "planned_loss", planned_loss, "0..0.95")
+    channel = Channel(planned_loss, queue.config.burst_frames)
+    queue.sender.config = replace(queue.sender.config, frame_bytes=frame_bytes, feedback=feedback, channels=(channel,))
+    restore_sender(queue.sender, {**read_map(core, "sender"), "pictures": pictures, **blocks})
     queue.names = dict(_import_name(entry) for entry in read_list(core, "names"))
     queue.messages = _import_messages(core, parts)
     queue.rate_choice.losses = dict(_import_loss(entry) for entry in read_list(core, "losses"))
@@ -151,7 +153,17 @@ def _import_message(part: Part) -> QueuedMessage:
     )
 
 
-def _ordered(parts: Mapping[str, Part], sent: Mapping[int, int]) -> list[Part]:
+def _import_blocks(parts: Mapping[str, Part], entries: list[object]) -> list[Part]:
+    blocks: list[Part] = []
+    for entry in entries:
+        fixed = parts.get(f"{_BLOCK}{read_number(entry, 'number', 0, 255)}")
+        if fixed is None or not isinstance(entry, Mapping):
+            raise FrameError(_WHERE, "blocks", entry, "a block whose part is there")
+        blocks.append({**fixed, **entry})
+    return blocks
+
+
+def _ordered(parts: Mapping[str, Part], sent: Mapping[int, object]) -> list[Part]:
     """Return the parts of pictures in the order of `sent`, which is that in which they came."""
     try:
         return [parts[f"{_PICTURE}{number}"] for number in sent]
@@ -159,12 +171,14 @@ def _ordered(parts: Mapping[str, Part], sent: Mapping[int, int]) -> list[Part]:
         raise FrameError(_WHERE, "pictures", str(error), "every picture named in the core") from error
 
 
-def _import_pair(entry: object) -> tuple[int, int]:
+def _import_progress(entry: object) -> tuple[int, Part]:
     match entry:
-        case [int(number), int(sent)]:
-            return number, sent
+        case [int(number), int(sent)]:  # as saved before there were repairs
+            return number, {"sent": sent}
+        case [int(number), int(sent), int(goal), list(settled)]:
+            return number, {"sent": sent, "goal": goal, "settled": settled}
         case _:
-            raise FrameError(_WHERE, "sent", entry, "[number, bytes]")
+            raise FrameError(_WHERE, "sent", entry, "[number, bytes, bytes, ranges]")
 
 
 def _import_name(entry: object) -> tuple[int, PictureName]:

@@ -10,12 +10,15 @@ import numpy as np
 from sonarpost.errors import FrameError
 from sonarpost.link import fec
 from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.intervals import Ranges
 from sonarpost.link.v1_frame import Symbol, SymbolKind
 from sonarpost.link.v1_gain import Values
 from sonarpost.link.v1_layers import Layering, layered_symbols
 from sonarpost.link.v1_objects import Piece, Pieces
 from sonarpost.link.v1_preview import Preview, contact_link, entry_shape
 
+Span = tuple[int, int, int, int]
+"""Number and link of a picture, and a part of its stream `[start, stop)`."""
 _AHEAD = 32
 """Symbols are made so many at a time: a matrix product of several costs little more than one."""
 
@@ -31,6 +34,8 @@ class Picture:
         curve: PSNR by bytes, see `v1_gain.quality_curve`.
         added_at: When it was handed over.
         sent: Bytes of the stream that blocks hold so far.
+        goal: Up to where the stream is to be sent, where that was asked for; 0 as configured.
+        settled: Parts of the stream that receivers are known to have; from 0 on, with the record.
     """
 
     number: int
@@ -39,6 +44,12 @@ class Picture:
     curve: Values
     added_at: float
     sent: int = 0
+    goal: int = 0
+    settled: Ranges = ()
+
+    def goal_bytes(self, usual: int) -> int:
+        """Return up to where the stream is to be sent, where `usual` bytes are unless more were asked for."""
+        return min(len(self.stream), max(self.goal or usual, self.sent))
 
     @property
     def link(self) -> int:
@@ -48,6 +59,10 @@ class Picture:
     def preview(self, prefix_bytes: int) -> Preview:
         """Return the preview with so much of the stream."""
         return Preview(self.number, self.contact, self.stream[:prefix_bytes], ended=len(self.stream) < prefix_bytes)
+
+    def span(self, start: int, stop: int) -> Span:
+        """Return what a block notes of a part of the stream that it holds."""
+        return self.number, self.link, start, stop
 
     def piece(self, start: int, stop: int) -> Piece:
         """Return a piece of the stream."""
@@ -71,6 +86,7 @@ class SendBlock:
         reported: Whether feedback has told of it.
         asked_at: When it was last sent or asked for.
         needs: Symbols lacking, by receiver, as last reported.
+        spans: Of every picture in it number, link, and the part of the stream; from 0 on, its record too.
     """
 
     kind: SymbolKind
@@ -85,6 +101,7 @@ class SendBlock:
     reported: bool = False
     asked_at: float = 0.0
     needs: dict[int, int] = field(default_factory=dict)
+    spans: tuple[Span, ...] = ()
     _made: dict[int, Symbol] = field(default_factory=dict)
 
     @property

@@ -107,6 +107,7 @@ class ReceiverConfig:
         contact_memory_s: A contact, after this long without news of it.
         report_frames: A report is due after so many frames ...
         report_s: ... or this long without one, while something is lacking.
+        presence_s: While frames come, a report goes after this long even where nothing is lacking.
 
     Raises:
         ConfigError: A value out of range.
@@ -118,11 +119,12 @@ class ReceiverConfig:
     contact_memory_s: float = 6 * 3600.0
     report_frames: int = 48
     report_s: float = 60.0
+    presence_s: float = 600.0
 
     def __post_init__(self) -> None:
         _check("max_sources", self.max_sources, 1, 128)
         _check("max_contacts", self.max_contacts, 1, 65535)
-        for name in ("block_memory_s", "contact_memory_s", "report_s"):
+        for name in ("block_memory_s", "contact_memory_s", "report_s", "presence_s"):
             _check(name, getattr(self, name), 0.001, 1e9)
         _check("report_frames", self.report_frames, 1, 65535)
 

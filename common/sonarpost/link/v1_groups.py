@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Final
 
@@ -39,7 +39,7 @@ def numbers_needed(pictures: Sequence[Picture], config: SenderConfig, symbol_byt
     """Return how many blocks a group makes at most."""
     if not config.feedback:
         return 2
-    total = sum(min(len(p.stream), config.stream_bytes) + 8 for p in pictures)
+    total = sum(p.goal_bytes(config.stream_bytes) + 8 for p in pictures)
     return 3 + total // (config.block_symbols * symbol_bytes)
 
 
@@ -70,6 +70,10 @@ def make_group(
     )
     for picture in pictures:
         picture.sent = min(shape.prefix_bytes, len(picture.stream))
+    previews.spans = tuple(p.span(0, p.sent) for p in pictures)
+    for picture in pictures:
+        if picture.sent == shape.prefix_bytes == picture.goal_bytes(config.stream_bytes):
+            picture.sent -= 1  # an entry that is just full cannot say that the stream ends: a piece of one byte does
     if config.feedback:
         return [previews, *whole_blocks(pictures, config, symbol_bytes, take_number, now)]
     frames = min(round(config.frames_per_picture * len(pictures)) - planned, fec.MAX_SYMBOLS)
@@ -116,6 +120,7 @@ def _layered(
         urgency=1.0,
         planned=frames,
         asked_at=now,
+        spans=tuple(p.span(a, b) for p, a, b in zip(pictures, starts, layer_stops[-1], strict=True)),
     )
     for picture, stop in zip(pictures, layer_stops[-1], strict=True):
         picture.sent = stop
@@ -148,23 +153,24 @@ def whole_blocks(
     symbol_bytes: int,
     take_number: TakeNumber,
     now: float,
-    upto: int | None = None,
 ) -> Iterator[SendBlock]:
-    """Yield blocks without layers that take pictures from what was sent to `upto` bytes (the configured length)."""
-    goal = config.stream_bytes if upto is None else upto
-    rest = [p for p in pictures if p.sent < min(len(p.stream), goal)]
+    """Yield blocks without layers that take pictures from what was sent to the length that is to be sent of each."""
+    goals = {p.number: p.goal_bytes(config.stream_bytes) for p in pictures}
+    rest = [p for p in pictures if p.sent < goals[p.number]]
     while rest:
-        run, room = _run_that_fits(rest, goal, config.block_symbols * symbol_bytes)
+        run, room = _run_that_fits(rest, goals, config.block_symbols * symbol_bytes)
         starts = [p.sent for p in run]
-        stops = [min(len(p.stream), goal) for p in run]
+        stops = [goals[p.number] for p in run]
         if len(run) == 1:
-            stops = fitted_stops(run, starts, stops, min(room, config.block_symbols * symbol_bytes), None)
+            # Drawn back to what a block holds, not pushed on: what goes beyond the goal only fills the last symbol.
+            most = fitted_stops(run, starts, stops, min(room, config.block_symbols * symbol_bytes), None)
+            stops = [min(a, b) for a, b in zip(most, stops, strict=True)]
         source = -(-_object_bytes(run, starts, stops) // symbol_bytes)
         stops = fitted_stops(run, starts, stops, source * symbol_bytes, None)
-        final = all(b >= min(len(p.stream), goal) for p, b in zip(run, stops, strict=True))
+        final = all(b >= goals[p.number] for p, b in zip(run, stops, strict=True))
         planned = symbols_to_send(source, config.worst, config.caution)
         yield _whole_block(run, stops, source, symbol_bytes, take_number(), planned, now, final=final)
-        rest = [p for p in rest if p.sent < min(len(p.stream), goal)]
+        rest = [p for p in rest if p.sent < goals[p.number]]
 
 
 def _whole_block(
@@ -180,6 +186,7 @@ def _whole_block(
 ) -> SendBlock:
     """Return a block without layers of the pictures from what was sent to their stops, and note that it is."""
     pieces = Pieces(tuple(p.piece(p.sent, stop) for p, stop in zip(run, stops, strict=True)), final)
+    spans = tuple(p.span(p.sent, stop) for p, stop in zip(run, stops, strict=True))
     for picture, stop in zip(run, stops, strict=True):
         picture.sent = stop
     return SendBlock(
@@ -192,6 +199,7 @@ def _whole_block(
         urgency=1.0,
         planned=planned,
         asked_at=now,
+        spans=spans,
     )
 
 
@@ -200,9 +208,9 @@ def _object_bytes(run: Sequence[Picture], starts: Sequence[int], stops: Sequence
     return pieces.overhead_bytes() + sum(stops) - sum(starts)
 
 
-def _run_that_fits(rest: Sequence[Picture], goal: int, room: int) -> tuple[list[Picture], int]:
+def _run_that_fits(rest: Sequence[Picture], goals: Mapping[int, int], room: int) -> tuple[list[Picture], int]:
     """Return pictures from the front whose rest fits one block (at least one), shared out evenly over the blocks."""
-    sizes = [min(len(p.stream), goal) - p.sent + 5 for p in rest]
+    sizes = [goals[p.number] - p.sent + 5 for p in rest]
     blocks = -(-(sum(sizes) + 16) // room)
     share = min(room, -(-sum(sizes) // blocks) + 16)
     run, used = [rest[0]], sizes[0] + 16

@@ -25,6 +25,7 @@ class WaitingMessage:
         copies: How often it is still to be sent.
         after_frame: Frame count before which it is not repeated, so that one burst does not take all copies.
         rises_at: When a priority below 0 becomes 0, so that what only fills frames does not wait for ever.
+        extra: Copies it gets more where copies follow one another and one burst may take several.
     """
 
     number: int
@@ -34,6 +35,7 @@ class WaitingMessage:
     copies: int
     after_frame: int = 0
     rises_at: float = math.inf
+    extra: int = 2
 
 
 @dataclass(eq=False)
@@ -79,9 +81,12 @@ class MessageQueue:
         return found
 
     def release(self, frame: int) -> None:
-        """Let copies go from this frame on that keep a distance from those before."""
+        """Let copies go from this frame on that keep a distance from those before, as there is nothing else to send."""
         for message in self.waiting:
-            message.after_frame = min(message.after_frame, frame)
+            if message.after_frame > frame:
+                message.after_frame = frame
+                message.copies += message.extra > 0
+                message.extra = max(0, message.extra - 1)
 
     def has_ready(self, least: int, frame: int) -> bool:
         """Whether a message of at least a priority may go into this frame."""

@@ -64,19 +64,20 @@ class ReportBook:
         now: float,
         receiver: int,
         frames_sent: int,
-    ) -> list[SendBlock]:
-        """Take a report; return the blocks that some receiver still lacks, with what to send of them planned anew."""
+    ) -> tuple[list[SendBlock], list[SendBlock]]:
+        """Take a report; return the blocks that some receiver still lacks, planned anew, and those that all have."""
         self.meters.setdefault(receiver, LossMeter()).take(report, frames_sent)
         return self.apply(report, blocks, config, now, receiver)
 
     def apply(
         self, report: Feedback, blocks: Sequence[SendBlock], config: SenderConfig, now: float, receiver: int
-    ) -> list[SendBlock]:
+    ) -> tuple[list[SendBlock], list[SendBlock]]:
         """As `take`, without measuring the loss."""
         self.receivers[receiver] = now
         self.receivers = {r: at for r, at in self.receivers.items() if at + config.receiver_memory_s >= now}
         self.meters = {r: meter for r, meter in self.meters.items() if r in self.receivers}
-        return [block for block in blocks if not self._is_done(block, report, config, now, receiver)]
+        done = [block for block in blocks if self._is_done(block, report, config, now, receiver)]
+        return [block for block in blocks if block not in done], done
 
     def _is_done(self, block: SendBlock, report: Feedback, config: SenderConfig, now: float, receiver: int) -> bool:
         need = report.need_of(block.number)

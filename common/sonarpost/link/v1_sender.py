@@ -31,6 +31,7 @@ from sonarpost.link.v1_frame import (
 )
 from sonarpost.link.v1_gain import Values, quality_curve
 from sonarpost.link.v1_groups import group_limit, make_group, numbers_needed, whole_blocks
+from sonarpost.link.v1_ledger import forgettable, owed, revived, settle, within_window
 from sonarpost.link.v1_messages import MessageQueue
 from sonarpost.link.v1_objects import MESSAGE_OVERHEAD_BYTES, Message
 from sonarpost.link.v1_plan import copies, symbols_to_send
@@ -46,6 +47,17 @@ _SAFE: Final = -2.5
 class Sender:
     """Sends contacts, their pictures and messages.
 
+    With feedback a picture is settled when reports have told that all of it arrived. Whatever was given up before, sent
+    while nobody reported or in blocks that had to make room, is sent again when nothing new is due, for as long as the
+    picture is kept.
+
+    Attributes:
+        waiting: Pictures that no block holds yet.
+        blocks: Blocks under way, the oldest first.
+        past: Blocks that were sent while nobody reported, and that a report may still tell of.
+        kept: Pictures by number, the oldest first, those that wait too.
+        owing: Whether there may be pictures of which something was given up.
+
     Args:
         config: How it behaves.
         first_block: Number of the first block, 0..31; a restarted vehicle that has lost its state should draw it.
@@ -57,6 +69,8 @@ class Sender:
         self._seal = seal
         self.waiting: list[Picture] = []
         self.blocks: list[SendBlock] = []
+        self.past: list[SendBlock] = []
+        self.owing = True
         self.messages = MessageQueue()
         self.kept: dict[int, Picture] = {}
         self.next_block = first_block % BLOCKS
@@ -112,12 +126,12 @@ class Sender:
         self._forget_kept()
 
     def _forget_kept(self) -> None:
-        """Forget the oldest pictures beyond the limit, but none that is still to be sent."""
+        """Forget pictures beyond the limit, settled ones first, the oldest first; none that is still to be sent."""
         excess = len(self.kept) - self.config.kept_pictures
         if excess <= 0:
             return
         needed = {p.number for p in self.waiting} | {n for block in self.blocks for n in block.contacts}
-        for number in [n for n in self.kept if n not in needed][:excess]:
+        for number in forgettable(self.kept, self.config, needed)[:excess]:
             del self.kept[number]
 
     def add_message(
@@ -160,9 +174,16 @@ class Sender:
         if expected == self.config.feedback:
             return
         self.config = replace(self.config, feedback=expected)
+        self.owing = True
         if not expected:
             # Nobody will say any more that these are complete.
-            self.blocks = [block for block in self.blocks if block.lacks > 0]
+            for block in [b for b in self.blocks if b.lacks <= 0]:
+                self._give_up(block)
+
+    def _give_up(self, block: SendBlock) -> None:
+        self.blocks.remove(block)
+        self.past += [block] if block.spans else []
+        self.owing = True
 
     def resize(self, frame_bytes: int) -> None:
         """Fill frames of another size from now on.
@@ -173,6 +194,8 @@ class Sender:
         room = segments_room(frame_bytes, self._seal)
         lost = [b for b in self.blocks if b.symbol_bytes != self.symbol_bytes and b.symbol_bytes + 5 > room]
         self.blocks = [b for b in self.blocks if b not in lost]
+        self.past = [b for b in self.past if b.symbol_bytes == self.symbol_bytes or b.symbol_bytes + 5 <= room]
+        self.owing = True
         waiting = {p.number for p in self.waiting}
         again = {n for block in lost for n in block.contacts} - waiting
         self.waiting = [p for n, p in self.kept.items() if n in again] + self.waiting
@@ -192,6 +215,7 @@ class Sender:
             pictures_first: Let pictures go before messages, so that no flood of messages keeps them out.
         """
         self._begin_groups(now)
+        self._begin_repairs(now)
         self.messages.prune(now)
         self._long_messages(now)
         ahead = self._pictures_frame(now) if pictures_first else self._segments_frame(now, least=0)
@@ -215,19 +239,40 @@ class Sender:
     def _begin_groups(self, now: float) -> None:
         symbol_bytes = self.symbol_bytes
         while self.waiting:
-            fresh = sum(1 for b in self.blocks if b.kind == SymbolKind.PREVIEW and b.lacks > 0)
-            busy = sum(1 for b in self.blocks if b.kind != SymbolKind.PREVIEW and b.lacks > 0)
             limit = group_limit(self.config, symbol_bytes)
             due = len(self.waiting) >= limit or now - self.waiting[0].added_at >= self.config.gather_s
-            if max(fresh, busy) >= self.config.depth or not due:
-                return
             group = self.waiting[:limit]
-            # Only an empty window may be too small: then there is nothing to wait for.
-            if self.blocks and self._free_numbers() < numbers_needed(group, self.config, symbol_bytes):
+            if not due or not self._may_begin(group):
                 return
             self.waiting = self.waiting[limit:]
             self.announced -= {p.number for p in group}
             self.blocks += make_group(group, self.config, symbol_bytes, self._take_number, now)
+
+    def _may_begin(self, group: Sequence[Picture]) -> bool:
+        fresh = sum(1 for b in self.blocks if b.kind == SymbolKind.PREVIEW and b.lacks > 0)
+        busy = sum(1 for b in self.blocks if b.kind != SymbolKind.PREVIEW and b.lacks > 0)
+        if max(fresh, busy) >= self.config.depth:
+            return False
+        # Only an empty window may be too small: then there is nothing to wait for.
+        return not self.blocks or self._free_numbers() >= numbers_needed(group, self.config, self.symbol_bytes)
+
+    def _begin_repairs(self, now: float) -> None:
+        """With feedback: send again what was given up, when no new group is due."""
+        if not (self.config.feedback and self.owing):
+            return
+        waiting = {p.number for p in self.waiting}
+        kept = {n: p for n, p in self.kept.items() if n not in waiting}
+        found = owed(kept, self.config, self.blocks, group_limit(self.config, self.symbol_bytes))
+        if not found:
+            self.owing = False
+            return
+        group = [picture for picture, _ in found]
+        if not self._may_begin(group):
+            return
+        for picture, start in found:
+            picture.goal, picture.sent = picture.goal_bytes(self.config.stream_bytes), start
+        make = make_group if found[0][1] == 0 else whole_blocks
+        self.blocks += make(group, self.config, self.symbol_bytes, self._take_number, now)
 
     def _free_numbers(self) -> int:
         if not self.blocks:
@@ -238,8 +283,11 @@ class Sender:
         # A block beyond the window pushes the oldest out: receivers forget it too.
         while self._free_numbers() < 1:
             self.blocks.pop(0)
+            self.owing = True
         number = self.next_block
         self.next_block = (number + 1) % BLOCKS
+        # A number must never be taken for that of the block which had it before.
+        self.past = within_window(self.past, self.next_block)
         return number
 
     def _long_messages(self, now: float) -> None:
@@ -324,7 +372,7 @@ class Sender:
         )
         symbol = block.next_symbol()
         if block.lacks <= 0 and not self.config.feedback:
-            self.blocks.remove(block)
+            self._give_up(block)
         return symbol
 
     def _remind(self, now: float) -> None:
@@ -355,11 +403,21 @@ class Sender:
 
         A block is done when every receiver that has reported of late has all of it.
         """
-        self.blocks = self.book.take(report, self.blocks, self.config, now, receiver, self.frames_sent)
+        self._revive(report)
+        self.blocks, done = self.book.take(report, self.blocks, self.config, now, receiver, self.frames_sent)
+        settle(self.kept, done)
+
+    def _revive(self, report: Feedback) -> None:
+        """Go on with blocks that were sent before anybody reported, where a receiver has some of them."""
+        if self.config.feedback and (found := revived(self.past, report)):
+            self.blocks = sorted([*self.blocks, *found], key=lambda b: (b.number - self.next_block) % BLOCKS)
 
     def on_mini(self, block_number: int, needed: int, now: float, receiver: int = 0) -> None:
         """Take the least form of feedback, from a mini-packet."""
-        self.blocks = self.book.apply(Feedback(block_number, 0, (needed,)), self.blocks, self.config, now, receiver)
+        report = Feedback(block_number, 0, (needed,))
+        self._revive(report)
+        self.blocks, done = self.book.apply(report, self.blocks, self.config, now, receiver)
+        settle(self.kept, done)
 
     def refine(self, request: Request, now: float) -> bool:
         """Send more detail of a picture than was planned; return whether there is any.
@@ -370,9 +428,10 @@ class Sender:
         picture = self.kept.get(request.number)
         if picture is None:
             raise FrameError("acoustic link v1", "contact number", request.number, "a contact that was sent of late")
-        made = list(
-            whole_blocks([picture], self.config, self.symbol_bytes, self._take_number, now, upto=request.stream_bytes)
-        )
+        picture.goal = max(picture.goal, picture.sent, min(request.stream_bytes, len(picture.stream)))
+        if any(p.number == picture.number for p in self.waiting):
+            return True
+        made = list(whole_blocks([picture], self.config, self.symbol_bytes, self._take_number, now))
         for block in made:
             if not self.config.feedback:
                 block.planned = min(255, symbols_to_send(block.source_symbols, self.config.worst, _SAFE))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import TypeGuard
 
 import numpy as np
 
 from sonarpost.errors import BadInputError, FrameError
 from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.v1_blocks import Picture, SendBlock
+from sonarpost.link.intervals import Ranges, add_range
+from sonarpost.link.v1_blocks import Picture, SendBlock, Span
 from sonarpost.link.v1_frame import BLOCKS, Segment, SymbolKind
 from sonarpost.link.v1_layers import Layering
 from sonarpost.link.v1_messages import MessageQueue, WaitingMessage
@@ -32,8 +34,9 @@ def export_sender(sender: Sender) -> dict[str, object]:
         "pictures": [_export_picture(p) for p in pictures.values()],
         "waiting": [p.number for p in sender.waiting],
         "blocks": [_export_block(b) for b in sender.blocks],
+        "past": [_export_block(b) for b in sender.past],
         "messages": [
-            [m.number, m.data, m.priority, m.expires_at, m.copies, m.after_frame, m.rises_at]
+            [m.number, m.data, m.priority, m.expires_at, m.copies, m.after_frame, m.rises_at, m.extra]
             for m in sender.messages.waiting
         ],
         "next_message": sender.messages.next_number,
@@ -59,6 +62,7 @@ def restore_sender(sender: Sender, state: Mapping[str, object]) -> None:
     try:
         pictures = [_import_picture(entry) for entry in read_list(state, "pictures")]
         blocks = [_import_block(entry) for entry in read_list(state, "blocks")]
+        past = [_import_block(entry) for entry in _later(state, "past")]
         messages = [_import_message(entry) for entry in read_list(state, "messages")]
         reports = [_import_report(entry) for entry in read_list(state, "reports")]
         queue = MessageQueue(messages, read_number(state, "next_message", 0, 255))
@@ -75,7 +79,7 @@ def restore_sender(sender: Sender, state: Mapping[str, object]) -> None:
         raise FrameError(_WHERE, "waiting", state.get("waiting"), "numbers of pictures in the state")
     sender.kept = by_number
     sender.waiting = [p for p in waiting if p is not None]
-    sender.blocks, sender.messages, sender.reports = blocks, queue, reports
+    sender.blocks, sender.past, sender.messages, sender.reports = blocks, past, queue, reports
     sender.book = ReportBook(receivers, meters)
     sender.next_block, sender.frames_sent, sender.announced = next_block, frames_sent, announced
 
@@ -88,10 +92,19 @@ def _export_picture(picture: Picture) -> dict[str, object]:
         "curve": picture.curve.astype("<f8").tobytes(),
         "added_at": float(picture.added_at),
         "sent": picture.sent,
+        "goal": picture.goal,
+        "settled": [list(part) for part in picture.settled],
     }
 
 
+def _later(entry: object, name: str) -> list[object]:
+    """Return a list that states saved by earlier versions do not have."""
+    return read_list(entry, name) if isinstance(entry, Mapping) and name in entry else []
+
+
 def _import_picture(entry: object) -> Picture:
+    if not isinstance(entry, Mapping):
+        raise FrameError(_WHERE, "pictures", entry, "maps")
     stream, raw = read_field(entry, "stream", bytes), read_field(entry, "curve", bytes)
     if not 1 <= len(stream) <= MAX_STREAM_BYTES or len(raw) != 8 * (len(stream) + 1):
         raise FrameError(_WHERE, "curve", f"{len(raw)} bytes", "8 for each length of a stream of 1..65535 bytes")
@@ -105,7 +118,20 @@ def _import_picture(entry: object) -> Picture:
         curve=curve,
         added_at=read_time(entry, "added_at"),
         sent=read_number(entry, "sent", 0, len(stream)),
+        goal=read_number({"goal": 0, **entry}, "goal", 0, MAX_STREAM_BYTES),
+        settled=_import_ranges(_later(entry, "settled"), len(stream)),
     )
+
+
+def _import_ranges(entries: list[object], length: int) -> Ranges:
+    ranges: Ranges = ()
+    for entry in entries:
+        match entry:
+            case [int(start), int(stop)] if 0 <= start < stop <= length:
+                ranges = add_range(ranges, start, stop)
+            case _:
+                raise FrameError(_WHERE, "settled", entry, f"[start, stop] within {length}")
+    return ranges
 
 
 def _export_block(block: SendBlock) -> dict[str, object]:
@@ -122,6 +148,7 @@ def _export_block(block: SendBlock) -> dict[str, object]:
         "reported": block.reported,
         "asked_at": float(block.asked_at),
         "needs": [list(item) for item in block.needs.items()],
+        "spans": [list(span) for span in block.spans],
     }
 
 
@@ -150,17 +177,40 @@ def _import_block(entry: object) -> SendBlock:
         reported=read_field(entry, "reported", bool),
         asked_at=read_time(entry, "asked_at"),
         needs=dict(_import_need(e) for e in read_list(entry, "needs")),
+        spans=tuple(_import_span(e) for e in _later(entry, "spans")),
     )
+
+
+def _import_span(entry: object) -> Span:
+    match entry:
+        case [int(number), int(link), int(start), int(stop)] if (
+            1 <= number <= MAX_NUMBER and 0 <= link <= 255 and 0 <= start <= stop <= MAX_STREAM_BYTES
+        ):
+            return number, link, start, stop
+        case _:
+            raise FrameError(_WHERE, "spans", entry, "[number, link, start, stop]")
 
 
 def _import_message(entry: object) -> WaitingMessage:
     match entry:
-        case [int(number), bytes(data), int(priority), float(expires_at), int(often), int(after), float(rises_at)] if (
-            0 <= number <= 255 and data
-        ):
-            return WaitingMessage(number, data, priority, expires_at, often, after, rises_at)
+        case [
+            int(number),
+            bytes(data),
+            int(priority),
+            float(expires_at),
+            int(often),
+            int(after),
+            float(rises_at),
+            *extra,
+        ] if 0 <= number <= 255 and data and _is_extra(extra):
+            return WaitingMessage(number, data, priority, expires_at, often, after, rises_at, *extra)
         case _:
-            raise FrameError(_WHERE, "messages", entry, "[number, bytes, priority, time, copies, frame, time]")
+            raise FrameError(_WHERE, "messages", entry, "[number, bytes, priority, time, copies, frame, time, copies]")
+
+
+def _is_extra(values: list[object]) -> TypeGuard[list[int]]:
+    """Whether this is what follows in a message's entry: nothing in states of before, or how many copies more."""
+    return not values or (len(values) == 1 and isinstance(values[0], int) and 0 <= values[0] <= 9)
 
 
 def _import_report(entry: object) -> Segment:

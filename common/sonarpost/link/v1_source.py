@@ -179,9 +179,14 @@ class Source:
         """Whether a report would help and the last is long ago, in frames or seconds.
 
         It helps where something is lacking, and where the sender goes on with blocks that are complete: then it has not
-        heard that they are.
+        heard that they are. The first tells the sender that there is somebody who reports, and so does one after a long
+        time even where nothing is lacking: a sender that hears none sends everything once, cut to what is sure.
         """
-        late = now - self.reported_at >= config.report_s
-        return (late or self.frames - self.reported_frames >= config.report_frames) and (
-            self.is_lacking or self.needless > 0
+        if self.newest < 0:
+            return False
+        silent_s = now - self.reported_at
+        helps = self.is_lacking or self.needless > 0 or self.reported_frames == 0
+        news = self.frames - self.reported_frames
+        return (helps and (silent_s >= config.report_s or news >= config.report_frames)) or (
+            news > 0 and silent_s >= config.presence_s
         )

@@ -70,6 +70,7 @@ class MissionSpec:
         burst_frames: Mean length of a run of lost frames.
         contact_every_s: Mean time between contacts of a vehicle.
         stream_bytes: Of a picture.
+        deaf_hours: How long from the beginning the vehicles hear nothing of the vessel.
         traffic: Other messages of every vehicle.
         seed: Of everything drawn.
 
@@ -83,11 +84,18 @@ class MissionSpec:
     burst_frames: float = 2.0
     contact_every_s: float = 1800.0
     stream_bytes: int = 300
+    deaf_hours: float = 0.0
     traffic: tuple[Traffic, ...] = USUAL
     seed: int = 1
 
     def __post_init__(self) -> None:
-        for name, low, high in (("vehicles", 1, 16), ("hours", 0.1, 240), ("loss", 0.0, 0.9), ("burst_frames", 1, 100)):
+        for name, low, high in (
+            ("vehicles", 1, 16),
+            ("hours", 0.1, 240),
+            ("loss", 0.0, 0.9),
+            ("burst_frames", 1, 100),
+            ("deaf_hours", 0, 240),
+        ):
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ConfigError("mission", name, value, f"{low}..{high}")
@@ -266,7 +274,7 @@ def run_mission(spec: MissionSpec) -> MissionResult:
                     for event in receiver.accept(vehicle.address, frame, now):
                         mission.arrived(event, now)
             vehicle.queue.sent(frame_s)
-        _report(vehicles, receiver, mission.water, now)
+        _report(vehicles, receiver, mission.water, now, deaf=now < spec.deaf_hours * _HOUR_S)
         now = (now // frame_s + 1) * frame_s
     return MissionResult(
         messages=mission.messages,
@@ -281,7 +289,7 @@ def run_mission(spec: MissionSpec) -> MissionResult:
     )
 
 
-def _report(vehicles: Sequence[_Vehicle], receiver: Receiver, water: _Water, now: float) -> None:
+def _report(vehicles: Sequence[_Vehicle], receiver: Receiver, water: _Water, now: float, *, deaf: bool) -> None:
     """Let the vessel report to the vehicles that need it most, as many as its slot holds."""
     sent = 0
     for vehicle in sorted(vehicles, key=lambda v: v.queue.last_report_at or -1.0):
@@ -291,7 +299,7 @@ def _report(vehicles: Sequence[_Vehicle], receiver: Receiver, water: _Water, now
             continue
         report = receiver.report(vehicle.address, now)
         sent += 1
-        if isinstance(report, Feedback) and not water.loses(-vehicle.address):
+        if isinstance(report, Feedback) and not water.loses(-vehicle.address) and not deaf:
             vehicle.queue.on_report(report, now, 100)
 
 

@@ -1,0 +1,201 @@
+"""What was given up is repaired: sent while nobody reported, pushed out, of another frame length, before a restart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgpack
+import numpy as np
+import pytest
+from link.v1_world import VEHICLE, contact, stream
+
+from sonarpost.link.intervals import count_positions
+from sonarpost.link.queue import AcousticQueue, PictureName, QueueConfig
+from sonarpost.link.queue_state import export_queue, restore_queue
+from sonarpost.link.v1_events import ContactUpdate
+from sonarpost.link.v1_receiver import Receiver
+from sonarpost.modem.rates import RATES
+
+VESSEL = 1
+
+
+class Exchange:
+    """A vehicle and a vessel; what the vessel has of each picture."""
+
+    def __init__(self, loss: float = 0.3, **config: object) -> None:
+        rng = np.random.default_rng(5)
+        self.lost: Callable[[], bool] = lambda: bool(rng.random() < loss)
+        self.config = QueueConfig(expected_loss=max(loss, 0.05), **config)
+        self.queue = AcousticQueue(self.config)
+        self.receiver = Receiver()
+        self.streams: dict[int, bytes] = {}
+        self.shown: dict[int, bytes] = {}
+        self.now = 0.0
+
+    def add(self, number: int, length: int = 300) -> None:
+        self.streams[number] = stream(number, length)
+        name = PictureName(f"{number:04d}", f"c{number}")
+        self.queue.add_picture(number, name, contact(number), self.streams[number], self.now)
+
+    def run(self, seconds: float, *, reports: bool, water: bool = True) -> None:
+        """Send for so long, or until there is nothing to send."""
+        end = self.now + seconds
+        while self.now < end:
+            packet = self.queue.next_packet(self.now)
+            self.now += RATES[self.queue.rate].airtime_s
+            for frame in packet:
+                if not water or self.lost():
+                    continue
+                for event in self.receiver.accept(VEHICLE, frame, self.now):
+                    assert isinstance(event, ContactUpdate)
+                    assert self.streams[event.number].startswith(event.stream)
+                    self.shown[event.number] = event.stream
+            if reports and self.receiver.report_is_due(VEHICLE, self.now):
+                report = self.receiver.report(VEHICLE, self.now)
+                if report is not None and not self.lost():
+                    self.queue.on_report(report, self.now, VESSEL)
+
+    def restart(self) -> None:
+        parts = {name: msgpack.packb(part) for name, part in export_queue(self.queue).items()}
+        self.queue = AcousticQueue(self.config)
+        restore_queue(self.queue, {n: msgpack.unpackb(p, strict_map_key=False) for n, p in parts.items()})
+
+    @property
+    def whole(self) -> list[int]:
+        return [n for n, data in self.streams.items() if self.shown.get(n) == data]
+
+
+def settled(exchange: Exchange) -> bool:
+    kept = exchange.queue.sender.kept
+    return all(count_positions(kept[n].settled) == len(data) for n, data in exchange.streams.items())
+
+
+def test_pictures_cut_while_nobody_reported_become_whole_when_reports_come() -> None:
+    exchange = Exchange()
+    for number in range(1, 25):
+        exchange.add(number)
+        exchange.run(300.0, reports=False)
+    assert len(exchange.shown) == 24
+    assert len(exchange.whole) < 24
+    exchange.run(3 * 3600.0, reports=True)
+    assert len(exchange.whole) == 24
+    assert settled(exchange)
+
+
+def test_pictures_of_which_nothing_arrived_become_whole_when_the_vessel_comes() -> None:
+    exchange = Exchange()
+    for number in range(1, 41):
+        exchange.add(number)
+        exchange.run(200.0, reports=False, water=False)
+    assert not exchange.shown
+    exchange.add(41)
+    exchange.run(4 * 3600.0, reports=True)
+    assert len(exchange.whole) == 41
+    assert settled(exchange)
+
+
+def test_what_is_settled_is_not_sent_again() -> None:
+    exchange = Exchange()
+    for number in range(1, 6):
+        exchange.add(number)
+    exchange.run(3600.0, reports=True)
+    assert len(exchange.whole) == 5
+    assert settled(exchange)
+    sent = exchange.queue.sender.frames_sent
+    exchange.run(3600.0, reports=True)
+    assert exchange.queue.sender.frames_sent == sent
+    assert exchange.queue.is_idle
+
+
+def test_what_receivers_have_of_a_block_sent_before_they_reported_is_not_sent_again() -> None:
+    exchange = Exchange(loss=0.0)
+    for number in range(1, 8):
+        exchange.add(number)
+        exchange.run(60.0, reports=False)
+    first = exchange.queue.sender.frames_sent
+    assert len(exchange.queue.sender.past) == 14
+    there = sum(len(data) for data in exchange.shown.values())
+    exchange.add(8)
+    exchange.run(7200.0, reports=True)
+    assert len(exchange.whole) == 8
+    assert settled(exchange)
+    # What had been cut from seven, and the eighth.
+    cut = 8 * 300 - there
+    assert exchange.queue.sender.frames_sent - first <= 2 + 1.25 * cut / exchange.queue.sender.symbol_bytes
+
+
+@pytest.mark.parametrize("reports", [True, False])
+def test_a_restart_at_any_time_forgets_nothing_that_is_owed(reports: bool) -> None:
+    exchange = Exchange(loss=0.4)
+    for number in range(1, 21):
+        exchange.add(number)
+        exchange.run(90.0, reports=reports and number % 3 == 0)
+        exchange.restart()
+    for _ in range(12):
+        exchange.run(1200.0, reports=True)
+        exchange.restart()
+    assert len(exchange.whole) == 20
+    assert settled(exchange)
+
+
+def test_a_break_in_the_reports_and_another_frame_length_cost_no_picture() -> None:
+    exchange = Exchange(rates=(1, 0), first_rate=1)
+    for number in range(1, 31):
+        exchange.add(number)
+        # Thirteen minutes with, twenty without anything that is heard: the rate falls back, blocks are given up.
+        exchange.run(200.0, reports=number % 10 < 4, water=number % 10 < 4)
+    exchange.run(6 * 3600.0, reports=True)
+    assert len(exchange.whole) == 30
+    assert settled(exchange)
+
+
+def test_pictures_beyond_the_limit_are_forgotten_settled_ones_first() -> None:
+    exchange = Exchange(loss=0.0, kept_pictures=8)
+    for number in range(1, 5):
+        exchange.add(number)
+    exchange.run(3600.0, reports=True)
+    assert settled(exchange)
+    exchange.run(5400.0, reports=False, water=False)
+    for number in range(5, 13):
+        exchange.add(number)
+        exchange.run(2000.0, reports=False, water=False)
+    assert set(exchange.queue.sender.kept) == set(range(5, 13)), "what may still have to be sent is kept"
+
+
+def test_a_state_of_before_there_were_repairs_is_taken_up() -> None:
+    exchange = Exchange()
+    for number in range(1, 4):
+        exchange.add(number)
+    exchange.run(60.0, reports=False)
+    parts = {name: dict(part) for name, part in export_queue(exchange.queue).items()}
+    core = parts["core"]
+    del core["past"]
+    core["sent"] = [entry[:2] for entry in core["sent"]]  # type: ignore[attr-defined]
+    for name in [n for n in parts if n.startswith("block/")]:
+        parts[name].pop("spans")
+    exchange.queue = AcousticQueue(exchange.config)
+    restore_queue(exchange.queue, parts)
+    exchange.run(2 * 3600.0, reports=True)
+    assert len(exchange.whole) == 3
+
+
+def test_a_refinement_asked_for_before_reports_came_is_sent_and_repaired() -> None:
+    exchange = Exchange(stream_bytes=200)
+    exchange.add(1, length=900)
+    exchange.run(200.0, reports=False)
+    assert exchange.queue.refine(1, 700, exchange.now)
+    exchange.run(60.0, reports=False, water=False)
+    exchange.run(3600.0, reports=True)
+    assert 700 <= len(exchange.shown[1]) < 760
+    assert exchange.queue.refine(1, 0, exchange.now)
+    exchange.run(3600.0, reports=True)
+    assert exchange.whole == [1]
+
+
+@pytest.mark.parametrize("length", [28, 29, 30, 31, 32])
+def test_a_stream_that_just_fills_its_preview_becomes_complete(length: int) -> None:
+    exchange = Exchange(loss=0.0)
+    exchange.add(1, length)
+    exchange.run(600.0, reports=True)
+    assert exchange.whole == [1]
+    assert exchange.receiver.counts.complete == 1
