@@ -71,7 +71,13 @@ export class Aside {
     this.element.addEventListener("toggle", (event) => this.open.set(event.target.dataset.name, event.target.open), true);
   }
 
-  show({ contact, record, advice, requests, measurements, group, audit, decisions }) {
+  show(detail) {
+    const focused = document.activeElement?.closest?.(".aside details")?.dataset.name;
+    this.#fill(detail);
+    if (focused) this.element.querySelector(`details[data-name="${CSS.escape(focused)}"] > summary`)?.focus();
+  }
+
+  #fill({ contact, record, advice, requests, measurements, group, audit, decisions }) {
     const part = (name, title, list, make) => (list.length ? section(name, title, list.length, make(list), this.open.get(name) ?? true) : null);
     fill(this.element,
       part("advice", "Advice from shore", advice, adviceList),

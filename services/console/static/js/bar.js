@@ -2,10 +2,10 @@
 
 import { api } from "./api.js";
 import { fill, h } from "./dom.js";
-import { DASH, duration, quantity } from "./format.js";
+import { duration, quantity } from "./format.js";
 import { listen, now, setting, state, tell } from "./state.js";
 
-export const VIEWS = [["review", "Review", "q"], ["map", "Map", "p"], ["fleet", "Link & fleet", "f"]];
+export const VIEWS = [["review", "Review", "q"], ["map", "Map", "p"], ["fleet", "Link", "f"]];
 
 export function toggleTheme() {
   const theme = document.documentElement.dataset.theme === "night" ? "day" : "night";
@@ -33,7 +33,7 @@ function linkWords(vehicles) {
   const age_s = now() - first.last_heard_utc_s;
   const stale = age_s > state.info.stale_after_s.vehicle;
   const more = heard.length > 1 ? ` +${heard.length - 1}` : "";
-  return [`${first.vehicle_id}${more} heard ${duration(age_s)} ago · rate ${first.rate ?? DASH} · ${quantity(first.snr_in_db, "dB", 0)}`, stale];
+  return [`${first.vehicle_id}${more}: ${duration(age_s)} ago, ${quantity(first.snr_in_db, "dB", 0)}${stale ? ", stale" : ""}`, stale];
 }
 
 export class Bar {
@@ -41,7 +41,7 @@ export class Bar {
     this.element = document.getElementById("bar");
     this.banners = document.getElementById("banners");
     this.count = h("span", { class: "count", id: "unreviewed" });
-    this.link = h("span", { class: "pill number", id: "link" });
+    this.link = h("span", { class: "pill number", id: "link", title: "the vehicle heard last, when, and how well" });
     this.live = h("span", { class: "pill", id: "live" });
     this.tabs = VIEWS.map(([name, title, key]) => h("button", {
       type: "button", "aria-pressed": "false", data: { view: name }, on: { click: () => tell("view", { name }) },
@@ -50,11 +50,11 @@ export class Bar {
       h("h1", {}, h("img", { src: "/static/icon.svg", alt: "", width: 26, height: 26 }), state.info.platform_id),
       h("nav", { "aria-label": "Views" }, this.tabs),
       this.count, h("span", { class: "gap" }), this.link, this.live,
-      h("button", { type: "button", title: "Exports (x)", on: { click: actions.exports } }, "export ", h("kbd", { text: "x" })),
+      h("button", { type: "button", title: "Exports (x)", "aria-label": "Exports (x)", on: { click: actions.exports } }, "⇩"),
       h("button", { type: "button", title: "Day or night (t)", "aria-label": "Day or night theme (t)", on: { click: toggleTheme } }, "◐"),
       h("button", { type: "button", title: "Type size (z)", "aria-label": "Type size (z)", on: { click: toggleType } }, "A±"),
       h("button", { type: "button", title: "Keys (?)", "aria-label": "Keys (?)", on: { click: actions.help } }, "?"),
-      h("button", { type: "button", title: `Log out ${state.session.user} (${state.session.role})`, on: { click: () => this.#logout() } }, `${state.session.user} ⏻`));
+      h("button", { type: "button", title: `Log out ${state.session.user} (${state.session.role})`, on: { click: () => this.#logout() } }, `${state.session.user}: log out`));
     listen("counts", () => this.#counts());
     listen("contact", ({ unreviewed, total }) => { Object.assign(state, { unreviewed, total }); this.#counts(); });
     listen("online", () => this.tick());
@@ -73,7 +73,7 @@ export class Bar {
   }
 
   #counts() {
-    fill(this.count, h("b", { class: "number", text: String(state.unreviewed) }), ` unreviewed of ${state.total}`);
+    fill(this.count, h("b", { class: "number", text: String(state.unreviewed) }), " to review", h("span", { class: "muted", text: ` of ${state.total}` }));
     document.title = `(${state.unreviewed}) ${state.info.platform_id} · sonarpost console`;
   }
 

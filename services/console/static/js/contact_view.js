@@ -3,14 +3,14 @@
 import { api } from "./api.js";
 import { h, fill, toast } from "./dom.js";
 import { DASH, position, quantity, received, time } from "./format.js";
+import { COMPARE, drawHint, drawTools, drawVersions, startMouse } from "./contact_tools.js";
 import { honestyStrip } from "./honesty.js";
-import { KINDS, Measuring, lineOf } from "./measure.js";
+import { Measuring, lineOf } from "./measure.js";
 import { MAPS, autoRange, loadPicture } from "./picture_data.js";
 import { PictureView, freshSight } from "./picture_view.js";
 import { setting, state } from "./state.js";
 
 const GAIN_STEP = 5;
-const COMPARE = { off: "one picture", versions: "first and newest", layers: "raw and enhanced" };
 
 export class ContactView {
   constructor() {
@@ -25,7 +25,7 @@ export class ContactView {
     this.look = { map: setting("map") in MAPS ? setting("map") : "grey", low: 0, high: 100, gamma: 1, hatch: true };
     this.#build();
     this.measuring = new Measuring(() => this.#place(), () => this.#lines());
-    this.#mouse();
+    startMouse(this);
   }
 
   #build() {
@@ -98,15 +98,18 @@ export class ContactView {
     if (names.length) await this.showLayer(names[(names.indexOf(this.layer) + 1) % names.length]);
   }
 
+  /** The next way of comparing that there is something to show for. */
   async nextCompare() {
+    if (!this.detail) return;
     const modes = Object.keys(COMPARE);
-    this.compare = modes[(modes.indexOf(this.compare) + 1) % modes.length];
+    do this.compare = modes[(modes.indexOf(this.compare) + 1) % modes.length];
+    while (this.compare !== "off" && !this.second());
     this.#words();
     await this.#pictures();
   }
 
   /** What the second canvas shows: [version, layer], or null. */
-  #second() {
+  second() {
     const { versions } = this.detail;
     if (this.compare === "versions" && versions.length > 1) {
       const first = versions.find((one) => one.version !== this.version);
@@ -138,12 +141,12 @@ export class ContactView {
 
   async #pictures() {
     const turn = (this.loading += 1);
-    const second = this.shown ? this.#second() : null;
+    const second = this.shown ? this.second() : null;
     const wanted = [this.shown ? [this.shown, this.layer] : null, second];
     this.canvases[0].classList.toggle("hidden", !wanted[0]);
     this.canvases[1].classList.toggle("hidden", !wanted[1]);
     const placeholder = this.stage.lastElementChild;
-    placeholder.textContent = this.shown ? "" : "Only the contact's record has arrived. The picture follows as its frames do.";
+    placeholder.textContent = this.shown && this.detail.contact.has_picture ? "" : "Only the contact's record has arrived. The picture follows as its frames do.";
     try {
       const pictures = await Promise.all(wanted.map((one) => one && this.#load(...one)));
       if (turn !== this.loading) return;
@@ -165,7 +168,8 @@ export class ContactView {
       across_m: (version.pixel_across_m * version.width_px) / picture.width,
     } : null;
     const title = `version ${version.version} · ${layer}${version.complete ? "" : ` · ${received(version)} received`}`;
-    view.show(picture, { scale, nadir: this.detail.record?.nadir_side ?? null, title });
+    const made = version.layers.find((one) => one.name === layer)?.synthesised ?? false;
+    view.show(picture, { scale, nadir: this.detail.record?.nadir_side ?? null, title, made });
   }
 
   #lines() {
@@ -199,18 +203,18 @@ export class ContactView {
 
   zoom(factor) {
     this.views[0].zoom(factor);
-    this.#redraw();
+    this.redrawAll();
   }
 
   fit() {
     Object.assign(this.views[0].sight, freshSight());
-    this.#redraw();
+    this.redrawAll();
   }
 
   pan(across, along) {
     const { zoom } = this.views[0].sight;
     this.views[0].pan(across / zoom, along / zoom);
-    this.#redraw();
+    this.redrawAll();
   }
 
   /** Make the picture brighter (1) or darker (-1); 0 is automatic again. */
@@ -245,7 +249,7 @@ export class ContactView {
     this.#tools();
   }
 
-  #redraw() {
+  redrawAll() {
     for (const view of this.views) view.draw();
   }
 
@@ -253,95 +257,22 @@ export class ContactView {
 
   #words() {
     const { contact, record } = this.detail;
+    const sigma = contact.position_sigma_m ? ` ± ${quantity(contact.position_sigma_m, "m", 0)}` : "";
     fill(this.heading,
       h("h2", { text: contact.name }),
       h("span", { class: "number", text: time(contact.seen_utc_s ?? contact.first_frame_utc_s, { date: true }) }),
-      h("span", { class: "number", text: `${position(contact.lat_deg, contact.lon_deg)}${contact.position_sigma_m ? ` ± ${quantity(contact.position_sigma_m, "m", 0)}` : ""}` }),
-      h("span", { text: `ATD ${contact.atd_class ?? ""} ${contact.atd_confidence === null ? DASH : contact.atd_confidence.toFixed(2)} of 2` }),
-      h("span", { class: "number", text: `range ${quantity(record?.slant_range_m ?? contact.range_m, "m", 0)}, altitude ${quantity(record?.altitude_m, "m")}` }));
+      h("span", { class: "number", text: `ATD ${contact.atd_class ? `${contact.atd_class} ` : ""}${contact.atd_confidence === null ? DASH : contact.atd_confidence.toFixed(2)}` }),
+      h("span", { class: "number", text: `${position(contact.lat_deg, contact.lon_deg)}${sigma} · range ${quantity(record?.slant_range_m ?? contact.range_m, "m", 0)} · altitude ${quantity(record?.altitude_m, "m")}` }));
     this.#tools();
-    this.#versionButtons();
+    drawVersions(this);
     fill(this.strip, honestyStrip(this.shown, this.shownLayer));
   }
 
-  #button(label, key, handler, props = {}) {
-    return h("button", { type: "button", title: `${label} (${key})`, on: { click: handler }, ...props }, props.words ?? label, " ", h("kbd", { text: key }));
-  }
-
   #tools() {
-    if (!this.detail) return;
-    const focused = document.activeElement?.dataset?.tool;
-    const locked = this.measureLock();
-    const layers = (this.shown?.layers ?? []).map((one) => h("button", {
-      type: "button", "aria-pressed": String(one.name === this.layer), title: one.reason || "as it was measured", data: { tool: `layer-${one.name}` },
-      on: { click: () => this.showLayer(one.name) }, text: one.synthesised ? `${one.name} ✱` : one.name,
-    }));
-    const maps = h("select", { "aria-label": "Colour map (c)", data: { tool: "map" }, on: { change: (event) => this.setMap(event.target.value) } },
-      Object.keys(MAPS).map((name) => h("option", { value: name, text: name })));
-    maps.value = this.look.map;
-    fill(this.tools,
-      h("span", { class: "set", role: "group", "aria-label": "Layer (e)" }, layers, h("kbd", { text: "e" })),
-      h("span", { class: "set" }, maps, h("kbd", { text: "c" })),
-      h("span", { class: "set", role: "group", "aria-label": "Gain" },
-        this.#button("darker", ",", () => this.gain(-1), { words: "☾", data: { tool: "darker" } }),
-        this.#button("automatic gain", "a", () => this.gain(0), { words: "auto", "aria-pressed": String(this.auto), data: { tool: "auto" } }),
-        this.#button("brighter", ".", () => this.gain(1), { words: "☀", data: { tool: "brighter" } })),
-      h("span", { class: "set", role: "group", "aria-label": "Zoom" },
-        this.#button("zoom out", "-", () => this.zoom(1 / 1.5), { words: "", data: { tool: "out" } }),
-        this.#button("whole picture", "0", () => this.fit(), { words: "fit", data: { tool: "fit" } }),
-        this.#button("zoom in", "+", () => this.zoom(1.5), { words: "", data: { tool: "in" } })),
-      this.#button("hatch over what is missing", "h", () => this.toggleHatch(), { words: "hatch", "aria-pressed": String(this.look.hatch), data: { tool: "hatch" } }),
-      this.#button(`side by side: ${COMPARE[this.compare]}`, "s", () => this.nextCompare(), { words: this.compare === "off" ? "compare" : COMPARE[this.compare], "aria-pressed": String(this.compare !== "off"), data: { tool: "compare" } }),
-      this.#button(locked ? `measuring is locked: ${locked}` : "measure", "m", () => this.measure(), {
-        words: locked ? "measure 🔒" : "measure", "aria-pressed": String(this.measuring.active), "aria-disabled": locked ? "true" : null, class: locked ? "locked" : "", data: { tool: "measure" },
-      }));
-    if (focused) this.tools.querySelector(`[data-tool="${CSS.escape(focused)}"]`)?.focus();
-  }
-
-  #versionButtons() {
-    const { versions } = this.detail;
-    const newest = versions.at(-1)?.version;
-    fill(this.versions, versions.length ? h("kbd", { text: "[" }) : null, versions.slice(-8).map((one) => h("button", {
-      type: "button", "aria-pressed": String(one.version === this.version), on: { click: () => this.showVersion(one.version) },
-      "aria-label": `Version ${one.version}, ${received(one)} received, ${time(one.received_utc_s)}`,
-    }, h("img", { src: api.thumbnailUrl(this.detail.contact.id, one.version), alt: "" }), h("span", { class: "number", text: `v${one.version} · ${received(one)}` }))),
-    versions.length ? h("kbd", { text: "]" }) : null,
-    newest && this.version !== newest ? h("span", { class: "stale", text: `Version ${newest} is newer than the one shown.` }) : null);
+    if (this.detail) drawTools(this);
   }
 
   #hint() {
-    const existing = this.stage.querySelector(".hint");
-    existing?.remove();
-    if (!this.measuring.active) return;
-    const words = this.measuring.result ? "Enter keeps it, Esc discards it" : this.measuring.from ? "second end: click, or arrows and Enter" : "first end: click, or arrows (Shift: 5 px) and Enter";
-    this.stage.append(h("p", { class: "hint", role: "status" }, h("b", { text: this.measuring.kind }), ` — ${words}; `, h("kbd", { text: "m" }), ` ${KINDS.at(-1) === this.measuring.kind ? "ends" : "next kind"}`));
-  }
-
-  #mouse() {
-    const canvas = this.canvases[0];
-    canvas.tabIndex = 0;
-    let held = null;
-    for (const [index, one] of this.canvases.entries()) {
-      one.addEventListener("wheel", (event) => {
-        event.preventDefault();
-        this.views[index].zoom(event.deltaY < 0 ? 1.25 : 0.8, event.offsetX, event.offsetY);
-        this.#redraw();
-      }, { passive: false });
-      one.addEventListener("pointerdown", (event) => {
-        if (index === 0 && this.measuring.active) {
-          this.measuring.to(this.views[0].at(event.offsetX, event.offsetY));
-          this.measuring.set();
-        } else held = [event.clientX, event.clientY];
-      });
-      one.addEventListener("pointermove", (event) => {
-        if (index === 0 && this.measuring.active && !this.measuring.result) this.measuring.to(this.views[0].at(event.offsetX, event.offsetY));
-        if (!held || !this.views[index].picture) return;
-        this.views[index].drag(event.clientX - held[0], event.clientY - held[1]);
-        held = [event.clientX, event.clientY];
-        this.#redraw();
-      });
-      one.addEventListener("dblclick", () => this.fit());
-    }
-    addEventListener("pointerup", () => { held = null; });
+    drawHint(this);
   }
 }

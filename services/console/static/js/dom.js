@@ -30,6 +30,7 @@ export function fill(element, ...children) {
 /** Say something for a few seconds; errors stay longer. */
 export function toast(message, { bad = false } = {}) {
   const place = document.getElementById("toasts");
+  for (const old of place.children) if (old.textContent === message) old.remove();
   const note = h("p", { class: bad ? "bad" : "", text: message });
   place.append(note);
   while (place.children.length > 4) place.firstElementChild.remove();

@@ -14,16 +14,17 @@ export function honestyStrip(version, layer) {
   const missing = 100 * version.missing_fraction;
   const guessed = 100 * (version.guessed_fraction ?? 0);
   const facts = h("dl", {},
-    item("codec", version.model ? `${version.codec} ${version.model.slice(0, 8)}` : version.codec),
-    item("bytes", version.bytes_total ? `${bytes(version.bytes_received)} of ${bytes(version.bytes_total)}` : bytes(version.bytes_received)),
+    item("codec", version.codec || "none", { title: version.model ? `model ${version.model}` : "no model" }),
+    item("bytes", version.bytes_total ? `${version.bytes_received} of ${bytes(version.bytes_total)}` : bytes(version.bytes_received)),
     item("frames", String(version.frames_received)),
     item("air time", airtime),
     item("received", received(version), { class: version.complete ? "" : "part" }),
-    item("never received", percent(missing, missing > 0 && missing < 1 ? 1 : 0), { class: missing > 0 ? "missing" : "" }),
-    item("guessed", percent(guessed, guessed > 0 && guessed < 1 ? 1 : 0), { class: guessed > 0 ? "guessed" : "" }));
+    item("missing", percent(missing, missing > 0 && missing < 1 ? 1 : 0), { class: missing > 0 ? "missing" : "" }),
+    item("guessed", layer?.synthesised ? "all of it" : percent(guessed, guessed > 0 && guessed < 1 ? 1 : 0), { class: guessed > 0 || layer?.synthesised ? "guessed" : "" }));
+  const said = version.complete ? "as the codec's stream says, all of it received." : missing > 0 ? "as the codec's stream says; hatched areas were never received." : "as the codec's stream says so far; detail is still to come.";
+  const notes = version.notes.length ? h("span", { class: "muted", text: ` ${version.notes.join(" · ")}` }) : null;
   const truth = layer?.synthesised
-    ? h("p", { class: "made" }, h("b", { text: `✱ ${layer.name}: not a measurement. ` }), layer.reason)
-    : h("p", { class: "measured" }, h("b", { text: `${layer?.name ?? "raw"}: ` }), version.complete ? "as the codec's stream says, all of it received." : "as the codec's stream says; hatched areas were never received.");
-  const notes = version.notes.length ? h("p", { class: "muted", text: version.notes.join(" · ") }) : null;
-  return [facts, truth, notes];
+    ? h("p", { class: "made" }, h("b", { text: `✱ ${layer.name}: not a measurement. ` }), layer.reason, notes)
+    : h("p", { class: "measured" }, h("b", { text: `${layer?.name ?? "raw"}: ` }), said, notes);
+  return [facts, truth];
 }

@@ -21,7 +21,10 @@ export class Measuring {
   constructor(place, changed) {
     this.place = place;
     this.changed = changed;
-    this.stop();
+    this.kind = null; // what is measured, null while nothing is
+    this.from = null;
+    this.cross = null;
+    this.result = null;
   }
 
   get active() { return this.kind !== null; }
@@ -47,7 +50,7 @@ export class Measuring {
     this.from = null;
     this.cross = null;
     this.result = null;
-    this.changed?.();
+    this.changed();
   }
 
   /** Take back the last point, or end measuring. */

@@ -42,8 +42,9 @@ export class PictureView {
     new ResizeObserver(() => this.draw()).observe(canvas);
   }
 
-  show(picture, { scale, nadir, title }) {
-    Object.assign(this, { picture, scale, nadir, title });
+  /** `made`: the whole layer is treated or made up; it then carries a frame that says so. */
+  show(picture, { scale, nadir, title, made }) {
+    Object.assign(this, { picture, scale, nadir, title, made });
     this.missing = picture && maskCanvas(picture.missing, picture.width, picture.height);
     this.guessed = picture && maskCanvas(picture.guessed, picture.width, picture.height);
     this.recolour();
@@ -94,6 +95,7 @@ export class PictureView {
 
   /** Move by shares of the picture's sides. */
   pan(across, along) {
+    if (this.sight.zoom === 1) return;
     this.sight.across = Math.max(0, Math.min(1, this.sight.across + across));
     this.sight.along = Math.max(0, Math.min(1, this.sight.along + along));
   }
@@ -132,8 +134,9 @@ export class PictureView {
     context.drawImage(this.image, g.x, g.y, width, height);
     if (this.look.hatch) {
       this.#overlay(context, this.missing, hatch, g, width, height);
-      this.#overlay(context, this.guessed, dots, g, width, height);
+      if (!this.made) this.#overlay(context, this.guessed, dots, g, width, height);
     }
+    if (this.made) this.#frame(context, g, width, height);
     context.restore();
   }
 
@@ -148,6 +151,20 @@ export class PictureView {
     paint.fillStyle = pattern(paint, draw);
     paint.fillRect(0, 0, layer.width, layer.height);
     context.drawImage(layer, 0, 0);
+  }
+
+  /** A layer that is made up as a whole: a frame and words, as dots over all of it would hide it. */
+  #frame(context, g, width, height) {
+    const [left, top] = [Math.max(g.x, MARGIN.left), Math.max(g.y, MARGIN.top)];
+    const [right, bottom] = [Math.min(g.x + width, MARGIN.left + g.box.width), Math.min(g.y + height, MARGIN.top + g.box.height)];
+    for (const [colour, dash] of [["#000000", []], ["#52e0ff", [8, 8]]]) {
+      context.strokeStyle = colour;
+      context.lineWidth = 4;
+      context.setLineDash(dash);
+      context.strokeRect(left + 2, top + 2, right - left - 4, bottom - top - 4);
+    }
+    context.setLineDash([]);
+    this.#label(context, "NOT MEASURED", (left + right) / 2, bottom - 18, "#52e0ff");
   }
 
   #drawScales(context, colour) {
@@ -187,7 +204,8 @@ export class PictureView {
     context.textAlign = "left";
     context.fillText(this.nadir === "left" ? "◀ nadir" : "nadir side not known", MARGIN.left, MARGIN.top - 13);
     context.textAlign = "right";
-    context.fillText(this.title, right, MARGIN.top - 13);
+    const room = g.box.width - context.measureText("nadir side not known").width;
+    context.fillText(context.measureText(this.title).width < room ? this.title : this.title.split(" · ").slice(0, 2).join(" · "), right, MARGIN.top - 13);
   }
 
   #drawLines(context) {

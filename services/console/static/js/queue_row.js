@@ -20,7 +20,7 @@ export function rowWords(row) {
 
 function marks(row) {
   const list = [];
-  if (row.looks > 1) list.push(h("span", { class: "mark", title: `${row.looks} looks at one place` }, `⧉\u202f${row.looks}`));
+  if (row.looks > 1) list.push(h("span", { class: "mark", title: `${row.looks} looks at one place` }, `×${row.looks}`));
   if (row.advised) list.push(h("span", { class: "mark", title: "Advice from shore" }, "✉"));
   if (row.open_requests > 0) list.push(h("span", { class: "mark", title: "Asked for more; not here yet" }, "⟳"));
   if (row.delivery?.vehicle === "confirmed" && ["delivered", "none"].includes(row.delivery?.shore)) {
