@@ -1,6 +1,6 @@
 """A fleet on one host: many vehicles over a few vessels into one shore, for minutes.
 
-    python bench/fleet.py [--vehicles 100] [--vessels 4] [--seconds 600] [--every 10] [--grow 10,30,100] [--dir DIR]
+    python bench/fleet.py [--vehicles 100] [--vessels 4] [--seconds 600] [--every 10] [--grow 10,30] [--dir DIR]
 
 Real, each a process of its own with its own store: a router and a relay for each vessel, the shore's router, and c2,
 which writes every picture's files. Simulated: the vehicles, the water and the decompressor. One load process a vessel
@@ -10,8 +10,9 @@ packets and more than that.) All run on this host, so there is one clock: a pict
 owed, before it is on the disk of the load process, until a plain subscriber ashore has it from c2, after c2 has written
 its files.
 
-One JSON object a run. The exit status is 0 where every picture is ashore
-once, with the right sha256.
+One JSON object a run, with the host's load average during it (mean of samples of the one-minute average) and how much
+of the host's CPU was in use by all that ran on it, and by the bench's own processes. The exit status is 0 where every
+picture is ashore once, with the right sha256.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from sonarpost.runtime.shore_index import ShoreIndex
 
 SHAPE = (100, 300)
 SETTLE_S = 120.0
+SAMPLE_S = 5.0
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
@@ -134,6 +136,47 @@ class Seen:
                 self.again += 1
             else:
                 self.latency_s[name] = now_utc_s - image["last_frame_utc_s"]
+
+
+class HostLoad:
+    """How busy the whole host is: samples of its load average, and its CPU time."""
+
+    def __init__(self) -> None:
+        self._samples: list[float] = []
+        self._stop = threading.Event()
+        self._busy_s, self._total_s = self._cpu_s()
+        self._own_s = sum(os.times()[:4])
+        self._thread = threading.Thread(target=self._sample, name="host-load", daemon=True)
+        self._thread.start()
+
+    @staticmethod
+    def _cpu_s() -> tuple[float, float]:
+        """Return busy and total CPU time of the host since it started."""
+        fields = [int(value) for value in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
+        idle = fields[3] + fields[4]
+        return (sum(fields) - idle) / TICKS_PER_S, sum(fields) / TICKS_PER_S
+
+    def _sample(self) -> None:
+        while not self._stop.is_set():
+            self._samples.append(os.getloadavg()[0])
+            self._stop.wait(SAMPLE_S)
+
+    def stop(self, services_s: float) -> dict[str, float]:
+        """Return load average (mean, highest) and CPU in use (percent of all cores) since the beginning.
+
+        Args:
+            services_s: CPU time the services have used; this process and those of the load are added.
+        """
+        self._stop.set()
+        self._thread.join()
+        busy_s, total_s = self._cpu_s()
+        own_s = services_s + sum(os.times()[:4]) - self._own_s
+        return {
+            "load_mean": round(sum(self._samples) / len(self._samples), 1),
+            "load_max": round(max(self._samples), 1),
+            "host_cpu_percent": round(100 * (busy_s - self._busy_s) / (total_s - self._total_s), 1),
+            "own_cpu_percent": round(100 * own_s / (total_s - self._total_s), 1),
+        }
 
 
 class Processes:
@@ -239,6 +282,7 @@ def run(folder: Path, vehicles: int, vessels: int, seconds: float, every_s: floa
         wait_until_ready(session, names)
         services = tuple(processes.running)
         before = {name: processes.cpu_s(name) for name in services}
+        host = HostLoad()
         began_s = time.monotonic()
         for n, name in enumerate(names):
             mine = ",".join(str(v) for v in range(n, vehicles, vessels))
@@ -254,9 +298,10 @@ def run(folder: Path, vehicles: int, vessels: int, seconds: float, every_s: floa
             time.sleep(0.1)
         took_s = time.monotonic() - began_s
         used = {name: processes.cpu_s(name) - before[name] for name in services}
+        host_load = host.stop(sum(used.values()))
         memory = {name: processes.rss_mb(name) for name in services}
         session.close()
-    return figures(vehicles, vessels, owed, took_s, seen, rows_ashore(folder / "out"), used, memory)
+    return {**figures(vehicles, vessels, owed, took_s, seen, rows_ashore(folder / "out"), used, memory), **host_load}
 
 
 def rows_ashore(out_dir: Path) -> int:
@@ -303,7 +348,6 @@ def figures(
         "cpu_percent": {k: round(100 * max(used[n] for n in ns) / took_s, 1) for k, ns in by_kind.items()},
         "cpu_ms_per_image": {k: round(1000 * sum(used[n] for n in ns) / owed, 2) for k, ns in by_kind.items()},
         "rss_mb": {k: round(max(memory[n] for n in ns)) for k, ns in by_kind.items()},
-        "host_load": round(os.getloadavg()[0], 1),
         "good": rows == owed and not seen.wrong and not seen.again,
     }
 

@@ -23,6 +23,8 @@ MAX_RECORDS = 128
 RECORD_OVERHEAD_BYTES = 48
 """What one more record in a query costs besides its payload: its entries in attachment and reply."""
 
+_STORED = Reply("stored")
+
 
 def attachment(origin: bytes, items: Sequence[OutboxItem], settled: int = 0) -> bytes:
     """Return the attachment of a query with several whole records of one key, their payloads one after the other.
@@ -114,6 +116,8 @@ def unpack_replies(payload: bytes, count: int, where: str) -> tuple[Reply, ...] 
 def _reply(reply: object, field: str, where: str) -> Reply:
     if isinstance(reply, tuple) and len(reply) == 2:
         status, reason = reply
+        if status == "stored" and reason == "":
+            return _STORED
         for known in ("stored", "refused", "later"):
             if status == known and isinstance(reason, str):
                 return Reply(known, reason=reason)

@@ -23,6 +23,8 @@ from sonarpost.runtime.transaction import Chunk, Transaction
 log = logging.getLogger(__name__)
 
 BATCH = 64
+BATCH_ATTACHED = 65_536
+"""Most bytes of attachments in one batch, about 1400 small records: whoever waits for the store waits no longer."""
 QUEUE_LIMIT = 256
 RETRY_S = 0.5
 MAX_REASON = 200
@@ -141,7 +143,7 @@ class Inbox:
             batch = [self._arrivals.get(timeout=0.2)]
         except queue.Empty:
             return []
-        while len(batch) < BATCH:
+        while len(batch) < BATCH and sum(len(arrival.attached) for arrival in batch) < BATCH_ATTACHED:
             try:
                 batch.append(self._arrivals.get_nowait())
             except queue.Empty:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Literal
 
@@ -22,7 +23,35 @@ def kv(**fields: object) -> dict[str, object]:
 
 
 _NEEDS_QUOTES = re.compile(r"[ \"'=]").search
-_concerned: ContextVar[Mapping[str, object]] = ContextVar("concerned", default=MappingProxyType({}))
+
+
+class concerning_later:  # noqa: N801  # a context manager, read as a verb like `concerning`
+    """As `concerning`, with fields that are looked for only if a line is logged inside."""
+
+    def __init__(self, find: Callable[[], Mapping[str, object]]) -> None:
+        self._find = find
+        self._found: Mapping[str, object] | None = None
+
+    def __enter__(self) -> None:
+        self._outer = _concerned.get()
+        self._token = _concerned.set(self)
+
+    def __exit__(self, *_: object) -> None:
+        _concerned.reset(self._token)
+
+    def fields(self) -> Mapping[str, object]:
+        """Return what is known outside, and what `find` finds."""
+        if self._found is None:
+            found = self._find()
+            self._found = {**_known(self._outer), **{name: found[name] for name in found if found[name] is not None}}
+        return self._found
+
+
+_concerned: ContextVar[Mapping[str, object] | concerning_later] = ContextVar("concerned", default=MappingProxyType({}))
+
+
+def _known(concerned: Mapping[str, object] | concerning_later) -> Mapping[str, object]:
+    return concerned.fields() if isinstance(concerned, concerning_later) else concerned
 
 
 @contextmanager
@@ -33,54 +62,26 @@ def concerning(**fields: object) -> Iterator[None]:
     one of them need not know which it is.
     """
     known = {name: value for name, value in fields.items() if value is not None}
-    token = _concerned.set({**_concerned.get(), **known})
+    token = _concerned.set({**_known(_concerned.get()), **known})
     try:
         yield
     finally:
         _concerned.reset(token)
-
-
-@contextmanager
-def concerning_later(find: Callable[[], Mapping[str, object]]) -> Iterator[None]:
-    """As `concerning`, with fields that are looked for only if a line is logged inside."""
-    token = _concerned.set(_Sought(_concerned.get(), find))
-    try:
-        yield
-    finally:
-        _concerned.reset(token)
-
-
-class _Sought(Mapping[str, object]):
-    """Fields of which some are not looked for before somebody wants to know them."""
-
-    def __init__(self, outer: Mapping[str, object], find: Callable[[], Mapping[str, object]]) -> None:
-        self._outer = outer
-        self._find = find
-        self._found: dict[str, object] | None = None
-
-    def _fields(self) -> dict[str, object]:
-        if self._found is None:
-            inner = {name: value for name, value in self._find().items() if value is not None}
-            self._found = {**self._outer, **inner}
-        return self._found
-
-    def __getitem__(self, name: str) -> object:
-        return self._fields()[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._fields())
-
-    def __len__(self) -> int:
-        return len(self._fields())
 
 
 def fields_of(record: logging.LogRecord) -> dict[str, object]:
     """Return the fields of a line: what it concerns first, then those of the call, which win."""
-    return {**_concerned.get(), **getattr(record, "fields", {})}
+    return {**_known(_concerned.get()), **getattr(record, "fields", {})}
 
 
 def _time_text(record: logging.LogRecord) -> str:
-    return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    second, microsecond = divmod(round(record.created * 1e6), 1_000_000)
+    return f"{_second_text(second)}.{microsecond // 1000:03}Z"
+
+
+@lru_cache(maxsize=2)
+def _second_text(second: int) -> str:
+    return datetime.fromtimestamp(second, UTC).isoformat()[:19]
 
 
 class TextFormatter(logging.Formatter):

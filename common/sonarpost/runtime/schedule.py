@@ -25,7 +25,7 @@ MAX_WINDOW_BYTES = 64 * CHUNK_BYTES
 """Most bytes in flight on a fast link, so that the consumer has the next records while it writes the last."""
 GROW_BELOW_S, SHRINK_ABOVE_S = 0.25, 1.0
 """Answers that come sooner let the bytes in flight grow, later ones halve them."""
-LOOKS_AT = 1024
+LOOKS_AT = 512
 """Most records looked at with a consumer that takes several with one query."""
 PROBE_WINDOW = 8
 """Most records looked at while nobody has answered yet."""
