@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 
 RELEASE_S = 0.5
 """Reports and new contacts wake the thread that lets contacts go; this is for what nothing tells of."""
+MOST_DELAY_S = 10.0
+"""A report that seems older when it is heard was made by another clock."""
 _RELEASED = "released"
 
 
@@ -69,7 +71,7 @@ class Outgoing:
         except PayloadError as error:
             log.warning("A report is left out", extra=kv(reason=str(error)))
             return
-        self._way.heard_health(report, time.monotonic())
+        self._way.heard_health(report, _moment(report.time_utc_s))
         self._wanted.set()
 
     def _hear_queue(self, sample: zenoh.Sample) -> None:
@@ -78,7 +80,7 @@ class Outgoing:
         except PayloadError as error:
             log.warning("A report is left out", extra=kv(reason=str(error)))
             return
-        self._way.heard_queue(report, time.monotonic())
+        self._way.heard_queue(report, _moment(report.time_utc_s))
         self._wanted.set()
 
     def taken(self) -> None:
@@ -136,3 +138,9 @@ class Outgoing:
 
     def _owe(self, effects: Effects, payload: bytes) -> None:
         effects.send_payload(keys.contact_detected(self._vehicle), COMPRESSOR, payload, Snippet)
+
+
+def _moment(time_utc_s: float) -> float:
+    """Return when a report was made, on the clock that never goes back; now where the other computer's clock differs."""
+    age_s = time.time() - time_utc_s
+    return time.monotonic() - (age_s if 0 <= age_s <= MOST_DELAY_S else 0.0)

@@ -13,8 +13,8 @@ QUEUE = "queue"
 
 STALE_S = 600.0
 """A service that has said nothing for this long may have been replaced by another program, and counts no more."""
-_MARGIN_S = 0.5
-"""A report was made this long before it was heard, at most."""
+_MARGIN_S = 0.1
+"""What a report says was read so long before the time it bears, at most."""
 
 
 class WayToTheWater:
