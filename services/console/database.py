@@ -106,8 +106,8 @@ class Database:
             if version not in (0, VERSION):
                 self._db.close()
                 raise HandoffError(f"{path}: console database of version {version}, expected {VERSION}")
-            self._db.executescript(_SCHEMA)
-            self._db.execute(f"PRAGMA user_version={VERSION}")
+            if version == 0:
+                self._db.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version={VERSION}; COMMIT;")
         except (OSError, sqlite3.Error) as error:
             raise HandoffError(f"{path}: cannot be opened as the console's database: {error}") from error
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,16 +142,29 @@ def cheap_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.console.users.COST", 2**4)
 
 
+@pytest.fixture(scope="session")
+def users_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of those who may log in, made once."""
+    path = tmp_path_factory.mktemp("users") / "console-users.db"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("services.console.users.COST", 2**4)
+        users = Users(path)
+        for name, role in PEOPLE.items():
+            users.add(name, role, PASSWORD)
+        users.close()
+    return path
+
+
 @pytest.fixture
-def make_console(tmp_path: Path) -> Iterator[ConsoleMaker]:
+def make_console(tmp_path: Path, users_file: Path) -> Iterator[ConsoleMaker]:
     made: list[Console] = []
 
     def make(**options: Any) -> Console:
         folder = tmp_path / str(len(made))
+        folder.mkdir()
+        shutil.copy(users_file, folder)
         config = ConsoleConfig(**options)
-        users = Users(folder / "console-users.db", config.session_s, config.session_most_s)
-        for name, role in PEOPLE.items():
-            users.add(name, role, PASSWORD)
+        users = Users(folder / users_file.name, config.session_s, config.session_most_s)
         board = Board(config, Database(folder / "console-review.db"))
         made.append(Console(board, users, ConsoleApp(board, users, "vessel-1")))
         return made[-1]

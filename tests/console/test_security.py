@@ -1,0 +1,301 @@
+"""Who gets in, who may what, and what hostile input leads to."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from console.conftest import PASSWORD, PEOPLE, Browser, picture_record
+from starlette.testclient import TestClient
+
+from services.console.config import ConsoleConfig
+from services.console.users import Attempts, Users
+from sonarpost.errors import BadInputError
+
+ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
+ONE = f"/api/contacts/{ID}"
+READ = [
+    "/api/session",
+    "/api/info",
+    "/api/contacts",
+    ONE,
+    f"{ONE}/costs",
+    f"{ONE}/versions/1/picture.png",
+    f"{ONE}/versions/1/mask.png",
+    f"{ONE}/versions/1/thumbnail.png",
+    "/api/fleet",
+    "/api/map",
+    "/tiles/1/1/1.png",
+    "/api/export/contacts.csv",
+    f"/report/{ID}",
+    "/events",
+]
+DONE = {
+    f"{ONE}/decisions": "decide",
+    f"{ONE}/undo": "decide",
+    f"{ONE}/measure": "measure",
+    f"{ONE}/requests": "request",
+    f"{ONE}/advice": "advise",
+}
+HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>\"'&"
+
+
+@pytest.fixture
+def with_contact(console):
+    console.board.take_image(picture_record())
+    return console
+
+
+@pytest.mark.parametrize("path", READ)
+def test_nothing_is_shown_without_a_session(with_contact, path):
+    stranger = with_contact.browser()
+    answer = stranger.get(path)
+    assert answer.status_code == 401
+    assert answer.json()["error"]["code"] == "no_session"
+    stranger.client.cookies.set("sonarpost_session", "x" * 43)
+    assert stranger.get(path).status_code == 401
+
+
+def test_pages_lead_a_stranger_to_the_log_in(console):
+    answer = console.browser().get("/")
+    assert (answer.status_code, answer.headers["location"]) == (303, "/login")
+
+
+@pytest.mark.parametrize("path", [*DONE, "/api/logout", "/api/password"])
+def test_nothing_is_done_without_a_session_or_its_token(with_contact, path):
+    assert with_contact.browser().post(path, {}).status_code == 401
+    anna = with_contact.browser("anna")
+    for headers in ({}, {"X-CSRF-Token": ""}, {"X-CSRF-Token": with_contact.browser("anna").csrf}):
+        answer = anna.client.post(path, json={}, headers=headers)
+        assert (answer.status_code, answer.json()["error"]["code"]) == (403, "csrf")
+
+
+@pytest.mark.parametrize(("path", "act"), DONE.items())
+def test_a_role_does_what_it_may_and_no_more(with_contact, path, act):
+    for user, role in PEOPLE.items():
+        browser = with_contact.browser(user)
+        allowed = browser.get("/api/session").json()["may"][act]
+        assert allowed == (role != "observer" and act != "advise")
+        # What is let in is wrong, so that nothing is changed by asking.
+        assert browser.post(path, {"x": 1}).status_code == (400 if allowed else 403)
+
+
+def test_ashore_only_experts_act(make_console):
+    console = make_console(side="shore")
+    may = {user: console.browser(user).get("/api/session").json()["may"] for user in ("watch", "anna", "eva")}
+    assert not any(may["watch"].values())
+    assert may["anna"] == {"decide": False, "measure": True, "request": False, "advise": False}
+    assert may["eva"] == {"decide": False, "measure": True, "request": True, "advise": True}
+
+
+def test_the_cookie_is_for_the_browser_alone(console, make_console):
+    answer = console.browser().login("anna")
+    cookie = answer.headers["set-cookie"]
+    assert "HttpOnly" in cookie
+    assert "SameSite=strict" in cookie
+    assert "Secure" not in cookie
+    assert "csrf" in answer.json()
+    assert "token" not in answer.text
+    secure = make_console(tls=True).browser().login("anna").headers
+    assert "Secure" in secure["set-cookie"]
+    assert "strict-transport-security" in secure
+
+
+def test_wrong_passwords_are_refused_and_limited(console):
+    browser = console.browser()
+    for _ in range(5):
+        assert browser.login("anna", "wrong password").status_code == 401
+    limited = browser.login("anna")
+    assert limited.status_code == 429
+    assert int(limited.headers["retry-after"]) > 200
+    assert browser.login("nobody").status_code == 401
+    assert browser.login("bo").status_code == 200
+
+
+def test_attempts_are_counted_by_user_and_by_address():
+    attempts = Attempts(most_of_user=2, most_from=3, within_s=10)
+    attempts.failed("a", "x", 0)
+    attempts.failed("a", "y", 1)
+    assert attempts.wait_s("a", "z", 2) == 8
+    assert attempts.wait_s("b", "x", 2) == 0
+    attempts.failed("b", "x", 2)
+    attempts.failed("c", "x", 2)
+    assert attempts.wait_s("d", "x", 2) == 8
+    attempts.succeeded("a")
+    assert attempts.wait_s("a", "z", 2) == 0
+    assert attempts.wait_s("d", "x", 13) == 0
+
+
+def test_a_session_ends(console, tmp_path):
+    browser = console.browser("anna")
+    cookie = browser.client.cookies["sonarpost_session"]
+    assert browser.post("/api/logout", {}).status_code == 204
+    browser.client.cookies.set("sonarpost_session", cookie)
+    assert browser.get("/api/contacts").status_code == 401
+    now = [1000.0]
+    users = Users(tmp_path / "users.db", session_s=100, session_most_s=250, clock=lambda: now[0])
+    users.add("anna", "operator", PASSWORD)
+    token = users.begin("anna").token
+    for now[0], use, there in ((1090, True, True), (1185, True, True), (1240, True, True), (1251, True, False)):
+        assert (users.session(token, use=use) is not None) == there
+    token, now[0] = users.begin("anna").token, 2000.0
+    assert users.session(token) is None
+    token = users.begin("anna").token
+    for now[0], there in ((2060, True), (2099, True), (2101, False)):
+        # A page that is merely open does not keep its session alive.
+        assert (users.session(token, use=False) is not None) == there
+    users.close()
+
+
+def test_a_new_password_ends_the_other_sessions(console):
+    here, there = console.browser("anna"), console.browser("anna")
+    wrong = here.post("/api/password", {"old": "not it at all", "new": "another fine one"})
+    assert (wrong.status_code, wrong.json()["error"]["field"]) == (403, "old")
+    assert here.post("/api/password", {"old": PASSWORD, "new": "short"}).status_code == 400
+    assert here.post("/api/password", {"old": PASSWORD, "new": "another fine one"}).status_code == 204
+    assert here.get("/api/session").status_code == 200
+    assert there.get("/api/session").status_code == 401
+    assert console.browser().login("anna").status_code == 401
+
+
+def test_passwords_are_not_in_the_file(tmp_path):
+    users = Users(tmp_path / "users.db")
+    users.add("anna", "operator", PASSWORD)
+    session = users.begin("anna")
+    users.close()
+    kept = b"".join(path.read_bytes() for path in tmp_path.iterdir())
+    assert b"anna" in kept
+    assert PASSWORD.encode() not in kept
+    assert session.token.encode() not in kept
+    assert (tmp_path / "users.db").stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "role", "password", "field"),
+    [("../x", "observer", PASSWORD, "name"), ("x", "admin", PASSWORD, "role"), ("x", "observer", "short", "password")],
+)
+def test_a_wrong_user_is_named(tmp_path, name, role, password, field):
+    users = Users(tmp_path / "users.db")
+    with pytest.raises(BadInputError) as caught:
+        users.add(name, role, password)
+    users.close()
+    assert caught.value.field == field
+    assert PASSWORD not in str(caught.value)
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:8470", "", "127.0.0.1.evil.example", "[::2]"])
+def test_another_host_name_is_refused(console, host):
+    answer = console.browser().client.get("/login", headers={"Host": host})
+    assert (answer.status_code, answer.json()["error"]["code"]) == (400, "bad_host")
+
+
+def test_a_configured_host_name_is_ours(make_console):
+    console = make_console(names=("bridge.example",))
+    browser = Browser(TestClient(console.app.asgi, base_url="http://bridge.example:8470"))
+    assert browser.login("anna").status_code == 200
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:9999", "null"])
+def test_another_sites_page_is_refused(with_contact, origin):
+    anna = with_contact.browser("anna")
+    answer = anna.post(f"{ONE}/decisions", {}, Origin=origin)
+    assert (answer.status_code, answer.json()["error"]["code"]) == (403, "bad_origin")
+    assert anna.post(f"{ONE}/decisions", {}, Origin="http://127.0.0.1:8470").status_code == 400
+
+
+def test_every_answer_has_the_policy(console):
+    for path in ("/", "/login", "/api/contacts", "/nothing", "/static/nothing.js"):
+        headers = console.browser().get(path).headers
+        assert "default-src 'none'; script-src 'self'" in headers["content-security-policy"]
+        assert "unsafe-inline" not in headers["content-security-policy"]
+        assert headers["x-content-type-options"] == "nosniff"
+        assert headers["x-frame-options"] == "DENY"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/static/../service.py",
+        "/static/%2e%2e/service.py",
+        "/static/..%2fservice.py",
+        "/static//etc/passwd",
+        "/static/%2fetc%2fpasswd",
+        f"{ONE}/versions/..%2f..%2f1/picture.png",
+        "/api/contacts/..%2f..%2fetc%2fpasswd/versions/1/picture.png",
+        "/api/contacts/%2e%2e/versions/1/picture.png",
+        f"{ONE}/versions/99999999999999999999/picture.png",
+        f"{ONE}/versions/-1/picture.png",
+        "/tiles/../1/1.png",
+        "/tiles/1/1/..%2f..%2fx.png",
+        "/api/export/..%2fx",
+        "/report/..%2f..%2fetc%2fpasswd",
+    ],
+)
+def test_no_path_leads_out(with_contact, path):
+    answer = with_contact.browser("anna").get(path)
+    assert answer.status_code == 404
+    assert answer.json()["error"]["code"] == "not_found"
+
+
+def test_a_tile_comes_from_its_folder_only(make_console, tmp_path):
+    tile = tmp_path / "tiles" / "3" / "4" / "5.png"
+    tile.parent.mkdir(parents=True)
+    tile.write_bytes(b"a tile")
+    console = make_console(tiles_dir=tmp_path / "tiles")
+    watch = console.browser("watch")
+    assert watch.get("/tiles/3/4/5.png").content == b"a tile"
+    assert watch.get("/tiles/3/4/6.png").status_code == 404
+    assert watch.get("/api/info").json()["tiles"]["max_zoom"] == 3
+
+
+def test_a_body_that_is_too_large_is_refused(with_contact):
+    anna = with_contact.browser("anna")
+    answer = anna.post(f"{ONE}/decisions", {"remark": "x" * 70_000})
+    assert (answer.status_code, answer.json()["error"]["code"]) == (413, "too_large")
+    assert with_contact.browser().login("x" * 70_000).status_code == 413
+
+
+@pytest.mark.parametrize("body", [b"", b"[]", b"{", b'"x"', b"\xff", b'{"revision": 1e999}', b"[" * 5000])
+def test_a_body_that_is_no_request_is_refused(with_contact, body):
+    anna = with_contact.browser("anna")
+    answer = anna.client.post(f"{ONE}/decisions", content=body, headers={"X-CSRF-Token": anna.csrf})
+    assert (answer.status_code, answer.json()["error"]["code"]) == (400, "bad_request")
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"verdict": "maybe"}, "verdict"),
+        ({"confidence": 1.5}, "confidence"),
+        ({"confidence": "0.5"}, "confidence"),
+        ({"remark": "x" * 2001}, "remark"),
+        ({"mlo_class": ""}, "mlo_class"),
+        ({"revision": True}, "revision"),
+        ({"operator": "somebody else"}, "operator"),
+    ],
+)
+def test_a_wrong_field_is_named(with_contact, changes, field):
+    answer = with_contact.decide(with_contact.browser("anna"), ID, **changes)
+    assert (answer.status_code, answer.json()["error"]["field"]) == (400, field)
+    assert with_contact.board.unsent() == []
+
+
+def test_a_hostile_remark_is_kept_as_it_is_and_never_becomes_markup(with_contact):
+    anna = with_contact.browser("anna")
+    assert with_contact.decide(anna, ID, remark=HOSTILE, mlo_class=HOSTILE[:60]).status_code == 201
+    whole = anna.get(ONE)
+    assert whole.headers["content-type"] == "application/json"
+    assert json.loads(whole.text)["decisions"][0]["remark"] == HOSTILE
+    report = anna.get(f"/report/{ID}").text
+    assert "&lt;script&gt;alert(1)" in report
+    assert "<script" not in report
+    assert "<img src=x" not in report
+    for name in ("contacts.kmz", "contacts.csv", "contacts.geojson", "contacts.cot.xml"):
+        assert anna.get(f"/api/export/{name}").status_code == 200
+
+
+def test_a_page_for_others_needs_tls():
+    with pytest.raises(ValueError, match="passwords go over this connection"):
+        ConsoleConfig(host="0.0.0.0")
+    assert ConsoleConfig(host="0.0.0.0", tls=True).tls
+    assert ConsoleConfig(host="0.0.0.0", insecure=True).insecure
