@@ -14,7 +14,7 @@ Two processes: the far side, with the router, and this one. For records of two s
   ("sink"), so that what is measured is the hand-off and not the writing of TIFF files. This process does nothing
   else meanwhile;
 - disk: how often a second a 4 kB write to the same folder reaches the disk, and how many bytes a second do, 2 MB at a
-  time. From both follows the bound: every record is committed three times (outbox, c2's inbox, forgotten), at most 256
+  time. From both follows the bound: every record is committed three times (outbox, c2's inbox, forgotten), at most 512
   with one write, and its bytes are written four times (the log and the table of either side).
 
 One JSON object a line. The exit status is 0 where the relay, logging, reaches half of the pipelined rate or of the
@@ -62,7 +62,7 @@ class Sink(Service[ServiceConfig]):
     """A c2 that commits records and does nothing else with them."""
 
     NAME = "c2"
-    BATCH = 64
+    BATCH = 512
 
     def consumes(self) -> Mapping[str, type[Record]]:
         """What vessels relay."""
@@ -169,22 +169,25 @@ def measure_bare(endpoint: str, payloads: Sequence[bytes], window: int) -> float
         return len(payloads) / (time.perf_counter() - started)
 
 
-def measure_relay(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes], level: str) -> float:
-    """Return records a second from the relay's inbox to c2's store, acknowledged and forgotten."""
+def measure_relay(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes], level: str) -> tuple[float, float]:
+    """Return records a second from the relay's inbox to c2's store, acknowledged and forgotten, and CPU time of each.
+
+    The CPU time, in microseconds, is this process's: the relay's.
+    """
     relay = RelayService(platform(VESSEL, endpoint, folder), RelayConfig())
     with relay.store.transaction() as tx:
         for payload in payloads:
             tx.accept(key, payload)
     with logged_to(folder / "relay.log", level):
-        started = time.perf_counter()
+        started, used = time.perf_counter(), time.process_time()
         relay.start()
         try:
             while relay.delivered_to("c2") < len(payloads) or relay.store.outbox_depth():
                 time.sleep(0.005)
-            seconds = time.perf_counter() - started
+            seconds, used_s = time.perf_counter() - started, time.process_time() - used
         finally:
             relay.stop()
-    return len(payloads) / seconds
+    return len(payloads) / seconds, 1e6 * used_s / len(payloads)
 
 
 @contextmanager
@@ -236,8 +239,8 @@ def measure(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes]) ->
     window = max(1, min(WINDOW, WINDOW_BYTES // size))
     sequential = measure_bare(endpoint, payloads[:SEQUENTIAL], 1)
     before = measure_bare(endpoint, payloads, window)
-    relayed = measure_relay(endpoint, folder, key, payloads, "info")
-    unlogged = measure_relay(endpoint, folder, key, payloads, "warning")
+    relayed, cpu_us = measure_relay(endpoint, folder, key, payloads, "info")
+    unlogged, unlogged_cpu_us = measure_relay(endpoint, folder, key, payloads, "warning")
     pipelined = (before + measure_bare(endpoint, payloads, window)) / 2
     fsyncs, bulk = measure_disk(folder, 4096), measure_disk(folder, BULK_BYTES) * BULK_BYTES
     bound = 1 / (COMMITS / (RelayService.BATCH * fsyncs) + WRITES * size / bulk)
@@ -251,6 +254,8 @@ def measure(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes]) ->
         "of_sequential": round(relayed / sequential, 2),
         "of_pipelined": round(relayed / pipelined, 3),
         "unlogged_of_pipelined": round(unlogged / pipelined, 3),
+        "relay_cpu_us": round(cpu_us),
+        "unlogged_cpu_us": round(unlogged_cpu_us),
         "relay_mb_per_s": round(relayed * size / 1e6, 2),
         "fsync_per_s": round(fsyncs),
         "disk_mb_per_s": round(bulk / 1e6),

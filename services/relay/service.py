@@ -41,7 +41,7 @@ class RelayService(Service[RelayConfig]):
     """
 
     NAME = "relay"
-    BATCH = 256
+    BATCH = 512
 
     def __init__(self, platform: PlatformConfig, config: RelayConfig) -> None:
         super().__init__(platform, config)

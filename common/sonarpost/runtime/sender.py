@@ -37,7 +37,7 @@ PRIORITIES = {
 IDLE_S = 1.0
 # Replies come in batches, one write to the consumer's disk apart: looked for soon at first, then less often.
 POLL_S = (0.0005, 0.02)
-FORGET_AT = 256
+FORGET_AT = 512
 LOADED_BYTES = 2 * MAX_WINDOW_BYTES
 """Most bytes of records that are held ready beyond the first 128."""
 FORGET_AFTER_S = 0.2

@@ -20,56 +20,14 @@ from pathlib import Path
 from typing import IO
 
 from sonarpost.errors import HandoffError
-from sonarpost.runtime import rows
+from sonarpost.runtime import rows, store_schema
+from sonarpost.runtime.store_schema import SCHEMA_VERSION
 from sonarpost.runtime.transaction import QUEUE_MARK, InboxItem, OutboxItem, Transaction
 
 log = logging.getLogger(__name__)
 
-SCHEMA_VERSION = 2
 CACHE_KB = 8000
 """Most memory for pages: what is on its way need not be read from the disk to be deleted."""
-
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS outbox (
-    consumer TEXT NOT NULL, seq INTEGER NOT NULL, key TEXT NOT NULL, encoding TEXT NOT NULL, priority INTEGER NOT NULL,
-    payload BLOB NOT NULL, sha256 BLOB NOT NULL, created_utc_s REAL NOT NULL,
-    topic TEXT NOT NULL DEFAULT '', edition INTEGER NOT NULL DEFAULT 0, place INTEGER NOT NULL DEFAULT 0,
-    PRIMARY KEY (consumer, seq));
-CREATE TABLE IF NOT EXISTS outbox_next (consumer TEXT PRIMARY KEY, seq INTEGER NOT NULL) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS inbox (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT NOT NULL, payload BLOB NOT NULL, origin BLOB, seq INTEGER,
-    received_utc_s REAL NOT NULL);
-CREATE TABLE IF NOT EXISTS seen (origin BLOB NOT NULL, seq INTEGER NOT NULL, PRIMARY KEY (origin, seq)) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS seen_upto (origin BLOB PRIMARY KEY, seq INTEGER NOT NULL) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS refused_before (
-    origin BLOB NOT NULL, seq INTEGER NOT NULL, PRIMARY KEY (origin, seq)) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS partial (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, origin BLOB NOT NULL, seq INTEGER NOT NULL, size INTEGER NOT NULL,
-    sha256 BLOB NOT NULL, has INTEGER NOT NULL, touched_ns INTEGER NOT NULL, UNIQUE (origin, seq));
-CREATE TABLE IF NOT EXISTS partial_piece (
-    partial INTEGER NOT NULL REFERENCES partial (id) ON DELETE CASCADE, start INTEGER NOT NULL, data BLOB NOT NULL,
-    PRIMARY KEY (partial, start));
-CREATE TABLE IF NOT EXISTS refused (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, direction TEXT NOT NULL, key TEXT NOT NULL, payload BLOB NOT NULL,
-    reason TEXT NOT NULL, at_utc_s REAL NOT NULL);
-CREATE TABLE IF NOT EXISTS state (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
-"""
-
-
-# Version 1 had no editions: what it owed keeps its order.
-_FROM_VERSION_1 = """
-ALTER TABLE outbox ADD COLUMN topic TEXT NOT NULL DEFAULT '';
-ALTER TABLE outbox ADD COLUMN edition INTEGER NOT NULL DEFAULT 0;
-ALTER TABLE outbox ADD COLUMN place INTEGER NOT NULL DEFAULT 0;
-UPDATE outbox SET place = seq;
-DROP INDEX IF EXISTS outbox_order;
-UPDATE meta SET value = CAST('2' AS BLOB) WHERE name = 'version';
-"""
-_INDEXES = """
-CREATE INDEX IF NOT EXISTS outbox_place ON outbox (consumer, priority, place, seq);
-CREATE INDEX IF NOT EXISTS outbox_topic ON outbox (consumer, topic, edition) WHERE topic <> '';
-"""
 _ITEM = "consumer, seq, key, encoding, priority, payload, sha256, place, created_utc_s"
 
 
@@ -96,6 +54,7 @@ class Store:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._lock = threading.RLock()
+        self._reader_lock = threading.Lock()
         self._outbox_listeners: list[threading.Event] = []
         self._begun: set[tuple[str, int]] = set()
         self.inbox_changed = threading.Event()
@@ -119,18 +78,21 @@ class Store:
             # Some builds of SQLite overwrite what is deleted: every record would be written to the disk once more.
             self._db.execute("PRAGMA secure_delete=OFF")
             self._db.execute(f"PRAGMA cache_size={-CACHE_KB}")
-            self._db.executescript(_SCHEMA)
+            self._db.executescript(store_schema.TABLES)
             with self.transaction():
                 self.origin = self._meta("origin", uuid.uuid4().bytes)
                 version = self._meta("version", str(SCHEMA_VERSION).encode())
             if version == b"1":
-                self._db.executescript(f"BEGIN IMMEDIATE; {_FROM_VERSION_1} COMMIT;")
+                self._db.executescript(f"BEGIN IMMEDIATE; {store_schema.FROM_VERSION_1} COMMIT;")
                 version = str(SCHEMA_VERSION).encode()
             if version == str(SCHEMA_VERSION).encode():
-                self._db.executescript(_INDEXES)
+                self._db.executescript(store_schema.INDEXES)
+            self._reader = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
+            self._reader.execute("PRAGMA query_only=ON")
         except sqlite3.Error as error:
             raise HandoffError(f"{self.path}: cannot be opened as a sonarpost store: {error}") from error
         if version != str(SCHEMA_VERSION).encode():
+            self._reader.close()
             self._db.close()
             raise HandoffError(f"{self.path}: store version {version!r}, expected {SCHEMA_VERSION}")
 
@@ -187,9 +149,17 @@ class Store:
             except sqlite3.Error as error:
                 raise HandoffError(f"{self.path}: {error}") from error
 
+    def _read(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[object, ...]]:
+        """Query what is committed, without waiting for a transaction that waits for the disk."""
+        with self._reader_lock:
+            try:
+                return self._reader.execute(sql, args).fetchall()
+            except sqlite3.Error as error:
+                raise HandoffError(f"{self.path}: {error}") from error
+
     def consumers(self) -> tuple[str, ...]:
         """Return the consumers to whom something is owed."""
-        return tuple(str(row[0]) for row in self._query("SELECT DISTINCT consumer FROM outbox"))
+        return tuple(str(row[0]) for row in self._read("SELECT DISTINCT consumer FROM outbox"))
 
     def owed(self, consumer: str, limit: int) -> tuple[OutboxItem, ...]:
         """Return what is owed to `consumer`, most urgent first, then oldest first."""
@@ -197,7 +167,7 @@ class Store:
 
     def owed_numbers(self, queue: str, limit: int) -> tuple[int, ...]:
         """Return the numbers of what is owed, most urgent first, then oldest first."""
-        found = self._query(
+        found = self._read(
             "SELECT seq FROM outbox WHERE consumer = ? ORDER BY priority, place, seq LIMIT ?", (queue, limit)
         )
         return tuple(_int(row[0]) for row in found)
@@ -207,7 +177,7 @@ class Store:
         sql = f"SELECT {_ITEM} FROM outbox WHERE consumer = ? AND seq BETWEEN ? AND ?"  # noqa: S608 constants
         found = {}
         for first, last in rows.runs(numbers):
-            for c, s, k, e, p, d, h, at, t in self._query(sql, (queue, first, last)):
+            for c, s, k, e, p, d, h, at, t in self._read(sql, (queue, first, last)):
                 seq = _int(s)
                 found[seq] = OutboxItem(
                     str(c), seq, str(k), str(e), _int(p), _bytes(d), _bytes(h), _int(at), float(str(t))
@@ -228,15 +198,16 @@ class Store:
 
     def end(self, queue: str, *numbers: int) -> None:
         """Take back what `begin` said."""
-        with self._lock:
-            self._begun.difference_update([(queue, seq) for seq in numbers])
+        # Without the lock, whose holder may wait for the disk: what a transaction still finds begun it leaves alone.
+        for seq in numbers:
+            self._begun.discard((queue, seq))
 
     def settled_upto(self, queue: str) -> int:
         """Return the highest number with which, and with all below it, the queue is done."""
-        first = self._query("SELECT MIN(seq) FROM outbox WHERE consumer = ?", (queue,))[0][0]
+        first = self._read("SELECT MIN(seq) FROM outbox WHERE consumer = ?", (queue,))[0][0]
         if first is not None:
             return int(str(first)) - 1
-        found = self._query("SELECT seq FROM outbox_next WHERE consumer = ?", (queue,))
+        found = self._read("SELECT seq FROM outbox_next WHERE consumer = ?", (queue,))
         return _int(found[0][0]) if found else 0
 
     def origin_of(self, queue: str) -> bytes:
@@ -251,7 +222,7 @@ class Store:
 
     def queue_depth(self, queue: str) -> QueueDepth:
         """Return what waits in one queue."""
-        records, size, oldest = self._query(
+        records, size, oldest = self._read(
             "SELECT COUNT(*), COALESCE(SUM(LENGTH(payload)), 0), MIN(created_utc_s) FROM outbox WHERE consumer = ?",
             (queue,),
         )[0]
@@ -259,19 +230,19 @@ class Store:
 
     def outbox_depth(self) -> int:
         """Return how many records are owed to all consumers."""
-        return int(str(self._query("SELECT COUNT(*) FROM outbox")[0][0]))
+        return int(str(self._read("SELECT COUNT(*) FROM outbox")[0][0]))
 
     def inbox_depth(self) -> int:
         """Return how many accepted records are not handled yet."""
-        return int(str(self._query("SELECT COUNT(*) FROM inbox")[0][0]))
+        return int(str(self._read("SELECT COUNT(*) FROM inbox")[0][0]))
 
     def refused_count(self) -> int:
         """Return how many records lie in the refused table."""
-        return int(str(self._query("SELECT COUNT(*) FROM refused")[0][0]))
+        return int(str(self._read("SELECT COUNT(*) FROM refused")[0][0]))
 
     def reusable_bytes(self) -> int:
         """Return how much lies free inside the file: it never becomes smaller."""
-        pages, size = self._query("PRAGMA freelist_count")[0][0], self._query("PRAGMA page_size")[0][0]
+        pages, size = self._read("PRAGMA freelist_count")[0][0], self._read("PRAGMA page_size")[0][0]
         return int(str(pages)) * int(str(size))
 
     def pending(self, limit: int = 1, after_id: int = 0, max_bytes: int | None = None) -> tuple[InboxItem, ...]:
@@ -284,11 +255,11 @@ class Store:
         """
         if max_bytes is not None:
             limit = self._how_many_within(limit, after_id, max_bytes)
-        found = self._query("SELECT id, key, payload FROM inbox WHERE id > ? ORDER BY id LIMIT ?", (after_id, limit))
+        found = self._read("SELECT id, key, payload FROM inbox WHERE id > ? ORDER BY id LIMIT ?", (after_id, limit))
         return tuple(InboxItem(_int(i), str(k), _bytes(p)) for i, k, p in found)
 
     def _how_many_within(self, limit: int, after_id: int, max_bytes: int) -> int:
-        sizes = self._query("SELECT LENGTH(payload) FROM inbox WHERE id > ? ORDER BY id LIMIT ?", (after_id, limit))
+        sizes = self._read("SELECT LENGTH(payload) FROM inbox WHERE id > ? ORDER BY id LIMIT ?", (after_id, limit))
         total = 0
         for count, (size,) in enumerate(sizes):
             total += _int(size)
@@ -308,7 +279,8 @@ class Store:
 
     def close(self) -> None:
         """Close the file."""
-        with self._lock:
+        with self._lock, self._reader_lock:
+            self._reader.close()
             self._db.close()
             self._lock_file.close()
 
