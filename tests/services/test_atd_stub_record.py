@@ -1,0 +1,341 @@
+"""What atd_stub says of a contact: position with its error, heights only where measured, pictures, the text beside."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import eventually
+from golden.zenoh.samples import BARE_CONTACT, FULL_CONTACT
+
+from services.atd_stub.config import AtdStubConfig
+from services.atd_stub.folder import FileSeen, SettledFiles, look_at
+from services.atd_stub.ground_picture import ground_picture
+from services.atd_stub.record import of_detection
+from services.atd_stub.seam import Origin
+from services.atd_stub.service import AtdStubService
+from services.atd_stub.text_file import contact_text, read_contact, write_snippet
+from sonarpost import keys
+from sonarpost.detect.contacts import FilterScores, detect
+from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.messages import Contact, Raster, Snippet
+from sonarpost.runtime.config import load
+from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.geometry import Position, offset_between_m
+from sonarpost.sonar.image_files import read_image, write_tiff
+from sonarpost.sonar.options import ErrorBudget, Mounting
+from sonarpost.sonar.readers import open_survey
+from sonarpost.sonar.source import gather
+from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
+from sonarpost.sonar.xtf_writer import write_xtf
+
+KEY = keys.contact_detected("uuv-1")
+ORIGIN = Origin("ab" * 32, "line-7.xtf", "line-7")
+
+
+@pytest.fixture(scope="module")
+def line(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("line") / "line-7.xtf"
+    write_xtf(simulate_survey(SurveySpec(seed=1, pings=200, samples=512, clutter=0)).survey, path)
+    return path
+
+
+def first_of(path: Path, config: AtdStubConfig, change=lambda ping: ping):
+    with open_survey(path, config.survey_options()) as source:
+        survey = gather(source)
+    survey = replace(survey, pings=tuple(change(ping) for ping in survey.pings))
+    found = detect(survey)[0]
+    return survey, found, of_detection(survey, found, ORIGIN, "uuv-1", config).contact
+
+
+# The record
+
+
+def test_a_contact_has_every_field_of_the_record(line):
+    _, found, contact = first_of(line, AtdStubConfig())
+    if found.shadow_is_cut:
+        pytest.fail("the survey of this test has a whole shadow for its best contact")
+    unknown = {name for name, value in contact.model_dump().items() if value is None}
+    assert unknown == set()
+    assert contact.contact_id == f"line-7-abababab-{found.ping_number}-{found.side.value}-{found.sample}"
+    assert contact.height_m == pytest.approx(
+        found.shadow_m * found.altitude_m / (found.slant_range_m + found.shadow_m), rel=1e-9
+    )
+
+
+def test_the_position_comes_with_its_error_and_the_error_with_the_configuration(line):
+    _, _, usual = first_of(line, AtdStubConfig())
+    assert 5 * 2**0.5 < usual.position_sigma_m < 12
+    _, _, sure = first_of(line, AtdStubConfig(errors=ErrorBudget(position_m=0.5)))
+    assert sure.position_sigma_m < usual.position_sigma_m - 3
+    assert (sure.lat_deg, sure.lon_deg) == (usual.lat_deg, usual.lon_deg)
+
+
+def test_a_layback_moves_the_contact_back_along_the_track(line):
+    _, found, plain = first_of(line, AtdStubConfig())
+    _, _, towed = first_of(line, AtdStubConfig(mounting=Mounting(layback_m=30.0)))
+    north_m, east_m = offset_between_m(Position(plain.lat_deg, plain.lon_deg), Position(towed.lat_deg, towed.lon_deg))
+    bearing_deg = np.degrees(np.arctan2(east_m, north_m)) % 360
+    assert np.hypot(north_m, east_m) == pytest.approx(30.0, abs=0.01)
+    assert (bearing_deg - found.heading_deg) % 360 == pytest.approx(180.0, abs=0.1)
+    assert towed.position_sigma_m > plain.position_sigma_m, "it is not known where a towed sonar is"
+
+
+@pytest.mark.parametrize("lost", ["lat_deg", "heading_deg"])
+def test_without_fix_or_heading_there_is_no_position_and_no_error_of_one(lost, line):
+    def without(ping):
+        return replace(ping, **({"lat_deg": None, "lon_deg": None} if lost == "lat_deg" else {lost: None}))
+
+    _, _, contact = first_of(line, AtdStubConfig(), without)
+    assert (contact.lat_deg, contact.lon_deg, contact.position_sigma_m) == (None, None, None)
+    assert contact.slant_range_m is not None
+
+
+def test_a_shadow_that_the_recording_cuts_gives_no_height(line):
+    survey, found, _ = first_of(line, AtdStubConfig())
+    cut = replace(found, shadow_is_cut=True)
+    contact = of_detection(survey, cut, ORIGIN, "uuv-1", AtdStubConfig()).contact
+    assert contact.height_m is None
+    assert contact.shadow_m == found.shadow_m
+
+
+def test_the_survey_keys_of_the_configuration_are_checked_and_named(tmp_path):
+    path = tmp_path / "uuv.toml"
+    head = '[platform]\nid = "uuv-1"\n[atd_stub]\nport_order = "nearest_first"\nprojected_crs = "EPSG:32619"\n'
+    path.write_text(head + "[atd_stub.mounting]\nlayback_m = 25\n[atd_stub.errors]\nposition_m = 1.5\n")
+    _, config = load(path, "atd_stub", AtdStubConfig, {})
+    options = config.survey_options()
+    assert (options.mounting.layback_m, options.errors.position_m) == (25.0, 1.5)
+    assert (options.port_order, options.projected_crs) == ("nearest_first", "EPSG:32619")
+    _, config = load(path, "atd_stub", AtdStubConfig, {"SONARPOST_ATD_STUB__MOUNTING": "{ forward_m = -2.0 }"})
+    assert config.survey_options().mounting == Mounting(forward_m=-2.0)
+    for line_of, value in (("layback_m", "-1"), ("layback", "5")):
+        path.write_text(head + f"[atd_stub.mounting]\n{line_of} = {value}\n")
+        with pytest.raises(ConfigError, match=rf"uuv\.toml:7: atd_stub\.mounting\.{line_of}: got"):
+            load(path, "atd_stub", AtdStubConfig, {})
+
+
+# Pictures in square pixels on the ground
+
+
+def flat_survey(rows=300, along_m=0.1, altitude_m=4.0, samples=400, range_m=20.0) -> Survey:
+    """Ground with a bright square metre at 12 m ground range, row 150, and nothing else."""
+    slant_m = (np.arange(samples) + 0.5) * range_m / samples
+    ground_m = np.sqrt(np.maximum(slant_m**2 - altitude_m**2, 0.0))
+    echo = np.full((rows, samples), 100, dtype=np.uint16)
+    along = (np.arange(rows) - 150) * along_m
+    echo[np.ix_(np.abs(along) <= 0.5, np.abs(ground_m - 12.0) <= 0.5)] = 10_000
+    pings = tuple(
+        Ping(
+            row,
+            1.0e9 + row * 0.1,
+            (ChannelPing(Side.PORT, echo[row], range_m),),
+            lat_deg=60.0 + row * along_m / 111_412.0,
+            lon_deg=5.0,
+            heading_deg=0.0,
+            altitude_m=altitude_m,
+            speed_mps=along_m / 0.1,
+        )
+        for row in range(rows)
+    )
+    return Survey(Path("flat.xtf"), "flat", "flat", pings)
+
+
+@pytest.fixture(scope="module")
+def detection(line):
+    return first_of(line, AtdStubConfig())[1]
+
+
+def contact_at(survey: Survey, row: int, ground_m: float, found):
+    channel = survey.pings[row].channel(Side.PORT)
+    slant_m = np.hypot(ground_m, survey.pings[row].altitude_m)
+    along_m = survey.pings[0].speed_mps * 0.1
+    return replace(
+        found,
+        side=Side.PORT,
+        ping_index=row,
+        sample=int(slant_m / channel.sample_spacing_m),
+        slant_range_m=float(slant_m),
+        ground_range_m=ground_m,
+        altitude_m=survey.pings[row].altitude_m,
+        pixel_along_m=along_m,
+        pixel_across_m=channel.sample_spacing_m,
+        scores=FilterScores(*([1.0] * len(FilterScores.__dataclass_fields__))),
+    )
+
+
+@pytest.mark.parametrize("along_m", [0.04, 0.1, 0.4])
+@pytest.mark.parametrize("altitude_m", [2.0, 8.0])
+def test_a_square_metre_is_a_square_in_the_middle_whatever_speed_and_altitude(along_m, altitude_m, detection):
+    survey = flat_survey(along_m=along_m, altitude_m=altitude_m)
+    picture = ground_picture(survey, contact_at(survey, 150, 12.0, detection), 80, 60, 0.1)
+    bright = np.argwhere(picture > 128)
+    low, high = bright.min(axis=0), bright.max(axis=0) + 1
+    assert picture.shape == (80, 60)
+    height, width = high - low
+    assert height == pytest.approx(10, abs=1 + along_m / 0.1)
+    assert width == pytest.approx(10, abs=2)
+    np.testing.assert_allclose((low + high) / 2, (40, 30), atol=1 + along_m / 0.1)
+
+
+def test_what_was_not_recorded_is_black(detection):
+    survey = flat_survey()
+    at_the_end = ground_picture(survey, contact_at(survey, 290, 12.0, detection), 80, 60, 0.1)
+    assert (at_the_end[52:] == 0).all()
+    at_the_nadir = ground_picture(survey, contact_at(survey, 150, 1.0, detection), 80, 60, 0.1)
+    assert (at_the_nadir[:, :19] == 0).all()
+    assert at_the_nadir[:, 22:].any()
+    far = ground_picture(survey, contact_at(survey, 150, 19.5, detection), 80, 60, 0.1)
+    assert (far[:, -20:] == 0).all()
+
+
+def test_without_altitude_or_travel_or_with_tiny_pixels_there_is_none(detection):
+    survey = flat_survey()
+    found = contact_at(survey, 150, 12.0, detection)
+    assert ground_picture(survey, replace(found, altitude_m=None), 80, 60, 0.1) is None
+    assert ground_picture(survey, replace(found, pixel_along_m=None), 80, 60, 0.1) is None
+    assert ground_picture(survey, found, 80, 60, 1e-5) is None
+
+
+def test_the_record_says_the_size_of_the_pixels_it_has(line):
+    survey, found, native = first_of(line, AtdStubConfig())
+    config = AtdStubConfig(snippet_pixel_m=0.05, snippet_height_px=64, snippet_width_px=96)
+    sent = of_detection(survey, found, ORIGIN, "uuv-1", config)
+    assert (sent.contact.pixel_along_m, sent.contact.pixel_across_m) == (0.05, 0.05)
+    assert (sent.picture.height_px, sent.picture.width_px) == (64, 96)
+    assert (native.pixel_along_m, native.pixel_across_m) == (found.pixel_along_m, found.pixel_across_m)
+
+
+# The text file
+
+
+@pytest.mark.parametrize("contact", [FULL_CONTACT, BARE_CONTACT])
+def test_a_text_file_is_read_as_it_was_written(contact, tmp_path):
+    path = tmp_path / "c.txt"
+    path.write_text(contact_text(contact))
+    assert read_contact(path, "other", contact.vehicle_id) == contact
+
+
+def test_a_text_file_is_for_people():
+    text = contact_text(FULL_CONTACT)
+    assert "time_utc: 2016-10-12T09:00:00.250Z\n" in text
+    assert "lat_deg: 41.5251\n" in text
+    assert "None" not in contact_text(BARE_CONTACT)
+
+
+def test_a_text_file_by_hand_may_say_little(tmp_path):
+    path = tmp_path / "c.txt"
+    path.write_text(
+        "\ufeff lat_deg :41.5\nlon_deg: -70\n\nseen_by: diver\nvehicle_id: uuv-9\ntime_utc: 2016-10-12T09:20\n"
+    )
+    contact = read_contact(path, "c1", "uuv-1")
+    assert contact == Contact(contact_id="c1", vehicle_id="uuv-1", lat_deg=41.5, lon_deg=-70.0, time_utc_s=1476264000.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("lat_deg: 91\n", "lat_deg: got 91, expected"),
+        ("lat_deg: north\n", "lat_deg: got 'north', expected a number"),
+        ("lat_deg: nan\n", "lat_deg"),
+        ("ping_number: 1.5\n", "ping_number"),
+        ("channel: middle\n", "channel: got 'middle'"),
+        ("time_utc: yesterday\n", "time_utc: got 'yesterday', expected a time as"),
+        ("what is this\n", "line 1: got 'what is this', expected name: value"),
+        ("x" * 70_000, "size: got 70000"),
+        (b"\xff\xfe\x00", "UTF-8"),
+    ],
+)
+def test_a_text_file_that_is_none_is_refused_by_name(text, said, tmp_path):
+    path = tmp_path / "c.txt"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(SurveyFileError, match=r"c\.txt: ") as caught:
+        read_contact(path, "c1", "uuv-1")
+    assert said in str(caught.value)
+
+
+def test_a_snippet_on_the_disk_is_named_by_its_contact_and_stays_in_its_folder(tmp_path):
+    picture = np.arange(400, dtype=np.uint8).reshape(20, 20)
+    contact = Contact(contact_id="../a b/ü", vehicle_id="uuv-1", lat_deg=1.0)
+    tiff = write_snippet(tmp_path / "new" / "out", Snippet(contact=contact, picture=Raster.from_array(picture)))
+    assert tiff.parent == tmp_path / "new" / "out"
+    np.testing.assert_array_equal(read_image(tiff), picture)
+    assert read_contact(tiff.with_suffix(".txt"), "x", "uuv-1") == contact
+
+
+# In the service
+
+
+@pytest.fixture
+def begin(crew, platform, tmp_path):
+    (tmp_path / "incoming").mkdir(exist_ok=True)
+
+    def start(**changes):
+        given = {"input_dir": tmp_path / "incoming", "poll_s": 0.02, "settle_s": 0.0, **changes}
+        return crew.start(AtdStubService(platform("uuv-1"), AtdStubConfig(**given)))
+
+    return start
+
+
+def test_what_is_kept_on_the_vehicle_can_be_sent_again_with_its_position(begin, crew, tmp_path, line):
+    compressor = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
+    service = begin(snippet_dir=tmp_path / "kept", max_contacts=2)
+    os.link(line, tmp_path / "incoming" / "line-7.xtf")
+    eventually(lambda: len(compressor.got) == 2)
+    crew.stop(service)
+    first = {s.contact.contact_id: s for s in compressor.got}
+    assert sorted(p.name for p in (tmp_path / "kept").iterdir()) == sorted(
+        f"{name}.{suffix}" for name in first for suffix in ("tiff", "txt")
+    )
+    begin(mode="snippets", input_dir=tmp_path / "kept")
+    eventually(lambda: len(compressor.got) == 4)
+    for again in compressor.got[2:]:
+        before = first[again.contact.contact_id]
+        assert again.picture == before.picture
+        assert again.contact.model_copy(update={"time_utc_s": 0.0}) == before.contact.model_copy(
+            update={"time_utc_s": 0.0}
+        )
+        assert again.contact.time_utc_s == pytest.approx(before.contact.time_utc_s, abs=0.001)
+
+
+def test_a_picture_with_a_bad_text_goes_to_quarantine(begin, tmp_path, texture):
+    folder = tmp_path / "incoming"
+    (folder / "p.txt").write_text("lat_deg: 123\n")
+    write_tiff(folder / "p.tiff", texture())
+    begin(mode="snippets")
+    reason = folder / "quarantine" / "p.tiff.reason.txt"
+    eventually(lambda: reason.is_file() and not (folder / "p.tiff").exists())
+    assert "lat_deg" in reason.read_text()
+
+
+def test_a_done_file_counts_at_once_and_where_it_is_needed_nothing_else_does(tmp_path):
+    (tmp_path / "a.xtf").write_bytes(b"x")
+    (tmp_path / "b.xtf").write_bytes(b"x")
+    (tmp_path / "a.xtf.done").write_bytes(b"")
+    here = look_at(tmp_path, (".xtf",))
+    assert {seen.path.name: seen.is_done for seen in here} == {"a.xtf": True, "b.xtf": False}
+    names = lambda found: [seen.path.name for seen in found]  # noqa: E731
+    assert names(SettledFiles(5.0).look(here, 0.0)) == ["a.xtf"]
+    patient = SettledFiles(5.0, needs_done=True)
+    assert names(patient.look(here, 0.0)) == ["a.xtf"]
+    assert names(patient.look(here, 100.0)) == ["a.xtf"]
+    done = tuple(replace(seen, is_done=True) for seen in here)
+    assert names(patient.look(done, 101.0)) == ["a.xtf", "b.xtf"]
+    assert FileSeen(Path("a"), 1, 2, is_done=True) == FileSeen(Path("a"), 1, 2), "what is dealt with stays so"
+
+
+def test_the_same_file_under_another_name_is_said(begin, crew, tmp_path, line, caplog):
+    caplog.set_level("INFO")
+    crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
+    service = begin()
+    os.link(line, tmp_path / "incoming" / "line-7.xtf")
+    eventually(lambda: service.health().counters.get("files_processed") == 1)
+    (tmp_path / "incoming" / ".again.xtf").write_bytes(line.read_bytes())
+    (tmp_path / "incoming" / ".again.xtf").rename(tmp_path / "incoming" / "again.xtf")
+    eventually(lambda: any(r.message == "File known already" for r in caplog.records))
+    (said,) = [r.fields for r in caplog.records if r.message == "File known already"]
+    assert (said["file"], said["processed_as"]) == ("again.xtf", "line-7.xtf")
+    assert service.health().counters["files_processed"] == 1
