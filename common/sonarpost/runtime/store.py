@@ -204,11 +204,13 @@ class Store:
 
     def settled_upto(self, queue: str) -> int:
         """Return the highest number with which, and with all below it, the queue is done."""
-        first = self._read("SELECT MIN(seq) FROM outbox WHERE consumer = ?", (queue,))[0][0]
-        if first is not None:
-            return int(str(first)) - 1
-        found = self._read("SELECT seq FROM outbox_next WHERE consumer = ?", (queue,))
-        return _int(found[0][0]) if found else 0
+        # One statement: a record that is queued between two would be told to its consumer as done with.
+        found = self._read(
+            "SELECT COALESCE((SELECT MIN(seq) - 1 FROM outbox WHERE consumer = ?1),"
+            " (SELECT seq FROM outbox_next WHERE consumer = ?1), 0)",
+            (queue,),
+        )
+        return _int(found[0][0])
 
     def origin_of(self, queue: str) -> bytes:
         """Return the 16 bytes by which a queue's consumer knows it.
