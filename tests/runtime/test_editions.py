@@ -149,6 +149,22 @@ def test_what_a_producer_is_done_with_needs_no_memory(tmp_path: Path, store: Sto
     assert store.settled_upto("c2") == 7
 
 
+@pytest.mark.parametrize("statement", [1, 2])
+def test_a_record_that_is_queued_meanwhile_is_not_told_to_be_done_with(store: Store, statement: int) -> None:
+    statements = 0
+
+    def queue_meanwhile(_: str) -> None:
+        nonlocal statements
+        statements += 1
+        if statements == statement:
+            send(store, "a", 1)
+
+    store._reader.set_trace_callback(queue_meanwhile)
+    settled = store.settled_upto("c2")
+    store._reader.set_trace_callback(None)
+    assert all(settled < item.seq for item in store.owed("c2", 9))
+
+
 def test_a_producer_cannot_settle_what_it_asks_for() -> None:
     item = OutboxItem("c2", 5, "k", "", 4, b"data", hashlib.sha256(b"data").digest())
     assert parse_chunk(attachment(b"o" * 16, item, settled=4), b"data", "k").settled == 4
