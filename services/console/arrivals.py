@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 
 from services.console import asking, contacts, decisions
@@ -69,6 +69,24 @@ class Arrivals:
             return False
         self._tell_contact(taken[0], new=taken[1])
         return True
+
+    def take_images(self, images: Sequence[ReconstructedImage]) -> int:
+        """Keep many versions with one write to the disk; return how many were new. Pages load anew.
+
+        Raises:
+            HandoffError: They cannot be kept now; none is.
+        """
+        now, new = self.clock(), 0
+        with self.database.writing() as db:
+            for image in images:
+                rate = self.fleet.rate_of(image.vehicle_id, self.config.assumed_rate)
+                taken = contacts.take_image(db, image, rate, now, self.config.group_radius_m)
+                if taken is not None and taken[1]:
+                    decisions.adopt(db, taken[0], now)
+                new += taken is not None
+        if new:
+            self.hub.publish("reset", {})
+        return new
 
     def take_decision(self, record: Decision) -> bool:
         """Keep a decision made elsewhere; tell whether it was new."""

@@ -7,6 +7,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import AsyncIterator
+from contextlib import suppress
 
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
@@ -16,7 +17,7 @@ from services.console.board import Board
 from services.console.events import Event
 from services.console.web import Gate, RefusedError, answer
 
-KEEP_ALIVE_S = 10.0
+KEEP_ALIVE_S = 5.0
 MOST_OF_A_SESSION = 4
 
 
@@ -44,7 +45,8 @@ class Stream:
             if self._open[session.csrf] >= MOST_OF_A_SESSION:
                 headers = {"Retry-After": "5"}
                 return answer(RefusedError(429, "too_many", "too many pages of one session are open", headers=headers))
-            events = self._events(request, gate, session.csrf, request.headers.get("last-event-id", ""))
+            last_id = request.headers.get("last-event-id") or request.query_params.get("last", "")
+            events = self._events(request, gate, session.csrf, last_id)
             headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
             return StreamingResponse(events, media_type="text/event-stream", headers=headers)
 
@@ -67,7 +69,7 @@ class Stream:
             at = hub.last if not last_id else hub.number_of(last_id)
             hello = {"now_utc_s": self._board.clock(), "training": self._training}
             yield _text("hello", json.dumps(hello), hub.identifier(hub.last if at is None else at))
-            checked_s = time.monotonic()
+            checked_s = told_s = time.monotonic()
             while not self._ended:
                 if time.monotonic() - checked_s >= KEEP_ALIVE_S:
                     checked_s = time.monotonic()
@@ -83,10 +85,11 @@ class Stream:
                 for event in events:
                     at = event.number
                     yield self._one(event)
-                try:
+                if time.monotonic() - told_s >= KEEP_ALIVE_S:
+                    told_s = time.monotonic()
+                    yield _text("clock", json.dumps({"now_utc_s": self._board.clock()}), None)
+                with suppress(TimeoutError):
                     await asyncio.wait_for(woken.wait(), KEEP_ALIVE_S)
-                except TimeoutError:
-                    yield ": still here\n\n"
         finally:
             hub.leave(listener)
             self._open[who] -= 1

@@ -24,6 +24,7 @@ from sonarpost.messages import (
     LinkQuality,
     QueuedImage,
     QueueState,
+    ReconstructedImage,
 )
 from sonarpost.modem.rates import RATES
 
@@ -33,6 +34,7 @@ VESSEL = "training"
 RATE = 1
 SERVICES = ("op_modem", "decompressor", "relay", "console")
 TICK_S = 0.5
+BACKLOG_AT_ONCE = 40
 
 
 @dataclass
@@ -76,12 +78,18 @@ class Training:
     def backlog(self, contacts: int) -> None:
         """Let some contacts have arrived before."""
         begun = time.time() - 30.0 * contacts
+        records: list[ReconstructedImage] = []
         for number in range(contacts):
             simulated = next(self._source)
             self._made += 1
             first = begun + 30.0 * number
-            for step in range(len(simulated.versions)):
-                self._board.take_image(simulated.record(VESSEL, step, first, first + 6.0 * step))
+            steps = range(len(simulated.versions))
+            records += [simulated.record(VESSEL, step, first, first + 6.0 * step) for step in steps]
+            if len(records) >= BACKLOG_AT_ONCE or number == contacts - 1 or self._stop.is_set():
+                self._board.take_images(records)
+                records.clear()
+            if self._stop.is_set():
+                return
 
     def start(self) -> None:
         """Begin."""

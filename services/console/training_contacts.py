@@ -25,7 +25,8 @@ VEHICLES: Final = ("uuv-1", "uuv-2")
 _BYTES: Final = 192
 _STEPS: Final = (24, 64, 128, _BYTES)
 """After how many bytes a picture of the embedded codec is shown anew."""
-_OBJECTS = 10
+_LINES: Final = 5
+"""Simulated in full; what comes after them is of the same pictures."""
 _ALPHABET: Final = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
@@ -87,7 +88,8 @@ def simulated_contacts(seed: int, first_utc_s: float) -> Iterator[Simulated]:
     chance = random.Random(seed)  # noqa: S311  nothing secret comes of it
     codecs: tuple[Codec, Codec] = (EmbCodec(), VqCodec(open_catalogue("nominal-10").tiles))
     line = number = 0
-    while True:
+    made: list[Simulated] = []
+    while line < _LINES:
         seabed = (SeabedKind.SAND, SeabedKind.RIPPLES, SeabedKind.MIXED)[line % 3]
         simulated = simulate_survey(_spec(seed, line, seabed, first_utc_s))
         for thing in simulated.truth:
@@ -97,15 +99,37 @@ def simulated_contacts(seed: int, first_utc_s: float) -> Iterator[Simulated]:
                 vehicle = VEHICLES[(line + look) % len(VEHICLES)]
                 contact = _contact(simulated.survey, thing, vehicle, chance, number)
                 image_id = _image_id(number)
-                yield Simulated(
-                    contact,
-                    image_id,
-                    _versions(codec, chip(simulated.survey, thing, look), lacking=chance.random() < 0.5),
-                    codec.name,
-                    codec.model_hash,
+                made.append(
+                    Simulated(
+                        contact,
+                        image_id,
+                        _versions(codec, chip(simulated.survey, thing, look), lacking=chance.random() < 0.5),
+                        codec.name,
+                        codec.model_hash,
+                    )
                 )
+                yield made[-1]
                 number += 1
         line += 1
+    yield from _more(made, number, chance)
+
+
+def _more(made: list[Simulated], number: int, chance: random.Random) -> Iterator[Simulated]:
+    """Yield the same pictures at other places, as fast as they are wanted."""
+    while True:
+        field, place = divmod(number, len(made))
+        known = made[place]
+        contact = known.contact
+        assert contact.lat_deg is not None
+        assert contact.lon_deg is not None
+        # Fields of 300 m side by side, ten in a row.
+        lat, lon = moved(contact.lat_deg, contact.lon_deg, 0.0, 300.0 * (field // 10))
+        lat, lon = moved(lat, lon, 90.0, 300.0 * (field % 10))
+        sure = round(min(2.0, max(0.1, (contact.atd_confidence or 1.0) + chance.gauss(0, 0.1))), 2)
+        changes = {"contact_id": f"training-{number}", "lat_deg": lat, "lon_deg": lon, "atd_confidence": sure}
+        copied = contact.model_copy(update=changes)
+        yield replace(known, contact=copied, image_id=_image_id(number), versions=known.versions[-1:])
+        number += 1
 
 
 def _spec(seed: int, line: int, seabed: SeabedKind, first_utc_s: float) -> SurveySpec:
