@@ -1,0 +1,362 @@
+"""The console between its neighbours: what arrives is shown, what people do reaches those who take it, once."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+import urllib.request
+from http.client import HTTPResponse
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from conftest import eventually
+
+from services.console.config import ConsoleConfig
+from services.console.service import ConsoleService
+from sonarpost import keys, wire
+from sonarpost.errors import ConfigError, PortError
+from sonarpost.messages import (
+    AcousticFrame,
+    Advice,
+    Command,
+    Contact,
+    Decision,
+    DownlinkState,
+    LinkQuality,
+    Raster,
+    ReconstructedImage,
+    TaskingState,
+)
+from sonarpost.runtime.picture_files import write_picture
+from sonarpost.runtime.process import main
+
+PASSWORD = "correct horse battery"
+VESSEL = "vessel-1"
+ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
+
+
+def picture(version: int = 1, *, complete: bool = True) -> ReconstructedImage:
+    pixels = np.full((20, 20), 100 + version, np.uint8)
+    raster = Raster.from_array(pixels)
+    mask = np.zeros(pixels.shape, np.bool_)
+    mask[10:] = not complete
+    return ReconstructedImage(
+        vessel_id=VESSEL,
+        vehicle_id="uuv-1",
+        image_id="00A7",
+        version=version,
+        contact=Contact(contact_id="uuv-1/00A7", vehicle_id="uuv-1", lat_deg=56.0, lon_deg=-5.0),
+        codec="emb",
+        model="",
+        picture=raster,
+        picture_sha256=raster.sha256,
+        complete=complete,
+        missing_fraction=float(mask.mean()),
+        missing_mask=b"" if complete else np.packbits(mask).tobytes(),
+        missing_halves=(),
+        bytes_received=128 if complete else 64,
+        bytes_total=128,
+        frames_received=version,
+        first_frame_utc_s=1_700_000_000.0,
+        last_frame_utc_s=1_700_000_000.0,
+    )
+
+
+class Page:
+    """A browser with a session at a running console."""
+
+    def __init__(self, console: ConsoleService, user: str, role: str) -> None:
+        self.base = console.address
+        console._users.add(user, role, PASSWORD)
+        answer, headers = self._ask("/api/login", {"user": user, "password": PASSWORD}, {})
+        self.headers = {"Cookie": headers["set-cookie"].partition(";")[0], "X-CSRF-Token": answer["csrf"]}
+
+    def _ask(self, path: str, body: Any, headers: dict[str, str]) -> tuple[Any, Any]:
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(self.base.rstrip("/") + path, data, headers)
+        with urllib.request.urlopen(request, timeout=20) as answer:
+            return json.load(answer), answer.headers
+
+    def get(self, path: str) -> Any:
+        return self._ask(path, None, self.headers)[0]
+
+    def post(self, path: str, body: Any) -> Any:
+        return self._ask(path, body, self.headers)[0]
+
+    def contact(self) -> Any:
+        return self.get(f"/api/contacts/{ID}")
+
+    def decide(self, **changes: Any) -> Any:
+        whole = self.contact()
+        version = whole["versions"][-1]
+        body = {"revision": whole["contact"]["revision"], "version": version["version"], "sha256": version["sha256"]}
+        return self.post(f"/api/contacts/{ID}/decisions", {**body, "verdict": "mine_like", **changes})["decision"]
+
+    def events(self) -> tuple[HTTPResponse, list[tuple[str, Any]]]:
+        """Follow the stream of events in a thread, until it is closed."""
+        request = urllib.request.Request(self.base + "events", None, self.headers)
+        stream, found = urllib.request.urlopen(request, timeout=60), []
+
+        def read() -> None:
+            name = ""
+            try:
+                for raw in stream:
+                    line = raw.decode().rstrip("\n")
+                    if line.startswith("event: "):
+                        name = line.removeprefix("event: ")
+                    elif line.startswith("data: "):
+                        found.append((name, json.loads(line.removeprefix("data: "))))
+            except (OSError, ValueError, AttributeError):
+                return  # closed
+
+        threading.Thread(target=read, daemon=True).start()
+        return stream, found
+
+
+@pytest.fixture(autouse=True)
+def cheap_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.console.users.COST", 2**4)
+
+
+@pytest.fixture
+def start(crew, platform):
+    def make(**options: Any) -> ConsoleService:
+        side = options.get("side", "vessel")
+        config = ConsoleConfig(port=0, **options)
+        return crew.start(ConsoleService(platform(VESSEL if side == "vessel" else "shore-1"), config))
+
+    return make
+
+
+def put(client: zenoh.Session, key: str, record: Any) -> None:
+    client.put(key, wire.encode(record), encoding=wire.encoding_of(type(record)))
+
+
+def test_a_picture_is_shown_as_it_refines_and_a_decision_reaches_relay_and_modem(crew, start):
+    relay = crew.neighbour(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
+    modem = crew.neighbour(
+        VESSEL, "op_modem", {keys.contact_decision(VESSEL): Decision, keys.command_all(VESSEL): Command}
+    )
+    decompressor = crew.neighbour(VESSEL, "decompressor")
+    console = start()
+    anna = Page(console, "anna", "operator")
+    stream, events = anna.events()
+    eventually(lambda: [name for name, _ in events] == ["hello"], what="stream")
+    key = keys.image_reconstructed(VESSEL)
+    decompressor.owe(key, "console", picture(1, complete=False))
+    eventually(lambda: any(name == "contact" and data["new"] for name, data in events), what="contact")
+    decompressor.owe(key, "console", picture(2))
+    eventually(lambda: any(name == "contact" and data["contact"]["complete"] for name, data in events), what="refined")
+    decision = anna.decide(remark="clean edge")
+    eventually(lambda: len(relay.got) == len(modem.got) == 1, what="decision handed on")
+    assert relay.got == modem.got
+    assert (relay.got[0].decision_id, relay.got[0].operator, relay.got[0].image_version) == (
+        decision["decision_id"],
+        "anna",
+        2,
+    )
+
+    def delivery() -> Any:
+        return anna.contact()["contact"]["delivery"]
+
+    eventually(lambda: (delivery()["shore"], delivery()["vehicle"]) == ("relay", "asked"), what="receipts")
+    stream.close()
+
+
+def test_how_far_a_decision_has_come_is_watched(crew, start, client):
+    for name in ("relay", "op_modem"):
+        crew.neighbour(VESSEL, name, {keys.contact_decision(VESSEL): Decision})
+    console = start()
+    put(client, keys.image_reconstructed(VESSEL), picture())
+    anna = Page(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
+    decision = anna.decide()
+    eventually(lambda: anna.contact()["contact"]["delivery"]["vehicle"] == "asked", what="receipt")
+    state = DownlinkState(
+        vessel_id=VESSEL,
+        vehicle_id="uuv-1",
+        kind="decision",
+        record_id=decision["decision_id"],
+        state="confirmed",
+        times_sent=2,
+        expires_utc_s=time.time() + 100,
+        changed_utc_s=time.time() + 1,
+    )
+    put(client, keys.acoustic_downlink(VESSEL), state)
+    eventually(lambda: anna.contact()["contact"]["delivery"]["vehicle"] == "confirmed", what="confirmation")
+    eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "relay", what="relay's receipt")
+
+
+def test_a_relay_with_nothing_waiting_means_that_decisions_are_ashore(start, client, crew):
+    relay = crew.neighbour(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
+    console = start(decision_consumers=("relay",))
+    put(client, keys.image_reconstructed(VESSEL), picture())
+    anna = Page(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
+    anna.decide()
+    eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "relay", what="relay's receipt")
+    health = relay.health()
+    # The neighbour says nothing of decisions, so nothing is concluded from its own records.
+    for gauges, at, ashore in (
+        ({"inbox": 0.0, "decisions_waiting": 1.0}, 60, "relay"),
+        ({"inbox": 1.0, "decisions_waiting": 0.0}, 60, "relay"),
+        ({"inbox": 0.0, "decisions_waiting": 0.0}, -60, "relay"),
+        ({"inbox": 0.0, "decisions_waiting": 0.0}, 60, "delivered"),
+    ):
+        console._on_relay(health.model_copy(update={"gauges": gauges, "time_utc_s": time.time() + at}))
+        assert anna.contact()["contact"]["delivery"]["shore"] == ashore
+
+
+def test_requests_go_to_the_modem(crew, start, client):
+    modem = crew.neighbour(VESSEL, "op_modem", {keys.command_all(VESSEL): Command})
+    console = start(decision_consumers=())
+    put(client, keys.image_reconstructed(VESSEL), picture(1, complete=False))
+    anna = Page(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
+    asked = anna.post(f"/api/contacts/{ID}/requests", {"kind": "resend", "airtime_s": 9.3})
+    eventually(lambda: len(modem.got) == 1, what="request")
+    assert (modem.got[0].command_id, modem.got[0].image_id, modem.got[0].issued_by) == (
+        asked["command_id"],
+        "00A7",
+        "anna",
+    )
+    eventually(lambda: anna.contact()["requests"][0]["state"] == "asked", what="receipt")
+    decision = anna.decide()
+    assert (decision["delivery"]["shore"], decision["delivery"]["vehicle"]) == ("none", "none")
+
+
+def test_advice_from_ashore_appears_beside_the_contact(crew, start, client):
+    console = start()
+    put(client, keys.image_reconstructed(VESSEL), picture())
+    relay = crew.neighbour(VESSEL, "relay")
+    anna = Page(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
+    names = {"vessel_id": VESSEL, "vehicle_id": "uuv-1", "image_id": "00A7", "image_version": 1}
+    advice = Advice(advice_id="a-1", author="eva", advised_utc_s=time.time(), remark="look again", **names)
+    relay.owe(keys.advice(VESSEL), "console", advice)
+    eventually(lambda: anna.contact()["contact"]["advised"], what="advice")
+    assert anna.contact()["advice"][0]["remark"] == "look again"
+
+
+def test_frames_are_shown_with_their_vehicle(start, client):
+    console = start(vehicles={"3": "uuv-1"})
+    anna = Page(console, "anna", "observer")
+    frame = AcousticFrame(
+        direction="rx",
+        platform_id=VESSEL,
+        time_utc_s=time.time(),
+        source=3,
+        destination=1,
+        rate=1,
+        packet=1,
+        frame_number=1,
+        frame_count=3,
+        data=b"x",
+        quality=LinkQuality(snr_in_db=12.5, frames=3, bad_frames=1),
+    )
+    put(client, keys.acoustic_rx(VESSEL), frame)
+    eventually(lambda: len(anna.get("/api/fleet")["vehicles"]) == 1, what="vehicle")
+    [vehicle] = anna.get("/api/fleet")["vehicles"]
+    assert (vehicle["vehicle_id"], vehicle["snr_in_db"], vehicle["loss"]) == ("uuv-1", 12.5, 0.333)
+    eventually(lambda: any(s["service"] == "console" for s in anna.get("/api/fleet")["services"]), what="own health")
+
+
+def test_a_record_that_is_none_is_counted_and_the_watch_goes_on(start, client):
+    console = start()
+    client.put(keys.acoustic_downlink(VESSEL), b"\xc1")
+    eventually(lambda: console.health().counters.get("records_ignored") == 1, what="ignored record")
+
+
+def test_a_picture_of_another_vessel_is_refused(start, client, refused):
+    console = start()
+    other = picture().model_copy(update={"vessel_id": "vessel-2"})
+    put(client, keys.image_reconstructed(VESSEL), other)
+    eventually(lambda: console.health().counters.get("records_refused") == 1, what="refusal")
+    assert "vessel_id" in refused(console)[0][1]
+    assert console.board.counts().total == 0
+
+
+def test_ashore_c2s_pictures_are_shown_and_advice_goes_to_c2(crew, start, client):
+    c2 = crew.neighbour("shore-1", "c2", {keys.tasking_advice_all(): Advice, keys.tasking_command_all(): Command})
+    console = start(side="shore")
+    put(client, keys.shore_image(VESSEL), picture())
+    eva = Page(console, "eva", "expert")
+    eventually(lambda: eva.get("/api/contacts")["total"] == 1, what="picture")
+    advice = eva.post(f"/api/contacts/{ID}/advice", {"version": 1, "verdict": "unsure", "remark": "shadow too long"})
+    eventually(lambda: len(c2.got) == 1, what="advice")
+    assert (c2.got[0].advice_id, c2.got[0].author) == (advice["advice_id"], "eva")
+    state = TaskingState(
+        vessel_id=VESSEL, kind="advice", record_id=advice["advice_id"], state="delivered", changed_utc_s=time.time()
+    )
+    put(client, keys.tasking_state(VESSEL), state)
+    eventually(lambda: eva.contact()["advice"][0]["delivery"]["state"] == "delivered", what="state")
+    names = {"vessel_id": VESSEL, "vehicle_id": "uuv-1", "image_id": "00A7", "image_version": 1}
+    decision = Decision(decision_id="d-1", verdict="mine_like", operator="anna", decided_utc_s=time.time(), **names)
+    put(client, keys.shore_decision(VESSEL), decision)
+    eventually(lambda: eva.contact()["contact"]["review"] == "mine_like", what="decision")
+    assert eva.contact()["decisions"][0]["delivery"]["shore"] == "delivered"
+
+
+def test_ashore_what_came_meanwhile_is_taken_from_c2s_folder(start, tmp_path):
+    write_picture(tmp_path / "out" / VESSEL, picture(2, complete=False))
+    (tmp_path / "out" / VESSEL / "broken.json").write_text("{")
+    console = start(side="shore", out_dir=tmp_path / "out")
+    eventually(lambda: console.board.counts().total == 1, what="kept picture")
+    kept = console.board.image(ID, 2)
+    assert (kept.missing() == picture(2, complete=False).missing()).all()
+    assert kept.picture == picture(2).picture
+
+
+def test_what_people_did_outlives_the_service(crew, start, client):
+    console = start()
+    put(client, keys.image_reconstructed(VESSEL), picture())
+    anna = Page(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
+    decision = anna.decide()
+    crew.stop(console)
+    again = start()
+    relay = crew.neighbour(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
+    eventually(lambda: len(relay.got) == 1, what="decision after the restart")
+    assert relay.got[0].decision_id == decision["decision_id"]
+    bo = Page(again, "bo", "operator")
+    assert bo.contact()["contact"]["review"] == "mine_like"
+    assert [entry["user"] for entry in bo.contact()["audit"]] == ["anna"]
+
+
+def test_a_decision_that_was_written_and_not_handed_on_goes_after_a_kill(crew, start, client, monkeypatch):
+    console = start()
+    put(client, keys.image_reconstructed(VESSEL), picture())
+    anna = Page(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
+    # As if it were killed between the two writes.
+    monkeypatch.setattr(console, "_send", lambda _item: console.stopping.wait())
+    decision = anna.decide()
+    crew.stop(console)
+    start()
+    relay = crew.neighbour(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
+    eventually(lambda: [d.decision_id for d in relay.got] == [decision["decision_id"]], what="decision")
+
+
+def test_tls_needs_a_certificate_and_a_port_its_place(platform, start):
+    with pytest.raises(ConfigError, match="certificate"):
+        ConsoleService(platform("vessel-2"), ConsoleConfig(tls=True))
+    first = start()
+    port = int(first.address.rstrip("/").rpartition(":")[2])
+    second = ConsoleService(platform("vessel-3"), ConsoleConfig(port=port))
+    with pytest.raises(PortError, match="cannot be listened on"):
+        second.start()
+    second.stop()
+
+
+def test_health_token_and_last_word(start, is_told):
+    is_told(start())
+
+
+def test_a_wrong_configuration_ends_the_process(tmp_path, capsys):
+    path = tmp_path / "vessel.toml"
+    path.write_text('[platform]\nid = "vessel-1"\n[console]\nhost = "0.0.0.0"\n')
+    assert main(ConsoleService, ConsoleConfig, ["--config", str(path)]) == 2
+    assert "passwords go over this connection" in capsys.readouterr().err
