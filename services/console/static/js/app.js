@@ -38,7 +38,11 @@ class App {
   #wire() {
     const again = calmly(() => this.load(), 20, 100);
     startKeys(this.keys, () => this.shown, { leave: () => this.escape(), send: () => this.decision.submit() });
-    listen("counts", (answer) => this.filters.found(answer));
+    listen("counts", (answer) => {
+      this.filters.found(answer);
+      // Nobody is looking at anything yet: show the first that there is.
+      if (state.selected === null && answer.matching > 0) queueMicrotask(() => this.queue.choose(0));
+    });
     listen("select", ({ id }) => this.select(id));
     listen("view", ({ name }) => this.show(name));
     listen("fleet", (fleet) => { state.fleet = fleet; });
@@ -56,7 +60,6 @@ class App {
     startEvents();
     const asked = decodeURIComponent(location.hash.slice(1));
     if (asked) await this.select(asked);
-    else await this.queue.choose(0);
     this.show("review");
     this.queue.list.focus();
   }

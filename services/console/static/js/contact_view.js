@@ -35,7 +35,8 @@ export class ContactView {
     for (const view of this.views) view.look = this.look;
     this.heading = h("div", { class: "heading" });
     this.tools = h("div", { class: "tools", role: "toolbar", "aria-label": "Picture" });
-    this.stage = h("div", { class: "stage" }, this.canvases, h("p", { class: "placeholder", id: "placeholder" }));
+    this.placeholder = h("p", { class: "placeholder" });
+    this.stage = h("div", { class: "stage" }, this.canvases, this.placeholder);
     this.versions = h("div", { class: "versions", role: "toolbar", "aria-label": "Versions of the picture" });
     this.strip = h("div", { class: "strip", role: "region", "aria-label": "What can be trusted in this picture" });
     this.element = h("section", { class: "contact", "aria-label": "Contact" }, this.heading, this.tools, this.stage, this.versions, this.strip);
@@ -145,8 +146,7 @@ export class ContactView {
     const wanted = [this.shown ? [this.shown, this.layer] : null, second];
     this.canvases[0].classList.toggle("hidden", !wanted[0]);
     this.canvases[1].classList.toggle("hidden", !wanted[1]);
-    const placeholder = this.stage.lastElementChild;
-    placeholder.textContent = this.shown && this.detail.contact.has_picture ? "" : "Only the contact's record has arrived. The picture follows as its frames do.";
+    this.placeholder.textContent = this.shown && this.detail.contact.has_picture ? "" : "Only the contact's record has arrived. The picture follows as its frames do.";
     try {
       const pictures = await Promise.all(wanted.map((one) => one && this.#load(...one)));
       if (turn !== this.loading) return;

@@ -52,7 +52,7 @@ export class DecisionForm {
     this.buttons = VERDICTS.map(([name, key]) => h("button", {
       type: "button", class: name, "aria-pressed": "false", data: { verdict: name }, on: { click: () => this.choose(name) },
     }, h("span", { text: symbol(name), "aria-hidden": "true" }), verdict(name), h("kbd", { text: key })));
-    this.sure = h("input", { type: "range", min: 0, max: 100, step: 5, id: "sure", on: { input: () => this.#typed() } });
+    this.sure = h("input", { type: "range", min: 0, max: 100, step: 5, id: "sure", "aria-label": "how sure (g)", on: { input: () => this.#typed() } });
     this.sureWords = h("output", { for: "sure", class: "number" });
     this.kind = h("input", { id: "mlo-class", list: "classes", maxlength: 60, autocomplete: "off", on: { input: () => this.#typed() } });
     this.remark = h("textarea", { id: "remark", rows: 2, maxlength: 2000, on: { input: () => this.#typed() } });
