@@ -196,6 +196,9 @@ class RelayService(Service[RelayConfig]):
             found[f"oldest_s_for_{upstream.site}"] = age_s
             found[f"delivered_to_{upstream.site}"] = float(self.delivered_to(upstream.queue))
             found[f"answering_{upstream.site}"] = float(self.answering(upstream.queue))
+        # While it is 0, and the inbox too, every decision is ashore: the console tells people by that.
+        urgent = (self.store.queue_depth(queue, DECISION_PRIORITY).records for queue in self._upstreams)
+        found["decisions_waiting"] = float(sum(urgent))
         found["held_for_removed"] = float(sum(self.store.queue_depth(q).records for q in self._removed_queues()))
         return found
 

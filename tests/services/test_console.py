@@ -16,6 +16,8 @@ from conftest import eventually
 
 from services.console.config import ConsoleConfig
 from services.console.service import ConsoleService
+from services.relay.config import RelayConfig
+from services.relay.service import RelayService
 from sonarpost import keys, wire
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import (
@@ -28,6 +30,7 @@ from sonarpost.messages import (
     LinkQuality,
     Raster,
     ReconstructedImage,
+    Relayed,
     TaskingState,
 )
 from sonarpost.runtime.picture_files import write_picture
@@ -360,3 +363,17 @@ def test_a_wrong_configuration_ends_the_process(tmp_path, capsys):
     path.write_text('[platform]\nid = "vessel-1"\n[console]\nhost = "0.0.0.0"\n')
     assert main(ConsoleService, ConsoleConfig, ["--config", str(path)]) == 2
     assert "passwords go over this connection" in capsys.readouterr().err
+
+
+def test_a_decision_is_ashore_when_the_real_relay_has_none_left(crew, start, client, platform):
+    relay = crew.start(RelayService(platform(VESSEL), RelayConfig()))
+    console = start(decision_consumers=("relay",))
+    put(client, keys.image_reconstructed(VESSEL), picture())
+    anna = Page(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
+    anna.decide()
+    eventually(lambda: relay.gauges()["decisions_waiting"] == 1.0, what="decision at the relay")
+    eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "relay", what="relay's receipt")
+    c2 = crew.neighbour("shore-1", "c2", {keys.shore_inbox_all(): Relayed})
+    eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "delivered", what="ashore")
+    assert keys.contact_decision(VESSEL) in [envelope.key for envelope in c2.got]

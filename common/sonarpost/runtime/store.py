@@ -222,11 +222,12 @@ class Store:
             return self.origin
         return hashlib.sha256(self.origin + queue.encode()).digest()[:16]
 
-    def queue_depth(self, queue: str) -> QueueDepth:
-        """Return what waits in one queue."""
+    def queue_depth(self, queue: str, most_priority: int = 7) -> QueueDepth:
+        """Return what waits in one queue, of priorities 1 to `most_priority`."""
         records, size, oldest = self._read(
-            "SELECT COUNT(*), COALESCE(SUM(LENGTH(payload)), 0), MIN(created_utc_s) FROM outbox WHERE consumer = ?",
-            (queue,),
+            "SELECT COUNT(*), COALESCE(SUM(LENGTH(payload)), 0), MIN(created_utc_s) FROM outbox"
+            " WHERE consumer = ? AND priority <= ?",
+            (queue, most_priority),
         )[0]
         return QueueDepth(int(str(records)), int(str(size)), None if oldest is None else float(str(oldest)))
 
