@@ -53,7 +53,14 @@ def test_networks_of_platforms_lead_nowhere_and_only_routers_meet() -> None:
     assert set(inside) == {"uuv", "uuv-line", "vessel", "vessel-line", "shore", "sim"}
     on_link = [name for name, block in blocks().items() if re.search(r"\blink\b", joins(block))]
     assert on_link == ["router-vessel", "router-shore"]
-    assert [name for name, block in blocks().items() if "ports:" in block] == ["router-shore"]
+    assert [name for name, block in blocks().items() if "ports:" in block] == [
+        "console",
+        "router-shore",
+        "console-shore",
+    ]
+    for name in ("console", "console-shore"):
+        # Pages are served to this host alone unless somebody says otherwise.
+        assert re.search(r'ports: \["\$\{\w+:-127\.0\.0\.1:\d+\}:8470"\]', blocks()[name]), name
     for name, block in blocks().items():
         if "profiles: [uuv]" in block:
             assert joins(block), name

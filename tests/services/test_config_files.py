@@ -16,8 +16,8 @@ from sonarpost.runtime.modem_service import ModemServiceConfig
 
 PLATFORMS = {
     "uuv": ("atd_stub", "compressor", "uuv_modem"),
-    "vessel": ("op_modem", "decompressor", "relay"),
-    "shore": ("c2",),
+    "vessel": ("op_modem", "decompressor", "relay", "console"),
+    "shore": ("c2", "console"),
 }
 PAIRS = [(file, service) for file, services in PLATFORMS.items() for service in services]
 
