@@ -115,12 +115,12 @@ class Gate:
     """Lets requests in.
 
     Args:
-        users: Who may log in.
+        users: Who may log in; None where nobody does.
         side: Which side of the water this is.
         behind_proxy: Whether `X-Forwarded-For` says where a request comes from.
     """
 
-    def __init__(self, users: Users, side: Side, *, behind_proxy: bool) -> None:
+    def __init__(self, users: Users | None, side: Side, *, behind_proxy: bool) -> None:
         self._users = users
         self._side = side
         self._behind_proxy = behind_proxy
@@ -128,6 +128,8 @@ class Gate:
     def session_of(self, request: Request, *, use: bool = True) -> Session | None:
         """Return the session that a request belongs to, None where it has none; see `Users.session`."""
         token = request.cookies.get(COOKIE, "")
+        if self._users is None:
+            return None
         return self._users.session(token, use=use) if 0 < len(token) < 200 else None
 
     def address_of(self, request: Request) -> str:

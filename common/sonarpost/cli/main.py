@@ -19,6 +19,7 @@ COMMANDS = {
     "status": "status",
     "c2": "c2",
     "console": "console",
+    "survey-panel": "survey_panel",
     "metrics": "metrics",
     "simulate": "simulate",
     "survey": "survey",
