@@ -153,7 +153,8 @@ def report(whole: Json, image: ReconstructedImage, now_utc_s: float) -> str:
     ]
     return (
         "<!DOCTYPE html>\n<html lang='en'><head><meta charset='utf-8'>"
-        f"<title>{name}</title><link rel='stylesheet' href='/static/report.css'></head><body class='report'>"
+        f"<title>{name}</title><link rel='icon' href='/static/icon.svg'>"
+        "<link rel='stylesheet' href='/static/report.css'></head><body class='report'>"
         f"<h1>Contact {name}</h1><p>Vessel {html.escape(str(contact['vessel_id']))}, report of {_when(now_utc_s)}</p>"
         f"<figure><img alt='Sonar picture of contact {name}' src='data:image/png;base64,{thumb}'>"
         f"<figcaption>{_scale(record, image)}</figcaption></figure>"

@@ -175,7 +175,7 @@ def test_seen_measured_decided_and_told(
     assert ashore[0].operator == "anna"
     there.wait('.progress >> text="ashore"')
     there.wait(".progress >> text=on the vehicle")
-    # Asked for another look, of which the cost was shown: the order reaches the vehicle. There is no more of the picture.
+    # All of the picture is here: another look, of which the cost is shown, is asked for, and the vehicle hears it.
     there.press("r")
     there.wait("dialog .costs input[value=revisit]:checked")
     there.press("Enter")
