@@ -34,7 +34,8 @@ class Chain:
         for folder in (self.settings.folder / "logs", self.settings.incoming, self.settings.channel_log.parent):
             folder.mkdir(parents=True, exist_ok=True)
         try:
-            for name in (*ROUTERS, *PLATFORM_OF):
+            page = () if self.settings.console_port is None else ("console",)
+            for name in (*ROUTERS, *PLATFORM_OF, *page):
                 self.start(name)
         except BaseException:
             self.stop()

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from sonarpost.cli.demo.account import settle
 from sonarpost.cli.demo.chain import Chain
+from sonarpost.cli.demo.page import Page
 from sonarpost.cli.demo.report import show
 from sonarpost.cli.demo.settings import ChainSettings, free_ports
 from sonarpost.cli.demo.watch import Watcher
@@ -53,6 +54,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--time-scale", type=_positive, default=20.0, metavar="X", help="simulated seconds a second (default 20)"
     )
+    parser.add_argument(
+        "--console", action="store_true", help="serve the operator's page, and leave it open afterwards until Ctrl-C"
+    )
     parser.add_argument("--json", action="store_true", help="end with one JSON object on the last line")
     parser.set_defaults(run=run)
 
@@ -79,7 +83,7 @@ def run(parsed: argparse.Namespace) -> int:
     started = time.monotonic()
     inputs = _inputs(parsed)
     folder = _fresh_folder(parsed.out)
-    ports = free_ports(3)
+    ports = free_ports(4)
     settings = ChainSettings(
         folder=folder,
         mode="snippets" if parsed.images else "survey",
@@ -89,12 +93,18 @@ def run(parsed: argparse.Namespace) -> int:
         seed=parsed.seed,
         time_scale=parsed.time_scale,
         router_ports=(ports[0], ports[1], ports[2]),
+        console_port=ports[3] if parsed.console else None,
     )
+    page = Page(settings) if parsed.console else None
     with Chain(settings) as chain, Watcher(settings) as watcher:
         with console.status("starting three routers and eight services"):
             watcher.wait_until_started(chain.check)
+        if page is not None:
+            page.show(console)
         files = _deposit(inputs, settings, parsed.seed, console)
         _follow(chain, watcher, files, console)
+        if page is not None:
+            page.leave_open(chain, console)
     result = settle(settings, len(watcher.snippets), time.monotonic() - started)
     show(watcher, settings, result, console)
     if parsed.json:

@@ -44,6 +44,7 @@ class ChainSettings:
         router_ports: TCP ports of the uuv, vessel and shore routers.
         shore_port_for_vessel: Where the vessel's router looks for the shore's; another than the shore's own where a
             test puts a link in between that can be cut.
+        console_port: Of the operator's page on the vessel; None without one.
         extra: More lines for a service's table, by service.
     """
 
@@ -58,6 +59,7 @@ class ChainSettings:
     vessel_catalogues: tuple[str, ...] = ("nominal-10", "nominal-20")
     router_ports: tuple[int, int, int] = (0, 0, 0)
     shore_port_for_vessel: int = 0
+    console_port: int | None = None
     extra: tuple[tuple[str, str], ...] = ()
 
     @property
@@ -123,7 +125,8 @@ class ChainSettings:
 
     def config_file(self, service: str) -> Path:
         """Return the file a service reads."""
-        return self.folder / "config" / f"{PLATFORM_OF[service]}.toml"
+        # Only the vessel's page is not always there.
+        return self.folder / "config" / f"{PLATFORM_OF.get(service, VESSEL)}.toml"
 
 
 def free_ports(count: int) -> tuple[int, ...]:
@@ -147,6 +150,8 @@ def write_config(settings: ChainSettings) -> None:
     for platform, port in ports.items():
         parts = [_platform_table(settings, platform, port)]
         parts += [_service_table(settings, service) for service, where in PLATFORM_OF.items() if where == platform]
+        if platform == VESSEL and settings.console_port is not None:
+            parts.append(_console_table(settings))
         (folder / f"{platform}.toml").write_text("\n".join(parts), encoding="utf-8")
 
 
@@ -159,6 +164,7 @@ def _platform_table(settings: ChainSettings, platform: str, port: int) -> str:
 
 
 def _service_table(settings: ChainSettings, service: str) -> str:
+    page = settings.console_port
     modem = '[{name}]\nport = "{port}"\naddress = {address}\n'
     catalogues = ", ".join(f'"{name}"' for name in settings.vessel_catalogues)
     tables = {
@@ -172,8 +178,9 @@ def _service_table(settings: ChainSettings, service: str) -> str:
         + _vessel_link(settings),
         "decompressor": f'[decompressor]\nout_dir = "{settings.vessel_pictures}"\n'
         f"pairing_timeout_s = {settings.pairing_timeout_s:.3f}\ncatalogues = [{catalogues}]\n"
-        f'vehicles = {{ {UUV_ADDRESS} = "{UUV}" }}\n',
-        "relay": "[relay]\n",
+        f'vehicles = {{ {UUV_ADDRESS} = "{UUV}" }}\n'
+        + ("" if page is None else 'picture_consumers = ["relay", "console"]\n'),
+        "relay": "[relay]\n" + ("" if page is None else 'advice_consumers = ["console"]\n'),
         "c2": f'[c2]\nout_dir = "{settings.shore_pictures.parent}"\n',
         "acoustic_channel": f'[acoustic_channel]\npty_dir = "{settings.ports_folder}"\nlog = "{settings.channel_log}"\n'
         f"seed = {settings.seed}\nframe_loss = {settings.loss}\ntime_scale = {settings.time_scale}\n"
@@ -181,6 +188,15 @@ def _service_table(settings: ChainSettings, service: str) -> str:
     }
     extra = "".join(f"{line}\n" for name, line in settings.extra if name == service)
     return tables[service] + extra
+
+
+def _console_table(settings: ChainSettings) -> str:
+    # The paper's link carries nothing down.
+    down = '"op_modem"' if settings.link == "v1" else ""
+    return (
+        f'[console]\nport = {settings.console_port}\nvehicles = {{ {UUV_ADDRESS} = "{UUV}" }}\n'
+        f'decision_consumers = ["relay", {down}]\ncommand_consumers = [{down}]\n'
+    )
 
 
 def _codec(settings: ChainSettings) -> str:
