@@ -158,21 +158,25 @@ def _put(db: sqlite3.Connection, contact_id: str, image: ReconstructedImage, now
 
 def _group(db: sqlite3.Connection, contact_id: str, radius_m: float) -> None:
     """Put a contact whose position is known, and that has no group yet, into the nearest group or one of its own."""
-    row = db.execute("SELECT group_id, lat_deg, lon_deg, position_sigma_m FROM contact WHERE id = ?", (contact_id,))
-    group, lat_deg, lon_deg, sigma_m = row.fetchone()
-    if group is not None or lat_deg is None or lon_deg is None:
+    row = db.execute(
+        "SELECT group_id, lat_deg, lon_deg, position_sigma_m, vehicle_id, seen_utc_s FROM contact WHERE id = ?",
+        (contact_id,),
+    ).fetchone()
+    if row["group_id"] is not None or row["lat_deg"] is None or row["lon_deg"] is None:
         return
-    # A box that holds every group within reach; degrees of longitude shrink towards the poles.
+    look = Place("", *tuple(row)[1:])
+    # Every group within reach lies in this band; degrees of longitude shrink towards the poles.
     reach_deg = 4.0 * radius_m / _METRES_PER_DEGREE
     near = db.execute(
-        "SELECT id, lat_deg, lon_deg, sigma_m FROM look_group WHERE lat_deg BETWEEN ? AND ?",
-        (lat_deg - reach_deg, lat_deg + reach_deg),
+        "SELECT 'g' || id, lat_deg, lon_deg, sigma_m, vehicle_id, seen_utc_s FROM look_group"
+        " WHERE lat_deg BETWEEN ? AND ?",
+        (look.lat_deg - reach_deg, look.lat_deg + reach_deg),
     )
-    places = [Place(f"g{row['id']}", row["lat_deg"], row["lon_deg"], row["sigma_m"]) for row in near]
-    group = nearest_group(lat_deg, lon_deg, sigma_m, places, radius_m)
+    group = nearest_group(look, (Place(*place) for place in near), radius_m)
     if group is None:
         inserted = db.execute(
-            "INSERT INTO look_group (lat_deg, lon_deg, sigma_m) VALUES (?, ?, ?)", (lat_deg, lon_deg, sigma_m)
+            "INSERT INTO look_group (lat_deg, lon_deg, sigma_m, vehicle_id, seen_utc_s) VALUES (?, ?, ?, ?, ?)",
+            (look.lat_deg, look.lon_deg, look.sigma_m, look.vehicle_id, look.seen_utc_s),
         )
         group = f"g{inserted.lastrowid}"
     db.execute("UPDATE contact SET group_id = ? WHERE id = ?", (group, contact_id))

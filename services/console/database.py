@@ -40,7 +40,8 @@ CREATE INDEX IF NOT EXISTS contact_name ON contact (name, id);
 CREATE INDEX IF NOT EXISTS contact_range ON contact (range_m, id);
 CREATE INDEX IF NOT EXISTS contact_group ON contact (group_id);
 CREATE TABLE IF NOT EXISTS look_group (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, lat_deg REAL NOT NULL, lon_deg REAL NOT NULL, sigma_m REAL);
+    id INTEGER PRIMARY KEY AUTOINCREMENT, lat_deg REAL NOT NULL, lon_deg REAL NOT NULL, sigma_m REAL,
+    vehicle_id TEXT NOT NULL, seen_utc_s REAL);
 CREATE INDEX IF NOT EXISTS look_group_place ON look_group (lat_deg, lon_deg);
 CREATE TABLE IF NOT EXISTS version (
     contact_id TEXT NOT NULL, version INTEGER NOT NULL, received_utc_s REAL NOT NULL, rate INTEGER,

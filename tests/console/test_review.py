@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sqlite3
+from dataclasses import replace
 
 import pytest
 from console.conftest import FIRST_UTC_S, picture_record
 
 from sonarpost.errors import HandoffError
 from sonarpost.messages import Advice, Decision, DownlinkState
+from sonarpost.review.grouping import Place, nearest_group
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 
@@ -92,6 +94,20 @@ def test_looks_at_one_object_are_grouped_and_neighbours_are_not(console):
     assert (rows["0001"]["looks"], rows["0003"]["looks"], rows["0003"]["group"]) == (2, 1, None)
     whole = watch.get(f"/api/contacts/{rows['0001']['id']}").json()
     assert {row["image_id"] for row in whole["group"]} == {"0001", "0002"}
+
+
+def test_what_a_vehicle_sees_on_one_pass_is_several_things_however_badly_it_knows_where():
+    first = Place("g1", 56.0, -5.0, 7.0, "uuv-1", 1000.0)
+    north_m = 1 / 111_320
+    beside = Place("", 56.0 + 12 * north_m, -5.0, 7.0, "uuv-1", 1010.0)
+    assert nearest_group(beside, [first], 8.0) is None
+    assert nearest_group(replace(beside, seen_utc_s=1500.0), [first], 8.0) == "g1"
+    assert nearest_group(replace(beside, vehicle_id="uuv-2"), [first], 8.0) == "g1"
+    assert nearest_group(replace(beside, lat_deg=56.0 + north_m), [first], 8.0) == "g1"
+    nearer = replace(first, group="g2", lat_deg=56.0 + 10 * north_m)
+    assert nearest_group(replace(beside, seen_utc_s=1500.0), [first, nearer], 8.0) == "g2"
+    far = replace(first, lat_deg=56.0 + 50 * north_m, sigma_m=500.0, seen_utc_s=None)
+    assert nearest_group(beside, [far], 8.0) is None
 
 
 def test_a_decision_is_kept_with_what_was_on_the_screen(console):
