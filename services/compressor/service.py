@@ -10,7 +10,7 @@ from services.compressor.config import CompressorConfig
 from services.compressor.kept import KeptPictures
 from sonarpost import keys, wire
 from sonarpost.catalogue.store import open_catalogue
-from sonarpost.codec.interface import Codec
+from sonarpost.codec.interface import Codec, Extensible
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.link.paper_format import format_image_id
 from sonarpost.link.v1_objects import MAX_STREAM_BYTES
@@ -103,7 +103,11 @@ class CompressorService(Service[CompressorConfig]):
         image = wire.decode(EncodedImage, found[0], where)
         if command.kind == "refine":
             snippet = wire.decode(Snippet, found[1], where)
-            finer = self._codec.encode(snippet.picture.to_array(), min(2 * len(image.stream), MAX_STREAM_BYTES))
+            pixels, budget_bytes = snippet.picture.to_array(), min(2 * len(image.stream), MAX_STREAM_BYTES)
+            if isinstance(self._codec, Extensible) and image.model == self._codec.model_hash:
+                finer = self._codec.extend(image.stream, pixels, budget_bytes)
+            else:
+                finer = self._codec.encode(pixels, budget_bytes)
             # The last byte ends the entropy coder's number, so that of a shorter stream may be another.
             if len(finer) > len(image.stream) and finer.startswith(image.stream[:-1]):
                 image = image.model_copy(update={"stream": finer})

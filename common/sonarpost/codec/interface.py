@@ -165,6 +165,26 @@ class Codec(Protocol):
         """
 
 
+@runtime_checkable
+class Extensible(Protocol):
+    """A codec that can go on with a stream it has made."""
+
+    def extend(self, stream: bytes, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], budget_bytes: int) -> bytes:
+        """Return a longer stream of the picture that begins as `stream` does, but for its last byte.
+
+        Args:
+            stream: Of this picture.
+            image: The picture, as `encode` had it.
+            budget_bytes: Upper bound of the longer stream's length.
+
+        Returns:
+            The longer stream; `stream` itself where there is none.
+
+        Raises:
+            StreamError: The stream or the picture cannot be used, or they do not belong together.
+        """
+
+
 def arrived_body(
     stream: bytes, received: Mask | None, codec_id: int, name: str
 ) -> tuple[StreamHeader, bytes, list[str]]:

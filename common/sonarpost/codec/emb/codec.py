@@ -6,7 +6,7 @@ decodes to the picture that its bytes determine, and to nothing that they do not
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -15,14 +15,18 @@ import numpy.typing as npt
 from sonarpost.codec.emb import transform
 from sonarpost.codec.emb.coder import Coder, State
 from sonarpost.codec.emb.enhance import enhanced
+from sonarpost.codec.emb.fit import Wanted, wanted_of
 from sonarpost.codec.emb.grain import make_grain, measure_grain
 from sonarpost.codec.emb.layout import Layout, layout
 from sonarpost.codec.emb.model import Model, shipped
-from sonarpost.codec.emb.planes import code_planes, extra_planes, known_plane, situation
-from sonarpost.codec.emb.region import OUTSIDE, fill_unknown, weights
+from sonarpost.codec.emb.planes import code_planes, extra_planes, held, known_plane, situation
+from sonarpost.codec.emb.region import fill_unknown, weights
 from sonarpost.codec.emb.side import MEAN_STEP, Box, Side, read_side, write_side
 from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, check_image, model_tag, to_uint8
 from sonarpost.errors import StreamError
+
+I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
 
 CODEC_ID: Final = 0x20
 NAME: Final = "emb"
@@ -142,25 +146,57 @@ class EmbCodec:
         lay = layout(height_px, width_px)
         mean_index = min((int(picture.astype(np.int64).sum()) // picture.size + MEAN_STEP // 2) // MEAN_STEP, 63)
         plane = (picture.astype(np.int64) - mean_index * MEAN_STEP) * transform.UNIT
-        plain = transform.to_flat(transform.forward(plane, lay), lay)
-        targets = (plain.astype(np.int64) * weights(lay, box) // OUTSIDE).astype(np.int32)
+        wanted = wanted_of(plane, lay, weights(lay, box), limit)
         grain = measure_grain(picture, lay) if self.grain else None
         steps = self.steps or (_TRY_STEPS if budget < _LONG_BYTES else _TRY_STEPS_LONG)
-        sides = [Side(mean_index, step, box, grain, extra_planes(targets, step)) for step in steps]
-        written = [self._write(targets, lay, side, limit) for side in sides]
-        body, curve = min(written, key=lambda found: int(found[1][0]))
+        sides = [Side(mean_index, step, box, grain, extra_planes(wanted.targets, step)) for step in steps]
+        _, body, curve = min(
+            (self._write(wanted, side, limit, self.price) for side in sides), key=lambda found: found[0]
+        )
         return Encoded(header.pack() + body, _estimate(curve, len(body), header.size, picture.size))
 
-    def _write(
-        self, targets: npt.NDArray[np.int32], lay: Layout, side: Side, limit: int
-    ) -> tuple[bytes, npt.NDArray[np.int64]]:
-        """Encode with one start step: return the body, and the squared error that stays by bytes."""
-        coder, state = Coder.writer(limit), State(lay)
-        coder.curve[0] = int((targets.astype(np.int64) ** 2).sum())
+    def extend(self, stream: bytes, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], budget_bytes: int) -> bytes:
+        """Return a longer stream of the picture that begins as `stream` does, but for its last byte.
+
+        Args:
+            stream: Of this picture.
+            image: The picture, as `encode` had it.
+            budget_bytes: Length of the longer stream.
+
+        Returns:
+            The longer stream; `stream` itself where there is none: it said all there is to say, or (seldom) the number
+            that its bytes write is rounded up across more than a byte.
+
+        Raises:
+            StreamError: As `encode` and `decode`; the picture has another size than the stream says.
+        """
+        check_image(image)
+        header = self._check_header(stream)
+        picture = to_uint8(image)
+        if picture.shape != (header.height_px, header.width_px):
+            raise StreamError("image", "shape", picture.shape, f"the stream's {(header.height_px, header.width_px)}")
+        state, side = self.read_state(stream)
+        limit = min(budget_bytes - header.size, MAX_BODY_BYTES)
+        if side.step < 0 or limit < len(stream) - header.size:
+            return stream
+        plane = (picture.astype(np.int64) - side.mean) * transform.UNIT
+        wanted = wanted_of(plane, state.lay, weights(state.lay, side.box), limit)
+        wanted = replace(wanted, targets=held(wanted.targets, state, side))
+        _, body, _ = self._write(wanted, side, limit, price=0)
+        longer = header.pack() + body
+        return longer if len(longer) > len(stream) and longer.startswith(stream[:-1]) else stream
+
+    def _write(self, wanted: Wanted, side: Side, limit: int, price: int) -> tuple[int, bytes, I64]:
+        """Encode with one start step: return the error that stays, the body, and the squared error by bytes."""
+        coder, state = Coder.writer(limit), State(wanted.lay)
+        coder.curve[0] = int((wanted.plain.astype(np.int64) ** 2).sum())
         write_side(coder, self.model, side)
         coder.record()
-        code_planes(coder, state, self.model, targets, side, self.price)
-        return coder.finish(), coder.curve
+        code_planes(coder, state, self.model, wanted.targets, side, price, plain=wanted.plain)
+        if side.box is not None:  # its own error weighs more
+            return int(coder.curve[0]), coder.finish(), coder.curve
+        shown, _ = transform.inverse(known_plane(state, self.model), wanted.lay)
+        return int(((wanted.plane - shown) ** 2).sum()), coder.finish(), coder.curve
 
     def decode(self, stream: bytes, received: Mask | None = None) -> Decoded:
         """Rebuild the picture from as much of the stream as is there.

@@ -491,7 +491,7 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
     nets: tuple[I32, I32, I32, I64],
     sign_nets: tuple[I32, I32, I32],
     tables: tuple[I32, I32, I32],
-    stream: tuple[I64, U8, U8, I64],
+    stream: tuple[I64, U8, U8, I64, I32],
     lists: tuple[I16, I16],
 ) -> int:
     """Code one pass over one band. Returns 0, or -1 at the end of the stream or of its budget.
@@ -507,7 +507,7 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
             threshold; 0 to spend all.
         bar: Least logit that the pass takes.
         bands: The band table.
-        targets: The true coefficients (WRITE, LIST), flat.
+        targets: The coefficients to tell (WRITE, LIST), flat.
         lows: Low-pass pictures known so far.
         f: Features; those from BAND_FEATURES on are filled in.
         bases: Shape (2, HIDDEN_1): first-layer sums that are the band's; first axis as in `nets`.
@@ -519,14 +519,15 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
         sign_nets: Weights w1, b1, w2; first axis the band's orientation.
         tables: By logit + LOGIT_LIMIT: probability of 1 in 1/65536, and bits of a 1 in 1/256. And where in its
             interval a coefficient lies, in 1/256, see `_guess`.
-        stream: The range coder's state, the bytes, the best whole stream so far (WRITE), squared error by bytes.
+        stream: The range coder's state, the bytes, the best whole stream so far (WRITE), squared error by bytes, and
+            the picture's own coefficients, flat, that it is an error of.
         lists: Examples of decisions and of signs (LIST).
     """
     values, widths, signs, seen, signed, marks, odds = known
     w1, w2, b2, live = nets
     sign_w1, sign_b1, sign_w2 = sign_nets
     chances, costs, centres = tables
-    coder, data, good, curve = stream
+    coder, data, good, curve, plain = stream
     stride, orient, level = bands[row, STRIDE], bands[row, ORIENT], bands[row, LEVEL]
     h1, h2, fs = np.zeros(HIDDEN_1, np.int32), np.zeros(HIDDEN_2, np.int32), np.zeros(SIGN_FEATURES, np.int32)
     share = 12 if level == 1 else 4 if level == 2 else 1
@@ -557,6 +558,7 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
                     bit = 1 if _is_worth(magnitude, threshold, guess, costs[logit + LOGIT_LIMIT], price) else 0
                 bit = _transfer(mode, bit, logit, chances, costs, coder, data, good)
                 if bit < 0:
+                    marks[at] = -plane
                     return -1
                 _learn(live[net], h2, bit, chances[logit + LOGIT_LIMIT])
             before = _guess(values[at], widths[at], odds[at], centres) if values[at] > 0 else 0
@@ -573,13 +575,15 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
                     slope = _sign_logit(fs, sign_b1[orient], sign_w1, sign_w2, orient)
                     sign = _transfer(mode, sign, slope, chances, costs, coder, data, good)
                     if sign < 0:
+                        marks[at] = -plane
                         return -1
                 values[at], widths[at], signs[at] = threshold, threshold, 2 * sign - 1
             if values[at] > 0:
                 seen[at] = min((values[at] + (widths[at] >> 1)) * 8 // threshold, CAP)
                 signed[at] = seen[at] * signs[at]
                 after = _guess(values[at], widths[at], odds[at], centres)
-                curve[0] += np.int64(magnitude - after) ** 2 - np.int64(magnitude - before) ** 2
+                truth = np.int64(plain[at] * signs[at])
+                curve[0] += (truth - after) ** 2 - (truth - before) ** 2
             if mode == WRITE:
                 curve[min(1 + (coder[CODER_COST] >> 11), curve.shape[0] - 1)] = curve[0]
     return 0

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from sonarpost.codec.emb import kernel, transform
 from sonarpost.codec.emb.coder import Coder, State
-from sonarpost.codec.emb.layout import HEIGHT, HH, HL, LEVEL, LH, LL, OFFSET, ORIENT, STRIDE, WIDTH
+from sonarpost.codec.emb.layout import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH
 from sonarpost.codec.emb.model import Model
 from sonarpost.codec.emb.region import OUTSIDE, weights
 from sonarpost.codec.emb.side import MAX_EXTRA, Box, Side
@@ -32,7 +32,14 @@ are count as that large."""
 
 
 def code_planes(
-    coder: Coder, state: State, model: Model, targets: I32, side: Side, price: int = 0, planes: int = PLANES
+    coder: Coder,
+    state: State,
+    model: Model,
+    targets: I32,
+    side: Side,
+    price: int = 0,
+    planes: int = PLANES,
+    plain: I32 | None = None,
 ) -> None:
     """Write, read or list plane after plane until the coder stops.
 
@@ -40,40 +47,60 @@ def code_planes(
         coder: Where to.
         state: What is known; brought forward.
         model: The networks.
-        targets: True coefficients, flat, int32; anything where the coder reads.
+        targets: Coefficients to tell, flat, int32; anything where the coder reads.
         side: Start step, mean level and region of interest.
         price: See `kernel.code_band`.
         planes: How many to code at most, beside the extra ones.
+        plain: What `Coder.curve` takes for the true coefficients; `targets` if not given.
     """
     lay, mean = state.lay, side.mean
+    bands, widths = lay.bands.tolist(), lay.sides[:, 1].tolist()  # plain numbers are ten times faster to work with
     features = np.zeros(kernel.FEATURES, np.int32)
     base = np.zeros((2, kernel.HIDDEN_1), np.int32)
     known = (state.values, state.widths, state.signs, state.seen, state.signed, state.marks, state.odds)
     nets = (model.w1, model.w2, model.b2, _last_layer(model))
     sign_nets, tables = (model.sign_w1, model.sign_b1, model.sign_w2), (model.chances, model.costs, model.centres)
-    stream, lists = (coder.words, coder.data, coder.good, coder.curve), (coder.rows, coder.sign_rows)
+    stream = (coder.words, coder.data, coder.good, coder.curve, targets if plain is None else plain)
+    lists = (coder.rows, coder.sign_rows)
     for plane in range(-side.extra, planes):
         threshold = (STEPS[side.step] << side.extra) >> (plane + side.extra)
         state.threshold, number = threshold, plane + side.extra + 1
         kernel.refresh(state.values, state.widths, state.signs, state.seen, state.signed, threshold)
-        rows = [i for i, band in enumerate(lay.bands) if plane >= _FIRST_PLANE.get(int(band[LEVEL]), -side.extra)]
-        finest = min(int(lay.bands[i][LEVEL]) for i in rows)
+        rows = [i for i, band in enumerate(bands) if plane >= _FIRST_PLANE.get(band[LEVEL], -side.extra)]
+        finest = min(bands[i][LEVEL] for i in rows)
         lows = low_pictures(state, model, side, finest)
         for kind, bar in PASSES:
             for row in rows:
-                band = lay.bands[row]
+                band = bands[row]
                 if row == 1 and kind != kernel.REFINE:
                     lows = low_pictures(state, model, side, finest)
                 _band_features(features, band, threshold, mean, _density(state, band))
                 for net in (0, 1):
                     kernel.band_base(features, model.w1[net], model.b1[net], base[net])
-                low_width = int(lay.sides[band[LEVEL], 1])
+                low_width = widths[band[LEVEL]]
                 end = kernel.code_band(
                     coder.mode, kind, number, threshold, row, low_width, price, bar, lay.bands, targets, lows,
                     features, base, known, nets, sign_nets, tables, stream, lists,
                 )  # fmt: skip
                 if end < 0:
                     return
+
+
+def held(targets: I32, state: State, side: Side) -> I32:
+    """Return targets changed by as little as makes the coder decide as a stream already has.
+
+    Args:
+        targets: Shape (lay.cells,), int32.
+        state: What the stream says.
+        side: Its side information.
+    """
+    first = STEPS[side.step] << side.extra
+    # A plane that only looked left what the plane before it had decided.
+    planes = np.where(state.marks > 0, state.marks - 1, np.maximum(-state.marks - 2, 0))
+    not_yet = np.where(state.marks == 0, first << 1, first >> planes)
+    low, high = state.values, np.where(state.values > 0, state.values + state.widths, not_yet) - 1
+    size = np.clip(np.abs(targets), low, high)
+    return (size * np.where(state.values > 0, state.signs, np.sign(targets))).astype(np.int32)
 
 
 def _last_layer(model: Model) -> I64:
@@ -89,11 +116,11 @@ def extra_planes(targets: I32, step: int) -> int:
     return extra
 
 
-def _density(state: State, band: I32) -> int:
+def _density(state: State, band: list[int]) -> int:
     """Share of the band that is significant, 8 log2 of it per 1/1024, shifted to be about zero."""
-    cells = int(band[HEIGHT]) * int(band[WIDTH])
-    start = int(band[OFFSET]) - 2 * int(band[STRIDE]) - 2
-    stop = start + (int(band[HEIGHT]) + 4) * int(band[STRIDE])
+    cells = band[HEIGHT] * band[WIDTH]
+    start = band[OFFSET] - 2 * band[STRIDE] - 2
+    stop = start + (band[HEIGHT] + 4) * band[STRIDE]
     significant = int(np.count_nonzero(state.values[start:stop]))
     share = (2048 * significant + 512) // (cells + 1)
     return _log2_eighths(share + 1) - 40
@@ -104,17 +131,15 @@ def _log2_eighths(value: int) -> int:
     return 8 * power + ((value << 3) >> power) - 8
 
 
-def _band_features(features: I32, band: I32, threshold: int, mean: int, density: int) -> None:
-    level, orient = int(band[LEVEL]), int(band[ORIENT])
-    here = features[kernel.BAND_FEATURES :]
-    here[:] = 0
-    if orient != LL:
-        here[min(level, 4) - 1] = 32
-    for column, kind in ((4, HL), (5, LH), (6, HH)):
-        here[column] = 32 if orient == kind else 0
+def _band_features(features: I32, band: list[int], threshold: int, mean: int, density: int) -> None:
+    here = [0] * (kernel.FEATURES - kernel.BAND_FEATURES)
+    if band[ORIENT] != LL:
+        here[min(band[LEVEL], 4) - 1] = 32
+        here[3 + band[ORIENT]] = 32
     here[7] = min(_log2_eighths(threshold) - 104, 36)
     here[8] = _log2_eighths(max(mean, 4)) - 48
     here[9] = density
+    features[kernel.BAND_FEATURES :] = here
 
 
 def low_pictures(state: State, model: Model, side: Side, down_to: int) -> I32:

@@ -23,12 +23,12 @@ UNIT: Final = 64
 FRACTION_BITS: Final = 14
 _ROUND: Final = 1 << (FRACTION_BITS - 1)
 # The constants times 2^14, rounded.
-_ALPHA: Final = -25987
-_BETA: Final = -868
-_GAMMA: Final = 14466
-_DELTA: Final = 7266
-_GAIN: Final = 18834  # 1.14954: makes a low-pass output as strong as its input's mean times sqrt(2)
-_GAIN_INVERSE: Final = 14253
+ALPHA: Final = -25987
+BETA: Final = -868
+GAMMA: Final = 14466
+DELTA: Final = 7266
+GAIN: Final = 18834  # 1.14954: makes a low-pass output as strong as its input's mean times sqrt(2)
+GAIN_INVERSE: Final = 14253
 
 
 # Strength in the picture of a coefficient's error, by level (the last for all above) and orientation LL, HL, LH, HH, in
@@ -54,33 +54,34 @@ def _lift(line: Plane, n: int, first: int, constant: int) -> None:
 def _analyse(line: Plane, n: int, scratch: Plane) -> None:
     if n == 1:
         return
-    _lift(line, n, 1, _ALPHA)
-    _lift(line, n, 0, _BETA)
-    _lift(line, n, 1, _GAMMA)
-    _lift(line, n, 0, _DELTA)
+    _lift(line, n, 1, ALPHA)
+    _lift(line, n, 0, BETA)
+    _lift(line, n, 1, GAMMA)
+    _lift(line, n, 0, DELTA)
     low = (n + 1) // 2
     for i in range(n):
         if i % 2 == 0:
-            scratch[i // 2] = (line[i] * _GAIN + _ROUND) >> FRACTION_BITS
+            scratch[i // 2] = (line[i] * GAIN + _ROUND) >> FRACTION_BITS
         else:
-            scratch[low + i // 2] = (line[i] * _GAIN_INVERSE + _ROUND) >> FRACTION_BITS
+            scratch[low + i // 2] = (line[i] * GAIN_INVERSE + _ROUND) >> FRACTION_BITS
     line[:n] = scratch[:n]
 
 
 @compiled
-def _synthesise(line: Plane, n: int, scratch: Plane) -> None:
+def synthesise_line(line: Plane, n: int, scratch: Plane) -> None:
+    """Undo one level of the wavelet on the first `n` values of a line, in place; `scratch` is at least as long."""
     if n == 1:
         return
     low = (n + 1) // 2
     for i in range(n):
         if i % 2 == 0:
-            scratch[i] = (line[i // 2] * _GAIN_INVERSE + _ROUND) >> FRACTION_BITS
+            scratch[i] = (line[i // 2] * GAIN_INVERSE + _ROUND) >> FRACTION_BITS
         else:
-            scratch[i] = (line[low + i // 2] * _GAIN + _ROUND) >> FRACTION_BITS
-    _lift(scratch, n, 0, -_DELTA)
-    _lift(scratch, n, 1, -_GAMMA)
-    _lift(scratch, n, 0, -_BETA)
-    _lift(scratch, n, 1, -_ALPHA)
+            scratch[i] = (line[low + i // 2] * GAIN + _ROUND) >> FRACTION_BITS
+    _lift(scratch, n, 0, -DELTA)
+    _lift(scratch, n, 1, -GAMMA)
+    _lift(scratch, n, 0, -BETA)
+    _lift(scratch, n, 1, -ALPHA)
     line[:n] = scratch[:n]
 
 
@@ -112,11 +113,11 @@ def _inverse(
         if level < sides.shape[0] - 1:
             for x in range(width):
                 line[:height] = plane[:height, x]
-                _synthesise(line, height, scratch)
+                synthesise_line(line, height, scratch)
                 plane[:height, x] = line[:height]
             for y in range(height):
                 line[:width] = plane[y, :width]
-                _synthesise(line, width, scratch)
+                synthesise_line(line, width, scratch)
                 plane[y, :width] = line[:width]
         if level > 0:
             for y in range(-1, height + 1):
@@ -213,7 +214,8 @@ def inverse(coefficients: Plane, lay: Layout, down_to: int = 0) -> tuple[Plane, 
 
 
 @lru_cache(maxsize=8)
-def _strength_map(lay: Layout) -> Plane:
+def strength_map(lay: Layout) -> Plane:
+    """Return the strength of every coefficient in the flat layout, in 1/1024."""
     strengths = np.full(lay.cells, 1024, np.int64)
     for offset, stride, rows, columns, level, orient, *_ in lay.bands.tolist():
         if rows and columns:
@@ -225,13 +227,13 @@ def to_flat(plane: Plane, lay: Layout) -> npt.NDArray[np.int32]:
     """Return coefficients in the flat layout, weighted by their strength, int32."""
     flat = np.zeros(lay.cells, np.int64)
     flat[lay.position] = plane
-    return ((flat * _strength_map(lay) + 512) >> 10).astype(np.int32)
+    return ((flat * strength_map(lay) + 512) >> 10).astype(np.int32)
 
 
 def from_flat(flat: npt.NDArray[np.int32], lay: Layout) -> Plane:
     """Undo `to_flat`."""
     out = np.zeros(lay.position.shape, np.int64)
-    _place(flat, _strength_map(lay), lay.position, out)
+    _place(flat, strength_map(lay), lay.position, out)
     return out
 
 

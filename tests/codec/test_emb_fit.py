@@ -1,0 +1,124 @@
+"""What the encoder of emb tells in place of the plain coefficients, and how it goes on with a stream."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonarpost.codec.emb import fit, transform
+from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.codec.emb.layout import layout
+from sonarpost.codec.emb.region import OUTSIDE, weights
+from sonarpost.codec.emb.side import Box
+from sonarpost.codec.interface import Extensible, StreamHeader
+from sonarpost.codec.quality import psnr_db
+from sonarpost.errors import StreamError
+
+CODEC = EmbCodec()
+
+
+def contact(height_px: int = 80, width_px: int = 80, seed: int = 0) -> np.ndarray:
+    """Speckled slope with a highlight and a shadow, that touch the border."""
+    rng = np.random.default_rng(seed)
+    image = (50 + 30 * np.linspace(0, 1, width_px)) * rng.gamma(6, 1 / 6, (height_px, width_px))
+    image[: height_px // 5, width_px // 4 : width_px // 2] *= 3
+    image[: height_px // 5, width_px // 2 : width_px * 3 // 4] *= 0.1
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def plane_of(image: np.ndarray) -> np.ndarray:
+    return (image.astype(np.int64) - int(image.mean())) * transform.UNIT
+
+
+@pytest.mark.parametrize("size", [(80, 80), (17, 33), (140, 80), (16, 512)])
+def test_gathering_is_the_transpose_of_drawing(size: tuple[int, int]) -> None:
+    """The scalar product of a drawn picture with another one is that of its coefficients with what is gathered."""
+    lay, rng = layout(*size), np.random.default_rng(1)
+    coefficients, other = (rng.integers(-8000, 8000, size) for _ in range(2))
+    drawn, _ = transform.inverse(coefficients, lay)
+    low_rows, low_columns = lay.sides[lay.levels]
+    gathered = other.copy()
+    fit._gather(gathered, lay.sides)
+    rows, columns = (transform.cosine_matrix(int(n)) / 2**14 for n in (low_rows, low_columns))
+    gathered = gathered.astype(float)
+    gathered[:low_rows, :low_columns] = rows @ gathered[:low_rows, :low_columns] @ columns.T
+    assert (drawn * other).sum() == pytest.approx(
+        (coefficients * gathered).sum(), abs=2e-3 * np.linalg.norm(drawn) * np.linalg.norm(other) / np.sqrt(drawn.size)
+    )
+
+
+@pytest.mark.parametrize("size", [(80, 80), (17, 33)])
+def test_the_reach_is_the_wavelets_own_norm(size: tuple[int, int]) -> None:
+    lay, rng = layout(*size), np.random.default_rng(2)
+    reach, strengths = fit._reach(lay), transform.strength_map(lay)
+    for at in rng.choice(lay.position.ravel(), 60, replace=False):
+        flat = np.zeros(lay.cells, np.int32)
+        flat[at] = 64000
+        drawn, _ = transform.inverse(transform.from_flat(flat, lay), lay)
+        plain = int(transform.from_flat(flat, lay).sum())
+        norm = float((drawn.astype(float) ** 2).sum()) / plain**2
+        assert reach[at] / 2**14 == pytest.approx(strengths[at] / 1024 / norm, rel=0.01)
+
+
+@pytest.mark.parametrize("body_bytes", [30, 120, 500])
+def test_as_many_fitted_coefficients_show_more_of_the_picture(body_bytes: int) -> None:
+    image = contact()
+    plane, lay = plane_of(image), layout(*image.shape)
+    wanted = fit.wanted_of(plane, lay, weights(lay, None), body_bytes)
+    error = []
+    for coefficients in (wanted.plain, wanted.targets):
+        least = np.partition(np.abs(coefficients), -body_bytes)[-body_bytes]
+        kept = np.where(np.abs(coefficients) >= least, coefficients, 0)
+        error.append(int(((plane - transform.inverse(transform.from_flat(kept, lay), lay)[0]) ** 2).sum()))
+    assert error[1] < 0.999 * error[0]
+
+
+def test_the_box_weighs_in_both() -> None:
+    image = contact()
+    plane, lay = plane_of(image), layout(*image.shape)
+    halves = weights(lay, Box(4, 4, 7, 7))
+    plain, boxed = (fit.wanted_of(plane, lay, w, 60) for w in (weights(lay, None), halves))
+    assert np.array_equal(boxed.plain, plain.plain.astype(np.int64) * halves // OUTSIDE)
+    strong = (halves > OUTSIDE) & (np.abs(plain.plain) > 3000)
+    assert np.abs(boxed.targets[strong]).mean() > 1.3 * np.abs(plain.targets[strong]).mean()
+
+
+@pytest.mark.parametrize("short", [12, 22, 64, 100])
+def test_a_stream_goes_on_as_it_began(short: int) -> None:
+    assert isinstance(CODEC, Extensible)
+    went_on = 0
+    for seed in range(4):
+        image = contact(64, 56, seed)
+        stream = CODEC.encode(image, short)
+        longer = CODEC.extend(stream, image, 2 * short)
+        assert longer.startswith(stream[:-1])
+        if longer != stream:
+            assert len(longer) == 2 * short
+            assert psnr_db(image, CODEC.decode(longer).image) > psnr_db(image, CODEC.decode(stream).image) + 0.1
+            went_on += 1
+    assert went_on >= 3
+
+
+@given(seed=st.integers(0, 1000), short=st.integers(9, 60), more=st.integers(0, 60), box=st.booleans())
+@settings(max_examples=12, deadline=None)
+def test_going_on_never_takes_anything_back(seed: int, short: int, more: int, box: bool) -> None:
+    image = contact(33, 48, seed)
+    stream = CODEC.encode_with_estimate(image, short, box=Box(3, 3, 8, 9) if box else None).stream
+    longer = CODEC.extend(stream, image, len(stream) + more)
+    assert longer.startswith(stream[:-1])
+    assert len(stream) <= len(longer) <= len(stream) + more
+
+
+def test_what_cannot_go_on_stays_or_is_refused() -> None:
+    image = contact(32, 32)
+    stream = CODEC.encode(image, 40)
+    size = StreamHeader.unpack(stream).size
+    assert CODEC.extend(stream, image, 20) == stream
+    assert CODEC.extend(stream, image, 40) == stream
+    assert CODEC.extend(stream[:size], image, 80) == stream[:size]
+    with pytest.raises(StreamError, match="shape"):
+        CODEC.extend(stream, contact(32, 48), 80)
+    with pytest.raises(StreamError, match="codec_id"):
+        CODEC.extend(b"\x04" + stream[1:], image, 80)
