@@ -36,7 +36,8 @@ class UuvModemConfig(ModemServiceConfig):
         max_messages: v1: most messages that wait; more stay with their programs.
         medium: v1: "continuous" sends at once, "tdma" in slots, "poll" when asked, "random" after random waits.
         listen_every_s: Continuous: it sends for so long, ...
-        listen_s: ... and then listens for so long, 0 for never.
+        listen_s: ... and then listens for so long, 0 for never. What begins meanwhile is heard to its end, so it has to
+            cover the vessel's `quiet_s`, sound's way there and back, and a second.
         quiet_s: Continuous and random: how long after others were heard it does not begin; they may go on.
         frame_s: TDMA: length of the frame of slots; it begins at multiples of this since 1970-01-01 UTC.
         slot_start_s: TDMA: where in the frame the slot begins.
@@ -64,8 +65,8 @@ class UuvModemConfig(ModemServiceConfig):
     aging_s: Seconds = 600.0
     max_messages: Annotated[int, Field(ge=1, le=100_000)] = 2000
     medium: Literal["continuous", "tdma", "poll", "random"] = "continuous"
-    listen_every_s: Seconds = 60.0
-    listen_s: Annotated[float, Field(ge=0, le=86400)] = 8.0
+    listen_every_s: Seconds = 150.0
+    listen_s: Annotated[float, Field(ge=0, le=86400)] = 5.0
     quiet_s: Annotated[float, Field(ge=0, le=600)] = 5.0
     frame_s: Seconds = 60.0
     slot_start_s: Annotated[float, Field(ge=0, le=86400)] = 0.0

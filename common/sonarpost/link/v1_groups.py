@@ -18,6 +18,7 @@ from sonarpost.link.v1_preview import entry_shape
 
 TakeNumber = Callable[[], int]
 _PREVIEW_URGENCY: Final = 2.0
+_MOST_GROUP: Final = 60
 _PREVIEW_SHARE: Final = 0.6
 """Most of a group's frames that previews take."""
 
@@ -27,6 +28,9 @@ def group_limit(config: SenderConfig, symbol_bytes: int) -> int:
     """Return how many pictures a group may have so that no block needs more than 255 symbols."""
     shape = entry_shape(symbol_bytes)
     most = config.group_size
+    if config.feedback and not config.group_pictures:
+        # Long frames hold more: at the fast rates a group of few symbols would fill the window with small blocks.
+        most = max(most, min(_MOST_GROUP, config.block_symbols * symbol_bytes // config.stream_bytes))
     while most > 1 and (
         _planned_previews(config, shape.source_symbols(most), most) >= fec.MAX_SYMBOLS
         or (not config.feedback and most * config.frames_per_picture > fec.MAX_SYMBOLS)

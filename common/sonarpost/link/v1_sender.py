@@ -39,6 +39,8 @@ from sonarpost.link.v1_preview import ENTRY_HEAD_BYTES, MAX_NUMBER
 from sonarpost.link.v1_reports import ReportBook
 
 _LEAST_PREFIX_BYTES: Final = 16
+_MOST_SENT: Final = 4
+"""So many times its symbols are sent of a block without a report, where others wait for it."""
 _MESSAGE_URGENCY: Final = 8.0
 _SAFE: Final = -2.5
 """Caution (see `symbols_to_send`) of blocks that go without feedback: so many deviations more than the average."""
@@ -352,6 +354,7 @@ class Sender:
         symbol = self._symbol(most_bytes=self.symbol_bytes)
         if symbol is None:
             self._remind(now)
+            self._go_on()
             symbol = self._symbol(most_bytes=self.symbol_bytes)
         if symbol is None:
             return None
@@ -381,6 +384,17 @@ class Sender:
             if block.lacks <= 0 and now - block.asked_at >= self.config.patience_s:
                 block.asked_at = now
                 block.planned += max(1, block.source_symbols // 16)
+
+    def _go_on(self) -> None:
+        """With feedback: where the next group waits for room among the blocks, send more of the one least likely there.
+
+        Plans stay below what is likely needed, so this is seldom wasted; silence always is.
+        """
+        if not self.waiting or any(b.lacks > 0 for b in self.blocks) or not self.config.feedback:
+            return
+        unsure = [b for b in self.blocks if b.sent < _MOST_SENT * b.source_symbols]
+        if self._free_numbers() < WINDOW and unsure:
+            min(unsure, key=lambda b: b.sent / b.source_symbols).planned += 1
 
     def on_report(self, report: Feedback | Request, now: float, receiver: int = 0) -> None:
         """Take what a receiver reports or asks for.

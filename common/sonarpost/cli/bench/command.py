@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 
 from sonarpost.cli.bench.codecs import add_action as add_codecs
+from sonarpost.cli.bench.detect import add_action as add_detect
 from sonarpost.cli.bench.link import add_action as add_link
+from sonarpost.cli.bench.link_busy import add_action as add_busy
 from sonarpost.cli.bench.mission import add_action as add_mission
 from sonarpost.cli.bench.paper import add_action as add_paper
 from sonarpost.cli.bench.recognition import add_action as add_recognition
@@ -32,3 +34,5 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_link(actions)
     add_sea_trial(actions)
     add_mission(actions)
+    add_detect(actions)
+    add_busy(actions)

@@ -1,0 +1,236 @@
+"""How much of the time a vehicle that has data keeps the water busy: queue, medium access, driver, modem, serial line.
+
+Everything runs as on a vehicle and a vessel, on a simulated clock: the vehicle's `AcousticQueue` and `Continuous`
+medium, drivers on emulated modems with serial lines of a given speed, and a vessel that reports in the pauses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from sonarpost.errors import ConfigError
+from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.medium import Continuous
+from sonarpost.link.orders import OrderBook
+from sonarpost.link.queue import AcousticQueue, PictureName, QueueConfig
+from sonarpost.link.v1_events import ReportReceived
+from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.vessel import Packet, VesselLink
+from sonarpost.modem.config import MicroModemConfig
+from sonarpost.modem.events import Event, FrameHeard, FrameReceived, PacketFailed, PacketSent
+from sonarpost.modem.micromodem import MicroModem
+from sonarpost.modem.rates import RATES
+from sonarpost.sim.acoustic_world import AcousticWorld, ModemPlace
+from sonarpost.sim.micromodem_config import ModemConfig
+from sonarpost.sim.water_config import WaterConfig
+from sonarpost.sim.water_physics import Position
+from sonarpost.sim.water_records import Transmission
+
+_VESSEL: Final = 1
+_VEHICLE: Final = 3
+_STEP_S: Final = 0.001
+_DOWNLINK_RATE: Final = 0
+_QUIET_S: Final = 2.0
+_TICK_S: Final = 0.25
+_ALWAYS_WAITING: Final = 12
+_STREAM_BYTES: Final = 400
+
+
+@dataclass(frozen=True, slots=True)
+class BusySpec:
+    """What is measured.
+
+    Attributes:
+        rate: Of the vehicle, 0..6.
+        serial_baud: Of both serial lines; 0 for lines without delay.
+        listen_every_s: See `Continuous`.
+        listen_s: See `Continuous`.
+        range_m: Between the modems.
+        frame_loss: Share of frames lost.
+        seconds: For how long, simulated.
+
+    Raises:
+        ConfigError: A value out of range.
+    """
+
+    rate: int = 5
+    serial_baud: float = 0.0
+    listen_every_s: float = 150.0
+    listen_s: float = 5.0
+    range_m: float = 500.0
+    frame_loss: float = 0.1
+    seconds: float = 3600.0
+
+    def __post_init__(self) -> None:
+        if self.rate not in RATES:
+            raise ConfigError("busy", "rate", self.rate, f"{min(RATES)}..{max(RATES)}")
+        limits = (("serial_baud", 0, 4e6), ("range_m", 1, 2e4), ("frame_loss", 0, 0.9), ("seconds", 60, 864000))
+        for name, low, high in limits:
+            if not low <= getattr(self, name) <= high:
+                raise ConfigError("busy", name, getattr(self, name), f"{low}..{high}")
+
+
+@dataclass(frozen=True, slots=True)
+class BusyResult:
+    """What was measured.
+
+    Attributes:
+        busy: Share of the time in which the vehicle's packets were in the water.
+        packets: Packets of the vehicle.
+        frames_full: Share of the frames of its packets that it filled.
+        reports: Reports of the vessel that the vehicle heard.
+        reports_sent: Reports of the vessel.
+    """
+
+    busy: float
+    packets: int
+    frames_full: float
+    reports: int
+    reports_sent: int
+
+
+class _Rig:
+    def __init__(self, spec: BusySpec) -> None:
+        places = {n: ModemPlace(ModemConfig(n), Position(e)) for n, e in ((_VESSEL, 0.0), (_VEHICLE, spec.range_m))}
+        water = WaterConfig(frame_loss=spec.frame_loss)
+        self.world = AcousticWorld(water, places, spec.serial_baud or None)
+        self.drivers = {n: MicroModem(MicroModemConfig(n)) for n in places}
+        self.now = 0.0
+        for driver in self.drivers.values():
+            driver.start(0.0)
+        self.sent: list[Transmission] = []
+
+    @property
+    def ready(self) -> bool:
+        """Whether both modems are configured."""
+        return all(driver.ready for driver in self.drivers.values())
+
+    def wait(self, stop_s: float) -> None:
+        """Go to when something happens next, to `stop_s` at the latest."""
+        times_s = [self.world.next_deadline_s(), *(d.next_wakeup() or stop_s for d in self.drivers.values())]
+        self.now = min(stop_s, max(min(times_s), self.now + _STEP_S))
+
+    def step(self) -> list[tuple[int, Event]]:
+        """Let happen what happens now; return the drivers' events."""
+        events: list[tuple[int, Event]] = []
+        for number, driver in self.drivers.items():
+            events += [(number, event) for event in driver.poll(self.now)]
+            self.world.receive(number, driver.bytes_to_send(), self.now)
+        self.sent += [t for t in self.world.advance(self.now) if isinstance(t, Transmission)]
+        for number, driver in self.drivers.items():
+            for output in self.world.take_outputs(number):
+                events += [(number, event) for event in driver.receive(output.data, self.now)]
+            self.world.receive(number, driver.bytes_to_send(), self.now)
+        return events
+
+
+class _Vehicle:
+    """Does what `uuv_modem` does."""
+
+    def __init__(self, spec: BusySpec) -> None:
+        self._rate = spec.rate
+        self.queue = AcousticQueue(QueueConfig(rates=(spec.rate,), first_rate=spec.rate, expected_loss=spec.frame_loss))
+        self._medium = Continuous(spec.listen_every_s, spec.listen_s, quiet_s=2.0)
+        self._receiver = Receiver()
+        self._asked = False
+        self._rng = np.random.default_rng(1)
+        self._number = 0
+        self.frames = self.reports = 0
+
+    def take(self, event: Event, now: float) -> None:
+        match event:
+            case PacketSent():
+                self._medium.sent(event.started_s, now)
+                self._asked = False
+            case PacketFailed():
+                self._asked = False
+            case FrameHeard():
+                self._medium.heard(now)
+            case FrameReceived():
+                for found in self._receiver.accept(event.src, event.data, now):
+                    if isinstance(found, ReportReceived):
+                        self.queue.on_report(found.report, now, event.src)
+                        self.reports += 1
+
+    def work(self, driver: MicroModem, now: float) -> float:
+        """Send where it may; return for how long it may not."""
+        while len(self.queue.sender.waiting) < _ALWAYS_WAITING:
+            self._number = self._number % 65535 + 1
+            contact = ContactSummary(80, 80, time_utc_s=self._number)
+            name, stream = PictureName("0001", str(self._number)), self._rng.bytes(_STREAM_BYTES)
+            self.queue.add_picture(self._number, name, contact, stream, now)
+        if self._asked:
+            return 0.0
+        wait_s = self._medium.wait_s(RATES[self._rate].airtime_s, now) or 0.0
+        if wait_s == 0.0 and driver.ready and (frames := self.queue.next_packet(now)):
+            driver.send_packet(_VESSEL, self._rate, frames, now=now)
+            self._asked = True
+            self.frames += len(frames)
+        return wait_s
+
+
+class _Vessel:
+    """Does what `op_modem` does: it reports when it has heard nothing for a while."""
+
+    def __init__(self) -> None:
+        self._link = VesselLink(OrderBook(60.0))
+        self._heard_s = 0.0
+        self._under_way: Packet | None = None
+        self.reports = 0
+
+    def take(self, event: Event, now: float) -> None:
+        match event:
+            case FrameReceived():
+                self._link.hear(event.src, event.data, now)
+                self._heard_s = now
+            case PacketSent() if self._under_way is not None:
+                self._link.sent(self._under_way, now)
+                self._under_way = None
+            case PacketFailed() if self._under_way is not None:
+                self._link.failed(self._under_way)
+                self._under_way = None
+
+    def work(self, driver: MicroModem, now: float) -> None:
+        quiet = now - self._heard_s >= _QUIET_S and not driver.receiving and driver.ready
+        if self._under_way is None and quiet and self._link.wants_to_send(now) is not None:
+            rate = RATES[_DOWNLINK_RATE]
+            packet = self._link.packet(rate.frames, rate.frame_bytes, now)
+            if packet is not None:
+                driver.send_packet(packet.address, rate.number, packet.frames, now=now)
+                self._under_way = packet
+                self.reports += packet.reports
+
+
+def run_busy(spec: BusySpec) -> BusyResult:
+    """Measure; the same specification gives the same result.
+
+    The clock starts when both modems are configured. The vehicle always has pictures to send.
+    """
+    rig, vehicle, vessel = _Rig(spec), _Vehicle(spec), _Vessel()
+    while not rig.ready:
+        rig.step()
+        rig.wait(rig.now + _TICK_S)
+    begun, end = rig.now, rig.now + spec.seconds
+    while rig.now < end:
+        for number, event in rig.step():
+            (vehicle if number == _VEHICLE else vessel).take(event, rig.now)
+        wait_s = vehicle.work(rig.drivers[_VEHICLE], rig.now)
+        vessel.work(rig.drivers[_VESSEL], rig.now)
+        rig.step()  # what they asked for goes at once; it leads to no event but later ones
+        rig.wait(min(end, rig.now + (min(wait_s, _TICK_S) or _TICK_S)))
+    mine = [sent for sent in rig.sent if sent.transmitter == _VEHICLE]
+    return BusyResult(
+        busy=_within(mine, begun, end) / spec.seconds,
+        packets=len(mine),
+        frames_full=vehicle.frames / max(1, len(mine) * RATES[spec.rate].frames),
+        reports=vehicle.reports,
+        reports_sent=vessel.reports,
+    )
+
+
+def _within(sent: Sequence[Transmission], start_s: float, stop_s: float) -> float:
+    return sum(max(0.0, min(t.ended_s, stop_s) - max(t.started_s, start_s)) for t in sent)
