@@ -155,10 +155,11 @@ def report(whole: Json, image: ReconstructedImage, now_utc_s: float) -> str:
         "<!DOCTYPE html>\n<html lang='en'><head><meta charset='utf-8'>"
         f"<title>{name}</title><link rel='icon' href='/static/icon.svg'>"
         "<link rel='stylesheet' href='/static/report.css'></head><body class='report'>"
-        f"<h1>Contact {name}</h1><p>Vessel {html.escape(str(contact['vessel_id']))}, report of {_when(now_utc_s)}</p>"
+        f"<header><h1>Contact {name}</h1>"
+        f"<p>Vessel {html.escape(str(contact['vessel_id']))}, report of {_when(now_utc_s)}</p></header>"
         f"<figure><img alt='Sonar picture of contact {name}' src='data:image/png;base64,{thumb}'>"
         f"<figcaption>{_scale(record, image)}</figcaption></figure>"
-        f"<table>{''.join(_fact(label, value) for label, value in facts)}</table>"
+        f"<dl>{''.join(_fact(label, value) for label, value in facts)}</dl>"
         f"{_list('Measurements', whole['measurements'], ('kind', 'value_m', 'sigma_m', 'height_m', 'user'))}"
         f"{_list('Decisions', whole['decisions'], ('operator', 'verdict', 'confidence', 'mlo_class', 'remark'))}"
         f"{_list('Advice', whole['advice'], ('author', 'verdict', 'confidence', 'mlo_class', 'remark'))}"
@@ -179,12 +180,12 @@ _LENGTHS: Final = (
 
 
 def _fact(label: str, value: object) -> str:
-    return f"<tr><th>{html.escape(label)}</th><td>{_shown(value)}</td></tr>"
+    return f"<dt>{html.escape(label)}</dt><dd>{_shown(value)}</dd>"
 
 
 def _shown(value: object) -> str:
     if value is None or value == "":
-        return "not known"
+        return '<span class="missing">not known</span>'
     return html.escape(f"{value:.4g}" if isinstance(value, float) else str(value))
 
 

@@ -142,13 +142,14 @@ def chart(board: Board) -> Json:
         return _empty_chart(board, unlocated)
     stale = {str(vehicle["vehicle_id"]): bool(vehicle["stale"]) for vehicle in board.fleet.link()}
     tracks: dict[str, list[list[float]]] = {}
-    for row in reversed(rows):
-        if row["vehicle_lat_deg"] is not None:
-            x_m, y_m = frame.to_local(row["vehicle_lat_deg"], row["vehicle_lon_deg"])
-            tracks.setdefault(row["vehicle_id"], []).append([round(x_m, 2), round(y_m, 2), row["at_utc_s"]])
+    seen = [row for row in reversed(rows) if row["vehicle_lat_deg"] is not None]
+    places = frame.to_local_all([r["vehicle_lat_deg"] for r in seen], [r["vehicle_lon_deg"] for r in seen])
+    for row, (x_m, y_m) in zip(seen, places, strict=True):
+        tracks.setdefault(row["vehicle_id"], []).append([x_m, y_m, row["at_utc_s"]])
+    points = frame.to_local_all([row["lat_deg"] for row in rows], [row["lon_deg"] for row in rows])
     return {
         "origin": {"lat_deg": frame.lat_deg, "lon_deg": frame.lon_deg},
-        "contacts": [_on_chart(frame, row) for row in rows],
+        "contacts": [_on_chart(row, point) for row, point in zip(rows, points, strict=True)],
         "unlocated": unlocated,
         "vehicles": [
             {"vehicle_id": name, "track": track, "stale": stale.get(name, True)}
@@ -170,13 +171,12 @@ def _empty_chart(board: Board, unlocated: int) -> Json:
     }
 
 
-def _on_chart(frame: LocalFrame, row: sqlite3.Row) -> Json:
-    x_m, y_m = frame.to_local(row["lat_deg"], row["lon_deg"])
+def _on_chart(row: sqlite3.Row, point: tuple[float, float]) -> Json:
     return {
         "id": row["id"],
         "name": row["name"],
-        "x_m": round(x_m, 2),
-        "y_m": round(y_m, 2),
+        "x_m": point[0],
+        "y_m": point[1],
         "sigma_m": row["position_sigma_m"],
         "review": row["review"],
         "atd_confidence": row["atd_confidence"],

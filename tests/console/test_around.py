@@ -45,6 +45,10 @@ def test_there_and_back_in_a_local_frame():
     lat, lon = frame.to_degrees(1234.0, -567.0)
     assert frame.to_local(lat, lon) == (pytest.approx(1234.0, abs=1e-3), pytest.approx(-567.0, abs=1e-3))
     assert distance_m(70.0, 179.99, lat, lon) == pytest.approx((1234.0**2 + 567.0**2) ** 0.5, abs=1e-3)
+    many = frame.to_local_all([lat, 70.001], [lon, 179.99])
+    assert many[0] == (1234.0, -567.0)
+    assert many[1] == tuple(round(part, 2) for part in frame.to_local(70.001, 179.99))
+    assert frame.to_local_all([], []) == []
     assert vehicle_position(56.0, -5.0, None, "port", 10.0) is None
 
 
@@ -148,7 +152,7 @@ def test_a_report_says_what_is_known_and_what_is_not(console):
     page = anna.get(f"/report/{ID}").text
     assert "data:image/png;base64," in page
     assert "25.0 % (black in the picture)" in page
-    assert "<th>Altitude of the vehicle, m</th><td>not known</td>" in page
+    assert '<dt>Altitude of the vehicle, m</dt><dd><span class="missing">not known</span></dd>' in page
     assert "clean edge" in page
     assert "style=" not in page
 

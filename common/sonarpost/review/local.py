@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from pyproj import Geod
 
 _WGS84 = Geod(ellps="WGS84")
@@ -27,6 +29,16 @@ class LocalFrame:
         bearing_deg, _, distance_m = _WGS84.inv(self.lon_deg, self.lat_deg, lon_deg, lat_deg)
         bearing = math.radians(float(bearing_deg))
         return float(distance_m) * math.sin(bearing), float(distance_m) * math.cos(bearing)
+
+    def to_local_all(self, lats_deg: Sequence[float], lons_deg: Sequence[float]) -> list[tuple[float, float]]:
+        """Return (x_m east, y_m north) of many WGS 84 positions, to a centimetre."""
+        if not lats_deg:
+            return []
+        ones = np.ones(len(lats_deg))
+        found = _WGS84.inv(self.lon_deg * ones, self.lat_deg * ones, np.asarray(lons_deg), np.asarray(lats_deg))
+        bearing, far_m = np.radians(np.asarray(found[0], np.float64)), np.asarray(found[2], np.float64)
+        x_m, y_m = (far_m * np.sin(bearing)).round(2), (far_m * np.cos(bearing)).round(2)
+        return [(float(x), float(y)) for x, y in zip(x_m, y_m, strict=True)]
 
     def to_degrees(self, x_m: float, y_m: float) -> tuple[float, float]:
         """Return (lat_deg, lon_deg) of a point of this frame."""

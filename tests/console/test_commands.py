@@ -1,0 +1,134 @@
+"""`sonarpost console`: users by command; training; the server by TLS."""
+
+from __future__ import annotations
+
+import io
+import json
+import ssl
+import time
+import urllib.request
+from itertools import islice
+from pathlib import Path
+
+import pytest
+from conftest import eventually
+from console.conftest import PASSWORD
+
+from services.console.server import WebServer
+from services.console.training import VESSEL, Training
+from services.console.training_contacts import simulated_contacts
+from services.console.users import FILE_NAME, Users
+from sonarpost.cli.main import main
+from sonarpost.errors import ConfigError
+from sonarpost.runtime.config import TlsConfig
+from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
+
+
+def user(state: Path, *words: str) -> int:
+    return main(["console", "user", *words, "--state-dir", str(state)])
+
+
+def test_users_come_and_go(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO(f"{PASSWORD}\n"))
+    assert user(tmp_path, "add", "anna", "--role", "operator", "--password-stdin") == 0
+    assert user(tmp_path, "ls") == 0
+    assert "anna" in capsys.readouterr().out
+    users = Users(tmp_path / FILE_NAME)
+    assert users.right("anna", PASSWORD)
+    assert not users.right("anna", PASSWORD + "x")
+    monkeypatch.setattr("sys.stdin", io.StringIO("another password\n"))
+    assert user(tmp_path, "passwd", "anna", "--password-stdin") == 0
+    assert users.right("anna", "another password")
+    assert user(tmp_path, "rm", "anna") == 0
+    assert users.find("anna") is None
+    users.close()
+    assert user(tmp_path, "rm", "anna") == 2
+    assert "may not log in" in capsys.readouterr().out
+
+
+def test_a_password_is_asked_for_twice(tmp_path, capsys, monkeypatch):
+    given = iter([PASSWORD, "another", PASSWORD, PASSWORD, "short", "short"])
+    monkeypatch.setattr("getpass.getpass", lambda _prompt: next(given))
+    config = tmp_path / "vessel.toml"
+    config.write_text(f'[platform]\nid = "vessel-1"\nstate_dir = "{tmp_path}/state"\n')
+    assert main(["console", "user", "add", "anna", "--config", str(config)]) == 2
+    assert main(["console", "user", "add", "anna", "--config", str(config)]) == 0
+    assert (tmp_path / "state" / FILE_NAME).is_file()
+    assert main(["console", "user", "passwd", "anna", "--config", str(config)]) == 2
+    assert "10 to 200 characters" in capsys.readouterr().err
+
+
+def test_what_is_not_asked_for_is_said(capsys):
+    assert main(["console"]) == 2
+    assert main(["console", "--training", "0"]) == 2
+    assert "1 to 100000" in capsys.readouterr().err
+
+
+def test_simulated_contacts_come_bit_by_bit_and_say_what_they_are():
+    seen = list(islice(simulated_contacts(3, 1_700_000_000.0), 8))
+    assert {one.codec for one in seen} == {"emb", "vq"}
+    assert len({one.image_id for one in seen}) == 8
+    for one in seen:
+        records = [one.record(VESSEL, step, 1000.0, 1001.0) for step in range(len(one.versions))]
+        assert [record.version for record in records] == list(range(1, len(records) + 1))
+        assert all("simulated, for training" in record.notes for record in records)
+        assert records[0].bytes_received < records[0].bytes_total
+        received = [record.bytes_received for record in records]
+        assert received == sorted(received)
+        # Of the paper's codec half a picture comes first.
+        assert records[0].missing_fraction == pytest.approx(0.5 if one.codec == "vq" else 0.0, abs=0.1)
+
+
+def test_training_arrives_travels_and_ends(console):
+    training = Training(console.board, contacts=3, interval_s=0.01)
+    training.backlog(2)
+    assert console.board.counts().total == 2
+    anna = console.browser("anna")
+    [contact_id] = [row["id"] for row in anna.get("/api/contacts", limit=1).json()["items"]]
+    console.decide(anna, contact_id)
+    now = time.time()
+    training.send(now)
+    for later, state in ((0.0, "asked"), (5.0, "sent"), (11.0, "confirmed")):
+        training.travel(now + later)
+        delivery = anna.get(f"/api/contacts/{contact_id}").json()["contact"]["delivery"]
+        assert delivery["vehicle"] == state
+    assert delivery["shore"] == "delivered"
+    for _ in range(8):
+        training.packet(time.time())
+    assert console.board.counts().total == 3
+    vehicles = anna.get("/api/fleet").json()["vehicles"]
+    assert any(vehicle["snr_in_db"] is not None and vehicle["queue"] for vehicle in vehicles)
+
+
+@pytest.fixture
+def certificate(tmp_path):
+    folder = Fleet.init(tmp_path / "pki", "test").issue("vessel-1", "vessel", hosts=("127.0.0.1",)).folder
+    return TlsConfig(ca=folder / CA_CERTIFICATE, certificate=folder / CERTIFICATE, key=folder / KEY)
+
+
+def test_the_page_by_tls_with_the_fleets_certificate(make_console, certificate):
+    console = make_console(tls=True)
+    server = WebServer(console.app.asgi, "127.0.0.1", 0, certificate)
+    server.start()
+    try:
+        assert server.address.startswith("https://")
+        trusted = ssl.create_default_context(cafile=str(certificate.ca))
+        body = json.dumps({"user": "anna", "password": PASSWORD}).encode()
+
+        def login() -> dict[str, object]:
+            with urllib.request.urlopen(server.address + "api/login", body, timeout=10, context=trusted) as answer:
+                assert "Secure" in answer.headers["set-cookie"]
+                found: dict[str, object] = json.load(answer)
+                return found
+
+        assert login()["user"] == "anna"
+    finally:
+        server.stop()
+    eventually(lambda: not server.running, what="end of the server")
+
+
+def test_a_certificate_that_is_none_is_named(make_console, certificate, tmp_path):
+    (tmp_path / "none.pem").write_text("none")
+    wrong = TlsConfig(ca=certificate.ca, certificate=tmp_path / "none.pem", key=certificate.key)
+    with pytest.raises(ConfigError, match="certificate"):
+        WebServer(make_console(tls=True).app.asgi, "127.0.0.1", 0, wrong)
