@@ -196,6 +196,7 @@ class Sender:
         begun = []
         for piece in pieces:
             if piece.transfer.begun or piece.transfer.item.seq in there:
+                piece.transfer.begun = True  # so that it is taken back if the query does not get away
                 begun.append(piece)
             else:
                 self._schedule.settled(piece.transfer)
