@@ -17,6 +17,7 @@ from sonarpost.runtime.logs import kv
 log = logging.getLogger(__name__)
 
 STOP_S = 1.0
+MOST_CONNECTIONS = 200
 
 
 class WebServer:
@@ -39,6 +40,8 @@ class WebServer:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._socket.bind((host, port))
+            # From here on browsers wait instead of being turned away; they are served when the thread runs.
+            self._socket.listen(MOST_CONNECTIONS)
             config = uvicorn.Config(
                 app,
                 log_config=None,
@@ -48,6 +51,7 @@ class WebServer:
                 server_header=False,
                 proxy_headers=False,
                 timeout_graceful_shutdown=1,
+                limit_concurrency=MOST_CONNECTIONS,
                 ssl_certfile=None if tls is None else tls.certificate,
                 ssl_keyfile=None if tls is None else tls.key,
             )

@@ -178,6 +178,9 @@ class Gate:
         except (HandoffError, OSError) as error:
             log.error("Request not served", extra=kv(path=request.url.path, reason=str(error)))
             raise RefusedError(503, "not_now", "the console cannot write or read its disk at the moment") from error
+        except Exception as error:
+            log.exception("Defect while serving a request", extra=kv(path=request.url.path))
+            raise RefusedError(500, "defect", "something is wrong in the console: its log says what") from error
 
     def _check(self, request: Request, session: Session | None, act: Act | None) -> None:
         if session is None:
