@@ -1,10 +1,11 @@
 """Memory that reading a survey takes, by the length of the file.
 
-    python bench/survey_memory.py [--sizes-mb 100,2048] [--folder DIR]
+    python bench/survey_memory.py [--sizes-mb 100,2048] [--actions read,plot,detect] [--folder DIR]
 
 Writes XTF recordings of the given sizes (the same simulated pings over and over, with numbers and times that go on),
-then walks through each in a process of its own: opened and read ping by ping, and drawn as a waterfall. Prints the
-process's peak resident memory, the time and the rate. The files are removed afterwards; the disk must have room.
+then walks through each in a process of its own: opened and read ping by ping, drawn as a waterfall, and looked through
+for contacts as the vehicle does (at most 20 contacts a file). Prints the process's peak resident memory and the time.
+The files are removed afterwards; the disk must have room.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+from services.atd_stub.config import AtdStubConfig
+from services.atd_stub.snippets import from_survey
 from sonarpost.cli.survey.waterfall_picture import draw_waterfall, reduce_survey
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.readers import open_survey
@@ -51,23 +54,26 @@ def write_long(path: Path, size_bytes: int) -> int:
 def walk(path: Path, action: str) -> None:
     """Do one action on a file and print what it took."""
     began = time.perf_counter()
-    with open_survey(path) as source:
-        if action == "read":
-            count = sum(1 for _ in source.pings())
-        else:
-            picture = draw_waterfall(reduce_survey(source, over_ground=False), "long", over_ground=False)
-            count = picture.height
+    if action == "detect":
+        count = from_survey(path, "0" * 64, "uuv-1", AtdStubConfig(max_contacts=20)).contacts
+    else:
+        with open_survey(path) as source:
+            if action == "read":
+                count = sum(1 for _ in source.pings())
+            else:
+                count = draw_waterfall(reduce_survey(source, over_ground=False), "long", over_ground=False).height
     taken_s = time.perf_counter() - began
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     size_mb = path.stat().st_size / 1e6
-    what = "pings" if action == "read" else "rows"
-    print(f"{size_mb:8.0f} MB  {action:5} {count:8} {what:5} {peak_mib:6.0f} MiB peak {taken_s:7.1f} s", flush=True)
+    what = {"read": "pings", "plot": "rows", "detect": "contacts"}[action]
+    print(f"{size_mb:8.0f} MB  {action:6} {count:8} {what:8} {peak_mib:6.0f} MiB peak {taken_s:7.1f} s", flush=True)
 
 
 def main() -> None:
     """Measure every size."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--sizes-mb", default="20,100,2048", help="(default: %(default)s)")
+    parser.add_argument("--actions", default="read,plot", help="of read, plot, detect (default: %(default)s)")
     parser.add_argument(
         "--folder", type=Path, help="where the files are written (default: the system's temporary folder)"
     )
@@ -80,7 +86,7 @@ def main() -> None:
         for size_mb in map(int, parsed.sizes_mb.split(",")):
             path = Path(folder) / "long.xtf"
             write_long(path, size_mb * 1_000_000)
-            for action in ("read", "plot"):
+            for action in parsed.actions.split(","):
                 subprocess.run([sys.executable, __file__, "--walk", str(path), action], check=True)
 
 

@@ -141,6 +141,6 @@ class Outgoing:
 
 
 def _moment(time_utc_s: float) -> float:
-    """Return when a report was made, on the clock that never goes back; now where the other computer's clock differs."""
+    """Return when a report was made, on the clock that never goes back; now where its maker has another time."""
     age_s = time.time() - time_utc_s
     return time.monotonic() - (age_s if 0 <= age_s <= MOST_DELAY_S else 0.0)

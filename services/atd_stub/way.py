@@ -52,9 +52,10 @@ class WayToTheWater:
                     self._reports.pop(QUEUE, None)  # it runs the paper's link now, which has no queue
 
     def heard_queue(self, state: QueueState, now: float) -> None:
-        """Note what waits in the acoustic queue."""
+        """Note what waits in the acoustic queue; pictures of which nothing is left to be sent do not."""
+        told = sum(image.bytes_left > 0 for image in state.images)
         with self._lock:
-            self._reports[QUEUE] = (now, state.images_waiting)
+            self._reports[QUEUE] = (now, told + max(state.images_waiting - len(state.images), 0))
 
     def taken(self, now: float) -> None:
         """Note that the compressor has taken one more."""

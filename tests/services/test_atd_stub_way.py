@@ -17,7 +17,7 @@ from services.atd_stub.pool import ContactPool
 from services.atd_stub.service import AtdStubService
 from services.atd_stub.way import STALE_S, WayToTheWater
 from sonarpost import keys, wire
-from sonarpost.messages import Contact, Health, QueueState, Raster, Snippet
+from sonarpost.messages import Contact, Health, QueuedImage, QueueState, Raster, Snippet
 from sonarpost.runtime.effects import Effects
 from sonarpost.runtime.store import Store
 from sonarpost.sonar.image_files import write_tiff
@@ -37,7 +37,7 @@ def report(service, **gauges):
     )
 
 
-def queue_of(images):
+def queue_of(images, *bytes_left):
     return QueueState(
         platform_id="uuv-1",
         time_utc_s=1.0,
@@ -47,7 +47,10 @@ def queue_of(images):
         messages_waiting=0,
         message_bytes=0,
         images_waiting=images,
-        images=(),
+        images=tuple(
+            QueuedImage(image_id=f"{n:04d}", contact_id="c", bytes_left=left, preview_utc_s=None, expected_utc_s=1.0)
+            for n, left in enumerate(bytes_left)
+        ),
     )
 
 
@@ -82,6 +85,13 @@ def test_what_was_taken_counts_until_every_report_has_it(way):
     assert way.on_the_way(0, 1006.0) == 8
     way.heard_queue(queue_of(1), 1007.0)
     assert way.on_the_way(0, 1007.0) == 5
+
+
+def test_pictures_of_which_nothing_is_left_have_gone(way):
+    way.heard_queue(queue_of(3, 64, 0, 1), 1000.0)
+    assert way.on_the_way(0, 1000.0) == 2
+    way.heard_queue(queue_of(503, *[1] * 500), 1001.0)
+    assert way.on_the_way(0, 1001.0) == 503
 
 
 def test_without_reports_what_was_taken_lately_counts(way):
