@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.ready
 
-.PHONY: setup demo test test-long check fmt lock clean images test-compose
+.PHONY: setup demo test test-long check fmt lock clean images test-compose screenshots
 
 setup: $(STAMP)
 
@@ -40,6 +40,10 @@ images:
 # The whole chain in containers, built, started, disturbed and taken away again. Needs a container engine.
 test-compose: setup
 	PYTHON=$(BIN)/python packaging/test-compose.sh $(ARGS)
+
+# The pictures of the console's page in docs/screenshots; needs Chromium.
+screenshots: setup
+	$(BIN)/python packaging/screenshots.py
 
 fmt: setup
 	$(BIN)/ruff format .

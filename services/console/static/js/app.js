@@ -25,6 +25,8 @@ class App {
     this.map = new MapView();
     this.fleet = new FleetView();
     this.shown = "review";
+    this.turn = 0; // of the question, counted
+    this.newest = 0; // whose answer is on the screen
     this.side = h("div", { class: "panel", role: "region", "aria-label": "Decision" }, this.decision.element, this.aside.element);
     this.review = h("section", { class: "review", "aria-label": "Review" },
       h("div", { class: "side" }, this.filters.element, this.queue.element), this.view.element, this.side);
@@ -56,10 +58,10 @@ class App {
   async start() {
     state.fleet = await api.fleet();
     clockIs(state.fleet.now_utc_s);
-    await this.queue.show(this.filters.query);
-    startEvents();
     const asked = decodeURIComponent(location.hash.slice(1));
     if (asked) await this.select(asked);
+    await this.queue.show(this.filters.query);
+    startEvents();
     this.show("review");
     this.queue.list.focus();
   }
@@ -89,6 +91,7 @@ class App {
   async load() {
     const id = state.selected;
     if (id === null) return;
+    const turn = (this.turn += 1);
     let detail;
     try {
       detail = await api.contact(id);
@@ -97,7 +100,9 @@ class App {
       if (error.status !== 0) toast(error.message, { bad: true });
       return;
     }
-    if (id !== state.selected) return;
+    // A slow answer must not replace a newer one.
+    if (id !== state.selected || turn < this.newest) return;
+    this.newest = turn;
     this.detail = detail;
     this.#empty();
     this.decision.show(detail);
