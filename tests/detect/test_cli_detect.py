@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from PIL import Image
 from sonarpost.cli import detect as command
 from sonarpost.detect.plot import annotated_waterfall
 from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.messages import Contact
 from sonarpost.sonar.survey import Side
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -32,21 +34,51 @@ def test_the_table_names_each_contact(file, capsys):
     assert run(file) == 0
     head, columns, line = capsys.readouterr().out.splitlines()
     assert head == f"{file}: 200 pings, 1 contacts"
-    assert len(columns.split()) - 1 == len(line.split()) - 2  # the position is two numbers
+    assert len(columns.split()) == len(line.split()) - 1  # the position is two numbers
     assert line.split()[2:4] == ["mine-like", "starboard"]
 
 
-def test_json_gives_one_object_a_line(file, capsys):
-    assert run(file, file, "--json") == 0
+def test_json_is_one_object_with_every_files_contacts(file, capsys):
+    assert run(file, file, "--json", "--vehicle", "uuv-7") == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2
-    contact = json.loads(lines[0])
-    assert contact == json.loads(lines[1])
-    assert contact["file"] == str(file)
+    files = json.loads(lines[-1])["files"]
+    assert [f["file"] for f in files] == [str(file)] * 2
+    assert [f["pings"] for f in files] == [200, 200]
+    assert all(f["seconds"] > 0 for f in files)
+    (contact,) = files[0]["contacts"]
+    assert files[1]["contacts"] == [contact]
+    assert contact["vehicle_id"] == "uuv-7"
     assert contact["channel"] == "starboard"
-    assert contact["ping_number"] == pytest.approx(1120, abs=3)
+    assert contact["ping"] == pytest.approx(120, abs=3)
+    assert contact["ping_number"] == 1000 + contact["ping"]
+    assert contact["time_utc"].startswith("2001-09-09T01:46:5")
     assert 1.0 <= contact["atd_confidence"] <= 2.0
     assert contact["lat_deg"] == pytest.approx(60.0, abs=0.01)
+    assert contact["position_sigma_m"] == pytest.approx(7.1, abs=0.2)
+    missing = set(Contact.model_fields) - set(contact)
+    assert missing <= {"type", "v", "schema_version", "time_utc_s"}, missing
+
+
+def test_snippets_are_written_at_both_scales(file, tmp_path):
+    (tmp_path / "out").mkdir()
+    assert run(file, "--snippets", tmp_path / "out") == 0
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["line7-001-ground.png", "line7-001.png"]
+    with Image.open(tmp_path / "out" / "line7-001-ground.png") as picture:
+        assert picture.size == (100, 100)
+
+
+def test_a_survey_in_two_files_is_one_line_to_the_command(make_survey, tmp_path, capsys):
+    whole = make_survey({"ping": 99, "sample": 300}, {"ping": 40, "sample": 350})
+    paths = [tmp_path / "a.xtf", tmp_path / "b.xtf"]
+    for path, pings in zip(paths, (whole.pings[:100], whole.pings[100:]), strict=True):
+        write_xtf(replace(whole, pings=pings), path)
+    assert run(*paths, "--json") == 0
+    files = json.loads(capsys.readouterr().out)["files"]
+    found = [(number, c["ping"], c["sample"]) for number, f in enumerate(files) for c in f["contacts"]]
+    assert len(found) == 2
+    on_the_seam = [100 * number + ping for number, ping, sample in found if abs(sample - 300) < 10]
+    assert on_the_seam == [pytest.approx(99, abs=3)]
+    assert run(*paths, "--plot", tmp_path / "out.png") == 0
 
 
 def test_the_plot_frames_the_contact_on_its_side(file, tmp_path):
@@ -65,10 +97,11 @@ def test_several_files_get_a_plot_each(file, tmp_path):
 
 
 def test_the_options_limit_the_list(file, capsys):
-    assert run(file, "--threshold", "1.99") == 0
+    assert run(file, "--threshold", "2") == 0
     assert capsys.readouterr().out.splitlines() == [f"{file}: 200 pings, 0 contacts"]
-    assert run(file, "--threshold", "0.3", "--max-contacts", "3", "--json") == 0
-    assert len(capsys.readouterr().out.splitlines()) == 3
+    assert run(file, "--threshold", "0.001", "--max-contacts", "3", "--json") == 0
+    (found,) = json.loads(capsys.readouterr().out)["files"]
+    assert len(found["contacts"]) == 3
 
 
 @pytest.mark.parametrize("options", [("--threshold", "3"), ("--threshold", "nan"), ("--max-contacts", "0")])

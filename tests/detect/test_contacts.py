@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import Geod
 
 from sonarpost.detect.contacts import MINE_LIKE, detect
 from sonarpost.detect.settings import DetectorSettings
 from sonarpost.detect.snippet import cut_snippet
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.bottom_track import track_bottom
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Ping, Side, Survey
@@ -139,8 +141,7 @@ def test_the_scotsman_gives_the_wreck_and_the_small_objects_to_port(data_dir):
     survey = read_survey(data_dir / "surveys" / "scotsman-iver2.xtf")
     found = detect(survey)
     assert len(found) <= 20
-    # The wreck, read off the picture: pings 165 to 365, samples 150 to 600. The label beside the file (sample 138,
-    # ping 281) marks its near edge, a few samples before the bottom's first return.
+    # The wreck, read off the picture: pings 165 to 365, samples 150 to 600.
     assert [d for d in found if d.side is Side.STARBOARD and 165 <= d.ping_index <= 365 and 150 <= d.sample <= 600]
     # Small objects with a shadow to port, likewise.
     for ping, sample in ((241, 895), (276, 611), (313, 945), (356, 283)):
@@ -156,6 +157,37 @@ def test_the_scotsman_gives_the_wreck_and_the_small_objects_to_port(data_dir):
         snippet = cut_snippet(survey, d)
         assert snippet.image.shape == (100, 100)
         assert snippet.image.std() > 20
+
+
+@pytest.mark.realdata
+def test_the_scotsmans_label_is_a_contact_by_position_and_positions_are_those_of_the_geodesic(data_dir):
+    survey = read_survey(data_dir / "surveys" / "scotsman-iver2.xtf")
+    channel, column, row = map(int, (data_dir / "surveys" / "scotsman-iver2.xtf.hits").read_text().split())
+    assert (channel, column, row) == (1, 138, 281)  # XTF's channel 1: starboard
+    ping = survey.pings[row]
+    spacing_m = ping.channel(Side.STARBOARD).sample_spacing_m
+    # As a slant range the label would lie in the water: the bottom begins later.
+    assert (column + 0.5) * spacing_m < track_bottom(survey)[row]
+    # As a ground range it is the wreck's near rim.
+    geod = Geod(ellps="WGS84")
+
+    def placed(at, side, ground_m):
+        turn = 90.0 if side is Side.STARBOARD else -90.0
+        lon, lat, _ = geod.fwd(at.lon_deg, at.lat_deg, at.heading_deg + turn, ground_m)
+        return lon, lat
+
+    label = placed(ping, Side.STARBOARD, (column + 0.5) * spacing_m)
+    found = detect(survey)
+    apart_m = [
+        (geod.inv(*label, d.position.lon_deg, d.position.lat_deg)[2], d) for d in found if d.side is Side.STARBOARD
+    ]
+    distance_m, nearest = min(apart_m, key=lambda pair: pair[0])
+    assert distance_m < nearest.position_sigma_m
+    for d in found:
+        at = survey.pings[d.ping_index]
+        slant_m = (d.sample + 0.5) * at.channel(d.side).sample_spacing_m
+        lon, lat = placed(at, d.side, np.sqrt(slant_m**2 - at.altitude_m**2))
+        assert geod.inv(lon, lat, d.position.lon_deg, d.position.lat_deg)[2] < 0.01
 
 
 @pytest.mark.realdata

@@ -1,16 +1,22 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sonarpost.detect.candidates import Candidate, FilterScores, candidates, geometry_score
+from sonarpost.detect.clutter import clutter_levels
 from sonarpost.detect.contacts import CLUTTER, MINE_LIKE, classify, height_from_shadow_m
-from sonarpost.detect.fusion import fused_confidence, suppress
+from sonarpost.detect.fusion import FILTERS, FusionModel, fused_confidences, log_scores, shipped_model, suppress
 from sonarpost.detect.highlight_shadow import matched_response, peaks
 from sonarpost.detect.measure import Measured, measure
 from sonarpost.detect.preprocess import preprocess
 from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detect.structures import structures
+from sonarpost.detect.texture import TextureMap
 from sonarpost.sonar.survey import Side
 
 SETTINGS = DetectorSettings()
@@ -31,7 +37,7 @@ def best_near(survey, ping=100, sample=250):
 
 def test_an_object_with_its_shadow_answers_and_the_seabed_does_not(make_survey):
     with_object, grid, response = best_near(make_survey(box()))
-    assert with_object > 2 * SETTINGS.matched_at_threshold
+    assert with_object > 5 * SETTINGS.least_matched
     strongest = peaks(response, grid, SETTINGS, 1.0)[0]
     assert abs(strongest.row - 100) <= 4
     assert abs(strongest.cell * 2 - 250) <= 10
@@ -64,42 +70,61 @@ def test_the_measured_extents_are_those_of_the_object(make_survey):
     assert 2 * (found.cells[1] - found.cells[0]) == pytest.approx(12, abs=4)
     assert 2 * found.shadow_cells == pytest.approx(30, abs=6)
     assert not found.shadow_is_cut
-    assert found.cfar > SETTINGS.cfar_at_threshold
-    assert found.shadow > SETTINGS.shadow_at_threshold
+    assert found.cfar > 1.8
+    assert found.shadow > 1.5
+    assert geometry_score(found, grid, SETTINGS) == 1.0
 
 
 def test_a_shadow_that_goes_on_along_track_counts_less(make_survey):
-    def shadow_score(survey):
+    def shadow_geometry(survey):
         _, grid, response = best_near(survey)
         peak = next(
             p for p in peaks(response, grid, SETTINGS, 0.5) if abs(p.row - 100) < 6 and abs(2 * p.cell - 250) < 16
         )
-        return measure(grid, peak, SETTINGS).shadow
+        return geometry_score(measure(grid, peak, SETTINGS), grid, SETTINGS)
 
     scar = [box(ping=p, highlight=1.0, pings=10) for p in range(40, 170, 10) if p != 100]
-    assert shadow_score(make_survey(box(pings=10), *scar)) < 0.5 * shadow_score(make_survey(box(pings=10)))
+    assert shadow_geometry(make_survey(box(pings=10), *scar)) < 0.5 * shadow_geometry(make_survey(box(pings=10)))
 
 
-@given(scores, scores, scores)
-def test_confidence_stays_within_0_and_2(matched, cfar, shadow):
-    assert 0.0 <= fused_confidence(matched, cfar, shadow, SETTINGS) <= 2.0
+five = st.tuples(scores, scores, scores, scores, scores)
 
 
-@given(st.tuples(scores, scores, scores), st.integers(0, 2), st.floats(0, 100))
-def test_confidence_never_falls_when_a_score_rises(three, which, more):
-    raised = tuple(s + more if i == which else s for i, s in enumerate(three))
-    assert fused_confidence(*raised, SETTINGS) >= fused_confidence(*three, SETTINGS) - 1e-12
+@given(five, st.floats(-50, 50))
+def test_confidence_stays_within_0_and_2(values, clutter):
+    model = shipped_model()
+    assert 0.0 <= model.confidence(model.evidence(FilterScores(*values)), clutter) <= 2.0
 
 
-def test_confidence_is_one_at_the_operating_point_and_none_without_evidence():
-    point = (SETTINGS.matched_at_threshold, SETTINGS.cfar_at_threshold, SETTINGS.shadow_at_threshold)
-    assert fused_confidence(*point, SETTINGS) == pytest.approx(1.0)
-    for missing in range(3):
-        assert fused_confidence(*(0.0 if i == missing else 100.0 for i in range(3)), SETTINGS) == 0.0
+@given(five, st.integers(0, 4), st.floats(0, 100))
+def test_confidence_never_falls_when_a_score_rises(values, which, more):
+    model = shipped_model()
+    raised = tuple(s + more if i == which else s for i, s in enumerate(values))
+    assert model.evidence(FilterScores(*raised)) >= model.evidence(FilterScores(*values)) - 1e-12
+
+
+def test_clutter_around_lowers_the_confidence_and_half_the_odds_are_one():
+    model = FusionModel(-2.0, (1.0,) * len(FILTERS), 0.5, -3.0)
+    assert model.confidence(2.0, 0.0) == pytest.approx(1.0)
+    assert model.confidence(2.0, 4.0) == pytest.approx(2.0 / (1.0 + np.exp(2.0)))
+    assert model.confidence(-1e6, 0.0) == 0.0
+    assert log_scores(FilterScores(0.0, 1e9, 1.0, 1.0, 1.0))[:2] == (0.0, np.log(10.0))
+
+
+@pytest.mark.parametrize(
+    "wrong", [(0.0, (1.0,), 0.0, 0.0), (0.0, (1.0, 1, 1, 1, -1), 0.0, 0.0), (0.0, (1.0,) * 5, -1.0, 0.0)]
+)
+def test_weights_that_could_let_the_confidence_fall_are_refused(wrong):
+    with pytest.raises(ValueError, match="weight"):
+        FusionModel(*wrong)
+
+
+def measured(row, cell, shadow_cells=10):
+    return Measured(row, cell, (row - 2, row + 3), (cell - 2, cell + 3), shadow_cells, False, 5.0, 3.0, 3.0)
 
 
 def candidate(row, cell, shadow_cells=10):
-    return Measured(row, cell, (row - 2, row + 3), (cell - 2, cell + 3), shadow_cells, False, 5.0, 3.0, 3.0)
+    return Candidate(measured(row, cell, shadow_cells), FilterScores(5.0, 3.0, 3.0, 3.0, 1.0))
 
 
 def test_one_place_gives_its_most_confident_candidate(make_survey):
@@ -111,6 +136,65 @@ def test_one_place_gives_its_most_confident_candidate(make_survey):
     assert [c for c, _ in kept] == [1.3, 1.2, 1.15]
     assert kept[0][1] is near
     assert suppress([(1.2, long_shadow), (1.1, in_shadow_of_it)], grid, SETTINGS) == [(1.2, long_shadow)]
+
+
+def test_a_few_strong_neighbours_are_no_clutter_and_a_field_of_them_is(make_survey):
+    grid = preprocess(make_survey(), Side.PORT, SETTINGS)
+    alone = [measured(100, 130)]
+    few = [measured(20 + 60 * i, 40 + 60 * i) for i in range(3)]
+    many = [measured(r, c) for r in range(10, 190, 31) for c in range(50, 240, 40)]
+
+    def level_at_first(found):
+        return clutter_levels(found, np.full(len(found), 7.0), grid, SETTINGS, floor=-2.0)[0]
+
+    assert level_at_first(alone) == -2.0
+    assert level_at_first([*alone, *few]) == -2.0
+    assert level_at_first([*alone, *many]) == 7.0
+    assert clutter_levels([], np.zeros(0), grid, SETTINGS, floor=-2.0).shape == (0,)
+
+
+def test_parts_of_the_same_thing_are_not_clutter(make_survey):
+    grid = preprocess(make_survey(), Side.PORT, SETTINGS)
+    parts = [measured(100 + i, 130 + j) for i in range(-6, 7, 3) for j in range(-8, 9, 4)]
+    assert (clutter_levels(parts, np.full(len(parts), 7.0), grid, SETTINGS, floor=-2.0) == -2.0).all()
+
+
+def test_texture_finds_an_object_and_not_the_seabed_nor_the_change_of_its_level(make_survey):
+    grid = preprocess(make_survey(box()), Side.PORT, SETTINGS)
+    texture = TextureMap(grid)
+    at_object = texture.anomaly(100, 125)
+    elsewhere = [texture.anomaly(row, cell) for row in range(30, 180, 30) for cell in (80, 180, 210)]
+    assert at_object > 3.0
+    assert max(elsewhere) < 0.6 * at_object
+    assert np.median(elsewhere) < 2.0
+
+
+def test_texture_says_nothing_where_nothing_is_known(make_survey):
+    grid = preprocess(make_survey(), Side.PORT, SETTINGS)
+    assert TextureMap(grid).anomaly(50, 0) == 0.0
+    unknown = replace(grid, level=np.full_like(grid.level, np.nan))
+    assert TextureMap(unknown).anomaly(100, 125) == 0.0
+
+
+def test_candidates_come_with_every_score_and_an_object_is_the_best(make_survey):
+    grid = preprocess(make_survey(box()), Side.PORT, SETTINGS)
+    found = candidates(grid, SETTINGS)
+    best = max(zip(fused_confidences(found, grid, SETTINGS), found, strict=True), key=lambda c: c[0])
+    assert best[0] > 1.5
+    assert abs(best[1].measured.row - 100) <= 4
+    assert all(value > 0 for value in (getattr(best[1].scores, name) for name in FILTERS))
+
+
+def test_a_wall_of_shadow_behind_a_bright_edge_is_a_structure_once(make_survey):
+    rows = [box(ping=ping, pings=10, sample=200, samples=14, shadow_samples=180) for ping in range(60, 150, 10)]
+    grid = preprocess(make_survey(*rows), Side.PORT, SETTINGS)
+    found = structures(grid)
+    assert len(found) == 1
+    one = found[0].candidate.measured
+    assert found[0].confidence > 1.0
+    assert (one.rows[0], one.rows[1]) == (pytest.approx(55, abs=6), pytest.approx(145, abs=6))
+    assert 2 * one.cells[1] == pytest.approx(207, abs=10)
+    assert structures(preprocess(make_survey(box()), Side.PORT, SETTINGS)) == []
 
 
 def test_height_is_that_of_similar_triangles():

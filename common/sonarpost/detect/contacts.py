@@ -5,31 +5,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from sonarpost.detect.fusion import fused_confidence, suppress
-from sonarpost.detect.highlight_shadow import matched_response, peaks
-from sonarpost.detect.measure import Measured, measure
+from sonarpost.detect.candidates import Candidate, FilterScores, candidates
+from sonarpost.detect.fusion import fused_confidences, suppress
 from sonarpost.detect.preprocess import FloatVector, LevelGrid, preprocess
 from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detect.structures import is_within, structures
 from sonarpost.sonar.bottom_track import altitudes_m
-from sonarpost.sonar.geometry import Position, sample_position, sample_slant_range_m, slant_to_ground_range_m
+from sonarpost.sonar.geometry import Position, sample_slant_range_m, slant_to_ground_range_m
+from sonarpost.sonar.georeference import georeference
+from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.survey import Side, Survey
 
 MINE_LIKE = "mine-like"
 CLUTTER = "clutter"
-
-# Peaks of the matched filter below this part of its operating point cannot reach a confidence of 1 with any plausible
-# answer of the other filters; measuring them would only cost time.
-_LEAST_PART = 0.4
-_MOST_CANDIDATES_PER_KILOPING = 250
-
-
-@dataclass(frozen=True, slots=True)
-class FilterScores:
-    """What each filter said of a contact; the units are those of the settings' operating points."""
-
-    matched: float
-    cfar: float
-    shadow: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +51,8 @@ class Detection:
         highlight_pings: First and one-past-last ping index of the highlight.
         highlight_samples: First and one-past-last sample of the highlight.
         shadow_samples: Length of the shadow in samples.
+        position_sigma_m: Root mean square distance of the true place from `position`, from the error budget of the
+            survey's options; None where there is no position.
     """
 
     side: Side
@@ -91,14 +81,19 @@ class Detection:
     highlight_pings: tuple[int, int]
     highlight_samples: tuple[int, int]
     shadow_samples: int
+    position_sigma_m: float | None = None
 
 
-def detect(survey: Survey, settings: DetectorSettings | None = None) -> tuple[Detection, ...]:
+def detect(
+    survey: Survey, settings: DetectorSettings | None = None, options: SurveyOptions | None = None
+) -> tuple[Detection, ...]:
     """Find the contacts of a survey.
 
     Args:
         survey: The recording; pings of both sides, any sample type.
         settings: How to look; the defaults when None.
+        options: The options the survey was opened with, for the errors of position, heading and altitude; the
+            defaults when None.
 
     Returns:
         The contacts of both sides whose confidence reaches the threshold, most confident first. Empty for a survey
@@ -106,36 +101,46 @@ def detect(survey: Survey, settings: DetectorSettings | None = None) -> tuple[De
     """
     chosen = settings if settings is not None else DetectorSettings()
     altitude_m = altitudes_m(survey)
-    found = [d for side in survey.sides() for d in _detect_side(survey, side, chosen, altitude_m)]
+    known = options if options is not None else SurveyOptions()
+    found = [d for side in survey.sides() for d in _detect_side(survey, side, chosen, known, altitude_m)]
     found.sort(key=lambda d: (-d.confidence, d.ping_index, d.side.value, d.sample))
     return tuple(found[: chosen.max_contacts])
 
 
-def _detect_side(survey: Survey, side: Side, settings: DetectorSettings, altitude_m: FloatVector) -> list[Detection]:
+def _detect_side(
+    survey: Survey, side: Side, settings: DetectorSettings, options: SurveyOptions, altitude_m: FloatVector
+) -> list[Detection]:
     grid = preprocess(survey, side, settings, altitude_m)
     if grid is None:
         return []
-    least = _LEAST_PART * settings.matched_at_threshold
-    most = math.ceil(_MOST_CANDIDATES_PER_KILOPING * max(1.0, len(survey.pings) / 1000))
-    candidates = []
-    for peak in peaks(matched_response(grid, settings), grid, settings, least)[:most]:
-        measured = measure(grid, peak, settings)
-        if measured is not None:
-            confidence = fused_confidence(measured.matched, measured.cfar, measured.shadow, settings)
-            candidates.append((confidence, measured))
-    kept = suppress([c for c in candidates if c[0] >= settings.confidence_threshold], grid, settings)
-    described = [_describe(survey, grid, confidence, measured, settings, altitude_m) for confidence, measured in kept]
+    kept = suppress(_scored(grid, settings), grid, settings)
+    # What lies within a structure and is plainer than it has its contact already.
+    for structure in structures(grid):
+        if structure.confidence < settings.confidence_threshold:
+            break
+        if not any(is_within(other, structure.candidate, grid) for _, other in kept):
+            kept.append((structure.confidence, structure.candidate))
+    described = [_describe(survey, grid, confidence, one, settings, options, altitude_m) for confidence, one in kept]
     return [d for d in described if d is not None]
+
+
+def _scored(grid: LevelGrid, settings: DetectorSettings) -> list[tuple[float, Candidate]]:
+    """Return the places of a grid whose confidence reaches the threshold."""
+    found = candidates(grid, settings)
+    scored = zip(fused_confidences(found, grid, settings), found, strict=True)
+    return [c for c in scored if c[0] >= settings.confidence_threshold]
 
 
 def _describe(
     survey: Survey,
     grid: LevelGrid,
     confidence: float,
-    measured: Measured,
+    candidate: Candidate,
     settings: DetectorSettings,
+    options: SurveyOptions,
     altitudes: FloatVector,
 ) -> Detection | None:
+    measured = candidate.measured
     ping = survey.pings[measured.row]
     channel = ping.channel(grid.side)
     if channel is None:
@@ -150,6 +155,7 @@ def _describe(
     width_m = (samples[1] - samples[0]) * across_m
     shadow_m = measured.shadow_cells * grid.samples_per_cell * across_m
     height_m = height_from_shadow_m(shadow_m, slant_m, altitude_m) if altitude_m is not None else None
+    place = georeference(ping, grid.side, sample, options, tracked_altitude_m=altitude_m)
     has_fix = ping.lat_deg is not None and ping.lon_deg is not None
     return Detection(
         side=grid.side,
@@ -158,7 +164,7 @@ def _describe(
         sample=sample,
         time_utc_s=ping.time_utc_s,
         vehicle=Position(ping.lat_deg, ping.lon_deg) if has_fix else None,  # type: ignore[arg-type]
-        position=sample_position(ping, grid.side, sample, altitude_m=altitude_m),
+        position=None if place is None else place.position,
         heading_deg=None if ping.heading_deg is None else ping.heading_deg % 360.0,
         altitude_m=altitude_m,
         depth_m=ping.depth_m,
@@ -171,13 +177,14 @@ def _describe(
         height_m=height_m,
         shadow_is_cut=measured.shadow_is_cut,
         confidence=confidence,
-        scores=FilterScores(measured.matched, measured.cfar, measured.shadow),
+        scores=candidate.scores,
         atd_class=classify(length_m, width_m, height_m, settings),
         pixel_along_m=grid.row_along_m if grid.row_is_measured else None,
         pixel_across_m=across_m,
         highlight_pings=measured.rows,
         highlight_samples=samples,
         shadow_samples=measured.shadow_cells * grid.samples_per_cell,
+        position_sigma_m=None if place is None else place.drms_m,
     )
 
 

@@ -38,7 +38,8 @@ class Measured:
         shadow_is_cut: True when the shadow runs to the end of the recording.
         matched: Matched-filter response in local-noise units.
         cfar: Highlight over the ring's median, in the ring's deviations.
-        shadow: Depth of the shadow below the ring's median, in the ring's deviations, times its consistency (0 to 1).
+        shadow: Depth of the shadow below the ring's median, in the ring's deviations, times its dark part.
+        shadow_rows: Along-track extent of the dark region that the shadow belongs to, in rows; 0 where none is.
     """
 
     row: int
@@ -50,6 +51,7 @@ class Measured:
     matched: float
     cfar: float
     shadow: float
+    shadow_rows: int = 0
 
 
 def measure(grid: LevelGrid, peak: Peak, settings: DetectorSettings) -> Measured | None:
@@ -61,7 +63,7 @@ def measure(grid: LevelGrid, peak: Peak, settings: DetectorSettings) -> Measured
     deviation = max(1.4826 * float(np.median(np.abs(ring - seabed))), 0.1)
     rows, cells = _highlight_extent(grid, peak, seabed, deviation)
     bright = _core_mean(grid.level, peak)
-    length, is_cut, depth, consistency = _shadow(grid, rows, cells, seabed, deviation)
+    length, is_cut, depth, dark_part, spread_rows = _shadow(grid, rows, cells, seabed, deviation)
     return Measured(
         row=(rows[0] + rows[1] - 1) // 2,
         cell=(cells[0] + cells[1] - 1) // 2,
@@ -71,7 +73,8 @@ def measure(grid: LevelGrid, peak: Peak, settings: DetectorSettings) -> Measured
         shadow_is_cut=is_cut,
         matched=peak.score,
         cfar=max(0.0, (bright - seabed) / deviation),
-        shadow=max(0.0, depth) * consistency,
+        shadow=max(0.0, depth) * dark_part,
+        shadow_rows=spread_rows,
     )
 
 
@@ -126,27 +129,30 @@ def _highlight_extent(
 
 def _shadow(
     grid: LevelGrid, rows: tuple[int, int], cells: tuple[int, int], seabed: float, deviation: float
-) -> tuple[int, bool, float, float]:
-    """Return the shadow's length in cells, whether the recording cuts it, its depth in deviations, its consistency."""
+) -> tuple[int, bool, float, float, int]:
+    """Return the shadow's length in cells, whether it is cut, its depth in deviations, its dark part, its rows."""
     middle = (rows[0] + rows[1]) // 2
     half = max(0, (rows[1] - rows[0]) // 4)  # the middle half: a shadow narrows at its ends
     behind = grid.level[max(0, middle - half) : middle + half + 1, cells[1] :]
     valid = np.isfinite(behind).all(axis=0)
     end = int(np.argmin(valid)) if not valid.all() else valid.size
     if end < 2:
-        return 0, False, 0.0, 0.0
+        return 0, False, 0.0, 0.0, 0
     behind = behind[:, :end]
     profile = ndimage.uniform_filter1d(behind.mean(axis=0), size=3, mode="nearest")
     dark = profile < seabed - deviation
     first, last = _run(dark, round(_START_M / grid.cell_across_m), max(1, round(_GAP_M / grid.cell_across_m)))
     if last <= first:
-        return 0, False, 0.0, 0.0
+        return 0, False, 0.0, 0.0, 0
     depth = (seabed - float(behind[:, first:last].mean())) / deviation
     filled = float((behind[:, first:last] < seabed - 0.5 * deviation).mean())
-    spread_rows = _dark_rows(grid, middle, (cells[1] + first, cells[1] + last), seabed - deviation)
-    # An object's shadow is about as wide along-track as its highlight; twice that, and at least a metre, is granted.
-    granted_rows = max(2.0 * (rows[1] - rows[0]), 1.0 / grid.row_along_m)
-    return last, last == end, depth, filled * min(1.0, granted_rows / max(spread_rows, 1))
+    return (
+        last,
+        last == end,
+        depth,
+        filled,
+        _dark_rows(grid, middle, (cells[1] + first, cells[1] + last), seabed - deviation),
+    )
 
 
 def _run(dark: npt.NDArray[np.bool_], start_within: int, gap: int) -> tuple[int, int]:

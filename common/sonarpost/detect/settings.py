@@ -24,9 +24,10 @@ class DetectorSettings:
         noise_window_m: Along and across extent of the neighbourhood that defines the local noise.
         guard_m: Distance from a highlight to the ring of seabed the constant-false-alarm test compares it with.
         ring_m: Width of that ring.
-        matched_at_threshold: Matched-filter response, in local-noise units, that counts as the operating point.
-        cfar_at_threshold: Highlight over the ring of seabed, in its deviations, that counts as the operating point.
-        shadow_at_threshold: Shadow depth in the same deviations, times its consistency (0 to 1), likewise.
+        least_matched: Matched-filter response, in local-noise units, below which a place is not looked at closer.
+        clutter_radius_m: How far around a place, along and across, other places tell how cluttered the seabed is.
+        clutter_area_m2: Seabed to which one contact is granted: the local level of clutter is the evidence that is
+            reached by one place in this area.
         separation_along_m: Contacts nearer than this along-track (and across) are one contact.
         separation_across_m: See `separation_along_m`.
         mine_length_m: Least and greatest highlight length of a mine-like contact.
@@ -48,9 +49,9 @@ class DetectorSettings:
     noise_window_m: tuple[float, float] = (24.0, 12.0)
     guard_m: float = 0.6
     ring_m: float = 1.5
-    matched_at_threshold: float = 4.0
-    cfar_at_threshold: float = 1.8
-    shadow_at_threshold: float = 1.5
+    least_matched: float = 1.6
+    clutter_radius_m: float = 30.0
+    clutter_area_m2: float = 90.0
     separation_along_m: float = 3.0
     separation_across_m: float = 3.0
     mine_length_m: tuple[float, float] = (0.3, 4.0)
@@ -62,7 +63,7 @@ class DetectorSettings:
         """Refuse what no detector can work with.
 
         Raises:
-            ValueError: A length, size or operating point is not a finite number above 0, the confidence is not within
+            ValueError: A length, size or response is not a finite number above 0, the confidence is not within
                 0 to 2, or there is no size to look for.
         """
         for item in fields(self):
