@@ -8,12 +8,12 @@ from collections.abc import Mapping
 
 from services.compressor.config import CompressorConfig
 from services.compressor.kept import KeptPictures
+from services.compressor.refine import encode, handed, refined
 from sonarpost import keys, wire
 from sonarpost.catalogue.store import open_catalogue
-from sonarpost.codec.interface import Codec, Extensible
+from sonarpost.codec.interface import Codec
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.link.paper_format import format_image_id
-from sonarpost.link.v1_objects import MAX_STREAM_BYTES
 from sonarpost.link.v1_preview import MAX_NUMBER
 from sonarpost.messages import Command, EncodedImage, Record, Snippet
 from sonarpost.runtime.config import PlatformConfig
@@ -57,7 +57,8 @@ class CompressorService(Service[CompressorConfig]):
             return
         assert isinstance(record, Snippet)
         started = time.perf_counter()
-        stream = self._codec.encode(record.picture.to_array(), self.config.budget_bytes or None)
+        whole = encode(self._codec, record.picture.to_array(), self.config.budget_bytes, self.config.refine_bytes)
+        stream = handed(self._codec, whole)
         number = self._next_number()
         effects.put_state(_NEXT_IMAGE, str(number % IMAGE_IDS + 1).encode())
         image = EncodedImage(
@@ -73,7 +74,8 @@ class CompressorService(Service[CompressorConfig]):
         )
         effects.send(keys.image_encoded(self.platform.id), "uuv_modem", image)
         if self.config.keep_pictures:
-            self._kept.keep(effects, image.image_id, wire.encode(image), effects.payload, time.time())
+            kept = image.model_copy(update={"stream": whole})
+            self._kept.keep(effects, image.image_id, wire.encode(kept), effects.payload, time.time())
         effects.count("images_encoded")
         effects.count("bytes_encoded", len(stream))
         log.info(
@@ -89,7 +91,7 @@ class CompressorService(Service[CompressorConfig]):
         )
 
     def _answer(self, command: Command, effects: Effects) -> None:
-        """Give a picture again; finer where that was asked for and the longer stream begins as the first did.
+        """Give a picture again; finer where that was asked for and its stream can go on where it ended.
 
         What a stream has more than the link has sent of it, the link sends by itself: this is for what it has not.
         """
@@ -101,18 +103,17 @@ class CompressorService(Service[CompressorConfig]):
             return
         where = f"compressor.db: kept/{image_id}"
         image = wire.decode(EncodedImage, found[0], where)
-        if command.kind == "refine":
+        # A picture that was encoded before the codec was changed goes as it is.
+        is_ours = (image.codec, image.model) == (self._codec.name, self._codec.model_hash)
+        if command.kind == "refine" and is_ours:
             snippet = wire.decode(Snippet, found[1], where)
-            pixels, budget_bytes = snippet.picture.to_array(), min(2 * len(image.stream), MAX_STREAM_BYTES)
-            if isinstance(self._codec, Extensible) and image.model == self._codec.model_hash:
-                finer = self._codec.extend(image.stream, pixels, budget_bytes)
-            else:
-                finer = self._codec.encode(pixels, budget_bytes)
-            # The last byte ends the entropy coder's number, so that of a shorter stream may be another.
-            if len(finer) > len(image.stream) and finer.startswith(image.stream[:-1]):
-                image = image.model_copy(update={"stream": finer})
+            longer = refined(self._codec, image.stream, snippet.picture.to_array())
+            if longer != image.stream:
+                image = image.model_copy(update={"stream": longer})
                 self._kept.keep(effects, image_id, wire.encode(image), found[1], time.time())
                 effects.count("images_refined")
+        if is_ours:
+            image = image.model_copy(update={"stream": handed(self._codec, image.stream)})
         effects.send(keys.image_encoded(self.platform.id), "uuv_modem", image, priority=3)
         effects.count("images_given_again")
         log.info("Picture given again", extra=kv(image_id=image_id, kind=command.kind, bytes=len(image.stream)))

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
 
 import pytest
+import zenoh
 from chain.conftest import RunningChain
 
+from sonarpost import keys, wire
 from sonarpost.cli.demo.account import settle
+from sonarpost.cli.demo.settings import UUV, VESSEL
+from sonarpost.messages import Command
+from sonarpost.runtime.session import open_with_retry
 
 pytestmark = pytest.mark.chain
 
@@ -38,3 +45,56 @@ def test_with_a_third_of_the_frames_lost_every_picture_is_ashore(start_chain: St
     assert result.sha256_match
     assert result.missing_ashore == ()
     assert all(image.codec == "emb" and image.missing_fraction == 0.0 for image in run.watcher.shore.values())
+
+
+@pytest.fixture
+def order():
+    """Publishes a command as a program on the vessel does that has no outbox."""
+    sessions: list[zenoh.Session] = []
+
+    def give(run: RunningChain, kind: str, image_id: str) -> None:
+        if not sessions:
+            session = open_with_retry([f"tcp/127.0.0.1:{run.settings.router_ports[1]}"], threading.Event())
+            assert session is not None
+            sessions.append(session)
+        key = keys.command(VESSEL, kind)
+        record = Command(
+            command_id=f"{kind}-{time.time_ns()}",
+            kind=kind,
+            vehicle_id=UUV,
+            image_id=image_id,
+            issued_by="test",
+            issued_utc_s=time.time(),
+        )
+        publisher = sessions[0].declare_publisher(key)
+        run.until(lambda: publisher.matching_status.matching, 20, f"subscriber of {key}")
+        publisher.put(wire.encode(record), encoding=wire.encoding_of(Command))
+        publisher.undeclare()
+
+    yield give
+    for session in sessions:
+        session.close()
+
+
+@pytest.mark.long
+def test_refining_brings_more_of_a_picture_first_from_uuv_modem_then_from_the_compressor(
+    start_chain: StartChain, order: Callable[[RunningChain, str, str], None]
+) -> None:
+    held = 700
+    run = start_chain(link="v1", loss=0.1, extra=(("compressor", f"refine_bytes = {held}"),))
+    begun = run.settings.stream_bytes
+    run.deposit(1)
+    run.until(lambda: len(run.watcher.encoded) == 1, 60, "the picture encoded")
+    [image_id] = run.watcher.encoded
+    assert len(run.watcher.encoded[image_id].stream) > 0.9 * held
+
+    def has(least: int, most: int) -> bool:
+        image = run.watcher.shore.get(image_id)
+        return image is not None and image.complete and least <= image.bytes_received <= most
+
+    # Unasked comes what is planned, and what fills the last frame.
+    run.until(lambda: has(begun, begun + 64), 60, "what is sent unasked ashore")
+    order(run, "refine", image_id)
+    run.until(lambda: has(held - 16, held), 60, "all that uuv_modem has ashore")
+    order(run, "refine", image_id)
+    run.until(lambda: has(int(1.9 * held), 2 * held + 2), 60, "what the compressor has made of it ashore")
