@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 _MAX_FILE_BYTES = 1 << 20
 
 
-def kept_since(out_dir: Path) -> Iterator[ReconstructedImage | Decision]:
+def kept_in(out_dir: Path) -> Iterator[ReconstructedImage | Decision]:
     """Yield every picture and decision that c2 keeps, pictures first; what cannot be read is logged and left out.
 
     The folder does not say which pixels are missing, only which rows and how many: such a picture is given with all of

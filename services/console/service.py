@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
+from itertools import islice
 from typing import TypeVar
 
 import zenoh
@@ -13,7 +14,7 @@ import zenoh
 from services.console.app import ConsoleApp
 from services.console.asking import Table
 from services.console.board import Board, Unsent
-from services.console.catch_up import kept_since
+from services.console.catch_up import kept_in
 from services.console.config import ConsoleConfig
 from services.console.database import Database
 from services.console.events import Pace
@@ -48,6 +49,7 @@ ADVICE_PRIORITY = 2
 DECISION_PRIORITY = 2
 C2 = "c2"
 TICK_S = 1.0
+CATCH_UP_AT_ONCE = 50
 FRAMES_EVERY_S = 0.2
 _SETTLED = "settled/"
 # The relay's health is as of a moment before it was sent.
@@ -262,19 +264,14 @@ class ConsoleService(Service[ConsoleConfig]):
 
     def _catch_up(self) -> None:
         assert self.config.out_dir is not None
-        for record in kept_since(self.config.out_dir):
-            if self.stopping.is_set():
-                return
-            try:
-                if isinstance(record, Decision):
-                    new = self.board.take_decision(record)
-                else:
-                    new = self.board.take_image(record)
-            except HandoffError as error:
-                log.error("What c2 keeps is not taken, the next start tries again", extra=kv(reason=str(error)))
-                return
-            if new:
-                self.count("records_caught_up")
+        kept = kept_in(self.config.out_dir)
+        try:
+            while not self.stopping.is_set() and (some := list(islice(kept, CATCH_UP_AT_ONCE))):
+                new = self.board.take_images([record for record in some if isinstance(record, ReconstructedImage)])
+                new += sum(self.board.take_decision(record) for record in some if isinstance(record, Decision))
+                self.count("records_caught_up", new)
+        except HandoffError as error:
+            log.error("What c2 keeps is not taken, the next start tries again", extra=kv(reason=str(error)))
 
     # Life
 

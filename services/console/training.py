@@ -16,6 +16,7 @@ from services.console.training_contacts import VEHICLES, Simulated, simulated_co
 from sonarpost import keys, wire
 from sonarpost.messages import (
     AcousticFrame,
+    Advice,
     Command,
     Decision,
     DownlinkState,
@@ -35,6 +36,7 @@ RATE = 1
 SERVICES = ("op_modem", "decompressor", "relay", "console")
 TICK_S = 0.5
 BACKLOG_AT_ONCE = 40
+ADVICE_EVERY = 5
 
 
 @dataclass
@@ -129,9 +131,28 @@ class Training:
             return
         record = arriving.simulated.record(VESSEL, arriving.step, arriving.first_utc_s, now_utc_s)
         self._board.take_image(record)
+        if self._packet % ADVICE_EVERY == ADVICE_EVERY - 2:
+            self._board.take_advice(self._advice(record))
         arriving.step += 1
         if arriving.step == len(arriving.simulated.versions):
             self._arriving.remove(arriving)
+
+    def _advice(self, record: ReconstructedImage) -> Advice:
+        """Return what an expert ashore would say of a picture that has just come."""
+        sure = record.contact.atd_confidence if record.contact else None
+        likely = sure is not None and sure > 1.1
+        return Advice(
+            advice_id=f"training-{self._packet}",
+            vessel_id=VESSEL,
+            vehicle_id=record.vehicle_id,
+            image_id=record.image_id,
+            image_version=record.version,
+            verdict="mine_like" if likely else "unsure",
+            confidence=0.7 if likely else 0.4,
+            remark="Simulated: the shadow has a straight edge." if likely else "Simulated: wait for more of it.",
+            author="ashore",
+            advised_utc_s=record.last_frame_utc_s,
+        )
 
     def _hear(self, vehicle: str, now_utc_s: float) -> None:
         bad = int(self._chance.random() < 0.15)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 import zipfile
 from xml.etree import ElementTree as ET
 
 import pytest
+from conftest import REPOSITORY
 from console.conftest import picture_record
 
 from services.console.events import Hub, Pace
@@ -164,3 +166,30 @@ def test_intervals_of_the_papers_share():
     assert wilson(0, 0) == clopper_pearson(0, 0) == (0.0, 1.0)
     assert clopper_pearson(20, 20)[1] == 1.0
     assert wilson(0, 5)[0] == 0.0
+
+
+def test_every_route_is_described(console):
+    told = (REPOSITORY / "docs" / "console-api.md").read_text(encoding="utf-8")
+    paths = [route.path for route in console.app.asgi._app.routes]
+    assert len(paths) > 20
+    for path in paths:
+        *_, before, last = re.sub(r"\{(\w+):\w+\}", r"{\1}", path).split("/")
+        known = {
+            "/": "`GET /`",
+            "/api/export/{name}": "/api/export/contacts.geojson",
+            "/static/{path:path}": "`/static/`",
+        }
+        assert known.get(path, f"/{last}" if before in ("", "{version}") else f"{before}/{last}") in told, path
+    for name in console.browser("watch").get("/api/info").json():
+        assert f'"{name}"' in told
+
+
+def test_every_field_of_a_contact_is_described(console):
+    console.board.take_image(picture_record())
+    anna = console.browser("anna")
+    console.decide(anna, ID)
+    whole = anna.get(f"/api/contacts/{ID}").json()
+    told = (REPOSITORY / "docs" / "console-api.md").read_text(encoding="utf-8")
+    for part in (whole, whole["contact"], whole["versions"][0], whole["decisions"][0], whole["audit"][0]):
+        for name in part:
+            assert f'"{name}"' in told, name

@@ -93,9 +93,10 @@ def test_training_arrives_travels_and_ends(console):
         delivery = anna.get(f"/api/contacts/{contact_id}").json()["contact"]["delivery"]
         assert delivery["vehicle"] == state
     assert delivery["shore"] == "delivered"
-    for _ in range(8):
+    for _ in range(6):
         training.packet(time.time())
     assert console.board.counts().total == 3
+    assert any(row["advised"] for row in anna.get("/api/contacts").json()["items"])
     vehicles = anna.get("/api/fleet").json()["vehicles"]
     assert any(vehicle["snr_in_db"] is not None and vehicle["queue"] for vehicle in vehicles)
 
