@@ -122,3 +122,17 @@ def test_what_cannot_go_on_stays_or_is_refused() -> None:
         CODEC.extend(stream, contact(32, 48), 80)
     with pytest.raises(StreamError, match="codec_id"):
         CODEC.extend(b"\x04" + stream[1:], image, 80)
+
+
+def test_going_on_leaves_out_what_is_not_known() -> None:
+    image = contact(64, 56)
+    known = np.ones(image.shape, np.bool_)
+    known[:, 40:] = False
+    holed = np.where(known, image, 0).astype(np.uint8)
+    stream = CODEC.encode_with_estimate(holed, 60, known=known).stream
+    error = []
+    for mask in (known, None):
+        longer = CODEC.extend(stream, holed, 120, known=mask)
+        assert len(longer) == 120
+        error.append(((CODEC.decode(longer).image.astype(float) - image)[known] ** 2).mean())
+    assert error[0] < 0.97 * error[1]

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
-from sonarpost.codec.emb.coder import Coder, State
+from sonarpost.codec.emb.coder import Coder, State, error_by_length
 from sonarpost.codec.emb.enhance import enhanced
 from sonarpost.codec.emb.fit import Wanted, wanted_of
 from sonarpost.codec.emb.grain import make_grain, measure_grain
@@ -153,15 +153,23 @@ class EmbCodec:
         _, body, curve = min(
             (self._write(wanted, side, limit, self.price) for side in sides), key=lambda found: found[0]
         )
-        return Encoded(header.pack() + body, _estimate(curve, len(body), header.size, picture.size))
+        return Encoded(header.pack() + body, error_by_length(curve, len(body), header.size, picture.size))
 
-    def extend(self, stream: bytes, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], budget_bytes: int) -> bytes:
+    def extend(
+        self,
+        stream: bytes,
+        image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+        budget_bytes: int,
+        *,
+        known: Mask | None = None,
+    ) -> bytes:
         """Return a longer stream of the picture that begins as `stream` does, but for its last byte.
 
         Args:
             stream: Of this picture.
             image: The picture, as `encode` had it.
             budget_bytes: Length of the longer stream.
+            known: As `encode_with_estimate` had it.
 
         Returns:
             The longer stream; `stream` itself where there is none: it said all there is to say, or (seldom) the number
@@ -172,7 +180,7 @@ class EmbCodec:
         """
         check_image(image)
         header = self._check_header(stream)
-        picture = to_uint8(image)
+        picture = to_uint8(image) if known is None else fill_unknown(to_uint8(image), known)
         if picture.shape != (header.height_px, header.width_px):
             raise StreamError("image", "shape", picture.shape, f"the stream's {(header.height_px, header.width_px)}")
         state, side = self.read_state(stream)
@@ -284,18 +292,6 @@ class EmbCodec:
         plane = enhanced(plain.plane, plain.mean, plain.situation, self.model)
         grey = (plane + transform.UNIT // 2) // transform.UNIT + plain.mean
         return np.clip(grey, 0, 255).astype(np.uint8)
-
-
-def _estimate(curve: npt.NDArray[np.int64], body_bytes: int, header_bytes: int, pixels: int) -> npt.NDArray[np.float64]:
-    """Mean squared error by stream length, from the coder's record of squared error by bytes begun."""
-    out = np.full(header_bytes + body_bytes + 1, np.inf)
-    last = np.inf
-    for n in range(body_bytes + 1):
-        # What was coded within the first n bytes; the coder's record n + 1 is of the byte begun after them.
-        if n < len(curve) - 1 and n > 0 and curve[n] >= 0:
-            last = float(curve[n]) / transform.UNIT**2 / pixels
-        out[header_bytes + n] = last
-    return out
 
 
 def _usable(body: bytes, received: Mask | None) -> tuple[bytes, tuple[str, ...]]:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from sonarpost.codec.emb import kernel
 from sonarpost.codec.emb.layout import Layout
+from sonarpost.codec.emb.transform import UNIT
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
@@ -83,3 +84,25 @@ class Coder:
             share = chance if bit else 65536 - chance
             self.words[kernel.CODER_COST] += round(256 * (16 - np.log2(share)))
         return int(kernel.code_plain(self.words, self.data, self.good, bit, chance, self.mode))
+
+
+def error_by_length(curve: I64, body_bytes: int, header_bytes: int, pixels: int) -> npt.NDArray[np.float64]:
+    """Return the mean squared error by stream length, from the coder's record of squared error by bytes begun.
+
+    Args:
+        curve: See `Coder.curve`.
+        body_bytes: Length of the body.
+        header_bytes: Length of what stands before it.
+        pixels: Of the picture.
+
+    Returns:
+        Shape (header_bytes + body_bytes + 1,), grey squared; infinite where there is no picture yet.
+    """
+    out = np.full(header_bytes + body_bytes + 1, np.inf)
+    last = np.inf
+    for n in range(body_bytes + 1):
+        # What was coded within the first n bytes; the coder's record n + 1 is of the byte begun after them.
+        if n < len(curve) - 1 and n > 0 and curve[n] >= 0:
+            last = float(curve[n]) / UNIT**2 / pixels
+        out[header_bytes + n] = last
+    return out
