@@ -87,7 +87,7 @@ def press(page: Page, *keys: str) -> None:
 def shoot(page: Page, name: str) -> None:
     """Save what is on the screen, in at most 256 colours."""
     path = OUT / f"{name}.png"
-    page.wait_for_function("() => [...document.images].every(one => one.complete)")
+    page.wait_for_function("() => [...document.images].every(one => one.complete || !one.checkVisibility())")
     page.screenshot(path=path)
     with Image.open(path) as shot:
         shot.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
@@ -110,17 +110,19 @@ def review_part(scene: Scene) -> None:
 
 def measured(scene: Scene) -> None:
     """By day, small: the shadow of a contact is measured."""
-    contact_id = scene.contact(complete=True, of=2)
+    contact_id = scene.contact(complete=True, of=0)
     with scene.page(SMALL, "day", contact_id) as page:
         shadow(page)
         press(page, "Enter", "Escape")
         page.wait_for_selector('details[data-name="measurements"]')
+        page.focus("#queue")
+        page.wait_for_selector("#toasts p", state="detached")
         shoot(page, "review-day-1366")
 
 
 def shadow(page: Page) -> None:
-    """Measure a shadow from near the middle of the picture outwards."""
-    press(page, "m", "m", "m", "Enter", *["Shift+ArrowRight"] * 3, "Enter")
+    """Measure the shadow, which begins left of the picture's middle."""
+    press(page, "m", "m", "m", *["Shift+ArrowLeft"] * 4, "Enter", *["Shift+ArrowRight"] * 3, "Enter")
     page.wait_for_selector(".hint >> text=Enter keeps it")
 
 
@@ -219,7 +221,7 @@ def main() -> None:
         try:
             scene = Scene(board, users, server.address, browser)
             review_part(scene)
-            for make in (decided, measured, partly_there, asked, conflict, around):
+            for make in (measured, decided, partly_there, asked, conflict, around):
                 make(scene)
         finally:
             browser.close()

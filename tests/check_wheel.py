@@ -16,7 +16,7 @@ def wanted() -> set[str]:
     """Return the files of the source tree that belong into the wheel."""
     files = {p.relative_to(REPOSITORY / "common").as_posix() for p in (REPOSITORY / "common" / "sonarpost").rglob("*")}
     files |= {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "services").rglob("*")}
-    suffixes = (".py", ".typed", ".tiles", ".md")
+    suffixes = (".py", ".typed", ".tiles", ".md", ".html", ".css", ".js", ".svg")
     return {name for name in files if name.endswith(suffixes) and "__pycache__" not in name}
 
 

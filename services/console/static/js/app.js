@@ -22,6 +22,7 @@ class App {
     this.aside = new Aside();
     this.queue = new Queue();
     this.filters = new Filters(calmly(() => this.queue.show(this.filters.query), 120));
+    listen("fleet", (fleet) => { state.fleet = fleet; }); // before anybody draws it
     this.map = new MapView();
     this.fleet = new FleetView();
     this.shown = "review";
@@ -47,7 +48,6 @@ class App {
     });
     listen("select", ({ id }) => this.select(id));
     listen("view", ({ name }) => this.show(name));
-    listen("fleet", (fleet) => { state.fleet = fleet; });
     listen("contact", ({ contact }) => { if (contact.id === state.selected) again(); });
     for (const name of ["decision", "request", "advice", "changed"]) listen(name, ({ id }) => { if (id === state.selected) again(); });
     listen("reload", () => this.reload());
@@ -56,14 +56,13 @@ class App {
   }
 
   async start() {
-    state.fleet = await api.fleet();
+    this.show("review");
+    tell("fleet", await api.fleet());
     clockIs(state.fleet.now_utc_s);
     const asked = decodeURIComponent(location.hash.slice(1));
     if (asked) await this.select(asked);
     await this.queue.show(this.filters.query);
     startEvents();
-    this.show("review");
-    this.queue.list.focus();
   }
 
   /** Everything anew: the stream was interrupted for longer than the server remembers. */

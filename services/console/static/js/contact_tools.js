@@ -54,9 +54,10 @@ export function drawVersions(view) {
   fill(view.versions, versions.length ? h("kbd", { text: "[" }) : null, versions.slice(-8).map((one) => h("button", {
     type: "button", "aria-pressed": String(one.version === view.version), on: { click: () => view.showVersion(one.version) },
     "aria-label": `Version ${one.version}, ${received(one)} received, ${time(one.received_utc_s)}`,
-  }, h("img", { src: api.thumbnailUrl(view.detail.contact.id, one.version), alt: "" }), h("span", { class: "number", text: `v${one.version} · ${received(one)}` }))),
+  }, h("img", { src: api.thumbnailUrl(view.detail.contact.id, one.version), alt: "" }), h("span", { class: "number", text: `v${one.version} ${received(one)}` }))),
   versions.length ? h("kbd", { text: "]" }) : null,
   newest && view.version !== newest ? h("span", { class: "stale", text: `Version ${newest} is newer than the one shown.` }) : null);
+  view.versions.querySelector('[aria-pressed="true"]')?.scrollIntoView({ block: "nearest", inline: "nearest" });
 }
 
 /** What to do next while measuring. */

@@ -16,14 +16,17 @@ function fact(name, ...value) {
   return [h("dt", { text: name }), h("dd", { class: "number" }, value)];
 }
 
+const many = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
+const until = (utc_s) => (utc_s <= now() ? "due" : `in ${duration(utc_s - now())}`);
+
 function queueTable(queue) {
   if (!queue) return h("p", { class: "muted", text: "The vehicle's queue is not seen on this side of the water." });
   const rows = queue.images.slice(0, 8).map((one) => h("tr", {},
     h("td", {}, h("code", { text: one.image_id })), h("td", { class: "number", text: bytes(one.bytes_left) }),
-    h("td", { class: "number", text: one.preview_utc_s === null ? "gone" : `in ${duration(one.preview_utc_s - now())}` }),
-    h("td", { class: "number", text: `in ${duration(one.expected_utc_s - now())}` })));
+    h("td", { class: "number", text: one.preview_utc_s === null ? "gone" : until(one.preview_utc_s) }),
+    h("td", { class: "number", text: until(one.expected_utc_s) })));
   return [
-    h("p", {}, `${queue.images_waiting} pictures and ${queue.messages_waiting} messages (${bytes(queue.message_bytes)}) wait; one packet every ${duration(queue.packet_interval_s)}. `, aged("", queue.time_utc_s, state.info.stale_after_s.vehicle)),
+    h("p", {}, `${many(queue.images_waiting, "picture")} and ${many(queue.messages_waiting, "message")} (${bytes(queue.message_bytes)}) waiting; one packet every ${duration(queue.packet_interval_s)}. `, aged("", queue.time_utc_s, state.info.stale_after_s.vehicle)),
     rows.length ? h("table", {}, h("thead", {}, h("tr", {}, ["picture", "left", "preview", "all of it"].map((name, i) => h("th", { scope: "col", class: i ? "number" : "", text: name })))), h("tbody", {}, rows)) : null,
   ];
 }

@@ -18,8 +18,11 @@ function halo(context, words, x, y, ink, paper) {
 export function drawFrame(stage, { ring_m: rings, vessel }) {
   const { context, width, height, toScreen, perMetre, colour, centre } = stage;
   const step = niceStep(width / perMetre, width / 110);
-  context.strokeStyle = colour("grid");
-  context.lineWidth = 1;
+  const line = () => {
+    context.strokeStyle = colour("grid");
+    context.lineWidth = 1;
+    context.stroke();
+  };
   context.textAlign = "left";
   context.textBaseline = "top";
   const west = centre.x - width / 2 / perMetre;
@@ -30,7 +33,7 @@ export function drawFrame(stage, { ring_m: rings, vessel }) {
     context.beginPath();
     context.moveTo(at, 0);
     context.lineTo(at, height);
-    context.stroke();
+    line();
     halo(context, label(x), at + 3, height - 18, colour("muted"), colour("water"));
   }
   for (let y = Math.ceil(south / step) * step; y < south + height / perMetre; y += step) {
@@ -38,21 +41,21 @@ export function drawFrame(stage, { ring_m: rings, vessel }) {
     context.beginPath();
     context.moveTo(0, at);
     context.lineTo(width, at);
-    context.stroke();
+    line();
     halo(context, label(y), 4, at + 2, colour("muted"), colour("water"));
   }
   const [x, y] = toScreen(vessel?.x_m ?? 0, vessel?.y_m ?? 0);
-  context.setLineDash([7, 6]);
-  context.strokeStyle = colour("muted");
   for (const radius of rings) {
+    context.strokeStyle = colour("muted");
     context.lineWidth = 1.3;
+    context.setLineDash([7, 6]);
     context.beginPath();
     context.arc(x, y, radius * perMetre, 0, 2 * Math.PI);
     context.stroke();
+    context.setLineDash([]);
     context.textAlign = "center";
     halo(context, METRES(radius), x, y - radius * perMetre + 3, colour("muted"), colour("water"));
   }
-  context.setLineDash([]);
   context.textAlign = "left";
   if (vessel) {
     context.fillStyle = colour("text");
