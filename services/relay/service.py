@@ -15,9 +15,9 @@ from sonarpost import keys, wire
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
 from sonarpost.runtime.config import PlatformConfig
+from sonarpost.runtime.lane import Lane
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.room import Room
-from sonarpost.runtime.sender import Lane
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.session import open_with_retry
 from sonarpost.runtime.shore_watch import ShoreWatch, Site

@@ -10,8 +10,8 @@ import zenoh
 
 from services.relay.config import UpstreamOptions
 from sonarpost import keys
+from sonarpost.runtime.lane import Lane
 from sonarpost.runtime.logs import kv
-from sonarpost.runtime.sender import Lane
 from sonarpost.runtime.transaction import consumer_of, queue_of
 
 log = logging.getLogger(__name__)

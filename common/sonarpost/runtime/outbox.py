@@ -9,9 +9,10 @@ from collections.abc import Callable
 import zenoh
 
 from sonarpost.errors import HandoffError
+from sonarpost.runtime.lane import PRIORITIES, REPLY_TIMEOUT_S, Lane, Settled
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.schedule import PROBE_WINDOW, WINDOW
-from sonarpost.runtime.sender import BACK_OFF_S, PRIORITIES, REPLY_TIMEOUT_S, Lane, Sender, Settled
+from sonarpost.runtime.sender import BACK_OFF_S, Sender
 from sonarpost.runtime.store import Store
 
 __all__ = ["BACK_OFF_S", "PRIORITIES", "PROBE_WINDOW", "REPLY_TIMEOUT_S", "WINDOW", "Lane", "Outbox"]

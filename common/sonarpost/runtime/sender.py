@@ -6,34 +6,24 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import zenoh
 
-from sonarpost import keys
 from sonarpost.errors import HandoffError, PayloadError
-from sonarpost.runtime import handoff, handoff_batch
+from sonarpost.runtime import handoff_batch, lane
 from sonarpost.runtime.concern import concern_of_payload
 from sonarpost.runtime.handoff import Reply
+from sonarpost.runtime.lane import Lane, Settled
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.schedule import MAX_WINDOW_BYTES, WINDOW, Piece, Schedule, Transfer
 from sonarpost.runtime.store import Store
-from sonarpost.runtime.transaction import OutboxItem, Transaction, consumer_of
+from sonarpost.runtime.transaction import OutboxItem
 
 log = logging.getLogger(__name__)
 
-REPLY_TIMEOUT_S = 5.0
 BACK_OFF_S = (0.05, 0.1, 0.2, 0.5, 1.0)
-PRIORITIES = {
-    1: zenoh.Priority.REAL_TIME,
-    2: zenoh.Priority.INTERACTIVE_HIGH,
-    3: zenoh.Priority.INTERACTIVE_LOW,
-    4: zenoh.Priority.DATA_HIGH,
-    5: zenoh.Priority.DATA,
-    6: zenoh.Priority.DATA_LOW,
-    7: zenoh.Priority.BACKGROUND,
-}
 IDLE_S = 1.0
 # Replies come in batches, one write to the consumer's disk apart: looked for soon at first, then less often.
 POLL_S = (0.0005, 0.02)
@@ -41,26 +31,6 @@ FORGET_AT = 512
 LOADED_BYTES = 2 * MAX_WINDOW_BYTES
 """Most bytes of records that are held ready beyond the first 128."""
 FORGET_AFTER_S = 0.2
-
-Settled = Callable[[Transaction, OutboxItem, str | None], None]
-"""Called in the transaction that forgets a record: the record, and the consumer's reason if it was refused."""
-
-
-@dataclass(frozen=True, slots=True)
-class Lane:
-    """How a queue is sent.
-
-    Attributes:
-        session: Returns the session to send over, None while there is none; by default the outbox's own.
-        publish: Also publish each record on its key, once a run, for whoever watches.
-        bytes_per_s: Bandwidth limit, None for none.
-        held: Nothing is sent: the queue's consumer is not configured any more.
-    """
-
-    session: Callable[[], zenoh.Session | None] | None = None
-    publish: bool = True
-    bytes_per_s: float | None = None
-    held: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,18 +52,17 @@ class Sender:
         delivered: How many it has acknowledged in this run.
     """
 
-    def __init__(self, session: zenoh.Session, store: Store, queue: str, lane: Lane, settled: Settled | None) -> None:
+    def __init__(self, session: zenoh.Session, store: Store, queue: str, how: Lane, settled: Settled | None) -> None:
         self.answering = False
         self.rejected = 0
         self.delivered = 0
         self._default_session = session
         self._store = store
         self._queue = queue
-        self._consumer = consumer_of(queue)
         self._origin = store.origin_of(queue)
-        self._lane = lane
+        self._lane = how
         self._on_settled = settled
-        self._schedule = Schedule(lane.bytes_per_s, time.monotonic())
+        self._schedule = Schedule(how.bytes_per_s, time.monotonic())
         self._shown: set[int] = set()
         self._in_flight: deque[_Asked] = deque()
         self._acknowledged: dict[int, OutboxItem] = {}
@@ -210,22 +179,7 @@ class Sender:
         for item in items:
             self._show(session, item)
         settled = min(self._settled_upto, *(item.seq - 1 for item in items))
-        if len(pieces) == 1:
-            [piece] = pieces
-            payload = items[0].payload[piece.start : piece.end]
-            attachment = handoff.attachment(self._origin, items[0], piece.start, settled)
-        else:
-            payload = b"".join(item.payload for item in items)
-            attachment = handoff_batch.attachment(self._origin, items, settled)
-        replies = session.get(
-            keys.handoff(items[0].key, self._consumer),
-            timeout=REPLY_TIMEOUT_S,
-            priority=PRIORITIES[items[0].priority],
-            # Waits for the link instead of dropping: a dropped query would cost its whole time-out.
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            payload=payload,
-            attachment=attachment,
-        )
+        replies = lane.ask(session, self._origin, pieces, settled)
         self._schedule.asked(pieces[0], time.monotonic(), *pieces[1:])
         self._in_flight.append(_Asked(pieces, replies))
 
@@ -234,13 +188,7 @@ class Sender:
         if not self._lane.publish or item.seq in self._shown:
             return
         self._shown.add(item.seq)
-        session.put(
-            item.key,
-            item.payload,
-            encoding=item.encoding,
-            priority=PRIORITIES[item.priority],
-            attachment=handoff.attachment(self._origin, item),
-        )
+        lane.show(session, self._origin, item)
 
     def _act_on_replies(self) -> bool:
         """Act on every reply that is there, oldest query first; tell whether there was one."""
