@@ -17,7 +17,16 @@ from sonarpost.messages import Advice, Command, CommandKind, DownlinkState, Task
 
 KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit")
 NOT_AVAILABLE: Final = {"wider": "no order for a wider picture exists on the acoustic link"}
-_FINAL: Final = ("confirmed", "refused", "expired")
+_RANK: Final = {
+    "none": 0,
+    "waiting": 0,
+    "asked": 1,
+    "sent": 2,
+    "delivered": 3,
+    "confirmed": 3,
+    "refused": 3,
+    "expired": 3,
+}
 
 Table = Literal["decision", "request", "advice"]
 ID_COLUMN: Final[dict[Table, str]] = {"decision": "decision_id", "request": "command_id", "advice": "advice_id"}
@@ -103,15 +112,23 @@ def requests_of(db: sqlite3.Connection, contact_id: str) -> list[Json]:
     return [request_of(row) for row in rows]
 
 
+def is_news(was: str, was_sent: int, state: str, times_sent: int | None) -> bool:
+    """Tell whether a state is farther on than what is known.
+
+    Not by its time: clocks of hosts differ, and a receipt may come after the first report.
+    """
+    if was == state:
+        return state == "sent" and times_sent is not None and times_sent > was_sent
+    return _RANK[state] > _RANK[was]
+
+
 def request_state(
     db: sqlite3.Connection, command_id: str, state: str, reason: str, times_sent: int | None, utc_s: float
 ) -> str | None:
     """Note how far a request has come; return its contact, None where that is no news."""
     row = db.execute("SELECT * FROM request WHERE command_id = ?", (command_id,)).fetchone()
-    if row is None or row["state"] in _FINAL or (row["state"] == state and row["times_sent"] == times_sent):
+    if row is None or not is_news(row["state"], row["times_sent"], state, times_sent):
         return None
-    if state == "asked" and row["state"] != "waiting":
-        return None  # a consumer's receipt that comes after its first report
     db.execute(
         "UPDATE request SET state = ?, reason = ?, times_sent = ?, changed_utc_s = ? WHERE command_id = ?",
         (state, reason, row["times_sent"] if times_sent is None else times_sent, utc_s, command_id),

@@ -5,9 +5,9 @@ from __future__ import annotations
 import sqlite3
 import uuid
 from dataclasses import dataclass
-from typing import Final
 
 from services.console import audit
+from services.console.asking import is_news
 from services.console.audit import OnScreen
 from services.console.contacts import contact_of_picture, find_row
 from services.console.people import Actor
@@ -15,8 +15,6 @@ from services.console.rows import Json, contact_row, decision_of, image_of
 from sonarpost import wire
 from sonarpost.errors import BadInputError, SonarpostError
 from sonarpost.messages import Decision, DownlinkState, Verdict
-
-_FINAL: Final = ("confirmed", "refused", "expired")
 
 
 class ConflictError(SonarpostError):
@@ -180,10 +178,11 @@ def of_contact(db: sqlite3.Connection, contact_id: str) -> list[Json]:
 def downlink(db: sqlite3.Connection, state: DownlinkState) -> bool:
     """Note how far a decision has come on its way to the vehicle; tell whether that was news."""
     row = find(db, state.record_id)
-    if row is None or row["vehicle"] in _FINAL or row["changed_utc_s"] > state.changed_utc_s:
+    if row is None or not is_news(row["vehicle"], row["times_sent"], state.state, state.times_sent):
         return False
     db.execute(
-        "UPDATE decision SET vehicle = ?, reason = ?, times_sent = ?, changed_utc_s = ? WHERE decision_id = ?",
+        "UPDATE decision SET vehicle = ?, reason = ?, times_sent = ?, changed_utc_s = MAX(changed_utc_s, ?)"
+        " WHERE decision_id = ?",
         (state.state, state.reason, state.times_sent, state.changed_utc_s, state.record_id),
     )
     return True

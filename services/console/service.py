@@ -235,7 +235,8 @@ class ConsoleService(Service[ConsoleConfig]):
         """Learn that decisions are ashore: none waits in the relay, and nothing that it has not looked at."""
         waiting = health.gauges.get("decisions_waiting")
         if waiting == 0 and health.gauges.get("inbox") == 0:
-            self.board.all_ashore_before(health.time_utc_s - ASHORE_MARGIN_S)
+            # By the earlier of both clocks: neither may make a record out that came since.
+            self.board.all_ashore_before(min(health.time_utc_s, time.time()) - ASHORE_MARGIN_S)
 
     def _on_frame(self, frame: AcousticFrame) -> None:
         if frame.direction != "rx":

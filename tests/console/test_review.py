@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 from console.conftest import FIRST_UTC_S, picture_record
 
+from services.console.asking import is_news
 from sonarpost.errors import HandoffError
 from sonarpost.messages import Advice, Decision, DownlinkState
 from sonarpost.review.grouping import Place, nearest_group
@@ -196,7 +197,8 @@ def test_a_decision_comes_ashore_and_to_the_vehicle(console):
     console.board.settled("decision", decision_id, "op_modem", None)
     assert (delivery()["shore"], delivery()["vehicle"]) == ("relay", "asked")
     now = console.board.clock()
-    for number, state in enumerate(("sent", "confirmed", "sent")):
+    # By the clock of a modem's host that is behind.
+    for number, state in enumerate(("asked", "sent", "confirmed", "sent"), start=-100):
         console.board.take_downlink(
             DownlinkState(
                 vessel_id="vessel-1",
@@ -214,6 +216,15 @@ def test_a_decision_comes_ashore_and_to_the_vehicle(console):
     assert delivery()["shore"] == "relay"
     console.board.all_ashore_before(now + 60)
     assert delivery()["shore"] == "delivered"
+
+
+def test_a_state_is_news_when_it_is_farther_on():
+    states = ("waiting", "asked", "sent", "confirmed")
+    for place, was in enumerate(states):
+        assert [is_news(was, 1, state, 1) for state in states] == [later > place for later in range(4)]
+    assert is_news("sent", 1, "sent", 2)
+    assert not is_news("sent", 2, "sent", 1)
+    assert not is_news("expired", 1, "confirmed", 1)
 
 
 def test_a_refused_decision_says_why(console):

@@ -193,7 +193,8 @@ def test_how_far_a_decision_has_come_is_watched(crew, start, client):
     eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "relay", what="relay's receipt")
 
 
-def test_a_relay_with_nothing_waiting_means_that_decisions_are_ashore(start, client, crew):
+def test_a_relay_with_nothing_waiting_means_that_decisions_are_ashore(start, client, crew, monkeypatch):
+    monkeypatch.setattr("services.console.service.ASHORE_MARGIN_S", -1.0)
     relay = crew.neighbour(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
     console = start(decision_consumers=("relay",))
     put(client, keys.image_reconstructed(VESSEL), picture())
