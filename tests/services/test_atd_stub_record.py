@@ -282,7 +282,7 @@ def begin(crew, platform, tmp_path):
 
 def test_what_is_kept_on_the_vehicle_can_be_sent_again_with_its_position(begin, crew, tmp_path, line):
     compressor = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
-    service = begin(snippet_dir=tmp_path / "kept", max_contacts=2)
+    service = begin(snippet_dir=tmp_path / "kept", confidence_threshold=0.3, max_contacts=2)
     os.link(line, tmp_path / "incoming" / "line-7.xtf")
     eventually(lambda: len(compressor.got) == 2)
     crew.stop(service)
