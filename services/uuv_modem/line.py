@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+import secrets
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -27,14 +28,16 @@ from sonarpost.link.downlink import (
     unpack,
 )
 from sonarpost.link.queue import AcousticQueue, PictureName
-from sonarpost.link.queue_state import export_queue, restore_queue
+from sonarpost.link.queue_state import export_queue, restore_queue, salvage_queue
 from sonarpost.link.seal import AcousticSeal
 from sonarpost.link.seal_key import Direction
 from sonarpost.link.v1_events import FrameRefused, MessageReceived, ReportReceived
 from sonarpost.link.v1_feedback import unpack_mini
+from sonarpost.link.v1_frame import BLOCKS
 from sonarpost.link.v1_objects import MAX_STREAM_BYTES
 from sonarpost.link.v1_receiver import Receiver
 from sonarpost.messages import EncodedImage, OutgoingMessage
+from sonarpost.modem.rates import RATES
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.store import Store
@@ -105,32 +108,63 @@ class VehicleLine:
 
     def _begin_anew(self, platform_id: str) -> None:
         first_block = self._store.origin[0]
-        self.queue = AcousticQueue(self._config.queue_config(), first_block=first_block, seal=self.seal)
+        self.queue = self._new_queue(first_block)
         self.receiver = Receiver(seal=self.seal)
         self.orders = OrderBook(platform_id, self._config)
         self.under_way = None
 
-    def load(self, platform_id: str) -> None:
-        """Go on where the last process was. A state that cannot be read is logged, and the link begins anew."""
+    def _new_queue(self, first_block: int) -> AcousticQueue:
+        return AcousticQueue(self._config.queue_config(), first_block=first_block, seal=self.seal)
+
+    def load(self, platform_id: str, now: float) -> None:
+        """Go on where the last process was.
+
+        What cannot be read is logged and kept apart as it is; pictures and messages are put into a new queue again.
+        """
+        parts, unreadable = self._parts.load()
+        if not parts and not unreadable:
+            return
+        queue_parts = {n.removeprefix(_QUEUE): part for n, part in parts.items() if n.startswith(_QUEUE)}
+        reasons = {name: f"{len(data)} bytes that are no msgpack map" for name, data in unreadable.items()}
         try:
-            parts = self._parts.load()
-            if not parts:
-                return
-            restore_queue(
-                self.queue, {n.removeprefix(_QUEUE): part for n, part in parts.items() if n.startswith(_QUEUE)}
-            )
-            self.receiver.restore(parts[_HEARD])
-            self.orders.restore(parts[_ORDERS])
-            match parts[_PACKET]:
-                case {"rate": int(rate), "frames": list(frames)} if frames:
-                    self.under_way = UnderWay(rate, tuple(bytes(frame) for frame in frames))
-            seal_state = parts.get(_SEAL)
-            if self.seal is not None and seal_state and seal_state["key"] == self.seal.snapshot()["key"]:
-                self.seal.restore(seal_state)
-        except (BadInputError, KeyError) as error:
-            log.error("The state of the link cannot be read, it begins anew", extra=kv(reason=str(error)))
+            restore_queue(self.queue, queue_parts)
+        except BadInputError as error:
+            reasons[_QUEUE + "core"] = str(error)
+            # Another first block, so that receivers do not take new blocks for those they know.
+            self.queue = self._new_queue(secrets.randbelow(BLOCKS))
+            saved, refused = salvage_queue(self.queue, queue_parts, now)
+            reasons |= {_QUEUE + each.where.rpartition(": ")[2]: str(each) for each in refused}
+            log.error("The queue is made anew of its pictures and messages", extra=kv(saved=saved))
+        reasons |= self._load_others(parts, platform_id)
+        if reasons:
+            for name, reason in reasons.items():
+                log.error("A part of the link's state cannot be read", extra=kv(part=name, reason=reason))
             self.count("states_discarded")
-            self._begin_anew(platform_id)
+            self._parts.keep_apart(reasons)
+
+    def _load_others(self, parts: Mapping[str, Mapping[str, object]], platform_id: str) -> dict[str, str]:
+        """Take up what is kept beside the queue; return why, by part, where that cannot be."""
+        reasons: dict[str, str] = {}
+        try:
+            self.receiver.restore(parts.get(_HEARD, {}))
+        except BadInputError as error:
+            reasons[_HEARD] = str(error)
+        try:
+            self.orders.restore(parts.get(_ORDERS, {}))
+        except BadInputError as error:
+            reasons[_ORDERS] = str(error)
+            self.orders = OrderBook(platform_id, self._config)
+        match parts.get(_PACKET, {}):
+            case {"rate": int(rate), "frames": [*listed]} if rate in RATES:
+                frames = tuple(frame for frame in listed if isinstance(frame, bytes))
+                self.under_way = UnderWay(rate, frames) if frames else None
+        seal_state = parts.get(_SEAL)
+        try:
+            if self.seal is not None and seal_state and seal_state.get("key") == self.seal.snapshot()["key"]:
+                self.seal.restore(seal_state)
+        except BadInputError as error:
+            reasons[_SEAL] = str(error)
+        return reasons
 
     def save(self) -> None:
         """Write what has changed, records for consumers included, in one transaction.

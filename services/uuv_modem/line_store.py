@@ -8,7 +8,6 @@ from typing import Final
 
 import msgpack
 
-from sonarpost.errors import FrameError
 from sonarpost.runtime.store import Store
 from sonarpost.runtime.transaction import Transaction
 
@@ -29,25 +28,36 @@ class LineStore:
         self._written: dict[str, bytes] = {}
         self._arrivals = max((_number(name) for name in store.state_names(ARRIVAL)), default=0)
 
-    def load(self) -> dict[str, Mapping[str, object]]:
-        """Return the parts that were saved.
-
-        Raises:
-            FrameError: One of them is no map.
-        """
+    def load(self) -> tuple[dict[str, Mapping[str, object]], dict[str, bytes]]:
+        """Return the parts that were saved, and the bytes of those that are no map."""
         parts: dict[str, Mapping[str, object]] = {}
+        unreadable: dict[str, bytes] = {}
         for full_name in self._store.state_names(_PREFIX):
             data = self._store.get_state(full_name) or b""
             name = full_name.removeprefix(_PREFIX)
+            self._written[name] = _digest(data)
             try:
                 part = msgpack.unpackb(data, strict_map_key=False)
-            except (ValueError, msgpack.exceptions.UnpackException) as error:
-                raise FrameError("uuv_modem state", name, data[:20], "msgpack") from error
-            if not isinstance(part, dict):
-                raise FrameError("uuv_modem state", name, data[:20], "a map")
-            parts[name] = part
-            self._written[name] = _digest(data)
-        return parts
+            except (ValueError, msgpack.exceptions.UnpackException):
+                part = None
+            if isinstance(part, dict):
+                parts[name] = part
+            else:
+                unreadable[name] = data
+        return parts, unreadable
+
+    def keep_apart(self, reasons: Mapping[str, str]) -> None:
+        """Keep parts apart as they are on the disk, where a person can find them, before others take their place.
+
+        Args:
+            reasons: Why, by the part's name.
+
+        Raises:
+            HandoffError: The disk refused.
+        """
+        with self._store.transaction() as tx:
+            for name, reason in reasons.items():
+                tx.refuse("in", f"state {_PREFIX}{name}", self._store.get_state(_PREFIX + name) or b"", reason)
 
     def write(self, tx: Transaction, parts: Mapping[str, Mapping[str, object]]) -> dict[str, bytes]:
         """Write the parts that differ from what is on the disk; return what `wrote` wants once it is committed."""

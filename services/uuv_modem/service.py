@@ -107,7 +107,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
         """Open the port, and go on with what was under way."""
         super().on_start()
         if self._line is not None and self._runner is not None:
-            self._line.load(self.platform.id)
+            self._line.load(self.platform.id, time.time())
             self.spawn(self._runner.run, "link")
 
     def commit_all(self, handled: Sequence[tuple[Effects, InboxItem | None]]) -> int:

@@ -28,7 +28,10 @@ def whole(run: RunningChain) -> bool:
     return len(encoded) == PICTURES and all(i in run.watcher.shore and run.watcher.shore[i].complete for i in encoded)
 
 
-@pytest.mark.parametrize("killed", [pytest.param(None, marks=pytest.mark.long), "op_modem"])
+@pytest.mark.parametrize(
+    "killed",
+    [pytest.param(None, marks=pytest.mark.long), "op_modem", pytest.param("uuv_modem", marks=pytest.mark.long)],
+)
 def test_with_a_third_of_the_frames_lost_every_picture_is_ashore(start_chain: StartChain, killed: str | None) -> None:
     run = start_chain(link="v1", loss=0.3)
     run.deposit(PICTURES)

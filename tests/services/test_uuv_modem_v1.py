@@ -35,6 +35,7 @@ from sonarpost.messages import (
 )
 from sonarpost.modem.rates import RATES
 from sonarpost.runtime.config import PlatformConfig
+from sonarpost.runtime.store import Store
 
 IN, OUT = keys.image_encoded("uuv-1"), keys.message_outgoing("uuv-1")
 RX, QUEUE = keys.acoustic_rx("vessel-1"), keys.acoustic_queue("uuv-1")
@@ -388,17 +389,32 @@ def test_polled_it_sends_what_it_is_asked_for_and_nothing_else(vessel, begin, pr
     assert sent(service) == 3
 
 
-def test_a_state_that_cannot_be_read_is_told_and_the_link_begins_anew(begin, programs, crew, vessel):
-    service = begin()
-    programs.owe(IN, "uuv_modem", image(1))
-    eventually(lambda: idle(service) and sent(service) > 0, 60)
-    with service.store.transaction() as tx:
-        tx.put_state("v1/queue/core", msgpack.packb({"format": 99}))
+@pytest.mark.parametrize("spoilt", [msgpack.packb({"format": 99}), b"\xc1 no msgpack"])
+def test_of_a_state_that_cannot_be_read_pictures_and_messages_are_queued_anew(
+    spoilt, begin, programs, crew, vessel, refused
+):
+    service = begin(gather_s=3600.0)  # the pictures wait
+    programs.owe(IN, "uuv_modem", *[image(n) for n in range(1, 4)])
+    programs.owe(OUT, "uuv_modem", message("kept", priority=6))
+    eventually(lambda: len(service._line.queue.names) == 3 and not service._line.accepted())
+    eventually(lambda: programs.store.outbox_depth() == 0)
     crew.stop(service)
+    store = Store(service.platform.state_dir / "uuv_modem.db")
+    with store.transaction() as tx:
+        tx.put_state("v1/queue/core", spoilt)
+        tx.put_state("v1/orders", b"\x01")
+        tx.put_state("v1/queue/picture/2", msgpack.packb({"number": 2}))
+    store.close()
     again = begin()
     eventually(lambda: again.health().counters.get("states_discarded") == 1)
-    programs.owe(IN, "uuv_modem", image(2))
-    eventually(lambda: 2 in vessel.streams(), 60)
+    assert {n: name.contact_id for n, name in again._line.queue.names.items()} == {1: "c1", 3: "c3"}
+    # The second had been announced, no more.
+    eventually(lambda: min(len(vessel.streams().get(n, b"")) for n in (1, 3)) > 100, 60)
+    assert len(vessel.streams().get(2, b"")) < 60
+    apart = {key for key, _ in refused(again)}
+    assert {"state v1/queue/core", "state v1/orders", "state v1/queue/picture/2"} <= apart
+    programs.owe(IN, "uuv_modem", image(4))
+    eventually(lambda: 4 in vessel.streams(), 60)
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from sonarpost.errors import FrameError
+from sonarpost.errors import BadInputError, FrameError
 from sonarpost.link.bounds import Channel
+from sonarpost.link.downlink import image_of_number
 from sonarpost.link.queue import AcousticQueue, PictureName
 from sonarpost.link.queue_messages import LEAST_URGENT, MessageStore, QueuedMessage
+from sonarpost.link.v1_blocks import Picture
 from sonarpost.link.v1_preview import MAX_NUMBER
-from sonarpost.link.v1_sender_state import export_sender, restore_sender
+from sonarpost.link.v1_sender_state import export_sender, import_picture, restore_sender
 from sonarpost.link.v1_state import read_field, read_list, read_map, read_number, read_time
 from sonarpost.modem.rates import RATES
 
@@ -41,6 +43,8 @@ def export_queue(queue: AcousticQueue) -> dict[str, Part]:
     for picture in _maps(sender.pop("pictures")):
         number = picture["number"]
         sent.append([number, picture.pop("sent"), picture.pop("goal"), picture.pop("settled")])
+        known = queue.names.get(number) if isinstance(number, int) else None
+        picture["name"] = [] if known is None else [known.image_id, known.contact_id]  # for `salvage_queue`
         parts[f"{_PICTURE}{number}"] = picture
     blocks: dict[str, list[object]] = {"blocks": [], "past": []}
     for kind, listed in blocks.items():
@@ -113,6 +117,50 @@ def restore_queue(queue: AcousticQueue, parts: Mapping[str, Part]) -> None:
         queue.rate_choice.current = rate
     else:
         queue.sender.resize(RATES[queue.rate].frame_bytes)
+
+
+def salvage_queue(queue: AcousticQueue, parts: Mapping[str, Part], now: float) -> tuple[int, list[FrameError]]:
+    """Fill a new queue with what can be read of the pictures and messages in parts that `restore_queue` refused.
+
+    What of the pictures has been sent is not known any more: all of them are sent again, and receivers know what they
+    have. Of messages, those that no frame has taken yet.
+
+    Args:
+        queue: A new one.
+        parts: As many as there are.
+        now: UTC in seconds.
+
+    Returns:
+        How many pictures and messages, and why the others are none.
+    """
+    pictures: list[tuple[Picture, PictureName]] = []
+    messages: list[QueuedMessage] = []
+    refused: list[FrameError] = []
+    for name, part in parts.items():
+        try:
+            if name.startswith(_PICTURE):
+                picture = import_picture({**part, "sent": 0})
+                pictures.append((picture, _name_in(part, picture.number)))
+            elif name.startswith(_MESSAGE):
+                messages.append(_import_message(part))
+        except BadInputError as error:
+            refused.append(FrameError(f"{_WHERE}: {name}", error.field, error.value, error.expected))
+    for picture, name_of_it in sorted(pictures, key=lambda found: found[0].added_at):
+        queue.add_picture(picture.number, name_of_it, picture.contact, picture.stream, now)
+    for message in sorted(messages, key=lambda m: m.key):
+        left_s = message.expires_at - now
+        queue.add_message(
+            message.message_id, message.source, message.data, now, priority=message.priority, lifetime_s=left_s
+        )
+    return len(pictures) + len(messages), refused
+
+
+def _name_in(part: Part, number: int) -> PictureName:
+    match part.get("name"):
+        case [str(image_id), str(contact_id)]:
+            return PictureName(image_id, contact_id)
+        case _:
+            return PictureName(image_of_number(number), "?")
 
 
 def _export_message(message: QueuedMessage) -> Part:

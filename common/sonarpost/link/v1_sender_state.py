@@ -60,7 +60,7 @@ def restore_sender(sender: Sender, state: Mapping[str, object]) -> None:
     if state.get("format") != _FORMAT:
         raise FrameError(_WHERE, "format", state.get("format"), str(_FORMAT))
     try:
-        pictures = [_import_picture(entry) for entry in read_list(state, "pictures")]
+        pictures = [import_picture(entry) for entry in read_list(state, "pictures")]
         blocks = [_import_block(entry) for entry in read_list(state, "blocks")]
         past = [_import_block(entry) for entry in _later(state, "past")]
         messages = [_import_message(entry) for entry in read_list(state, "messages")]
@@ -102,7 +102,12 @@ def _later(entry: object, name: str) -> list[object]:
     return read_list(entry, name) if isinstance(entry, Mapping) and name in entry else []
 
 
-def _import_picture(entry: object) -> Picture:
+def import_picture(entry: object) -> Picture:
+    """Return a picture as `export_sender` wrote it.
+
+    Raises:
+        BadInputError: It did not write this.
+    """
     if not isinstance(entry, Mapping):
         raise FrameError(_WHERE, "pictures", entry, "maps")
     stream, raw = read_field(entry, "stream", bytes), read_field(entry, "curve", bytes)
