@@ -11,6 +11,7 @@ import tempfile
 import threading
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from services.console.app import ConsoleApp
 from services.console.board import Board
@@ -18,10 +19,12 @@ from services.console.config import ConsoleConfig
 from services.console.database import Database
 from services.console.people import ROLES
 from services.console.server import WebServer
-from services.console.training import VESSEL, Training
 from services.console.users import FILE_NAME, Users
 from sonarpost.errors import ConfigError
 from sonarpost.runtime.config import load
+
+if TYPE_CHECKING:
+    from services.console.training import Training
 
 DATABASE_NAME = "console-review.db"
 TRAINING_USERS = (("watch", "observer"), ("op", "operator"), ("expert", "expert"))
@@ -137,6 +140,8 @@ def _ls(parsed: argparse.Namespace) -> int:
 
 
 def _train(parsed: argparse.Namespace) -> int:
+    from services.console.training import VESSEL, Training  # noqa: PLC0415  it brings codecs and their compiler
+
     with tempfile.TemporaryDirectory(prefix="sonarpost-training-") as scratch:
         folder: Path = parsed.state or Path(scratch)
         config = ConsoleConfig(port=parsed.port, vessel_lat_deg=56.4495, vessel_lon_deg=-5.6012)

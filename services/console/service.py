@@ -199,7 +199,9 @@ class ConsoleService(Service[ConsoleConfig]):
             self._watch(keys.acoustic_queue_everywhere(), QueueState, self.board.fleet.take_queue)
         else:
             self._watch(keys.tasking_state_all(self.config.site), TaskingState, self.board.take_tasking)
-        self.session.declare_subscriber(keys.health_everywhere(), self._on_health)
+        # Ashore only the site's own: the health of every service of every vessel would load their radios for ever.
+        health = keys.health_everywhere() if self._on_vessel else keys.health_all(self.platform.id)
+        self.session.declare_subscriber(health, self._on_health)
         self._server.start()
         self.spawn(self._send_unsent, "send")
         self.spawn(self._tick, "tick")

@@ -47,6 +47,7 @@ ONLY_COMPARED = {
         keys.acoustic_downlink("x"),
         keys.acoustic_queue_everywhere(),
         keys.health_everywhere(),
+        keys.health_all("x"),
         keys.health("x", "x"),
         keys.tasking_state_all("x"),
         keys.shore_image_all("x"),
