@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import sqlite3
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import count
 
 import pytest
 from console.conftest import FIRST_UTC_S, picture_record
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from services.console.asking import is_news
+from services.console.audit import OnScreen
+from services.console.contacts import Filter
+from services.console.decisions import ConflictError, Judgement
+from services.console.people import Actor
 from sonarpost.errors import HandoffError
 from sonarpost.messages import Advice, Decision, DownlinkState
 from sonarpost.review.grouping import Place, nearest_group
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
+SECONDS = count()
 
 
 def test_a_contact_appears_refines_and_stays_one(console):
@@ -140,6 +149,43 @@ def test_of_two_people_at_once_the_second_is_told(console):
     assert again.status_code == 201
     decided = bo.get(f"/api/contacts/{ID}").json()["decisions"]
     assert [d["operator"] for d in decided] == ["bo", "anna"]
+
+
+def test_of_many_at_the_same_moment_one_decides(console):
+    console.board.take_image(picture_record())
+    screen = OnScreen(1, console.board.image(ID, 1).picture_sha256, "raw")
+
+    def decide(name: str) -> bool:
+        try:
+            console.board.decide(ID, Judgement(0, screen, "unsure", None, None, name), Actor(name, "operator", "here"))
+        except ConflictError as error:
+            return error.decision is None
+        return True
+
+    names = [f"op-{number}" for number in range(12)]
+    with ThreadPoolExecutor(12) as pool:
+        made = dict(zip(names, pool.map(decide, names), strict=True))
+    [winner] = [name for name, decided in made.items() if decided]
+    whole = console.browser("watch").get(f"/api/contacts/{ID}").json()
+    assert [decision["operator"] for decision in whole["decisions"]] == [winner]
+    assert (whole["contact"]["decided_by"], whole["contact"]["revision"]) == (winner, 1)
+
+
+@given(
+    st.lists(st.text(alphabet="ab%_\\'é", max_size=4), max_size=6), st.text(alphabet="ab%_\\'é", min_size=1, max_size=3)
+)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_search_finds_what_has_the_text_and_nothing_else(console, remarks, wanted):
+    with console.board.database.writing() as db:
+        db.execute("DELETE FROM contact")
+    for number, remark in enumerate(remarks):
+        console.board.take_images([picture_record(f"{number:04d}", first_utc_s=FIRST_UTC_S + next(SECONDS))])
+        with console.board.database.writing() as db:
+            db.execute("UPDATE contact SET remark = ? WHERE image_id = ?", (remark, f"{number:04d}"))
+    found = console.board.contacts(Filter(text=wanted))["items"]
+    # Upper and lower case of ASCII are one, and of other letters two, as SQLite has it.
+    expected = {f"{number:04d}" for number, remark in enumerate(remarks) if wanted in remark or wanted in "uuv-1/"}
+    assert {row["image_id"] for row in found} == expected
 
 
 def test_a_refined_picture_is_no_conflict(console):
