@@ -113,7 +113,7 @@ def measured(scene: Scene) -> None:
     contact_id = scene.contact(complete=True, of=0)
     with scene.page(SMALL, "day", contact_id) as page:
         shadow(page)
-        press(page, "Enter", "Escape")
+        press(page, "Enter")
         page.wait_for_selector('details[data-name="measurements"]')
         page.focus("#queue")
         page.wait_for_selector("#toasts p", state="detached")

@@ -139,7 +139,7 @@ def test_measuring_by_keys_and_its_lock_on_what_is_made_up(served):
     )
     # Across the gap it is refused, and nothing is kept.
     there.may_say("409")
-    there.press("Enter", *["Shift+ArrowDown"] * 3, "Enter")
+    there.press("m", "Enter", *["Shift+ArrowDown"] * 3, "Enter")
     there.wait("#toasts .bad")
     there.press("Escape")
     assert len(served.board.contact(contact_ids(served)["00A7"])["measurements"]) == 1

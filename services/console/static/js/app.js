@@ -39,7 +39,7 @@ class App {
   }
 
   #wire() {
-    const again = calmly(() => this.load(), 20, 100);
+    const again = calmly(() => this.load(), 5, 50);
     startKeys(this.keys, () => this.shown, { leave: () => this.escape(), send: () => this.decision.submit() });
     listen("counts", (answer) => {
       this.filters.found(answer);
@@ -57,11 +57,12 @@ class App {
 
   async start() {
     this.show("review");
-    tell("fleet", await api.fleet());
-    clockIs(state.fleet.now_utc_s);
     const asked = decodeURIComponent(location.hash.slice(1));
-    if (asked) await this.select(asked);
-    await this.queue.show(this.filters.query);
+    await Promise.all([
+      asked ? this.select(asked) : null,
+      this.queue.show(this.filters.query),
+      api.fleet().then((fleet) => tell("fleet", fleet)),
+    ]);
     startEvents();
   }
 
@@ -161,9 +162,8 @@ class App {
 
 restoreLook();
 try {
-  state.session = await api.session();
+  [state.session, state.info] = await Promise.all([api.session(), api.info()]);
   useToken(state.session.csrf);
-  state.info = await api.info();
   clockIs(state.info.now_utc_s);
   await new App().start();
 } catch (error) {

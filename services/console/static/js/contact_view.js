@@ -128,8 +128,11 @@ export class ContactView {
     const key = `${id} ${version.version} ${layer}`;
     if (!this.cache.has(key)) {
       if (this.cache.size > 12) this.cache.delete(this.cache.keys().next().value);
+      const made = version.layers.find((one) => one.name === layer)?.synthesised;
       this.cache.set(key, loadPicture(
-        api.pictureUrl(id, version.version, layer), api.maskUrl(id, version.version, "missing", layer), api.maskUrl(id, version.version, "guessed", layer),
+        api.pictureUrl(id, version.version, layer),
+        version.missing_fraction > 0 ? api.maskUrl(id, version.version, "missing", layer) : null,
+        version.guessed_fraction > 0 && !made ? api.maskUrl(id, version.version, "guessed", layer) : null,
       ));
     }
     try {

@@ -89,7 +89,7 @@ export class Measuring {
     const kept = await this.#ask(this.result.to, true);
     if (kept) {
       toast(`Kept: ${lineOf(kept).words}`);
-      this.start(this.kind);
+      this.stop();
     }
     return kept;
   }

@@ -14,13 +14,14 @@ async function grey(url) {
 }
 
 /**
- * Load one layer of one version of a picture.
+ * Load one layer of one version of a picture; a mask that is empty anyway has no address (null).
  *
  * Returns `{width, height, levels, missing, guessed}`: grey levels 0…255 and two masks, rows along-track, columns across-track.
  */
 export async function loadPicture(pictureUrl, missingUrl, guessedUrl) {
-  const [picture, missing, guessed] = await Promise.all([grey(pictureUrl), grey(missingUrl), grey(guessedUrl)]);
-  return { ...picture, missing: missing.levels, guessed: guessed.levels };
+  const [picture, missing, guessed] = await Promise.all([pictureUrl, missingUrl, guessedUrl].map((url) => url && grey(url)));
+  const none = () => new Uint8Array(picture.levels.length);
+  return { ...picture, missing: missing?.levels ?? none(), guessed: guessed?.levels ?? none() };
 }
 
 const between = (value) => Math.max(0, Math.min(255, Math.round(value)));
