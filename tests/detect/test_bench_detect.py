@@ -17,6 +17,7 @@ from sonarpost.cli.bench.detect_truth import Scale, object_at
 from sonarpost.cli.bench.measure import subjects
 from sonarpost.codec.registry import default_registry
 from sonarpost.detect.piece import Piece
+from sonarpost.detect.pieces import best_of_piece
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import TruthObject
@@ -96,18 +97,25 @@ def test_a_bad_index_is_one_documented_error(tmp_path, text):
         tile_scores(tmp_path)
 
 
-def test_a_codec_at_a_large_budget_keeps_the_confidence_and_at_a_small_one_loses_it():
+def test_a_codec_is_judged_at_each_budget_and_a_large_one_keeps_the_confidence():
     rng = np.random.default_rng(0)
     picture = rng.rayleigh(60, (80, 140))
     picture[36:46, 50:60] *= 4
     picture[36:46, 60:90] *= 0.05
     piece = Piece(np.clip(picture, 0, 255).astype(np.uint8), 0.1, 0.03)
     ((subject,), _) = subjects(default_registry(), ["spiht"])
-    small, large = effects([Shot(piece, 1.9)], subject, [16, 8000])
-    assert (small.pictures, large.pictures) == (1, 1)
-    assert large.after > 1.0
-    assert small.after < large.after
-    assert large.before == 1.9
+    original = best_of_piece(piece, side=Side.STARBOARD).confidence
+    small, large = effects([Shot(piece, original)], subject, [16, 8000])
+    assert [(e.label, e.budget_bytes, e.pictures, e.misses) for e in (small, large)] == [
+        ("spiht", 16, 1, 0),
+        ("spiht", 8000, 1, 0),
+    ]
+    assert large.before == original
+    assert large.after == pytest.approx(original, abs=0.05)
+    assert (large.kept, small.kept) == (1.0, float(small.after >= 1.0))
+    (absent,) = effects([Shot(piece, original)], subject, [1])
+    assert (absent.pictures, absent.misses) == (0, 1)
+    assert np.isnan(absent.after)
 
 
 def test_plots_are_written_for_what_there_is(tmp_path):

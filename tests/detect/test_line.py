@@ -31,7 +31,7 @@ def place(contact, first_ping):
     return first_ping + contact.ping, contact.detection.sample
 
 
-@pytest.mark.parametrize("seam", [90, 96, 98, 99, 100, 101, 102, 104, 110])
+@pytest.mark.parametrize("seam", [90, 98, 100, 103, 110])
 def test_a_target_on_the_seam_is_found_once_where_it_lies(make_survey, seam):
     survey = make_survey({"ping": 100, "sample": 250})
     (whole,) = detect(survey)
@@ -87,7 +87,7 @@ def test_a_file_follows_another_when_time_sonar_and_sampling_go_on(make_survey):
 def test_a_file_shorter_than_what_is_held_back_changes_nothing(make_survey):
     survey = make_survey({"ping": 100})
     settings = DetectorSettings()
-    for seams in ((97, 103), (99, 100, 101), (50, 95, 99)):
+    for seams in ((97, 103), (99, 100, 101)):
         found = all_of(cut(survey, *seams), settings)
         firsts = {Path(f"{n}.xtf"): first for n, first in enumerate((0, *seams))}
         assert [firsts[c.path] + c.ping for c in found] == [pytest.approx(100, abs=3)], seams
