@@ -190,7 +190,8 @@ class OpModemService(SpeakingService):
 
 def _images_of(packet: PacketReceived) -> list[str]:
     """Return the images a packet's frames belong to, as far as their wire format says it."""
-    return sorted({image_id for frame in packet.frames if (image_id := image_of_frame(frame.data)) is not None})
+    named = [image_of_frame(frame.data) for frame in packet.frames]
+    return sorted({image_id for names in named if names is not None for image_id in names.split(",")})
 
 
 def quality_of(statistics: LinkStatistics | None) -> LinkQuality | None:

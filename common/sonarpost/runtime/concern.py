@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from sonarpost import wire
-from sonarpost.errors import FrameError, PayloadError
+from sonarpost.errors import BadInputError, FrameError, PayloadError
+from sonarpost.link.downlink import image_of_number
 from sonarpost.link.paper_format import parse_frame
+from sonarpost.link.v1_frame import Content, SegmentKind, Symbol, SymbolKind, parse_symbol
+from sonarpost.link.v1_frame import parse_frame as parse_v1_frame
+from sonarpost.link.v1_preview import Preview, entry_shape
 from sonarpost.messages import AcousticFrame, Record, Relayed
 
 
@@ -75,8 +79,51 @@ def _is_envelope(payload: bytes, where: str) -> bool:
 
 
 def image_of_frame(data: bytes) -> str | None:
-    """Return the image a frame belongs to; None where its wire format does not say it in every frame."""
+    """Return the image a frame belongs to, several with commas between; None where the frame does not say it.
+
+    Frames of the paper's format all say it. Those of v1 do where they hold records of contacts; a symbol of a block of
+    pictures belongs to all pictures of its block, which only the receiver knows. Sealed frames say nothing without the
+    key.
+    """
+    try:
+        content = parse_v1_frame(data)
+    except FrameError:
+        return _image_of_paper_frame(data)
+    return ",".join(dict.fromkeys(image_of_number(number) for number in _contacts(content))) or None
+
+
+def _image_of_paper_frame(data: bytes) -> str | None:
     try:
         return parse_frame(data).image_id
     except FrameError:
         return None
+
+
+def _contacts(content: Content) -> Iterator[int]:
+    """Yield the numbers of the contacts whose records are in a frame of v1."""
+    if isinstance(content, Symbol):
+        yield from _contacts_of_symbol(content)
+        return
+    for segment in content:
+        try:
+            if segment.kind in (SegmentKind.CONTACT, SegmentKind.PREVIEW):
+                yield Preview.unpack(segment.data, "frame").number
+            elif segment.kind == SegmentKind.SYMBOL:
+                yield from _contacts_of_symbol(parse_symbol(segment.data))
+        except BadInputError:
+            continue  # the receiver says what is wrong with it
+
+
+def _contacts_of_symbol(symbol: Symbol) -> Iterator[int]:
+    if symbol.kind != SymbolKind.PREVIEW or symbol.index >= symbol.parameter:
+        return
+    try:
+        shape = entry_shape(len(symbol.data))
+        if shape.symbols > 1:
+            return  # half an entry: nothing says that its number is right
+        for place in range(shape.entries):
+            entry = symbol.data[place * shape.entry_bytes : (place + 1) * shape.entry_bytes]
+            if any(entry):
+                yield Preview.unpack(entry, "frame").number
+    except BadInputError:
+        return
