@@ -9,15 +9,14 @@ import pytest
 from PIL import Image
 
 from sonarpost.cli.bench import detect as command
-from sonarpost.cli.bench.detect_codecs import Shot, effects
+from sonarpost.cli.bench.detect_codecs import confidence_with, effects, shot
 from sonarpost.cli.bench.detect_plots import plot_all
 from sonarpost.cli.bench.detect_simulated import JudgedContact, JudgedFile, operating, pd_at, reliability, roc
 from sonarpost.cli.bench.detect_tiles import TileScore, tile_auc, tile_scores
 from sonarpost.cli.bench.detect_truth import Scale, object_at
 from sonarpost.cli.bench.measure import subjects
 from sonarpost.codec.registry import default_registry
-from sonarpost.detect.piece import Piece
-from sonarpost.detect.pieces import best_of_piece
+from sonarpost.detect.contacts import detect
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import TruthObject
@@ -97,25 +96,31 @@ def test_a_bad_index_is_one_documented_error(tmp_path, text):
         tile_scores(tmp_path)
 
 
-def test_a_codec_is_judged_at_each_budget_and_a_large_one_keeps_the_confidence():
-    rng = np.random.default_rng(0)
-    picture = rng.rayleigh(60, (80, 140))
-    picture[36:46, 50:60] *= 4
-    picture[36:46, 60:90] *= 0.05
-    piece = Piece(np.clip(picture, 0, 255).astype(np.uint8), 0.1, 0.03)
+def test_a_codec_is_judged_at_each_budget_in_the_survey_and_a_large_one_keeps_the_confidence(make_survey):
+    survey = make_survey({}, {"ping": 30, "side": Side.STARBOARD})
+    found = next(d for d in detect(survey) if d.side is Side.PORT)
+    one = shot(survey, found)
+    assert one.confidence == pytest.approx(found.confidence, abs=0.1)
     ((subject,), _) = subjects(default_registry(), ["spiht"])
-    original = best_of_piece(piece, side=Side.STARBOARD).confidence
-    small, large = effects([Shot(piece, original)], subject, [16, 8000])
+    small, large = effects([one], subject, [16, 11_000])
     assert [(e.label, e.budget_bytes, e.pictures, e.misses) for e in (small, large)] == [
         ("spiht", 16, 1, 0),
-        ("spiht", 8000, 1, 0),
+        ("spiht", 11_000, 1, 0),
     ]
-    assert large.before == original
-    assert large.after == pytest.approx(original, abs=0.05)
+    assert large.before == one.confidence
+    assert large.after == pytest.approx(one.confidence, abs=0.05)
     assert (large.kept, small.kept) == (1.0, float(small.after >= 1.0))
-    (absent,) = effects([Shot(piece, original)], subject, [1])
+    (absent,) = effects([one], subject, [1])
     assert (absent.pictures, absent.misses) == (0, 1)
     assert np.isnan(absent.after)
+
+
+def test_a_picture_without_the_object_has_no_confidence_left(make_survey):
+    survey = make_survey({})
+    (found,) = detect(survey)
+    one = shot(survey, found)
+    seabed = np.full_like(one.cut.image, int(np.median(one.cut.image)))
+    assert confidence_with(one.survey, one.found, one.cut, seabed) < 0.5 < one.confidence
 
 
 def test_plots_are_written_for_what_there_is(tmp_path):

@@ -1,33 +1,50 @@
-"""The paper's measure of a codec: the detector's confidence in a contact before and after, at each budget."""
+"""The paper's measure of a codec: the detector's confidence in a contact before and after, at each budget.
+
+A contact's picture is cut from its survey as the vehicle cuts it, coded and decoded, put back where it was cut from,
+and the detector looks at the survey again: the confidence is that of the same place among the same seabed, and only
+what the codec did differs. Before: the picture put back as it was cut, which already has lost what grey levels lose.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from sonarpost.cli.bench.detect_simulated import JudgedFile
 from sonarpost.cli.bench.measure import Subject, code
-from sonarpost.detect.piece import Picture, Piece
-from sonarpost.detect.pieces import best_of_piece
+from sonarpost.codec.interface import Image
+from sonarpost.detect.contacts import Detection, detect
 from sonarpost.detect.settings import DetectorSettings
-from sonarpost.detect.snippet import cut_snippet
-from sonarpost.sonar.survey import Side
+from sonarpost.detect.snippet import HIGH_PERCENTILE, LOW_PERCENTILE, Snippet, cut_snippet
+from sonarpost.sonar.survey import ChannelPing, Survey
 
 HEIGHT_PX: Final = 80
 WIDTH_PX: Final = 140
+_AROUND_PINGS: Final = 200
 _LEAST_CONFIDENCE: Final = 1.0
-_SETTINGS: Final = DetectorSettings()
+_EVERYTHING: Final = DetectorSettings(confidence_threshold=0.01)
+_NEAR_M: Final = 1.5
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Shot:
-    """A contact's picture, as the vehicle cuts it, and its confidence as a picture."""
+    """A contact's picture and the survey around it.
 
-    piece: Piece
+    Attributes:
+        survey: The pings around the contact.
+        found: The contact, in its indices.
+        cut: The picture.
+        confidence: Of the contact, with its picture put back.
+    """
+
+    survey: Survey
+    found: Detection
+    cut: Snippet
     confidence: float
 
 
@@ -56,31 +73,40 @@ class CodecEffect:
 
 def shots(files: Sequence[JudgedFile], most: int) -> list[Shot]:
     """Cut the pictures of mine-like objects that were found, evenly over the files, at most `most`."""
-    cut = []
-    for file in files:
-        for found, judged in zip(file.found, file.contacts, strict=True):
-            is_mine = judged.thing is not None and judged.thing.is_mine_like and judged.is_first
-            if not is_mine or found.confidence < _LEAST_CONFIDENCE or found.pixel_along_m is None:
-                continue
-            picture = cut_snippet(file.survey, found, HEIGHT_PX, WIDTH_PX).image
-            cut.append(Piece(picture, found.pixel_along_m, found.pixel_across_m))
-    step = max(len(cut) / most, 1.0) if most > 0 else math.inf
-    chosen = [cut[int(i * step)] for i in range(min(most, len(cut)))]
-    return [Shot(piece, _confidence(piece, piece.picture)) for piece in chosen]
+    chosen = [
+        (file.survey, found)
+        for file in files
+        for found, judged in zip(file.found, file.contacts, strict=True)
+        if judged.thing is not None
+        and judged.thing.is_mine_like
+        and judged.is_first
+        and found.confidence >= _LEAST_CONFIDENCE
+    ]
+    step = max(len(chosen) / most, 1.0)
+    return [shot(*chosen[int(i * step)]) for i in range(min(most, len(chosen)))]
+
+
+def shot(survey: Survey, found: Detection) -> Shot:
+    """Cut a contact's picture and the pings around it."""
+    first = max(0, found.ping_index - _AROUND_PINGS)
+    around = replace(survey, pings=survey.pings[first : found.ping_index + _AROUND_PINGS])
+    there = replace(found, ping_index=found.ping_index - first)
+    cut = cut_snippet(around, there, HEIGHT_PX, WIDTH_PX)
+    return Shot(around, there, cut, confidence_with(around, there, cut, cut.image))
 
 
 def effects(pictures: Sequence[Shot], subject: Subject, budgets: Sequence[int]) -> list[CodecEffect]:
     """Code every picture at every budget (once, for a codec of natural size) and judge it again."""
-    coded = [code(subject, np.asarray(shot.piece.picture, dtype=np.uint8), budgets) for shot in pictures]
+    coded = [code(subject, one.cut.image, budgets) for one in pictures]
     found = []
     for place in range(len(coded[0]) if coded else 0):
         before, after = [], []
-        for shot, results in zip(pictures, coded, strict=True):
+        for one, results in zip(pictures, coded, strict=True):
             result = results[place]
             if not isinstance(result, str):
-                before.append(shot.confidence)
-                after.append(_confidence(shot.piece, result.rebuilt))
-        sure = [b >= _LEAST_CONFIDENCE for b in before]
+                before.append(one.confidence)
+                after.append(confidence_with(one.survey, one.found, one.cut, result.rebuilt))
+        still = [a >= _LEAST_CONFIDENCE for a, b in zip(after, before, strict=True) if b >= _LEAST_CONFIDENCE]
         found.append(
             CodecEffect(
                 label=subject.label,
@@ -89,15 +115,50 @@ def effects(pictures: Sequence[Shot], subject: Subject, budgets: Sequence[int]) 
                 misses=len(pictures) - len(after),
                 before=float(np.mean(before)) if before else math.nan,
                 after=float(np.mean(after)) if after else math.nan,
-                kept=float(np.mean([a >= _LEAST_CONFIDENCE for a, s in zip(after, sure, strict=True) if s]))
-                if any(sure)
-                else math.nan,
+                kept=float(np.mean(still)) if still else math.nan,
             )
         )
     return found
 
 
-def _confidence(like: Piece, picture: Picture) -> float:
-    """Return the confidence of a picture of the piece's scale; snippets lead away from the vehicle to the right."""
-    best = best_of_piece(Piece(picture, like.pixel_along_m, like.pixel_across_m), _SETTINGS, Side.STARBOARD)
-    return 0.0 if best is None else best.confidence
+def confidence_with(survey: Survey, found: Detection, cut: Snippet, picture: Image) -> float:
+    """Return the greatest confidence at a contact's place with `picture` in its snippet's place; 0 without contact.
+
+    Args:
+        survey: The survey the snippet was cut from.
+        found: The contact.
+        cut: The snippet, for where it lies and how its greys were made.
+        picture: Of the snippet's shape, uint8.
+    """
+    samples = _unmapped(picture, cut)
+    pings = list(survey.pings)
+    for row, line in enumerate(samples):
+        ping = pings[cut.first_ping_index + row]
+        channels = tuple(_with(c, cut.first_sample, line) if c.side is found.side else c for c in ping.channels)
+        pings[cut.first_ping_index + row] = replace(ping, channels=channels)
+    along_m = found.pixel_along_m or _EVERYTHING.assumed_row_along_m
+    return max(
+        (
+            d.confidence
+            for d in detect(replace(survey, pings=tuple(pings)), _EVERYTHING)
+            if d.side is found.side
+            and abs(d.ping_index - found.ping_index) * along_m < _NEAR_M
+            and abs(d.sample - found.sample) * found.pixel_across_m < _NEAR_M
+        ),
+        default=0.0,
+    )
+
+
+def _unmapped(picture: Image, cut: Snippet) -> npt.NDArray[np.float64]:
+    """Return the sample values that a picture's greys stand for, by the snippet's own mapping, backwards."""
+    root = np.sqrt(cut.image16.astype(np.float64) * cut.divisor16)
+    low, high = np.percentile(root, (LOW_PERCENTILE, HIGH_PERCENTILE))
+    return np.asarray((low + picture.astype(np.float64) / 255.0 * (high - low)) ** 2)
+
+
+def _with(channel: ChannelPing, first: int, line: npt.NDArray[np.float64]) -> ChannelPing:
+    samples = channel.samples.copy()
+    room = len(samples) - first
+    limit = np.iinfo(samples.dtype).max
+    samples[first : first + len(line)] = np.clip(np.rint(line[:room]), 0, limit).astype(samples.dtype)
+    return replace(channel, samples=samples)
