@@ -16,6 +16,8 @@ from sonarpost.errors import BadInputError
 from sonarpost.messages import Advice, Command, CommandKind, DownlinkState, TaskingState
 
 KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit")
+REFINABLE: Final = ("emb", "spiht")
+"""Codecs of which a longer stream begins with a shorter one."""
 NOT_AVAILABLE: Final = {"wider": "no order for a wider picture exists on the acoustic link"}
 _RANK: Final = {
     "none": 0,
@@ -38,8 +40,10 @@ def why_not(row: sqlite3.Row, kind: str) -> str:
         return NOT_AVAILABLE[kind]
     if kind == "revisit" and (row["lat_deg"] is None or row["lon_deg"] is None):
         return "the contact's position is not known"
-    if kind in ("refine", "resend") and row["complete"]:
+    if kind == "resend" and row["complete"]:
         return "all of the picture that the vehicle announced is here"
+    if kind == "refine" and row["codec"] not in REFINABLE:
+        return f"the codec {row['codec']} makes no longer stream" if row["codec"] else "nothing of its picture is here"
     return ""
 
 

@@ -134,6 +134,7 @@ def _put(db: sqlite3.Connection, contact_id: str, image: ReconstructedImage, now
         "percent": percent_of(image),
         "bytes_received": image.bytes_received,
         "bytes_total": image.bytes_total,
+        "codec": image.codec,
         "has_picture": int(bool(image.codec)),
         "height_px": image.picture.height_px,
         "width_px": image.picture.width_px,

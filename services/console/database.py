@@ -27,7 +27,8 @@ CREATE TABLE IF NOT EXISTS contact (
     vehicle_lat_deg REAL, vehicle_lon_deg REAL, seen_utc_s REAL, first_frame_utc_s REAL NOT NULL,
     last_frame_utc_s REAL NOT NULL, arrived_utc_s REAL NOT NULL, updated_utc_s REAL NOT NULL,
     complete INTEGER NOT NULL, percent REAL NOT NULL, bytes_received INTEGER NOT NULL, bytes_total INTEGER NOT NULL,
-    has_picture INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL, group_id TEXT
+    codec TEXT NOT NULL, has_picture INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL,
+    group_id TEXT
 ) WITHOUT ROWID;
 CREATE UNIQUE INDEX IF NOT EXISTS contact_image ON contact (vessel_id, vehicle_id, image_id, first_s);
 CREATE INDEX IF NOT EXISTS contact_updated ON contact (updated_utc_s, id);

@@ -37,6 +37,7 @@ SERVICES = ("op_modem", "decompressor", "relay", "console")
 TICK_S = 0.5
 BACKLOG_AT_ONCE = 40
 ADVICE_EVERY = 5
+KEPT = 300
 
 
 @dataclass
@@ -73,6 +74,7 @@ class Training:
         self._made = 0
         self._packet = 0
         self._arriving: list[_Arriving] = []
+        self._kept: dict[str, _Arriving] = {}
         self._travelling: list[_Travelling] = []
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="training", daemon=True)
@@ -86,6 +88,7 @@ class Training:
             self._made += 1
             first = begun + 30.0 * number
             steps = range(len(simulated.versions))
+            self._keep(_Arriving(simulated, first, len(simulated.versions)))
             records += [simulated.record(VESSEL, step, first, first + 6.0 * step) for step in steps]
             if len(records) >= BACKLOG_AT_ONCE or number == contacts - 1 or self._stop.is_set():
                 self._board.take_images(records)
@@ -136,6 +139,20 @@ class Training:
         arriving.step += 1
         if arriving.step == len(arriving.simulated.versions):
             self._arriving.remove(arriving)
+            self._keep(arriving)
+
+    def _keep(self, arrived: _Arriving) -> None:
+        """Remember what may be asked for again; the vehicle forgets the oldest."""
+        self._kept[arrived.simulated.image_id] = arrived
+        while len(self._kept) > KEPT:
+            del self._kept[next(iter(self._kept))]
+
+    def _obey(self, command: Command) -> None:
+        """Send what a command asks for, as the vehicle would."""
+        known = self._kept.get(command.image_id or "")
+        if known is not None and command.kind in ("refine", "resend"):
+            more = known.simulated.more(refine=command.kind == "refine")
+            self._arriving.append(_Arriving(more, known.first_utc_s, len(more.versions) - 1))
 
     def _advice(self, record: ReconstructedImage) -> Advice:
         """Return what an expert ashore would say of a picture that has just come."""
@@ -239,6 +256,8 @@ class Training:
                 self._board.take_downlink(self._state(order.record, order.steps.pop(0)[1], now_utc_s))
             if not order.steps:
                 self._travelling.remove(order)
+                if isinstance(order.record, Command):
+                    self._obey(order.record)
 
     @staticmethod
     def _state(record: Decision | Command, step: DownlinkStep, now_utc_s: float) -> DownlinkState:

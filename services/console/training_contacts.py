@@ -40,6 +40,7 @@ class Simulated:
         versions: What of its picture is known after each packet: bytes received, of how many, frames, the picture.
         codec: That made it.
         model: Of that codec.
+        original: What the vehicle has, shape (80, 140).
     """
 
     contact: Contact
@@ -47,6 +48,17 @@ class Simulated:
     versions: tuple[tuple[int, int, int, Decoded], ...]
     codec: str
     model: str
+    original: npt.NDArray[np.uint8]
+
+    def more(self, *, refine: bool) -> Simulated:
+        """Return it with one version more: what was lacking, or to refine a stream of twice the length."""
+        total = self.versions[-1][1]
+        codec: Codec = EmbCodec() if self.codec == EmbCodec().name else VqCodec(open_catalogue("nominal-10").tiles)
+        stream = codec.encode(self.original, 2 * total if refine and isinstance(codec, EmbCodec) else None)
+        if isinstance(codec, EmbCodec) and not refine:
+            stream = codec.encode(self.original, total)
+        last = (len(stream), len(stream), self.versions[-1][2] + 1, codec.decode(stream))
+        return replace(self, versions=(*self.versions, last))
 
     def record(self, vessel_id: str, step: int, first_utc_s: float, now_utc_s: float) -> ReconstructedImage:
         """Return the record of a version, from 0, as a decompressor would give it out."""
@@ -99,15 +111,9 @@ def simulated_contacts(seed: int, first_utc_s: float) -> Iterator[Simulated]:
                 vehicle = VEHICLES[(line + look) % len(VEHICLES)]
                 contact = _contact(simulated.survey, thing, vehicle, chance, number)
                 image_id = _image_id(number)
-                made.append(
-                    Simulated(
-                        contact,
-                        image_id,
-                        _versions(codec, chip(simulated.survey, thing, look), lacking=chance.random() < 0.5),
-                        codec.name,
-                        codec.model_hash,
-                    )
-                )
+                original = chip(simulated.survey, thing, look)
+                versions = _versions(codec, original, lacking=chance.random() < 0.5)
+                made.append(Simulated(contact, image_id, versions, codec.name, codec.model_hash, original))
                 yield made[-1]
                 number += 1
         line += 1

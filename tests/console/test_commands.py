@@ -93,8 +93,16 @@ def test_training_arrives_travels_and_ends(console):
         delivery = anna.get(f"/api/contacts/{contact_id}").json()["contact"]["delivery"]
         assert delivery["vehicle"] == state
     assert delivery["shore"] == "delivered"
-    for _ in range(6):
+    whole = anna.get(f"/api/contacts/{contact_id}").json()["contact"]
+    kind = "resend" if not whole["complete"] else "refine"
+    assert anna.post(f"/api/contacts/{contact_id}/requests", {"kind": kind}).status_code == 201
+    training.send(now)
+    training.travel(now + 11.0)
+    for _ in range(10):
         training.packet(time.time())
+    more = anna.get(f"/api/contacts/{contact_id}").json()["contact"]
+    assert more["complete"]
+    assert (more["version"], more["bytes_received"] > whole["bytes_received"]) == (whole["version"] + 1, True)
     assert console.board.counts().total == 3
     assert any(row["advised"] for row in anna.get("/api/contacts").json()["items"])
     vehicles = anna.get("/api/fleet").json()["vehicles"]

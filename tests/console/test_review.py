@@ -306,6 +306,8 @@ def test_requests_cost_what_they_cost_and_are_not_doubled(make_console):
     # 150 of 200 bytes lack: 3 frames of 64 bytes, one packet of 6.1 s, after one of 3.2 s down.
     assert (costs["resend"]["bytes"], costs["resend"]["packets"]) == (150, 1)
     assert costs["resend"]["airtime_s"] == pytest.approx(9.3)
+    # Twice the stream: 350 bytes lack, 7 frames, three packets.
+    assert (costs["refine"]["bytes"], costs["refine"]["packets"]) == (350, 3)
     assert costs["revisit"]["airtime_s"] == pytest.approx(3.2)
     assert not costs["wider"]["available"]
     path = f"/api/contacts/{ID}/requests"
@@ -325,12 +327,28 @@ def test_a_cost_that_cannot_be_told_is_not_invented(console):
     assert [c["airtime_s"] for c in costs if c["kind"] == "refine"] == [None]
 
 
-def test_nothing_is_asked_of_a_complete_picture(console):
-    console.board.take_image(picture_record(place=None))
+@pytest.mark.parametrize(
+    ("changes", "possible"),
+    [
+        ({}, {"refine", "revisit"}),
+        ({"place": None}, {"refine"}),
+        ({"place": None, "codec": "vq"}, set()),
+        ({"missing_rows": 10, "codec": "vq"}, {"resend", "revisit"}),
+        ({"missing_rows": 10}, {"refine", "resend", "revisit"}),
+    ],
+)
+def test_what_leads_to_nothing_is_not_asked(console, changes, possible):
+    rest = {name: value for name, value in changes.items() if name != "codec"}
+    image = picture_record(**rest)
+    console.board.take_image(image.model_copy(update={"codec": changes.get("codec", "emb")}))
     anna = console.browser("anna")
+    costs = anna.get(f"/api/contacts/{ID}/costs").json()["costs"]
+    assert {cost["kind"] for cost in costs if cost["available"]} == possible
+    assert all(cost["reason"] for cost in costs if not cost["available"])
     for kind in ("refine", "resend", "revisit"):
-        assert anna.post(f"/api/contacts/{ID}/requests", {"kind": kind}).status_code == 400
-    assert console.board.unsent() == []
+        answer = anna.post(f"/api/contacts/{ID}/requests", {"kind": kind})
+        assert answer.status_code == (201 if kind in possible else 400)
+    assert len(console.board.unsent()) == len(possible)
 
 
 def test_ashore_experts_advise_and_nobody_decides(make_console):

@@ -55,15 +55,16 @@ def request_cost(
 ) -> Cost:
     """Return what a `refine`, `resend` or `revisit` costs.
 
-    A revisit costs the request alone: what the vehicle then sees is a contact of its own. Frames that will be lost are
-    sent again, so the way up is longer by 1 / (1 - loss).
+    To refine gives a stream of twice the length, to resend what is lacking of the stream there is. A revisit costs the
+    request alone: what the vehicle then sees is a contact of its own. Frames that will be lost are sent again, so the
+    way up is longer by 1 / (1 - loss).
 
     Args:
         kind: The request.
         downlink_rate: Micro-Modem rate of the vessel.
         uplink_rate: Of the vehicle, as heard last; None where it is not known.
         bytes_received: Of the picture's stream.
-        bytes_total: Of the stream as far as it was announced; `refine` asks for all of it.
+        bytes_total: Of the stream as far as it was announced.
         loss: Share of frames lost lately; None where it is not known.
         overhead_bytes: Of header in a frame.
     """
@@ -72,13 +73,14 @@ def request_cost(
         return Cost(downlink_s, 0.0, 0, 0, f"one packet down at rate {downlink_rate}; a new look is a new contact")
     if uplink_rate is None:
         return Cost(downlink_s, None, None, None, "the vehicle's rate is not known: nothing was heard from it")
-    wanted = max(0, bytes_total - bytes_received)
     if bytes_total == 0:
         return Cost(downlink_s, None, None, None, "the length of the picture's stream is not known")
+    whole = 2 * bytes_total if kind == "refine" else bytes_total
+    wanted = max(0, whole - bytes_received)
     share = min(0.9, loss or 0.0)
     sent = math.ceil(wanted / (1 - share))
     packets = packets_for(sent, uplink_rate, overhead_bytes)
-    basis = f"rate {uplink_rate} as heard last, {wanted} of {bytes_total} bytes lacking"
+    basis = f"rate {uplink_rate} as heard last, {wanted} of {whole} bytes lacking"
     if share:
         basis += f", {share:.0%} of frames lost"
     return Cost(downlink_s, packets * RATES[uplink_rate].airtime_s, wanted, packets, basis)
