@@ -1,13 +1,13 @@
 // The recognition panel: which original is it? Right and wrong are not told, so that nobody learns on the way.
 
 import { fill, h, toast } from "./dom.js";
-import { percent } from "./format.js";
+import { duration, percent } from "./format.js";
 
 const main = document.getElementById("panel");
-const panel = { id: null, csrf: "", title: "", trial: null, choice: null, sure: null, began_ms: 0 };
+const panel = { id: null, title: "", trial: null, choice: null, sure: null, began_ms: 0 };
 
 async function call(method, path, body) {
-  const headers = { "Content-Type": "application/json", "X-CSRF-Token": panel.csrf };
+  const headers = { "Content-Type": "application/json" };
   if (panel.id) headers["X-Panel"] = panel.id;
   const response = await fetch(path, { method, headers, body: body === undefined ? undefined : JSON.stringify(body), cache: "no-store" });
   const answer = await response.json().catch(() => ({}));
@@ -22,8 +22,8 @@ const guarded = (handler) => async (...args) => {
 function start(info) {
   const name = h("input", { id: "name", required: true, maxlength: 60, autocomplete: "off" });
   const begin = guarded(async () => {
-    const { panel: id, csrf } = await call("POST", "/api/panel/start", { name: name.value.trim() });
-    Object.assign(panel, { id, csrf });
+    const { panel: id } = await call("POST", "/api/panel/start", { name: name.value.trim() });
+    panel.id = id;
     await next();
   });
   fill(main,
@@ -82,14 +82,14 @@ function draw() {
 
 const share = (one) => [
   h("td", { class: "number", text: `${one.right} of ${one.answered}` }), h("td", { class: "number", text: percent(100 * one.share, 1) }),
-  h("td", { class: "number", text: `${percent(100 * one.wilson[0], 1)} – ${percent(100 * one.wilson[1], 1)}` }), h("td", { class: "number", text: `${percent(100 * one.exact[0], 1)} – ${percent(100 * one.exact[1], 1)}` }),
+  h("td", { class: "number", text: `${percent(100 * one.wilson[0], 1)} – ${percent(100 * one.wilson[1], 1)}` }), h("td", { class: "number", text: `${percent(100 * one.exact[0], 1)} – ${percent(100 * one.exact[1], 1)}` }), h("td", { class: "number", text: duration(one.median_s) }),
 ];
 
 async function results() {
-  const { people, pooled, by_group: groups } = await call("GET", "/api/panel/results");
-  const row = (name, one) => (one.answered ? h("tr", {}, h("th", { scope: "row", text: name }), share(one)) : h("tr", {}, h("th", { scope: "row", text: name }), h("td", { colspan: 4, text: "nothing answered yet" })));
-  fill(main, h("h1", { text: "Results" }), h("table", {},
-    h("thead", {}, h("tr", {}, ["", "right", "share", "95 % (Wilson)", "95 % (exact)"].map((name) => h("th", { scope: "col", class: name ? "number" : "", text: name })))),
+  const { people, pooled, chance, by_group: groups } = await call("GET", "/api/panel/results");
+  const row = (name, one) => (one.answered ? h("tr", {}, h("th", { scope: "row", text: name }), share(one)) : h("tr", {}, h("th", { scope: "row", text: name }), h("td", { colspan: 5, text: "nothing answered yet" })));
+  fill(main, h("h1", { text: "Results" }), h("p", { text: `By chance alone ${percent(100 * chance, 1)} would be right.` }), h("table", {},
+    h("thead", {}, h("tr", {}, ["", "right", "share", "95 % (Wilson)", "95 % (exact)", "time, median"].map((name) => h("th", { scope: "col", class: name ? "number" : "", text: name })))),
     h("tbody", {}, people.map((one) => row(one.name, one)), row("all together", pooled), Object.entries(groups).map(([name, one]) => row(`group ${name}`, one)))),
   h("button", { type: "button", text: "Back", on: { click: () => location.reload() } }));
 }
