@@ -12,7 +12,7 @@ from link.v1_world import VEHICLE, contact, stream
 from sonarpost.link.intervals import count_positions
 from sonarpost.link.queue import AcousticQueue, PictureName, QueueConfig
 from sonarpost.link.queue_state import export_queue, restore_queue
-from sonarpost.link.v1_events import ContactUpdate
+from sonarpost.link.v1_events import ContactUpdate, MessageReceived
 from sonarpost.link.v1_receiver import Receiver
 from sonarpost.modem.rates import RATES
 
@@ -47,6 +47,8 @@ class Exchange:
                 if not water or self.lost():
                     continue
                 for event in self.receiver.accept(VEHICLE, frame, self.now):
+                    if isinstance(event, MessageReceived):
+                        continue
                     assert isinstance(event, ContactUpdate)
                     assert self.streams[event.number].startswith(event.stream)
                     self.shown[event.number] = event.stream
@@ -199,3 +201,19 @@ def test_a_stream_that_just_fills_its_preview_becomes_complete(length: int) -> N
     exchange.run(600.0, reports=True)
     assert exchange.whole == [1]
     assert exchange.receiver.counts.complete == 1
+
+
+def test_a_block_that_was_lost_altogether_is_reminded_of_through_a_flood_of_messages() -> None:
+    exchange = Exchange(loss=0.0)
+    exchange.add(1)
+    exchange.run(600.0, reports=True)
+    assert exchange.whole == [1]
+    exchange.add(2)
+    count = 0
+    for minutes in range(60):
+        for _ in range(30):  # more than there is room for
+            count += 1
+            exchange.queue.add_message(f"m{count}", "flood", bytes([count % 256]) * 55, exchange.now, lifetime_s=600.0)
+        # Of the second picture nothing comes at first, so that the receiver does not even know that something lacks.
+        exchange.run(60.0, reports=True, water=minutes >= 3)
+    assert exchange.whole == [1, 2]

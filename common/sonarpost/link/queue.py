@@ -312,7 +312,7 @@ class AcousticQueue:
         return tuple(frames)
 
     def _next_frame(self, now: float) -> bytes | None:
-        pictures_wait = any(block.lacks > 0 for block in self.sender.blocks) or bool(self.sender.waiting)
+        pictures_wait = self.sender.pictures_are_due(now)
         due = pictures_wait and self.picture_credit >= 1.0
         frame = self.sender.next_frame(now, pictures_first=due)
         if frame is not None and pictures_wait:

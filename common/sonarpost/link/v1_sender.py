@@ -380,10 +380,16 @@ class Sender:
 
     def _remind(self, now: float) -> None:
         """With feedback: where no report came for long, send a little more, which makes the receiver report."""
-        for block in self.blocks:
-            if block.lacks <= 0 and now - block.asked_at >= self.config.patience_s:
-                block.asked_at = now
-                block.planned += max(1, block.source_symbols // 16)
+        for block in self._forgotten(now):
+            block.asked_at = now
+            block.planned += max(1, block.source_symbols // 16)
+
+    def _forgotten(self, now: float) -> list[SendBlock]:
+        return [b for b in self.blocks if b.lacks <= 0 and now - b.asked_at >= self.config.patience_s]
+
+    def pictures_are_due(self, now: float) -> bool:
+        """Whether something of pictures is to be sent, be it a reminder of what nobody has reported of."""
+        return bool(self.waiting) or any(b.lacks > 0 for b in self.blocks) or bool(self._forgotten(now))
 
     def _go_on(self) -> None:
         """With feedback: where the next group waits for room among the blocks, send more of the one least likely there.
