@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from conftest import eventually
 from console.conftest import PASSWORD, picture_record
@@ -379,3 +381,15 @@ def test_expert_advice_appears_beside_the_picture(serve):
     contact_id = shore.board.contacts(Filter())["items"][0]["id"]
     eventually(lambda: len(shore.board.contact(contact_id)["advice"]) == 1, what="the advice")
     expert.wait(".advice >> text=have a second look")
+
+
+def test_every_key_is_in_the_documents(served):
+    few(served, 1)
+    there = served.visit()
+    there.press("?")
+    there.wait("dialog .keys")
+    page = Path(__file__).resolve().parents[3] / "docs" / "console.md"
+    section = page.read_text("utf-8").split("## Screens and keys")[1].split("\n## ")[0]
+    keys = set(there.page.locator("dialog .keys kbd").all_inner_texts())
+    assert len(keys) > 25
+    assert {key for key in keys if f"`{key}`" not in section} == {"arrows"}
