@@ -175,8 +175,11 @@ def test_seen_measured_decided_and_told(
     assert ashore[0].operator == "anna"
     there.wait('.progress >> text="ashore"')
     there.wait(".progress >> text=on the vehicle")
-    # All of the picture is here: another look, of which the cost is shown, is asked for, and the vehicle hears it.
+    # All of the picture is here: not more of it but another look, of which the cost is shown, is asked for, and the
+    # vehicle hears it.
     there.press("r")
+    there.wait("dialog .costs input[value=refine]:checked")
+    there.press("ArrowDown")
     there.wait("dialog .costs input[value=revisit]:checked")
     there.press("Enter")
     eventually(lambda: len(autonomy.got) == 2, what="the order on the vehicle")
