@@ -97,7 +97,9 @@ class App {
       detail = await api.contact(id);
     } catch (error) {
       if (error.status === 404) { state.selected = null; this.#empty(); }
-      if (error.status !== 0) toast(error.message, { bad: true });
+      // Without an answer it is asked again, for as long as somebody wants to see it.
+      if (error.status === 0) setTimeout(() => { if (id === state.selected && turn === this.turn) this.load(); }, 1000);
+      else toast(error.message, { bad: true });
       return;
     }
     // A slow answer must not replace a newer one.

@@ -35,7 +35,7 @@ function marks(row) {
 /** Make the element of a row; `index` counts from 0, `count` is the length of the whole list. */
 export function queueRow(row, index, count, selected) {
   const picture = row.has_picture
-    ? h("img", { src: row.thumbnail, alt: "", loading: "lazy", decoding: "async" })
+    ? h("img", { src: row.thumbnail, alt: "", decoding: "async" })
     : h("span", { class: "nothing", text: "no picture yet" });
   return h("div", {
     id: `row-${index}`, class: "row", role: "option", "aria-selected": String(selected), "aria-posinset": index + 1, "aria-setsize": count,
