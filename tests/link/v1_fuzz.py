@@ -1,7 +1,6 @@
-"""Hostile frames for the v1 receiver: as a bounded run, a long run, and a coverage-guided target.
+"""Hostile frames for the v1 receiver, a bounded run and a long one; by coverage: `tests/fuzz/run_atheris_link.py`.
 
-python tests/link/v1_fuzz.py FRAMES [SEED]     deterministic
-python tests/link/v1_fuzz.py --atheris …       guided by coverage (needs the package atheris)
+python tests/link/v1_fuzz.py FRAMES [SEED]
 """
 
 from __future__ import annotations
@@ -160,13 +159,6 @@ def one_input(data: bytes) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    if arguments and arguments[0] == "--atheris":
-        import atheris  # type: ignore[import-not-found]
-
-        atheris.instrument_all()
-        atheris.Setup([sys.argv[0], *arguments[1:]], one_input)
-        atheris.Fuzz()
-        return
     started = time.process_time()
     seed = int(arguments[1]) if len(arguments) > 1 else 0
     print(run(int(arguments[0]), seed), f"{time.process_time() - started:.0f} s CPU")
