@@ -14,6 +14,7 @@ from xml.etree import ElementTree as ET
 import pytest
 import zenoh
 from conftest import eventually, free_port
+from records import picture_record
 
 from services.c2.archive import Archive
 from services.c2.config import C2Config
@@ -23,7 +24,7 @@ from sonarpost.cli.c2.ls import join, select
 from sonarpost.cli.c2.options import printable, since_of
 from sonarpost.cli.main import main
 from sonarpost.errors import ConfigError
-from sonarpost.messages import Advice, Contact, Decision, Raster, ReconstructedImage, TaskingState
+from sonarpost.messages import Advice, Contact, Decision, Raster, TaskingState
 from sonarpost.runtime.session import router_config
 
 FIRST_S = 1_700_000_000.0
@@ -31,23 +32,13 @@ FIRST_S = 1_700_000_000.0
 
 def image(image_id="AAAA", version=1, vehicle="uuv-1", vessel="vessel-1", first_frame_utc_s=FIRST_S):
     picture = Raster(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
-    return ReconstructedImage(
+    return picture_record(
+        picture,
         vessel_id=vessel,
         vehicle_id=vehicle,
         image_id=image_id,
         version=version,
         contact=Contact(contact_id=f"{vehicle}/{image_id}", vehicle_id=vehicle, lat_deg=56.4, lon_deg=-5.6),
-        codec="vq",
-        model="",
-        picture=picture,
-        picture_sha256=picture.sha256,
-        complete=True,
-        missing_fraction=0.0,
-        missing_mask=b"",
-        missing_halves=(),
-        bytes_received=42,
-        bytes_total=42,
-        frames_received=2,
         first_frame_utc_s=first_frame_utc_s,
         last_frame_utc_s=first_frame_utc_s + 1,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+from records import picture_record
 
 from sonarpost import keys
 from sonarpost.messages import Raster, ReconstructedImage
@@ -20,23 +21,11 @@ def make_image(
     """Return a picture of noise that no other number, mission or version has."""
     rng = np.random.default_rng([mission, number, version])
     raster = Raster.from_array(rng.integers(0, 256, shape, dtype=np.uint8))
-    return ReconstructedImage(
-        vessel_id=VESSEL,
+    return picture_record(
+        raster,
         vehicle_id=f"uuv-{number % 3 + 1}",
         image_id=f"{number:04d}",
         version=version,
-        contact=None,
-        codec="vq",
-        model="",
-        picture=raster,
-        picture_sha256=raster.sha256,
-        complete=True,
-        missing_fraction=0.0,
-        missing_mask=b"",
-        missing_halves=(),
-        bytes_received=232,
-        bytes_total=232,
-        frames_received=6,
         first_frame_utc_s=1.0e9 + 86400.0 * mission + number,
         last_frame_utc_s=1.0e9 + 86400.0 * mission + number,
     )

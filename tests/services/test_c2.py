@@ -9,12 +9,13 @@ import msgpack
 import numpy as np
 import pytest
 from conftest import eventually
+from records import decision_record, picture_record
 
 from services.c2.config import C2Config
 from services.c2.service import C2Service
 from sonarpost import keys, wire
 from sonarpost.files import AtomicFiles
-from sonarpost.messages import Contact, Decision, Raster, ReconstructedImage, Relayed
+from sonarpost.messages import Contact, Raster, ReconstructedImage, Relayed
 from sonarpost.sonar.image_files import read_image
 
 
@@ -39,42 +40,18 @@ def image(texture):
         picture = Raster.from_array(texture(seed=seed))
         missing = np.zeros((40, 60), dtype=np.bool_)
         missing[30:, :] = True
-        return ReconstructedImage(
+        return picture_record(
+            picture,
             vessel_id=vessel,
-            vehicle_id="uuv-1",
             image_id=image_id,
-            version=1,
             contact=Contact(contact_id="uuv-1/AAAA", vehicle_id="uuv-1", lat_deg=56.4, lon_deg=-5.6),
-            codec="vq",
-            model="",
-            picture=picture,
-            picture_sha256=picture.sha256,
             complete=False,
             missing_fraction=0.25,
             missing_mask=np.packbits(missing).tobytes(),
-            missing_halves=(),
             bytes_received=30,
-            bytes_total=42,
-            frames_received=2,
-            first_frame_utc_s=1_700_000_000.0,
-            last_frame_utc_s=1_700_000_001.0,
         )
 
     return make
-
-
-def decision(decision_id="d1", vessel="vessel-1", **changes):
-    fields = {
-        "decision_id": decision_id,
-        "vessel_id": vessel,
-        "vehicle_id": "uuv-1",
-        "image_id": "AAAA",
-        "image_version": 1,
-        "verdict": "mine_like",
-        "operator": "op",
-        "decided_utc_s": 1.0,
-    }
-    return Decision(**(fields | changes))
 
 
 def key_of(record, vessel):
@@ -127,23 +104,23 @@ def test_a_picture_is_kept_and_shown_for_msgpack_alone(begin, relay, image, out,
 def test_a_decision_is_kept_and_shown(begin, relay, out, watch):
     seen = watch(keys.shore_decision("vessel-1"))
     begin()
-    send(relay, decision("d1", remark="Stein oder Mine? \u2014 pr\u00fcfen", confidence=0.75))
+    send(relay, decision_record("d1", remark="Stein oder Mine? \u2014 pr\u00fcfen", confidence=0.75))
     eventually(lambda: len(seen) == 1)
     assert msgpack.unpackb(seen[0].payload.to_bytes())["verdict"] == "mine_like"
     [kept] = (out / "vessel-1" / "decisions").iterdir()
     assert (
         json.loads(kept.read_text())
-        == decision("d1", remark="Stein oder Mine? \u2014 prüfen", confidence=0.75).model_dump()
+        == decision_record("d1", remark="Stein oder Mine? \u2014 prüfen", confidence=0.75).model_dump()
     )
 
 
 def test_the_same_record_again_changes_no_file_and_is_shown_again(begin, relay, image, out, watch):
     pictures, decisions = watch(keys.shore_image("vessel-1")), watch(keys.shore_decision("vessel-1"))
     service = begin()
-    send(relay, image(), decision())
+    send(relay, image(), decision_record())
     eventually(lambda: len(decisions) == 1)
     before = {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in out.rglob("*.[!d]*") if p.is_file()}
-    send(relay, image(), decision())
+    send(relay, image(), decision_record())
     eventually(lambda: (len(pictures), len(decisions)) == (2, 2))
     assert before == {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in out.rglob("*.[!d]*") if p.is_file()}
     eventually(lambda: service.health().counters.get("records_handled") == 4)
@@ -155,7 +132,7 @@ def test_the_same_record_again_changes_no_file_and_is_shown_again(begin, relay, 
 def test_another_decision_under_the_same_identifier_is_refused(begin, relay, out, refused, watch):
     seen = watch(keys.shore_decision("vessel-1"))
     service = begin()
-    send(relay, decision("d1"), decision("d1", verdict="not_mine_like"), decision("d2"))
+    send(relay, decision_record("d1"), decision_record("d1", verdict="not_mine_like"), decision_record("d2"))
     eventually(lambda: len(seen) == 2)
     assert [msgpack.unpackb(s.payload.to_bytes())["decision_id"] for s in seen] == ["d1", "d2"]
     [(_, reason)] = refused(service)
@@ -171,7 +148,7 @@ def test_another_decision_under_the_same_identifier_is_refused(begin, relay, out
 )
 def test_no_identifier_leads_out_of_the_folder(hostile, begin, relay, out, tmp_path):
     service = begin()
-    send(relay, decision(hostile), decision("after"))
+    send(relay, decision_record(hostile), decision_record("after"))
     eventually(lambda: service.health().counters.get("decisions_stored") == 2)
     kept = list((out / "vessel-1" / "decisions").iterdir())
     assert {json.loads(p.read_text())["decision_id"] for p in kept} == {hostile, "after"}
@@ -183,8 +160,8 @@ def test_no_identifier_leads_out_of_the_folder(hostile, begin, relay, out, tmp_p
 def test_an_identifier_that_is_no_file_name_blocks_nothing(long, begin, relay, refused):
     """A vessel's console may be of another make; whatever it sends, the records behind go on."""
     service = begin()
-    fields = msgpack.unpackb(wire.encode(decision())) | {"decision_id": long}
-    send(relay, envelope(decision(), payload=msgpack.packb(fields)), decision("after"))
+    fields = msgpack.unpackb(wire.encode(decision_record())) | {"decision_id": long}
+    send(relay, envelope(decision_record(), payload=msgpack.packb(fields)), decision_record("after"))
     eventually(lambda: service.health().counters.get("decisions_stored", 0) >= 1)
     assert service.store.inbox_depth() == 0
     assert len(refused(service)) + service.health().counters["decisions_stored"] == 2
@@ -196,19 +173,19 @@ def wrong_vessel(image):
 
 
 def unknown_key(image):
-    return envelope(decision(), key="sonarpost/v1/vessel-1/health/relay")
+    return envelope(decision_record(), key="sonarpost/v1/vessel-1/health/relay")
 
 
 def escaping_key(image):
-    return envelope(decision(), key="../../../etc")
+    return envelope(decision_record(), key="../../../etc")
 
 
 def wrong_record(image):
-    return envelope(decision(), key=keys.image_reconstructed("vessel-1"))
+    return envelope(decision_record(), key=keys.image_reconstructed("vessel-1"))
 
 
 def damaged(image):
-    return envelope(decision(), payload=wire.encode(decision())[:-3])
+    return envelope(decision_record(), payload=wire.encode(decision_record())[:-3])
 
 
 @pytest.mark.parametrize(
@@ -248,8 +225,8 @@ def test_no_vessel_speaks_for_another(begin, relay, image, refused, out):
 def test_two_vessels_are_kept_apart(begin, crew, relay, image, out):
     begin()
     other = crew.neighbour("vessel-2", "relay")
-    send(relay, image(seed=1), decision())
-    send(other, image(vessel="vessel-2", seed=2), decision(vessel="vessel-2"), vessel="vessel-2")
+    send(relay, image(seed=1), decision_record())
+    send(other, image(vessel="vessel-2", seed=2), decision_record(vessel_id="vessel-2"), vessel="vessel-2")
     eventually(lambda: len(list(out.rglob("*.json"))) == 4)
     one, two = (json.loads(next((out / v).glob("*.json")).read_text()) for v in ("vessel-1", "vessel-2"))
     assert (one["vessel_id"], two["vessel_id"]) == ("vessel-1", "vessel-2")
@@ -294,7 +271,7 @@ def test_records_that_come_together_are_kept_with_one_wait_for_the_disk(begin, r
     monkeypatch.setattr(AtomicFiles, "commit", lambda files: (flushes.append(len(files)), commit(files)))
     seen = watch(keys.shore_image("vessel-1"))
     twice = image("0007", seed=7)
-    send(relay, *(image(f"{n:04d}", seed=n) for n in range(40)), twice, decision("d1"), decision("d1"))
+    send(relay, *(image(f"{n:04d}", seed=n) for n in range(40)), twice, decision_record("d1"), decision_record("d1"))
     service = begin()
     eventually(lambda: service.health().counters.get("records_handled") == 43)
     counters = service.health().counters
@@ -330,5 +307,5 @@ def test_what_a_killed_c2_was_writing_is_removed_at_the_next_start(begin, relay,
         folder.mkdir(parents=True)
         (folder / ".uuv-1_20231114T221320Z_AAAA_v1.tiff.k2j3h4.tmp").write_bytes(b"half")
     begin()
-    send(relay, image(), decision())
+    send(relay, image(), decision_record())
     eventually(lambda: [name.rpartition(".")[2] for name in files(out)] == ["json", "json", "png", "tiff"])

@@ -8,11 +8,12 @@ import pytest
 from conftest import eventually
 from hypothesis import given
 from hypothesis import strategies as st
+from records import picture_record
 
 from services.c2.archive import Archive
 from services.c2.config import C2Config
 from sonarpost.errors import KeptFileError
-from sonarpost.messages import Decision, Raster, ReconstructedImage
+from sonarpost.messages import Decision, Raster
 from sonarpost.runtime.shore_files import find_picture, to_remove
 from sonarpost.runtime.shore_index import FILE_NAME, PictureRow, ShoreIndex
 
@@ -21,23 +22,11 @@ DAY_S = 86400.0
 
 def image(image_id="AAAA", version=1, vessel="vessel-1", first_frame_utc_s=1_700_000_000.0):
     picture = Raster(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
-    return ReconstructedImage(
+    return picture_record(
+        picture,
         vessel_id=vessel,
-        vehicle_id="uuv-1",
         image_id=image_id,
         version=version,
-        contact=None,
-        codec="vq",
-        model="",
-        picture=picture,
-        picture_sha256=picture.sha256,
-        complete=True,
-        missing_fraction=0.0,
-        missing_mask=b"",
-        missing_halves=(),
-        bytes_received=42,
-        bytes_total=42,
-        frames_received=2,
         first_frame_utc_s=first_frame_utc_s,
         last_frame_utc_s=first_frame_utc_s + 1,
     )

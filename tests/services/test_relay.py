@@ -5,11 +5,12 @@ from __future__ import annotations
 import msgpack
 import pytest
 from conftest import eventually
+from records import decision_record, picture_record
 
 from services.relay.config import RelayConfig
 from services.relay.service import RelayService
 from sonarpost import keys, wire
-from sonarpost.messages import Decision, Raster, ReconstructedImage, Relayed
+from sonarpost.messages import Raster, Relayed
 
 IMAGES, DECISIONS = keys.image_reconstructed("vessel-1"), keys.contact_decision("vessel-1")
 INBOX = keys.shore_inbox("vessel-1")
@@ -33,48 +34,14 @@ def source(crew):
 @pytest.fixture
 def image(texture):
     def make(image_id="AAAA", vessel="vessel-1"):
-        picture = Raster.from_array(texture())
-        return ReconstructedImage(
-            vessel_id=vessel,
-            vehicle_id="uuv-1",
-            image_id=image_id,
-            version=1,
-            contact=None,
-            codec="vq",
-            model="",
-            picture=picture,
-            picture_sha256=picture.sha256,
-            complete=True,
-            missing_fraction=0.0,
-            missing_mask=b"",
-            missing_halves=(),
-            bytes_received=42,
-            bytes_total=42,
-            frames_received=2,
-            first_frame_utc_s=1_700_000_000.0,
-            last_frame_utc_s=1_700_000_001.0,
-        )
+        return picture_record(Raster.from_array(texture()), vessel_id=vessel, image_id=image_id)
 
     return make
 
 
-def decision(decision_id="d1", vessel="vessel-1", **changes):
-    fields = {
-        "decision_id": decision_id,
-        "vessel_id": vessel,
-        "vehicle_id": "uuv-1",
-        "image_id": "AAAA",
-        "image_version": 1,
-        "verdict": "mine_like",
-        "operator": "op",
-        "decided_utc_s": 1.0,
-    }
-    return Decision(**(fields | changes))
-
-
 def test_each_record_travels_in_an_envelope_unchanged(begin, c2, source, image, is_told):
     shore, service = c2(), begin()
-    records = {IMAGES: image(), DECISIONS: decision()}
+    records = {IMAGES: image(), DECISIONS: decision_record()}
     for key, record in records.items():
         source.owe(key, "relay", record)
     eventually(lambda: len(shore.got) == 2)
@@ -92,7 +59,7 @@ def test_without_the_shore_everything_waits_and_decisions_go_first(begin, crew, 
     service = begin()
     source.owe(IMAGES, "relay", *(image(f"{n:04d}") for n in range(3)))
     eventually(lambda: service.health().gauges["waiting_for_shore"] == 3.0)
-    source.owe(DECISIONS, "relay", decision("d1"), decision("d2"))
+    source.owe(DECISIONS, "relay", decision_record("d1"), decision_record("d2"))
     eventually(lambda: service.health().gauges["waiting_for_shore"] == 5.0)
     crew.stop(service)
     shore = c2()
@@ -106,16 +73,16 @@ def test_nothing_is_shown_on_the_vessel_a_second_time(begin, c2, source, watch):
     seen = watch(INBOX)
     shore = c2()
     begin()
-    source.owe(DECISIONS, "relay", decision())
+    source.owe(DECISIONS, "relay", decision_record())
     eventually(lambda: len(shore.got) == 1)
     assert seen == []
 
 
 def test_another_vessels_record_is_refused_while_its_sender_can_be_told(begin, c2, source, image, refused):
     shore, service = c2(), begin()
-    source.owe(DECISIONS, "relay", decision("strange", vessel="vessel-2"))
+    source.owe(DECISIONS, "relay", decision_record("strange", vessel_id="vessel-2"))
     source.owe(IMAGES, "relay", image("BBBB", vessel="vessel-2"))
-    source.owe(DECISIONS, "relay", decision("own"))
+    source.owe(DECISIONS, "relay", decision_record("own"))
     eventually(lambda: len(shore.got) == 1)
     assert msgpack.unpackb(shore.got[0].payload)["decision_id"] == "own"
     eventually(lambda: len(refused(source)) == 2)
@@ -124,12 +91,12 @@ def test_another_vessels_record_is_refused_while_its_sender_can_be_told(begin, c
 
 
 @pytest.mark.parametrize(
-    "payload", [b"", b"\xff", msgpack.packb({"type": "decision", "v": 1}), wire.encode(decision())[:-1]]
+    "payload", [b"", b"\xff", msgpack.packb({"type": "decision", "v": 1}), wire.encode(decision_record())[:-1]]
 )
 def test_what_is_no_record_is_refused_and_the_next_one_relayed(payload, begin, c2, source, refused):
     shore, service = c2(), begin()
     source.owe_bytes(DECISIONS, "relay", payload)
-    source.owe(DECISIONS, "relay", decision())
+    source.owe(DECISIONS, "relay", decision_record())
     eventually(lambda: len(shore.got) == 1)
     assert [key for key, _ in refused(service)] == [DECISIONS]
     assert "expected" in refused(service)[0][1]

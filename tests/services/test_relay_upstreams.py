@@ -10,11 +10,12 @@ import pytest
 import zenoh
 from conftest import eventually, free_port
 from pydantic import ValidationError
+from records import decision_record, picture_record
 
 from services.relay.config import RelayConfig, UpstreamOptions
 from services.relay.service import RelayService, topic_of
 from sonarpost import keys
-from sonarpost.messages import Decision, Raster, ReconstructedImage, Relayed
+from sonarpost.messages import Raster, Relayed
 from sonarpost.runtime.session import client_config, router_config
 
 IMAGES, DECISIONS = keys.image_reconstructed("vessel-1"), keys.contact_decision("vessel-1")
@@ -42,40 +43,7 @@ def source(crew):
 
 def image(image_id="AAAA", version=1, height_px=40, **changes):
     picture = Raster(height_px=height_px, width_px=100, bits=8, data=bytes([version]) * height_px * 100)
-    fields = {
-        "vessel_id": "vessel-1",
-        "vehicle_id": "uuv-1",
-        "image_id": image_id,
-        "version": version,
-        "contact": None,
-        "codec": "vq",
-        "model": "",
-        "picture": picture,
-        "picture_sha256": picture.sha256,
-        "complete": True,
-        "missing_fraction": 0.0,
-        "missing_mask": b"",
-        "missing_halves": (),
-        "bytes_received": 42,
-        "bytes_total": 42,
-        "frames_received": 2,
-        "first_frame_utc_s": 1_700_000_000.0,
-        "last_frame_utc_s": 1_700_000_001.0,
-    }
-    return ReconstructedImage(**(fields | changes))
-
-
-def decision(decision_id="d1"):
-    return Decision(
-        decision_id=decision_id,
-        vessel_id="vessel-1",
-        vehicle_id="uuv-1",
-        image_id="AAAA",
-        image_version=1,
-        verdict="mine_like",
-        operator="op",
-        decided_utc_s=1.0,
-    )
+    return picture_record(picture, image_id=image_id, version=version, **changes)
 
 
 def names(neighbour):
@@ -88,7 +56,7 @@ def test_every_site_gets_everything_and_one_that_is_away_holds_none_back(begin, 
     first = c2("shore")
     service = begin(UpstreamOptions(), UpstreamOptions(site="shore-2"))
     source.owe(IMAGES, "relay", *(image(f"{n:04d}") for n in range(20)))
-    source.owe(DECISIONS, "relay", decision())
+    source.owe(DECISIONS, "relay", decision_record())
     eventually(lambda: len(first.got) == 21)
     eventually(lambda: service.gauges()["waiting_for_shore"] == 0)
     gauges = service.gauges()
@@ -111,7 +79,7 @@ def test_a_site_with_a_router_of_its_own_is_reached_when_that_comes_up(begin, so
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     near = c2("shore")
     service = begin(UpstreamOptions(), UpstreamOptions(site="far", router=(endpoint,)))
-    source.owe(DECISIONS, "relay", decision())
+    source.owe(DECISIONS, "relay", decision_record())
     eventually(lambda: len(near.got) == 1)
     assert service.gauges()["waiting_for_far"] == 1
     far_router = zenoh.open(router_config([endpoint]))
@@ -135,21 +103,21 @@ def test_a_site_with_a_router_of_its_own_is_reached_when_that_comes_up(begin, so
 def test_a_renamed_site_gets_its_records_although_its_c2_knows_the_old_numbers(begin, crew, c2, source, platform):
     shore = c2("shore")
     service = begin(UpstreamOptions())
-    source.owe(DECISIONS, "relay", decision("d1"), decision("d2"))
+    source.owe(DECISIONS, "relay", decision_record("d1"), decision_record("d2"))
     eventually(lambda: len(shore.got) == 2)
     eventually(lambda: service.gauges()["waiting_for_shore"] == 0)
     crew.stop(service)
     crew.stop(shore)
     renamed = c2("hq")
     begin(UpstreamOptions(site="hq"))
-    source.owe(DECISIONS, "relay", decision("d3"))
+    source.owe(DECISIONS, "relay", decision_record("d3"))
     eventually(lambda: names(renamed) == ["d3"])
 
 
 def test_first_versions_come_before_more_detail_and_decisions_before_both(begin, c2, source, crew):
     service = begin(supersede=False)
     source.owe(IMAGES, "relay", image("AAAA", 1), image("AAAA", 2), image("AAAA", 3), image("BBBB", 1))
-    source.owe(DECISIONS, "relay", decision())
+    source.owe(DECISIONS, "relay", decision_record())
     eventually(lambda: service.gauges()["waiting_for_shore"] == 5)
     crew.stop(service)
     shore = c2()
@@ -161,7 +129,7 @@ def test_first_versions_come_before_more_detail_and_decisions_before_both(begin,
 def test_a_newer_version_takes_the_place_of_those_not_sent_yet(begin, c2, source, crew):
     service = begin()
     # The first record is on its way as soon as the relay looks for c2; the ones behind it wait.
-    source.owe(DECISIONS, "relay", decision())
+    source.owe(DECISIONS, "relay", decision_record())
     eventually(lambda: service.gauges()["waiting_for_shore"] == 1)
     for version in (1, 2, 3):
         source.owe(IMAGES, "relay", image("AAAA", version))
@@ -192,7 +160,7 @@ def test_with_a_bandwidth_limit_a_decision_passes_a_picture_in_the_middle(begin,
     started_s = time.monotonic()
     source.owe(IMAGES, "relay", image("AAAA", height_px=400))
     eventually(lambda: shore.store._query("SELECT COUNT(*) FROM partial") == [(1,)])
-    source.owe(DECISIONS, "relay", decision())
+    source.owe(DECISIONS, "relay", decision_record())
     eventually(lambda: len(shore.got) == 2)
     assert names(shore) == ["d1", "AAAAv1"]
     assert time.monotonic() - started_s > 1.0, "40 kB at 20 kB/s, of which half a second's worth goes at once"
@@ -211,7 +179,7 @@ def test_below_the_reserve_pictures_wait_with_their_senders_and_decisions_are_ta
     source.owe(IMAGES, "relay", image("AAAA"))
     eventually(lambda: "below the reserve of 50000000" in service.health().detail)
     assert service.health().state == "degraded"
-    source.owe(DECISIONS, "relay", decision("d1"), decision("d2"), priority=3)
+    source.owe(DECISIONS, "relay", decision_record("d1"), decision_record("d2"), priority=3)
     eventually(lambda: sorted(names(shore)) == ["d1", "d2"])
     free[0] = 10**8
     eventually(lambda: sorted(names(shore)) == ["AAAAv1", "d1", "d2"])
@@ -231,7 +199,7 @@ def test_below_the_reserve_a_plain_publication_of_a_picture_is_refused_aloud(beg
 
 def test_a_quota_drops_pictures_of_one_site_and_no_decision(begin, crew, c2, source):
     service = begin(UpstreamOptions(max_bytes=15_000), UpstreamOptions(site="shore-2"))
-    source.owe(DECISIONS, "relay", decision())
+    source.owe(DECISIONS, "relay", decision_record())
     source.owe(IMAGES, "relay", *(image(f"{n:04d}") for n in range(6)))
     eventually(lambda: service.gauges()["waiting_for_shore-2"] == 7)
     eventually(lambda: service.health().counters.get("pictures_dropped") == 3)
@@ -245,7 +213,7 @@ def test_a_quota_drops_pictures_of_one_site_and_no_decision(begin, crew, c2, sou
 
 def test_what_waits_for_a_removed_site_is_kept_until_it_is_dropped_on_purpose(begin, crew, source):
     service = begin(UpstreamOptions(), UpstreamOptions(site="old"))
-    source.owe(DECISIONS, "relay", decision())
+    source.owe(DECISIONS, "relay", decision_record())
     eventually(lambda: service.gauges().get("waiting_for_old") == 1)
     crew.stop(service)
     service = begin(UpstreamOptions())
