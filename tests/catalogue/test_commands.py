@@ -136,6 +136,7 @@ def test_wrong_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Path
         ("catalogue", "info", tmp_path / "file"),
         ("catalogue", "build", "--images", empty, "--out", tmp_path / "x.tiles"),
         ("catalogue", "nominal", "--humminbird", empty, "--out", tmp_path),
+        ("catalogue", "nominal", "--humminbird", empty, "--out", tmp_path, "--refine", -1),
     ]
     for arguments in wrong:
         with pytest.raises(SonarpostError):

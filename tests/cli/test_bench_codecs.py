@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sonarpost.catalogue.store import Catalogue, save
 from sonarpost.cli import bench
 from sonarpost.cli.bench import measure as measuring
 from sonarpost.cli.bench.curves import RateDifference
@@ -23,7 +24,8 @@ from sonarpost.cli.bench.report import json_line
 from sonarpost.cli.bench.sdvd import sdvd_crops, survey_line
 from sonarpost.codec.interface import Decoded, StreamHeader
 from sonarpost.codec.quality import psnr_db
-from sonarpost.errors import ConfigError, SonarpostError, StreamError, SurveyFileError
+from sonarpost.codec.tiles import TileDatabase
+from sonarpost.errors import CatalogueError, ConfigError, SonarpostError, StreamError, SurveyFileError
 from sonarpost.sonar.image_files import write_png, write_tiff
 
 Run = Callable[..., int]
@@ -135,6 +137,21 @@ def test_of_vq_the_best_catalogue_that_fits_a_budget_counts(folder: Path, tmp_pa
     assert np.array_equal(large.psnr, np.maximum(coarse.psnr, fine.psnr))
     assert (large.stream_bytes <= fine.stream_bytes).all()  # of the packings the tightest
     assert sum(none.reasons.values()) == len(pictures)
+
+
+def test_vq_is_measured_with_any_catalogue(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tiles = np.random.default_rng(3).integers(0, 256, (9, 400), np.uint8)
+    own = tmp_path / "own.tiles"
+    save(own, Catalogue(TileDatabase.from_tiles(20, tiles), {}))
+    found = {}
+    for catalogue in (own, "nominal-20"):
+        options = ("--images", folder, "--codecs", "vq", "--budgets", "90", "--json")
+        assert run("codecs", *options, "--catalogues", catalogue) == 0
+        (found[catalogue],) = json.loads(capsys.readouterr().out)["results"]
+    assert found[own]["bytes"] == found["nominal-20"]["bytes"]
+    assert found[own]["psnr"] < found["nominal-20"]["psnr"] - 1  # nine tiles of noise
+    with pytest.raises(CatalogueError, match=r"absent\.tiles"):
+        run("codecs", "--images", folder, "--codecs", "vq", "--catalogues", tmp_path / "absent.tiles")
 
 
 def test_bd_rate_of_the_flagship_against_every_other(

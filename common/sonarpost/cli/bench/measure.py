@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.store import NOMINAL_TILE_PX, load_nominal
+from sonarpost.catalogue.store import NOMINAL_TILE_PX, open_catalogue
 from sonarpost.cli.bench.pictures import BenchPicture
 from sonarpost.codec.interface import Codec, Image
 from sonarpost.codec.quality import ms_ssim, psnr_db, ssim
@@ -26,6 +26,7 @@ EMBEDDED: Final = ("emb", "spiht")
 """Codecs whose stream may be cut anywhere."""
 PSNR_LIMIT_DB: Final = 60.0
 """A picture rebuilt without error has an infinite PSNR, which no mean survives; it counts as this."""
+SHIPPED_CATALOGUES: Final = tuple(f"nominal-{tile_px}" for tile_px in NOMINAL_TILE_PX)
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,12 @@ class Point:
 
 
 def subjects(
-    registry: CodecRegistry, names: Sequence[str] | None, *, all_packings: bool = True, cut: bool = False
+    registry: CodecRegistry,
+    names: Sequence[str] | None,
+    *,
+    all_packings: bool = True,
+    cut: bool = False,
+    catalogues: Sequence[str] = SHIPPED_CATALOGUES,
 ) -> tuple[list[Subject], list[str]]:
     """Make the codecs to measure.
 
@@ -115,18 +121,25 @@ def subjects(
         names: Which; None for every one that can be made here.
         all_packings: Whether vq is measured with every packing of an index, or the tightest only.
         cut: Whether codecs of `EMBEDDED` make one stream, cut for each budget.
+        catalogues: Names of shipped catalogues, or paths of others, that vq is measured with.
 
     Returns:
         The codecs, and one line for each that cannot be made here (only with `names` None).
 
     Raises:
         ConfigError: A codec asked for by name is unknown or cannot be made.
+        CatalogueError: A catalogue cannot be read.
     """
+    packings = tuple(IndexPacking) if all_packings else (IndexPacking.BITS14,)
     found: list[Subject] = []
     absent: list[str] = []
     for name in registry.names() if names is None else dict.fromkeys(names):
         try:
-            found += _variants(registry, name, tuple(IndexPacking) if all_packings else (IndexPacking.BITS14,), cut=cut)
+            if registry.spec(name).needs_tiles:
+                found += _with_tiles(registry, name, packings, catalogues)
+            else:
+                codec = registry.create(name, CodecResources())
+                found.append(Subject(codec, is_embedded=cut and name in EMBEDDED))
         except ConfigError as error:
             if names is not None:
                 raise
@@ -134,15 +147,15 @@ def subjects(
     return found, absent
 
 
-def _variants(registry: CodecRegistry, name: str, packings: Sequence[IndexPacking], *, cut: bool) -> list[Subject]:
-    if not registry.spec(name).needs_tiles:
-        return [Subject(registry.create(name, CodecResources()), is_embedded=cut and name in EMBEDDED)]
+def _with_tiles(
+    registry: CodecRegistry, name: str, packings: Sequence[IndexPacking], catalogues: Sequence[str]
+) -> list[Subject]:
     made = []
-    for tile_px in NOMINAL_TILE_PX:
-        tiles = load_nominal(tile_px).tiles
+    for catalogue in catalogues:
+        tiles = open_catalogue(catalogue).tiles
         for packing in packings:
             codec = registry.create(name, CodecResources(tiles, packing))
-            made.append(Subject(codec, f"nominal-{tile_px} {packing.value}", is_natural=True))
+            made.append(Subject(codec, f"{catalogue} {packing.value}", is_natural=True))
     return made
 
 

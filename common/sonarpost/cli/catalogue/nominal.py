@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -13,6 +14,7 @@ from sonarpost.catalogue.plan import TrainingImage
 from sonarpost.catalogue.store import load, save
 from sonarpost.catalogue.windows import Line, WindowPlan, cut_around, cut_line
 from sonarpost.cli.catalogue.progress import ProgressDisplay
+from sonarpost.errors import ConfigError
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 
@@ -32,6 +34,9 @@ def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         "--humminbird", type=Path, required=True, metavar="DIR", help="folder with the PyHum recording's channels"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the catalogues")
+    parser.add_argument(
+        "--refine", type=int, metavar="N", help="passes of refinement, other than the recipe's 2; 0: Table IV alone"
+    )
     parser.set_defaults(run=run)
 
 
@@ -41,10 +46,13 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         SonarpostError: The recording cannot be read or a catalogue not be written.
     """
+    if args.refine is not None and args.refine < 0:
+        raise ConfigError("--refine", "", args.refine, "zero or more passes")
+    recipes = RECIPES if args.refine is None else tuple(replace(r, passes=args.refine) for r in RECIPES)
     console = Console(stderr=True)
     images = [*humminbird_images(args.humminbird), *simulated_images(console)]
     console.print(f"{len(images)} training images")
-    for recipe in RECIPES:
+    for recipe in recipes:
         _write(recipe, images, args.out, console)
     return 0
 
