@@ -32,7 +32,7 @@ class BadInputError(SonarpostError):
     def __str__(self) -> str:
         shown = repr(self.value)
         if len(shown) > 80:
-            shown = shown[:77] + "..."
+            shown = f"{shown[:40]}...{shown[-37:]}"  # of a path, the end tells more than the beginning
         field = f"{self.field}: " if self.field else ""
         return f"{self.where}: {field}got {shown}, expected {self.expected}"
 
