@@ -54,6 +54,14 @@ def eventually(condition: Callable[[], bool], timeout_s: float = 40.0, what: str
         time.sleep(0.01)
 
 
+def publish_once(session: zenoh.Session, key: str, payload: bytes, encoding: str | None = None) -> None:
+    """Publish as a program without an outbox does, once somebody listens."""
+    publisher = session.declare_publisher(key, encoding=encoding)
+    eventually(lambda: publisher.matching_status.matching, what=f"subscriber of {key}")
+    publisher.put(payload)
+    publisher.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
+
+
 @pytest.fixture
 def router() -> Iterator[str]:
     """An in-process Zenoh router; the fixture is its endpoint."""

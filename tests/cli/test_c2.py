@@ -13,7 +13,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 import zenoh
-from conftest import eventually, free_port
+from conftest import eventually, free_port, publish_once
 from records import picture_record
 
 from services.c2.archive import Archive
@@ -293,15 +293,8 @@ def watching():
         process.stderr.close()
 
 
-def publish(session, key, payload):
-    publisher = session.declare_publisher(key)
-    eventually(lambda: publisher.matching_status.matching, what=f"subscriber of {key}")
-    publisher.put(payload)
-    publisher.undeclare()
-
-
 def shown(session, record, key):
-    publish(session, key, wire.encode(record))
+    publish_once(session, key, wire.encode(record))
 
 
 def test_watch_prints_a_line_each_and_ends_with_ctrl_c_whatever_happens_to_the_router(watching):
@@ -310,7 +303,7 @@ def test_watch_prints_a_line_each_and_ends_with_ctrl_c_whatever_happens_to_the_r
     process, said, complaints = watching("--router", endpoint)
     try:
         eventually(lambda: any("watching shore" in line for line in complaints), timeout_s=30)
-        publish(hub, keys.shore_image("vessel-1"), b"rubbish")
+        publish_once(hub, keys.shore_image("vessel-1"), b"rubbish")
         eventually(lambda: any("expected" in line for line in complaints))
         shown(hub, image(), keys.shore_image("vessel-1"))
         shown(hub, decision(remark="two\nlines \x1b[31m"), keys.shore_decision("vessel-1"))

@@ -8,13 +8,14 @@ import threading
 import tty
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
-from conftest import eventually
+from conftest import eventually, publish_once
 
 from sonarpost import keys, wire
 from sonarpost.messages import Contact, Health, Raster, Record, Snippet
@@ -141,14 +142,7 @@ def refused() -> Callable[[Service[Any]], list[tuple[str, str]]]:
 @pytest.fixture
 def publish(client: zenoh.Session) -> Callable[[str, bytes], None]:
     """Publishes as a program without an outbox does, once somebody listens."""
-
-    def put(key: str, payload: bytes) -> None:
-        publisher = client.declare_publisher(key)
-        eventually(lambda: publisher.matching_status.matching, what=f"subscriber of {key}")
-        publisher.put(payload)
-        publisher.undeclare()
-
-    return put
+    return partial(publish_once, client)
 
 
 @pytest.fixture

@@ -254,11 +254,11 @@ def test_a_full_acoustic_queue_holds_contacts_over_a_restart(begin, crew, put_pi
     assert [s.contact.atd_confidence for s in compressor.got] == [1.0, 1.5, 0.5]
 
 
-def test_a_report_that_is_none_is_left_out(begin, crew, put_pictures, client, caplog):
+def test_a_report_that_is_none_is_left_out(begin, crew, put_pictures, publish, caplog):
     compressor = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
     service = begin()
-    client.put(keys.acoustic_queue("uuv-1"), b"\xc1")
-    client.put(keys.health("uuv-1", "uuv_modem"), b"no report")
+    publish(keys.acoustic_queue("uuv-1"), b"\xc1")
+    publish(keys.health("uuv-1", "uuv_modem"), b"no report")
     eventually(lambda: sum(r.message == "A report is left out" for r in caplog.records) == 2)
     put_pictures([1.0])
     eventually(lambda: len(compressor.got) == 1)

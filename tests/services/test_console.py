@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from conftest import eventually
+from conftest import eventually, publish_once
 
 from services.console.config import ConsoleConfig
 from services.console.service import ConsoleService
@@ -135,7 +135,7 @@ def start(crew, platform):
 
 
 def put(client: zenoh.Session, key: str, record: Any) -> None:
-    client.put(key, wire.encode(record), encoding=wire.encoding_of(type(record)))
+    publish_once(client, key, wire.encode(record), wire.encoding_of(type(record)))
 
 
 def test_a_picture_is_shown_as_it_refines_and_a_decision_reaches_relay_and_modem(crew, start):
@@ -270,7 +270,7 @@ def test_frames_are_shown_with_their_vehicle(start, client):
 
 def test_a_record_that_is_none_is_counted_and_the_watch_goes_on(start, client):
     console = start()
-    client.put(keys.acoustic_downlink(VESSEL), b"\xc1")
+    publish_once(client, keys.acoustic_downlink(VESSEL), b"\xc1")
     eventually(lambda: console.health().counters.get("records_ignored") == 1, what="ignored record")
 
 
