@@ -23,6 +23,8 @@ SERVICES = (
     "decompressor",
     "relay",
     "c2",
+    "console",
+    "console-shore",
     "router-uuv",
     "router-vessel",
     "router-shore",
@@ -51,6 +53,23 @@ for entry in pathlib.Path("/proc").iterdir():
     if entry.name.isdigit() and int(entry.name) not in (1, os.getpid()):
         if (entry / "stat").read_text().rpartition(")")[2].split()[1] == "1":
             os.kill(int(entry.name), signal.SIGKILL)
+"""
+
+# Logs in and prints how many contacts the console shows, and the status of a request without a session.
+LOG_IN = """
+import json, urllib.error, urllib.request
+site = "http://127.0.0.1:8470"
+body = json.dumps({{"user": "anna", "password": {password!r}}}).encode()
+asked = urllib.request.Request(site + "/api/login", body, {{"Content-Type": "application/json"}})
+with urllib.request.urlopen(asked) as answer:
+    cookie = answer.headers["Set-Cookie"].split(";")[0]
+asked = urllib.request.Request(site + "/api/contacts", headers={{"Cookie": cookie}})
+with urllib.request.urlopen(asked) as answer:
+    total = json.load(answer)["total"]
+try:
+    urllib.request.urlopen(site + "/api/contacts")
+except urllib.error.HTTPError as error:
+    print(json.dumps([total, error.code]))
 """
 
 

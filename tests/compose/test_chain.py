@@ -5,10 +5,11 @@ Each test goes on from where the one before it has left the chain, as a deployme
 
 from __future__ import annotations
 
+import json
 import time
 
 import pytest
-from compose.conftest import KILL, SERVICES, Project, docker, until
+from compose.conftest import KILL, LOG_IN, SERVICES, Project, docker, until
 
 ARRIVAL_S = 120.0
 
@@ -66,6 +67,17 @@ def test_a_simulated_survey_is_ashore_as_it_is_aboard(project: Project) -> None:
     aboard, complete = project.pictures("decompressor")
     assert aboard == ashore
     assert complete == contacts
+
+
+def test_people_see_the_contacts_on_both_consoles_after_logging_in(project: Project) -> None:
+    contacts = project.contacts()
+    password = "not-a-secret-of-anybody"
+    for service, platform in (("console", "vessel"), ("console-shore", "shore")):
+        add = ["user", "add", "anna", "--role", "operator", "--config", f"/etc/sonarpost/{platform}.toml"]
+        add_user = ["sh", "-c", f"echo {password} | sonarpost console {' '.join(add)} --password-stdin"]
+        docker("exec", project.container(service), *add_user)
+        said = project.inside(service, LOG_IN.format(password=password))
+        assert json.loads(said) == [contacts, 401], service
 
 
 def test_no_container_has_more_rights_than_it_needs(project: Project) -> None:
