@@ -9,12 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sonarpost.catalogue.nominal import Recipe
 from sonarpost.catalogue.plan import Round
 from sonarpost.catalogue.store import load, load_nominal
+from sonarpost.catalogue.windows import WindowPlan, cut_line
 from sonarpost.cli import catalogue, encode
+from sonarpost.cli.catalogue import nominal
 from sonarpost.cli.catalogue.build import parse_rounds
 from sonarpost.cli.catalogue.progress import ProgressDisplay
 from sonarpost.codec.quality import psnr_db
+from sonarpost.codec.tiles import cut_tiles
 from sonarpost.errors import CatalogueError, ConfigError, SonarpostError, StreamError
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff
 
@@ -142,6 +146,23 @@ def test_wrong_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Path
         with pytest.raises(SonarpostError):
             run(*arguments)
     assert not (tmp_path / "x.tiles").exists()
+
+
+def test_a_nominal_catalogue_can_be_left_unrefined(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    speckle = 60 * np.random.default_rng(4).rayleigh(1.0, (200, 200))
+    images = list(cut_line("x", speckle.astype(np.float32), WindowPlan(copies=2)))
+    monkeypatch.setattr(nominal, "humminbird_images", lambda _: images)
+    monkeypatch.setattr(nominal, "simulated_images", lambda _: iter(()))
+    monkeypatch.setattr(nominal, "RECIPES", (Recipe(10, 80, (Round(100.0, 60.0),), 2),))
+    made = []
+    for options in (("--refine", 0), ("--refine", 2), ()):
+        assert run("catalogue", "nominal", "--humminbird", tmp_path, "--out", tmp_path, *options) == 0
+        made.append(load(tmp_path / "nominal-10.tiles"))
+    alone, twice, usual = made
+    assert twice.tiles.identity == usual.tiles.identity != alone.tiles.identity
+    assert [one.notes["refine passes"] for one in made] == ["0", "2", "2"]
+    pieces = {tile.tobytes() for image in images for tile in cut_tiles(image.load(), 10)}
+    assert all(tile.tobytes() in pieces for tile in alone.tiles.tiles)  # Table IV keeps tiles as they are
 
 
 def test_the_codecs_are_listed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
