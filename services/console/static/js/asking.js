@@ -6,7 +6,7 @@ import { bytes, duration } from "./format.js";
 import { state, tell } from "./state.js";
 
 const WHAT = {
-  refine: "refine: more detail of the whole picture", resend: "resend: what was lost on the way", wider: "wider: more seabed around it",
+  refine: "refine: more detail of the whole picture", resend: "resend: what was lost on the way", wider: "wider: more seabed around it, as a picture of its own",
   revisit: "revisit: pass the place again",
 };
 
