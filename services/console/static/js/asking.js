@@ -6,7 +6,7 @@ import { bytes, duration } from "./format.js";
 import { state, tell } from "./state.js";
 
 const WHAT = {
-  refine: "refine: more detail of the whole picture", resend: "resend: what was lost on the way", wider: "wider: more seabed around it, as a picture of its own",
+  refine: "refine: more detail of the whole picture", resend: "resend: what was lost on the way", wider: "wider: more seabed around it",
   revisit: "revisit: pass the place again",
 };
 
@@ -42,7 +42,7 @@ export async function askForMore(contact) {
   const { airtime_s } = costs.find((cost) => cost.kind === kind);
   try {
     await api.request(contact.id, { kind, airtime_s });
-    toast(`${contact.name}: asked to ${kind}, ≈ ${duration(airtime_s)} of air time`);
+    toast(`${contact.name}: asked for ${kind}, ≈ ${duration(airtime_s)} of air time`);
   } catch (error) {
     toast(error.message, { bad: true });
   }
