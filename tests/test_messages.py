@@ -61,7 +61,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "bits": [0, 1, 32],
         "data": [b"", b"12345", b"1234567"],
     },
-    SAMPLES["snippet"].__class__: {"source": [LONG]},
+    SAMPLES["snippet-without-wide"].__class__: {"source": [LONG]},
     SAMPLES["encoded-image"].__class__: {
         "vehicle_id": NO_NAME,
         "image_id": NO_IMAGE,
@@ -214,6 +214,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
 ANY_VALUE = {
     ("snippet", "contact"),
     ("snippet", "picture"),
+    ("snippet", "wide"),
     ("encoded_image", "contact"),
     ("acoustic_frame", "quality"),
     ("reconstructed_image", "contact"),
@@ -385,6 +386,7 @@ def test_the_digest_of_another_picture_is_refused_by_name() -> None:
     [
         ("refine", {}, "image_id"),
         ("resend", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
+        ("wider", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
         ("revisit", {"lon_deg": 1.0}, "lat_deg"),
         ("revisit", {"lat_deg": 1.0}, "lon_deg"),
         ("revisit", {"image_id": "0001"}, "lat_deg"),

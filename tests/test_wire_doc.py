@@ -197,7 +197,7 @@ def test_attachment_and_reply_have_the_documented_fields() -> None:
 
 
 def test_the_example_of_an_error_is_one() -> None:
-    snippet = SAMPLES["snippet"].model_dump()
+    snippet = SAMPLES["snippet-without-wide"].model_dump()
     snippet["contact"]["lat_deg"] = 91.0
     with pytest.raises(wire.PayloadError) as caught:
         wire.decode(

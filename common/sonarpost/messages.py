@@ -35,10 +35,10 @@ RecordId = Annotated[str, Field(pattern=r"^[!-~]{1,64}$")]
 
 Channel = Literal["port", "starboard"]
 Verdict = Literal["mine_like", "not_mine_like", "unsure"]
-CommandKind = Literal["refine", "resend", "revisit"]
+CommandKind = Literal["refine", "resend", "revisit", "wider"]
 TaskingKind = Literal["advice", "command"]
 DeliveryState = Literal["waiting", "delivered", "refused"]
-DownlinkKind = Literal["refine", "resend", "revisit", "decision"]
+DownlinkKind = Literal["refine", "resend", "revisit", "decision", "wider"]
 DownlinkStep = Literal["asked", "sent", "confirmed", "refused", "expired"]
 ServiceState = Literal["starting", "ok", "degraded", "stopping"]
 
@@ -139,13 +139,19 @@ class Contact(Record):
 
 
 class Snippet(Record):
-    """A contact and its picture (the paper's imgToCompress). The nadir is to the left where the sonar is known."""
+    """A contact and its picture (the paper's imgToCompress). The nadir is to the left where the sonar is known.
+
+    Attributes:
+        wide: More of the seabed around the contact: pixels of twice the size of those of `picture`, along and across.
+            It stays on the vehicle until the vessel asks for it; None where there is none.
+    """
 
     TYPE: ClassVar[str] = "snippet"
 
     contact: Contact
     picture: Raster
     source: Text = ""
+    wide: Raster | None = None
 
 
 class EncodedImage(Record):
@@ -391,8 +397,8 @@ class Command(Record):
     @classmethod
     def _names_an_image(cls, image_id: str | None, info: ValidationInfo) -> str | None:
         kind = info.data.get("kind")
-        if image_id is None and kind in ("refine", "resend"):
-            raise ValueError(f"the image to {kind}")
+        if image_id is None and kind in ("refine", "resend", "wider"):
+            raise ValueError("the image to show more around" if kind == "wider" else f"the image to {kind}")
         return image_id
 
     @field_validator("lat_deg", "lon_deg")

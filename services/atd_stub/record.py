@@ -5,15 +5,16 @@ from __future__ import annotations
 from services.atd_stub.config import AtdStubConfig
 from services.atd_stub.ground_picture import ground_picture
 from services.atd_stub.seam import Origin
+from sonarpost.codec.interface import MIN_SIDE_PX
 from sonarpost.detect.contacts import Detection
-from sonarpost.detect.snippet import cut_snippet
+from sonarpost.detect.snippet import cut_snippet, cut_wide
 from sonarpost.messages import Contact, Raster, Snippet
 from sonarpost.sonar.georeference import georeference
 from sonarpost.sonar.survey import Survey
 
 
 def of_detection(survey: Survey, found: Detection, origin: Origin, vehicle_id: str, config: AtdStubConfig) -> Snippet:
-    """Return a detection as the record that is sent, with its picture.
+    """Return a detection as the record that is sent, with its picture and a wider one, where the survey has more.
 
     A position is given only with its standard deviation, and a height only where the shadow was recorded to its end.
 
@@ -24,13 +25,17 @@ def of_detection(survey: Survey, found: Detection, origin: Origin, vehicle_id: s
         vehicle_id: This vehicle.
         config: Size of the picture, and the errors of positions.
     """
-    cut = cut_snippet(survey, found, config.snippet_height_px, config.snippet_width_px)
+    size = (config.snippet_height_px, config.snippet_width_px)
+    cut = cut_snippet(survey, found, *size)
     picture, along_m, across_m = cut.image, cut.pixel_along_m, cut.pixel_across_m
+    wide = None
     if config.snippet_pixel_m > 0:
-        size = (config.snippet_height_px, config.snippet_width_px)
         ground = ground_picture(survey, found, *size, config.snippet_pixel_m)
         if ground is not None:
             picture, along_m, across_m = ground, config.snippet_pixel_m, config.snippet_pixel_m
+            wide = ground_picture(survey, found, *size, 2 * config.snippet_pixel_m)
+    if picture is cut.image:
+        wide = cut_wide(survey, found, *size)
     place = georeference(
         survey.pings[found.ping_index],
         found.side,
@@ -66,4 +71,9 @@ def of_detection(survey: Survey, found: Detection, origin: Origin, vehicle_id: s
         pixel_along_m=along_m,
         pixel_across_m=across_m,
     )
-    return Snippet(contact=contact, picture=Raster.from_array(picture), source=origin.source)
+    return Snippet(
+        contact=contact,
+        picture=Raster.from_array(picture),
+        source=origin.source,
+        wide=None if wide is None or min(wide.shape) < MIN_SIDE_PX else Raster.from_array(wide),
+    )

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import msgpack
 
 from sonarpost.errors import PayloadError
@@ -10,6 +13,21 @@ from sonarpost.runtime.store import Store
 
 _INDEX = "kept"
 _PICTURE = "kept/"
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What is kept of a picture.
+
+    Attributes:
+        image: Its `encoded_image` record, packed.
+        snippet: The `snippet` record it was made of, packed.
+        wider_id: Identifier of the picture that shows more around it; empty where none was made.
+    """
+
+    image: bytes
+    snippet: bytes
+    wider_id: str = ""
 
 
 class KeptPictures:
@@ -30,30 +48,31 @@ class KeptPictures:
         packed = self._store.get_state(_INDEX)
         return {} if packed is None else {str(name): float(at) for name, at in msgpack.unpackb(packed)}
 
-    def keep(self, effects: Effects, image_id: str, image: bytes, snippet: bytes, now_utc_s: float) -> None:
-        """Keep a picture, and forget with the same transaction what is too old or too much.
+    def keep(self, effects: Effects, pictures: Mapping[str, Kept], now_utc_s: float) -> None:
+        """Keep pictures, and forget with the same transaction what is too old or too much.
 
         Args:
-            effects: What the picture's record leads to.
-            image_id: Of the picture.
-            image: Its `encoded_image` record, packed.
-            snippet: Its `snippet` record, packed.
+            effects: What the record leads to that they come from; once for each.
+            pictures: What is kept of them, by image identifier, the oldest first.
             now_utc_s: The time.
         """
         index = self._index()
-        index.pop(image_id, None)
-        index[image_id] = now_utc_s
+        for image_id in pictures:
+            index.pop(image_id, None)
+            index[image_id] = now_utc_s
         oldest = [name for name, at in index.items() if now_utc_s - at > self._keep_s]
         oldest += [name for name in index if name not in oldest][: max(0, len(index) - len(oldest) - self._most)]
         for name in oldest:
             del index[name]
             effects.delete_state(_PICTURE + name)
         effects.put_state(_INDEX, msgpack.packb(list(index.items())))
-        if image_id in index:
-            effects.put_state(_PICTURE + image_id, msgpack.packb([image, snippet]))
+        for image_id, kept in pictures.items():
+            if image_id in index:
+                packed = msgpack.packb([kept.image, kept.snippet, kept.wider_id])
+                effects.put_state(_PICTURE + image_id, packed)
 
-    def find(self, image_id: str) -> tuple[bytes, bytes] | None:
-        """Return the `encoded_image` and the `snippet` record of a picture, None where it is not kept.
+    def find(self, image_id: str) -> Kept | None:
+        """Return what is kept of a picture, None where that is nothing.
 
         Raises:
             PayloadError: What is there was not written by `keep`.
@@ -62,7 +81,9 @@ class KeptPictures:
         if packed is None:
             return None
         match msgpack.unpackb(packed):
-            case [bytes(image), bytes(snippet)]:
-                return image, snippet
+            case [bytes(image), bytes(snippet)]:  # of a version without wider pictures
+                return Kept(image, snippet)
+            case [bytes(image), bytes(snippet), str(wider_id)]:
+                return Kept(image, snippet, wider_id)
             case other:
                 raise PayloadError(f"compressor.db: {_PICTURE}{image_id}", "", other, "an image and a snippet")

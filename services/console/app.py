@@ -13,7 +13,7 @@ from starlette.responses import FileResponse, RedirectResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from services.console.asking import KINDS, NOT_AVAILABLE
+from services.console.asking import KINDS
 from services.console.board import Board
 from services.console.contact_routes import ContactRoutes
 from services.console.exporting import ExportRoutes
@@ -97,7 +97,6 @@ class ConsoleApp:
                 "classes": list(config.classes),
                 "maps": list(MAPS),
                 "requests": list(KINDS),
-                "not_available": dict(NOT_AVAILABLE),
                 "stale_after_s": {
                     "service": SERVICE_STALE_S,
                     "vehicle": config.vehicle_stale_s,

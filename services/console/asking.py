@@ -15,10 +15,9 @@ from sonarpost import wire
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Advice, Command, CommandKind, DownlinkState, TaskingState
 
-KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit")
+KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider")
 REFINABLE: Final = ("emb", "spiht")
 """Codecs of which a longer stream begins with a shorter one."""
-NOT_AVAILABLE: Final = {"wider": "no order for a wider picture exists on the acoustic link"}
 _RANK: Final = {
     "none": 0,
     "waiting": 0,
@@ -36,8 +35,6 @@ ID_COLUMN: Final[dict[Table, str]] = {"decision": "decision_id", "request": "com
 
 def why_not(row: sqlite3.Row, kind: str) -> str:
     """Return why a contact's picture cannot be asked for in this way; empty where it can."""
-    if kind in NOT_AVAILABLE:
-        return NOT_AVAILABLE[kind]
     if kind == "revisit" and (row["lat_deg"] is None or row["lon_deg"] is None):
         return "the contact's position is not known"
     if kind == "resend" and row["complete"]:

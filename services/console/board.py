@@ -112,17 +112,17 @@ class Board(Arrivals):
         with self.database.reading() as db:
             full = contacts.find_row(db, contact_id)
             assert full is not None
-        for kind in (*asking.KINDS, *asking.NOT_AVAILABLE):
+            first = contacts.find_version(db, contact_id, 1)
+        # A wider picture is as long as this one was before more of it was asked for.
+        new_bytes = (0 if first is None else image_of(first).bytes_total) or full["bytes_total"]
+        for kind in asking.KINDS:
             reason = asking.why_not(full, kind)
-            if kind in asking.NOT_AVAILABLE:
-                found.append({"kind": kind, "available": False, "reason": reason})
-                continue
             cost = request_cost(
                 kind,
                 downlink_rate=self.config.downlink_rate,
                 uplink_rate=rate,
-                bytes_received=full["bytes_received"],
-                bytes_total=full["bytes_total"],
+                bytes_received=0 if kind == "wider" else full["bytes_received"],
+                bytes_total=new_bytes if kind == "wider" else full["bytes_total"],
                 loss=loss,
                 overhead_bytes=FRAME_HEADER_BYTES,
             )

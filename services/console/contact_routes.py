@@ -19,7 +19,7 @@ from services.console.contacts import REVIEWS, SORTS, Filter
 from services.console.decisions import Judgement
 from services.console.measures import Line
 from services.console.web import Body, Call, Gate, RefusedError, json_answer
-from sonarpost.messages import Advice, ReconstructedImage, Verdict
+from sonarpost.messages import Advice, CommandKind, ReconstructedImage, Verdict
 from sonarpost.review import rendering
 from sonarpost.review.rendering import LAYERS, MAPS
 
@@ -57,7 +57,7 @@ class _Measure(Body):
 
 
 class _Request(Body):
-    kind: Literal["refine", "resend", "revisit"]
+    kind: CommandKind
     airtime_s: Annotated[float, Field(ge=0, le=1e6)] | None = None
 
 

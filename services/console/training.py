@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from services.console.board import Board
 from services.console.fleet import frame_event
 from services.console.place_routes import fleet
-from services.console.training_contacts import VEHICLES, Simulated, simulated_contacts
+from services.console.training_contacts import VEHICLES, Simulated, simulated_contacts, wider_image_id
 from sonarpost import keys, wire
 from sonarpost.messages import (
     AcousticFrame,
@@ -75,6 +75,7 @@ class Training:
         self._packet = 0
         self._arriving: list[_Arriving] = []
         self._kept: dict[str, _Arriving] = {}
+        self._wider: dict[str, str] = {}
         self._travelling: list[_Travelling] = []
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="training", daemon=True)
@@ -147,12 +148,21 @@ class Training:
         while len(self._kept) > KEPT:
             del self._kept[next(iter(self._kept))]
 
-    def _obey(self, command: Command) -> None:
+    def _obey(self, command: Command, now_utc_s: float) -> None:
         """Send what a command asks for, as the vehicle would."""
-        known = self._kept.get(command.image_id or "")
-        if known is not None and command.kind in ("refine", "resend"):
-            more = known.simulated.more(refine=command.kind == "refine")
-            self._arriving.append(_Arriving(more, known.first_utc_s, len(more.versions) - 1))
+        image_id = command.image_id or ""
+        # What was widened before is given again.
+        known = self._kept.get(self._wider.get(image_id, image_id) if command.kind == "wider" else image_id)
+        if known is None or command.kind == "revisit":
+            return
+        if command.kind == "wider" and image_id not in self._wider:
+            wide = known.simulated.wider(wider_image_id(len(self._wider)))
+            if wide is not None:
+                self._wider[image_id] = wide.image_id
+                self._arriving.append(_Arriving(wide, now_utc_s))
+            return
+        more = known.simulated.more(refine=command.kind == "refine")
+        self._arriving.append(_Arriving(more, known.first_utc_s, len(more.versions) - 1))
 
     def _advice(self, record: ReconstructedImage) -> Advice:
         """Return what an expert ashore would say of a picture that has just come."""
@@ -257,7 +267,7 @@ class Training:
             if not order.steps:
                 self._travelling.remove(order)
                 if isinstance(order.record, Command):
-                    self._obey(order.record)
+                    self._obey(order.record, now_utc_s)
 
     @staticmethod
     def _state(record: Decision | Command, step: DownlinkStep, now_utc_s: float) -> DownlinkState:

@@ -41,6 +41,7 @@ class Simulated:
         codec: That made it.
         model: Of that codec.
         original: What the vehicle has, shape (80, 140).
+        wide: The same around twice the ground in each direction; None where it shows that already.
     """
 
     contact: Contact
@@ -49,11 +50,38 @@ class Simulated:
     codec: str
     model: str
     original: npt.NDArray[np.uint8]
+    wide: npt.NDArray[np.uint8] | None = None
+
+    def wider(self, image_id: str) -> Simulated | None:
+        """Return more of the seabed around it as a picture of its own, None where the vehicle has no more.
+
+        Args:
+            image_id: Of the new picture.
+        """
+        if self.wide is None:
+            return None
+        codec = self._codec()
+        sizes = {
+            name: None if pixel_m is None else 2 * pixel_m
+            for name in ("pixel_along_m", "pixel_across_m")
+            for pixel_m in [getattr(self.contact, name)]
+        }
+        return replace(
+            self,
+            contact=self.contact.model_copy(update=sizes),
+            image_id=image_id,
+            versions=_versions(codec, self.wide, lacking=False),
+            original=self.wide,
+            wide=None,
+        )
+
+    def _codec(self) -> Codec:
+        return EmbCodec() if self.codec == EmbCodec().name else VqCodec(open_catalogue("nominal-10").tiles)
 
     def more(self, *, refine: bool) -> Simulated:
         """Return it with one version more: what was lacking, or to refine a stream of twice the length."""
         total = self.versions[-1][1]
-        codec: Codec = EmbCodec() if self.codec == EmbCodec().name else VqCodec(open_catalogue("nominal-10").tiles)
+        codec = self._codec()
         stream = codec.encode(self.original, 2 * total if refine and isinstance(codec, EmbCodec) else None)
         if isinstance(codec, EmbCodec) and not refine:
             stream = codec.encode(self.original, total)
@@ -111,9 +139,9 @@ def simulated_contacts(seed: int, first_utc_s: float) -> Iterator[Simulated]:
                 vehicle = VEHICLES[(line + look) % len(VEHICLES)]
                 contact = _contact(simulated.survey, thing, vehicle, chance, number)
                 image_id = _image_id(number)
-                original = chip(simulated.survey, thing, look)
+                original, wide = (chip(simulated.survey, thing, look, times) for times in (1, 2))
                 versions = _versions(codec, original, lacking=chance.random() < 0.5)
-                made.append(Simulated(contact, image_id, versions, codec.name, codec.model_hash, original))
+                made.append(Simulated(contact, image_id, versions, codec.name, codec.model_hash, original, wide))
                 yield made[-1]
                 number += 1
         line += 1
@@ -150,16 +178,26 @@ def _spec(seed: int, line: int, seabed: SeabedKind, first_utc_s: float) -> Surve
     return replace(spec, start_lat_deg=lat, start_lon_deg=lon, heading_deg=heading, start_time_utc_s=time_s)
 
 
-def chip(survey: Survey, thing: TruthObject, look: int = 0) -> npt.NDArray[np.uint8]:
-    """Return the picture of an object, shape (80, 140), nadir to the left; another look is shifted a little."""
-    centre = min(max(thing.ping + 7 * look, HEIGHT_PX // 2), len(survey.pings) - HEIGHT_PX // 2)
+def chip(survey: Survey, thing: TruthObject, look: int = 0, times: int = 1) -> npt.NDArray[np.uint8]:
+    """Return the picture of an object, shape (80, 140), nadir to the left.
+
+    Args:
+        survey: The simulated survey.
+        thing: The object.
+        look: Another look is shifted a little.
+        times: So many times the ground in each direction, around the same middle; pixels are means.
+    """
+    height, width = times * HEIGHT_PX, times * WIDTH_PX
+    centre = min(max(thing.ping + 7 * look, height // 2), len(survey.pings) - height // 2)
+    middle = thing.sample_index - WIDTH_PX // 3 + WIDTH_PX // 2
     rows = []
-    for ping in survey.pings[centre - HEIGHT_PX // 2 : centre + HEIGHT_PX // 2]:
+    for ping in survey.pings[centre - height // 2 : centre + height // 2]:
         channel = ping.channel(thing.side)
         assert channel is not None  # every simulated ping has both
-        left = min(max(thing.sample_index - WIDTH_PX // 3, 0), channel.samples.shape[0] - WIDTH_PX)
-        rows.append(channel.samples[left : left + WIDTH_PX])
-    root = np.sqrt(np.stack(rows).astype(np.float64))
+        left = min(max(middle - width // 2, 0), channel.samples.shape[0] - width)
+        rows.append(channel.samples[left : left + width])
+    amplitude = np.stack(rows).astype(np.float64).reshape(HEIGHT_PX, times, WIDTH_PX, times).mean(axis=(1, 3))
+    root = np.sqrt(amplitude)
     low, high = np.percentile(root, (0.5, 99.5))
     grey: npt.NDArray[np.uint8] = np.clip(255 * (root - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
     return grey
@@ -211,6 +249,11 @@ def _versions(
     first = (len(stream) // 2, len(stream), 2, codec.decode(stream, half))
     whole = (len(stream), len(stream), 4, codec.decode(stream))
     return (first,) if lacking else (first, whole)
+
+
+def wider_image_id(count: int) -> str:
+    """Return the identifier of a wider picture, counted from 0: from the last one down, as contacts count upwards."""
+    return _image_id(len(_ALPHABET) ** 4 - 1 - count)
 
 
 def _image_id(number: int) -> str:

@@ -138,7 +138,9 @@ def order_of(record: Command | Decision, token: int) -> dl.DownlinkOrder:
         return dl.Revisit(token, issued, record.lat_deg, record.lon_deg)
     assert record.image_id is not None
     number = dl.number_of_image(record.image_id)
-    return dl.Refine(token, issued, number) if record.kind == "refine" else dl.Resend(token, issued, number)
+    if record.kind == "refine":
+        return dl.Refine(token, issued, number)
+    return (dl.Wider if record.kind == "wider" else dl.Resend)(token, issued, number)
 
 
 def _issued_utc_s(record: Command | Decision) -> float:

@@ -45,7 +45,7 @@ class UuvModemConfig(ModemServiceConfig):
         guard_s: TDMA: end of the slot that stays silent.
         mean_wait_s: Random: mean of the waits.
         queue_interval_s: v1: how often the state of the queue is published.
-        refine_consumers: v1: services that take commands to refine or resend a picture.
+        refine_consumers: v1: services that take commands to refine, resend or widen a picture.
         revisit_consumers: v1: services that take commands to revisit a position.
         decision_consumers: v1: services that take operators' decisions.
     """

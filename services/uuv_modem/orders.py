@@ -16,6 +16,7 @@ from sonarpost.link.downlink import (
     Refine,
     Resend,
     Revisit,
+    Wider,
     image_of_number,
     pack,
     record_id_of,
@@ -82,7 +83,9 @@ class OrderBook:
             record = self._command(record_id, source, order, image_id)
         return Handed(keys.command(self.platform_id, kind), record, consumers)
 
-    def _command(self, record_id: str, source: int, order: Refine | Resend | Revisit, image_id: str | None) -> Command:
+    def _command(
+        self, record_id: str, source: int, order: Refine | Resend | Revisit | Wider, image_id: str | None
+    ) -> Command:
         lat_deg = lon_deg = None
         if isinstance(order, Revisit):
             image_id, lat_deg, lon_deg = None, order.lat_deg, order.lon_deg
@@ -133,7 +136,12 @@ class OrderBook:
         self.known = known
 
 
-_COMMANDS: Final[dict[type, CommandKind]] = {Refine: "refine", Resend: "resend", Revisit: "revisit"}
+_COMMANDS: Final[dict[type, CommandKind]] = {
+    Refine: "refine",
+    Resend: "resend",
+    Revisit: "revisit",
+    Wider: "wider",
+}
 
 
 def kind_of(order: DownlinkOrder) -> str:

@@ -15,6 +15,8 @@ from sonarpost.cli.demo.account import settle
 from sonarpost.cli.demo.settings import UUV, VESSEL
 from sonarpost.messages import Command
 from sonarpost.runtime.session import open_with_retry
+from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.xtf_writer import write_xtf
 
 pytestmark = pytest.mark.chain
 
@@ -101,3 +103,30 @@ def test_refining_brings_more_of_a_picture_first_from_uuv_modem_then_from_the_co
     run.until(lambda: has(held - 16, held), 60, "all that uuv_modem has ashore")
     order(run, "refine", image_id)
     run.until(lambda: has(int(1.9 * held), 2 * held + 2), 60, "what the compressor has made of it ashore")
+
+
+@pytest.mark.long
+def test_wider_brings_twice_the_ground_as_a_picture_of_its_own(
+    start_chain: StartChain, order: Callable[[RunningChain, str, str], None]
+) -> None:
+    run = start_chain(link="v1", loss=0.1, mode="survey")
+    survey = simulate_survey(SurveySpec(seed=1, pings=400, samples=1024, clutter=0)).survey
+    hidden = run.settings.incoming / ".line.xtf"
+    write_xtf(survey, hidden)
+    hidden.rename(run.settings.incoming / "line.xtf")
+    shore = run.watcher.shore
+    run.until(lambda: any(image.complete for image in shore.values()), 120, "a picture ashore")
+    run.until_idle()
+    before = set(shore)
+    first = next(image for image in shore.values() if image.complete)
+    order(run, "wider", first.image_id)
+    run.until(lambda: any(i not in before and shore[i].complete for i in shore), 120, "the wider picture ashore")
+    (wide_id,) = set(shore) - before
+    near, wide = run.watcher.encoded[first.image_id].contact, run.watcher.encoded[wide_id].contact
+    assert wide.contact_id == near.contact_id
+    assert wide.pixel_across_m == 2 * (near.pixel_across_m or 0.0) > 0
+    # By sound sizes go in steps of 2.5 %.
+    told = shore[wide_id].contact
+    assert told is not None
+    assert told.pixel_across_m == pytest.approx(wide.pixel_across_m, rel=0.03)
+    assert (told.lat_deg, told.lon_deg) == pytest.approx((near.lat_deg, near.lon_deg), abs=1e-6)

@@ -109,6 +109,34 @@ def test_training_arrives_travels_and_ends(console):
     assert any(vehicle["snr_in_db"] is not None and vehicle["queue"] for vehicle in vehicles)
 
 
+def test_training_answers_wider_with_a_picture_of_its_own_once(console):
+    training = Training(console.board, contacts=1, interval_s=0.01)
+    training.backlog(1)
+    anna = console.browser("anna")
+
+    def rows() -> dict[str, dict[str, object]]:
+        return {row["image_id"]: row for row in anna.get("/api/contacts").json()["items"]}
+
+    def ask(image_id: str) -> None:
+        assert anna.post(f"/api/contacts/{rows()[image_id]['id']}/requests", {"kind": "wider"}).status_code == 201
+        now = time.time()
+        training.send(now)
+        training.travel(now + 11.0)
+        for _ in range(10):
+            training.packet(time.time())
+
+    (first,) = rows()
+    ask(first)
+    assert set(rows()) == {first, "ZZZZ"}
+    near, wide = (console.board.image(str(rows()[name]["id"]), 1) for name in (first, "ZZZZ"))
+    assert wide.contact.pixel_along_m == 2 * near.contact.pixel_along_m
+    assert wide.contact.pixel_across_m == 2 * near.contact.pixel_across_m
+    assert rows()["ZZZZ"]["complete"]
+    ask(first)  # the same again
+    ask("ZZZZ")  # nothing wider is kept
+    assert set(rows()) == {first, "ZZZZ"}
+
+
 @pytest.fixture
 def certificate(tmp_path):
     folder = Fleet.init(tmp_path / "pki", "test").issue("vessel-1", "vessel", hosts=("127.0.0.1",)).folder

@@ -309,7 +309,10 @@ def test_requests_cost_what_they_cost_and_are_not_doubled(make_console):
     # Twice the stream: 350 bytes lack, 7 frames, three packets.
     assert (costs["refine"]["bytes"], costs["refine"]["packets"]) == (350, 3)
     assert costs["revisit"]["airtime_s"] == pytest.approx(3.2)
-    assert not costs["wider"]["available"]
+    # A picture of its own, of 200 bytes: 4 frames, two packets.
+    assert (costs["wider"]["bytes"], costs["wider"]["packets"]) == (200, 2)
+    assert costs["wider"]["airtime_s"] == pytest.approx(3.2 + 2 * 6.1)
+    assert costs["wider"]["basis"] == "rate 1 as heard last, a new picture of 200 bytes"
     path = f"/api/contacts/{ID}/requests"
     asked = anna.post(path, {"kind": "resend", "airtime_s": 9.3})
     assert (asked.status_code, asked.json()["state"]) == (201, "waiting")
@@ -318,7 +321,16 @@ def test_requests_cost_what_they_cost_and_are_not_doubled(make_console):
     [request] = anna.get(f"/api/contacts/{ID}").json()["requests"]
     assert (request["state"], request["reason"]) == ("refused", "it only listens")
     assert anna.post(path, {"kind": "resend"}).status_code == 201
-    assert anna.post(path, {"kind": "wider"}).status_code == 400
+    assert anna.post(path, {"kind": "wider"}).status_code == 201
+    assert anna.post(path, {"kind": "larger"}).status_code == 400
+
+
+def test_a_wider_picture_costs_what_this_one_did_before_it_was_refined(make_console):
+    console = make_console(assumed_rate=1)
+    console.board.take_image(picture_record())
+    console.board.take_image(picture_record(version=2).model_copy(update={"bytes_received": 400, "bytes_total": 400}))
+    costs = {cost["kind"]: cost for cost in console.browser("anna").get(f"/api/contacts/{ID}/costs").json()["costs"]}
+    assert (costs["refine"]["bytes"], costs["wider"]["bytes"]) == (400, 200)
 
 
 def test_a_cost_that_cannot_be_told_is_not_invented(console):
@@ -330,11 +342,11 @@ def test_a_cost_that_cannot_be_told_is_not_invented(console):
 @pytest.mark.parametrize(
     ("changes", "possible"),
     [
-        ({}, {"refine", "revisit"}),
-        ({"place": None}, {"refine"}),
-        ({"place": None, "codec": "vq"}, set()),
-        ({"missing_rows": 10, "codec": "vq"}, {"resend", "revisit"}),
-        ({"missing_rows": 10}, {"refine", "resend", "revisit"}),
+        ({}, {"refine", "revisit", "wider"}),
+        ({"place": None}, {"refine", "wider"}),
+        ({"place": None, "codec": "vq"}, {"wider"}),
+        ({"missing_rows": 10, "codec": "vq"}, {"resend", "revisit", "wider"}),
+        ({"missing_rows": 10}, {"refine", "resend", "revisit", "wider"}),
     ],
 )
 def test_what_leads_to_nothing_is_not_asked(console, changes, possible):
@@ -345,7 +357,7 @@ def test_what_leads_to_nothing_is_not_asked(console, changes, possible):
     costs = anna.get(f"/api/contacts/{ID}/costs").json()["costs"]
     assert {cost["kind"] for cost in costs if cost["available"]} == possible
     assert all(cost["reason"] for cost in costs if not cost["available"])
-    for kind in ("refine", "resend", "revisit"):
+    for kind in ("refine", "resend", "revisit", "wider"):
         answer = anna.post(f"/api/contacts/{ID}/requests", {"kind": kind})
         assert answer.status_code == (201 if kind in possible else 400)
     assert len(console.board.unsent()) == len(possible)

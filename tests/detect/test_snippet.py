@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.detect.contacts import detect
-from sonarpost.detect.snippet import cut_snippet, to_grey
+from sonarpost.detect.snippet import cut_snippet, cut_wide, to_grey
 from sonarpost.sonar.survey import ChannelPing, Side
 
 
@@ -106,11 +106,54 @@ def test_a_window_of_one_value_is_mid_grey_and_an_unknown_one_black():
 @pytest.mark.parametrize("change", [{"ping_index": 200}, {"ping_index": -1}, {"sample": 512}])
 def test_a_detection_of_another_survey_is_refused(found, change):
     survey, detection = found
-    with pytest.raises(ValueError, match="expected inside 200 pings of 512 samples"):
-        cut_snippet(survey, replace(detection, **change))
+    for cut in (cut_snippet, cut_wide):
+        with pytest.raises(ValueError, match="expected inside 200 pings of 512 samples"):
+            cut(survey, replace(detection, **change), 80, 100)
 
 
 @pytest.mark.parametrize("size", [(0, 10), (10, 0)])
 def test_a_picture_without_pixels_is_refused(found, size):
     with pytest.raises(ValueError, match="expected 1 or more"):
         cut_snippet(*found, *size)
+
+
+def fours(image):
+    """Means of blocks of two rows and two columns."""
+    return sum(image[row::2, column::2].astype(float) for row in (0, 1) for column in (0, 1)) / 4
+
+
+def test_the_wide_picture_is_twice_the_ground_around_the_same_middle(found):
+    survey, detection = found
+    narrow = cut_snippet(survey, detection, 40, 60)
+    wide = cut_wide(survey, detection, 40, 60)
+    top, left = narrow.first_ping_index - 20, narrow.first_sample - 30
+    values = fours(survey.waterfall(Side.STARBOARD)[top : top + 80, left : left + 120])
+    root = np.sqrt(values)
+    low, high = np.percentile(root, (0.5, 99.5))
+    assert wide.shape == narrow.image.shape
+    np.testing.assert_array_equal(wide, np.clip(np.rint(255 * (root - low) / (high - low)), 0, 255))
+
+
+@given(ping=st.integers(0, 199), sample=st.integers(0, 511), height=st.integers(1, 210), width=st.integers(1, 600))
+def test_the_wide_picture_keeps_within_the_recording(found, ping, sample, height, width):
+    survey, detection = found
+    wide = cut_wide(survey, replace(detection, ping_index=ping, sample=sample), height, width)
+    if height >= 200 or width >= 512:
+        assert wide is None, "there is no more ground than the snippet shows"
+    else:
+        assert wide.shape == (min(height, 100), min(width, 256))
+
+
+def test_samples_a_ping_does_not_have_do_not_darken_the_wide_picture(found):
+    survey, detection = found
+    pings = list(survey.pings)
+    whole = cut_wide(survey, detection, 40, 60)
+    top = cut_snippet(survey, detection, 40, 60).first_ping_index - 20
+    for row in (top + 10, top + 11, top + 20):
+        pings[row] = replace(pings[row], channels=())
+    holed = cut_wide(replace(survey, pings=tuple(pings)), detection, 40, 60)
+    assert not holed[5].any(), "both of its pings are absent"
+    # One of two pings is there: its mean stands, unhalved.
+    assert abs(float(holed[10].mean()) - float(whole[10].mean())) < 15
+    untouched = [row for row in range(40) if row not in (5, 10)]
+    assert np.abs(holed[untouched].astype(int) - whole[untouched]).max() <= 6

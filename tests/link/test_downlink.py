@@ -23,6 +23,7 @@ SAMPLES: dict[str, dl.Content] = {
     "decision": dl.Judgement(6, 1_790_000_003, 300, 4, "not_mine_like", 0.5, "Manta"),
     "decision-bare": dl.Judgement(7, 4_294_967_295, 300, 300, "unsure"),
     "confirmation": dl.Confirmation(((1, dl.Outcome.TAKEN), (2**32 - 1, dl.Outcome.UNKNOWN_IMAGE))),
+    "wider": dl.Wider(0x0A0B0C0D, 1_790_000_004, 7),
     "data": dl.Data(b"\x00status"),
 }
 
@@ -41,6 +42,7 @@ heads = {"token": st.integers(0, 2**32 - 1), "issued_utc_s": st.integers(0, 2**3
 orders = st.one_of(
     st.builds(dl.Refine, **heads, number=numbers, stream_bytes=st.integers(0, 65535)),
     st.builds(dl.Resend, **heads, number=numbers),
+    st.builds(dl.Wider, **heads, number=numbers),
     st.builds(
         dl.Revisit,
         **heads,
@@ -103,6 +105,8 @@ def test_hostile_bytes_parse_or_are_refused_by_name(data: bytes) -> None:
         (b"\x04" + bytes(8) + b"\0\1\1\3\xff", "verdict"),
         (b"\x04" + bytes(8) + b"\0\1\0\0\xff", "version"),
         (b"\x04" + bytes(8) + b"\0\1\1\0\xff\xc3", "mlo_class"),
+        (b"\x05" + bytes(8) + b"\0\1\0", "length"),
+        (b"\x05" + bytes(10), "number"),
         (b"\x08" + bytes(4), "length"),
         (b"\x08" + bytes(4) + b"\x09", "outcome"),
         (b"\x10", "data"),

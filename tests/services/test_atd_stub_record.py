@@ -17,6 +17,7 @@ from services.atd_stub.ground_picture import ground_picture
 from services.atd_stub.record import of_detection
 from services.atd_stub.seam import Origin
 from services.atd_stub.service import AtdStubService
+from services.atd_stub.snippets import from_picture
 from services.atd_stub.text_file import contact_text, read_contact, write_snippet
 from sonarpost import keys
 from sonarpost.detect.contacts import FilterScores, detect
@@ -179,6 +180,34 @@ def test_a_square_metre_is_a_square_in_the_middle_whatever_speed_and_altitude(al
     assert height == pytest.approx(10, abs=1 + along_m / 0.1)
     assert width == pytest.approx(10, abs=2)
     np.testing.assert_allclose((low + high) / 2, (40, 30), atol=1 + along_m / 0.1)
+
+
+@pytest.mark.parametrize("pixel_m", [0.0, 0.1])
+def test_beside_its_picture_goes_a_wide_one_of_twice_the_ground(pixel_m, detection):
+    survey = flat_survey()
+    config = AtdStubConfig(snippet_height_px=60, snippet_width_px=60, snippet_pixel_m=pixel_m)
+    record = of_detection(survey, contact_at(survey, 150, 12.0, detection), ORIGIN, "uuv-1", config)
+    sizes = []
+    for raster in (record.picture, record.wide):
+        bright = np.argwhere(raster.to_array() > 128)
+        sizes.append(bright.max(axis=0) + 1 - bright.min(axis=0))
+    assert (record.wide.height_px, record.wide.width_px) == (60, 60)
+    # The square metre has half as many pixels each way, and lies where it lay.
+    np.testing.assert_allclose(sizes[1], sizes[0] / 2, atol=1.5)
+    np.testing.assert_allclose(np.mean(np.argwhere(record.wide.to_array() > 128), axis=0)[0], 30, atol=1.5)
+    assert record.contact.pixel_across_m == (pixel_m or 20.0 / 400)
+
+
+def test_where_the_survey_has_no_more_ground_there_is_no_wide_picture(detection):
+    survey = flat_survey()
+    config = AtdStubConfig(snippet_height_px=300, snippet_width_px=60)
+    assert of_detection(survey, contact_at(survey, 150, 12.0, detection), ORIGIN, "uuv-1", config).wide is None
+
+
+def test_a_picture_of_snippets_mode_has_no_wide_one(tmp_path, texture):
+    write_tiff(tmp_path / "p.tiff", texture())
+    (record,) = from_picture(tmp_path / "p.tiff", "ab" * 32, "uuv-1").snippets
+    assert record.wide is None
 
 
 def test_what_was_not_recorded_is_black(detection):

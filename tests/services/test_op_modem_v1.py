@@ -158,7 +158,12 @@ def test_orders_go_through_the_water_and_are_confirmed(sealed, sea, begin, conso
     sea.start()
     far = vehicle(key=read_key(key_file) if sealed else None)
     service = begin(key_file=key_file if sealed else None)
-    sent = {"c-1": command(), "c-2": command("resend", "c-2"), "c-3": command("revisit", "c-3")}
+    sent = {
+        "c-1": command(),
+        "c-2": command("resend", "c-2"),
+        "c-3": command("revisit", "c-3"),
+        "c-4": command("wider", "c-4"),
+    }
     for record in sent.values():
         console.owe(keys.command(VESSEL, record.kind), "op_modem", record)
     fresh = VERDICT.model_copy(update={"decided_utc_s": time.time()})
@@ -173,7 +178,7 @@ def test_orders_go_through_the_water_and_are_confirmed(sealed, sea, begin, conso
         assert steps[0] == "asked"
         assert set(steps[1:-1]) == {"sent"}
     by_kind = {type(order): order for order in far.orders}
-    assert by_kind[dl.Refine].number == by_kind[dl.Resend].number == 7
+    assert by_kind[dl.Refine].number == by_kind[dl.Resend].number == by_kind[dl.Wider].number == 7
     assert (by_kind[dl.Revisit].lat_deg, by_kind[dl.Revisit].lon_deg) == (41.5, -70.5)
     judged = by_kind[dl.Judgement]
     assert (judged.verdict, judged.confidence, judged.version) == ("mine_like", 0.5, 2)

@@ -15,7 +15,7 @@ from services.op_modem.service import OpModemService
 from services.uuv_modem.config import UuvModemConfig
 from services.uuv_modem.service import UuvModemService
 from sonarpost import keys, wire
-from sonarpost.link.downlink import Confirmation, Data, Judgement, Outcome, Refine, Resend, Revisit, pack, unpack
+from sonarpost.link.downlink import Confirmation, Data, Judgement, Outcome, Refine, Resend, Revisit, Wider, pack, unpack
 from sonarpost.link.paper_format import format_image_id
 from sonarpost.link.seal import AcousticSeal
 from sonarpost.link.seal_key import Direction, SealKey
@@ -263,6 +263,7 @@ ORDERS = [
     (Refine(1, 1000, 2, 400), "refine", "0002"),
     (Resend(2, 1001, 3), "resend", "0003"),
     (Revisit(3, 1002, 56.5, -5.25), "revisit", None),
+    (Wider(5, 1004, 4), "wider", "0004"),
 ]
 
 
@@ -278,16 +279,16 @@ def test_orders_by_sound_are_handed_on_once_and_confirmed_each_time(vessel, begi
     def told() -> list[tuple[int, Outcome]]:
         return [o for m in vessel.messages() if isinstance(m, Confirmation) for o in m.outcomes]
 
-    vessel.say(*orders, until=lambda: {token for token, _ in told()} == {1, 2, 3, 4})
+    vessel.say(*orders, until=lambda: {token for token, _ in told()} == {1, 2, 3, 4, 5})
     before = told().count((1, Outcome.TAKEN))
     vessel.say(orders[0], until=lambda: told().count((1, Outcome.TAKEN)) > before)
-    eventually(lambda: len(compressor.got) == 2 and len(autonomy.got) == 2)
+    eventually(lambda: len(compressor.got) == 3 and len(autonomy.got) == 2)
     assert {outcome for _, outcome in told()} == {Outcome.TAKEN}
-    assert {(c.kind, c.image_id) for c in compressor.got} == {("refine", "0002"), ("resend", "0003")}
+    assert {(c.kind, c.image_id) for c in compressor.got} == {("refine", "0002"), ("resend", "0003"), ("wider", "0004")}
     revisit, decision = sorted(autonomy.got, key=lambda r: r.TYPE)
     assert (revisit.lat_deg, revisit.lon_deg, revisit.command_id) == (56.5, -5.25, "a1-00000003")
     assert (decision.verdict, decision.mlo_class, decision.image_id) == ("mine_like", "sphere", "0002")
-    assert service.health().counters["orders_taken"] == 4
+    assert service.health().counters["orders_taken"] == 5
 
 
 def test_an_order_that_nobody_takes_is_told(vessel, begin):

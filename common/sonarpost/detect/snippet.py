@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.detect.contacts import Detection
-from sonarpost.sonar.survey import Survey
+from sonarpost.sonar.survey import Side, Survey
 
 SNIPPET_HEIGHT_PX = 100
 SNIPPET_WIDTH_PX = 100
@@ -60,25 +60,11 @@ def cut_snippet(
     Raises:
         ValueError: When a size is below 1, or the detection does not belong to this survey.
     """
-    if height_px < 1 or width_px < 1:
-        raise ValueError(f"height_px, width_px: got {height_px}, {width_px}, expected 1 or more")
-    samples = max((c.samples.shape[0] for p in survey.pings for c in p.channels if c.side is detection.side), default=0)
-    if not (0 <= detection.ping_index < len(survey.pings) and 0 <= detection.sample < samples):
-        raise ValueError(
-            f"detection: got ping index {detection.ping_index}, sample {detection.sample}, "
-            f"expected inside {len(survey.pings)} pings of {samples} samples"
-        )
-    centre_column = detection.sample + min(detection.shadow_samples // 2, width_px // 4)
+    samples = _samples(survey, detection, height_px, width_px)
+    centre_column = _centre_column(detection, width_px)
     top, rows = _window(detection.ping_index, height_px, len(survey.pings))
     left, columns = _window(centre_column, width_px, samples)
-    raw = np.zeros((rows, columns), dtype=np.uint32)
-    known = np.zeros((rows, columns), dtype=np.bool_)
-    for row in range(rows):
-        channel = survey.pings[top + row].channel(detection.side)
-        if channel is not None:
-            piece = channel.samples[left : left + columns]
-            raw[row, : piece.shape[0]] = piece
-            known[row, : piece.shape[0]] = True
+    raw, known = _cut(survey, detection.side, (top, rows), (left, columns))
     divisor = 1 << max(0, int(raw.max()).bit_length() - 16)
     return Snippet(
         image=to_grey(raw, known),
@@ -93,7 +79,83 @@ def cut_snippet(
     )
 
 
-def to_grey(raw: npt.NDArray[np.uint32], known: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
+def cut_wide(survey: Survey, detection: Detection, height_px: int, width_px: int) -> npt.NDArray[np.uint8] | None:
+    """Cut twice the ground of `cut_snippet` in each direction, around the same centre, in pixels of twice the size.
+
+    A pixel is the mean of the four file values that it covers, of those there are; 0 where there is none. The window is
+    shifted at the recording's borders as that of `cut_snippet`.
+
+    Args:
+        survey: The pings in which it was found.
+        detection: The contact.
+        height_px: Rows of the snippet.
+        width_px: Columns of the snippet.
+
+    Returns:
+        Shape (height_px, width_px), uint8, or less where the survey has less than twice the snippet's pings or samples.
+        None where that would show no more ground than the snippet along, or across.
+
+    Raises:
+        ValueError: As `cut_snippet`.
+    """
+    samples = _samples(survey, detection, height_px, width_px)
+    top, rows = _window(detection.ping_index, 2 * height_px, len(survey.pings) // 2 * 2)
+    left, columns = _window(_centre_column(detection, width_px), 2 * width_px, samples // 2 * 2)
+    if rows <= height_px or columns <= width_px:
+        return None
+    raw, known = _cut(survey, detection.side, (top, rows), (left, columns))
+    count = _by_fours(known.astype(np.float64))
+    means = _by_fours(raw.astype(np.float64)) / np.maximum(count, 1.0)
+    return to_grey(means, count > 0)
+
+
+def _by_fours(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Sums of blocks of two rows and two columns."""
+    rows, columns = values.shape
+    sums: npt.NDArray[np.float64] = values.reshape(rows // 2, 2, columns // 2, 2).sum(axis=(1, 3))
+    return sums
+
+
+def _samples(survey: Survey, detection: Detection, height_px: int, width_px: int) -> int:
+    """Return the most samples that a ping has on the detection's side.
+
+    Raises:
+        ValueError: When a size is below 1, or the detection does not belong to this survey.
+    """
+    if height_px < 1 or width_px < 1:
+        raise ValueError(f"height_px, width_px: got {height_px}, {width_px}, expected 1 or more")
+    samples = max((c.samples.shape[0] for p in survey.pings for c in p.channels if c.side is detection.side), default=0)
+    if not (0 <= detection.ping_index < len(survey.pings) and 0 <= detection.sample < samples):
+        raise ValueError(
+            f"detection: got ping index {detection.ping_index}, sample {detection.sample}, "
+            f"expected inside {len(survey.pings)} pings of {samples} samples"
+        )
+    return samples
+
+
+def _centre_column(detection: Detection, width_px: int) -> int:
+    return detection.sample + min(detection.shadow_samples // 2, width_px // 4)
+
+
+def _cut(
+    survey: Survey, side: Side, pings: tuple[int, int], samples: tuple[int, int]
+) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.bool_]]:
+    """Return a window's file values, 0 where there are none, and where there are; `pings`, `samples`: first, count."""
+    (top, rows), (left, columns) = pings, samples
+    raw = np.zeros((rows, columns), dtype=np.uint32)
+    known = np.zeros((rows, columns), dtype=np.bool_)
+    for row in range(rows):
+        channel = survey.pings[top + row].channel(side)
+        if channel is not None:
+            piece = channel.samples[left : left + columns]
+            raw[row, : piece.shape[0]] = piece
+            known[row, : piece.shape[0]] = True
+    return raw, known
+
+
+def to_grey(
+    raw: npt.NDArray[np.uint32] | npt.NDArray[np.float64], known: npt.NDArray[np.bool_]
+) -> npt.NDArray[np.uint8]:
     """Map file values to grey.
 
     grey = 255 * (sqrt(value) - low) / (high - low), rounded and limited to 0..255, where low and high are the 0.5th and
@@ -101,7 +163,7 @@ def to_grey(raw: npt.NDArray[np.uint32], known: npt.NDArray[np.bool_]) -> npt.ND
     give 0.
 
     Args:
-        raw: Shape (rows, columns), uint32, the file's values.
+        raw: Shape (rows, columns), the file's values, or means of them.
         known: Same shape, True where the file has a sample.
     """
     root = np.sqrt(raw.astype(np.float64))

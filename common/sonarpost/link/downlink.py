@@ -36,7 +36,7 @@ _MOST_VERSION: Final = 255
 
 _HEAD = struct.Struct(">BII")
 _REFINE = struct.Struct(">HH")
-_RESEND = struct.Struct(">H")
+_NUMBER = struct.Struct(">H")
 _REVISIT = struct.Struct(">ii")
 _DECISION = struct.Struct(">HBBB")
 _OUTCOME = struct.Struct(">IB")
@@ -49,8 +49,18 @@ class MessageKind(IntEnum):
     RESEND = 0x02
     REVISIT = 0x03
     DECISION = 0x04
+    WIDER = 0x05
     CONFIRMATION = 0x08
     DATA = 0x10
+
+
+_ORDERS: Final = (
+    MessageKind.REFINE,
+    MessageKind.RESEND,
+    MessageKind.REVISIT,
+    MessageKind.DECISION,
+    MessageKind.WIDER,
+)
 
 
 class Outcome(IntEnum):
@@ -111,6 +121,17 @@ class Refine(Order):
 @dataclass(frozen=True, slots=True)
 class Resend(Order):
     """A picture again, from its beginning. `number`: of the contact, 1..65535."""
+
+    number: int
+
+    def __post_init__(self) -> None:
+        Order.__post_init__(self)
+        _check("number", self.number, 1, MAX_NUMBER)
+
+
+@dataclass(frozen=True, slots=True)
+class Wider(Order):
+    """More of the seabed around a contact, as a picture of its own. `number`: of the contact, 1..65535."""
 
     number: int
 
@@ -187,7 +208,7 @@ class Data:
         _check("data", len(self.data), 1, 4095)
 
 
-DownlinkOrder = Refine | Resend | Revisit | Judgement
+DownlinkOrder = Refine | Resend | Revisit | Judgement | Wider
 Content = DownlinkOrder | Confirmation | Data
 
 
@@ -215,8 +236,9 @@ def _packed(content: Content, room_bytes: int) -> bytes:
             return bytes([MessageKind.CONFIRMATION]) + b"".join(_OUTCOME.pack(*each) for each in content.outcomes)
         case Refine():
             return _head(MessageKind.REFINE, content) + _REFINE.pack(content.number, content.stream_bytes)
-        case Resend():
-            return _head(MessageKind.RESEND, content) + _RESEND.pack(content.number)
+        case Resend() | Wider():
+            kind = MessageKind.RESEND if isinstance(content, Resend) else MessageKind.WIDER
+            return _head(kind, content) + _NUMBER.pack(content.number)
         case Revisit():
             degrees = (round(value * _DEGREE_STEPS) for value in (content.lat_deg, content.lon_deg))
             return _head(MessageKind.REVISIT, content) + _REVISIT.pack(*degrees)
@@ -247,7 +269,7 @@ def unpack(data: bytes, where: str = _WHERE) -> Content:
         return _made(where, lambda: Data(data[1:]))
     if kind == MessageKind.CONFIRMATION:
         return _confirmation(data[1:], where)
-    if kind not in (MessageKind.REFINE, MessageKind.RESEND, MessageKind.REVISIT, MessageKind.DECISION):
+    if kind not in _ORDERS:
         raise FrameError(where, "kind", kind, ", ".join(f"{int(known):#04x}" for known in MessageKind))
     if len(data) < _HEAD.size:
         raise FrameError(where, "length", len(data), f"at least {_HEAD.size} bytes")
@@ -260,9 +282,9 @@ def _order(kind: MessageKind, token: int, issued: int, body: bytes) -> DownlinkO
     if kind == MessageKind.REFINE:
         number, stream_bytes = _fields(_REFINE, body)
         return Refine(token, issued, number, stream_bytes)
-    if kind == MessageKind.RESEND:
-        (number,) = _fields(_RESEND, body)
-        return Resend(token, issued, number)
+    if kind in (MessageKind.RESEND, MessageKind.WIDER):
+        (number,) = _fields(_NUMBER, body)
+        return (Resend if kind == MessageKind.RESEND else Wider)(token, issued, number)
     if kind == MessageKind.REVISIT:
         lat, lon = _fields(_REVISIT, body)
         return Revisit(token, issued, lat / _DEGREE_STEPS, lon / _DEGREE_STEPS)

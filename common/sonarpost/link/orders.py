@@ -42,7 +42,7 @@ class OpenOrder:
     """An order and what became of it.
 
     Attributes:
-        kind: `refine`, `resend`, `revisit` or `decision`.
+        kind: `refine`, `resend`, `revisit`, `wider` or `decision`.
         record_id: Identifier of the record it comes from.
         vehicle: Name of the vehicle.
         address: Its modem's.

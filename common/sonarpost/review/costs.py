@@ -53,18 +53,19 @@ def request_cost(
     loss: float | None,
     overhead_bytes: int,
 ) -> Cost:
-    """Return what a `refine`, `resend` or `revisit` costs.
+    """Return what a `refine`, `resend`, `revisit` or `wider` costs.
 
-    To refine gives a stream of twice the length, to resend what is lacking of the stream there is. A revisit costs the
-    request alone: what the vehicle then sees is a contact of its own. Frames that will be lost are sent again, so the
+    To refine gives a stream of twice the length, to resend what is lacking of the stream there is; more seabed around a
+    contact is a new picture, of which nothing is here. A revisit costs the request alone: what the vehicle then sees is
+    a contact of its own. Frames that will be lost are sent again, so the
     way up is longer by 1 / (1 - loss).
 
     Args:
         kind: The request.
         downlink_rate: Micro-Modem rate of the vessel.
         uplink_rate: Of the vehicle, as heard last; None where it is not known.
-        bytes_received: Of the picture's stream.
-        bytes_total: Of the stream as far as it was announced.
+        bytes_received: Of the picture's stream; 0 for a wider one.
+        bytes_total: Of the stream as far as it was announced; for a wider one, of the new stream.
         loss: Share of frames lost lately; None where it is not known.
         overhead_bytes: Of header in a frame.
     """
@@ -80,7 +81,8 @@ def request_cost(
     share = min(0.9, loss or 0.0)
     sent = math.ceil(wanted / (1 - share))
     packets = packets_for(sent, uplink_rate, overhead_bytes)
-    basis = f"rate {uplink_rate} as heard last, {wanted} of {whole} bytes lacking"
+    lacking = f"a new picture of {whole} bytes" if kind == "wider" else f"{wanted} of {whole} bytes lacking"
+    basis = f"rate {uplink_rate} as heard last, {lacking}"
     if share:
         basis += f", {share:.0%} of frames lost"
     return Cost(downlink_s, packets * RATES[uplink_rate].airtime_s, wanted, packets, basis)

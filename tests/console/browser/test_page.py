@@ -105,6 +105,7 @@ def test_a_whole_review_by_keys_alone(served):
     there.press("r")
     there.wait("dialog .costs")
     assert "air time" in there.text("dialog .costs")
+    assert there.page.locator("dialog .costs input[value=wider]:not([disabled])").count() == 1
     there.press("ArrowDown", "Enter")
     there.wait('details[data-name="requests"] >> text=/resend|revisit/')
     # The other views, and back.

@@ -174,7 +174,8 @@ SAMPLES: dict[str, Record] = {
     "contact-bare": BARE_CONTACT,
     "raster-8-bits": RASTER_8,
     "raster-16-bits": RASTER_16,
-    "snippet": Snippet(contact=FULL_CONTACT, picture=RASTER_16, source="line-7.xtf"),
+    "snippet-wide": Snippet(contact=FULL_CONTACT, picture=RASTER_16, source="line-7.xtf", wide=RASTER_8),
+    "snippet-without-wide": Snippet(contact=FULL_CONTACT, picture=RASTER_16, source="line-7.xtf"),
     "encoded-image": EncodedImage(
         vehicle_id="uuv-1",
         image_id="00A7",
@@ -254,6 +255,14 @@ SAMPLES: dict[str, Record] = {
         lon_deg=-70.6712,
         issued_by="op",
         issued_utc_s=1476262902.0,
+    ),
+    "command-wider": Command(
+        command_id="c-3",
+        kind="wider",
+        vehicle_id="uuv-1",
+        image_id="00A7",
+        issued_by="op",
+        issued_utc_s=1476262903.0,
     ),
     "advice-full": Advice(
         advice_id="a-2016-10-12-1",
@@ -418,7 +427,7 @@ def images(draw: st.DrawFn) -> ReconstructedImage:
 
 @st.composite
 def commands(draw: st.DrawFn) -> Command:
-    kind = draw(st.sampled_from(["refine", "resend", "revisit"]))
+    kind = draw(st.sampled_from(["refine", "resend", "revisit", "wider"]))
     place = kind == "revisit"
     return Command(
         command_id=draw(_record_id),
@@ -435,7 +444,7 @@ def commands(draw: st.DrawFn) -> Command:
 STRATEGIES: dict[type[Record], st.SearchStrategy[Any]] = {
     Contact: contacts,
     Raster: rasters(),
-    Snippet: st.builds(Snippet, contact=contacts, picture=rasters(), source=_text(0, 2000)),
+    Snippet: st.builds(Snippet, contact=contacts, picture=rasters(), source=_text(0, 2000), wide=_maybe(rasters())),
     EncodedImage: st.builds(
         EncodedImage,
         vehicle_id=_name,
@@ -538,7 +547,7 @@ STRATEGIES[DownlinkState] = st.builds(
     DownlinkState,
     vessel_id=_name,
     vehicle_id=_name,
-    kind=st.sampled_from(["refine", "resend", "revisit", "decision"]),
+    kind=st.sampled_from(["refine", "resend", "revisit", "decision", "wider"]),
     record_id=_record_id,
     state=st.sampled_from(["asked", "sent", "confirmed", "refused", "expired"]),
     times_sent=_count,

@@ -42,7 +42,7 @@ export async function askForMore(contact) {
   const { airtime_s } = costs.find((cost) => cost.kind === kind);
   try {
     await api.request(contact.id, { kind, airtime_s });
-    toast(`${contact.name}: asked to ${kind}, ≈ ${duration(airtime_s)} of air time`);
+    toast(`${contact.name}: asked for ${kind}, ≈ ${duration(airtime_s)} of air time`);
   } catch (error) {
     toast(error.message, { bad: true });
   }
