@@ -36,17 +36,17 @@ from pathlib import Path
 import msgpack
 import numpy as np
 import zenoh
+from noise import noise_picture
 
 from sonarpost import keys
 from sonarpost.cli.demo.settings import free_ports
-from sonarpost.messages import Raster, ReconstructedImage, Record
+from sonarpost.messages import ReconstructedImage, Record
 from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.process import EXIT_WITH_PARENT
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.session import client_config
 from sonarpost.runtime.shore_index import ShoreIndex
 
-SHAPE = (100, 300)
 SETTLE_S = 120.0
 SAMPLE_S = 5.0
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
@@ -65,28 +65,7 @@ class Load(Service[ServiceConfig]):
 
 def picture(vessel: str, vehicle: int, number: int, now_utc_s: float) -> ReconstructedImage:
     """Return a picture of noise, 30 kB, that no other number has."""
-    pixels = np.random.default_rng([vehicle, number]).integers(0, 256, SHAPE, dtype=np.uint8)
-    raster = Raster.from_array(pixels)
-    return ReconstructedImage(
-        vessel_id=vessel,
-        vehicle_id=f"uuv-{vehicle}",
-        image_id=f"{number:04X}",
-        version=1,
-        contact=None,
-        codec="vq",
-        model="",
-        picture=raster,
-        picture_sha256=raster.sha256,
-        complete=True,
-        missing_fraction=0.0,
-        missing_mask=b"",
-        missing_halves=(),
-        bytes_received=232,
-        bytes_total=232,
-        frames_received=6,
-        first_frame_utc_s=now_utc_s,
-        last_frame_utc_s=now_utc_s,
-    )
+    return noise_picture(vessel, f"uuv-{vehicle}", f"{number:04X}", [vehicle, number], now_utc_s)
 
 
 def run_load(endpoint: str, folder: Path, vessel: str, vehicles: Sequence[int], seconds: float, every_s: float) -> None:

@@ -36,14 +36,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
 
-import numpy as np
 import zenoh
+from noise import noise_picture
 
 from services.relay.config import RelayConfig
 from services.relay.service import RelayService
 from sonarpost import keys, wire
 from sonarpost.cli.demo.settings import free_ports
-from sonarpost.messages import Decision, Raster, ReconstructedImage, Record, Relayed
+from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
 from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.logs import set_up
 from sonarpost.runtime.schedule import CHUNK_BYTES, WINDOW, WINDOW_BYTES
@@ -112,28 +112,7 @@ def decision(number: int) -> Decision:
 
 def picture(number: int) -> ReconstructedImage:
     """Return a picture of 100 x 300 px, 30 kB."""
-    pixels = np.random.default_rng(number).integers(0, 256, (100, 300), dtype=np.uint8)
-    raster = Raster.from_array(pixels)
-    return ReconstructedImage(
-        vessel_id=VESSEL,
-        vehicle_id="uuv-1",
-        image_id=f"{number:04d}",
-        version=1,
-        contact=None,
-        codec="vq",
-        model="",
-        picture=raster,
-        picture_sha256=raster.sha256,
-        complete=True,
-        missing_fraction=0.0,
-        missing_mask=b"",
-        missing_halves=(),
-        bytes_received=232,
-        bytes_total=232,
-        frames_received=6,
-        first_frame_utc_s=float(number),
-        last_frame_utc_s=float(number),
-    )
+    return noise_picture(VESSEL, "uuv-1", f"{number:04d}", number, float(number))
 
 
 @contextmanager
