@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from sonarpost.codec.emb import transform
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.layout import layout
-from sonarpost.codec.emb.model import parse, shipped
-from sonarpost.codec.interface import StreamHeader
+from sonarpost.codec.emb.model import SHIPPED, all_shipped, parse, shipped
+from sonarpost.codec.interface import StreamHeader, model_tag
 from sonarpost.codec.quality import psnr_db
+from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.errors import StreamError
 
 CODEC = EmbCodec()
@@ -150,7 +151,7 @@ def test_other_codecs_models_and_small_budgets_are_refused() -> None:
     stream = bytearray(CODEC.encode(contact(), 40))
     with pytest.raises(StreamError, match="codec_id"):
         CODEC.decode(bytes([0x21]) + bytes(stream[1:]))
-    with pytest.raises(StreamError, match="another model"):
+    with pytest.raises(StreamError, match="not at hand"):
         CODEC.decode(bytes([stream[0], stream[1] ^ 1]) + bytes(stream[2:]))
     for budget in (-1, 0, 3, 5):
         with pytest.raises(StreamError, match="budget_bytes"):
@@ -160,12 +161,36 @@ def test_other_codecs_models_and_small_budgets_are_refused() -> None:
 def test_the_model_file_is_checked() -> None:
     from importlib.resources import files
 
-    raw = files("sonarpost.codec").joinpath("data", "emb.model").read_bytes()
-    assert parse(raw).identity == hashlib.sha256(raw).hexdigest() == shipped().identity == CODEC.model_hash
-    with pytest.raises(StreamError, match="magic"):
-        parse(b"x" + raw)
-    with pytest.raises(StreamError, match="length"):
-        parse(raw[:-1])
+    for name, model in zip(SHIPPED, all_shipped(), strict=True):
+        raw = files("sonarpost.codec").joinpath("data", name).read_bytes()
+        assert parse(raw).identity == hashlib.sha256(raw).hexdigest() == model.identity
+        with pytest.raises(StreamError, match="magic"):
+            parse(b"x" + raw)
+        with pytest.raises(StreamError, match="length"):
+            parse(raw[:-1])
+    assert CODEC.model_hash == shipped().identity == all_shipped()[0].identity
+
+
+def test_models_of_the_package_have_tags_of_their_own() -> None:
+    tags = [model_tag(CODEC.codec_id, model.identity) for model in all_shipped()]
+    assert len(set(tags)) == len(tags)
+
+
+def test_streams_of_an_earlier_model_are_read_and_go_on() -> None:
+    """A vehicle may be older or newer than its vessel."""
+    old = EmbCodec(all_shipped()[-1])
+    image = contact()
+    stream = old.encode(image, 64)
+    assert stream[:1] == CODEC.encode(image, 64)[:1]
+    assert stream[1] != CODEC.encode(image, 64)[1]
+    assert np.array_equal(CODEC.decode(stream).image, old.decode(stream).image)
+    assert np.array_equal(CODEC.decode_plain(stream).plane, old.decode_plain(stream).plane)
+    longer = CODEC.extend(stream, image, 160)
+    assert longer == old.extend(stream, image, 160)
+    assert len(longer) > 150
+    assert longer.startswith(stream[:-1])
+    found = default_registry().create_for_stream(stream, CodecResources())
+    assert found.model_hash == old.model_hash != CODEC.model_hash
 
 
 def test_weights_decide_the_bytes() -> None:
@@ -178,10 +203,11 @@ def test_weights_decide_the_bytes() -> None:
 
 
 def test_accumulators_hold_the_largest_sums() -> None:
-    model = shipped()
-    first = 290 * np.abs(model.w1.astype(np.int64)).sum(1) + np.abs(model.b1)
-    second = 4095 * np.abs(model.w2.astype(np.int64)).sum(1) + np.abs(model.b2)
-    assert max(first.max(), second.max()) < 2**31
+    for model in all_shipped():
+        first = 290 * np.abs(model.w1.astype(np.int64)).sum(1) + np.abs(model.b1)
+        second = 4095 * np.abs(model.w2.astype(np.int64)).sum(1) + np.abs(model.b2)
+        sign = 96 * np.abs(model.sign_w1.astype(np.int64)).sum(1) + np.abs(model.sign_b1)
+        assert max(first.max(), second.max(), sign.max()) < 2**31
 
 
 @pytest.mark.parametrize("size", [(16, 16), (17, 33), (80, 80), (140, 80), (16, 512), (301, 127)])

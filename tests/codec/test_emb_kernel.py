@@ -4,11 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from sonarpost.codec.emb import kernel
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.coder import State
-from sonarpost.codec.emb.layout import COUSIN_1, HEIGHT, LEVEL, LL, NEXT_1, ORIENT, PARENT, SIBLING_1, WIDTH, layout
+from sonarpost.codec.emb.layout import (
+    COUSIN_1,
+    HEIGHT,
+    LEVEL,
+    LL,
+    NEXT_1,
+    OFFSET,
+    ORIENT,
+    PARENT,
+    SIBLING_1,
+    STRIDE,
+    WIDTH,
+    layout,
+)
 from sonarpost.codec.emb.model import shipped
 from sonarpost.codec.emb.planes import PASSES, known_plane
 from sonarpost.codec.emb.transform import STRENGTHS
@@ -58,6 +73,67 @@ def test_the_network_and_its_learning_are_the_plain_sums(net: int, reach: int) -
         assert live.tolist() == last
         moved.append(max(map(abs, steps)))
     assert max(moved) > 0
+
+
+def plain_sign_logit(features: list[int], orient: int) -> int:
+    """The sign network in Python's whole numbers."""
+    w1, base, w2 = (getattr(MODEL, name)[orient].tolist() for name in ("sign_w1", "sign_b1", "sign_w2"))
+    total = 0
+    for j in range(kernel.SIGN_HIDDEN):
+        odd = sum(features[i] * w1[i][j] for i in range(kernel.SIGN_ODD))
+        even = base[j] + sum(features[i] * w1[i][j] for i in range(kernel.SIGN_ODD, kernel.SIGN_FEATURES))
+        total += (min(max(even + odd >> 6, 0), 4095) - min(max(even - odd >> 6, 0), 4095)) * w2[j]
+    return min(max(total >> 12, -kernel.LOGIT_LIMIT), kernel.LOGIT_LIMIT)
+
+
+@pytest.mark.parametrize("orient", range(4))
+@pytest.mark.parametrize("reach", [3, 48, 96])
+def test_the_sign_network_is_the_plain_sums_and_odd(orient: int, reach: int) -> None:
+    rng = np.random.default_rng(reach + orient)
+    logits = []
+    for _ in range(40):
+        f = rng.integers(-reach, reach + 1, kernel.SIGN_FEATURES).astype(np.int32)
+        f[kernel.SIGN_ODD :] = rng.integers(0, 25, kernel.SIGN_FEATURES - kernel.SIGN_ODD)
+        nets = (MODEL.sign_b1[orient], MODEL.sign_w1, MODEL.sign_w2, orient)
+        logits.append(kernel._sign_logit(f, *nets))
+        assert logits[-1] == plain_sign_logit(f.tolist(), orient)
+        f[: kernel.SIGN_ODD] *= -1
+        assert abs(kernel._sign_logit(f, *nets) + logits[-1]) <= 1  # rounded down, whichever way it is turned
+    assert len(set(logits)) > 20
+
+
+@pytest.mark.parametrize("orient", range(4))
+def test_a_picture_turned_to_its_negative_has_the_other_sign(orient: int) -> None:
+    """All that the sign network sees turns, but for where the coefficient is."""
+    lay = layout(80, 80)
+    row = next(n for n, band in enumerate(lay.bands) if band[ORIENT] == orient and band[LEVEL] in (0, 2, lay.levels))
+    rng = np.random.default_rng(orient)
+    signed = rng.integers(-48, 49, lay.cells).astype(np.int32)
+    lows = rng.integers(-3000, 3000, lay.low_cells).astype(np.int32) * 512  # exact in thresholds, so that halves are
+    f, turned = np.zeros(kernel.SIGN_FEATURES, np.int32), np.zeros(kernel.SIGN_FEATURES, np.int32)
+    band = lay.bands[row]
+    width = int(lay.sides[band[LEVEL], 1])
+    for y, x in ((0, 0), (2, 3), (int(band[HEIGHT]) - 1, int(band[WIDTH]) - 1)):
+        at = int(band[OFFSET] + y * band[STRIDE] + x)
+        kernel._sign_context(f, signed, lows, lay.bands, width, 2048, row, y, x, at)
+        kernel._sign_context(turned, -signed, -lows, lay.bands, width, 2048, row, y, x, at)
+        assert np.array_equal(f[: kernel.SIGN_ODD], -turned[: kernel.SIGN_ODD])
+        assert np.array_equal(f[kernel.SIGN_ODD :], turned[kernel.SIGN_ODD :])
+        assert f[: kernel.SIGN_ODD].any()
+
+
+@given(threshold=st.integers(100, 2880 * 64 << 6), size=st.integers(0, 2**40))
+@example(threshold=2880 * 64 << 6, size=48 * (2880 * 64 << 6) - 1)
+def test_sizes_in_thresholds_need_no_division(threshold: int, size: int) -> None:
+    inverse = (1 << kernel._INVERSE_BITS) // threshold + 1
+    for near in (size, size // threshold * threshold, max(size // threshold * threshold - 1, 0), size % (50 * threshold)):
+        assert kernel._thresholds(near, threshold, inverse) == min(near // threshold, kernel.CAP)
+
+
+@given(st.integers(1, 2**40))
+def test_the_logarithm_is_that_of_the_power_below_and_a_line(value: int) -> None:
+    power = value.bit_length() - 1
+    assert kernel._log2_eighths(value) == 8 * power + ((value << 3) >> power) - 8
 
 
 def test_learning_makes_what_happened_likelier() -> None:

@@ -19,23 +19,26 @@ import optax
 from train import write_model
 
 from sonarpost.codec.emb.codec import EmbCodec
-from sonarpost.codec.emb.enhance import DILATIONS
-from sonarpost.codec.emb.model import CHANNELS, GLOBALS, LAYERS, Model, parse, read_arrays
+from sonarpost.codec.emb.model import CHANNELS, DILATIONS, GLOBALS, Model, parse, read_arrays
 
 SEED = 11
 BATCH = 10
-LARGEST_BYTES = 640
+LEAST_BYTES, LARGEST_BYTES = 18, 640
 Params = dict[str, jax.Array]
 
 
-def coded(codec: EmbCodec, pictures: np.ndarray, rng: np.random.Generator, prefixes: int) -> tuple[np.ndarray, ...]:
-    """Decode chance prefixes of each picture: planes without enhancement (1/64 grey), means, situations."""
+def coded(codec: EmbCodec, pictures: np.ndarray, rng: np.random.Generator, streams: int) -> tuple[np.ndarray, ...]:
+    """Decode chance lengths of each picture: planes without enhancement (1/64 grey), means, situations.
+
+    Every other stream is the beginning of a longer one, as a receiver has it that still waits for more.
+    """
     planes, means, situations = [], [], []
     for picture in pictures:
-        one = EmbCodec(codec.model, steps=(int(rng.integers(8)),))
-        stream = one.encode(picture, LARGEST_BYTES * picture.size // 6400 + 6)
-        for length in np.exp(rng.uniform(np.log(16), np.log(LARGEST_BYTES), prefixes)) * picture.size / 6400 + 6:
-            plain = one.decode_plain(stream[: int(length)])
+        for i, size in enumerate(np.exp(rng.uniform(np.log(LEAST_BYTES), np.log(LARGEST_BYTES), streams))):
+            length = int(size * picture.size / 6400)
+            made = length if i % 2 == 0 else int(length * rng.uniform(1, 4))
+            stream = EmbCodec(codec.model, steps=(int(rng.integers(8)),)).encode(picture, made)
+            plain = codec.decode_plain(stream[:length])
             low, high = -64 * plain.mean, 64 * (255 - plain.mean)
             planes.append(np.clip(plain.plane, low, high).astype(np.int16))
             means.append(plain.mean)
@@ -130,7 +133,7 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
     parser.add_argument("--model", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=12000)
-    parser.add_argument("--prefixes", type=int, default=3, help="decoded prefixes of each picture")
+    parser.add_argument("--streams", type=int, default=3, help="streams of each picture")
     parser.add_argument("--pictures", type=int, default=3000)
     parser.add_argument("--resume", action="store_true", help="begin with the enhancer of --model")
     parser.add_argument("--rate", type=float, default=1.5e-3)
@@ -143,7 +146,7 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
     began = time.time()
     sets = {}
     for name, source in (("train", pool["tp80"][-args.pictures :]), ("check", pool["vp80"][:100])):
-        plane, mean, situation = coded(codec, source, rng, args.prefixes if name == "train" else 2)
+        plane, mean, situation = coded(codec, source, rng, args.streams if name == "train" else 2)
         sets[name] = (source.repeat(len(plane) // len(source), 0), plane, mean, situation)
     print(f"coded, {time.time() - began:.0f} s", flush=True)
     params = resumed(codec.model) if args.resume else start(rng)
@@ -198,7 +201,7 @@ def write(out: Path, model: Path, params: Params) -> None:
     """Round the weights and write a model file with them and all else of another one."""
     arrays: dict[str, np.ndarray] = dict(read_arrays(model.read_bytes()))
     arrays["situation"] = np.rint(np.asarray(params["s"], np.float64) * (1 << 14))
-    for i in range(len(LAYERS)):
+    for i in range(len(DILATIONS)):
         taps = np.rint(np.asarray(params[f"w{i}"], np.float64) * (1 << 12))
         bias = np.rint(np.asarray(params[f"b{i}"], np.float64) * (1 << 20))
         if (np.abs(taps).sum((0, 1)) * 4095 + np.abs(bias)).max() >= 2**31:

@@ -7,46 +7,68 @@ import numpy.typing as npt
 
 from sonarpost.codec.emb import kernel, transform
 from sonarpost.codec.emb.coder import Coder, State
+from sonarpost.codec.emb.fit import Wanted, wanted_of
 from sonarpost.codec.emb.layout import layout
-from sonarpost.codec.emb.model import ARRAYS, Model, model_of
-from sonarpost.codec.emb.planes import code_planes
-from sonarpost.codec.emb.side import Side
+from sonarpost.codec.emb.model import SECOND, Model, model_of
+from sonarpost.codec.emb.planes import STEPS, code_planes, extra_planes
+from sonarpost.codec.emb.region import weights
+from sonarpost.codec.emb.side import MEAN_STEP, Side
 
 Rows = npt.NDArray[np.int16]
+
+LEAST_BYTES, MOST_BYTES = 18, 620
+"""Of a stream of 80 x 80 px; larger pictures get more."""
 
 
 def blank_model() -> Model:
     """A model that knows nothing but where in its interval a coefficient lies."""
-    zeros = {name: np.zeros(shape, np.int32) for name, shape, _ in ARRAYS}
+    zeros = {name: np.zeros(shape, np.int32) for name, shape, _ in SECOND.arrays}
     zeros["centres"][:] = np.array([104, 110, 118, 124])[:, None]
     return model_of(zeros)
 
 
-def list_examples(
-    model: Model, pictures: npt.NDArray[np.uint8], planes: int, rng: np.random.Generator, rows_a_picture: int
-) -> tuple[Rows, Rows]:
-    """Return decisions (contexts, bit, net, weight) and signs (contexts, orientation, sign, level).
+def chance_side(targets: npt.NDArray[np.int32], mean_index: int, rng: np.random.Generator) -> Side:
+    """Side information with a chance start step."""
+    step = int(rng.integers(8))
+    return Side(mean_index, step, None, None, extra_planes(targets, step))
 
-    Each picture is listed at a chance start step. The model decides in which pass a coefficient comes.
+
+def chance_wanted(picture: npt.NDArray[np.uint8], rng: np.random.Generator) -> tuple[Wanted, int, int]:
+    """What the encoder would tell of a picture in a chance number of bytes, the mean level, and the bytes."""
+    lay = layout(*picture.shape)
+    size = int(np.exp(rng.uniform(np.log(LEAST_BYTES), np.log(MOST_BYTES))) * picture.size / 6400)
+    mean_index = min((int(picture.astype(np.int64).sum()) // picture.size + MEAN_STEP // 2) // MEAN_STEP, 63)
+    plane = (picture.astype(np.int64) - mean_index * MEAN_STEP) * transform.UNIT
+    return wanted_of(plane, lay, weights(lay, None), size), mean_index, size
+
+
+def list_examples(
+    model: Model, pictures: npt.NDArray[np.uint8], rng: np.random.Generator, rows_a_picture: int
+) -> tuple[Rows, Rows]:
+    """Return decisions (contexts, bit, net, share, weight) and signs (contexts, orientation, sign).
+
+    Each picture is listed at a chance start step, with the targets that the encoder would have for a chance number of
+    bytes, and down to the plane that those bytes reach. The model decides in which pass a coefficient comes. The weight
+    makes every stream count alike, however long it is.
     """
-    count = len(pictures)
-    out = np.zeros((count * rows_a_picture, kernel.FEATURES + 3), np.int16)
-    signs = np.zeros((count * 1200, kernel.SIGN_FEATURES), np.int16)
-    used = used_signs = 0
+    decisions, signs = [], []
+    rows = np.zeros((rows_a_picture, kernel.FEATURES + 3), np.int16)
+    sign_rows = np.zeros((rows_a_picture // 8, kernel.SIGN_FEATURES + 2), np.int16)
     for picture in pictures:
-        lay = layout(*picture.shape)
-        side = Side(int(picture.mean() / 4 + 0.5), int(rng.integers(8)))
-        plane = (picture.astype(np.int64) - side.mean) * transform.UNIT
-        targets = transform.to_flat(transform.forward(plane, lay), lay)
+        wanted, mean_index, size = chance_wanted(picture, rng)
+        side = chance_side(wanted.targets, mean_index, rng)
+        writer, state = Coder.writer(size), State(wanted.lay)
+        code_planes(writer, state, model, wanted.targets, side)
+        planes = round(np.log2((STEPS[side.step] << side.extra) / state.threshold)) + 1 - side.extra
         coder = Coder(kernel.LIST, np.zeros(0, np.uint8))
-        coder.rows, coder.sign_rows = out[used:], signs[used_signs:]
+        coder.rows, coder.sign_rows = rows, sign_rows
         coder.words[kernel.CODER_CODE] = int(rng.integers(1 << 30))
-        state = State(lay)
-        depth = planes - int(rng.random() < 0.4)
-        code_planes(coder, state, model, targets, side, planes=depth)
-        used += int(coder.words[kernel.CODER_ROWS])
-        used_signs += int(coder.words[kernel.CODER_SIGN_ROWS])
-    return out[:used], signs[:used_signs]
+        code_planes(coder, State(wanted.lay), model, wanted.targets, side, planes=planes)
+        used, used_signs = (int(coder.words[word]) for word in (kernel.CODER_ROWS, kernel.CODER_SIGN_ROWS))
+        weight = np.full((used, 1), min(12500 // size, 32000), np.int16)
+        decisions.append(np.concatenate([rows[:used], weight], axis=1))
+        signs.append(sign_rows[:used_signs].copy())
+    return np.concatenate(decisions), np.concatenate(signs)
 
 
 def measure_centres(model: Model, pictures: npt.NDArray[np.uint8], rng: np.random.Generator) -> npt.NDArray[np.float64]:
@@ -57,15 +79,12 @@ def measure_centres(model: Model, pictures: npt.NDArray[np.uint8], rng: np.rando
     """
     total = np.zeros((4, kernel.CENTRE_COLUMNS, 2))
     for picture in pictures:
-        lay = layout(*picture.shape)
-        side = Side(int(picture.mean() / 4 + 0.5), int(rng.integers(8)))
-        plane = (picture.astype(np.int64) - side.mean) * transform.UNIT
-        targets = transform.to_flat(transform.forward(plane, lay), lay)
-        coder, state = Coder.writer(int(np.exp(rng.uniform(np.log(19), np.log(640))))), State(lay)
-        code_planes(coder, state, model, targets, side)
+        wanted, mean_index, size = chance_wanted(picture, rng)
+        coder, state = Coder.writer(size), State(wanted.lay)
+        code_planes(coder, state, model, wanted.targets, chance_side(wanted.targets, mean_index, rng))
         known = state.values > 0
         value, width = state.values[known], state.widths[known]
-        part = (np.abs(targets[known]) - value) / width
+        part = (np.abs(wanted.targets[known]) - value) / width
         row, column = (
             np.minimum(value // width, 4) - 1,
             np.clip((state.odds[known] + 2304) >> 7, 0, kernel.CENTRE_COLUMNS - 1),

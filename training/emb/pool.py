@@ -23,7 +23,7 @@ from sonarpost.sonar.readers import read_survey
 
 Floats = npt.NDArray[np.float64]
 SEED = 20240611
-SCALES = (1.0, 0.67, 0.5, 0.33)
+SCALES = (1.0, 1.5, 0.67, 0.5, 0.33)
 SIZES_PX = {"p80": (80, 80), "p140": (140, 80), "p112": (112, 96)}
 TRAIN_COUNTS = {"p80": 5000, "p140": 1600, "p112": 1600}
 VALIDATION_COUNTS = {"p80": 150, "p140": 40, "p112": 0}
@@ -71,8 +71,8 @@ def sheets_of(root: Path, *, validation: bool) -> list[tuple[Floats, bool]]:
             sheets.append((np.asarray(Image.open(path).convert("L"), np.float64), False))
     for sheet in simulated_sheets(range(100, 103) if validation else range(12)):
         sheets += [(stretched(sheet), False), (sheet, True)]
-    smaller = [(_resized(s, f), grey) for s, grey in sheets for f in SCALES[1:] if min(s.shape) * f >= 90]
-    return sheets + smaller
+    resized = [(_resized(s, f), grey) for s, grey in sheets for f in SCALES[1:] if min(s.shape) * f >= 90]
+    return sheets + resized
 
 
 def _resized(sheet: Floats, factor: float) -> Floats:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import jax
@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from examples import blank_model, list_examples, measure_centres
+from examples import Rows, blank_model, list_examples, measure_centres
 from sonarpost.codec.emb import kernel as k
-from sonarpost.codec.emb.model import ARRAYS, MAGIC, model_of, parse, read_arrays
+from sonarpost.codec.emb.model import SECOND, Model, model_of, parse, read_arrays
 
 SEED = 7
 BATCH = 8192
@@ -37,9 +37,10 @@ def network(p: Params, x: jax.Array) -> jax.Array:
 
 
 def sign_network(p: Params, x: jax.Array) -> jax.Array:
-    """Logit of a positive sign, odd in x; the integer twin is `kernel._sign_logit`."""
-    z = x / 16 @ p["w1"]
-    return (layer(z + p["b1"]) - layer(p["b1"] - z)) @ p["w2"]
+    """Logit of a positive sign, odd in the odd features; the integer twin is `kernel._sign_logit`."""
+    odd = x[:, : k.SIGN_ODD] / 16 @ p["w1"][: k.SIGN_ODD]
+    even = x[:, k.SIGN_ODD :] / 16 @ p["w1"][k.SIGN_ODD :] + p["b1"]
+    return (layer(even + odd) - layer(even - odd)) @ p["w2"]
 
 
 def start(rng: np.random.Generator, features: int) -> Params:
@@ -61,9 +62,10 @@ def fit(
     steps: int,
     rng: np.random.Generator,
     rate: float = 4e-3,
+    decay: float = 0.0,
 ) -> Params:
     """Minimise the weighted code length; prints it in bits as it goes."""
-    optimiser = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.005))
+    optimiser = optax.adamw(optax.cosine_decay_schedule(rate, steps, 0.005), weight_decay=decay)
 
     def loss(p: Params, x: jax.Array, y: jax.Array, w: jax.Array) -> jax.Array:
         return (optax.sigmoid_binary_cross_entropy(function(p, x), y) * w).sum() / w.sum() / np.log(2)
@@ -71,7 +73,7 @@ def fit(
     @jax.jit
     def step(p, state, x, y, w):  # noqa: ANN001, ANN202
         value, grad = jax.value_and_grad(loss)(p, x.astype(jnp.float32), y, w)
-        update, state = optimiser.update(grad, state)
+        update, state = optimiser.update(grad, state, p)
         p = optax.apply_updates(p, update)
         return {n: jnp.clip(v, -7.9, 7.9) if n.startswith("w") else v for n, v in p.items()}, state, value
 
@@ -124,14 +126,51 @@ def mean_tree(means: np.ndarray) -> np.ndarray:
 
 def write_model(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write the arrays in the file's order and types."""
-    raw = bytearray(MAGIC)
-    for name, shape, kind in ARRAYS:
+    raw = bytearray(SECOND.magic)
+    for name, shape, kind in SECOND.arrays:
         array = np.asarray(arrays[name])
         whole = array.astype(kind)
         if array.shape != shape or not np.array_equal(whole, array):
             raise SystemExit(f"{name}: does not fit {shape} {kind}")
         raw += whole.tobytes()
     path.write_bytes(bytes(raw))
+
+
+def listed(order: Model, pool: Mapping[str, np.ndarray], pictures: int, rng: np.random.Generator) -> tuple[Rows, Rows]:
+    """Decisions and signs of so many pictures of 80 x 80 px and a seventh as many of each larger size."""
+    parts = [
+        list_examples(order, pool[name][: int(pictures * share)], rng, 20000 * pool[name][0].size // 6400)
+        for name, share in (("tp80", 1.0), ("tp140", 1 / 7), ("tp112", 1 / 7))
+    ]
+    return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+
+def trained_contexts(rows: Rows, steps: int, rng: np.random.Generator) -> list[Params]:
+    """The networks of significance and refinement."""
+    nets, f = [], k.FEATURES
+    for net, count in ((0, steps), (1, steps // 3)):
+        mine = rows[:, f + 1] == net
+        # A row stands for `share` like it, and every stream counts alike.
+        weight = rows[mine, f + 2].astype(np.float32) * rows[mine, f + 3] / 100
+        bits = rows[mine, f].astype(np.float32)
+        nets.append(fit(network, start(rng, f), rows[mine][:, :f], bits, weight, count, rng))
+    return nets
+
+
+def trained_signs(rows: Rows, steps: int, rng: np.random.Generator) -> list[Params]:
+    """The network of signs of each orientation."""
+    signs, f = [], k.SIGN_FEATURES
+    for orient in range(4):
+        mine = rows[rows[:, f] == orient]
+        first = {
+            "w1": jnp.asarray(rng.normal(0, 0.15, (f, k.SIGN_HIDDEN))),
+            "b1": jnp.zeros(k.SIGN_HIDDEN) + 0.2,
+            "w2": jnp.asarray(rng.normal(0, 0.1, k.SIGN_HIDDEN)),
+        }
+        even = np.ones(len(mine), np.float32)
+        bits = mine[:, f + 1].astype(np.float32)
+        signs.append(fit(sign_network, first, mine[:, :f], bits, even, steps, rng, decay=1e-3))
+    return signs
 
 
 def main() -> None:
@@ -141,46 +180,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--pictures", type=int, default=1000)
     parser.add_argument("--steps", type=int, default=5000)
-    parser.add_argument(
-        "--order", type=Path, help="model whose contexts order the coefficients, and whose enhancer is kept"
-    )
+    parser.add_argument("--order", type=Path, help="model whose contexts order the coefficients, and whose enhancer is kept")
     args = parser.parse_args()
     rng = np.random.default_rng(SEED)
     pool = np.load(args.pool)
     began = time.time()
     order = parse(args.order.read_bytes()) if args.order else blank_model()
-    parts = [
-        list_examples(order, pool[name][: int(args.pictures * share)], 7, rng, 16000 * pool[name][0].size // 6400)
-        for name, share in (("tp80", 1.0), ("tp140", 0.25), ("tp112", 0.25))
-    ]
-    rows = np.concatenate([p[0] for p in parts])
-    sign_rows = np.concatenate([p[1] for p in parts])
+    rows, sign_rows = listed(order, pool, args.pictures, rng)
     print(f"listed {len(rows)} decisions, {len(sign_rows)} signs, {time.time() - began:.0f} s")
-    f = k.FEATURES
-    # Every octave of rate counts alike: a plane has about three times the bits of the one before.
-    weight = (rows[:, f + 2] * 2.0 ** (0.1 * rows[:, k.BAND_FEATURES + 7])).astype(np.float32)
-    nets = []
-    for net, steps in ((0, args.steps), (1, args.steps // 3)):
-        mine = rows[:, f + 1] == net
-        nets.append(
-            fit(network, start(rng, f), rows[mine][:, :f], rows[mine, f].astype(np.float32), weight[mine], steps, rng)
-        )
-    signs = []
-    for orient in range(4):
-        mine = sign_rows[:, 11] == orient
-        first = {
-            "w1": jnp.asarray(rng.normal(0, 0.3, (11, k.SIGN_HIDDEN))),
-            "b1": jnp.zeros(k.SIGN_HIDDEN) + 0.2,
-            "w2": jnp.asarray(rng.normal(0, 0.1, k.SIGN_HIDDEN)),
-        }
-        plain = np.ones(int(mine.sum()), np.float32)
-        signs.append(
-            fit(sign_network, first, sign_rows[mine][:, :11], sign_rows[mine, 12].astype(np.float32), plain, 900, rng)
-        )
+    nets, signs = trained_contexts(rows, args.steps, rng), trained_signs(sign_rows, args.steps // 5, rng)
     arrays = integers(nets, signs) | tables()
     arrays["mean_tree"] = mean_tree(np.concatenate([pool[n].mean((1, 2)) for n in ("tp80", "tp140", "tp112")]))
     kept = read_arrays(args.order.read_bytes()) if args.order else {}
-    for name, shape, _ in ARRAYS:
+    for name, shape, _ in SECOND.arrays:
         arrays.setdefault(name, kept.get(name, np.zeros(shape)))  # an enhancer of zeros does nothing
     arrays["centres"] = order.centres
     whole = model_of({name: np.asarray(array, np.int32) for name, array in arrays.items()})

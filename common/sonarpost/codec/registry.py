@@ -15,7 +15,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
 from sonarpost.codec.huffman import HuffmanCodec
-from sonarpost.codec.interface import Codec, StreamHeader, tag_length
+from sonarpost.codec.interface import Codec, StreamHeader, model_tag, tag_length
 from sonarpost.codec.jpeg2000 import Jpeg2000Codec
 from sonarpost.codec.modern import ModernCodec, ModernFormat
 from sonarpost.codec.spiht import SpihtCodec
@@ -41,6 +41,7 @@ class CodecResources:
     tiles: TileDatabase | None = None
     packing: IndexPacking = IndexPacking.BITS14
     codec_id: int | None = None
+    model_tag: int | None = None
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,13 @@ def _what_is_absent(name_or_id: str | int) -> str:
 
 
 def _create_emb(resources: CodecResources) -> Codec:
-    del resources  # its model comes with the package
-    from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415  it brings a compiler, which nobody else waits for
+    # It brings a compiler, which nobody else waits for.
+    from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415
+    from sonarpost.codec.emb.model import all_shipped  # noqa: PLC0415
 
-    return EmbCodec()
+    models = all_shipped()  # the first encodes, and tells a stream of a strange model so
+    wanted = (model for model in models if model_tag(0x20, model.identity) == resources.model_tag)
+    return EmbCodec(next(wanted, models[0]))
 
 
 BUILTINS = (
@@ -189,8 +193,9 @@ class CodecRegistry:
             StreamError: The header is wrong or its codec unknown.
             ConfigError: A resource the codec needs is absent or does not suit it.
         """
-        codec_id = StreamHeader.unpack(stream).codec_id
-        return self.spec_for_id(codec_id).create(replace(resources, codec_id=codec_id))
+        header = StreamHeader.unpack(stream)
+        resources = replace(resources, codec_id=header.codec_id, model_tag=header.model_tag)
+        return self.spec_for_id(header.codec_id).create(resources)
 
 
 def load_plugins(registry: CodecRegistry, found: Iterable[EntryPoint]) -> None:

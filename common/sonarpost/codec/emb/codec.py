@@ -18,8 +18,8 @@ from sonarpost.codec.emb.enhance import enhanced
 from sonarpost.codec.emb.fit import Wanted, wanted_of
 from sonarpost.codec.emb.grain import make_grain, measure_grain
 from sonarpost.codec.emb.layout import Layout, layout
-from sonarpost.codec.emb.model import Model, shipped
-from sonarpost.codec.emb.planes import code_planes, extra_planes, held, known_plane, situation
+from sonarpost.codec.emb.model import Model, all_shipped, shipped
+from sonarpost.codec.emb.planes import STEPS, code_planes, extra_planes, held, known_plane, situation
 from sonarpost.codec.emb.region import fill_unknown, weights
 from sonarpost.codec.emb.side import MEAN_STEP, Box, Side, read_side, write_side
 from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, check_image, model_tag, to_uint8
@@ -32,10 +32,9 @@ CODEC_ID: Final = 0x20
 NAME: Final = "emb"
 MIN_BODY_BYTES: Final = 3
 MAX_BODY_BYTES: Final = 0xFFFF
-_TRY_STEPS: Final = (0, 2, 4, 6)
-_TRY_STEPS_LONG: Final = (0, 3, 5)
-_LONG_BYTES: Final = 320
-"""From this budget on three start steps are as good as four, and keep the time within 100 ms."""
+_SEARCHES: Final = ((96, (0, 2, 4, 6), 1), (319, (0, 2, 4, 6), 0), (MAX_BODY_BYTES, (0, 4), 2))
+"""Up to which budget which start steps are tried, and how many more beside the best of them (`_beside`): as many as
+stay within 100 ms for 140 x 80 px."""
 _PRICE: Final = 20
 """Least error, in 1/256 of the squared threshold, that a bit must take away; see `kernel.code_band`."""
 
@@ -76,9 +75,10 @@ class EmbCodec:
     """The embedded codec. Satisfies `sonarpost.codec.interface.Codec`.
 
     Attributes:
-        model: The networks; the one that comes with the package if not given.
+        model: The networks that encode; those that the package encodes with if not given. Streams of the package's
+            earlier models are decoded with theirs.
         grain: Whether streams say how strong the picture's texture is (4 bytes); see `decode_grain`.
-        steps: Start steps to try; none: as many as the budget deserves.
+        steps: Start steps to try; none: as many as the time allows, see `_SEARCHES`.
         price: See `kernel.code_band`.
     """
 
@@ -148,11 +148,15 @@ class EmbCodec:
         plane = (picture.astype(np.int64) - mean_index * MEAN_STEP) * transform.UNIT
         wanted = wanted_of(plane, lay, weights(lay, box), limit)
         grain = measure_grain(picture, lay) if self.grain else None
-        steps = self.steps or (_TRY_STEPS if budget < _LONG_BYTES else _TRY_STEPS_LONG)
-        sides = [Side(mean_index, step, box, grain, extra_planes(wanted.targets, step)) for step in steps]
-        _, body, curve = min(
-            (self._write(wanted, side, limit, self.price) for side in sides), key=lambda found: found[0]
-        )
+        steps, more = next((first, more) for most, first, more in _SEARCHES if limit <= most)
+        if self.steps:
+            steps, more = self.steps, 0
+        found: dict[int, tuple[int, bytes, I64]] = {}
+        for i in range(len(steps) + more):
+            step = steps[i] if i < len(steps) else _beside({at: error for at, (error, _, _) in found.items()})
+            side = Side(mean_index, step, box, grain, extra_planes(wanted.targets, step))
+            found[step] = self._write(wanted, side, limit, self.price)
+        _, body, curve = min(found.values(), key=lambda one: one[0])
         return Encoded(header.pack() + body, error_by_length(curve, len(body), header.size, picture.size))
 
     def extend(
@@ -179,18 +183,18 @@ class EmbCodec:
             StreamError: As `encode` and `decode`; the picture has another size than the stream says.
         """
         check_image(image)
-        header = self._check_header(stream)
+        codec, header = self._reader(stream)
         picture = to_uint8(image) if known is None else fill_unknown(to_uint8(image), known)
         if picture.shape != (header.height_px, header.width_px):
             raise StreamError("image", "shape", picture.shape, f"the stream's {(header.height_px, header.width_px)}")
-        state, side = self.read_state(stream)
+        state, side = codec._read(stream[header.size :], layout(header.height_px, header.width_px))
         limit = min(budget_bytes - header.size, MAX_BODY_BYTES)
         if side.step < 0 or limit < len(stream) - header.size:
             return stream
         plane = (picture.astype(np.int64) - side.mean) * transform.UNIT
         wanted = wanted_of(plane, state.lay, weights(state.lay, side.box), limit)
         wanted = replace(wanted, targets=held(wanted.targets, state, side))
-        _, body, _ = self._write(wanted, side, limit, price=0)
+        _, body, _ = codec._write(wanted, side, limit, price=0)
         longer = header.pack() + body
         return longer if len(longer) > len(stream) and longer.startswith(stream[:-1]) else stream
 
@@ -217,13 +221,13 @@ class EmbCodec:
         Raises:
             StreamError: The header is wrong, or the stream is of another codec or model.
         """
-        header = self._check_header(stream)
+        codec, header = self._reader(stream)
         body, notes = _usable(stream[header.size :], received)
-        state, side = self._read(body, layout(header.height_px, header.width_px))
+        state, side = codec._read(body, layout(header.height_px, header.width_px))
         if side.mean_index < 0:
             blank = np.zeros((header.height_px, header.width_px), np.uint8)
             return Decoded(blank, np.ones(blank.shape, np.bool_), (*notes, "too little arrived for any picture"))
-        picture = self._picture(state, side)
+        picture = codec._picture(state, side)
         return Decoded(picture, np.zeros(picture.shape, np.bool_), notes)
 
     def decode_grain(self, stream: bytes) -> npt.NDArray[np.int16]:
@@ -232,10 +236,10 @@ class EmbCodec:
         Raises:
             StreamError: As `decode`, or the stream carries no grain.
         """
-        state, side = self.read_state(stream)
+        codec, state, side = self._known(stream)
         if side.grain is None:
             raise StreamError("stream", "grain", None, "a stream made by a codec with grain on")
-        return make_grain(self._picture(state, side), state.lay, side.grain)
+        return make_grain(codec._picture(state, side), state.lay, side.grain)
 
     def decode_with_grain(self, stream: bytes) -> Image:
         """Return the picture with grain at half strength: a view for the eye, not to be measured on.
@@ -252,10 +256,10 @@ class EmbCodec:
         Raises:
             StreamError: As `decode`, or the stream is too short for any picture.
         """
-        state, side = self.read_state(stream)
+        codec, state, side = self._known(stream)
         if side.mean_index < 0:
             raise StreamError("stream", "length", len(stream), "enough bytes for a mean level")
-        return self._plain(state, side)
+        return codec._plain(state, side)
 
     def read_state(self, stream: bytes) -> tuple[State, Side]:
         """Return what a stream says of the coefficients, and its side information.
@@ -263,18 +267,24 @@ class EmbCodec:
         Raises:
             StreamError: As `decode`.
         """
-        header = self._check_header(stream)
-        return self._read(stream[header.size :], layout(header.height_px, header.width_px))
+        _, state, side = self._known(stream)
+        return state, side
 
-    def _check_header(self, stream: bytes) -> StreamHeader:
+    def _known(self, stream: bytes) -> tuple[EmbCodec, State, Side]:
+        codec, header = self._reader(stream)
+        return codec, *codec._read(stream[header.size :], layout(header.height_px, header.width_px))
+
+    def _reader(self, stream: bytes) -> tuple[EmbCodec, StreamHeader]:
+        """The codec with the model that a stream was made with, and the stream's header."""
         header = StreamHeader.unpack(stream)
         if header.codec_id != CODEC_ID:
             raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", f"{CODEC_ID:#04x} (emb)")
+        for model in (self.model, *all_shipped()):
+            if header.model_tag == model_tag(CODEC_ID, model.identity):
+                return (self if model is self.model else replace(self, model=model)), header
         tag = model_tag(CODEC_ID, self.model.identity)
-        if header.model_tag != tag:
-            expected = f"{tag:#04x}: the stream was made with another model"
-            raise StreamError("stream", "model_tag", f"{header.model_tag:#04x}", expected)
-        return header
+        expected = f"{tag:#04x}: the stream was made with a model that is not at hand"
+        raise StreamError("stream", "model_tag", f"{header.model_tag:#04x}", expected)
 
     def _read(self, body: bytes, lay: Layout) -> tuple[State, Side]:
         coder, state = Coder.reader(body), State(lay)
@@ -292,6 +302,27 @@ class EmbCodec:
         plane = enhanced(plain.plane, plain.mean, plain.situation, self.model)
         grey = (plane + transform.UNIT // 2) // transform.UNIT + plain.mean
         return np.clip(grey, 0, 255).astype(np.uint8)
+
+
+def _beside(errors: dict[int, int]) -> int:
+    """The step to try next: beside the best so far, on the side where the error is less, as far as that is known.
+
+    The error is much like a wave over the steps: eight of them halve the threshold, and so come back to the first.
+    """
+    count = len(STEPS)
+    for step in sorted(errors, key=lambda tried: (errors[tried], tried)):
+        sides = [(step + way) % count for way in (-1, 1) if (step + way) % count not in errors]
+        if sides:
+            return min(sides, key=lambda side: _mean([errors[n] for n in _neighbours(side, count) if n in errors]))
+    raise StreamError("codec emb", "steps", sorted(errors), f"fewer than all {count}")
+
+
+def _neighbours(step: int, count: int) -> tuple[int, int]:
+    return (step - 1) % count, (step + 1) % count
+
+
+def _mean(values: list[int]) -> int:
+    return sum(values) // len(values)
 
 
 def _usable(body: bytes, received: Mask | None) -> tuple[bytes, tuple[str, ...]]:

@@ -48,7 +48,7 @@ class Coder:
     good: npt.NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
     curve: I64 = field(default_factory=lambda: np.zeros(1, np.int64))
     rows: npt.NDArray[np.int16] = field(default_factory=lambda: np.zeros((0, kernel.FEATURES + 3), np.int16))
-    sign_rows: npt.NDArray[np.int16] = field(default_factory=lambda: np.zeros((0, kernel.SIGN_FEATURES), np.int16))
+    sign_rows: npt.NDArray[np.int16] = field(default_factory=lambda: np.zeros((0, kernel.SIGN_FEATURES + 2), np.int16))
 
     @classmethod
     def reader(cls, body: bytes) -> Coder:

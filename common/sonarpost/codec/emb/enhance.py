@@ -19,8 +19,6 @@ from sonarpost.codec.emb.transform import UNIT
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 
-DILATIONS: Final = (1, 2, 3, 1)
-"""Of the layers of 3 x 3 taps; the last one's output is the four corrections of a block."""
 LIMIT_GREY: Final = 48
 _ACTIVE_MAX: Final = 4095  # activations are 1/256
 
@@ -74,12 +72,12 @@ def enhanced(plane: I64, mean: int, situation: tuple[int, int, int], model: Mode
     grey = np.clip(padded, -mean * UNIT, (255 - mean) * UNIT)
     active = blocks_of(grey >> 4)
     rows, columns, _ = active.shape
-    for i, ((taps, bias), dilation) in enumerate(zip(model.layers, DILATIONS, strict=True)):
+    for i, ((taps, bias), dilation) in enumerate(zip(model.layers, model.dilations, strict=True)):
         total = bias
         if i == 0:
             total = (bias + np.array(situation, np.int32) @ model.situation).astype(np.int32)
         out = np.zeros((rows, columns, bias.shape[0]), np.int32)
-        _layer(active, taps, total, dilation, out, int(i < len(DILATIONS) - 1))
+        _layer(active, taps, total, dilation, out, int(i < len(model.layers) - 1))
         active = out
     # The network's output is 1/256 of 16 grey.
     change = np.clip(pixels_of(active).astype(np.int64) * (UNIT // 16), -UNIT * LIMIT_GREY, UNIT * LIMIT_GREY)

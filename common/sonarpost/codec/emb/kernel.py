@@ -38,13 +38,15 @@ WRITE, READ, LIST = 0, 1, 2
 NEAR, REFINE, ALL = 0, 1, 2
 """Kinds of pass: coefficients with something significant around them; those that are significant; all that are not."""
 
-FEATURES: Final = 50
-BAND_FEATURES: Final = 40
+FEATURES: Final = 54
+BAND_FEATURES: Final = 44
 """Features from this one on are the same for a whole band."""
-SIGN_FEATURES: Final = 14
+SIGN_ODD: Final = 51
+"""Features of a sign that turn with the picture's sign; the others do not."""
+SIGN_FEATURES: Final = 61
 HIDDEN_1: Final = 32
 HIDDEN_2: Final = 16
-SIGN_HIDDEN: Final = 8
+SIGN_HIDDEN: Final = 32
 CAP: Final = 48
 """Largest magnitude that a context shows: 6 thresholds, in eighths."""
 LOGIT_LIMIT: Final = 3071
@@ -53,10 +55,13 @@ CENTRE_COLUMNS: Final = 24
 """Columns of the table of centres: logits from -9 up, in halves."""
 _CENTRE_SHIFT: Final = 2304
 _LIVE_LIMIT: Final = 1 << 34
+_INVERSE_BITS: Final = 54
 # A coefficient whose logit was so far below a pass's least when last looked at is not looked at again in that pass:
 # one that this plane has looked at already, and one that it has not (its chance grows as the threshold is halved).
 _SKIP_NEAR: Final = 384
 _SKIP_FAR: Final = 896
+
+_AROUND: Final = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 
 # The coder's state.
 CODER_LOW, CODER_RANGE, CODER_LENGTH, CODER_CODE, CODER_UNSURE, CODER_AT, CODER_STOP, CODER_EVENTS = range(8)
@@ -192,9 +197,11 @@ def _clip(value: int, limit: int) -> int:
 @compiled
 def _log2_eighths(value: int) -> int:
     """8 log2(value) for value >= 1, linear between powers of two."""
-    power = 0
-    while value >> (power + 1):
-        power += 1
+    power, rest = 0, value
+    for step in (32, 16, 8, 4, 2, 1):
+        if rest >> step:
+            power += step
+            rest >>= step
     return int(8 * power + ((value << 3) >> power) - 8)
 
 
@@ -241,8 +248,29 @@ def _is_near(seen: I32, bands: I32, row: int, y: int, x: int, at: int) -> bool:
 
 
 @compiled
-def _context(  # noqa: C901, PLR0912, PLR0915  a list of 40 features, one after the other
-    f: I32, seen: I32, lows: I32, bands: I32, low_width: int, threshold: int, row: int, y: int, x: int, at: int
+def _thresholds(size: int, threshold: int, inverse: int) -> int:
+    """min(size // threshold, CAP) without a division: `inverse` is 2^54 // threshold + 1.
+
+    Exact, since what is multiplied is less than 48 thresholds, and 48 times the largest threshold squared is less than
+    2^54.
+    """
+    return int((size * inverse) >> _INVERSE_BITS) if size < CAP * threshold else CAP
+
+
+@compiled
+def _context(  # noqa: C901, PLR0912, PLR0915  a list of 44 features, one after the other
+    f: I32,
+    seen: I32,
+    still: I32,
+    lows: I32,
+    bands: I32,
+    low_width: int,
+    threshold: int,
+    inverse: int,
+    row: int,
+    y: int,
+    x: int,
+    at: int,
 ) -> None:
     """Fill in the features of one coefficient; those of its band stand already at the end."""
     stride = bands[row, STRIDE]
@@ -260,6 +288,9 @@ def _context(  # noqa: C901, PLR0912, PLR0915  a list of 40 features, one after 
     f[13] = (ring - seen[at]) >> 2
     for i in range(14, BAND_FEATURES):
         f[i] = 0
+    f[40] = min(min(y, bands[row, HEIGHT] - 1 - y), 6) * 4
+    f[41] = min(min(x, bands[row, WIDTH] - 1 - x), 6) * 4
+    f[42] = _box(still, at, stride) * 6
     if bands[row, ORIENT] == LL:
         f[31], f[32] = min(y, 8) * 4, min(x, 8) * 4
         f[33] = 32 if y == 0 and x == 0 else 0
@@ -270,6 +301,7 @@ def _context(  # noqa: C901, PLR0912, PLR0915  a list of 40 features, one after 
         if cell >= 0:
             width = bands[parent, STRIDE]
             f[14], f[15] = seen[cell], _box(seen, cell, width) >> 1
+            f[43] += still[cell] * 16
             f[16], f[17] = seen[cell - 1] + seen[cell + 1], seen[cell - width] + seen[cell + width]
             # The parent's neighbour on the side this coefficient lies on.
             f[18] = seen[cell + (1 if x & 1 else -1)]
@@ -284,6 +316,7 @@ def _context(  # noqa: C901, PLR0912, PLR0915  a list of 40 features, one after 
         if sibling >= 0:
             cell = bands[sibling, OFFSET] + y * bands[sibling, STRIDE] + x
             f[22 + 2 * k], f[23 + 2 * k] = seen[cell], _box(seen, cell, bands[sibling, STRIDE]) >> 1
+            f[43] += still[cell] * 16
         following = bands[row, NEXT_1 + k]
         if following >= 0:
             cell = _relative(bands, following, y, x)
@@ -306,9 +339,9 @@ def _context(  # noqa: C901, PLR0912, PLR0915  a list of 40 features, one after 
     f[27] = min(_log2_eighths(grey), 120) - 80
     across = abs(lows[here + 1] - lows[here - 1])
     along = abs(lows[here + low_stride] - lows[here - low_stride])
-    f[28], f[29] = min(across * 4 // threshold, CAP), min(along * 4 // threshold, CAP)
+    f[28], f[29] = _thresholds(across * 4, threshold, inverse), _thresholds(along * 4, threshold, inverse)
     bend = abs(4 * lows[here] - lows[here + 1] - lows[here - 1] - lows[here + low_stride] - lows[here - low_stride])
-    f[30] = min(bend * 2 // threshold, CAP)
+    f[30] = _thresholds(bend * 2, threshold, inverse)
     around = lows[here + 1] + lows[here - 1] + lows[here + low_stride] + lows[here - low_stride]
     f[31] = min(_log2_eighths(max(around >> (level + 2), 256)), 120) - 80
 
@@ -316,20 +349,25 @@ def _context(  # noqa: C901, PLR0912, PLR0915  a list of 40 features, one after 
 @compiled
 def _logit(f: I32, base: I32, w1: I32, w2: I32, b2: I32, live: I64, h1: I32, h2: I32) -> int:
     """Run the network: features, two hidden layers, one output in 1/256. Leaves the last hidden layer in `h2`."""
-    for j in range(h1.shape[0]):
+    for j in range(HIDDEN_1):
         h1[j] = base[j]
-    for i in range(BAND_FEATURES):
-        value = f[i]
-        if value != 0:
-            for j in range(h1.shape[0]):
-                h1[j] += value * w1[i, j]
-    for j in range(h2.shape[0]):
+    for i in range(0, BAND_FEATURES, 4):  # several rows at a time: fewer loads and stores
+        p, q, r, s = f[i], f[i + 1], f[i + 2], f[i + 3]
+        if (p | q | r | s) != 0:
+            for j in range(HIDDEN_1):
+                h1[j] += p * w1[i, j] + q * w1[i + 1, j] + r * w1[i + 2, j] + s * w1[i + 3, j]
+    for j in range(HIDDEN_2):
         h2[j] = b2[j]
-    for i in range(h1.shape[0]):
-        value = min(max(h1[i] >> 6, 0), 4095)
-        if value != 0:
-            for j in range(h2.shape[0]):
-                h2[j] += value * w2[i, j]
+    for j in range(HIDDEN_1):
+        h1[j] = min(max(h1[j] >> 6, 0), 4095)
+    for i in range(0, HIDDEN_1, 8):
+        p, q, r, s = h1[i], h1[i + 1], h1[i + 2], h1[i + 3]
+        t, u, v, w = h1[i + 4], h1[i + 5], h1[i + 6], h1[i + 7]
+        for j in range(HIDDEN_2):
+            h2[j] += (
+                p * w2[i, j] + q * w2[i + 1, j] + r * w2[i + 2, j] + s * w2[i + 3, j]
+                + t * w2[i + 4, j] + u * w2[i + 5, j] + v * w2[i + 6, j] + w * w2[i + 7, j]
+            )  # fmt: skip
     total = np.int64(live[HIDDEN_2]) * 256
     for i in range(h2.shape[0]):
         h2[i] = min(max(h2[i] >> 12, 0), 4095)
@@ -360,31 +398,78 @@ def band_base(f: I32, w1: I32, b1: I32, base: I32) -> None:
 
 
 @compiled
-def _sign_context(
+def _cross(f: I32, first: int, signed: I32, at: int, stride: int) -> None:
+    """A signed coefficient and its neighbours left, right, above, below."""
+    f[first] = signed[at]
+    f[first + 1], f[first + 2] = signed[at - 1], signed[at + 1]
+    f[first + 3], f[first + 4] = signed[at - stride], signed[at + stride]
+
+
+@compiled
+def _corners(f: I32, first: int, signed: I32, at: int, stride: int) -> None:
+    """The four diagonal neighbours of a signed coefficient."""
+    f[first], f[first + 1] = signed[at - stride - 1], signed[at - stride + 1]
+    f[first + 2], f[first + 3] = signed[at + stride - 1], signed[at + stride + 1]
+
+
+@compiled
+def _sign_context(  # noqa: PLR0915  a list of 63 features, one after the other
     f: I32, signed: I32, lows: I32, bands: I32, low_width: int, threshold: int, row: int, y: int, x: int, at: int
 ) -> None:
-    """Signed surroundings of a coefficient."""
-    stride = bands[row, STRIDE]
+    """Signed surroundings of a coefficient, which turn with the picture's sign; and where it is, which does not."""
+    stride, level = bands[row, STRIDE], bands[row, LEVEL]
+    for i in range(SIGN_FEATURES):
+        f[i] = 0
     f[0], f[1] = signed[at - 1], signed[at + 1]
     f[2], f[3] = signed[at - stride], signed[at + stride]
-    f[4], f[5] = signed[at - stride - 1] - signed[at - stride + 1], signed[at + stride + 1] - signed[at + stride - 1]
-    f[6] = 0
-    for i in range(7, 11):
-        f[i] = 0
-    if bands[row, ORIENT] == LL:
-        return
-    parent = bands[row, PARENT]
-    if parent >= 0:
-        cell = _relative(bands, parent, y >> 1, x >> 1)
-        if cell >= 0:
-            f[6] = signed[cell]
-    low_stride = low_width + 2
-    here = bands[row, LOW] + (y + 1) * low_stride + x + 1
-    middle = 2 * lows[here]
-    f[7] = _clip((lows[here + 1] - lows[here - 1]) * 4 // threshold, CAP)
-    f[8] = _clip((lows[here + low_stride] - lows[here - low_stride]) * 4 // threshold, CAP)
-    f[9] = _clip((lows[here + 1] + lows[here - 1] - middle) * 4 // threshold, CAP)
-    f[10] = _clip((lows[here + low_stride] + lows[here - low_stride] - middle) * 4 // threshold, CAP)
+    _corners(f, 11, signed, at, stride)
+    f[4], f[5] = f[11] - f[12], f[14] - f[13]
+    f[15], f[16], f[17], f[18] = signed[at - 2], signed[at + 2], signed[at - 2 * stride], signed[at + 2 * stride]
+    f[SIGN_ODD], f[SIGN_ODD + 1] = (x & 1) * 16, (y & 1) * 16
+    f[SIGN_ODD + 2], f[SIGN_ODD + 3] = min(y, 8) * 2, min(x, 8) * 2
+    f[SIGN_ODD + 3 + min(level, 5)] = 16
+    if bands[row, ORIENT] != LL:
+        parent = bands[row, PARENT]
+        if parent >= 0:
+            cell = _relative(bands, parent, y >> 1, x >> 1)
+            if cell >= 0:
+                width = bands[parent, STRIDE]
+                f[6] = signed[cell]
+                f[19], f[20] = signed[cell - 1], signed[cell + 1]
+                f[21], f[22] = signed[cell - width], signed[cell + width]
+                _corners(f, 23, signed, cell, width)
+        for k in range(2):
+            sibling, following, cousin = bands[row, SIBLING_1 + k], bands[row, NEXT_1 + k], bands[row, COUSIN_1 + k]
+            if sibling >= 0:
+                width = bands[sibling, STRIDE]
+                _cross(f, 27 + 5 * k, signed, bands[sibling, OFFSET] + y * width + x, width)
+            if following >= 0:
+                cell = _relative(bands, following, y, x)
+                if cell >= 0:
+                    _cross(f, 27 + 5 * k, signed, cell, bands[following, STRIDE])
+            if cousin >= 0:
+                cell = _relative(bands, cousin, y >> 1, x >> 1)
+                if cell >= 0:
+                    f[37 + k] = signed[cell]
+        child = bands[row, CHILD]
+        if child >= 0:
+            cell = bands[child, OFFSET] + 2 * y * bands[child, STRIDE] + 2 * x
+            below = cell + bands[child, STRIDE]
+            f[39], f[40], f[41], f[42] = signed[cell], signed[cell + 1], signed[below], signed[below + 1]
+        low_stride = low_width + 2
+        here = bands[row, LOW] + (y + 1) * low_stride + x + 1
+        for i in range(8):
+            beside = here + _AROUND[i][0] * low_stride + _AROUND[i][1]
+            f[43 + i] = _clip((lows[beside] - lows[here]) * 4 // threshold, CAP)
+        f[7] = _clip((lows[here + 1] - lows[here - 1]) * 4 // threshold, CAP)
+        f[8] = _clip((lows[here + low_stride] - lows[here - low_stride]) * 4 // threshold, CAP)
+        f[9] = _clip((lows[here + 1] + lows[here - 1] - 2 * lows[here]) * 4 // threshold, CAP)
+        f[10] = _clip((lows[here + low_stride] + lows[here - low_stride] - 2 * lows[here]) * 4 // threshold, CAP)
+    known = 0
+    for i in range(6):
+        if f[i] != 0:
+            known += 4
+    f[SIGN_ODD + 9] = known
 
 
 @compiled
@@ -395,14 +480,16 @@ def _active(total: int) -> int:
 
 @compiled
 def _sign_logit(f: I32, base: I32, w1: I32, w2: I32, orient: int) -> int:
-    """An odd function of the features: with all signs turned the logit turns. A small network a band orientation."""
+    """An odd function of the odd features: with all signs turned the logit turns. A network a band orientation."""
+    turn, even = np.zeros(SIGN_HIDDEN, np.int32), base.copy()
+    for i in range(SIGN_FEATURES):
+        if f[i] != 0:
+            into = turn if i < SIGN_ODD else even
+            for j in range(SIGN_HIDDEN):
+                into[j] += f[i] * w1[orient, i, j]
     total = np.int64(0)
     for j in range(SIGN_HIDDEN):
-        turn = np.int64(0)
-        for i in range(11):
-            turn += f[i] * w1[orient, i, j]
-        forth, back = base[j] + turn, base[j] - turn
-        total += (_active(forth) - _active(back)) * w2[orient, j]
+        total += np.int64(_active(even[j] + turn[j]) - _active(even[j] - turn[j])) * w2[orient, j]
     return _clip(int(total >> 12), LOGIT_LIMIT)
 
 
@@ -444,13 +531,13 @@ def _list_decision(rows: I16, coder: I64, f: I32, bit: int, net: int, share: int
 
 
 @compiled
-def _list_sign(rows: I16, coder: I64, f: I32, orient: int, sign: int, level: int) -> None:
+def _list_sign(rows: I16, coder: I64, f: I32, orient: int, sign: int) -> None:
     n = coder[CODER_SIGN_ROWS]
     if n >= rows.shape[0]:
         return
     for i in range(SIGN_FEATURES):
         rows[n, i] = f[i]
-    rows[n, 11], rows[n, 12], rows[n, 13] = orient, sign, level
+    rows[n, SIGN_FEATURES], rows[n, SIGN_FEATURES + 1] = orient, sign
     coder[CODER_SIGN_ROWS] = n + 1
 
 
@@ -487,7 +574,7 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
     lows: I32,
     f: I32,
     bases: I32,
-    known: tuple[I32, I32, I32, I32, I32, I32, I32],
+    known: tuple[I32, I32, I32, I32, I32, I32, I32, I32],
     nets: tuple[I32, I32, I32, I64],
     sign_nets: tuple[I32, I32, I32],
     tables: tuple[I32, I32, I32],
@@ -513,7 +600,8 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
         bases: Shape (2, HIDDEN_1): first-layer sums that are the band's; first axis as in `nets`.
         known: Lower bounds of the magnitudes, 0 where not significant; how far above the magnitude may lie; signs;
             magnitudes in eighths of the threshold, at most CAP; the same with sign; the plane that decided last, or
-            minus the plane that looked last; the logit of the last decision or look.
+            minus the plane that looked last; the logit of the last decision or look; 1 where this plane decided that
+            a coefficient is still not significant.
         nets: Weights w1, w2, b2, and the last layer's w3 and b3 as they have been learned in this picture, 1/2^28
             (see `_learn`); first axis 0 for significance and 1 for refinement.
         sign_nets: Weights w1, b1, w2; first axis the band's orientation.
@@ -523,13 +611,14 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
             the picture's own coefficients, flat, that it is an error of.
         lists: Examples of decisions and of signs (LIST).
     """
-    values, widths, signs, seen, signed, marks, odds = known
+    values, widths, signs, seen, signed, marks, odds, still = known
     w1, w2, b2, live = nets
     sign_w1, sign_b1, sign_w2 = sign_nets
     chances, costs, centres = tables
     coder, data, good, curve, plain = stream
     stride, orient, level = bands[row, STRIDE], bands[row, ORIENT], bands[row, LEVEL]
     h1, h2, fs = np.zeros(HIDDEN_1, np.int32), np.zeros(HIDDEN_2, np.int32), np.zeros(SIGN_FEATURES, np.int32)
+    inverse = (1 << _INVERSE_BITS) // np.int64(threshold) + 1
     share = 12 if level == 1 else 4 if level == 2 else 1
     net = 1 if kind == REFINE else 0
     for y in range(bands[row, HEIGHT]):
@@ -544,7 +633,7 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
                 continue
             magnitude = abs(targets[at])
             bit = 1 if magnitude >= values[at] + threshold else 0
-            _context(f, seen, lows, bands, low_width, threshold, row, y, x, at)
+            _context(f, seen, still, lows, bands, low_width, threshold, inverse, row, y, x, at)
             logit = _logit(f, bases[net], w1[net], w2[net], b2[net], live[net], h1, h2)
             if logit < bar:
                 marks[at], odds[at] = -plane, logit
@@ -570,7 +659,7 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
                 sign = 1 if targets[at] > 0 else 0
                 _sign_context(fs, signed, lows, bands, low_width, threshold, row, y, x, at)
                 if mode == LIST:
-                    _list_sign(lists[1], coder, fs, orient, sign, level)
+                    _list_sign(lists[1], coder, fs, orient, sign)
                 else:
                     slope = _sign_logit(fs, sign_b1[orient], sign_w1, sign_w2, orient)
                     sign = _transfer(mode, sign, slope, chances, costs, coder, data, good)
@@ -584,6 +673,8 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
                 after = _guess(values[at], widths[at], odds[at], centres)
                 truth = np.int64(plain[at] * signs[at])
                 curve[0] += (truth - after) ** 2 - (truth - before) ** 2
+            else:
+                still[at] = 1
             if mode == WRITE:
                 curve[min(1 + (coder[CODER_COST] >> 11), curve.shape[0] - 1)] = curve[0]
     return 0

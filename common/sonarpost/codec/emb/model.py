@@ -1,7 +1,8 @@
 """The trained model: integer weights of the networks, reconstruction points and tables.
 
-The file, `data/emb.model`, is a magic word and then arrays of fixed shapes and types, little-endian, one after
-the other (`ARRAYS`). Its sha256 is the model's identity. `training/emb` makes it.
+A model file is a magic word, which says which form it has, and then the form's arrays of fixed shapes and types,
+little-endian, one after the other (`FORMS`). Its sha256 is the model's identity. `training/emb` makes it. Models of
+earlier releases stay in the package, so that their streams decode for ever: what their networks do not have is zero.
 """
 
 from __future__ import annotations
@@ -19,35 +20,63 @@ from sonarpost.codec.emb import kernel as k
 from sonarpost.errors import StreamError
 
 I32 = npt.NDArray[np.int32]
-MAGIC = b"SPEMB1\n"
+Arrays = tuple[tuple[str, tuple[int, ...], str], ...]
 
-CHANNELS: Final = 24
 GLOBALS: Final = 3
-LAYERS: Final = ((4, CHANNELS), *((CHANNELS, CHANNELS),) * 2, (CHANNELS, 4))
-"""Channels in and out of the enhancer's layers."""
+CHANNELS: Final = 24
+DILATIONS: Final = (1, 2, 3, 1)
+SHIPPED: Final = ("emb-2.model", "emb.model")
+"""Model files of the package; the first is the one that encodes."""
 
-# Name, shape and type in the file, in order.
-ARRAYS: tuple[tuple[str, tuple[int, ...], str], ...] = (
-    ("w1", (2, k.FEATURES, k.HIDDEN_1), "<i2"),
-    ("b1", (2, k.HIDDEN_1), "<i4"),
-    ("w2", (2, k.HIDDEN_1, k.HIDDEN_2), "<i2"),
-    ("b2", (2, k.HIDDEN_2), "<i4"),
-    ("w3", (2, k.HIDDEN_2), "<i2"),
-    ("b3", (2,), "<i4"),
-    ("sign_w1", (4, 11, k.SIGN_HIDDEN), "<i2"),
-    ("sign_b1", (4, k.SIGN_HIDDEN), "<i4"),
-    ("sign_w2", (4, k.SIGN_HIDDEN), "<i2"),
-    ("chances", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
-    ("costs", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
-    ("centres", (4, k.CENTRE_COLUMNS), "<i2"),
-    ("mean_tree", (64,), "<u2"),
-    ("situation", (GLOBALS, CHANNELS), "<i4"),
-    *(
-        (f"{kind}{i}", shape, number)
-        for i, (inputs, outputs) in enumerate(LAYERS)
-        for kind, shape, number in (("taps", (9, inputs, outputs), "<i2"), ("bias", (outputs,), "<i4"))
-    ),
+
+def _arrays(features: int, sign_features: int, sign_hidden: int, channels: int, layers: int) -> Arrays:
+    """Name, shape and type in the file, in order."""
+    sides = [4, *[channels] * (layers - 1), 4]
+    return (
+        ("w1", (2, features, k.HIDDEN_1), "<i2"),
+        ("b1", (2, k.HIDDEN_1), "<i4"),
+        ("w2", (2, k.HIDDEN_1, k.HIDDEN_2), "<i2"),
+        ("b2", (2, k.HIDDEN_2), "<i4"),
+        ("w3", (2, k.HIDDEN_2), "<i2"),
+        ("b3", (2,), "<i4"),
+        ("sign_w1", (4, sign_features, sign_hidden), "<i2"),
+        ("sign_b1", (4, sign_hidden), "<i4"),
+        ("sign_w2", (4, sign_hidden), "<i2"),
+        ("chances", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
+        ("costs", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
+        ("centres", (4, k.CENTRE_COLUMNS), "<i2"),
+        ("mean_tree", (64,), "<u2"),
+        ("situation", (GLOBALS, channels), "<i4"),
+        *(
+            (f"{kind}{i}", shape, number)
+            for i, (inputs, outputs) in enumerate(zip(sides, sides[1:], strict=False))
+            for kind, shape, number in (("taps", (9, inputs, outputs), "<i2"), ("bias", (outputs,), "<i4"))
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class Form:
+    """What a model file holds.
+
+    Attributes:
+        magic: How it begins.
+        arrays: Name, shape and type of each array, in order.
+        dilations: Of the enhancer's layers; see `enhance`.
+    """
+
+    magic: bytes
+    arrays: Arrays
+    dilations: tuple[int, ...]
+
+
+FIRST: Final = Form(b"SPEMB1\n", _arrays(50, 11, 8, channels=24, layers=4), (1, 2, 3, 1))
+SECOND: Final = Form(
+    b"SPEMB2\n", _arrays(k.FEATURES, k.SIGN_FEATURES, k.SIGN_HIDDEN, channels=CHANNELS, layers=len(DILATIONS)), DILATIONS
 )
+FORMS: Final = (FIRST, SECOND)
+_FIRST_LOCAL: Final = 40
+"""Features of one coefficient in the first form; those of its band came after them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +90,7 @@ class Model:
         mean_tree: Probability of 1 of each decision of the mean level, by node of the binary tree.
         situation: Shape (GLOBALS, CHANNELS): the enhancer's weights of the whole picture's features.
         layers: Taps (9, in, out) and bias (out,) of the enhancer's layers.
+        dilations: Distance of the taps of each layer.
     """
 
     identity: str
@@ -79,6 +109,19 @@ class Model:
     mean_tree: I32
     situation: I32
     layers: tuple[tuple[I32, I32], ...]
+    dilations: tuple[int, ...]
+
+
+def form_of(raw: bytes, where: str = "emb model") -> Form:
+    """Return what a model file holds.
+
+    Raises:
+        StreamError: It is not one.
+    """
+    for form in FORMS:
+        if raw.startswith(form.magic):
+            return form
+    raise StreamError(where, "magic", raw[: len(SECOND.magic)], " or ".join(repr(form.magic) for form in FORMS))
 
 
 def read_arrays(raw: bytes, where: str = "emb model") -> dict[str, I32]:
@@ -87,24 +130,34 @@ def read_arrays(raw: bytes, where: str = "emb model") -> dict[str, I32]:
     Raises:
         StreamError: It is not one, or its length is wrong.
     """
-    if not raw.startswith(MAGIC):
-        raise StreamError(where, "magic", raw[: len(MAGIC)], repr(MAGIC))
-    expected = len(MAGIC) + sum(int(np.prod(shape)) * np.dtype(kind).itemsize for _, shape, kind in ARRAYS)
+    form = form_of(raw, where)
+    expected = len(form.magic) + sum(int(np.prod(shape)) * np.dtype(kind).itemsize for _, shape, kind in form.arrays)
     if len(raw) != expected:
         raise StreamError(where, "length", len(raw), f"{expected} bytes")
-    arrays, at = {}, len(MAGIC)
-    for name, shape, kind in ARRAYS:
+    arrays, at = {}, len(form.magic)
+    for name, shape, kind in form.arrays:
         count = int(np.prod(shape))
         arrays[name] = np.frombuffer(raw, kind, count, at).reshape(shape).astype(np.int32)
         at += count * np.dtype(kind).itemsize
     return arrays
 
 
-def model_of(arrays: dict[str, I32], identity: str = "") -> Model:
-    """Make a model of its arrays."""
+def model_of(arrays: dict[str, I32], identity: str = "", dilations: tuple[int, ...] = DILATIONS) -> Model:
+    """Make a model of its arrays, of either form."""
     plain = {name: array for name, array in arrays.items() if name[:4] not in ("taps", "bias")}
-    layers = tuple((arrays[f"taps{i}"], arrays[f"bias{i}"]) for i in range(len(LAYERS)))
-    return Model(identity=identity, layers=layers, **plain)
+    plain["w1"] = _with_rows(plain["w1"], _FIRST_LOCAL, k.FEATURES)
+    plain["sign_w1"] = _with_rows(plain["sign_w1"], plain["sign_w1"].shape[1], k.SIGN_FEATURES)
+    for name in ("sign_w1", "sign_b1", "sign_w2"):
+        missing = k.SIGN_HIDDEN - plain[name].shape[-1]
+        plain[name] = np.pad(plain[name], [(0, 0)] * (plain[name].ndim - 1) + [(0, missing)])
+    layers = tuple((arrays[f"taps{i}"], arrays[f"bias{i}"]) for i in range(len(dilations)))
+    return Model(identity=identity, layers=layers, dilations=dilations, **plain)
+
+
+def _with_rows(weights: I32, at: int, rows: int) -> I32:
+    """Insert weights of zero for features that the network does not have; its second axis is made `rows` long."""
+    missing = np.zeros((weights.shape[0], rows - weights.shape[1], weights.shape[2]), np.int32)
+    return np.concatenate([weights[:, :at], missing, weights[:, at:]], axis=1)
 
 
 def parse(raw: bytes, where: str = "emb model") -> Model:
@@ -113,10 +166,17 @@ def parse(raw: bytes, where: str = "emb model") -> Model:
     Raises:
         StreamError: It is not one, or its length is wrong.
     """
-    return model_of(read_arrays(raw, where), hashlib.sha256(raw).hexdigest())
+    dilations = form_of(raw, where).dilations
+    return model_of(read_arrays(raw, where), hashlib.sha256(raw).hexdigest(), dilations)
 
 
 @cache
+def all_shipped() -> tuple[Model, ...]:
+    """Return the models that come with the package, the one that encodes first."""
+    data = files("sonarpost.codec").joinpath("data")
+    return tuple(parse(data.joinpath(name).read_bytes(), name) for name in SHIPPED)
+
+
 def shipped() -> Model:
-    """Return the model that comes with the package."""
-    return parse(files("sonarpost.codec").joinpath("data", "emb.model").read_bytes())
+    """Return the model that encodes."""
+    return all_shipped()[0]

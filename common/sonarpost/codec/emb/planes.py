@@ -57,7 +57,8 @@ def code_planes(
     bands, widths = lay.bands.tolist(), lay.sides[:, 1].tolist()  # plain numbers are ten times faster to work with
     features = np.zeros(kernel.FEATURES, np.int32)
     base = np.zeros((2, kernel.HIDDEN_1), np.int32)
-    known = (state.values, state.widths, state.signs, state.seen, state.signed, state.marks, state.odds)
+    still = np.zeros(lay.cells, np.int32)
+    known = (state.values, state.widths, state.signs, state.seen, state.signed, state.marks, state.odds, still)
     nets = (model.w1, model.w2, model.b2, _last_layer(model))
     sign_nets, tables = (model.sign_w1, model.sign_b1, model.sign_w2), (model.chances, model.costs, model.centres)
     stream = (coder.words, coder.data, coder.good, coder.curve, targets if plain is None else plain)
@@ -66,6 +67,7 @@ def code_planes(
         threshold = (STEPS[side.step] << side.extra) >> (plane + side.extra)
         state.threshold, number = threshold, plane + side.extra + 1
         kernel.refresh(state.values, state.widths, state.signs, state.seen, state.signed, threshold)
+        still[:] = 0
         rows = [i for i, band in enumerate(bands) if plane >= _FIRST_PLANE.get(band[LEVEL], -side.extra)]
         finest = min(bands[i][LEVEL] for i in rows)
         lows = low_pictures(state, model, side, finest)
