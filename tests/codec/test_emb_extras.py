@@ -22,8 +22,8 @@ from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import StreamError
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "emb"
-PLAIN, FITTED = GOLDEN / "streams.json", GOLDEN / "streams_fitted.json"
-"""Of the encoder that told the plain coefficients, and of that which fits them to the picture."""
+PLAIN, FITTED, SECOND = (GOLDEN / name for name in ("streams.json", "streams_fitted.json", "streams_second.json"))
+"""Of the encoder that told the plain coefficients, of that which fits them to the picture, and of the second model."""
 CODEC = EmbCodec()
 
 
