@@ -9,9 +9,11 @@ from hypothesis import strategies as st
 
 from sonarpost.codec.emb import fit, transform
 from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.codec.emb.fit import Wanted
 from sonarpost.codec.emb.layout import layout
 from sonarpost.codec.emb.region import OUTSIDE, weights
-from sonarpost.codec.emb.side import Box
+from sonarpost.codec.emb.search import Writer, Written, beside
+from sonarpost.codec.emb.side import Box, Side
 from sonarpost.codec.interface import Extensible, StreamHeader
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import StreamError
@@ -125,14 +127,43 @@ def test_what_cannot_go_on_stays_or_is_refused() -> None:
 
 
 def test_going_on_leaves_out_what_is_not_known() -> None:
-    image = contact(64, 56)
-    known = np.ones(image.shape, np.bool_)
-    known[:, 40:] = False
-    holed = np.where(known, image, 0).astype(np.uint8)
-    stream = CODEC.encode_with_estimate(holed, 60, known=known).stream
-    error = []
-    for mask in (known, None):
-        longer = CODEC.extend(stream, holed, 120, known=mask)
-        assert len(longer) == 120
-        error.append(((CODEC.decode(longer).image.astype(float) - image)[known] ** 2).mean())
+    error = np.zeros(2)
+    for seed in range(6):
+        image = contact(64, 56, seed)
+        known = np.ones(image.shape, np.bool_)
+        known[:, 40:] = False
+        holed = np.where(known, image, 0).astype(np.uint8)
+        stream = CODEC.encode_with_estimate(holed, 60, known=known).stream
+        for i, mask in enumerate((known, None)):
+            longer = CODEC.extend(stream, holed, 120, known=mask)
+            assert len(longer) == 120
+            error[i] += ((CODEC.decode(longer).image.astype(float) - image)[known] ** 2).mean()
     assert error[0] < 0.97 * error[1]
+
+
+def test_the_search_goes_to_the_better_side_of_the_best_step() -> None:
+    """Steps are a circle: eight of them halve the threshold."""
+    assert beside({0: 10, 2: 5, 4: 8, 6: 9}) == 3
+    assert beside({0: 5, 2: 9, 4: 10, 6: 6}) == 7
+    assert beside({0: 5, 4: 9}) in (1, 7)
+    assert beside({0: 5, 1: 6, 7: 4, 4: 9}) == 6
+    assert beside({step: 10 - step for step in range(7)}) == 7
+    assert beside({step: abs(step - 3) for step in range(8)}) == 3
+
+
+@pytest.mark.parametrize(("budget", "tries"), [(40, 5), (200, 4), (400, 4)])
+def test_a_searched_step_is_the_best_of_those_tried(budget: int, tries: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[tuple[int, int]] = []
+    write = Writer.write
+
+    def watched(self: Writer, wanted: Wanted, side: Side) -> Written:
+        written = write(self, wanted, side)
+        tried.append((written.error, side.step))
+        return written
+
+    monkeypatch.setattr(Writer, "write", watched)
+    image = contact()
+    stream = EmbCodec().encode(image, budget)
+    assert len({step for _, step in tried}) == len(tried) == tries
+    assert EmbCodec().read_state(stream)[1].step == min(tried)[1]
+    assert stream == EmbCodec(steps=(min(tried)[1],)).encode(image, budget)

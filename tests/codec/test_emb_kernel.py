@@ -126,7 +126,12 @@ def test_a_picture_turned_to_its_negative_has_the_other_sign(orient: int) -> Non
 @example(threshold=2880 * 64 << 6, size=48 * (2880 * 64 << 6) - 1)
 def test_sizes_in_thresholds_need_no_division(threshold: int, size: int) -> None:
     inverse = (1 << kernel._INVERSE_BITS) // threshold + 1
-    for near in (size, size // threshold * threshold, max(size // threshold * threshold - 1, 0), size % (50 * threshold)):
+    for near in (
+        size,
+        size // threshold * threshold,
+        max(size // threshold * threshold - 1, 0),
+        size % (50 * threshold),
+    ):
         assert kernel._thresholds(near, threshold, inverse) == min(near // threshold, kernel.CAP)
 
 

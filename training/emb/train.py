@@ -180,7 +180,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--pictures", type=int, default=1000)
     parser.add_argument("--steps", type=int, default=5000)
-    parser.add_argument("--order", type=Path, help="model whose contexts order the coefficients, and whose enhancer is kept")
+    parser.add_argument(
+        "--order", type=Path, help="model whose contexts order the coefficients, and whose enhancer is kept"
+    )
     args = parser.parse_args()
     rng = np.random.default_rng(SEED)
     pool = np.load(args.pool)

@@ -288,8 +288,8 @@ def _context(  # noqa: C901, PLR0912, PLR0915  a list of 44 features, one after 
     f[13] = (ring - seen[at]) >> 2
     for i in range(14, BAND_FEATURES):
         f[i] = 0
-    f[40] = min(min(y, bands[row, HEIGHT] - 1 - y), 6) * 4
-    f[41] = min(min(x, bands[row, WIDTH] - 1 - x), 6) * 4
+    f[40] = min(y, bands[row, HEIGHT] - 1 - y, 6) * 4
+    f[41] = min(x, bands[row, WIDTH] - 1 - x, 6) * 4
     f[42] = _box(still, at, stride) * 6
     if bands[row, ORIENT] == LL:
         f[31], f[32] = min(y, 8) * 4, min(x, 8) * 4
@@ -413,7 +413,7 @@ def _corners(f: I32, first: int, signed: I32, at: int, stride: int) -> None:
 
 
 @compiled
-def _sign_context(  # noqa: PLR0915  a list of 63 features, one after the other
+def _sign_context(  # noqa: C901, PLR0912  a list of 61 features, one after the other
     f: I32, signed: I32, lows: I32, bands: I32, low_width: int, threshold: int, row: int, y: int, x: int, at: int
 ) -> None:
     """Signed surroundings of a coefficient, which turn with the picture's sign; and where it is, which does not."""
@@ -618,7 +618,7 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
     coder, data, good, curve, plain = stream
     stride, orient, level = bands[row, STRIDE], bands[row, ORIENT], bands[row, LEVEL]
     h1, h2, fs = np.zeros(HIDDEN_1, np.int32), np.zeros(HIDDEN_2, np.int32), np.zeros(SIGN_FEATURES, np.int32)
-    inverse = (1 << _INVERSE_BITS) // np.int64(threshold) + 1
+    inverse = int((1 << _INVERSE_BITS) // np.int64(threshold) + 1)
     share = 12 if level == 1 else 4 if level == 2 else 1
     net = 1 if kind == REFINE else 0
     for y in range(bands[row, HEIGHT]):

@@ -11,6 +11,7 @@ import hashlib
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -49,7 +50,7 @@ def _arrays(features: int, sign_features: int, sign_hidden: int, channels: int, 
         ("situation", (GLOBALS, channels), "<i4"),
         *(
             (f"{kind}{i}", shape, number)
-            for i, (inputs, outputs) in enumerate(zip(sides, sides[1:], strict=False))
+            for i, (inputs, outputs) in enumerate(pairwise(sides))
             for kind, shape, number in (("taps", (9, inputs, outputs), "<i2"), ("bias", (outputs,), "<i4"))
         ),
     )
@@ -72,7 +73,9 @@ class Form:
 
 FIRST: Final = Form(b"SPEMB1\n", _arrays(50, 11, 8, channels=24, layers=4), (1, 2, 3, 1))
 SECOND: Final = Form(
-    b"SPEMB2\n", _arrays(k.FEATURES, k.SIGN_FEATURES, k.SIGN_HIDDEN, channels=CHANNELS, layers=len(DILATIONS)), DILATIONS
+    b"SPEMB2\n",
+    _arrays(k.FEATURES, k.SIGN_FEATURES, k.SIGN_HIDDEN, channels=CHANNELS, layers=len(DILATIONS)),
+    DILATIONS,
 )
 FORMS: Final = (FIRST, SECOND)
 _FIRST_LOCAL: Final = 40

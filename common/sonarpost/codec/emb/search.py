@@ -1,0 +1,118 @@
+"""The encoder's choice of the start step: it writes the picture with several and takes the one that shows it best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from sonarpost.codec.emb import transform
+from sonarpost.codec.emb.coder import Coder, State
+from sonarpost.codec.emb.fit import Wanted
+from sonarpost.codec.emb.model import Model
+from sonarpost.codec.emb.planes import STEPS, code_planes, extra_planes, known_plane
+from sonarpost.codec.emb.side import Box, Side, write_side
+
+I64 = npt.NDArray[np.int64]
+
+MAX_BODY_BYTES: Final = 0xFFFF
+SEARCHES: Final[tuple[tuple[int, tuple[int, ...], int], ...]] = (
+    (96, (0, 2, 4, 6), 1),
+    (319, (0, 2, 4, 6), 0),
+    (MAX_BODY_BYTES, (0, 4), 2),
+)
+"""Up to which budget which start steps are tried, and how many more beside the best of them (`beside`): as many as
+stay within 100 ms for 140 x 80 px."""
+
+
+@dataclass(frozen=True, eq=False)
+class Written:
+    """A body.
+
+    Attributes:
+        error: Squared error that stays, in the transform's units; of the coefficients where there is a region of
+            interest, whose own error weighs more, else of the picture.
+        body: The bytes.
+        curve: See `Coder.curve`.
+    """
+
+    error: int
+    body: bytes
+    curve: I64
+
+
+@dataclass(frozen=True)
+class Writer:
+    """Writes bodies of at most so many bytes.
+
+    Attributes:
+        model: The networks.
+        limit: Most bytes of a body.
+        price: See `kernel.code_band`.
+    """
+
+    model: Model
+    limit: int
+    price: int
+
+    def write(self, wanted: Wanted, side: Side) -> Written:
+        """Write a body with the start step of `side`."""
+        coder, state = Coder.writer(self.limit), State(wanted.lay)
+        coder.curve[0] = int((wanted.plain.astype(np.int64) ** 2).sum())
+        write_side(coder, self.model, side)
+        coder.record()
+        code_planes(coder, state, self.model, wanted.targets, side, self.price, plain=wanted.plain)
+        if side.box is not None:
+            return Written(int(coder.curve[0]), coder.finish(), coder.curve)
+        shown, _ = transform.inverse(known_plane(state, self.model), wanted.lay)
+        return Written(int(((wanted.plane - shown) ** 2).sum()), coder.finish(), coder.curve)
+
+    def best(
+        self,
+        wanted: Wanted,
+        mean_index: int,
+        box: Box | None,
+        grain: tuple[int, ...] | None,
+        steps: tuple[int, ...] = (),
+    ) -> Written:
+        """Write bodies with several start steps and return the one with the least error.
+
+        Args:
+            wanted: What to encode.
+            mean_index: See `Side`.
+            box: Region of interest.
+            grain: See `Side`.
+            steps: Start steps to try; none: as many as the time allows, see `SEARCHES`.
+        """
+        first, more = next((first, more) for most, first, more in SEARCHES if self.limit <= most)
+        if steps:
+            first, more = steps, 0
+        found: dict[int, Written] = {}
+        for i in range(len(first) + more):
+            step = first[i] if i < len(first) else beside({at: written.error for at, written in found.items()})
+            side = Side(mean_index, step, box, grain, extra_planes(wanted.targets, step))
+            found[step] = self.write(wanted, side)
+        return min(found.values(), key=lambda written: written.error)
+
+
+def beside(errors: dict[int, int]) -> int:
+    """Return the step to try next: beside the best so far, on the side where the error is less, if known.
+
+    The error is much like a wave over the steps: eight of them halve the threshold, and so come back to the first.
+    """
+    count = len(STEPS)
+    for step in sorted(errors, key=lambda tried: (errors[tried], tried)):
+        sides = [(step + way) % count for way in (-1, 1) if (step + way) % count not in errors]
+        if sides:
+            return min(sides, key=lambda side: _mean([errors[n] for n in _neighbours(side, count) if n in errors]))
+    return min(errors, key=lambda tried: (errors[tried], tried))  # all have been tried
+
+
+def _neighbours(step: int, count: int) -> tuple[int, int]:
+    return (step - 1) % count, (step + 1) % count
+
+
+def _mean(values: list[int]) -> int:
+    return sum(values) // len(values)
