@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from sonarpost.codec.emb import fit, transform
 from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.codec.emb.coder import Coder
 from sonarpost.codec.emb.fit import Wanted
 from sonarpost.codec.emb.layout import layout
 from sonarpost.codec.emb.region import OUTSIDE, weights
@@ -90,17 +91,54 @@ def test_the_box_weighs_in_both() -> None:
 @pytest.mark.parametrize("short", [12, 22, 64, 100])
 def test_a_stream_goes_on_as_it_began(short: int) -> None:
     assert isinstance(CODEC, Extensible)
-    went_on = 0
     for seed in range(4):
         image = contact(64, 56, seed)
         stream = CODEC.encode(image, short)
         longer = CODEC.extend(stream, image, 2 * short)
         assert longer.startswith(stream[:-1])
-        if longer != stream:
-            assert len(longer) == 2 * short
-            assert psnr_db(image, CODEC.decode(longer).image) > psnr_db(image, CODEC.decode(stream).image) + 0.1
-            went_on += 1
-    assert went_on >= 3
+        assert len(longer) == 2 * short
+        assert psnr_db(image, CODEC.decode(longer).image) > psnr_db(image, CODEC.decode(stream).image) + 0.1
+
+
+def test_what_is_written_after_a_beginning_leaves_it_as_it_is() -> None:
+    """Also where what comes next would lie beyond the number that the beginning ends in."""
+    turned = 0
+    for seed in range(600):
+        rng = np.random.default_rng(seed)
+        bits = rng.integers(0, 2, 200).tolist()
+        chances = rng.integers(6, 65530, 200).tolist()
+        short = Coder.writer(int(rng.integers(3, 9)))
+        for bit, chance in zip(bits, chances, strict=True):
+            if short.plain(bit, chance) < 0:
+                break
+        begin = short.finish()
+        reader, said = Coder.reader(begin), []
+        for chance in chances:
+            said.append(reader.plain(0, chance))
+            if said[-1] < 0:
+                break
+        known = len(said) - 1  # the bytes may happen to say more than was written
+        longer = Coder.writer(40, begin[:-1])
+        assert [longer.plain(bit, chance) for bit, chance in zip(said[:-1], chances, strict=False)] == said[:-1]
+        wanted = rng.integers(0, 2, 60).tolist()
+        after = [longer.plain(bit, chance) for bit, chance in zip(wanted, chances[known:], strict=False)]
+        turned += sum(a != b for a, b in zip(after, wanted, strict=False) if a >= 0)
+        body = longer.finish()
+        assert body.startswith(begin[:-1])
+        reader = Coder.reader(body)
+        assert [reader.plain(0, chance) for chance in chances[:known]] == said[:-1]
+        again = [reader.plain(0, chance) for chance, bit in zip(chances[known:], after, strict=False) if bit >= 0]
+        assert again == [bit for bit in after if bit >= 0]
+    assert turned >= 3
+
+
+@pytest.mark.parametrize("budget", range(9, 16))
+def test_the_least_budgets_with_a_box_hold(budget: int) -> None:
+    """What is said before the first coefficient may be all there is room for."""
+    image = contact(33, 48)
+    stream = CODEC.encode_with_estimate(image, budget, box=Box(3, 3, 8, 9)).stream
+    assert len(stream) <= budget
+    assert CODEC.decode(stream).image.shape == image.shape
 
 
 @given(seed=st.integers(0, 1000), short=st.integers(9, 60), more=st.integers(0, 60), box=st.booleans())

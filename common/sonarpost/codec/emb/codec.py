@@ -148,8 +148,7 @@ class EmbCodec:
             known: As `encode_with_estimate` had it.
 
         Returns:
-            The longer stream; `stream` itself where there is none: it said all there is to say, or (seldom) the number
-            that its bytes write is rounded up across more than a byte.
+            The longer stream; `stream` itself where there is none: it said all there is to say.
 
         Raises:
             StreamError: As `encode` and `decode`; the picture has another size than the stream says.
@@ -166,7 +165,7 @@ class EmbCodec:
         plane = (picture.astype(np.int64) - side.mean) * transform.UNIT
         wanted = wanted_of(plane, state.lay, weights(state.lay, side.box), limit)
         wanted = replace(wanted, targets=held(wanted.targets, state, side))
-        longer = header.pack() + Writer(model, limit, price=0).write(wanted, side).body
+        longer = header.pack() + Writer(model, limit, 0, stream[header.size : -1]).write(wanted, side).body
         return longer if len(longer) > len(stream) and longer.startswith(stream[:-1]) else stream
 
     def decode(self, stream: bytes, received: Mask | None = None) -> Decoded:

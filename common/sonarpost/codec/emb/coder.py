@@ -58,18 +58,24 @@ class Coder:
         return coder
 
     @classmethod
-    def writer(cls, limit_bytes: int) -> Coder:
-        """Write a body of at most `limit_bytes`."""
+    def writer(cls, limit_bytes: int, begin: bytes = b"") -> Coder:
+        """Write a body of at most `limit_bytes` that begins with `begin`.
+
+        What is written first must be what `begin` says; the decisions after that are turned where they would change it.
+        """
         coder = cls(kernel.WRITE, np.zeros(limit_bytes + 8, np.uint8))
         coder.good = np.zeros(limit_bytes, np.uint8)
         coder.curve = np.full(limit_bytes + 2, -1, np.int64)
         coder.words[kernel.CODER_RANGE] = (1 << 32) - 1
         coder.words[kernel.CODER_LIMIT] = limit_bytes
+        coder.words[kernel.CODER_HELD] = len(begin)
+        coder.good[: len(begin)] = np.frombuffer(begin, np.uint8)
         return coder
 
     def record(self) -> None:
         """Note that the squared error so far is that of the bytes so far."""
-        self.curve[1 + (int(self.words[kernel.CODER_COST]) >> 11)] = self.curve[0]
+        at = 1 + (int(self.words[kernel.CODER_COST]) >> 11)
+        self.curve[min(at, len(self.curve) - 1)] = self.curve[0]
 
     def finish(self) -> bytes:
         """Return the shortest body that tells everything that was written and fits the budget."""

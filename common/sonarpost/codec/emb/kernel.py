@@ -65,8 +65,8 @@ _AROUND: Final = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-
 
 # The coder's state.
 CODER_LOW, CODER_RANGE, CODER_LENGTH, CODER_CODE, CODER_UNSURE, CODER_AT, CODER_STOP, CODER_EVENTS = range(8)
-CODER_GOOD_EVENTS, CODER_GOOD_LENGTH, CODER_COST, CODER_ROWS, CODER_SIGN_ROWS, CODER_LIMIT = range(8, 14)
-CODER_WORDS: Final = 14
+CODER_GOOD_EVENTS, CODER_GOOD_LENGTH, CODER_COST, CODER_ROWS, CODER_SIGN_ROWS, CODER_LIMIT, CODER_HELD = range(8, 15)
+CODER_WORDS: Final = 15
 _TOP: Final = 1 << 32
 _BOTTOM: Final = 1 << 24
 
@@ -115,9 +115,39 @@ def _get(coder: I64, data: U8, chance: int) -> int:
 
 
 @compiled
-def _put(coder: I64, data: U8, good: U8, bit: int, chance: int) -> None:
-    """Write a decision. Stops where no stream of CODER_LIMIT bytes could tell it from its opposite."""
+def _held_bit(coder: I64, data: U8, good: U8, bit: int, bound: int) -> int:
+    """Return `bit`, or its opposite where only that leads to bytes that begin with the CODER_HELD first ones of `good`.
+
+    The number that the bytes write lies in [low, low + range); it must come to lie in [first, first + size).
+    """
+    length, held = coder[CODER_LENGTH], coder[CODER_HELD]
+    first, size = np.int64(0), np.int64(_TOP)
+    for i in range(held, length):
+        if data[i] != 255:  # no carry goes past it
+            return bit
+    for i in range(min(length, held)):
+        if data[i] != good[i]:
+            first = np.int64(_TOP)  # only a carry makes them the same
+    for i in range(min(held - length, 4)):
+        size >>= 8
+        first += np.int64(good[length + i]) * size
+    low, split, end = coder[CODER_LOW], coder[CODER_LOW] + bound, coder[CODER_LOW] + coder[CODER_RANGE]
+    if bit == 1 and split <= first:
+        return 0
+    if bit == 0 and split >= first + size and low < first + size and end > first:
+        return 1
+    return bit
+
+
+@compiled
+def _put(coder: I64, data: U8, good: U8, bit: int, chance: int) -> int:
+    """Write a decision, and return it as it was written (see `_held_bit`).
+
+    Stops where no stream of CODER_LIMIT bytes could tell it from its opposite.
+    """
     bound = (coder[CODER_RANGE] >> 16) * chance
+    if coder[CODER_HELD] > 0:
+        bit = _held_bit(coder, data, good, bit, bound)
     if bit:
         coder[CODER_RANGE] = bound
     else:
@@ -127,7 +157,7 @@ def _put(coder: I64, data: U8, good: U8, bit: int, chance: int) -> None:
         length = coder[CODER_LENGTH]
         if length >= coder[CODER_LIMIT]:
             coder[CODER_STOP] = 1
-            return
+            return bit
         if coder[CODER_LOW] >> 32:
             _carry(data, length)
         data[length] = (coder[CODER_LOW] >> 24) & 255
@@ -136,6 +166,7 @@ def _put(coder: I64, data: U8, good: U8, bit: int, chance: int) -> None:
         coder[CODER_RANGE] <<= 8
     coder[CODER_EVENTS] += 1
     _keep_if_whole(coder, data, good)
+    return bit
 
 
 @compiled
@@ -185,7 +216,7 @@ def code_plain(coder: I64, data: U8, good: U8, bit: int, chance: int, mode: int)
     """Write or read one decision of known chance; returns it, or -1 at the end."""
     if mode == READ:
         return _get(coder, data, chance)
-    _put(coder, data, good, bit, chance)
+    bit = _put(coder, data, good, bit, chance)
     return -1 if coder[CODER_STOP] else bit
 
 
@@ -547,7 +578,7 @@ def _transfer(mode: int, bit: int, logit: int, chances: I32, costs: I32, coder: 
     chance = chances[logit + LOGIT_LIMIT]
     if mode == READ:
         return _get(coder, data, chance)
-    _put(coder, data, good, bit, chance)
+    bit = _put(coder, data, good, bit, chance)
     coder[CODER_COST] += costs[(logit if bit else -logit) + LOGIT_LIMIT]
     return -1 if coder[CODER_STOP] else bit
 

@@ -51,15 +51,17 @@ class Writer:
         model: The networks.
         limit: Most bytes of a body.
         price: See `kernel.code_band`.
+        begin: What bodies shall begin with: all but the last byte of one that says what is written first.
     """
 
     model: Model
     limit: int
     price: int
+    begin: bytes = b""
 
     def write(self, wanted: Wanted, side: Side) -> Written:
         """Write a body with the start step of `side`."""
-        coder, state = Coder.writer(self.limit), State(wanted.lay)
+        coder, state = Coder.writer(self.limit, self.begin), State(wanted.lay)
         coder.curve[0] = int((wanted.plain.astype(np.int64) ** 2).sum())
         write_side(coder, self.model, side)
         coder.record()
