@@ -189,8 +189,20 @@ def test_the_search_goes_to_the_better_side_of_the_best_step() -> None:
     assert beside({step: abs(step - 3) for step in range(8)}) == 3
 
 
-@pytest.mark.parametrize(("budget", "tries"), [(40, 5), (200, 4), (400, 4)])
-def test_a_searched_step_is_the_best_of_those_tried(budget: int, tries: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("budget", "size", "tries"),
+    [
+        (40, (80, 80), 5),
+        (200, (80, 80), 4),
+        (400, (80, 80), 4),
+        (40, (140, 80), 5),
+        (200, (140, 80), 3),
+        (400, (140, 80), 3),
+    ],
+)
+def test_a_searched_step_is_the_best_of_those_tried(
+    budget: int, size: tuple[int, int], tries: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tried: list[tuple[int, int]] = []
     write = Writer.write
 
@@ -200,7 +212,7 @@ def test_a_searched_step_is_the_best_of_those_tried(budget: int, tries: int, mon
         return written
 
     monkeypatch.setattr(Writer, "write", watched)
-    image = contact()
+    image = contact(*size)
     stream = EmbCodec().encode(image, budget)
     assert len({step for _, step in tried}) == len(tried) == tries
     assert EmbCodec().read_state(stream)[1].step == min(tried)[1]

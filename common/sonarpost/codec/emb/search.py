@@ -14,17 +14,22 @@ from sonarpost.codec.emb.fit import Wanted
 from sonarpost.codec.emb.model import Model
 from sonarpost.codec.emb.planes import STEPS, code_planes, extra_planes, known_plane
 from sonarpost.codec.emb.side import Box, Side, write_side
+from sonarpost.codec.interface import MAX_SIDE_PX
 
 I64 = npt.NDArray[np.int64]
 
 MAX_BODY_BYTES: Final = 0xFFFF
-SEARCHES: Final[tuple[tuple[int, tuple[int, ...], int], ...]] = (
-    (96, (0, 2, 4, 6), 1),
-    (319, (0, 2, 4, 6), 0),
-    (MAX_BODY_BYTES, (0, 4), 2),
+MAX_PIXELS: Final = MAX_SIDE_PX * MAX_SIDE_PX
+_SMALL_PX: Final = 8000
+SEARCHES: Final[tuple[tuple[int, int, tuple[int, ...], int], ...]] = (
+    (96, MAX_PIXELS, (0, 2, 4, 6), 1),
+    (319, _SMALL_PX, (0, 2, 4, 6), 0),
+    (319, MAX_PIXELS, (0, 4), 1),
+    (MAX_BODY_BYTES, _SMALL_PX, (0, 4), 2),
+    (MAX_BODY_BYTES, MAX_PIXELS, (0, 4), 1),
 )
-"""Up to which budget which start steps are tried, and how many more beside the best of them (`beside`): as many as
-stay within 100 ms for 140 x 80 px."""
+"""Up to which length of the body and size of the picture which start steps are tried, and how many more beside the best
+of them (`beside`): as many as keep the time for 140 x 80 px to about 100 ms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +93,10 @@ class Writer:
             grain: See `Side`.
             steps: Start steps to try; none: as many as the time allows, see `SEARCHES`.
         """
-        first, more = next((first, more) for most, first, more in SEARCHES if self.limit <= most)
+        pixels = wanted.plane.size
+        first, more = next(
+            (first, more) for longest, largest, first, more in SEARCHES if self.limit <= longest and pixels <= largest
+        )
         if steps:
             first, more = steps, 0
         found: dict[int, Written] = {}
