@@ -156,13 +156,18 @@ def test_a_nominal_catalogue_can_be_left_unrefined(run: Run, tmp_path: Path, mon
     monkeypatch.setattr(nominal, "RECIPES", (Recipe(10, 80, (Round(100.0, 60.0),), 2),))
     made = []
     for options in (("--refine", 0), ("--refine", 2), ()):
-        assert run("catalogue", "nominal", "--humminbird", tmp_path, "--out", tmp_path, *options) == 0
-        made.append(load(tmp_path / "nominal-10.tiles"))
+        assert (
+            run("catalogue", "nominal", "--humminbird", tmp_path, "--out", tmp_path / "new" / "folder", *options) == 0
+        )
+        made.append(load(tmp_path / "new" / "folder" / "nominal-10.tiles"))
     alone, twice, usual = made
     assert twice.tiles.identity == usual.tiles.identity != alone.tiles.identity
     assert [one.notes["refine passes"] for one in made] == ["0", "2", "2"]
     pieces = {tile.tobytes() for image in images for tile in cut_tiles(image.load(), 10)}
     assert all(tile.tobytes() in pieces for tile in alone.tiles.tiles)  # Table IV keeps tiles as they are
+    (tmp_path / "file").touch()
+    with pytest.raises(SonarpostError, match="--out"):
+        run("catalogue", "nominal", "--humminbird", tmp_path, "--out", tmp_path / "file" / "folder")
 
 
 def test_the_codecs_are_listed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:

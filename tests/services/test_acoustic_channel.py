@@ -273,11 +273,11 @@ def test_a_client_that_does_not_read_loses_whole_sentences_only(make: Make):
         for _ in range(200):  # some 10 MB of answers
             idle.sendall(query)
         eventually(lambda: channel.connected() == 1, what="client seen")
-        idle.settimeout(0.5)
         assembler = nmea.LineAssembler()
         seen = 0
         try:
             while data := idle.recv(1 << 20):
+                idle.settimeout(0.5)
                 for item in assembler.feed(data):
                     assert isinstance(item, nmea.Sentence)
                     seen += 1

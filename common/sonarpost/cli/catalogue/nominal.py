@@ -33,7 +33,9 @@ def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.add_argument(
         "--humminbird", type=Path, required=True, metavar="DIR", help="folder with the PyHum recording's channels"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the catalogues")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder for the catalogues, made where absent"
+    )
     parser.add_argument(
         "--refine", type=int, metavar="N", help="passes of refinement, other than the recipe's 2; 0: Table IV alone"
     )
@@ -48,6 +50,10 @@ def run(args: argparse.Namespace) -> int:
     """
     if args.refine is not None and args.refine < 0:
         raise ConfigError("--refine", "", args.refine, "zero or more passes")
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError("--out", "", f"{args.out} ({error.strerror})", "a folder, or a place for one") from error
     recipes = RECIPES if args.refine is None else tuple(replace(r, passes=args.refine) for r in RECIPES)
     console = Console(stderr=True)
     images = [*humminbird_images(args.humminbird), *simulated_images(console)]
