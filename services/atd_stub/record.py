@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.ground_picture import ground_picture
 from services.atd_stub.seam import Origin
 from sonarpost.codec.interface import MIN_SIDE_PX
 from sonarpost.detect.contacts import Detection
+from sonarpost.detect.ground_snippet import ground_picture
 from sonarpost.detect.snippet import cut_snippet, cut_wide
 from sonarpost.messages import Contact, Raster, Snippet
 from sonarpost.sonar.georeference import georeference

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.ndimage import uniform_filter1d
 
 from sonarpost.sonar.geometry import ground_to_slant_range_m
-from sonarpost.sonar.survey import FloatImage, Side, Survey
+from sonarpost.sonar.survey import FloatImage, Samples, Side, Survey
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -51,12 +51,31 @@ def ground_range_image(survey: Survey, side: Side, altitude_m: FloatArray, spaci
         if channel is None or not np.isfinite(height_m):
             continue
         places = ground_to_slant_range_m(edges_m, height_m) / channel.sample_spacing_m
-        cumulative = np.concatenate([[0.0], np.cumsum(channel.echo(), dtype=np.float64)])
-        total = np.diff(np.interp(places, np.arange(len(cumulative)), cumulative))
-        width = np.diff(places)
-        inside = (places[1:] <= len(channel.samples)) & (width > 0)
-        image[row, inside] = total[inside] / width[inside]
+        image[row] = means_between(channel.echo(), places)
     return image
+
+
+def means_between(samples: Samples | FloatImage, places: FloatArray, *, least_width: float = 0.0) -> FloatArray:
+    """Return the mean of a ping's samples between each two neighbouring places.
+
+    Places count samples from the beginning of the first one. A sample that a place cuts counts on both sides with its
+    part there, so a step within one sample has that sample's value.
+
+    Args:
+        samples: Of one channel, or their echo strength, shape (n,), any number dtype, n from 1.
+        places: Not decreasing, from 0 on, shape (m + 1,).
+        least_width: A step must span more samples than this to have a mean.
+
+    Returns:
+        Shape (m,), float64; NaN where a step ends beyond the last sample or is not wider than `least_width`.
+    """
+    cumulative = np.concatenate([[0.0], np.cumsum(samples, dtype=np.float64)])
+    totals = np.diff(np.interp(places, np.arange(len(cumulative)), cumulative))
+    widths = np.diff(places)
+    inside = (places[1:] <= len(samples)) & (widths > least_width)
+    means = np.full(len(widths), np.nan)
+    means[inside] = totals[inside] / widths[inside]
+    return means
 
 
 def range_normalised(image: FloatImage, *, window_pings: int = 501) -> FloatImage:
