@@ -14,15 +14,13 @@ from typing import Final
 import msgpack
 import numpy as np
 
-from sonarpost.detect.contacts import Detection
+from sonarpost.detect.looks import Look, Sameness
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 
 FORMAT: Final = 1
-SAME_ALONG_M: Final = 3.0
-SAME_ACROSS_M: Final = 3.0
-"""Contacts nearer to each other than this are one, as within a file."""
-_UNKNOWN_ALONG_M: Final = 0.2
+_SAMENESS: Final = Sameness(along_m=3.0, across_m=math.nextafter(3.0, math.inf), overlapping=True)
+"""Contacts nearer to each other than 3 m are one, as within a file; across-track at 3 m too."""
 _LEAST_GAP_S: Final = 1.0
 _GAP_INTERVALS: Final = 3.0
 _MOST_GAP_M: Final = 30.0
@@ -46,50 +44,18 @@ class Origin:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """A contact as it was seen in one look at a stream of pings.
-
-    Rows count in that stream, not in times: a clock that stands still must not make all contacts one.
+class SeamLook(Look):
+    """A contact as it was seen in one look, and what waits with it.
 
     Attributes:
-        row: Of the highlight's middle.
-        first_row: The highlight's first.
-        end_row: One past its last.
-        slant_range_m: To its middle.
-        along_m: Travel between two rows.
         held: The snippet's payload where it waits for the next file, else None.
     """
 
-    side: Side
-    row: int
-    first_row: int
-    end_row: int
-    slant_range_m: float
-    along_m: float
     held: bytes | None = None
 
     def is_same(self, other: Look) -> bool:
         """Tell whether both are looks at one object."""
-        if self.side is not other.side or abs(self.slant_range_m - other.slant_range_m) > SAME_ACROSS_M:
-            return False
-        overlap = self.first_row < other.end_row and other.first_row < self.end_row
-        return overlap or abs(self.row - other.row) * self.along_m < SAME_ALONG_M
-
-    def moved(self, rows: int) -> Look:
-        """Return the look in a stream that begins so many rows earlier."""
-        return replace(self, row=self.row + rows, first_row=self.first_row + rows, end_row=self.end_row + rows)
-
-
-def look_of(found: Detection, first_row: int) -> Look:
-    """Return a detection as a look.
-
-    Args:
-        found: The detection.
-        first_row: Row of the first ping of the survey it was found in.
-    """
-    along_m = found.pixel_along_m if found.pixel_along_m is not None else _UNKNOWN_ALONG_M
-    first, end = found.highlight_pings
-    return Look(found.side, found.ping_index, first, end, found.slant_range_m, along_m).moved(first_row)
+        return _SAMENESS.holds(self, other, abs(self.slant_range_m - other.slant_range_m))
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +73,7 @@ class Seam:
     sonar_id: str
     pings: tuple[Ping, ...]
     origins: tuple[Origin, ...]
-    looks: tuple[Look, ...]
+    looks: tuple[SeamLook, ...]
     until_utc_s: float
 
     @property
@@ -202,7 +168,7 @@ def unpack(packed: bytes) -> Seam:
         sonar_id=fields["sonar_id"],
         pings=tuple(_unpacked_ping(each) for each in fields["pings"]),
         origins=tuple(files[number] for number in fields["file_of"]),
-        looks=tuple(Look(Side(side), *rest) for side, *rest in fields["looks"]),
+        looks=tuple(SeamLook(Side(side), *rest) for side, *rest in fields["looks"]),
         until_utc_s=fields["until_utc_s"],
     )
 

@@ -10,7 +10,7 @@ from typing import Final
 
 from services.atd_stub.config import AtdStubConfig
 from services.atd_stub.record import of_detection
-from services.atd_stub.seam import Look, Origin, Seam, last_pings, look_of
+from services.atd_stub.seam import Origin, Seam, SeamLook, last_pings
 from sonarpost import wire
 from sonarpost.detect.contacts import Detection, detect
 from sonarpost.detect.settings import DetectorSettings
@@ -45,7 +45,7 @@ class Finding:
 
 @dataclass(slots=True)
 class _Found:
-    look: Look
+    look: SeamLook
     snippet: Snippet
     is_new: bool
 
@@ -72,8 +72,8 @@ class SurveyWalk:
         self._settings = DetectorSettings(confidence_threshold=config.confidence_threshold)
         self._before: Seam | None = None
         self._first_wanted = 0
-        self._held: list[Look] = []
-        self._known: list[Look] = []
+        self._held: list[SeamLook] = []
+        self._known: list[SeamLook] = []
         self._found: list[_Found] = []
 
     def run(self, seam: Seam | None, now_utc_s: float) -> Finding:
@@ -112,11 +112,11 @@ class SurveyWalk:
         lower = strip.first_row + self._overlap - half if strip.first_row else self._first_wanted
         upper = math.inf if strip.is_last else strip.first_row + len(strip.pings) - half
         for found in detect(survey, self._settings):
-            look = look_of(found, strip.first_row)
+            look = SeamLook.of(found, strip.first_row)
             if lower - _TOLERANCE_PINGS <= look.row < upper + _TOLERANCE_PINGS:
                 self._take(survey, found, look)
 
-    def _take(self, survey: Survey, found: Detection, look: Look) -> None:
+    def _take(self, survey: Survey, found: Detection, look: SeamLook) -> None:
         is_new = True
         for known in [known for known in self._known if known.is_same(look)]:
             if known not in self._held:

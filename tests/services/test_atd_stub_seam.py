@@ -11,7 +11,7 @@ import pytest
 from conftest import eventually
 
 from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.seam import Look, last_pings, pack, unpack
+from services.atd_stub.seam import SeamLook, last_pings, pack, unpack
 from services.atd_stub.service import AtdStubService
 from services.atd_stub.snippets import from_survey
 from sonarpost import keys, wire
@@ -219,7 +219,7 @@ def test_a_seam_survives_the_store(tmp_path):
 
 
 def test_looks_are_one_object_only_side_by_side():
-    look = Look(Side.PORT, 50, 46, 54, 11.0, 0.1)
+    look = SeamLook(Side.PORT, 50, 46, 54, 11.0, 0.1)
     assert look.is_same(look)
     assert look.is_same(replace(look, row=79, first_row=75, end_row=83))
     assert not look.is_same(replace(look, row=81, first_row=77, end_row=85))

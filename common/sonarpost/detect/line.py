@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from sonarpost.detect.contacts import Detection, detect
+from sonarpost.detect.looks import Look, Sameness
 from sonarpost.detect.settings import DetectorSettings
 from sonarpost.sonar.geometry import ping_spacing_m
 from sonarpost.sonar.options import SurveyOptions
@@ -61,6 +62,14 @@ class _Origin:
 
 
 @dataclass(frozen=True, slots=True)
+class _Told:
+    """A contact that was told, and its sample."""
+
+    look: Look
+    sample: int
+
+
+@dataclass(frozen=True, slots=True)
 class _Tail:
     """The end of what was looked at.
 
@@ -68,13 +77,13 @@ class _Tail:
         survey: Its last pings, of one file or several.
         origins: For each of them its file's number and path, and its index there.
         held: Contacts near its end, not told yet.
-        told: Those told, in its own ping indices.
+        told: Those told; row 0 is its first ping.
     """
 
     survey: Survey
     origins: tuple[_Origin, ...]
     held: tuple[LineContact, ...]
-    told: tuple[Detection, ...]
+    told: tuple[_Told, ...]
 
 
 class LineDetector:
@@ -88,6 +97,10 @@ class LineDetector:
     def __init__(self, settings: DetectorSettings | None = None, options: SurveyOptions | None = None) -> None:
         self._settings = settings if settings is not None else DetectorSettings()
         self._options = options if options is not None else SurveyOptions()
+        # A contact is told only where it lies `HELD_M` before the end, so that both looks see the same middle.
+        self._sameness = Sameness(
+            self._settings.separation_along_m, self._settings.separation_across_m, overlapping=False
+        )
         self._tail: _Tail | None = None
         self._files = 0
 
@@ -100,7 +113,7 @@ class LineDetector:
         origins = tuple(_Origin(self._files, survey.path, row) for row in range(len(survey.pings)))
         self._files += 1
         released: tuple[LineContact, ...] = ()
-        known: tuple[Detection, ...] = ()
+        known: tuple[_Told, ...] = ()
         first_row = 0
         if before is not None and follows(before.survey, survey):
             first_row = max(0, len(before.survey.pings) - self._pings(before.survey, HELD_M))
@@ -112,12 +125,12 @@ class LineDetector:
         found = [
             LineContact(origins[d.ping_index].file, origins[d.ping_index].path, origins[d.ping_index].ping, d, survey)
             for d in detect(survey, self._settings, self._options)
-            if d.ping_index >= first_row and not any(self._is_same(d, other) for other in known)
+            if d.ping_index >= first_row and not self._is_known(d, known)
         ]
         end = len(survey.pings) - self._pings(survey, HELD_M)
         held = tuple(c for c in found if c.detection.ping_index >= end)
         told = tuple(c for c in found if c.detection.ping_index < end)
-        self._tail = self._last_of(survey, origins, held, (*known, *(c.detection for c in told)))
+        self._tail = self._last_of(survey, origins, held, (*known, *(self._told(c.detection) for c in told)))
         return _in_order((*released, *told))
 
     def finish(self) -> tuple[LineContact, ...]:
@@ -126,20 +139,25 @@ class LineDetector:
         return () if before is None else _in_order(before.held)
 
     def _last_of(
-        self, survey: Survey, origins: tuple[_Origin, ...], held: tuple[LineContact, ...], told: tuple[Detection, ...]
+        self, survey: Survey, origins: tuple[_Origin, ...], held: tuple[LineContact, ...], told: tuple[_Told, ...]
     ) -> _Tail:
         cut = max(0, len(survey.pings) - self._pings(survey, OVERLAP_M))
-        kept = tuple(replace(d, ping_index=d.ping_index - cut) for d in told if d.ping_index >= cut)
+        kept = tuple(replace(each, look=each.look.moved(-cut)) for each in told if each.look.row >= cut)
         return _Tail(replace(survey, pings=survey.pings[cut:]), origins[cut:], held, kept)
 
     def _pings(self, survey: Survey, length_m: float) -> int:
         return math.ceil(length_m / (ping_spacing_m(survey) or self._settings.assumed_row_along_m))
 
-    def _is_same(self, one: Detection, other: Detection) -> bool:
-        along_m = abs(one.ping_index - other.ping_index) * (one.pixel_along_m or self._settings.assumed_row_along_m)
-        across_m = abs(one.sample - other.sample) * one.pixel_across_m
-        near = along_m < self._settings.separation_along_m and across_m < self._settings.separation_across_m
-        return one.side is other.side and near
+    def _told(self, found: Detection) -> _Told:
+        return _Told(Look.of(found, unknown_along_m=self._settings.assumed_row_along_m), found.sample)
+
+    def _is_known(self, found: Detection, known: Sequence[_Told]) -> bool:
+        new = self._told(found)
+        # Files of a line have the same samples: those between two contacts are counted.
+        return any(
+            self._sameness.holds(new.look, other.look, abs(new.sample - other.sample) * found.pixel_across_m)
+            for other in known
+        )
 
 
 def follows(before: Survey, after: Survey) -> bool:
