@@ -10,7 +10,8 @@ from typing import Any
 import msgpack
 import pytest
 from golden.zenoh.add_vectors import BATCH, batch_samples, handoff_samples, plain
-from golden.zenoh.samples import RECORD_TYPES, SAMPLES, STRATEGIES, any_record
+from golden.zenoh.samples import RECORD_TYPES, SAMPLES
+from golden.zenoh.strategies import STRATEGIES, any_record
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

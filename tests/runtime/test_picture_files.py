@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from golden.zenoh.samples import COMPLETE_IMAGE, DAMAGED_IMAGE, images
+from golden.zenoh.samples import COMPLETE_IMAGE, DAMAGED_IMAGE
+from golden.zenoh.strategies import images
 from hypothesis import given, settings
 
 from sonarpost.messages import Raster, ReconstructedImage

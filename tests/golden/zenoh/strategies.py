@@ -1,0 +1,287 @@
+"""Hypothesis strategies for all records: any values that the wire can hold."""
+
+from __future__ import annotations
+
+import hashlib
+import string
+from typing import Any
+
+from hypothesis import strategies as st
+
+from sonarpost.messages import (
+    AcousticFrame,
+    Advice,
+    Command,
+    Contact,
+    Decision,
+    DownlinkState,
+    EncodedImage,
+    Health,
+    LinkQuality,
+    OutgoingMessage,
+    QueuedImage,
+    QueueState,
+    Raster,
+    ReceivedMessage,
+    ReconstructedImage,
+    Record,
+    Relayed,
+    Snippet,
+    TaskingState,
+)
+
+_LOWER = string.ascii_lowercase + string.digits
+
+
+def _real(low: float, high: float, **more: bool) -> st.SearchStrategy[float]:
+    return st.floats(low, high, allow_nan=False, allow_infinity=False, **more)
+
+
+def _maybe(strategy: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    return st.none() | strategy
+
+
+def _text(low: int, high: int) -> st.SearchStrategy[str]:
+    # Surrogates are no characters: UTF-8 has no bytes for them.
+    return st.text(st.characters(exclude_categories=("Cs",)), min_size=low, max_size=min(high, 60))
+
+
+_name = st.builds(lambda a, b: a + b, st.sampled_from(_LOWER), st.text(_LOWER + "-", max_size=31))
+_image_id = st.text(string.digits + string.ascii_uppercase, min_size=4, max_size=4)
+_sha256 = st.text("0123456789abcdef", min_size=64, max_size=64)
+_model = st.just("") | _sha256
+_time = _real(0, 253402300799)
+_metres = _maybe(_real(0, 20000))
+_count = st.integers(0, 2**63 - 1)
+_ordinal = st.integers(1, 2**63 - 1)
+_record_id = st.text([chr(code) for code in range(0x21, 0x7F)], min_size=1, max_size=64)
+_lat, _lon = _real(-90, 90), _real(-180, 180)
+_finite = st.floats(allow_nan=False, allow_infinity=False)
+
+contacts = st.builds(
+    Contact,
+    contact_id=_text(1, 120),
+    vehicle_id=_name,
+    sonar_id=_maybe(_text(0, 2000)),
+    line_name=_maybe(_text(0, 2000)),
+    ping_number=_maybe(_count),
+    channel=st.sampled_from([None, "port", "starboard"]),
+    time_utc_s=_maybe(_time),
+    lat_deg=_maybe(_lat),
+    lon_deg=_maybe(_lon),
+    position_sigma_m=_metres,
+    depth_m=_maybe(_real(-100, 12000)),
+    altitude_m=_metres,
+    heading_deg=_maybe(_real(0, 360, exclude_max=True)),
+    speed_mps=_maybe(_real(-50, 50)),
+    slant_range_m=_metres,
+    ground_range_m=_metres,
+    atd_class=_maybe(_text(0, 60)),
+    atd_confidence=_maybe(_real(0, 2)),
+    length_m=_metres,
+    width_m=_metres,
+    shadow_m=_metres,
+    height_m=_metres,
+    pixel_along_m=_maybe(_real(0, 100, exclude_min=True)),
+    pixel_across_m=_maybe(_real(0, 100, exclude_min=True)),
+)
+
+
+@st.composite
+def rasters(draw: st.DrawFn) -> Raster:
+    height_px, width_px, bits = draw(st.integers(1, 12)), draw(st.integers(1, 12)), draw(st.sampled_from([8, 16]))
+    size = height_px * width_px * bits // 8
+    return Raster(height_px=height_px, width_px=width_px, bits=bits, data=draw(st.binary(min_size=size, max_size=size)))
+
+
+qualities = st.builds(
+    LinkQuality,
+    snr_in_db=_maybe(_finite),
+    snr_out_db=_maybe(_finite),
+    spl_db=_maybe(_finite),
+    mse_db=_maybe(_finite),
+    doppler=_maybe(_finite),
+    frames=_maybe(_count),
+    bad_frames=_maybe(_count),
+)
+
+
+@st.composite
+def images(draw: st.DrawFn) -> ReconstructedImage:
+    picture = draw(rasters())
+    size = (picture.height_px * picture.width_px + 7) // 8
+    return ReconstructedImage(
+        vessel_id=draw(_name),
+        vehicle_id=draw(_name),
+        image_id=draw(_image_id),
+        version=draw(_ordinal),
+        contact=draw(_maybe(contacts)),
+        codec=draw(_text(0, 40)),
+        model=draw(_model),
+        picture=picture,
+        picture_sha256=hashlib.sha256(picture.data).hexdigest(),
+        complete=draw(st.booleans()),
+        missing_fraction=draw(_real(0, 1)),
+        missing_mask=draw(st.just(b"") | st.binary(min_size=size, max_size=size)),
+        missing_halves=draw(st.sampled_from([(), ("top",), ("bottom",), ("top", "bottom")])),
+        bytes_received=draw(_count),
+        bytes_total=draw(_count),
+        frames_received=draw(_count),
+        first_frame_utc_s=draw(_time),
+        last_frame_utc_s=draw(_time),
+        notes=tuple(draw(st.lists(_text(0, 2000), max_size=3))),
+    )
+
+
+@st.composite
+def commands(draw: st.DrawFn) -> Command:
+    kind = draw(st.sampled_from(["refine", "resend", "revisit", "wider"]))
+    place = kind == "revisit"
+    return Command(
+        command_id=draw(_record_id),
+        kind=kind,
+        vehicle_id=draw(_name),
+        image_id=draw(_maybe(_image_id) if place else _image_id),
+        lat_deg=draw(_lat if place else _maybe(_lat)),
+        lon_deg=draw(_lon if place else _maybe(_lon)),
+        issued_by=draw(_text(1, 120)),
+        issued_utc_s=draw(_time),
+    )
+
+
+STRATEGIES: dict[type[Record], st.SearchStrategy[Any]] = {
+    Contact: contacts,
+    Raster: rasters(),
+    Snippet: st.builds(Snippet, contact=contacts, picture=rasters(), source=_text(0, 2000), wide=_maybe(rasters())),
+    EncodedImage: st.builds(
+        EncodedImage,
+        vehicle_id=_name,
+        image_id=_image_id,
+        contact=contacts,
+        codec=_text(1, 40),
+        model=_model,
+        height_px=st.integers(1, 4096),
+        width_px=st.integers(1, 4096),
+        stream=st.binary(min_size=8, max_size=300),
+        original_sha256=_sha256,
+    ),
+    LinkQuality: qualities,
+    AcousticFrame: st.builds(
+        AcousticFrame,
+        direction=st.sampled_from(["tx", "rx"]),
+        platform_id=_name,
+        time_utc_s=_time,
+        source=st.integers(0, 127),
+        destination=st.integers(0, 127),
+        rate=_maybe(st.integers(0, 6)),
+        packet=_count,
+        frame_number=st.integers(1, 8),
+        frame_count=_maybe(st.integers(0, 8)),
+        data=st.binary(max_size=256),
+        quality=_maybe(qualities),
+    ),
+    ReconstructedImage: images(),
+    Decision: st.builds(
+        Decision,
+        decision_id=_record_id,
+        vessel_id=_name,
+        vehicle_id=_name,
+        image_id=_image_id,
+        image_version=_ordinal,
+        verdict=st.sampled_from(["mine_like", "not_mine_like", "unsure"]),
+        confidence=_maybe(_real(0, 1)),
+        mlo_class=_maybe(_text(0, 60)),
+        remark=_text(0, 2000),
+        operator=_text(1, 120),
+        decided_utc_s=_time,
+    ),
+    Advice: st.builds(
+        Advice,
+        advice_id=_record_id,
+        vessel_id=_name,
+        vehicle_id=_name,
+        image_id=_image_id,
+        image_version=_ordinal,
+        verdict=st.sampled_from([None, "mine_like", "not_mine_like", "unsure"]),
+        confidence=_maybe(_real(0, 1)),
+        mlo_class=_maybe(_text(0, 60)),
+        remark=_text(0, 2000),
+        author=_text(1, 120),
+        advised_utc_s=_time,
+    ),
+    TaskingState: st.builds(
+        TaskingState,
+        vessel_id=_name,
+        kind=st.sampled_from(["advice", "command"]),
+        record_id=_record_id,
+        state=st.sampled_from(["waiting", "delivered", "refused"]),
+        reason=_text(0, 2000),
+        changed_utc_s=_time,
+    ),
+    Command: commands(),
+    Relayed: st.builds(
+        Relayed, vessel_id=_name, key=_text(1, 300), payload=st.binary(max_size=200), relayed_utc_s=_time
+    ),
+    Health: st.builds(
+        Health,
+        platform_id=_name,
+        service=_text(1, 40),
+        time_utc_s=_time,
+        started_utc_s=_time,
+        state=st.sampled_from(["starting", "ok", "degraded", "stopping"]),
+        detail=_text(0, 2000),
+        counters=st.dictionaries(_text(0, 40), _count, max_size=4),
+        gauges=st.dictionaries(_text(0, 40), _finite, max_size=4),
+    ),
+}
+
+STRATEGIES[OutgoingMessage] = st.builds(
+    OutgoingMessage,
+    message_id=_record_id,
+    source=_text(1, 40),
+    priority=st.integers(1, 7),
+    lifetime_s=_real(0, 604800, exclude_min=True),
+    created_utc_s=_time,
+    data=st.binary(min_size=1, max_size=100),
+)
+STRATEGIES[ReceivedMessage] = st.builds(
+    ReceivedMessage,
+    vessel_id=_name,
+    vehicle_id=_name,
+    received_utc_s=_time,
+    data=st.binary(min_size=1, max_size=100),
+)
+STRATEGIES[DownlinkState] = st.builds(
+    DownlinkState,
+    vessel_id=_name,
+    vehicle_id=_name,
+    kind=st.sampled_from(["refine", "resend", "revisit", "decision", "wider"]),
+    record_id=_record_id,
+    state=st.sampled_from(["asked", "sent", "confirmed", "refused", "expired"]),
+    times_sent=_count,
+    expires_utc_s=_time,
+    changed_utc_s=_time,
+    reason=_text(0, 2000),
+)
+STRATEGIES[QueuedImage] = st.builds(
+    QueuedImage,
+    image_id=_image_id,
+    contact_id=_text(1, 120),
+    bytes_left=_count,
+    preview_utc_s=_maybe(_time),
+    expected_utc_s=_time,
+)
+STRATEGIES[QueueState] = st.builds(
+    QueueState,
+    platform_id=_name,
+    time_utc_s=_time,
+    rate=st.integers(0, 6),
+    frame_loss=_maybe(_real(0, 1)),
+    packet_interval_s=_real(0, 86400),
+    messages_waiting=_count,
+    message_bytes=_count,
+    images_waiting=_count,
+    images=st.lists(STRATEGIES[QueuedImage], max_size=3).map(tuple),
+)
+
+any_record: st.SearchStrategy[Record] = st.one_of(*STRATEGIES.values())
