@@ -1,0 +1,71 @@
+"""Emulated Micro-Modems in one water on simulated time, and what each tells its host."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+from sonarpost.modem import nmea
+from sonarpost.sim.acoustic_world import AcousticWorld, ModemPlace
+from sonarpost.sim.micromodem_config import ModemConfig, Report
+from sonarpost.sim.water_config import WaterConfig
+from sonarpost.sim.water_physics import Position
+from sonarpost.sim.water_records import Transmission
+
+START_UTC_S = datetime(2016, 10, 12, 9, 0, 0, tzinfo=UTC).timestamp()
+RANGE_M = 150.0
+
+
+class Bench:
+    """Modems 150 m apart in one water, with what each told its host."""
+
+    def __init__(self, modems: int = 2, serial_baud: float | None = None, **config: object) -> None:
+        water = {name: config.pop(name) for name in list(config) if name in WaterConfig.__dataclass_fields__}
+        places = {
+            n: ModemPlace(ModemConfig(n, utc_at_zero_s=START_UTC_S, **config), Position(RANGE_M * (n - 1)))  # type: ignore[arg-type]
+            for n in range(1, modems + 1)
+        }
+        self.world = AcousticWorld(WaterConfig(**water), places, serial_baud)  # type: ignore[arg-type]
+        self.told = dict.fromkeys(places, b"")
+        self.reports: list[Report] = []
+        self.transmissions: list[Transmission] = []
+        self.now = 0.0
+        self.advance(1.0)
+        self.clear()
+
+    def advance(self, now: float) -> None:
+        self.now = now
+        for happened in self.world.advance(now):
+            (self.reports if isinstance(happened, Report) else self.transmissions).append(happened)  # type: ignore[arg-type]
+        for n in self.told:
+            for output in self.world.take_outputs(n):
+                self.told[n] += output.data
+                if output.report:
+                    self.reports.append(output.report)
+
+    def say(self, modem: int, *sentences: tuple[str | int, ...]) -> None:
+        for kind, *fields in sentences:
+            self.world.receive(modem, nmea.format(str(kind), *fields), self.now)
+            self.advance(self.now)
+
+    def clear(self) -> None:
+        self.told = dict.fromkeys(self.told, b"")
+
+    def lines(self, modem: int) -> list[str]:
+        """What the host was told since the last call, without checksums, which are checked."""
+        told, self.told[modem] = self.told[modem], b""
+        assert told == b"" or told.endswith(b"\r\n")
+        shown = []
+        for line in told.split(b"\r\n")[:-1]:
+            body, _, digits = line[1:].partition(b"*")
+            assert digits == b"%02X" % nmea.checksum(body), line
+            shown.append(body.decode())
+        return [line for line in shown if not line.startswith("CAREV")]
+
+
+def cst(clock: str, rate: int, *, kind: int = 3, frames: int, bad: int = 0, mode: int = 0) -> str:
+    """The statistics of a packet from 1 to 2 at 150 m; the levels follow the range and the first packet's draw."""
+    psk = kind == 3
+    error = 3 if bad and psk else 0
+    snr = "15.4,12.41,-100,-12.41,-01" if psk else "15.4,-100,-100,-100,195"
+    head = f"CACST,6,{mode},{clock},05,25158,40,0131,0141,07,00,00,00,00,{rate},001,002"
+    return f"{head},{error},{kind},{frames},{bad},141,{snr},0.00,51,25000,5000"
