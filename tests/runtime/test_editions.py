@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import sqlite3
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,13 +14,6 @@ from sonarpost.errors import PayloadError
 from sonarpost.runtime.handoff import attachment, parse_chunk
 from sonarpost.runtime.store import Store
 from sonarpost.runtime.transaction import OutboxItem, Topic, consumer_of, queue_of
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store(tmp_path / "s.db")
-    yield opened
-    opened.close()
 
 
 def send(store: Store, topic: str, edition: int, *, priority: int = 6, queue: str = "c2", size: int = 3) -> int:

@@ -8,17 +8,9 @@ import pytest
 
 from sonarpost.runtime.inbox import NotNowError
 from sonarpost.runtime.room import Room
-from sonarpost.runtime.store import Store
 
 DiskUsage = namedtuple("DiskUsage", "total used free")
 RECORD = bytes(100_000)
-
-
-@pytest.fixture
-def store(tmp_path):
-    store = Store(tmp_path / "s.db")
-    yield store
-    store.close()
 
 
 @pytest.fixture

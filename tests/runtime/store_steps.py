@@ -1,0 +1,22 @@
+"""What tests of the durable store do again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sonarpost.runtime.store import Store
+from sonarpost.runtime.transaction import Transaction
+
+ORIGIN = b"o" * 16
+
+
+def send(store: Store, *payloads: bytes, consumer: str = "c", priority: int = 4) -> list[int]:
+    with store.transaction() as tx:
+        return [tx.send("k", consumer, p, encoding="e", priority=priority) for p in payloads]
+
+
+def fail_within(store: Store, write: Callable[[Transaction], object]) -> None:
+    """Write in a transaction that then meets an error which has nothing to do with the store."""
+    with store.transaction() as tx:
+        write(tx)
+        raise ZeroDivisionError
