@@ -1,8 +1,8 @@
-"""Records that the tests of several services share: a picture that has arrived and a decision on it."""
+"""Records that the tests of several services share: a picture that has arrived, a decision on it, a command."""
 
 from __future__ import annotations
 
-from sonarpost.messages import Decision, Raster, ReconstructedImage
+from sonarpost.messages import Command, Decision, Raster, ReconstructedImage
 
 FIRST_S = 1_700_000_000.0
 
@@ -45,3 +45,15 @@ def decision_record(decision_id: str = "d1", **changes: object) -> Decision:
         "decided_utc_s": 1.0,
     }
     return Decision.model_validate(fields | changes)
+
+
+def command_record(kind: str, image_id: str) -> Command:
+    """Return what the vessel's operator asks of the vehicle about one of its pictures."""
+    return Command(
+        command_id=f"{kind}-{image_id}",
+        kind=kind,
+        vehicle_id="uuv-1",
+        image_id=image_id,
+        issued_by="modem 1",
+        issued_utc_s=1476262800.0,
+    )

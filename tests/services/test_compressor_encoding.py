@@ -1,0 +1,232 @@
+"""compressor: one stream a snippet, identifiers that are never given twice, bad pictures apart."""
+
+from __future__ import annotations
+
+import msgpack
+import numpy as np
+import pytest
+from conftest import eventually
+
+from services.compressor.config import CompressorConfig
+from services.compressor.service import IMAGE_IDS, CompressorService
+from sonarpost import keys, wire
+from sonarpost.catalogue.store import open_catalogue
+from sonarpost.codec.interface import StreamHeader, to_uint8
+from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.codec.vq import IndexPacking
+from sonarpost.errors import CatalogueError, ConfigError
+from sonarpost.link.paper_format import format_image_id, is_image_id
+from sonarpost.messages import Contact, EncodedImage, Raster, Snippet
+
+IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
+
+
+@pytest.fixture
+def begin(crew, platform):
+    def start(**options):
+        return crew.start(CompressorService(platform("uuv-1"), CompressorConfig(**options)))
+
+    return start
+
+
+@pytest.fixture
+def modem(crew):
+    return crew.neighbour("uuv-1", "uuv_modem", {OUT: EncodedImage})
+
+
+@pytest.fixture
+def atd(crew):
+    return crew.neighbour("uuv-1", "atd_stub")
+
+
+@pytest.fixture(scope="session")
+def vq():
+    tiles = open_catalogue("nominal-10").tiles
+    return default_registry().create("vq", CodecResources(tiles, IndexPacking.BITS14))
+
+
+def test_a_snippet_becomes_a_stream_with_its_contact(begin, atd, modem, snippet, vq, is_told, watch):
+    seen = watch(OUT)
+    service = begin()
+    sent = snippet("c1")
+    atd.owe(IN, "compressor", sent)
+    eventually(lambda: len(modem.got) == 1)
+    image = modem.got[0]
+    assert image.contact == sent.contact
+    assert (image.vehicle_id, image.codec, image.model) == ("uuv-1", "vq", vq.model_hash)
+    assert (image.height_px, image.width_px, image.original_sha256) == (40, 60, sent.picture.sha256)
+    assert image.stream == vq.encode(sent.picture.to_array())
+    assert is_image_id(image.image_id)
+    eventually(lambda: atd.store.outbox_depth() == 0)
+    # The header, and 14 bits for each tile of 10 x 10 px.
+    size = StreamHeader.unpack(image.stream).size + 4 * 6 * 14 // 8
+    eventually(lambda: service.health().counters == {"records_handled": 1, "images_encoded": 1, "bytes_encoded": size})
+    eventually(lambda: len(seen) == 1, what="the copy for watchers")
+    assert msgpack.unpackb(seen[0].payload.to_bytes())["image_id"] == image.image_id
+    is_told(service)
+
+
+def test_sixteen_bits_are_mapped_over_their_own_range(begin, atd, modem, snippet, vq):
+    begin()
+    deep = snippet("deep", dtype=np.uint16)
+    assert deep.picture.bits == 16
+    atd.owe(IN, "compressor", deep)
+    eventually(lambda: len(modem.got) == 1)
+    assert modem.got[0].stream == vq.encode(to_uint8(deep.picture.to_array()))
+    assert modem.got[0].original_sha256 == deep.picture.sha256
+
+
+@pytest.mark.parametrize(
+    ("height_px", "width_px", "said"),
+    [(15, 60, "height_px: got 15"), (60, 15, "width_px: got 15"), (513, 40, "height_px: got 513")],
+)
+def test_a_picture_of_the_wrong_size_is_kept_apart(height_px, width_px, said, begin, atd, modem, snippet, refused):
+    service = begin()
+    atd.owe(IN, "compressor", snippet("bad", height_px, width_px), snippet("good"))
+    eventually(lambda: [i.contact.contact_id for i in modem.got] == ["good"])
+    [(key, reason)] = refused(service)
+    assert key == IN
+    assert said in reason
+    assert "expected 16..512" in reason
+    health = service.health()
+    assert (health.state, health.counters["records_refused"], health.gauges["refused"]) == ("ok", 1, 1.0)
+
+
+def test_a_budget_that_cannot_be_met_is_said(begin, atd, modem, snippet, refused):
+    service = begin(budget_bytes=9)
+    atd.owe(IN, "compressor", snippet("large"))
+    eventually(lambda: len(refused(service)) == 1)
+    assert "budget" in refused(service)[0][1]
+    assert not service.failed
+    assert modem.got == []
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda fields: b"",
+        lambda fields: b"\xc1",
+        lambda fields: msgpack.packb(list(fields)),
+        lambda fields: msgpack.packb(fields | {"v": 2}),
+        lambda fields: msgpack.packb(fields | {"type": "decision"}),
+        lambda fields: msgpack.packb(fields | {"contact": None}),
+        lambda fields: msgpack.packb(fields | {"picture": fields["picture"] | {"data": b"short"}}),
+        lambda fields: msgpack.packb(fields | {"picture": fields["picture"] | {"height_px": -1}}),
+    ],
+)
+def test_a_payload_that_is_no_snippet_is_refused_and_the_next_one_taken(spoil, begin, atd, modem, snippet, refused):
+    service = begin()
+    atd.owe_bytes(IN, "compressor", spoil(msgpack.unpackb(wire.encode(snippet("spoilt")))))
+    atd.owe(IN, "compressor", snippet("good"))
+    eventually(lambda: [i.contact.contact_id for i in modem.got] == ["good"])
+    [(key, reason)] = refused(service)
+    assert key == IN
+    assert IN in reason
+    assert "expected" in reason
+    # The producer has it too, with what was said of it.
+    eventually(lambda: refused(atd) == [(IN, reason)])
+    assert service.health().counters["records_refused"] == 1
+
+
+def test_a_plain_publication_is_encoded_too(begin, modem, snippet, publish):
+    begin()
+    publish(IN, wire.encode(snippet("from somebody's own detector")))
+    eventually(lambda: len(modem.got) == 1)
+
+
+def test_identifiers_go_on_over_restarts(begin, crew, atd, modem, snippet):
+    for turn in range(3):
+        service = begin()
+        atd.owe(IN, "compressor", *(snippet(f"{turn}-{n}") for n in range(4)))
+        eventually(lambda turn=turn: len(modem.got) == 4 * (turn + 1))
+        crew.stop(service)
+    first = int(modem.got[0].image_id, 36)
+    assert [i.image_id for i in modem.got] == [format_image_id(first + n) for n in range(12)]
+    assert [i.contact.contact_id for i in modem.got] == [f"{t}-{n}" for t in range(3) for n in range(4)]
+
+
+def test_the_last_identifier_is_followed_by_the_first(begin, crew, platform, atd, modem, snippet):
+    service = begin()
+    with service.store.transaction() as tx:
+        tx.put_state("next_image", str(IMAGE_IDS).encode())
+    atd.owe(IN, "compressor", snippet("a"), snippet("b"))
+    eventually(lambda: [i.image_id for i in modem.got] == ["1EKF", "0001"])
+
+
+def test_a_wiped_vehicle_does_not_begin_where_its_last_mission_did(crew, platform, tmp_path):
+    starts = set()
+    for number in range(4):
+        wiped = platform("uuv-1").model_copy(update={"state_dir": tmp_path / str(number)})
+        service = CompressorService(wiped, CompressorConfig())
+        starts.add(service._next_number())
+        service.store.close()
+    assert len(starts) == 4
+
+
+def test_what_was_encoded_before_a_stop_is_sent_after_it(begin, crew, atd, snippet):
+    service = begin()
+    atd.owe(IN, "compressor", snippet("a"), snippet("b"))
+    eventually(lambda: service.store.outbox_depth() == 2)
+    crew.stop(service)
+    begin()
+    late = crew.neighbour("uuv-1", "uuv_modem", {OUT: EncodedImage})
+    eventually(lambda: [i.contact.contact_id for i in late.got] == ["a", "b"])
+
+
+def test_what_was_accepted_before_a_stop_is_encoded_after_it(begin, platform, modem, snippet):
+    idle = CompressorService(platform("uuv-1"), CompressorConfig())
+    with idle.store.transaction() as tx:
+        tx.accept(IN, wire.encode(snippet("waiting")))
+    idle.store.close()
+    begin()
+    eventually(lambda: [i.contact.contact_id for i in modem.got] == ["waiting"])
+
+
+@pytest.mark.parametrize("packing", list(IndexPacking))
+def test_every_packing_is_what_the_configuration_says(packing, begin, atd, modem, snippet):
+    begin(packing=packing)
+    atd.owe(IN, "compressor", snippet("c"))
+    eventually(lambda: len(modem.got) == 1)
+    assert modem.got[0].stream[0] == packing.codec_id
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "said"),
+    [
+        ({"catalogue": "/nowhere/own.tiles"}, CatalogueError, "/nowhere/own.tiles"),
+        ({"catalogue": "nominal-11"}, CatalogueError, "nominal-11"),
+        ({"codec": "jpeg-of-the-future"}, ConfigError, "one of"),
+    ],
+)
+def test_a_wrong_configuration_is_said_before_anything_is_opened(options, error, said, platform):
+    with pytest.raises(error, match=said):
+        CompressorService(platform("uuv-1"), CompressorConfig(**options))
+    assert not (platform("uuv-1").state_dir / "compressor.db").exists()
+
+
+def test_a_damaged_catalogue_is_named(platform, tmp_path):
+    path = tmp_path / "own.tiles"
+    path.write_bytes(b"SPTILES\n" + bytes(100))
+    with pytest.raises(CatalogueError, match=r"own\.tiles"):
+        CompressorService(platform("uuv-1"), CompressorConfig(catalogue=str(path)))
+
+
+def test_a_full_disk_leaves_the_snippet_with_its_sender(begin, atd, modem, snippet):
+    service = begin()
+    service.store._db.execute("PRAGMA max_page_count=1")
+    atd.owe(IN, "compressor", snippet("late", 200, 200))
+    eventually(lambda: service.health().state == "degraded")
+    assert atd.store.outbox_depth() == 1
+    service.store._db.execute("PRAGMA max_page_count=1000000")
+    eventually(lambda: len(modem.got) == 1)
+    eventually(lambda: service.health().state == "ok")
+
+
+def test_the_contact_arrives_as_it_was(begin, atd, modem, texture):
+    begin()
+    contact = Contact(
+        contact_id="full", vehicle_id="uuv-1", lat_deg=56.1, lon_deg=-5.2, atd_confidence=1.5, ping_number=7
+    )
+    atd.owe(IN, "compressor", Snippet(contact=contact, picture=Raster.from_array(texture())))
+    eventually(lambda: len(modem.got) == 1)
+    assert modem.got[0].contact == contact
