@@ -104,16 +104,21 @@ class Seam:
 
 
 def _same_shape(one: Ping, other: Ping) -> bool:
-    """Whether two pings can be rows of one picture."""
-    if {c.side for c in one.channels} != {c.side for c in other.channels}:
-        return False
-    pairs = [(c, other.channel(c.side)) for c in one.channels]
-    return all(
-        theirs is not None
-        and mine.samples.dtype == theirs.samples.dtype
-        and len(mine.samples) == len(theirs.samples)
-        and math.isclose(mine.slant_range_m, theirs.slant_range_m, rel_tol=_RANGE_AGREEMENT)
-        for mine, theirs in pairs
+    """Whether two pings can be rows of one picture: the same channels, each sampled as before."""
+    for side in Side:
+        mine = [channel for channel in one.channels if channel.side is side]
+        theirs = [channel for channel in other.channels if channel.side is side]
+        # A sonar of two frequencies has two channels a side, each with a range of its own: a file keeps their order.
+        if len(mine) != len(theirs) or not all(map(_same_sampling, mine, theirs)):
+            return False
+    return True
+
+
+def _same_sampling(one: ChannelPing, other: ChannelPing) -> bool:
+    return (
+        one.samples.dtype == other.samples.dtype
+        and len(one.samples) == len(other.samples)
+        and math.isclose(one.slant_range_m, other.slant_range_m, rel_tol=_RANGE_AGREEMENT)
     )
 
 

@@ -15,6 +15,7 @@ from services.atd_stub.seam import SeamLook, last_pings, pack, unpack
 from services.atd_stub.service import AtdStubService
 from services.atd_stub.snippets import from_survey
 from sonarpost import keys, wire
+from sonarpost.detect.line import follows
 from sonarpost.messages import Snippet
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_reader import read_xtf
@@ -63,6 +64,18 @@ def survey_of(rows: int, *boxes: Box, seed: int = 5, first_row: int = 0) -> Surv
         for row in range(first_row, rows)
     )
     return Survey(Path("made.xtf"), "made", "made", pings)
+
+
+def with_second_frequency(survey: Survey, samples: int, range_m: float) -> Survey:
+    """Return a recording of a sonar of two frequencies: after each side's channel another, which shows mere speckle."""
+    rng = np.random.default_rng(9)
+
+    def channels(ping: Ping) -> tuple[ChannelPing, ...]:
+        noise = {side: (rng.rayleigh(0.8, samples) * 2000).astype(np.uint16) for side in Side}
+        high = (ChannelPing(side, noise[side], range_m, 900e3) for side in Side)
+        return (*(replace(c, frequency_hz=400e3) for c in ping.channels), *high)
+
+    return replace(survey, pings=tuple(replace(ping, channels=channels(ping)) for ping in survey.pings))
 
 
 def cut_into(folder: Path, survey: Survey, *spans: tuple[int, int], sonar: str = "") -> list[Path]:
@@ -158,7 +171,29 @@ def test_a_long_file_gives_each_object_once_whatever_strip_it_is_in(tmp_path):
     assert [len(near(sent, box.row, box.side)) for box in boxes] == [1] * len(boxes)
 
 
-@pytest.mark.parametrize("what", ["later", "elsewhere", "other sonar", "other range", "earlier"])
+@pytest.mark.parametrize(("samples", "range_m"), [(SAMPLES, RANGE_M), (SAMPLES // 2, RANGE_M), (320, 12.5)])
+def test_files_of_two_frequencies_go_on_where_the_one_before_ended(samples, range_m, tmp_path):
+    survey = with_second_frequency(survey_of(300, Box(150)), samples, range_m)
+    paths = cut_into(tmp_path, survey, (0, 149), (149, 300))
+    read = [read_xtf(path) for path in paths]
+    assert [len(ping.channels) for ping in (read[0].pings[-1], read[1].pings[0])] == [4, 4]
+    assert follows(*read), "commands join them"
+    assert len(near(run(paths, seam_wait_s=30.0), 150)) == 1
+    seam = from_survey(paths[0], "0" * 64, "uuv-1", AtdStubConfig(seam_wait_s=30.0), {}, 100.0).seam
+    assert from_survey(paths[1], "1" * 64, "uuv-1", AtdStubConfig(), {seam.sonar_id: unpack(pack(seam))}, 100.0).joined
+
+
+def test_a_second_frequency_with_another_range_is_not_the_same_recording(tmp_path):
+    survey = survey_of(200, Box(97))
+    before, after = (with_second_frequency(survey, 320, range_m) for range_m in (12.5, 10.0))
+    first, second = cut_into(tmp_path, before, (0, 100), (100, 200))
+    write_xtf(replace(after, pings=after.pings[100:]), second)
+    assert not follows(read_xtf(first), read_xtf(second))
+    seam = from_survey(first, "0" * 64, "uuv-1", AtdStubConfig(), {}, 100.0).seam
+    assert not from_survey(second, "1" * 64, "uuv-1", AtdStubConfig(), {seam.sonar_id: seam}, 100.0).joined
+
+
+@pytest.mark.parametrize("what", ["later", "elsewhere", "other sonar", "other range", "earlier", "one more channel"])
 def test_a_file_that_does_not_go_on_there_lets_what_waited_go(what, tmp_path):
     survey = survey_of(200, Box(97))
     first, second = cut_into(tmp_path, survey, (0, 100), (100, 200))
@@ -172,6 +207,8 @@ def test_a_file_that_does_not_go_on_there_lets_what_waited_go(what, tmp_path):
             later = tuple(replace(p, channels=tuple(replace(c, slant_range_m=30.0) for c in p.channels)) for p in later)
         case "earlier":
             later = tuple(replace(p, time_utc_s=p.time_utc_s - 3600.0) for p in later)
+        case "one more channel":
+            later = with_second_frequency(replace(survey, pings=later), SAMPLES, RANGE_M).pings
     write_xtf(replace(survey, pings=later, sonar_id="else" if what == "other sonar" else "made"), second)
     config = AtdStubConfig(seam_wait_s=30.0)
     seam = from_survey(first, "0" * 64, "uuv-1", config, {}, 100.0).seam
