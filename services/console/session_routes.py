@@ -11,7 +11,7 @@ from starlette.routing import Route
 
 from services.console.people import Actor, Side
 from services.console.rows import Json
-from services.console.users import Attempts, Session, Users
+from services.console.users import MAX_PASSWORD, MIN_PASSWORD, Attempts, Session, Users
 from services.console.web import COOKIE, Body, Call, Gate, RefusedError, json_answer
 from sonarpost.runtime.logs import kv
 
@@ -108,10 +108,15 @@ class SessionRoutes:
         assert call.session is not None
         given = call.parsed(_Password)
         name = call.session.name
+        if not MIN_PASSWORD <= len(given.new) <= MAX_PASSWORD:
+            expected = f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters; this one has {len(given.new)}"
+            raise RefusedError(400, "bad_request", expected, "new")
         self._wait(name, call.address)
         if not self._users.right(name, given.old):
             self._attempts.failed(name, call.address, time.monotonic())
-            raise RefusedError(403, "wrong_login", "this is not the password so far", "old")
+            # Somebody may be guessing at a page that was left open.
+            log.warning("Change of password refused", extra=kv(user=name, address=call.address))
+            raise RefusedError(403, "wrong_login", "this is not your present password", "old")
         self._users.set_password(name, given.new, keep=call.session.token)
         log.info("Password changed", extra=kv(user=name, address=call.address))
         return Response(status_code=204)
