@@ -20,8 +20,8 @@ from services.console.exporting import ExportRoutes
 from services.console.place_routes import PlaceRoutes
 from services.console.session_routes import SessionRoutes
 from services.console.stream import Stream
-from services.console.users import Users
-from services.console.web import Call, Gate, Guard, RefusedError, answer, json_answer
+from services.console.users import MAX_PASSWORD, MIN_PASSWORD, Users
+from services.console.web import Call, Endpoint, Gate, Guard, RefusedError, answer, json_answer
 from sonarpost.review.rendering import MAPS
 
 STATIC: Final = Path(__file__).parent / "static"
@@ -54,6 +54,7 @@ class ConsoleApp:
         self, board: Board, users: Users, platform_id: str, *, training: bool = False, static: Path = STATIC
     ) -> None:
         config = board.config
+        self._static = static
         self._board = board
         self._platform_id = platform_id
         self._training = training
@@ -68,11 +69,11 @@ class ConsoleApp:
             *self._places.routes(self._gate),
             *ExportRoutes(board).routes(self._gate),
             *self._stream.routes(self._gate),
-            Route("/", self._gate.open(self._page, needs_session=False)),
+            Route("/", self._page("index.html")),
+            Route("/password", self._page("password.html")),
             Route("/login", lambda _: page_file(static, "login.html")),
             *static_routes(static),
         ]
-        self._static = static
         app = Starlette(routes=routes, exception_handlers={HTTPException: not_routed})
         self.asgi: ASGIApp = Guard(app, (config.host, *config.names), tls=config.tls)
 
@@ -80,10 +81,13 @@ class ConsoleApp:
         """End the streams of events, so that the server can end."""
         self._stream.end()
 
-    def _page(self, call: Call) -> Response:
-        if call.session is None:
-            return RedirectResponse("/login", 303)
-        return page_file(self._static, "index.html")
+    def _page(self, name: str) -> Endpoint:
+        """Return the endpoint of a page for those who are logged in; others are sent to the log-in."""
+
+        def serve(call: Call) -> Response:
+            return RedirectResponse("/login", 303) if call.session is None else page_file(self._static, name)
+
+        return self._gate.open(serve, needs_session=False)
 
     def _info(self, _call: Call) -> Response:
         config = self._board.config
@@ -97,6 +101,7 @@ class ConsoleApp:
                 "classes": list(config.classes),
                 "maps": list(MAPS),
                 "requests": list(KINDS),
+                "password_characters": [MIN_PASSWORD, MAX_PASSWORD],
                 "stale_after_s": {
                     "service": SERVICE_STALE_S,
                     "vehicle": config.vehicle_stale_s,

@@ -322,6 +322,21 @@ def test_contrast_and_names(served, theme):
         assert seen > 10, name
         assert low == [], name
         assert there.page.evaluate(UNNAMED) == [], name
+    # The page for one's password has the same theme, with everything wrong.
+    there.page.goto(served.address + "password")
+    there.wait("button[type=submit]:enabled")
+    assert there.page.evaluate("document.documentElement.dataset.theme") == ("night" if theme == "dark" else "day")
+    there.page.fill("#again", "another")
+    there.press("Enter")
+    there.wait("#again-problem:has-text('differ')")
+    seen, low = there.page.evaluate(CONTRAST)
+    assert (seen > 10, low, there.page.evaluate(UNNAMED)) == (True, [], [])
+    there.page.fill("#old", PASSWORD)
+    there.page.fill("#new", "another fine one")
+    there.page.fill("#again", "another fine one")
+    there.press("Enter")
+    there.wait("#done:has-text('changed')")
+    assert there.page.evaluate(CONTRAST)[1] == []
 
 
 def test_thousands_of_contacts(served):

@@ -36,6 +36,26 @@ function linkWords(vehicles) {
   return [`${first.vehicle_id}${more}: ${duration(age_s)} ago, ${quantity(first.snr_in_db, "dB", 0)}${stale ? ", stale" : ""}`, stale];
 }
 
+/** Who one is: the way to another password, and out. */
+export function account() {
+  const here = location.pathname === "/password";
+  const { user, role } = state.session;
+  const words = `Change the password of ${user}${here ? "" : " (in another tab)"}`;
+  return [
+    // In a tab of its own: a remark that is not sent yet stays where it is.
+    h("a", {
+      class: "button", id: "to-password", href: "/password", target: here ? null : "_blank", rel: here ? null : "noopener",
+      title: words, "aria-label": words, "aria-current": here ? "page" : null,
+    }, h("span", { class: "key" })),
+    h("button", { type: "button", title: `Log out ${user} (${role})`, on: { click: logout } }, `${user}: log out`),
+  ];
+}
+
+async function logout() {
+  await api.logout();
+  location.assign("/login");
+}
+
 export class Bar {
   constructor(actions) {
     this.element = document.getElementById("bar");
@@ -54,18 +74,13 @@ export class Bar {
       h("button", { type: "button", title: "Day or night (t)", "aria-label": "Day or night theme (t)", on: { click: toggleTheme } }, "◐"),
       h("button", { type: "button", title: "Type size (z)", "aria-label": "Type size (z)", on: { click: toggleType } }, "A±"),
       h("button", { type: "button", title: "Keys (?)", "aria-label": "Keys (?)", on: { click: actions.help } }, "?"),
-      h("button", { type: "button", title: `Log out ${state.session.user} (${state.session.role})`, on: { click: () => this.#logout() } }, `${state.session.user}: log out`));
+      account());
     listen("counts", () => this.#counts());
     listen("contact", ({ unreviewed, total }) => { Object.assign(state, { unreviewed, total }); this.#counts(); });
     listen("online", () => this.tick());
     listen("fleet", () => this.tick());
     setInterval(() => this.tick(), 1000);
     this.tick();
-  }
-
-  async #logout() {
-    await api.logout();
-    location.assign("/login");
   }
 
   shows(view) {
