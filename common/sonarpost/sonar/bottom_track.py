@@ -46,7 +46,7 @@ def track_bottom(survey: Survey, *, window_pings: int = 31) -> FloatArray:
     """
     if window_pings < 1 or window_pings % 2 == 0:
         raise ValueError(f"window_pings is {window_pings}, expected an odd number above 0")
-    reach_m = max((c.slant_range_m for ping in survey.pings for c in ping.channels), default=0.0)
+    reach_m = max(survey.reach_m(side) for side in Side)
     if reach_m <= 0:
         return np.full(len(survey.pings), np.nan)
     echo = _common_range(survey, reach_m)

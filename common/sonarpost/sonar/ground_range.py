@@ -41,7 +41,7 @@ def ground_range_image(survey: Survey, side: Side, altitude_m: FloatArray, spaci
     """
     if altitude_m.shape != (len(survey.pings),):
         raise ValueError(f"altitudes of shape {altitude_m.shape}, expected one for each of {len(survey.pings)} pings")
-    reach_m = max((c.slant_range_m for p in survey.pings for c in p.channels if c.side is side), default=0.0)
+    reach_m = survey.reach_m(side)
     if not spacing_m > 0 or reach_m / spacing_m > MAX_COLUMNS:
         raise ValueError(f"spacing of {spacing_m} m over {reach_m} m, expected 1 to {MAX_COLUMNS} columns")
     edges_m = np.arange(int(np.ceil(reach_m / spacing_m)) + 1) * spacing_m

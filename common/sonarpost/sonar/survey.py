@@ -71,8 +71,16 @@ class Ping:
     roll_deg: float | None = None
 
     def channel(self, side: Side) -> ChannelPing | None:
-        """Return the channel that looks to `side`, or None."""
+        """Return the channel that pictures of `side` are made of, or None: the first of those that look there.
+
+        A sonar of two frequencies has two channels a side, each with its own samples and range. Whatever looks at a
+        side asks here, or `Survey.channels`, and never goes through all of a ping's channels.
+        """
         return next((c for c in self.channels if c.side is side), None)
+
+    def reach_m(self) -> float | None:
+        """Return the slant range that pictures of this ping reach to, the farther side's; None without a channel."""
+        return max((c.slant_range_m for side in Side if (c := self.channel(side)) is not None), default=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,14 +106,28 @@ class Survey:
         present = {c.side for p in self.pings for c in p.channels}
         return tuple(s for s in Side if s in present)
 
+    def channels(self, side: Side) -> Iterator[ChannelPing]:
+        """Yield the channel that pictures of `side` are made of, of each ping that has one."""
+        for ping in self.pings:
+            channel = ping.channel(side)
+            if channel is not None:
+                yield channel
+
+    def sample_count(self, side: Side) -> int:
+        """Return how many samples the longest ping has in pictures of `side`; 0 where none has any."""
+        return max((c.samples.shape[0] for c in self.channels(side)), default=0)
+
+    def reach_m(self, side: Side) -> float:
+        """Return the greatest slant range, in metres, of pictures of `side`; 0.0 where no ping has it."""
+        return max((c.slant_range_m for c in self.channels(side)), default=0.0)
+
     def waterfall(self, side: Side) -> FloatImage:
         """Return one side as an image, shape (pings, samples), float32 in the file's units.
 
         A recorder's weight is applied. Row i is `pings[i]`; column 0 is nearest the vehicle. A ping without that
-        channel, and samples beyond a shorter ping, are NaN.
+        side, and samples beyond a shorter ping, are NaN. Of several channels of a side the first is shown.
         """
-        width = max((c.samples.shape[0] for p in self.pings for c in p.channels if c.side is side), default=0)
-        image = np.full((len(self.pings), width), np.nan, dtype=np.float32)
+        image = np.full((len(self.pings), self.sample_count(side)), np.nan, dtype=np.float32)
         for row, ping in enumerate(self.pings):
             channel = ping.channel(side)
             if channel is not None:

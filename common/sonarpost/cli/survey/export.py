@@ -83,7 +83,7 @@ def write_csv(source: SurveySource, out: TextIO) -> None:
     writer.writerow(("number", "time_utc", *_FIELDS, "slant_range_m"))
     for ping in source.pings():
         values = ["" if (value := getattr(ping, name)) is None else f"{value:.10g}" for name in _FIELDS]
-        reach_m = max((channel.slant_range_m for channel in ping.channels), default=None)
+        reach_m = ping.reach_m()
         writer.writerow((ping.number, utc_text(ping.time_utc_s), *values, "" if reach_m is None else f"{reach_m:.7g}"))
 
 

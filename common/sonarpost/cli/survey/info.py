@@ -12,7 +12,7 @@ from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import SurveySource
-from sonarpost.sonar.survey import Ping
+from sonarpost.sonar.survey import Ping, Side
 
 _MOST_VALUES = 16
 """Of the different sample counts and frequencies, so many are listed."""
@@ -44,10 +44,12 @@ def run(parsed: argparse.Namespace) -> int:
             print(json.dumps(facts))
             continue
         print(path)
+        notes = facts.pop("warnings")
+        assert isinstance(notes, list)
         for name, value in facts.items():
-            if name not in ("file", "warnings"):
+            if name != "file":
                 print(f"  {name:20} {_shown(value)}")
-        for warning in source.info.warnings:
+        for warning in notes:
             print(f"  note: {warning}")
     return 0
 
@@ -83,12 +85,16 @@ class _Facts:
     frequencies_hz: set[float] = field(default_factory=set)
     fixes: int = 0
     track_m: float = 0.0
+    several: int = 0
+    """Pings with more than one channel on a side."""
+    pictured_hz: set[float] = field(default_factory=set)
     _from: Position | None = None
 
     def add(self, ping: Ping) -> None:
         self._span("time", ping.time_utc_s)
         for name in ("lat_deg", "lon_deg", "altitude_m", "depth_m", "speed_mps"):
             self._span(name, getattr(ping, name))
+        self._add_pictured(ping)
         for channel in ping.channels:
             self._span("slant_range_m", channel.slant_range_m)
             self.sample_types.add(channel.samples.dtype.name)
@@ -98,6 +104,25 @@ class _Facts:
                 self.frequencies_hz.add(channel.frequency_hz)
         if ping.lat_deg is not None and ping.lon_deg is not None:
             self._move(Position(ping.lat_deg, ping.lon_deg))
+
+    def _add_pictured(self, ping: Ping) -> None:
+        """Note what pictures are made of: the first channel of each side."""
+        pictured = [channel for side in Side if (channel := ping.channel(side)) is not None]
+        self.several += len(pictured) < len(ping.channels)
+        for channel in pictured:
+            self._span("pictured_m", channel.slant_range_m)
+            if channel.frequency_hz is not None and len(self.pictured_hz) < _MOST_VALUES:
+                self.pictured_hz.add(channel.frequency_hz)
+
+    def note(self, total: int) -> list[str]:
+        """Return which of several channels a side is looked at, where there are several."""
+        reach = self.spans.get("pictured_m", _Span()).pair()
+        if not self.several or reach is None:
+            return []
+        frequencies = "".join(f", {hz / 1000:g} kHz" for hz in sorted(self.pictured_hz))
+        ranges = " to ".join(dict.fromkeys(f"{range_m:g}" for range_m in reach))
+        met = f"several channels a side in {self.several} of {total} pings"
+        return [f"{met}: pictures and contacts are of the first{frequencies}, slant range {ranges} m"]
 
     def _span(self, name: str, value: float | None) -> None:
         self.spans.setdefault(name, _Span()).add(value)
@@ -142,5 +167,5 @@ def describe(source: SurveySource) -> dict[str, object]:
         "fixes": facts.fixes,
         "track_m": round(facts.track_m, 1),
         **ranges,
-        "warnings": list(info.warnings),
+        "warnings": [*info.warnings, *facts.note(info.ping_count)],
     }

@@ -56,7 +56,7 @@ def reduce_survey(source: SurveySource, *, over_ground: bool, max_rows: int = MA
     Raises:
         SurveyFileError: The file can no longer be read.
     """
-    reach_m = max(channel.slant_range_m for ping in source.pings() for channel in ping.channels)
+    reach_m = max(reach_m for ping in source.pings() if (reach_m := ping.reach_m()) is not None)
     per_row = math.ceil(source.info.ping_count / max_rows)
     rows = math.ceil(source.info.ping_count / per_row)
     total, count = np.zeros((rows, 2 * SIDE_PX)), np.zeros((rows, 2 * SIDE_PX))

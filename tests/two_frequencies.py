@@ -1,0 +1,47 @@
+"""Surveys of sonars of two frequencies, for tests: a second channel on each side, which shows mere speckle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
+from sonarpost.sonar.xtf_reader import read_xtf
+from sonarpost.sonar.xtf_writer import write_xtf
+
+FIRST_HZ, SECOND_HZ = 400e3, 900e3
+
+
+def with_second_frequency(survey: Survey, samples: int, range_m: float) -> Survey:
+    """Return the survey with another channel after each side's own, of so many samples over another range."""
+    rng = np.random.default_rng(9)
+
+    def channels(ping: Ping) -> tuple[ChannelPing, ...]:
+        noise = {c.side: (rng.rayleigh(0.8, samples) * 2000).astype(np.uint16) for c in ping.channels}
+        high = (ChannelPing(side, noise[side], range_m, SECOND_HZ) for side in Side if side in noise)
+        return (*(replace(c, frequency_hz=FIRST_HZ) for c in ping.channels), *high)
+
+    return replace(survey, pings=tuple(replace(ping, channels=channels(ping)) for ping in survey.pings))
+
+
+def files_of(survey: Survey, folder: Path, samples: int, range_m: float) -> tuple[Path, Path]:
+    """Write a survey as the file of its first frequency alone, and as that of both; return the files.
+
+    Both are called the same, each in a folder of its own.
+    """
+    paths = (folder / "alone" / "line.xtf", folder / "both" / "line.xtf")
+    both = with_second_frequency(survey, samples, range_m)
+    alone = replace(survey, pings=tuple(replace(p, channels=p.channels[: len(p.channels) // 2]) for p in both.pings))
+    for path, recording in zip(paths, (alone, both), strict=True):
+        path.parent.mkdir(exist_ok=True)
+        write_xtf(recording, path)
+    return paths
+
+
+def read_both(survey: Survey, folder: Path, samples: int, range_m: float) -> tuple[Survey, Survey]:
+    """Return the survey as it is read from the file of its first frequency alone, and from that of both."""
+    alone, both = (read_xtf(path) for path in files_of(survey, folder, samples, range_m))
+    assert {len(p.channels) for p in both.pings} == {2 * len(p.channels) for p in alone.pings}
+    return alone, both
