@@ -140,8 +140,7 @@ def ground_picture(
     place = _place(found)
     if place is None:
         return None
-    reach_m = max((c.slant_range_m for p in survey.pings for c in p.channels if c.side is found.side), default=0.0)
-    if reach_m / pixel_m > MAX_COLUMNS:
+    if survey.reach_m(found.side) / pixel_m > MAX_COLUMNS:
         return None
     # Edges of the rows, in pings from the beginning of the survey.
     edges = found.ping_index + 0.5 + (np.arange(height_px + 1) - height_px / 2) * pixel_m / place.along_m

@@ -18,7 +18,7 @@ from sonarpost.detect.looks import Look, Sameness
 from sonarpost.detect.settings import DetectorSettings
 from sonarpost.sonar.geometry import ping_spacing_m
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.survey import Survey
+from sonarpost.sonar.survey import Ping, Side, Survey
 
 OVERLAP_M: Final = 40.0
 """How much of a file is put before the next: more than the filters look around."""
@@ -169,8 +169,12 @@ def follows(before: Survey, after: Survey) -> bool:
     interval_s = (last.time_utc_s - before.pings[0].time_utc_s) / max(len(before.pings) - 1, 1)
     if not 0 <= gap_s <= max(_LONGEST_GAP_S if interval_s <= 0 else 0.0, _LONGEST_GAP_PINGS * interval_s):
         return False
-    sampling = [{(c.side, len(c.samples), c.slant_range_m) for c in ping.channels} for ping in (last, first)]
-    return sampling[0] == sampling[1]
+    return _sampling(last) == _sampling(first)
+
+
+def _sampling(ping: Ping) -> dict[Side, list[tuple[int, float]]]:
+    """Return the samples and the range of each channel of a side, in their order: the first is the picture."""
+    return {side: [(len(c.samples), c.slant_range_m) for c in ping.channels if c.side is side] for side in Side}
 
 
 def _in_order(contacts: Sequence[LineContact]) -> tuple[LineContact, ...]:

@@ -101,9 +101,7 @@ def preprocess(
 
 
 def _sample_spacing_m(survey: Survey, side: Side) -> float | None:
-    spacings = [
-        c.sample_spacing_m for p in survey.pings for c in p.channels if c.side is side and c.samples.shape[0] > 0
-    ]
+    spacings = [c.sample_spacing_m for c in survey.channels(side) if c.samples.shape[0] > 0]
     usable = [s for s in spacings if np.isfinite(s) and s > 0]
     return float(np.median(usable)) if usable else None
 

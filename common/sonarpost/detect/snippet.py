@@ -124,7 +124,7 @@ def _samples(survey: Survey, detection: Detection, height_px: int, width_px: int
     """
     if height_px < 1 or width_px < 1:
         raise ValueError(f"height_px, width_px: got {height_px}, {width_px}, expected 1 or more")
-    samples = max((c.samples.shape[0] for p in survey.pings for c in p.channels if c.side is detection.side), default=0)
+    samples = survey.sample_count(detection.side)
     if not (0 <= detection.ping_index < len(survey.pings) and 0 <= detection.sample < samples):
         raise ValueError(
             f"detection: got ping index {detection.ping_index}, sample {detection.sample}, "

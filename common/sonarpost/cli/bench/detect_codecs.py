@@ -134,7 +134,8 @@ def confidence_with(survey: Survey, found: Detection, cut: Snippet, picture: Ima
     pings = list(survey.pings)
     for row, line in enumerate(samples):
         ping = pings[cut.first_ping_index + row]
-        channels = tuple(_with(c, cut.first_sample, line) if c.side is found.side else c for c in ping.channels)
+        shown = ping.channel(found.side)
+        channels = tuple(_with(c, cut.first_sample, line) if c is shown else c for c in ping.channels)
         pings[cut.first_ping_index + row] = replace(ping, channels=channels)
     along_m = found.pixel_along_m or _EVERYTHING.assumed_row_along_m
     return max(
