@@ -2,122 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import eventually
+from seams import RANGE_M, SAMPLES, START_S, Box, cut_into, held_of, near, run, survey_of
+from two_frequencies import with_second_frequency
 
 from services.atd_stub.config import AtdStubConfig
 from services.atd_stub.seam import SeamLook, last_pings, pack, unpack
 from services.atd_stub.service import AtdStubService
 from services.atd_stub.snippets import from_survey
-from sonarpost import keys, wire
-from sonarpost.detect.line import follows
+from sonarpost import keys
 from sonarpost.messages import Snippet
-from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
+from sonarpost.sonar.survey import ChannelPing, Ping, Side
 from sonarpost.sonar.xtf_reader import read_xtf
 from sonarpost.sonar.xtf_writer import write_xtf
 
 KEY = keys.contact_detected("uuv-1")
-START_S, PING_S, SAMPLES, RANGE_M, ALTITUDE_M, ALONG_M = 1.0e9, 0.1, 256, 20.0, 3.0, 0.1
-OBJECT_SAMPLE = 150
-
-
-@dataclass(frozen=True)
-class Box:
-    """A bright box of 8 pings and 10 samples, and its shadow, about a row."""
-
-    row: int
-    side: Side = Side.PORT
-
-
-def survey_of(rows: int, *boxes: Box, seed: int = 5, first_row: int = 0) -> Survey:
-    """Return a seabed of speckle with boxes; row 0 of the whole is at START_S."""
-    rng = np.random.default_rng(seed)
-    images = {}
-    for side in Side:
-        mean = np.ones((rows, SAMPLES))
-        for box in boxes:
-            if box.side is side:
-                span = slice(box.row - 4, box.row + 4)
-                mean[span, OBJECT_SAMPLE - 5 : OBJECT_SAMPLE + 5] = 6.0
-                mean[span, OBJECT_SAMPLE + 5 : OBJECT_SAMPLE + 30] = 0.04
-        ranges = (np.arange(SAMPLES) + 0.5) * RANGE_M / SAMPLES
-        mean *= 1.0 / (1.0 + ranges / 8.0)
-        mean[:, ranges < ALTITUDE_M] = 0.004
-        images[side] = np.clip(mean * rng.rayleigh(0.8, mean.shape) * 4000, 0, 65535).astype(np.uint16)
-    pings = tuple(
-        Ping(
-            number=row,
-            time_utc_s=START_S + row * PING_S,
-            channels=tuple(ChannelPing(side, images[side][row], RANGE_M) for side in Side),
-            lat_deg=60.0 + row * ALONG_M / 111_412.0,
-            lon_deg=5.0,
-            heading_deg=0.0,
-            altitude_m=ALTITUDE_M,
-            depth_m=12.0,
-            speed_mps=ALONG_M / PING_S,
-        )
-        for row in range(first_row, rows)
-    )
-    return Survey(Path("made.xtf"), "made", "made", pings)
-
-
-def with_second_frequency(survey: Survey, samples: int, range_m: float) -> Survey:
-    """Return a recording of a sonar of two frequencies: after each side's channel another, which shows mere speckle."""
-    rng = np.random.default_rng(9)
-
-    def channels(ping: Ping) -> tuple[ChannelPing, ...]:
-        noise = {side: (rng.rayleigh(0.8, samples) * 2000).astype(np.uint16) for side in Side}
-        high = (ChannelPing(side, noise[side], range_m, 900e3) for side in Side)
-        return (*(replace(c, frequency_hz=400e3) for c in ping.channels), *high)
-
-    return replace(survey, pings=tuple(replace(ping, channels=channels(ping)) for ping in survey.pings))
-
-
-def cut_into(folder: Path, survey: Survey, *spans: tuple[int, int], sonar: str = "") -> list[Path]:
-    """Write pieces of a survey as files of a recorder that begins a new one now and then."""
-    paths = []
-    for number, (first, end) in enumerate(spans):
-        part = replace(survey, pings=survey.pings[first:end], sonar_id=sonar or survey.sonar_id)
-        paths.append(folder / f"line-{number}.xtf")
-        write_xtf(part, paths[-1])
-    return paths
-
-
-def run(paths: list[Path], **changes) -> list[Snippet]:
-    """Return what files give that come one after the other, and what is still held when no other comes."""
-    config = AtdStubConfig(**changes)
-    seams, sent, total = {}, [], 0
-    for path in paths:
-        found = from_survey(path, path.stem.ljust(64, "0"), "uuv-1", config, seams, 100.0)
-        if not found.joined:
-            sent += [payload for seam in seams.values() for payload in held_of(seam)]
-        sent += found.snippets
-        total += found.contacts
-        seams = {} if found.seam is None else {found.seam.sonar_id: found.seam}
-    sent += [snippet for seam in seams.values() for snippet in held_of(seam)]
-    assert len(sent) == total, "every contact is counted once"
-    return sent
-
-
-def held_of(seam) -> list[Snippet]:
-    return [wire.decode(Snippet, payload, "held") for payload in seam.held]
-
-
-def near(sent: list[Snippet], row: int, side: Side = Side.PORT) -> list[Snippet]:
-    """Return the contacts within a metre of a box."""
-    slant_m = OBJECT_SAMPLE * RANGE_M / SAMPLES
-    return [
-        s
-        for s in sent
-        if s.contact.channel == side.value
-        and abs(s.contact.ping_number - row) <= 10
-        and abs(s.contact.slant_range_m - slant_m) < 1.0
-    ]
 
 
 @pytest.mark.parametrize("wait_s", [0.0, 30.0])
@@ -169,28 +73,6 @@ def test_a_long_file_gives_each_object_once_whatever_strip_it_is_in(tmp_path):
     (path,) = cut_into(tmp_path, survey_of(1700, *boxes), (0, 1700))
     sent = run([path])
     assert [len(near(sent, box.row, box.side)) for box in boxes] == [1] * len(boxes)
-
-
-@pytest.mark.parametrize(("samples", "range_m"), [(SAMPLES, RANGE_M), (SAMPLES // 2, RANGE_M), (320, 12.5)])
-def test_files_of_two_frequencies_go_on_where_the_one_before_ended(samples, range_m, tmp_path):
-    survey = with_second_frequency(survey_of(300, Box(150)), samples, range_m)
-    paths = cut_into(tmp_path, survey, (0, 149), (149, 300))
-    read = [read_xtf(path) for path in paths]
-    assert [len(ping.channels) for ping in (read[0].pings[-1], read[1].pings[0])] == [4, 4]
-    assert follows(*read), "commands join them"
-    assert len(near(run(paths, seam_wait_s=30.0), 150)) == 1
-    seam = from_survey(paths[0], "0" * 64, "uuv-1", AtdStubConfig(seam_wait_s=30.0), {}, 100.0).seam
-    assert from_survey(paths[1], "1" * 64, "uuv-1", AtdStubConfig(), {seam.sonar_id: unpack(pack(seam))}, 100.0).joined
-
-
-def test_a_second_frequency_with_another_range_is_not_the_same_recording(tmp_path):
-    survey = survey_of(200, Box(97))
-    before, after = (with_second_frequency(survey, 320, range_m) for range_m in (12.5, 10.0))
-    first, second = cut_into(tmp_path, before, (0, 100), (100, 200))
-    write_xtf(replace(after, pings=after.pings[100:]), second)
-    assert not follows(read_xtf(first), read_xtf(second))
-    seam = from_survey(first, "0" * 64, "uuv-1", AtdStubConfig(), {}, 100.0).seam
-    assert not from_survey(second, "1" * 64, "uuv-1", AtdStubConfig(), {seam.sonar_id: seam}, 100.0).joined
 
 
 @pytest.mark.parametrize("what", ["later", "elsewhere", "other sonar", "other range", "earlier", "one more channel"])

@@ -1,0 +1,100 @@
+"""Recordings cut into files, for tests of the seam between them: a seabed with boxes, and what atd_stub makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from services.atd_stub.config import AtdStubConfig
+from services.atd_stub.snippets import from_survey
+from sonarpost import wire
+from sonarpost.messages import Snippet
+from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
+from sonarpost.sonar.xtf_writer import write_xtf
+
+START_S, PING_S, SAMPLES, RANGE_M, ALTITUDE_M, ALONG_M = 1.0e9, 0.1, 256, 20.0, 3.0, 0.1
+OBJECT_SAMPLE = 150
+
+
+@dataclass(frozen=True)
+class Box:
+    """A bright box of 8 pings and 10 samples, and its shadow, about a row."""
+
+    row: int
+    side: Side = Side.PORT
+
+
+def survey_of(rows: int, *boxes: Box, seed: int = 5, first_row: int = 0) -> Survey:
+    """Return a seabed of speckle with boxes; row 0 of the whole is at START_S."""
+    rng = np.random.default_rng(seed)
+    images = {}
+    for side in Side:
+        mean = np.ones((rows, SAMPLES))
+        for box in boxes:
+            if box.side is side:
+                span = slice(box.row - 4, box.row + 4)
+                mean[span, OBJECT_SAMPLE - 5 : OBJECT_SAMPLE + 5] = 6.0
+                mean[span, OBJECT_SAMPLE + 5 : OBJECT_SAMPLE + 30] = 0.04
+        ranges = (np.arange(SAMPLES) + 0.5) * RANGE_M / SAMPLES
+        mean *= 1.0 / (1.0 + ranges / 8.0)
+        mean[:, ranges < ALTITUDE_M] = 0.004
+        images[side] = np.clip(mean * rng.rayleigh(0.8, mean.shape) * 4000, 0, 65535).astype(np.uint16)
+    pings = tuple(
+        Ping(
+            number=row,
+            time_utc_s=START_S + row * PING_S,
+            channels=tuple(ChannelPing(side, images[side][row], RANGE_M) for side in Side),
+            lat_deg=60.0 + row * ALONG_M / 111_412.0,
+            lon_deg=5.0,
+            heading_deg=0.0,
+            altitude_m=ALTITUDE_M,
+            depth_m=12.0,
+            speed_mps=ALONG_M / PING_S,
+        )
+        for row in range(first_row, rows)
+    )
+    return Survey(Path("made.xtf"), "made", "made", pings)
+
+
+def cut_into(folder: Path, survey: Survey, *spans: tuple[int, int], sonar: str = "") -> list[Path]:
+    """Write pieces of a survey as files of a recorder that begins a new one now and then."""
+    paths = []
+    for number, (first, end) in enumerate(spans):
+        part = replace(survey, pings=survey.pings[first:end], sonar_id=sonar or survey.sonar_id)
+        paths.append(folder / f"line-{number}.xtf")
+        write_xtf(part, paths[-1])
+    return paths
+
+
+def run(paths: list[Path], **changes) -> list[Snippet]:
+    """Return what files give that come one after the other, and what is still held when no other comes."""
+    config = AtdStubConfig(**changes)
+    seams, sent, total = {}, [], 0
+    for path in paths:
+        found = from_survey(path, path.stem.ljust(64, "0"), "uuv-1", config, seams, 100.0)
+        if not found.joined:
+            sent += [payload for seam in seams.values() for payload in held_of(seam)]
+        sent += found.snippets
+        total += found.contacts
+        seams = {} if found.seam is None else {found.seam.sonar_id: found.seam}
+    sent += [snippet for seam in seams.values() for snippet in held_of(seam)]
+    assert len(sent) == total, "every contact is counted once"
+    return sent
+
+
+def held_of(seam) -> list[Snippet]:
+    return [wire.decode(Snippet, payload, "held") for payload in seam.held]
+
+
+def near(sent: list[Snippet], row: int, side: Side = Side.PORT) -> list[Snippet]:
+    """Return the contacts within a metre of a box."""
+    slant_m = OBJECT_SAMPLE * RANGE_M / SAMPLES
+    return [
+        s
+        for s in sent
+        if s.contact.channel == side.value
+        and abs(s.contact.ping_number - row) <= 10
+        and abs(s.contact.slant_range_m - slant_m) < 1.0
+    ]

@@ -1,0 +1,55 @@
+"""atd_stub on files of sonars of two frequencies: they are joined, and give what the first frequency alone gives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from seams import RANGE_M, SAMPLES, Box, cut_into, near, run, survey_of
+from two_frequencies import files_of, with_second_frequency
+
+from services.atd_stub.config import AtdStubConfig
+from services.atd_stub.seam import pack, unpack
+from services.atd_stub.snippets import from_survey
+from sonarpost.detect.line import follows
+from sonarpost.sonar.survey import Side
+from sonarpost.sonar.xtf_reader import read_xtf
+from sonarpost.sonar.xtf_writer import write_xtf
+
+SECOND = pytest.mark.parametrize(
+    ("samples", "range_m"), [(SAMPLES, RANGE_M), (SAMPLES // 2, RANGE_M), (320, 12.5), (1024, 60.0)]
+)
+
+
+@SECOND
+@pytest.mark.parametrize("ground", [False, True])
+def test_contacts_and_their_pictures_are_those_of_the_first_frequency_alone(ground, samples, range_m, tmp_path):
+    survey = survey_of(300, Box(150), Box(210, Side.STARBOARD))
+    config = AtdStubConfig(snippet_pixel_m=0.1) if ground else AtdStubConfig()
+    alone, both = (
+        from_survey(path, "0" * 64, "uuv-1", config).snippets for path in files_of(survey, tmp_path, samples, range_m)
+    )
+    assert len(near(list(both), 150)) == len(near(list(both), 210, Side.STARBOARD)) == 1
+    assert both == alone
+
+
+@SECOND
+def test_files_of_two_frequencies_go_on_where_the_one_before_ended(samples, range_m, tmp_path):
+    survey = with_second_frequency(survey_of(300, Box(150)), samples, range_m)
+    paths = cut_into(tmp_path, survey, (0, 149), (149, 300))
+    read = [read_xtf(path) for path in paths]
+    assert [len(ping.channels) for ping in (read[0].pings[-1], read[1].pings[0])] == [4, 4]
+    assert follows(*read), "commands join them"
+    assert len(near(run(paths, seam_wait_s=30.0), 150)) == 1
+    seam = from_survey(paths[0], "0" * 64, "uuv-1", AtdStubConfig(seam_wait_s=30.0), {}, 100.0).seam
+    assert from_survey(paths[1], "1" * 64, "uuv-1", AtdStubConfig(), {seam.sonar_id: unpack(pack(seam))}, 100.0).joined
+
+
+def test_a_second_frequency_with_another_range_is_not_the_same_recording(tmp_path):
+    survey = survey_of(200, Box(97))
+    before, after = (with_second_frequency(survey, 320, range_m) for range_m in (12.5, 10.0))
+    first, second = cut_into(tmp_path, before, (0, 100), (100, 200))
+    write_xtf(replace(after, pings=after.pings[100:]), second)
+    assert not follows(read_xtf(first), read_xtf(second))
+    seam = from_survey(first, "0" * 64, "uuv-1", AtdStubConfig(), {}, 100.0).seam
+    assert not from_survey(second, "1" * 64, "uuv-1", AtdStubConfig(), {seam.sonar_id: seam}, 100.0).joined
