@@ -16,7 +16,7 @@ from sonarpost.codec.emb.coder import Coder
 from sonarpost.codec.emb.grain import make_grain, measure_grain
 from sonarpost.codec.emb.layout import layout
 from sonarpost.codec.emb.model import shipped
-from sonarpost.codec.emb.region import fill_unknown, weights
+from sonarpost.codec.emb.region import INSIDE, OUTSIDE, fill_unknown, weights
 from sonarpost.codec.emb.side import Box, Side, read_side, write_side
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import StreamError
@@ -87,11 +87,11 @@ def test_a_region_of_interest_gets_more_of_the_bits() -> None:
 def test_weights_stand_over_the_box() -> None:
     lay = layout(80, 80)
     weight = weights(lay, Box(4, 4, 7, 7))
-    assert set(np.unique(weight[lay.position])) == {2, 3}
+    assert set(np.unique(weight[lay.position])) == {OUTSIDE, INSIDE}
     finest = weight[lay.position][:40, 40:]
-    assert (finest[10:20, 10:20] == 3).all()
-    assert (finest == 3).sum() == 100
-    assert (weights(lay, None) == 2).all()
+    assert (finest[10:20, 10:20] == INSIDE).all()
+    assert (finest == INSIDE).sum() == 100
+    assert (weights(lay, None) == OUTSIDE).all()
 
 
 @pytest.mark.parametrize("corners", [(-1, 0, 3, 3), (0, 16, 3, 16), (5, 0, 4, 3), (0, 5, 3, 4)])

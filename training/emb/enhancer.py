@@ -139,6 +139,7 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
     parser.add_argument("--rate", type=float, default=1.5e-3)
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--likeness", type=float, default=0.1, help="weight of structural similarity")
+    parser.add_argument("--error", type=float, default=1.0, help="weight of the squared error's logarithm")
     args = parser.parse_args()
     rng = np.random.default_rng(args.seed)
     pool = np.load(args.pool)
@@ -165,7 +166,7 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
 
     def loss(p, *batch):  # noqa: ANN001, ANN002, ANN202
         before, after, _, like = parts(p, *batch)
-        return (jnp.log(after + 8) - jnp.log(before + 8)).mean() - args.likeness * like.mean()
+        return args.error * (jnp.log(after + 8) - jnp.log(before + 8)).mean() - args.likeness * like.mean()
 
     optimiser = optax.chain(optax.clip_by_global_norm(0.3), optax.inject_hyperparams(optax.adam)(2e-3))
 

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import kernel, transform
-from sonarpost.codec.emb.coder import Coder, State
+from sonarpost.codec.emb.coder import PLAIN_SCALE, Coder, State
 from sonarpost.codec.emb.fit import Wanted, wanted_of
 from sonarpost.codec.emb.layout import layout
 from sonarpost.codec.emb.model import SECOND, Model, model_of
@@ -33,13 +33,15 @@ def chance_side(targets: npt.NDArray[np.int32], mean_index: int, rng: np.random.
     return Side(mean_index, step, None, None, extra_planes(targets, step))
 
 
-def chance_wanted(picture: npt.NDArray[np.uint8], rng: np.random.Generator) -> tuple[Wanted, int, int]:
+def chance_wanted(
+    model: Model, picture: npt.NDArray[np.uint8], rng: np.random.Generator
+) -> tuple[Wanted, int, int]:
     """What the encoder would tell of a picture in a chance number of bytes, the mean level, and the bytes."""
     lay = layout(*picture.shape)
     size = int(np.exp(rng.uniform(np.log(LEAST_BYTES), np.log(MOST_BYTES))) * picture.size / 6400)
     mean_index = min((int(picture.astype(np.int64).sum()) // picture.size + MEAN_STEP // 2) // MEAN_STEP, 63)
     plane = (picture.astype(np.int64) - mean_index * MEAN_STEP) * transform.UNIT
-    return wanted_of(plane, lay, weights(lay, None), size), mean_index, size
+    return wanted_of(plane, lay, weights(lay, None), size, model.aim), mean_index, size
 
 
 def list_examples(
@@ -55,7 +57,7 @@ def list_examples(
     rows = np.zeros((rows_a_picture, kernel.FEATURES + 3), np.int16)
     sign_rows = np.zeros((rows_a_picture // 8, kernel.SIGN_FEATURES + 2), np.int16)
     for picture in pictures:
-        wanted, mean_index, size = chance_wanted(picture, rng)
+        wanted, mean_index, size = chance_wanted(model, picture, rng)
         side = chance_side(wanted.targets, mean_index, rng)
         writer, state = Coder.writer(size), State(wanted.lay)
         code_planes(writer, state, model, wanted.targets, side)
@@ -79,12 +81,12 @@ def measure_centres(model: Model, pictures: npt.NDArray[np.uint8], rng: np.rando
     """
     total = np.zeros((4, kernel.CENTRE_COLUMNS, 2))
     for picture in pictures:
-        wanted, mean_index, size = chance_wanted(picture, rng)
+        wanted, mean_index, size = chance_wanted(model, picture, rng)
         coder, state = Coder.writer(size), State(wanted.lay)
         code_planes(coder, state, model, wanted.targets, chance_side(wanted.targets, mean_index, rng))
         known = state.values > 0
         value, width = state.values[known], state.widths[known]
-        part = (np.abs(wanted.targets[known]) - value) / width
+        part = (np.abs(wanted.targets[known]) * (state.scale[known] / PLAIN_SCALE) - value) / width
         row, column = (
             np.minimum(value // width, 4) - 1,
             np.clip((state.odds[known] + 2304) >> 7, 0, kernel.CENTRE_COLUMNS - 1),

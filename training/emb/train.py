@@ -19,7 +19,7 @@ import optax
 
 from examples import Rows, blank_model, list_examples, measure_centres
 from sonarpost.codec.emb import kernel as k
-from sonarpost.codec.emb.model import SECOND, Model, model_of, parse, read_arrays
+from sonarpost.codec.emb.model import AIMED, SECOND, Model, model_of, parse, read_arrays
 
 SEED = 7
 BATCH = 8192
@@ -126,8 +126,9 @@ def mean_tree(means: np.ndarray) -> np.ndarray:
 
 def write_model(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write the arrays in the file's order and types."""
-    raw = bytearray(SECOND.magic)
-    for name, shape, kind in SECOND.arrays:
+    form = AIMED if "aim_levels" in arrays else SECOND
+    raw = bytearray(form.magic)
+    for name, shape, kind in form.arrays:
         array = np.asarray(arrays[name])
         whole = array.astype(kind)
         if array.shape != shape or not np.array_equal(whole, array):
@@ -194,7 +195,7 @@ def main() -> None:
     arrays = integers(nets, signs) | tables()
     arrays["mean_tree"] = mean_tree(np.concatenate([pool[n].mean((1, 2)) for n in ("tp80", "tp140", "tp112")]))
     kept = read_arrays(args.order.read_bytes()) if args.order else {}
-    for name, shape, _ in SECOND.arrays:
+    for name, shape, _ in (AIMED if order.aim is not None else SECOND).arrays:
         arrays.setdefault(name, kept.get(name, np.zeros(shape)))  # an enhancer of zeros does nothing
     arrays["centres"] = order.centres
     whole = model_of({name: np.asarray(array, np.int32) for name, array in arrays.items()})

@@ -86,22 +86,32 @@ def _what_is_absent(name_or_id: str | int) -> str:
     return "".join(f" ({wanted.value} needs {wanted.needs})" for wanted in absent)
 
 
-def _create_emb(resources: CodecResources) -> Codec:
+def _create_emb(resources: CodecResources, codec_id: int) -> Codec:
     # It brings a compiler, which nobody else waits for.
     from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415
-    from sonarpost.codec.emb.model import all_shipped  # noqa: PLC0415
+    from sonarpost.codec.emb.model import all_shipped, all_structure  # noqa: PLC0415
 
-    models = all_shipped()  # the first encodes, and tells a stream of a strange model so
-    wanted = (model for model in models if model_tag(0x20, model.identity) == resources.model_tag)
+    # The first encodes, and tells a stream of a strange model so.
+    models = all_shipped() if codec_id == _EMB else all_structure()
+    wanted = (model for model in models if model_tag(codec_id, model.identity) == resources.model_tag)
     return EmbCodec(next(wanted, models[0]))
+
+
+_EMB, _EMB_STRUCTURE = 0x20, 0x21
 
 
 BUILTINS = (
     CodecSpec(
         "emb",
-        (0x20,),
-        _create_emb,
+        (_EMB,),
+        lambda resources: _create_emb(resources, _EMB),
         "embedded wavelet codec with learned contexts: a picture at every length, from 20 bytes up",
+    ),
+    CodecSpec(
+        "emb-structure",
+        (_EMB_STRUCTURE,),
+        lambda resources: _create_emb(resources, _EMB_STRUCTURE),
+        "the same, made for likeness of structure (MS-SSIM) instead of the least squared error",
     ),
     CodecSpec(
         "vq",

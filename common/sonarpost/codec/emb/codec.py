@@ -17,7 +17,7 @@ from sonarpost.codec.emb.coder import State, error_by_length
 from sonarpost.codec.emb.fit import wanted_of
 from sonarpost.codec.emb.grain import make_grain, measure_grain
 from sonarpost.codec.emb.layout import layout
-from sonarpost.codec.emb.model import Model, all_shipped, shipped
+from sonarpost.codec.emb.model import Model, all_shipped, all_structure, shipped
 from sonarpost.codec.emb.planes import held
 from sonarpost.codec.emb.reading import Plain, picture_of, plain_of, read_body, usable
 from sonarpost.codec.emb.region import fill_unknown, weights
@@ -28,6 +28,8 @@ from sonarpost.errors import StreamError
 
 CODEC_ID: Final = 0x20
 NAME: Final = "emb"
+STRUCTURE_ID: Final = 0x21
+STRUCTURE_NAME: Final = "emb-structure"
 MIN_BODY_BYTES: Final = 3
 _PRICE: Final = 20
 """Least error, in 1/256 of the squared threshold, that a bit must take away; see `kernel.code_band`."""
@@ -69,12 +71,12 @@ class EmbCodec:
     @property
     def name(self) -> str:
         """Name in the registry."""
-        return NAME
+        return NAME if self.model.aim is None else STRUCTURE_NAME
 
     @property
     def codec_id(self) -> int:
         """Number in the stream header."""
-        return CODEC_ID
+        return CODEC_ID if self.model.aim is None else STRUCTURE_ID
 
     @property
     def model_hash(self) -> str:
@@ -117,7 +119,7 @@ class EmbCodec:
         if known is not None:
             picture = fill_unknown(picture, known)
         height_px, width_px = (int(n) for n in picture.shape)
-        header = StreamHeader(CODEC_ID, model_tag(CODEC_ID, self.model.identity), height_px, width_px)
+        header = StreamHeader(self.codec_id, model_tag(self.codec_id, self.model.identity), height_px, width_px)
         budget = max(64, height_px * width_px // 25) if budget_bytes is None else budget_bytes
         limit = min(budget - header.size, MAX_BODY_BYTES)
         if limit < MIN_BODY_BYTES:
@@ -125,7 +127,7 @@ class EmbCodec:
         lay = layout(height_px, width_px)
         mean_index = min((int(picture.astype(np.int64).sum()) // picture.size + MEAN_STEP // 2) // MEAN_STEP, 63)
         plane = (picture.astype(np.int64) - mean_index * MEAN_STEP) * transform.UNIT
-        wanted = wanted_of(plane, lay, weights(lay, box), limit)
+        wanted = wanted_of(plane, lay, weights(lay, box), limit, self.model.aim)
         grain = measure_grain(picture, lay) if self.grain else None
         written = Writer(self.model, limit, self.price).best(wanted, mean_index, box, grain, self.steps)
         estimate = error_by_length(written.curve, len(written.body), header.size, picture.size)
@@ -163,7 +165,7 @@ class EmbCodec:
         if side.step < 0 or limit < len(stream) - header.size:
             return stream
         plane = (picture.astype(np.int64) - side.mean) * transform.UNIT
-        wanted = wanted_of(plane, state.lay, weights(state.lay, side.box), limit)
+        wanted = wanted_of(plane, state.lay, weights(state.lay, side.box), limit, model.aim)
         wanted = replace(wanted, targets=held(wanted.targets, state, side))
         longer = header.pack() + Writer(model, limit, 0, stream[header.size : -1]).write(wanted, side).body
         return longer if len(longer) > len(stream) and longer.startswith(stream[:-1]) else stream
@@ -235,11 +237,13 @@ class EmbCodec:
     def _model_of(self, stream: bytes) -> tuple[Model, StreamHeader]:
         """The model that a stream was made with, and the stream's header."""
         header = StreamHeader.unpack(stream)
-        if header.codec_id != CODEC_ID:
-            raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", f"{CODEC_ID:#04x} (emb)")
-        for model in (self.model, *all_shipped()):
-            if header.model_tag == model_tag(CODEC_ID, model.identity):
+        if header.codec_id != self.codec_id:
+            expected = f"{self.codec_id:#04x} ({self.name})"
+            raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", expected)
+        others = all_shipped() if self.model.aim is None else all_structure()
+        for model in (self.model, *others):
+            if header.model_tag == model_tag(self.codec_id, model.identity):
                 return model, header
-        tag = model_tag(CODEC_ID, self.model.identity)
+        tag = model_tag(self.codec_id, self.model.identity)
         expected = f"{tag:#04x}: the stream was made with a model that is not at hand"
         raise StreamError("stream", "model_tag", f"{header.model_tag:#04x}", expected)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -15,12 +16,17 @@ I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 
 
+PLAIN_SCALE: Final = 256
+"""A coefficient that is coded as it is."""
+
+
 @dataclass
 class State:
     """What is known of a picture's coefficients; flat arrays of `Layout.cells`, see `kernel.code_band`.
 
     Attributes:
         threshold: Of the plane that was coded last.
+        scale: By what each coefficient is multiplied before it is coded, 1/256; see `aim`.
     """
 
     lay: Layout
@@ -32,10 +38,12 @@ class State:
     signed: I32 = field(init=False)
     marks: I32 = field(init=False)
     odds: I32 = field(init=False)
+    scale: I32 = field(init=False)
 
     def __post_init__(self) -> None:
         for name in ("values", "widths", "signs", "seen", "signed", "marks", "odds"):
             setattr(self, name, np.zeros(self.lay.cells, np.int32))
+        self.scale = np.full(self.lay.cells, PLAIN_SCALE, np.int32)
 
 
 @dataclass

@@ -16,6 +16,8 @@ import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
 from sonarpost.codec.emb._jit import compiled
+from sonarpost.codec.emb.aim import Aim, expected, start_scales
+from sonarpost.codec.emb.coder import PLAIN_SCALE
 from sonarpost.codec.emb.layout import HH, HL, LH, LL, Layout
 from sonarpost.codec.emb.region import OUTSIDE
 
@@ -47,22 +49,31 @@ class Wanted:
     targets: I32
 
 
-def wanted_of(plane: Plane, lay: Layout, halves: Plane, body_bytes: int) -> Wanted:
+def wanted_of(plane: Plane, lay: Layout, worth: Plane, body_bytes: int, aim: Aim | None = None) -> Wanted:
     """Return what to encode of a picture into so many bytes.
 
     Args:
         plane: See `Wanted`.
         lay: The picture's layout.
-        halves: Weight of each coefficient in halves, flat; see `region.weights`.
+        worth: Weight of each coefficient in 1/256, flat; see `region.weights`.
         body_bytes: The budget.
+        aim: The model's, if it has one.
     """
     plain = transform.to_flat(transform.forward(plane, lay), lay)
-    targets = fitted(plane, plain, halves, lay, body_bytes)
-    plain, targets = ((c.astype(np.int64) * halves // OUTSIDE).astype(np.int32) for c in (plain, targets))
+    worth_coded = worth if aim is None else _worth_with_aim(aim, plain, worth, lay, body_bytes)
+    targets = fitted(plane, plain, worth_coded, lay, body_bytes)
+    plain, targets = ((c.astype(np.int64) * worth // OUTSIDE).astype(np.int32) for c in (plain, targets))
     return Wanted(lay, plane, plain, targets)
 
 
-def fitted(picture: Plane, plain: I32, halves: Plane, lay: Layout, body_bytes: int) -> I32:
+def _worth_with_aim(aim: Aim, plain: I32, worth: Plane, lay: Layout, body_bytes: int) -> Plane:
+    """Weight of each coefficient with the scale that it will about have once the budget is spent."""
+    scaled = plain.astype(np.int64) * start_scales(aim, lay) // PLAIN_SCALE
+    shown = np.where(np.abs(scaled) >= _threshold(scaled, body_bytes), plain, 0).astype(np.int32)
+    return np.maximum(worth * expected(aim, shown, lay) // PLAIN_SCALE, 1)
+
+
+def fitted(picture: Plane, plain: I32, worth: Plane, lay: Layout, body_bytes: int) -> I32:
     """Return what to code instead of the plain coefficients.
 
     A few rounds of iterated thresholding (Blumensath and Davies, 2008): those that the budget will reach move half way
@@ -71,15 +82,15 @@ def fitted(picture: Plane, plain: I32, halves: Plane, lay: Layout, body_bytes: i
     Args:
         picture: Shape (height_px, width_px), int64, 1/64 grey, without its mean level.
         plain: Its coefficients, flat, int32.
-        halves: As `wanted_of`.
+        worth: As `wanted_of`.
         lay: The picture's layout.
         body_bytes: What they are coded into.
 
     Returns:
         Shape (lay.cells,), int32, not weighted.
     """
-    threshold = _threshold(plain.astype(np.int64) * halves // OUTSIDE, body_bytes)
-    least = threshold * OUTSIDE // halves
+    threshold = _threshold(plain.astype(np.int64) * worth // OUTSIDE, body_bytes)
+    least = threshold * OUTSIDE // worth
     near = plain.astype(np.int64)
     for _ in range(_ROUNDS):
         kept = np.where(np.abs(near) >= least, near, 0)

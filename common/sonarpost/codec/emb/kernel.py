@@ -605,7 +605,7 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
     lows: I32,
     f: I32,
     bases: I32,
-    known: tuple[I32, I32, I32, I32, I32, I32, I32, I32],
+    known: tuple[I32, I32, I32, I32, I32, I32, I32, I32, I32],
     nets: tuple[I32, I32, I32, I64],
     sign_nets: tuple[I32, I32, I32],
     tables: tuple[I32, I32, I32],
@@ -625,14 +625,14 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
             threshold; 0 to spend all.
         bar: Least logit that the pass takes.
         bands: The band table.
-        targets: The coefficients to tell (WRITE, LIST), flat.
+        targets: The coefficients to tell (WRITE, LIST), flat, multiplied.
         lows: Low-pass pictures known so far.
         f: Features; those from BAND_FEATURES on are filled in.
         bases: Shape (2, HIDDEN_1): first-layer sums that are the band's; first axis as in `nets`.
         known: Lower bounds of the magnitudes, 0 where not significant; how far above the magnitude may lie; signs;
             magnitudes in eighths of the threshold, at most CAP; the same with sign; the plane that decided last, or
             minus the plane that looked last; the logit of the last decision or look; 1 where this plane decided that
-            a coefficient is still not significant.
+            a coefficient is still not significant; by what each coefficient is multiplied, 1/256.
         nets: Weights w1, w2, b2, and the last layer's w3 and b3 as they have been learned in this picture, 1/2^28
             (see `_learn`); first axis 0 for significance and 1 for refinement.
         sign_nets: Weights w1, b1, w2; first axis the band's orientation.
@@ -642,7 +642,7 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
             the picture's own coefficients, flat, that it is an error of.
         lists: Examples of decisions and of signs (LIST).
     """
-    values, widths, signs, seen, signed, marks, odds, still = known
+    values, widths, signs, seen, signed, marks, odds, still, scale = known
     w1, w2, b2, live = nets
     sign_w1, sign_b1, sign_w2 = sign_nets
     chances, costs, centres = tables
@@ -684,8 +684,9 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
             before = _guess(values[at], widths[at], odds[at], centres) if values[at] > 0 else 0
             odds[at] = logit
             if kind == REFINE:
+                # A plane halves the interval, unless its bounds have been scaled anew.
+                widths[at] = max(widths[at] - threshold, threshold >> 1) if bit else min(widths[at], threshold)
                 values[at] += threshold * bit
-                widths[at] = threshold
             elif bit:
                 sign = 1 if targets[at] > 0 else 0
                 _sign_context(fs, signed, lows, bands, low_width, threshold, row, y, x, at)
@@ -702,8 +703,8 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes sha
                 seen[at] = min((values[at] + (widths[at] >> 1)) * 8 // threshold, CAP)
                 signed[at] = seen[at] * signs[at]
                 after = _guess(values[at], widths[at], odds[at], centres)
-                truth = np.int64(plain[at] * signs[at])
-                curve[0] += (truth - after) ** 2 - (truth - before) ** 2
+                truth, whole = np.int64(plain[at] * signs[at]), np.int64(scale[at])
+                curve[0] += (truth - after * 256 // whole) ** 2 - (truth - before * 256 // whole) ** 2
             else:
                 still[at] = 1
             if mode == WRITE:

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import kernel as k
+from sonarpost.codec.emb.aim import CONTRASTS, LEVELS, Aim
 from sonarpost.errors import StreamError
 
 I32 = npt.NDArray[np.int32]
@@ -27,7 +28,9 @@ GLOBALS: Final = 3
 CHANNELS: Final = 24
 DILATIONS: Final = (1, 2, 3, 1)
 SHIPPED: Final = ("emb-2.model", "emb.model")
-"""Model files of the package; the first is the one that encodes."""
+"""Model files of `emb`; the first is the one that encodes."""
+STRUCTURE: Final = ("emb-structure.model",)
+"""Those of `emb-structure`."""
 
 
 def _arrays(features: int, sign_features: int, sign_hidden: int, channels: int, layers: int) -> Arrays:
@@ -71,13 +74,15 @@ class Form:
     dilations: tuple[int, ...]
 
 
+_AIM_ARRAYS: Final[Arrays] = (("aim_levels", (LEVELS,), "<i2"), ("aim_contrast", (CONTRASTS,), "<i2"))
 FIRST: Final = Form(b"SPEMB1\n", _arrays(50, 11, 8, channels=24, layers=4), (1, 2, 3, 1))
 SECOND: Final = Form(
     b"SPEMB2\n",
     _arrays(k.FEATURES, k.SIGN_FEATURES, k.SIGN_HIDDEN, channels=CHANNELS, layers=len(DILATIONS)),
     DILATIONS,
 )
-FORMS: Final = (FIRST, SECOND)
+AIMED: Final = Form(b"SPEMB3\n", SECOND.arrays + _AIM_ARRAYS, DILATIONS)
+FORMS: Final = (FIRST, SECOND, AIMED)
 _FIRST_LOCAL: Final = 40
 """Features of one coefficient in the first form; those of its band came after them."""
 
@@ -94,6 +99,7 @@ class Model:
         situation: Shape (GLOBALS, CHANNELS): the enhancer's weights of the whole picture's features.
         layers: Taps (9, in, out) and bias (out,) of the enhancer's layers.
         dilations: Distance of the taps of each layer.
+        aim: How it scales coefficients; None: it aims at the least squared error.
     """
 
     identity: str
@@ -113,6 +119,7 @@ class Model:
     situation: I32
     layers: tuple[tuple[I32, I32], ...]
     dilations: tuple[int, ...]
+    aim: Aim | None = None
 
 
 def form_of(raw: bytes, where: str = "emb model") -> Form:
@@ -146,15 +153,16 @@ def read_arrays(raw: bytes, where: str = "emb model") -> dict[str, I32]:
 
 
 def model_of(arrays: dict[str, I32], identity: str = "", dilations: tuple[int, ...] = DILATIONS) -> Model:
-    """Make a model of its arrays, of either form."""
-    plain = {name: array for name, array in arrays.items() if name[:4] not in ("taps", "bias")}
+    """Make a model of its arrays, of any form."""
+    plain = {name: array for name, array in arrays.items() if name[:4] not in ("taps", "bias", "aim_")}
     plain["w1"] = _with_rows(plain["w1"], _FIRST_LOCAL, k.FEATURES)
     plain["sign_w1"] = _with_rows(plain["sign_w1"], plain["sign_w1"].shape[1], k.SIGN_FEATURES)
     for name in ("sign_w1", "sign_b1", "sign_w2"):
         missing = k.SIGN_HIDDEN - plain[name].shape[-1]
         plain[name] = np.pad(plain[name], [(0, 0)] * (plain[name].ndim - 1) + [(0, missing)])
     layers = tuple((arrays[f"taps{i}"], arrays[f"bias{i}"]) for i in range(len(dilations)))
-    return Model(identity=identity, layers=layers, dilations=dilations, **plain)
+    aim = Aim(arrays["aim_levels"], arrays["aim_contrast"]) if "aim_levels" in arrays else None
+    return Model(identity=identity, layers=layers, dilations=dilations, aim=aim, **plain)
 
 
 def _with_rows(weights: I32, at: int, rows: int) -> I32:
@@ -173,13 +181,23 @@ def parse(raw: bytes, where: str = "emb model") -> Model:
     return model_of(read_arrays(raw, where), hashlib.sha256(raw).hexdigest(), dilations)
 
 
+def _read(names: tuple[str, ...]) -> tuple[Model, ...]:
+    data = files("sonarpost.codec").joinpath("data")
+    return tuple(parse(data.joinpath(name).read_bytes(), name) for name in names)
+
+
 @cache
 def all_shipped() -> tuple[Model, ...]:
-    """Return the models that come with the package, the one that encodes first."""
-    data = files("sonarpost.codec").joinpath("data")
-    return tuple(parse(data.joinpath(name).read_bytes(), name) for name in SHIPPED)
+    """Return the models of `emb` that come with the package, the one that encodes first."""
+    return _read(SHIPPED)
+
+
+@cache
+def all_structure() -> tuple[Model, ...]:
+    """Return the models of `emb-structure` that come with the package, the one that encodes first."""
+    return _read(STRUCTURE)
 
 
 def shipped() -> Model:
-    """Return the model that encodes."""
+    """Return the model with which `emb` encodes."""
     return all_shipped()[0]

@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb import kernel, transform
-from sonarpost.codec.emb.coder import Coder, State
-from sonarpost.codec.emb.layout import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH
+from sonarpost.codec.emb import aim, kernel, transform
+from sonarpost.codec.emb.coder import PLAIN_SCALE, Coder, State
+from sonarpost.codec.emb.layout import HEIGHT, HL, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH
 from sonarpost.codec.emb.model import Model
 from sonarpost.codec.emb.region import OUTSIDE, weights
 from sonarpost.codec.emb.side import MAX_EXTRA, Box, Side
@@ -58,10 +58,12 @@ def code_planes(
     features = np.zeros(kernel.FEATURES, np.int32)
     base = np.zeros((2, kernel.HIDDEN_1), np.int32)
     still = np.zeros(lay.cells, np.int32)
-    known = (state.values, state.widths, state.signs, state.seen, state.signed, state.marks, state.odds, still)
+    plain = targets if plain is None else plain
+    scaled = targets if model.aim is None else aim.begin(model.aim, state, targets)
+    known = (state.values, state.widths, state.signs, state.seen, state.signed, state.marks, state.odds, still, state.scale)
     nets = (model.w1, model.w2, model.b2, _last_layer(model))
     sign_nets, tables = (model.sign_w1, model.sign_b1, model.sign_w2), (model.chances, model.costs, model.centres)
-    stream = (coder.words, coder.data, coder.good, coder.curve, targets if plain is None else plain)
+    stream = (coder.words, coder.data, coder.good, coder.curve, plain)
     lists = (coder.rows, coder.sign_rows)
     for plane in range(-side.extra, planes):
         threshold = (STEPS[side.step] << side.extra) >> (plane + side.extra)
@@ -71,9 +73,13 @@ def code_planes(
         rows = [i for i, band in enumerate(bands) if plane >= _FIRST_PLANE.get(band[LEVEL], -side.extra)]
         finest = min(bands[i][LEVEL] for i in rows)
         lows = low_pictures(state, model, side, finest)
-        for kind, bar in PASSES:
+        for number_in_plane, (kind, bar) in enumerate(PASSES):
             for row in rows:
                 band = bands[row]
+                is_new_level = number_in_plane == 0 and band[ORIENT] == HL and band[LEVEL] in aim.FOLLOWING
+                if model.aim is not None and is_new_level:
+                    aim.follow(model.aim, state, row, lows, finest, targets, scaled)
+                    kernel.refresh(state.values, state.widths, state.signs, state.seen, state.signed, threshold)
                 if row == 1 and kind != kernel.REFINE:
                     lows = low_pictures(state, model, side, finest)
                 _band_features(features, band, threshold, mean, _density(state, band))
@@ -81,7 +87,7 @@ def code_planes(
                     kernel.band_base(features, model.w1[net], model.b1[net], base[net])
                 low_width = widths[band[LEVEL]]
                 end = kernel.code_band(
-                    coder.mode, kind, number, threshold, row, low_width, price, bar, lay.bands, targets, lows,
+                    coder.mode, kind, number, threshold, row, low_width, price, bar, lay.bands, scaled, lows,
                     features, base, known, nets, sign_nets, tables, stream, lists,
                 )  # fmt: skip
                 if end < 0:
@@ -101,7 +107,9 @@ def held(targets: I32, state: State, side: Side) -> I32:
     planes = np.where(state.marks > 0, state.marks - 1, np.maximum(-state.marks - 2, 0))
     not_yet = np.where(state.marks == 0, first << 1, first >> planes)
     low, high = state.values, np.where(state.values > 0, state.values + state.widths, not_yet) - 1
-    size = np.clip(np.abs(targets), low, high)
+    scaled = np.abs(targets.astype(np.int64)) * state.scale // PLAIN_SCALE
+    size = -(-np.clip(scaled, low, high) * PLAIN_SCALE // state.scale)
+    size = np.where(scaled == np.clip(scaled, low, high), np.abs(targets), size)
     return (size * np.where(state.values > 0, state.signs, np.sign(targets))).astype(np.int32)
 
 
@@ -159,6 +167,8 @@ def known_plane(state: State, model: Model, box: Box | None = None) -> I64:
     """Most likely value of every coefficient, in the transform's square layout."""
     flat = np.zeros(state.lay.cells, np.int32)
     kernel.most_likely(state.values, state.widths, state.signs, state.odds, model.centres, flat)
+    if model.aim is not None:
+        flat = (flat.astype(np.int64) * PLAIN_SCALE // state.scale).astype(np.int32)
     if box is not None:
         flat = (flat * OUTSIDE // weights(state.lay, box)).astype(np.int32)
     return transform.from_flat(flat, state.lay)

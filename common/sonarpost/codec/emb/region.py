@@ -12,14 +12,14 @@ from sonarpost.codec.emb.side import SIXTEENTHS, Box
 from sonarpost.codec.interface import Image, Mask
 from sonarpost.errors import StreamError
 
-INSIDE: Final = 3
-OUTSIDE: Final = 2
+INSIDE: Final = 384
+OUTSIDE: Final = 256
 """Coefficients inside the box are coded as if they were 3/2 as large: their error weighs 9/4 as much."""
 _SMOOTHING_ROUNDS: Final = 24
 
 
 def weights(lay: Layout, box: Box | None) -> npt.NDArray[np.int64]:
-    """Return the weight of every coefficient in the flat layout, in halves (2 is plain).
+    """Return the weight of every coefficient in the flat layout, in 1/256 (256 is plain).
 
     The lowest band is the same for the whole picture and stays plain.
     """

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
+from sonarpost.codec.emb.aim import likeness
 from sonarpost.codec.emb.coder import Coder, State
 from sonarpost.codec.emb.fit import Wanted
 from sonarpost.codec.emb.model import Model
@@ -37,8 +38,9 @@ class Written:
     """A body.
 
     Attributes:
-        error: Squared error that stays, in the transform's units; of the coefficients where there is a region of
-            interest, whose own error weighs more, else of the picture.
+        error: What to make small. Squared error that stays, in the transform's units; of the coefficients where there is
+            a region of interest, whose own error weighs more, else of the picture. Of a model with an aim and no region
+            of interest: minus the likeness of the pictures.
         body: The bytes.
         curve: See `Coder.curve`.
     """
@@ -74,7 +76,11 @@ class Writer:
         if side.box is not None:
             return Written(int(coder.curve[0]), coder.finish(), coder.curve)
         shown, _ = transform.inverse(known_plane(state, self.model), wanted.lay)
-        return Written(int(((wanted.plane - shown) ** 2).sum()), coder.finish(), coder.curve)
+        if self.model.aim is not None:
+            error = -likeness(_grey(wanted.plane, side.mean), _grey(shown, side.mean))
+        else:
+            error = int(((wanted.plane - shown) ** 2).sum())
+        return Written(error, coder.finish(), coder.curve)
 
     def best(
         self,
@@ -105,6 +111,10 @@ class Writer:
             side = Side(mean_index, step, box, grain, extra_planes(wanted.targets, step))
             found[step] = self.write(wanted, side)
         return min(found.values(), key=lambda written: written.error)
+
+
+def _grey(plane: I64, mean: int) -> I64:
+    return np.asarray(np.clip((plane + transform.UNIT // 2) // transform.UNIT + mean, 0, 255), np.int64)
 
 
 def beside(errors: dict[int, int]) -> int:
