@@ -16,7 +16,7 @@ from sonarpost.errors import BadInputError
 from sonarpost.messages import Advice, Command, CommandKind, DownlinkState, TaskingState
 
 KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider")
-REFINABLE: Final = ("emb", "spiht")
+REFINABLE: Final = ("emb", "emb-structure", "spiht")
 """Codecs of which a longer stream begins with a shorter one."""
 _RANK: Final = {
     "none": 0,

@@ -6,6 +6,7 @@ texture was.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -51,8 +52,8 @@ def with_grain(codec: Codec, stream: bytes, picture: Image, strength: float = DE
 
 def grainy_twin(codec: Codec) -> Codec | None:
     """Return the codec that writes the grain's description into its streams, within the same budget; None if none."""
-    if codec.name != "emb":
+    if not codec.name.startswith("emb"):
         return None
     from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415  it brings a compiler, which nobody else waits for
 
-    return EmbCodec(grain=True)
+    return replace(codec, grain=True) if isinstance(codec, EmbCodec) else None

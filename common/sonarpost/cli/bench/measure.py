@@ -22,7 +22,7 @@ from sonarpost.errors import ConfigError, StreamError
 Values = npt.NDArray[np.float64]
 T = TypeVar("T")
 
-EMBEDDED: Final = ("emb", "spiht")
+EMBEDDED: Final = ("emb", "emb-structure", "spiht")
 """Codecs whose stream may be cut anywhere."""
 PSNR_LIMIT_DB: Final = 60.0
 """A picture rebuilt without error has an infinite PSNR, which no mean survives; it counts as this."""
