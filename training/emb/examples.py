@@ -33,9 +33,7 @@ def chance_side(targets: npt.NDArray[np.int32], mean_index: int, rng: np.random.
     return Side(mean_index, step, None, None, extra_planes(targets, step))
 
 
-def chance_wanted(
-    model: Model, picture: npt.NDArray[np.uint8], rng: np.random.Generator
-) -> tuple[Wanted, int, int]:
+def chance_wanted(model: Model, picture: npt.NDArray[np.uint8], rng: np.random.Generator) -> tuple[Wanted, int, int]:
     """What the encoder would tell of a picture in a chance number of bytes, the mean level, and the bytes."""
     lay = layout(*picture.shape)
     size = int(np.exp(rng.uniform(np.log(LEAST_BYTES), np.log(MOST_BYTES))) * picture.size / 6400)

@@ -70,7 +70,7 @@ def _worth_with_aim(aim: Aim, plain: I32, worth: Plane, lay: Layout, body_bytes:
     """Weight of each coefficient with the scale that it will about have once the budget is spent."""
     scaled = plain.astype(np.int64) * start_scales(aim, lay) // PLAIN_SCALE
     shown = np.where(np.abs(scaled) >= _threshold(scaled, body_bytes), plain, 0).astype(np.int32)
-    return np.maximum(worth * expected(aim, shown, lay) // PLAIN_SCALE, 1)
+    return np.asarray(np.maximum(worth * expected(aim, shown, lay) // PLAIN_SCALE, 1), np.int64)
 
 
 def fitted(picture: Plane, plain: I32, worth: Plane, lay: Layout, body_bytes: int) -> I32:

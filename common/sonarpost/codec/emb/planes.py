@@ -60,7 +60,9 @@ def code_planes(
     still = np.zeros(lay.cells, np.int32)
     plain = targets if plain is None else plain
     scaled = targets if model.aim is None else aim.begin(model.aim, state, targets)
-    known = (state.values, state.widths, state.signs, state.seen, state.signed, state.marks, state.odds, still, state.scale)
+    known = (
+        state.values, state.widths, state.signs, state.seen, state.signed, state.marks, state.odds, still, state.scale,
+    )  # fmt: skip
     nets = (model.w1, model.w2, model.b2, _last_layer(model))
     sign_nets, tables = (model.sign_w1, model.sign_b1, model.sign_w2), (model.chances, model.costs, model.centres)
     stream = (coder.words, coder.data, coder.good, coder.curve, plain)

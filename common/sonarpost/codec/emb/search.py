@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
-from sonarpost.codec.emb.aim import likeness
 from sonarpost.codec.emb.coder import Coder, State
 from sonarpost.codec.emb.fit import Wanted
+from sonarpost.codec.emb.likeness import likeness
 from sonarpost.codec.emb.model import Model
 from sonarpost.codec.emb.planes import STEPS, code_planes, extra_planes, known_plane
 from sonarpost.codec.emb.side import Box, Side, write_side
@@ -38,9 +38,9 @@ class Written:
     """A body.
 
     Attributes:
-        error: What to make small. Squared error that stays, in the transform's units; of the coefficients where there is
-            a region of interest, whose own error weighs more, else of the picture. Of a model with an aim and no region
-            of interest: minus the likeness of the pictures.
+        error: What to make small. Squared error that stays, in the transform's units; of the coefficients where there
+            is a region of interest, whose own error weighs more, else of the picture. Of a model with an aim, where
+            there is no region of interest: minus the likeness of the pictures.
         body: The bytes.
         curve: See `Coder.curve`.
     """
