@@ -15,14 +15,16 @@ from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.coder import Coder
 from sonarpost.codec.emb.grain import make_grain, measure_grain
 from sonarpost.codec.emb.layout import layout
-from sonarpost.codec.emb.model import shipped
+from sonarpost.codec.emb.model import Model, all_structure, shipped
 from sonarpost.codec.emb.region import INSIDE, OUTSIDE, fill_unknown, weights
 from sonarpost.codec.emb.side import Box, Side, read_side, write_side
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import StreamError
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "emb"
-PLAIN, FITTED, SECOND = (GOLDEN / name for name in ("streams.json", "streams_fitted.json", "streams_second.json"))
+PLAIN, FITTED, SECOND, STRUCTURE = (
+    GOLDEN / name for name in ("streams.json", "streams_fitted.json", "streams_second.json", "streams_structure.json")
+)
 """Of the encoder that told the plain coefficients, of that which fits them to the picture, and of the second model."""
 CODEC = EmbCodec()
 
@@ -184,13 +186,14 @@ def test_extreme_bodies_decode(byte: int) -> None:
         assert CODEC.decode(head + bytes([byte]) * length).image.shape == (32, 48)
 
 
-def golden_cases() -> dict[str, tuple[np.ndarray, int, EmbCodec]]:
+def golden_cases(model: Model | None = None) -> dict[str, tuple[np.ndarray, int, EmbCodec]]:
+    plain, grainy = (EmbCodec(model or shipped(), grain=grain) for grain in (False, True))
     return {
-        "80x80 at 64 B": (speckled(), 64, CODEC),
-        "140x80 at 256 B": (speckled(140, 80), 256, CODEC),
-        "17x33 at 40 B": (speckled(17, 33), 40, CODEC),
-        "201x300 at 200 B": (speckled(201, 300), 200, CODEC),
-        "80x80 with grain at 68 B": (speckled(), 68, EmbCodec(grain=True)),
+        "80x80 at 64 B": (speckled(), 64, plain),
+        "140x80 at 256 B": (speckled(140, 80), 256, plain),
+        "17x33 at 40 B": (speckled(17, 33), 40, plain),
+        "201x300 at 200 B": (speckled(201, 300), 200, plain),
+        "80x80 with grain at 68 B": (speckled(), 68, grainy),
     }
 
 
@@ -203,17 +206,22 @@ def hashes(stream: bytes, codec: EmbCodec) -> dict[str, str]:
     return out
 
 
-@pytest.mark.parametrize("file", [PLAIN, FITTED, SECOND], ids=lambda path: path.stem)
+def model_of_file(file: Path) -> Model:
+    return all_structure()[0] if file == STRUCTURE else shipped()
+
+
+@pytest.mark.parametrize("file", [PLAIN, FITTED, SECOND, STRUCTURE], ids=lambda path: path.stem)
 @pytest.mark.parametrize("name", golden_cases())
 def test_golden_streams_of_every_encoder_and_model_decode(name: str, file: Path) -> None:
-    """The same pixels on every machine, and in every release that calls itself codec 0x20 and has this model."""
+    """The same pixels on every machine, and in every release that knows the codec's id and this model."""
     golden = json.loads(file.read_text())[name]
     stream = bytes.fromhex(golden.pop("stream"))
-    assert hashes(stream, golden_cases()[name][2]) == golden
+    assert hashes(stream, golden_cases(model_of_file(file))[name][2]) == golden
 
 
+@pytest.mark.parametrize("file", [SECOND, STRUCTURE], ids=lambda path: path.stem)
 @pytest.mark.parametrize("name", golden_cases())
-def test_golden_streams_are_written_again(name: str) -> None:
+def test_golden_streams_are_written_again(name: str, file: Path) -> None:
     """The same bytes on every machine."""
-    image, budget, codec = golden_cases()[name]
-    assert codec.encode(image, budget).hex() == json.loads(SECOND.read_text())[name]["stream"]
+    image, budget, codec = golden_cases(model_of_file(file))[name]
+    assert codec.encode(image, budget).hex() == json.loads(file.read_text())[name]["stream"]

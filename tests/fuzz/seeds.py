@@ -18,7 +18,8 @@ _BUDGETS = (40, 400)
 def golden_streams(ids: Sequence[int]) -> Iterator[bytes]:
     """Yield the golden streams of these codecs."""
     found = [bytes.fromhex(path.read_text()) for path in sorted(GOLDEN.glob("*/*.hex")) if "picture" not in path.name]
-    found += [bytes.fromhex(case["stream"]) for case in json.loads((GOLDEN / "emb/streams.json").read_text()).values()]
+    for path in sorted(GOLDEN.glob("emb/*.json")):
+        found += [bytes.fromhex(case["stream"]) for case in json.loads(path.read_text()).values()]
     yield from (stream for stream in found if stream and stream[0] in ids)
 
 
