@@ -33,7 +33,7 @@ except ImportError:
 # Functions that numba compiles must not be instrumented.
 COMPILED = [
     "sonarpost.codec.tile_search",
-    *(f"sonarpost.codec.emb.{name}" for name in ("kernel", "enhance", "transform")),
+    *(f"sonarpost.codec.emb.{name}" for name in ("aim", "enhance", "fit", "kernel", "likeness", "transform")),
 ]
 
 with atheris.instrument_imports(include=["sonarpost", "fuzz"], exclude=COMPILED):

@@ -29,6 +29,8 @@ takes away more error, so those come first. A refinement is worth about as much 
 _FIRST_PLANE: Final = {1: 3, 2: 2, 3: 1}
 """Plane from which a level is coded; its coefficients are hardly ever larger than twice that threshold, and those that
 are count as that large."""
+_FIRST_PLANE_AIMED: Final = _FIRST_PLANE | {1: 4}
+"""The same of models with an aim, which make the finest level small."""
 
 
 def code_planes(
@@ -67,12 +69,13 @@ def code_planes(
     sign_nets, tables = (model.sign_w1, model.sign_b1, model.sign_w2), (model.chances, model.costs, model.centres)
     stream = (coder.words, coder.data, coder.good, coder.curve, plain)
     lists = (coder.rows, coder.sign_rows)
+    first_plane = _FIRST_PLANE if model.aim is None else _FIRST_PLANE_AIMED
     for plane in range(-side.extra, planes):
         threshold = (STEPS[side.step] << side.extra) >> (plane + side.extra)
         state.threshold, number = threshold, plane + side.extra + 1
         kernel.refresh(state.values, state.widths, state.signs, state.seen, state.signed, threshold)
         still[:] = 0
-        rows = [i for i, band in enumerate(bands) if plane >= _FIRST_PLANE.get(band[LEVEL], -side.extra)]
+        rows = [i for i, band in enumerate(bands) if plane >= first_plane.get(band[LEVEL], -side.extra)]
         finest = min(bands[i][LEVEL] for i in rows)
         lows = low_pictures(state, model, side, finest)
         for number_in_plane, (kind, bar) in enumerate(PASSES):
