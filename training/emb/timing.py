@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.codec.registry import CodecResources, default_registry
 
 BUDGETS = (64, 256, 512)
 
@@ -21,8 +21,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pool", type=Path, required=True)
     parser.add_argument("--pictures", type=int, default=6)
+    parser.add_argument("--codec", default="emb")
     args = parser.parse_args()
-    codec, pictures = EmbCodec(), np.load(args.pool)["vp140"][: args.pictures]
+    codec = default_registry().create(args.codec, CodecResources())
+    pictures = np.load(args.pool)["vp140"][: args.pictures]
     for budget in BUDGETS:
         codec.decode(codec.encode(pictures[0], budget))  # compiles
         began = time.process_time()

@@ -33,6 +33,10 @@ SEARCHES: Final[tuple[tuple[int, int, tuple[int, ...], int], ...]] = (
 of them (`beside`): as many as keep the time for 140 x 80 px to about 100 ms."""
 
 
+AIMED_SEARCHES: Final = (*SEARCHES[:-2], SEARCHES[-1])
+"""The same of models with an aim: their longer streams go through more planes."""
+
+
 @dataclass(frozen=True, eq=False)
 class Written:
     """A body.
@@ -100,8 +104,9 @@ class Writer:
             steps: Start steps to try; none: as many as the time allows, see `SEARCHES`.
         """
         pixels = wanted.plane.size
+        searches = SEARCHES if self.model.aim is None else AIMED_SEARCHES
         first, more = next(
-            (first, more) for longest, largest, first, more in SEARCHES if self.limit <= longest and pixels <= largest
+            (first, more) for longest, largest, first, more in searches if self.limit <= longest and pixels <= largest
         )
         if steps:
             first, more = steps, 0
