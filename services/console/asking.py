@@ -12,12 +12,11 @@ from services.console.contacts import contact_of_picture, find_row
 from services.console.people import Actor
 from services.console.rows import Json, advice_of, request_of
 from sonarpost import wire
+from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Advice, Command, CommandKind, DownlinkState, TaskingState
 
 KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider")
-REFINABLE: Final = ("emb", "emb-structure", "spiht")
-"""Codecs of which a longer stream begins with a shorter one."""
 _RANK: Final = {
     "none": 0,
     "waiting": 0,
@@ -39,7 +38,7 @@ def why_not(row: sqlite3.Row, kind: str) -> str:
         return "the contact's position is not known"
     if kind == "resend" and row["complete"]:
         return "all of the picture that the vehicle announced is here"
-    if kind == "refine" and row["codec"] not in REFINABLE:
+    if kind == "refine" and not default_registry().is_embedded(row["codec"]):
         return f"the codec {row['codec']} makes no longer stream" if row["codec"] else "nothing of its picture is here"
     return ""
 

@@ -437,10 +437,14 @@ def test_codecs_that_cannot_be_made_here_are_told_unless_asked_for(monkeypatch: 
         raise ConfigError("codec rare", "library", "absent", "pip install rare")
 
     registry = CodecRegistry(
-        [CodecSpec("rare", (0x90,), absent), CodecSpec("halving", (0x91,), lambda _: Halving())],
+        [CodecSpec("rare", (0x90,), absent), CodecSpec("halving", (0x91,), lambda _: Halving(), is_embedded=True)],
     )
     found, left_out = measuring.subjects(registry, None)
     assert [subject.codec.codec_id for subject in found] == [0x7E]
     assert "pip install rare" in left_out[0]
+    assert [measuring.subjects(registry, ["halving"], cut=cut)[0][0].is_embedded for cut in (False, True)] == [
+        False,
+        True,
+    ]
     with pytest.raises(SonarpostError, match="pip install rare"):
         measuring.subjects(registry, ["rare"])

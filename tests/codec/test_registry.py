@@ -135,3 +135,14 @@ def test_a_wrong_plug_in_is_named(registry: CodecRegistry, name: str, value: str
 def test_the_default_registry_is_made_once() -> None:
     assert default_registry() is default_registry()
     assert "vq" in default_registry().names()
+
+
+def test_embedded_codecs_are_those_whose_beginnings_are_pictures(registry: CodecRegistry) -> None:
+    assert {name for name in registry.names() if registry.is_embedded(name)} == {"emb", "emb-structure", "spiht"}
+    assert not registry.is_embedded("nothing")
+    image = np.random.default_rng(1).integers(0, 256, (32, 40), dtype=np.uint8)
+    for name in ("emb", "emb-structure", "spiht"):
+        codec = registry.create(name, CodecResources())
+        stream = codec.encode(image, 120)
+        errors = [np.abs(codec.decode(stream[:n]).image.astype(int) - image).mean() for n in (30, 120)]
+        assert errors[1] < errors[0]

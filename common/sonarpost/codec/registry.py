@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
+from sonarpost.codec import emb
 from sonarpost.codec.huffman import HuffmanCodec
 from sonarpost.codec.interface import Codec, StreamHeader, model_tag, tag_length
 from sonarpost.codec.jpeg2000 import Jpeg2000Codec
@@ -55,6 +56,7 @@ class CodecSpec:
         summary: One line for people.
         needs_tiles: Whether `create` needs a tile database. A receiver finds it by the two bytes of its identity that a
             stream carries, so all ids must be of the class that carries two (`interface.tag_length`).
+        is_embedded: Whether every beginning of a stream is a picture, and longer streams can begin as shorter ones do.
     """
 
     name: str
@@ -62,6 +64,7 @@ class CodecSpec:
     create: Callable[[CodecResources], Codec]
     summary: str = ""
     needs_tiles: bool = False
+    is_embedded: bool = False
 
 
 def _create_vq(resources: CodecResources) -> Codec:
@@ -92,25 +95,24 @@ def _create_emb(resources: CodecResources, codec_id: int) -> Codec:
     from sonarpost.codec.emb.model import all_shipped, all_structure  # noqa: PLC0415
 
     # The first encodes, and tells a stream of a strange model so.
-    models = all_shipped() if codec_id == _EMB else all_structure()
+    models = all_shipped() if codec_id == emb.CODEC_ID else all_structure()
     wanted = (model for model in models if model_tag(codec_id, model.identity) == resources.model_tag)
     return EmbCodec(next(wanted, models[0]))
 
 
-_EMB, _EMB_STRUCTURE = 0x20, 0x21
+def _emb_spec(name: str, codec_id: int, summary: str) -> CodecSpec:
+    return CodecSpec(name, (codec_id,), lambda resources: _create_emb(resources, codec_id), summary, is_embedded=True)
 
 
 BUILTINS = (
-    CodecSpec(
-        "emb",
-        (_EMB,),
-        lambda resources: _create_emb(resources, _EMB),
+    _emb_spec(
+        emb.NAME,
+        emb.CODEC_ID,
         "embedded wavelet codec with learned contexts: a picture at every length, from 20 bytes up",
     ),
-    CodecSpec(
-        "emb-structure",
-        (_EMB_STRUCTURE,),
-        lambda resources: _create_emb(resources, _EMB_STRUCTURE),
+    _emb_spec(
+        emb.STRUCTURE_NAME,
+        emb.STRUCTURE_ID,
         "the same, made for likeness of structure (MS-SSIM) instead of the least squared error",
     ),
     CodecSpec(
@@ -123,7 +125,13 @@ BUILTINS = (
     CodecSpec("huffman", (0x01,), lambda _: HuffmanCodec(), "quantised grey levels in a Huffman code (in the paper)"),
     CodecSpec("jpeg2000", (0x02,), lambda _: Jpeg2000Codec(), "JPEG 2000, raw codestream (in the paper)"),
     CodecSpec("jpeg2000-packets", (0x03,), lambda _: Jpeg2000Codec(packets_only=True), "JPEG 2000 without its headers"),
-    CodecSpec("spiht", (0x04,), lambda _: SpihtCodec(), "set partitioning of a 9/7 wavelet, embedded (in the paper)"),
+    CodecSpec(
+        "spiht",
+        (0x04,),
+        lambda _: SpihtCodec(),
+        "set partitioning of a 9/7 wavelet, embedded (in the paper)",
+        is_embedded=True,
+    ),
     *(_modern_spec(wanted) for wanted in ModernFormat if wanted.available),
 )
 
@@ -164,6 +172,10 @@ class CodecRegistry:
     def names(self) -> tuple[str, ...]:
         """Return the names, sorted."""
         return tuple(sorted(self._by_name))
+
+    def is_embedded(self, name: str) -> bool:
+        """Return whether a codec's streams may be cut and continued; False of one that is not known."""
+        return name in self._by_name and self._by_name[name].is_embedded
 
     def spec(self, name: str) -> CodecSpec:
         """Return a codec's entry.

@@ -12,6 +12,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from sonarpost.codec import emb
 from sonarpost.codec.interface import Codec, Image
 from sonarpost.errors import StreamError
 
@@ -52,7 +53,7 @@ def with_grain(codec: Codec, stream: bytes, picture: Image, strength: float = DE
 
 def grainy_twin(codec: Codec) -> Codec | None:
     """Return the codec that writes the grain's description into its streams, within the same budget; None if none."""
-    if not codec.name.startswith("emb"):
+    if codec.name not in (emb.NAME, emb.STRUCTURE_NAME):
         return None
     from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415  it brings a compiler, which nobody else waits for
 

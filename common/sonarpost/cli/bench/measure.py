@@ -22,8 +22,6 @@ from sonarpost.errors import ConfigError, StreamError
 Values = npt.NDArray[np.float64]
 T = TypeVar("T")
 
-EMBEDDED: Final = ("emb", "emb-structure", "spiht")
-"""Codecs whose stream may be cut anywhere."""
 PSNR_LIMIT_DB: Final = 60.0
 """A picture rebuilt without error has an infinite PSNR, which no mean survives; it counts as this."""
 SHIPPED_CATALOGUES: Final = tuple(f"nominal-{tile_px}" for tile_px in NOMINAL_TILE_PX)
@@ -120,7 +118,7 @@ def subjects(
         registry: Where they are from.
         names: Which; None for every one that can be made here.
         all_packings: Whether vq is measured with every packing of an index, or the tightest only.
-        cut: Whether codecs of `EMBEDDED` make one stream, cut for each budget.
+        cut: Whether embedded codecs make one stream, cut for each budget.
         catalogues: Names of shipped catalogues, or paths of others, that vq is measured with.
 
     Returns:
@@ -139,7 +137,7 @@ def subjects(
                 found += _with_tiles(registry, name, packings, catalogues)
             else:
                 codec = registry.create(name, CodecResources())
-                found.append(Subject(codec, is_embedded=cut and name in EMBEDDED))
+                found.append(Subject(codec, is_embedded=cut and registry.is_embedded(name)))
         except ConfigError as error:
             if names is not None:
                 raise

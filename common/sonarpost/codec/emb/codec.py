@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb import transform
+from sonarpost.codec.emb import CODEC_ID, NAME, STRUCTURE_ID, STRUCTURE_NAME, transform
 from sonarpost.codec.emb.coder import State, error_by_length
 from sonarpost.codec.emb.fit import wanted_of
 from sonarpost.codec.emb.grain import make_grain, measure_grain
@@ -26,10 +26,6 @@ from sonarpost.codec.emb.side import MEAN_STEP, Box, Side
 from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, check_image, model_tag, to_uint8
 from sonarpost.errors import StreamError
 
-CODEC_ID: Final = 0x20
-NAME: Final = "emb"
-STRUCTURE_ID: Final = 0x21
-STRUCTURE_NAME: Final = "emb-structure"
 MIN_BODY_BYTES: Final = 3
 _PRICE: Final = 20
 """Least error, in 1/256 of the squared threshold, that a bit must take away; see `kernel.code_band`."""
