@@ -8,31 +8,9 @@ import pytest
 from conftest import eventually
 from records import command_record
 
-from services.compressor.config import CompressorConfig
-from services.compressor.service import CompressorService
 from sonarpost import keys
-from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.messages import EncodedImage
 
 IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
-
-
-@pytest.fixture
-def begin(crew, platform):
-    def start(**options):
-        return crew.start(CompressorService(platform("uuv-1"), CompressorConfig(**options)))
-
-    return start
-
-
-@pytest.fixture
-def modem(crew):
-    return crew.neighbour("uuv-1", "uuv_modem", {OUT: EncodedImage})
-
-
-@pytest.fixture
-def atd(crew):
-    return crew.neighbour("uuv-1", "atd_stub")
 
 
 def test_a_picture_that_is_asked_for_again_is_given_again_until_it_is_forgotten(begin, crew, atd, modem, snippet):
@@ -46,11 +24,6 @@ def test_a_picture_that_is_asked_for_again_is_given_again_until_it_is_forgotten(
     eventually(lambda: service.health().counters.get("commands_unknown_image") == 1)
     eventually(lambda: len(modem.got) == 4)
     assert modem.got[3] == third
-
-
-@pytest.fixture(scope="session")
-def emb():
-    return default_registry().create("emb", CodecResources())
 
 
 def refine(uuv_modem, modem, times):

@@ -11,51 +11,17 @@ from records import command_record
 from services.atd_stub.config import AtdStubConfig
 from services.atd_stub.record import of_detection
 from services.atd_stub.seam import Origin
-from services.compressor.config import CompressorConfig
-from services.compressor.service import CompressorService
 from services.compressor.wide import wider
 from services.op_modem.station import order_of
 from services.uuv_modem.config import UuvModemConfig
 from services.uuv_modem.orders import OrderBook
 from sonarpost import keys
-from sonarpost.catalogue.store import open_catalogue
-from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq import IndexPacking
 from sonarpost.detect.contacts import detect
 from sonarpost.link import downlink as dl
-from sonarpost.messages import Contact, EncodedImage, Snippet
+from sonarpost.messages import Contact, Snippet
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 
 IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
-
-
-@pytest.fixture
-def begin(crew, platform):
-    def start(**options):
-        return crew.start(CompressorService(platform("uuv-1"), CompressorConfig(**options)))
-
-    return start
-
-
-@pytest.fixture
-def modem(crew):
-    return crew.neighbour("uuv-1", "uuv_modem", {OUT: EncodedImage})
-
-
-@pytest.fixture
-def atd(crew):
-    return crew.neighbour("uuv-1", "atd_stub")
-
-
-@pytest.fixture(scope="session")
-def vq():
-    tiles = open_catalogue("nominal-10").tiles
-    return default_registry().create("vq", CodecResources(tiles, IndexPacking.BITS14))
-
-
-@pytest.fixture(scope="session")
-def emb():
-    return default_registry().create("emb", CodecResources())
 
 
 @pytest.fixture

@@ -10,39 +10,13 @@ from conftest import eventually
 from services.compressor.config import CompressorConfig
 from services.compressor.service import IMAGE_IDS, CompressorService
 from sonarpost import keys, wire
-from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.interface import StreamHeader, to_uint8
-from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq import IndexPacking
 from sonarpost.errors import CatalogueError, ConfigError
 from sonarpost.link.paper_format import format_image_id, is_image_id
 from sonarpost.messages import Contact, EncodedImage, Raster, Snippet
 
 IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
-
-
-@pytest.fixture
-def begin(crew, platform):
-    def start(**options):
-        return crew.start(CompressorService(platform("uuv-1"), CompressorConfig(**options)))
-
-    return start
-
-
-@pytest.fixture
-def modem(crew):
-    return crew.neighbour("uuv-1", "uuv_modem", {OUT: EncodedImage})
-
-
-@pytest.fixture
-def atd(crew):
-    return crew.neighbour("uuv-1", "atd_stub")
-
-
-@pytest.fixture(scope="session")
-def vq():
-    tiles = open_catalogue("nominal-10").tiles
-    return default_registry().create("vq", CodecResources(tiles, IndexPacking.BITS14))
 
 
 def test_a_snippet_becomes_a_stream_with_its_contact(begin, atd, modem, snippet, vq, is_told, watch):

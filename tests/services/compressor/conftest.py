@@ -1,0 +1,44 @@
+"""What the tests of compressor share: it, what stands before and behind it, and codecs to compare with."""
+
+from __future__ import annotations
+
+import pytest
+
+from services.compressor.config import CompressorConfig
+from services.compressor.service import CompressorService
+from sonarpost import keys
+from sonarpost.catalogue.store import open_catalogue
+from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.codec.vq import IndexPacking
+from sonarpost.messages import EncodedImage
+
+OUT = keys.image_encoded("uuv-1")
+
+
+@pytest.fixture
+def begin(crew, platform):
+    def start(**options):
+        return crew.start(CompressorService(platform("uuv-1"), CompressorConfig(**options)))
+
+    return start
+
+
+@pytest.fixture
+def modem(crew):
+    return crew.neighbour("uuv-1", "uuv_modem", {OUT: EncodedImage})
+
+
+@pytest.fixture
+def atd(crew):
+    return crew.neighbour("uuv-1", "atd_stub")
+
+
+@pytest.fixture(scope="session")
+def vq():
+    tiles = open_catalogue("nominal-10").tiles
+    return default_registry().create("vq", CodecResources(tiles, IndexPacking.BITS14))
+
+
+@pytest.fixture(scope="session")
+def emb():
+    return default_registry().create("emb", CodecResources())
