@@ -17,7 +17,7 @@ import numpy.typing as npt
 from sonarpost.codec.emb import transform
 from sonarpost.codec.emb._jit import compiled
 from sonarpost.codec.emb.coder import PLAIN_SCALE, State
-from sonarpost.codec.emb.layout import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, Layout
+from sonarpost.codec.emb.layout import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, Layout, cells_of
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
@@ -52,8 +52,7 @@ class Aim:
 def _first_scales(levels: tuple[int, ...], lay: Layout) -> I32:
     out = np.full(lay.cells, PLAIN_SCALE, np.int32)
     for band in lay.bands.tolist():
-        at = band[OFFSET] + np.arange(band[HEIGHT])[:, None] * band[STRIDE] + np.arange(band[WIDTH])
-        out[at] = levels[0 if band[ORIENT] == LL else band[LEVEL]]
+        out[cells_of(band)] = levels[0 if band[ORIENT] == LL else band[LEVEL]]
     return out
 
 

@@ -18,7 +18,7 @@ from sonarpost.codec.emb import transform
 from sonarpost.codec.emb._jit import compiled
 from sonarpost.codec.emb.aim import Aim, expected, start_scales
 from sonarpost.codec.emb.coder import PLAIN_SCALE
-from sonarpost.codec.emb.layout import HH, HL, LH, LL, Layout
+from sonarpost.codec.emb.layout import HEIGHT, HH, HL, LEVEL, LH, LL, ORIENT, WIDTH, Layout, cells_of
 from sonarpost.codec.emb.region import OUTSIDE
 
 Plane = npt.NDArray[np.int64]
@@ -173,13 +173,14 @@ def _reach(lay: Layout) -> Plane:
     """
     columns, rows = (_squared_norms(side, lay.levels) for side in (lay.height_px, lay.width_px))
     out, strengths = np.zeros(lay.cells, np.int64), transform.strength_map(lay)
-    for offset, stride, height, width, level, orient, *_ in lay.bands.tolist():
-        if not height or not width:
+    for band in lay.bands.tolist():
+        if not band[HEIGHT] or not band[WIDTH]:
             continue
+        level, orient = band[LEVEL], band[ORIENT]
         down = columns[level - 1][int(orient in (LH, HH))] if orient != LL else columns[lay.levels][0]
         across = rows[level - 1][int(orient in (HL, HH))] if orient != LL else rows[lay.levels][0]
         norms = (down[:, None] * across) >> _SQUARE_BITS
-        at = offset + np.arange(height)[:, None] * stride + np.arange(width)
+        at = cells_of(band)
         out[at] = (strengths[at] << (_SQUARE_BITS + _STEP_BITS - 10)) // norms
     return out
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
-from sonarpost.codec.emb.layout import HEIGHT, HH, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, Layout
+from sonarpost.codec.emb.layout import HH, LEVEL, LL, ORIENT, Layout, cells_of
 from sonarpost.codec.emb.side import GRAIN_BANDS
 from sonarpost.codec.interface import Image
 
@@ -53,8 +53,7 @@ def _strengths_square(picture: Image, lay: Layout) -> list[int]:
 
 
 def _cells(flat: npt.NDArray[np.int64], band: list[int]) -> npt.NDArray[np.int64]:
-    rows = np.arange(band[HEIGHT])[:, None] * band[STRIDE] + np.arange(band[WIDTH])
-    return np.asarray(flat[band[OFFSET] + rows], np.int64)
+    return np.asarray(flat[cells_of(band)], np.int64)
 
 
 def _square_of(level: int) -> int:
@@ -91,7 +90,7 @@ def make_grain(picture: Image, lay: Layout, levels: tuple[int, ...], seed: int =
             continue
         number = _band_number(band[LEVEL], band[ORIENT])
         strength = _root(max(_square_of(levels[number]) - have[number], 0))
-        rows = band[OFFSET] + np.arange(band[HEIGHT])[:, None] * band[STRIDE] + np.arange(band[WIDTH])
+        rows = cells_of(band)
         flat[rows] = noise[rows] * strength >> 8
     relative, _ = transform.inverse(transform.from_flat(flat.astype(np.int32), lay), lay)
     return (relative * np.maximum(picture, _DARKEST) // _ONE).clip(-255, 255).astype(np.int16)

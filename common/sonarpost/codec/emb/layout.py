@@ -48,6 +48,11 @@ def level_count(height_px: int, width_px: int) -> int:
     return 4 if longest <= 160 else 5 if longest <= 320 else 6
 
 
+def cells_of(band: list[int]) -> Index:
+    """Return the flat index of every cell of a band, shape (its height, its width), of its row of the table."""
+    return np.asarray(band[OFFSET] + np.arange(band[HEIGHT])[:, None] * band[STRIDE] + np.arange(band[WIDTH]), np.int64)
+
+
 @dataclass(frozen=True, eq=False)
 class Layout:
     """Memory layout for one picture size.
@@ -109,9 +114,7 @@ def layout(height_px: int, width_px: int) -> Layout:
         table.append(
             (offset, stride, rows, columns, level, orient, parent, first, second, child, low, *following, *cousins)
         )
-        position[top : top + rows, left : left + columns] = (
-            offset + np.arange(rows)[:, None] * stride + np.arange(columns)
-        )
+        position[top : top + rows, left : left + columns] = cells_of(list(table[-1]))
     return Layout(
         height_px,
         width_px,

@@ -54,12 +54,16 @@ def plain_of(state: State, side: Side, model: Model) -> Plain:
     return Plain(plane, side.mean, situation(state, side.mean))
 
 
+def grey_of(plane: npt.NDArray[np.int64], mean: int) -> Image:
+    """Return a plane without its mean, 1/64 grey, as a picture."""
+    return np.clip((plane + transform.UNIT // 2) // transform.UNIT + mean, 0, 255).astype(np.uint8)
+
+
 def picture_of(state: State, side: Side, model: Model) -> Image:
     """Return the picture with what the model knows of what the coefficients do not say."""
     plain = plain_of(state, side, model)
     plane = enhanced(plain.plane, plain.mean, plain.situation, model)
-    grey = (plane + transform.UNIT // 2) // transform.UNIT + plain.mean
-    return np.clip(grey, 0, 255).astype(np.uint8)
+    return grey_of(plane, plain.mean)
 
 
 def usable(body: bytes, received: Mask | None) -> tuple[bytes, tuple[str, ...]]:

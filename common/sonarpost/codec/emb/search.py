@@ -14,6 +14,7 @@ from sonarpost.codec.emb.fit import Wanted
 from sonarpost.codec.emb.likeness import likeness
 from sonarpost.codec.emb.model import Model
 from sonarpost.codec.emb.planes import STEPS, code_planes, extra_planes, known_plane
+from sonarpost.codec.emb.reading import grey_of
 from sonarpost.codec.emb.side import Box, Side, write_side
 from sonarpost.codec.interface import MAX_SIDE_PX
 
@@ -81,7 +82,7 @@ class Writer:
             return Written(int(coder.curve[0]), coder.finish(), coder.curve)
         shown, _ = transform.inverse(known_plane(state, self.model), wanted.lay)
         if self.model.aim is not None:
-            error = -likeness(_grey(wanted.plane, side.mean), _grey(shown, side.mean))
+            error = -likeness(*(grey_of(plane, side.mean).astype(np.int64) for plane in (wanted.plane, shown)))
         else:
             error = int(((wanted.plane - shown) ** 2).sum())
         return Written(error, coder.finish(), coder.curve)
@@ -116,10 +117,6 @@ class Writer:
             side = Side(mean_index, step, box, grain, extra_planes(wanted.targets, step))
             found[step] = self.write(wanted, side)
         return min(found.values(), key=lambda written: written.error)
-
-
-def _grey(plane: I64, mean: int) -> I64:
-    return np.asarray(np.clip((plane + transform.UNIT // 2) // transform.UNIT + mean, 0, 255), np.int64)
 
 
 def beside(errors: dict[int, int]) -> int:
