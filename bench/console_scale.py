@@ -21,14 +21,14 @@ from pathlib import Path
 
 import zenoh
 
-from services.console.config import ConsoleConfig
-from services.console.service import ConsoleService
-from services.console.training import VESSEL, Training
-from services.console.training_contacts import simulated_contacts
 from sonarpost import keys, wire
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.session import client_config, router_config
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.service import ConsoleService
+from sonarpost.services.console.training import VESSEL, Training
+from sonarpost.services.console.training_contacts import simulated_contacts
 
 PASSWORD = "a password for the bench"
 LISTS = (

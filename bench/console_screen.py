@@ -20,16 +20,16 @@ from pathlib import Path
 import zenoh
 from playwright.sync_api import Page, sync_playwright
 
-from services.console.config import ConsoleConfig
-from services.console.service import ConsoleService
-from services.console.training import VESSEL, Training
-from services.console.training_contacts import simulated_contacts
-from services.console.users import FILE_NAME, Users
 from sonarpost import keys, wire
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.messages import ReconstructedImage
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.session import client_config, router_config
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.service import ConsoleService
+from sonarpost.services.console.training import VESSEL, Training
+from sonarpost.services.console.training_contacts import simulated_contacts
+from sonarpost.services.console.users import FILE_NAME, Users
 
 # When the first row was drawn, in ms since the navigation began; and when a wanted change was, in ms since 1970.
 WATCH = """() => {

@@ -211,7 +211,7 @@ def fleet(folder: Path, vessels: Sequence[str]) -> Iterator[tuple[Processes, dic
     )
     try:
         processes.start("router-shore", "-m", "sonarpost.runtime.router", "--listen", shore)
-        processes.start("c2", "-m", "services.c2", "--config", str(folder / "shore.toml"))
+        processes.start("c2", "-m", "sonarpost.services.c2", "--config", str(folder / "shore.toml"))
         for vessel, endpoint in endpoints.items():
             file = folder / f"{vessel}.toml"
             file.write_text(
@@ -220,7 +220,7 @@ def fleet(folder: Path, vessels: Sequence[str]) -> Iterator[tuple[Processes, dic
             processes.start(
                 f"router-{vessel}", "-m", "sonarpost.runtime.router", "--listen", endpoint, "--connect", shore
             )
-            processes.start(f"relay-{vessel}", "-m", "services.relay", "--config", str(file))
+            processes.start(f"relay-{vessel}", "-m", "sonarpost.services.relay", "--config", str(file))
         yield processes, endpoints, shore
     finally:
         processes.stop()

@@ -39,8 +39,6 @@ from pathlib import Path
 import zenoh
 from noise import noise_picture
 
-from services.relay.config import RelayConfig
-from services.relay.service import RelayService
 from sonarpost import keys, wire
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
@@ -49,6 +47,8 @@ from sonarpost.runtime.logs import set_up
 from sonarpost.runtime.schedule import CHUNK_BYTES, WINDOW, WINDOW_BYTES
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.session import client_config, router_config
+from sonarpost.services.relay.config import RelayConfig
+from sonarpost.services.relay.service import RelayService
 
 GOAL = 0.5
 COMMITS, WRITES = 3, 4

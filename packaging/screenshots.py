@@ -17,19 +17,19 @@ from urllib.parse import quote
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from services.console.app import ConsoleApp
-from services.console.audit import OnScreen
-from services.console.board import Board
-from services.console.config import ConsoleConfig
-from services.console.contacts import Filter
-from services.console.database import Database
-from services.console.decisions import Judgement
-from services.console.people import Actor
-from services.console.rows import Json
-from services.console.server import WebServer
-from services.console.training import VESSEL, Training
-from services.console.users import Users
 from sonarpost.messages import Advice
+from sonarpost.services.console.app import ConsoleApp
+from sonarpost.services.console.audit import OnScreen
+from sonarpost.services.console.board import Board
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.contacts import Filter
+from sonarpost.services.console.database import Database
+from sonarpost.services.console.decisions import Judgement
+from sonarpost.services.console.people import Actor
+from sonarpost.services.console.rows import Json
+from sonarpost.services.console.server import WebServer
+from sonarpost.services.console.training import VESSEL, Training
+from sonarpost.services.console.users import Users
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "screenshots"
 SMALL, LARGE = (1366, 768), (1920, 1080)

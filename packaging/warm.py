@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-import services
 import sonarpost
 from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.emb.codec import EmbCodec
@@ -56,15 +55,14 @@ def code(picture: Image) -> None:
 
 def import_everything() -> None:
     """Import every module of the library and the services."""
-    for package in (sonarpost, services):
-        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            if module.name.endswith("__main__"):
-                continue
-            try:
-                importlib.import_module(module.name)
-            except ModuleNotFoundError as error:
-                if error.name is None or not error.name.startswith(OPTIONAL):
-                    raise
+    for module in pkgutil.walk_packages(sonarpost.__path__, "sonarpost."):
+        if module.name.endswith("__main__"):
+            continue
+        try:
+            importlib.import_module(module.name)
+        except ModuleNotFoundError as error:
+            if error.name is None or not error.name.startswith(OPTIONAL):
+                raise
 
 
 def main() -> None:

@@ -1,1 +1,1 @@
-"""One folder a process; run as python -m services.<name> --config FILE."""
+"""One folder a process; run as python -m sonarpost.services.<name> --config FILE."""

@@ -9,14 +9,13 @@ import zipfile
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-FORBIDDEN = ("tests/", "bench/", "docs/", "demo-out/", "__pycache__")
 
 
 def wanted() -> set[str]:
     """Return the files of the source tree that belong into the wheel."""
     files = {p.relative_to(REPOSITORY / "common").as_posix() for p in (REPOSITORY / "common" / "sonarpost").rglob("*")}
-    files |= {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "services").rglob("*")}
-    suffixes = (".py", ".typed", ".tiles", ".md", ".html", ".css", ".js", ".svg")
+    files |= {f"sonarpost/{p.relative_to(REPOSITORY).as_posix()}" for p in (REPOSITORY / "services").rglob("*")}
+    suffixes = (".py", ".typed", ".tiles", ".model", ".json", ".md", ".html", ".css", ".js", ".svg")
     return {name for name in files if name.endswith(suffixes) and "__pycache__" not in name}
 
 
@@ -29,7 +28,8 @@ def main() -> int:
         with zipfile.ZipFile(wheel) as archive:
             names = set(archive.namelist())
     missing = wanted() - names
-    extra = {name for name in names if name.startswith(FORBIDDEN) or "__pycache__" in name}
+    top_level = {"sonarpost"} | {name.partition("/")[0] for name in names if ".dist-info/" in name}
+    extra = {name for name in names if name.partition("/")[0] not in top_level or "__pycache__" in name}
     licence = any(name.endswith("licenses/LICENSE") for name in names)
     for problem, which in (("missing from", missing), ("does not belong into", extra)):
         for name in sorted(which):

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.snippets import from_survey
 from sonarpost import wire
 from sonarpost.messages import Snippet
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.snippets import from_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 

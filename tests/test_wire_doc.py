@@ -19,8 +19,6 @@ import zenoh
 from conftest import REPOSITORY, eventually
 from golden.zenoh.samples import RECORD_TYPES, SAMPLES
 
-from services.c2.service import ADVICE_PRIORITY, COMMAND_PRIORITY
-from services.relay.service import DECISION_PRIORITY, DETAIL_PRIORITY, PREVIEW_PRIORITY
 from sonarpost import keys, wire
 from sonarpost.messages import Contact, Decision, Record, Snippet
 from sonarpost.runtime import handoff, handoff_batch, outbox, schedule, transaction
@@ -28,6 +26,8 @@ from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.handoff import Reply, attachment
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.transaction import OutboxItem
+from sonarpost.services.c2.service import ADVICE_PRIORITY, COMMAND_PRIORITY
+from sonarpost.services.relay.service import DECISION_PRIORITY, DETAIL_PRIORITY, PREVIEW_PRIORITY
 
 PlatformMaker = Callable[[str], PlatformConfig]
 TEXT = (REPOSITORY / "docs" / "wire-zenoh.md").read_text(encoding="utf-8")

@@ -1,10 +1,10 @@
-"""Run with `python -m services.acoustic_channel --config FILE`."""
+"""Run with `python -m sonarpost.services.acoustic_channel --config FILE`."""
 
 import sys
 
-from services.acoustic_channel.config import AcousticChannelConfig
-from services.acoustic_channel.service import AcousticChannelService
 from sonarpost.runtime.process import main
+from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
+from sonarpost.services.acoustic_channel.service import AcousticChannelService
 
 
 def run() -> int:

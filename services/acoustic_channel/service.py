@@ -8,11 +8,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
-from services.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.messages import Record
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects, Service
+from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.sim.acoustic_channel import AcousticChannel
 
 __all__ = ["AcousticChannel", "AcousticChannelService"]

@@ -1,10 +1,10 @@
-"""Run with `python -m services.atd_stub --config FILE`."""
+"""Run with `python -m sonarpost.services.atd_stub --config FILE`."""
 
 import sys
 
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.service import AtdStubService
 from sonarpost.runtime.process import main
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.service import AtdStubService
 
 
 def run() -> int:

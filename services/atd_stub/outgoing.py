@@ -9,8 +9,6 @@ from collections.abc import Callable, Sequence
 
 import zenoh
 
-from services.atd_stub.pool import ContactPool
-from services.atd_stub.way import COMPRESSOR, MODEM, WayToTheWater
 from sonarpost import keys, wire
 from sonarpost.errors import HandoffError, PayloadError
 from sonarpost.messages import Health, QueueState, Snippet
@@ -18,6 +16,8 @@ from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.effects import Effects
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.store import Store
+from sonarpost.services.atd_stub.pool import ContactPool
+from sonarpost.services.atd_stub.way import COMPRESSOR, MODEM, WayToTheWater
 
 log = logging.getLogger(__name__)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.seam import Origin
 from sonarpost.codec.interface import MIN_SIDE_PX
 from sonarpost.detect.contacts import Detection
 from sonarpost.detect.ground_snippet import ground_picture
 from sonarpost.detect.snippet import cut_snippet, cut_wide
 from sonarpost.messages import Contact, Raster, Snippet
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.seam import Origin
 from sonarpost.sonar.georeference import georeference
 from sonarpost.sonar.survey import Survey
 

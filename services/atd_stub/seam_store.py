@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
-from services.atd_stub.seam import Seam, pack, unpack
 from sonarpost import wire
 from sonarpost.messages import Snippet
 from sonarpost.runtime.effects import Effects
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.store import Store
+from sonarpost.services.atd_stub.seam import Seam, pack, unpack
 
 log = logging.getLogger(__name__)
 

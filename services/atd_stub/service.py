@@ -10,13 +10,6 @@ from pathlib import Path
 
 import msgpack
 
-from services.atd_stub import snippets
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.folder import FileSeen, SettledFiles, content_hash, look_at, printable
-from services.atd_stub.outgoing import Outgoing
-from services.atd_stub.seam_store import SeamStore
-from services.atd_stub.survey_walk import Finding
-from services.atd_stub.text_file import write_snippet
 from sonarpost.errors import HandoffError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.messages import Record, Snippet
@@ -24,6 +17,13 @@ from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.transaction import OutboxItem, Transaction
+from sonarpost.services.atd_stub import snippets
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.folder import FileSeen, SettledFiles, content_hash, look_at, printable
+from sonarpost.services.atd_stub.outgoing import Outgoing
+from sonarpost.services.atd_stub.seam_store import SeamStore
+from sonarpost.services.atd_stub.survey_walk import Finding
+from sonarpost.services.atd_stub.text_file import write_snippet
 from sonarpost.sonar.readers import SUPPORTED_SUFFIXES
 
 log = logging.getLogger(__name__)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.folder import printable
-from services.atd_stub.seam import Origin, Seam
-from services.atd_stub.survey_walk import Finding, SurveyWalk
-from services.atd_stub.text_file import read_contact
 from sonarpost.codec.interface import check_image
 from sonarpost.errors import StreamError, SurveyFileError
 from sonarpost.messages import Contact, Raster, Snippet
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.folder import printable
+from sonarpost.services.atd_stub.seam import Origin, Seam
+from sonarpost.services.atd_stub.survey_walk import Finding, SurveyWalk
+from sonarpost.services.atd_stub.text_file import read_contact
 from sonarpost.sonar.image_files import read_image
 from sonarpost.sonar.readers import open_survey
 

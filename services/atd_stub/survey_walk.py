@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Final
 
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.record import of_detection
-from services.atd_stub.seam import Origin, Seam, SeamLook, last_pings
 from sonarpost import wire
 from sonarpost.detect.contacts import Detection, detect
 from sonarpost.detect.settings import DetectorSettings
 from sonarpost.messages import Snippet
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.record import of_detection
+from sonarpost.services.atd_stub.seam import Origin, Seam, SeamLook, last_pings
 from sonarpost.sonar.source import Strip, SurveySource, strips
 from sonarpost.sonar.survey import Ping, Survey
 

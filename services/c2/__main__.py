@@ -1,10 +1,10 @@
-"""Run with `python -m services.c2 --config FILE`."""
+"""Run with `python -m sonarpost.services.c2 --config FILE`."""
 
 import sys
 
-from services.c2.config import C2Config
-from services.c2.service import C2Service
 from sonarpost.runtime.process import main
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
 
 
 def run() -> int:

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Sequence
 
-from services.c2.config import C2Config
 from sonarpost import keys
 from sonarpost.errors import PayloadError
 from sonarpost.files import AtomicFiles
@@ -24,6 +23,7 @@ from sonarpost.runtime.shore_files import (
     to_remove,
 )
 from sonarpost.runtime.shore_index import DecisionRow, PictureRow, ShoreIndex, TaskingRow
+from sonarpost.services.c2.config import C2Config
 
 log = logging.getLogger(__name__)
 

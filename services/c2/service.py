@@ -10,10 +10,6 @@ from dataclasses import replace
 
 import zenoh
 
-from services.c2 import tasking
-from services.c2.archive import Archive
-from services.c2.config import C2Config
-from services.c2.tasking import Tasking
 from sonarpost import keys, wire
 from sonarpost.errors import HandoffError, PayloadError
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
@@ -23,6 +19,10 @@ from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects, InterruptedByStopError, Service
 from sonarpost.runtime.shore_files import decision_file_name
 from sonarpost.runtime.transaction import InboxItem, OutboxItem, Transaction, queue_of
+from sonarpost.services.c2 import tasking
+from sonarpost.services.c2.archive import Archive
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.tasking import Tasking
 
 __all__ = ["C2Service", "decision_file_name"]
 

@@ -1,10 +1,10 @@
-"""Run with `python -m services.compressor --config FILE`."""
+"""Run with `python -m sonarpost.services.compressor --config FILE`."""
 
 import sys
 
-from services.compressor.config import CompressorConfig
-from services.compressor.service import CompressorService
 from sonarpost.runtime.process import main
+from sonarpost.services.compressor.config import CompressorConfig
+from sonarpost.services.compressor.service import CompressorService
 
 
 def run() -> int:

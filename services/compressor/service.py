@@ -7,10 +7,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 
-from services.compressor.config import CompressorConfig
-from services.compressor.kept import Kept, KeptPictures
-from services.compressor.refine import encode, handed, refined
-from services.compressor.wide import wider
 from sonarpost import keys, wire
 from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.interface import Codec
@@ -21,6 +17,10 @@ from sonarpost.messages import Command, CommandKind, EncodedImage, Record, Snipp
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects, Service
+from sonarpost.services.compressor.config import CompressorConfig
+from sonarpost.services.compressor.kept import Kept, KeptPictures
+from sonarpost.services.compressor.refine import encode, handed, refined
+from sonarpost.services.compressor.wide import wider
 
 log = logging.getLogger(__name__)
 

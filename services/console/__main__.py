@@ -1,10 +1,10 @@
-"""Run with `python -m services.console --config FILE`."""
+"""Run with `python -m sonarpost.services.console --config FILE`."""
 
 import sys
 
-from services.console.config import ConsoleConfig
-from services.console.service import ConsoleService
 from sonarpost.runtime.process import main
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.service import ConsoleService
 
 
 def run() -> int:

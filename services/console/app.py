@@ -13,16 +13,16 @@ from starlette.responses import FileResponse, RedirectResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from services.console.asking import KINDS
-from services.console.board import Board
-from services.console.contact_routes import ContactRoutes
-from services.console.exporting import ExportRoutes
-from services.console.place_routes import PlaceRoutes
-from services.console.session_routes import SessionRoutes
-from services.console.stream import Stream
-from services.console.users import MAX_PASSWORD, MIN_PASSWORD, Users
-from services.console.web import Call, Endpoint, Gate, Guard, RefusedError, answer, json_answer
 from sonarpost.review.rendering import MAPS
+from sonarpost.services.console.asking import KINDS
+from sonarpost.services.console.board import Board
+from sonarpost.services.console.contact_routes import ContactRoutes
+from sonarpost.services.console.exporting import ExportRoutes
+from sonarpost.services.console.place_routes import PlaceRoutes
+from sonarpost.services.console.session_routes import SessionRoutes
+from sonarpost.services.console.stream import Stream
+from sonarpost.services.console.users import MAX_PASSWORD, MIN_PASSWORD, Users
+from sonarpost.services.console.web import Call, Endpoint, Gate, Guard, RefusedError, answer, json_answer
 
 STATIC: Final = Path(__file__).parent / "static"
 _MEDIA: Final = {

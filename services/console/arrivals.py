@@ -6,20 +6,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 
-from services.console import asking, contacts, decisions
-from services.console.asking import ID_COLUMN, Table
-from services.console.config import ConsoleConfig
-from services.console.contacts import Counts
-from services.console.database import Database
-from services.console.events import Hub
-from services.console.fleet import FleetPanel
-from services.console.rows import (
-    Json,
-    advice_of,
-    contact_row,
-    decision_of,
-    request_of,
-)
 from sonarpost.errors import BadInputError
 from sonarpost.messages import (
     Advice,
@@ -27,6 +13,20 @@ from sonarpost.messages import (
     DownlinkState,
     ReconstructedImage,
     TaskingState,
+)
+from sonarpost.services.console import asking, contacts, decisions
+from sonarpost.services.console.asking import ID_COLUMN, Table
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.contacts import Counts
+from sonarpost.services.console.database import Database
+from sonarpost.services.console.events import Hub
+from sonarpost.services.console.fleet import FleetPanel
+from sonarpost.services.console.rows import (
+    Json,
+    advice_of,
+    contact_row,
+    decision_of,
+    request_of,
 )
 
 

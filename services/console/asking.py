@@ -6,15 +6,15 @@ import sqlite3
 import uuid
 from typing import Final, Literal
 
-from services.console import audit
-from services.console.audit import OnScreen
-from services.console.contacts import contact_of_picture, find_row
-from services.console.people import Actor
-from services.console.rows import Json, advice_of, request_of
 from sonarpost import wire
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Advice, Command, CommandKind, DownlinkState, TaskingState
+from sonarpost.services.console import audit
+from sonarpost.services.console.audit import OnScreen
+from sonarpost.services.console.contacts import contact_of_picture, find_row
+from sonarpost.services.console.people import Actor
+from sonarpost.services.console.rows import Json, advice_of, request_of
 
 KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider")
 _RANK: Final = {

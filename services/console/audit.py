@@ -7,7 +7,7 @@ import sqlite3
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from services.console.people import Actor
+from sonarpost.services.console.people import Actor
 
 
 @dataclass(frozen=True, slots=True)

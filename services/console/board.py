@@ -6,15 +6,24 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from services.console import asking, audit, contacts, decisions
-from services.console.arrivals import Arrivals, NoSuchError
-from services.console.asking import ID_COLUMN, Table
-from services.console.audit import OnScreen
-from services.console.contacts import Filter
-from services.console.decisions import Judgement
-from services.console.measures import Line, measured
-from services.console.people import Actor
-from services.console.rows import (
+from sonarpost import wire
+from sonarpost.messages import (
+    Advice,
+    Command,
+    CommandKind,
+    Decision,
+    ReconstructedImage,
+)
+from sonarpost.review.costs import request_cost
+from sonarpost.services.console import asking, audit, contacts, decisions
+from sonarpost.services.console.arrivals import Arrivals, NoSuchError
+from sonarpost.services.console.asking import ID_COLUMN, Table
+from sonarpost.services.console.audit import OnScreen
+from sonarpost.services.console.contacts import Filter
+from sonarpost.services.console.decisions import Judgement
+from sonarpost.services.console.measures import Line, measured
+from sonarpost.services.console.people import Actor
+from sonarpost.services.console.rows import (
     Json,
     advice_of,
     audit_of,
@@ -25,15 +34,6 @@ from services.console.rows import (
     request_of,
     version_of,
 )
-from sonarpost import wire
-from sonarpost.messages import (
-    Advice,
-    Command,
-    CommandKind,
-    Decision,
-    ReconstructedImage,
-)
-from sonarpost.review.costs import request_cost
 
 FRAME_HEADER_BYTES = 13
 """Of a frame of the paper's format; v1's are shorter."""

@@ -13,18 +13,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from services.console.app import ConsoleApp
-from services.console.board import Board
-from services.console.config import ConsoleConfig
-from services.console.database import Database
-from services.console.people import ROLES
-from services.console.server import WebServer
-from services.console.users import FILE_NAME, Users
 from sonarpost.errors import ConfigError
 from sonarpost.runtime.config import load
+from sonarpost.services.console.app import ConsoleApp
+from sonarpost.services.console.board import Board
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.database import Database
+from sonarpost.services.console.people import ROLES
+from sonarpost.services.console.server import WebServer
+from sonarpost.services.console.users import FILE_NAME, Users
 
 if TYPE_CHECKING:
-    from services.console.training import Training
+    from sonarpost.services.console.training import Training
 
 DATABASE_NAME = "console-review.db"
 TRAINING_USERS = (("watch", "observer"), ("op", "operator"), ("expert", "expert"))
@@ -140,7 +140,7 @@ def _ls(parsed: argparse.Namespace) -> int:
 
 
 def _train(parsed: argparse.Namespace) -> int:
-    from services.console.training import VESSEL, Training  # noqa: PLC0415  it brings codecs and their compiler
+    from sonarpost.services.console.training import VESSEL, Training  # noqa: PLC0415  it brings codecs and their compiler
 
     with tempfile.TemporaryDirectory(prefix="sonarpost-training-") as scratch:
         folder: Path = parsed.state or Path(scratch)

@@ -12,16 +12,16 @@ from pydantic import Field
 from starlette.responses import Response
 from starlette.routing import Route
 
-from services.console.arrivals import NoSuchError
-from services.console.audit import OnScreen
-from services.console.board import Board
-from services.console.contacts import REVIEWS, SORTS, Filter
-from services.console.decisions import Judgement
-from services.console.measures import Line
-from services.console.web import Body, Call, Gate, RefusedError, json_answer
 from sonarpost.messages import Advice, CommandKind, ReconstructedImage, Verdict
 from sonarpost.review import rendering
 from sonarpost.review.rendering import LAYERS, MAPS
+from sonarpost.services.console.arrivals import NoSuchError
+from sonarpost.services.console.audit import OnScreen
+from sonarpost.services.console.board import Board
+from sonarpost.services.console.contacts import REVIEWS, SORTS, Filter
+from sonarpost.services.console.decisions import Judgement
+from sonarpost.services.console.measures import Line
+from sonarpost.services.console.web import Body, Call, Gate, RefusedError, json_answer
 
 _NUMBER = re.compile(r"-?\d{1,9}(\.\d{1,9})?")
 _Sure = Annotated[float, Field(ge=0, le=1)] | None

@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Final
 
-from services.console.rows import CONTACT, Json, contact_row, percent_of
 from sonarpost import wire
 from sonarpost.messages import ReconstructedImage
 from sonarpost.review.grouping import Place, nearest_group
 from sonarpost.review.local import vehicle_position
+from sonarpost.services.console.rows import CONTACT, Json, contact_row, percent_of
 
 SORTS: Final[Mapping[str, str]] = {
     "arrived": "arrived_utc_s",

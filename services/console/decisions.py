@@ -6,15 +6,15 @@ import sqlite3
 import uuid
 from dataclasses import dataclass
 
-from services.console import audit
-from services.console.asking import is_news
-from services.console.audit import OnScreen
-from services.console.contacts import contact_of_picture, find_row
-from services.console.people import Actor
-from services.console.rows import Json, contact_row, decision_of, image_of
 from sonarpost import wire
 from sonarpost.errors import BadInputError, SonarpostError
 from sonarpost.messages import Decision, DownlinkState, Verdict
+from sonarpost.services.console import audit
+from sonarpost.services.console.asking import is_news
+from sonarpost.services.console.audit import OnScreen
+from sonarpost.services.console.contacts import contact_of_picture, find_row
+from sonarpost.services.console.people import Actor
+from sonarpost.services.console.rows import Json, contact_row, decision_of, image_of
 
 
 class ConflictError(SonarpostError):

@@ -16,11 +16,6 @@ from typing import Final
 from starlette.responses import Response
 from starlette.routing import Route
 
-from services.console.board import Board
-from services.console.contact_routes import filter_of
-from services.console.contacts import Filter, list_contacts
-from services.console.rows import Json, image_of
-from services.console.web import Call, Gate, RefusedError
 from sonarpost import wire
 from sonarpost.export.accepted import Accepted, AcceptedContact, SideCar
 from sonarpost.export.cot import cot_events
@@ -30,6 +25,11 @@ from sonarpost.export.kml import kmz_bytes
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review import rendering
 from sonarpost.runtime.picture_files import side_car
+from sonarpost.services.console.board import Board
+from sonarpost.services.console.contact_routes import filter_of
+from sonarpost.services.console.contacts import Filter, list_contacts
+from sonarpost.services.console.rows import Json, image_of
+from sonarpost.services.console.web import Call, Gate, RefusedError
 
 MOST: Final = 10_000
 _PAGE: Final = 500

@@ -7,9 +7,9 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 
-from services.console.rows import Json
 from sonarpost.messages import AcousticFrame, Health, QueueState
 from sonarpost.runtime.fleet import Fleet, Seen
+from sonarpost.services.console.rows import Json
 
 PACKETS_KEPT = 20
 MOST_VEHICLES = 200

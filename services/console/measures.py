@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-from services.console.rows import Json
 from sonarpost.messages import ReconstructedImage
 from sonarpost.review.measuring import NotMeasurableError, height_from_shadow, measure_length
 from sonarpost.review.rendering import LAYERS
+from sonarpost.services.console.rows import Json
 
 Measure = Literal["length", "width", "shadow"]
 

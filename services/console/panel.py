@@ -19,11 +19,11 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from services.console.app import STATIC, not_routed, page_file, static_routes
-from services.console.web import Body, Call, Endpoint, Gate, Guard, Handler, RefusedError, json_answer
 from sonarpost.errors import ConfigError, HandoffError
 from sonarpost.review import rendering
 from sonarpost.review.panel import NONE_OF_THEM, Answer, Decoded, Trial, results, trials_for
+from sonarpost.services.console.app import STATIC, not_routed, page_file, static_routes
+from sonarpost.services.console.web import Body, Call, Endpoint, Gate, Guard, Handler, RefusedError, json_answer
 from sonarpost.sonar.image_files import read_image
 
 SUFFIXES: Final = (".png", ".tif", ".tiff")

@@ -8,10 +8,10 @@ import signal
 import threading
 from pathlib import Path
 
-from services.console.panel import Answers, Folders, PanelApp
-from services.console.server import WebServer
 from sonarpost.errors import ConfigError
 from sonarpost.review.panel import results, table
+from sonarpost.services.console.panel import Answers, Folders, PanelApp
+from sonarpost.services.console.server import WebServer
 
 FILE_NAME = "panel.db"
 

@@ -8,12 +8,12 @@ from pathlib import Path
 from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
-from services.console.arrivals import NoSuchError
-from services.console.board import Board
-from services.console.config import ConsoleConfig
-from services.console.rows import Json
-from services.console.web import Call, Gate, json_answer
 from sonarpost.review.local import LocalFrame, distance_m
+from sonarpost.services.console.arrivals import NoSuchError
+from sonarpost.services.console.board import Board
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.rows import Json
+from sonarpost.services.console.web import Call, Gate, json_answer
 
 MOST_ON_MAP = 10_000
 

@@ -11,17 +11,6 @@ from typing import TypeVar
 
 import zenoh
 
-from services.console.app import ConsoleApp
-from services.console.asking import Table
-from services.console.board import Board, Unsent
-from services.console.catch_up import kept_in
-from services.console.config import ConsoleConfig
-from services.console.database import Database
-from services.console.events import Pace
-from services.console.fleet import frame_event
-from services.console.place_routes import fleet
-from services.console.server import WebServer
-from services.console.users import FILE_NAME, Users
 from sonarpost import keys, wire
 from sonarpost.errors import BadInputError, ConfigError, HandoffError, PayloadError
 from sonarpost.messages import (
@@ -40,6 +29,17 @@ from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.transaction import OutboxItem, Transaction
+from sonarpost.services.console.app import ConsoleApp
+from sonarpost.services.console.asking import Table
+from sonarpost.services.console.board import Board, Unsent
+from sonarpost.services.console.catch_up import kept_in
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.database import Database
+from sonarpost.services.console.events import Pace
+from sonarpost.services.console.fleet import frame_event
+from sonarpost.services.console.place_routes import fleet
+from sonarpost.services.console.server import WebServer
+from sonarpost.services.console.users import FILE_NAME, Users
 
 log = logging.getLogger(__name__)
 

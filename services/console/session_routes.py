@@ -9,11 +9,11 @@ import time
 from starlette.responses import Response
 from starlette.routing import Route
 
-from services.console.people import Actor, Side
-from services.console.rows import Json
-from services.console.users import MAX_PASSWORD, MIN_PASSWORD, Attempts, Session, Users
-from services.console.web import COOKIE, Body, Call, Gate, RefusedError, json_answer
 from sonarpost.runtime.logs import kv
+from sonarpost.services.console.people import Actor, Side
+from sonarpost.services.console.rows import Json
+from sonarpost.services.console.users import MAX_PASSWORD, MIN_PASSWORD, Attempts, Session, Users
+from sonarpost.services.console.web import COOKIE, Body, Call, Gate, RefusedError, json_answer
 
 log = logging.getLogger(__name__)
 

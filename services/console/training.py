@@ -9,10 +9,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from services.console.board import Board
-from services.console.fleet import frame_event
-from services.console.place_routes import fleet
-from services.console.training_contacts import VEHICLES, Simulated, simulated_contacts, wider_image_id
 from sonarpost import keys, wire
 from sonarpost.messages import (
     AcousticFrame,
@@ -28,6 +24,10 @@ from sonarpost.messages import (
     ReconstructedImage,
 )
 from sonarpost.modem.rates import RATES
+from sonarpost.services.console.board import Board
+from sonarpost.services.console.fleet import frame_event
+from sonarpost.services.console.place_routes import fleet
+from sonarpost.services.console.training_contacts import VEHICLES, Simulated, simulated_contacts, wider_image_id
 
 log = logging.getLogger(__name__)
 

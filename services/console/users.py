@@ -17,8 +17,8 @@ from pathlib import Path
 from cryptography.exceptions import InvalidKey
 from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
 
-from services.console.people import ROLES, Role
 from sonarpost.errors import BadInputError, HandoffError
+from sonarpost.services.console.people import ROLES, Role
 
 FILE_NAME = "console-users.db"
 COST = 2**15

@@ -14,14 +14,14 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from services.console.arrivals import NoSuchError
-from services.console.decisions import ConflictError
-from services.console.people import Act, Actor, Side
-from services.console.rows import Json
-from services.console.users import Session, Users, same
 from sonarpost.errors import BadInputError, HandoffError
 from sonarpost.review.measuring import NotMeasurableError
 from sonarpost.runtime.logs import kv
+from sonarpost.services.console.arrivals import NoSuchError
+from sonarpost.services.console.decisions import ConflictError
+from sonarpost.services.console.people import Act, Actor, Side
+from sonarpost.services.console.rows import Json
+from sonarpost.services.console.users import Session, Users, same
 from sonarpost.wire import expected_text
 
 log = logging.getLogger(__name__)

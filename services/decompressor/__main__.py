@@ -1,10 +1,10 @@
-"""Run with `python -m services.decompressor --config FILE`."""
+"""Run with `python -m sonarpost.services.decompressor --config FILE`."""
 
 import sys
 
-from services.decompressor.config import DecompressorConfig
-from services.decompressor.service import DecompressorService
 from sonarpost.runtime.process import main
+from sonarpost.services.decompressor.config import DecompressorConfig
+from sonarpost.services.decompressor.service import DecompressorService
 
 
 def run() -> int:

@@ -7,9 +7,6 @@ import threading
 import time
 from collections.abc import Iterable, Mapping
 
-from services.decompressor.config import DecompressorConfig
-from services.decompressor.decoder import Decoder, image_id_of
-from services.decompressor.hearing import Event, Hearing
 from sonarpost import keys, wire
 from sonarpost.errors import BadInputError, ConfigError, HandoffError
 from sonarpost.link.paper_events import ContactOnly, FrameRejected, ImageReady
@@ -23,6 +20,9 @@ from sonarpost.runtime.picture_files import write_picture
 from sonarpost.runtime.service import RETRY_AFTER_S, Effects, Service
 from sonarpost.runtime.transaction import InboxItem
 from sonarpost.security.acoustic_key import read_key
+from sonarpost.services.decompressor.config import DecompressorConfig
+from sonarpost.services.decompressor.decoder import Decoder, image_id_of
+from sonarpost.services.decompressor.hearing import Event, Hearing
 
 log = logging.getLogger(__name__)
 

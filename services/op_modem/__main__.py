@@ -1,10 +1,10 @@
-"""Run with `python -m services.op_modem --config FILE`."""
+"""Run with `python -m sonarpost.services.op_modem --config FILE`."""
 
 import sys
 
-from services.op_modem.config import OpModemConfig
-from services.op_modem.service import OpModemService
 from sonarpost.runtime.process import main
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.service import OpModemService
 
 
 def run() -> int:

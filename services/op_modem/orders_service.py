@@ -10,9 +10,6 @@ from contextlib import contextmanager
 
 import zenoh
 
-from services.op_modem.config import OpModemConfig
-from services.op_modem.speaking import Turn
-from services.op_modem.station import Station
 from sonarpost import keys, wire
 from sonarpost.errors import FrameError, HandoffError, PayloadError
 from sonarpost.link.orders import OpenOrder
@@ -28,6 +25,9 @@ from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import Effects
 from sonarpost.runtime.transaction import InboxItem
 from sonarpost.security.acoustic_key import read_key
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.speaking import Turn
+from sonarpost.services.op_modem.station import Station
 
 log = logging.getLogger(__name__)
 

@@ -10,9 +10,6 @@ from collections.abc import Mapping
 
 from pydantic import ValidationError
 
-from services.op_modem.arriving import pack, unpack
-from services.op_modem.config import OpModemConfig
-from services.op_modem.orders_service import SpeakingService
 from sonarpost import keys
 from sonarpost.errors import HandoffError
 from sonarpost.messages import AcousticFrame, LinkQuality
@@ -23,6 +20,9 @@ from sonarpost.runtime.concern import image_of_frame
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects
+from sonarpost.services.op_modem.arriving import pack, unpack
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.orders_service import SpeakingService
 
 log = logging.getLogger(__name__)
 

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from services.op_modem.config import OpModemConfig
 from sonarpost.modem.rates import RATES
+from sonarpost.services.op_modem.config import OpModemConfig
 
 _PACKET_MARGIN_S = 1.0
 _WAIT_AFTER_FAILURE_S = 2.0

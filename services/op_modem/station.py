@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import msgpack
 
-from services.op_modem.config import OpModemConfig
 from sonarpost.errors import FrameError, PayloadError
 from sonarpost.link import downlink as dl
 from sonarpost.link.orders import MOST_OPEN, OpenOrder, OrderBook
@@ -13,6 +12,7 @@ from sonarpost.link.v1_frame import segments_room
 from sonarpost.link.vessel import VesselLink
 from sonarpost.messages import Command, Decision, DownlinkState
 from sonarpost.modem.rates import RATES
+from sonarpost.services.op_modem.config import OpModemConfig
 
 _MESSAGE_OVERHEAD_BYTES = 3  # kind, length and number of a message segment
 LATEST_UTC_S = 2**32 - 1

@@ -1,10 +1,10 @@
-"""Run with `python -m services.relay --config FILE`."""
+"""Run with `python -m sonarpost.services.relay --config FILE`."""
 
 import sys
 
-from services.relay.config import RelayConfig
-from services.relay.service import RelayService
 from sonarpost.runtime.process import main
+from sonarpost.services.relay.config import RelayConfig
+from sonarpost.services.relay.service import RelayService
 
 
 def run() -> int:

@@ -9,8 +9,6 @@ from collections.abc import Collection, Mapping, Sequence
 
 import zenoh
 
-from services.relay.config import RelayConfig
-from services.relay.upstreams import Upstream, is_upstream_queue
 from sonarpost import keys, wire
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
@@ -22,6 +20,8 @@ from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.session import open_with_retry
 from sonarpost.runtime.shore_watch import ShoreWatch, Site
 from sonarpost.runtime.transaction import InboxItem, Topic
+from sonarpost.services.relay.config import RelayConfig
+from sonarpost.services.relay.upstreams import Upstream, is_upstream_queue
 
 log = logging.getLogger(__name__)
 

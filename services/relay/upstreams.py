@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 
 import zenoh
 
-from services.relay.config import UpstreamOptions
 from sonarpost import keys
 from sonarpost.runtime.lane import Lane
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.transaction import consumer_of, queue_of
+from sonarpost.services.relay.config import UpstreamOptions
 
 log = logging.getLogger(__name__)
 

@@ -1,10 +1,10 @@
-"""Run with `python -m services.uuv_modem --config FILE`."""
+"""Run with `python -m sonarpost.services.uuv_modem --config FILE`."""
 
 import sys
 
-from services.uuv_modem.config import UuvModemConfig
-from services.uuv_modem.service import UuvModemService
 from sonarpost.runtime.process import main
+from sonarpost.services.uuv_modem.config import UuvModemConfig
+from sonarpost.services.uuv_modem.service import UuvModemService
 
 
 def run() -> int:

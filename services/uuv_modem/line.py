@@ -8,9 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from services.uuv_modem.config import UuvModemConfig
-from services.uuv_modem.line_store import LineStore
-from services.uuv_modem.orders import Handed, OrderBook
 from sonarpost import wire
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import BadInputError, FrameError
@@ -43,6 +40,9 @@ from sonarpost.runtime.logs import kv
 from sonarpost.runtime.store import Store
 from sonarpost.runtime.transaction import Transaction
 from sonarpost.security.acoustic_key import read_key
+from sonarpost.services.uuv_modem.config import UuvModemConfig
+from sonarpost.services.uuv_modem.line_store import LineStore
+from sonarpost.services.uuv_modem.orders import Handed, OrderBook
 
 log = logging.getLogger(__name__)
 

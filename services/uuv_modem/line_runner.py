@@ -9,8 +9,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from services.uuv_modem.config import UuvModemConfig
-from services.uuv_modem.line import VehicleLine
 from sonarpost import wire
 from sonarpost.errors import BadInputError, HandoffError
 from sonarpost.link.medium import Medium
@@ -27,6 +25,8 @@ from sonarpost.modem.events import (
 from sonarpost.modem.rates import RATES
 from sonarpost.runtime.logs import kv
 from sonarpost.runtime.modem_runner import ModemRunner
+from sonarpost.services.uuv_modem.config import UuvModemConfig
+from sonarpost.services.uuv_modem.line import VehicleLine
 
 log = logging.getLogger(__name__)
 

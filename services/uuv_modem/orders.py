@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from services.uuv_modem.config import UuvModemConfig
 from sonarpost import keys
 from sonarpost.errors import FrameError
 from sonarpost.link.downlink import (
@@ -23,6 +22,7 @@ from sonarpost.link.downlink import (
 )
 from sonarpost.link.v1_state import read_list
 from sonarpost.messages import Command, CommandKind, Decision, Record
+from sonarpost.services.uuv_modem.config import UuvModemConfig
 
 _REMEMBERED: Final = 512
 _VESSEL_BY_SOUND: Final = "vessel"

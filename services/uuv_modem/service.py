@@ -10,9 +10,6 @@ from collections.abc import Mapping, Sequence
 import msgpack
 import zenoh
 
-from services.uuv_modem.config import UuvModemConfig
-from services.uuv_modem.line import VehicleLine
-from services.uuv_modem.line_runner import TAKEN, LineRunner
 from sonarpost import keys, wire
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_sender import Packet, plan_packets
@@ -33,6 +30,9 @@ from sonarpost.runtime.logs import kv
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import Effects, InterruptedByStopError
 from sonarpost.runtime.transaction import InboxItem
+from sonarpost.services.uuv_modem.config import UuvModemConfig
+from sonarpost.services.uuv_modem.line import VehicleLine
+from sonarpost.services.uuv_modem.line_runner import TAKEN, LineRunner
 from sonarpost.sonar.survey import Side
 
 log = logging.getLogger(__name__)

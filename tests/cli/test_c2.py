@@ -16,9 +16,6 @@ import zenoh
 from conftest import eventually, free_port, publish_once
 from records import picture_record
 
-from services.c2.archive import Archive
-from services.c2.config import C2Config
-from services.c2.service import C2Service
 from sonarpost import keys, wire
 from sonarpost.cli.c2.ls import join, select
 from sonarpost.cli.c2.options import printable, since_of
@@ -26,6 +23,9 @@ from sonarpost.cli.main import main
 from sonarpost.errors import ConfigError
 from sonarpost.messages import Advice, Contact, Decision, Raster, TaskingState
 from sonarpost.runtime.session import router_config
+from sonarpost.services.c2.archive import Archive
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
 
 FIRST_S = 1_700_000_000.0
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from services.console.app import ConsoleApp
-from services.console.board import Board
-from services.console.config import ConsoleConfig
-from services.console.database import Database
-from services.console.users import Users
 from sonarpost.messages import Contact, Raster, ReconstructedImage
+from sonarpost.services.console.app import ConsoleApp
+from sonarpost.services.console.board import Board
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.database import Database
+from sonarpost.services.console.users import Users
 
 PASSWORD = "correct horse battery"
 PEOPLE = {"watch": "observer", "anna": "operator", "bo": "operator", "eva": "expert"}
@@ -139,7 +139,7 @@ ConsoleMaker = Callable[..., Console]
 @pytest.fixture(autouse=True)
 def cheap_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hashing costs time on purpose; how much of it is no matter here."""
-    monkeypatch.setattr("services.console.users.COST", 2**4)
+    monkeypatch.setattr("sonarpost.services.console.users.COST", 2**4)
 
 
 @pytest.fixture(scope="session")
@@ -147,7 +147,7 @@ def users_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The file of those who may log in, made once."""
     path = tmp_path_factory.mktemp("users") / "console-users.db"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("services.console.users.COST", 2**4)
+        patch.setattr("sonarpost.services.console.users.COST", 2**4)
         users = Users(path)
         for name, role in PEOPLE.items():
             users.add(name, role, PASSWORD)

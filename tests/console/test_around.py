@@ -13,10 +13,10 @@ import pytest
 from conftest import REPOSITORY
 from console.conftest import picture_record
 
-from services.console.events import Hub, Pace
 from sonarpost.messages import AcousticFrame, LinkQuality, QueuedImage, QueueState
 from sonarpost.review.choice import clopper_pearson, wilson
 from sonarpost.review.local import LocalFrame, distance_m, moved, vehicle_position
+from sonarpost.services.console.events import Hub, Pace
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 

@@ -14,14 +14,14 @@ import pytest
 from conftest import eventually
 from console.conftest import PASSWORD
 
-from services.console.server import WebServer
-from services.console.training import VESSEL, Training
-from services.console.training_contacts import simulated_contacts
-from services.console.users import FILE_NAME, Users
 from sonarpost.cli.main import main
 from sonarpost.errors import ConfigError
 from sonarpost.runtime.config import TlsConfig
 from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
+from sonarpost.services.console.server import WebServer
+from sonarpost.services.console.training import VESSEL, Training
+from sonarpost.services.console.training_contacts import simulated_contacts
+from sonarpost.services.console.users import FILE_NAME, Users
 
 
 def user(state: Path, *words: str) -> int:

@@ -11,10 +11,10 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from starlette.testclient import TestClient
 
-from services.console.panel import Answers, Folders, PanelApp
 from sonarpost.cli.main import main
 from sonarpost.errors import ConfigError
 from sonarpost.review.panel import Decoded, trials_for
+from sonarpost.services.console.panel import Answers, Folders, PanelApp
 
 NAMES = [f"contact-{number}" for number in range(6)]
 

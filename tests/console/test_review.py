@@ -12,14 +12,14 @@ from console.conftest import FIRST_UTC_S, picture_record
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from services.console.asking import is_news
-from services.console.audit import OnScreen
-from services.console.contacts import Filter
-from services.console.decisions import ConflictError, Judgement
-from services.console.people import Actor
 from sonarpost.errors import HandoffError
 from sonarpost.messages import Advice, Decision, DownlinkState
 from sonarpost.review.grouping import Place, nearest_group
+from sonarpost.services.console.asking import is_news
+from sonarpost.services.console.audit import OnScreen
+from sonarpost.services.console.contacts import Filter
+from sonarpost.services.console.decisions import ConflictError, Judgement
+from sonarpost.services.console.people import Actor
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 SECONDS = count()

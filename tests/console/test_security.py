@@ -8,9 +8,9 @@ import pytest
 from console.conftest import PASSWORD, PEOPLE, Browser, picture_record
 from starlette.testclient import TestClient
 
-from services.console.config import ConsoleConfig
-from services.console.users import Attempts, Users
 from sonarpost.errors import BadInputError
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.users import Attempts, Users
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 ONE = f"/api/contacts/{ID}"

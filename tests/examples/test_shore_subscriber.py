@@ -16,12 +16,12 @@ from conftest import REPOSITORY, eventually, free_port
 from export.make import decision, image
 from PIL import Image
 
-from services.c2.config import C2Config
-from services.c2.service import C2Service
 from sonarpost import keys, wire
 from sonarpost.messages import Decision, Raster, ReconstructedImage, Relayed
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.session import client_config
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
 
 EXAMPLE = REPOSITORY / "examples" / "shore_subscriber.py"
 

@@ -9,13 +9,13 @@ import pytest
 from conftest import eventually
 from export.make import FIRST_UTC_S, decision, image, keep, mission
 
-from services.c2.config import C2Config
-from services.c2.service import C2Service
 from sonarpost import keys, wire
 from sonarpost.errors import KeptFileError
 from sonarpost.export.accepted import load_accepted
 from sonarpost.messages import Relayed
 from sonarpost.runtime.config import PlatformConfig
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
 
 
 def test_the_latest_version_of_a_picture_counts(tmp_path: Path) -> None:

@@ -129,7 +129,7 @@ class Coast:
             return [*launch, "sonarpost.runtime.router", "--listen", self._endpoint(name), "--connect", shore]
         if name == "router-shore":
             return [*prefix, *launch, "sonarpost.runtime.router", "--listen", self._endpoint(name)]
-        return [*prefix, *launch, f"services.{name}", "--config", str(self.folder / f"{name}.toml")]
+        return [*prefix, *launch, f"sonarpost.services.{name}", "--config", str(self.folder / f"{name}.toml")]
 
     def start(self, name: str) -> None:
         """Start a process; its output goes to NAME.log."""

@@ -12,8 +12,6 @@ from golden.zenoh.samples import COMPLETE_IMAGE, SAMPLES
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.relay.config import RelayConfig
-from services.relay.service import RelayService
 from sonarpost import keys, wire
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_sender import plan_packets
@@ -21,6 +19,8 @@ from sonarpost.messages import AcousticFrame, Contact, Decision, Raster, Relayed
 from sonarpost.runtime import logs
 from sonarpost.runtime.concern import Concern, concern_of_payload
 from sonarpost.runtime.config import PlatformConfig
+from sonarpost.services.relay.config import RelayConfig
+from sonarpost.services.relay.service import RelayService
 
 CONTACT = Contact(contact_id="line-7", vehicle_id="uuv-1")
 SNIPPET = Snippet(contact=CONTACT, picture=Raster(height_px=1, width_px=1, bits=8, data=b"\0"))

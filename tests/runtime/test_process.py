@@ -242,7 +242,7 @@ def test_help_names_the_service(start: Start) -> None:
         [sys.executable, "-c", TINY, "--help"], capture_output=True, text=True, check=False, timeout=20
     )
     assert done.returncode == 0
-    assert "usage: python -m services.relay" in done.stdout
+    assert "usage: python -m sonarpost.services.relay" in done.stdout
     assert "Takes decisions." in done.stdout
 
 

@@ -8,10 +8,6 @@ from pathlib import Path
 import pytest
 from conftest import eventually, free_port
 
-from services.c2.config import C2Config
-from services.c2.service import C2Service
-from services.relay.config import RelayConfig, UpstreamOptions
-from services.relay.service import RelayService
 from sonarpost import keys, wire
 from sonarpost.messages import Advice, Command, Decision, Record
 from sonarpost.runtime.config import PlatformConfig, ServiceConfig
@@ -19,6 +15,10 @@ from sonarpost.runtime.reach import Reach, ask_shore, try_endpoint, why_no_answe
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.session import open_with_retry
 from sonarpost.security.router_config import Wanted
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
+from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
+from sonarpost.services.relay.service import RelayService
 
 
 class Producer(Service[ServiceConfig]):

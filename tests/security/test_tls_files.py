@@ -206,7 +206,7 @@ def test_a_service_with_wrong_files_ends_with_one_line(tmp_path, folder):
     files = ", ".join(f'{name} = "{folder / file}"' for name, file in names.items())
     path.write_text(f'[platform]\nid = "vessel-1"\nstate_dir = "{tmp_path}"\ntls = {{ {files} }}\n')
     done = subprocess.run(
-        [sys.executable, "-m", "services.relay", "--config", str(path)],
+        [sys.executable, "-m", "sonarpost.services.relay", "--config", str(path)],
         check=False,
         capture_output=True,
         text=True,

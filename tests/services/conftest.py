@@ -63,9 +63,9 @@ class Neighbour(Service[ServiceConfig]):
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Waits before another attempt are shortened; they are counted in tries, never in seconds, here."""
     monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.05)
-    monkeypatch.setattr("services.decompressor.service.RETRY_AFTER_S", 0.05)
-    monkeypatch.setattr("services.decompressor.service.QUIET_S", 0.05)
-    monkeypatch.setattr("services.op_modem.service.SAVE_AGAIN_S", 0.05)
+    monkeypatch.setattr("sonarpost.services.decompressor.service.RETRY_AFTER_S", 0.05)
+    monkeypatch.setattr("sonarpost.services.decompressor.service.QUIET_S", 0.05)
+    monkeypatch.setattr("sonarpost.services.op_modem.service.SAVE_AGAIN_S", 0.05)
 
 
 class Crew:

@@ -20,14 +20,14 @@ import zenoh
 from conftest import eventually, free_port
 from pydantic import ValidationError
 
-from services.acoustic_channel.config import AcousticChannelConfig
-from services.acoustic_channel.service import AcousticChannel, AcousticChannelService
 from sonarpost import keys, wire
 from sonarpost.cli import modem_emulator
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import Health
 from sonarpost.modem import nmea
 from sonarpost.runtime.config import PlatformConfig
+from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
+from sonarpost.services.acoustic_channel.service import AcousticChannel, AcousticChannelService
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.water_config import WaterConfig

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from conftest import eventually
 
-from services.atd_stub import service as atd_stub
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.folder import FileSeen, SettledFiles, look_at
-from services.atd_stub.service import AtdStubService
 from sonarpost import keys
 from sonarpost.detect.contacts import detect
 from sonarpost.detect.settings import DetectorSettings
 from sonarpost.messages import Snippet
+from sonarpost.services.atd_stub import service as atd_stub
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.folder import FileSeen, SettledFiles, look_at
+from sonarpost.services.atd_stub.service import AtdStubService
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff
 from sonarpost.sonar.xtf_reader import read_xtf
 

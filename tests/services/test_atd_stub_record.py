@@ -11,19 +11,19 @@ import pytest
 from conftest import eventually
 from golden.zenoh.samples import BARE_CONTACT, FULL_CONTACT
 
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.folder import FileSeen, SettledFiles, look_at
-from services.atd_stub.record import of_detection
-from services.atd_stub.seam import Origin
-from services.atd_stub.service import AtdStubService
-from services.atd_stub.snippets import from_picture
-from services.atd_stub.text_file import contact_text, read_contact, write_snippet
 from sonarpost import keys
 from sonarpost.detect.contacts import FilterScores, detect
 from sonarpost.detect.ground_snippet import ground_picture
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.messages import Contact, Raster, Snippet
 from sonarpost.runtime.config import load
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.folder import FileSeen, SettledFiles, look_at
+from sonarpost.services.atd_stub.record import of_detection
+from sonarpost.services.atd_stub.seam import Origin
+from sonarpost.services.atd_stub.service import AtdStubService
+from sonarpost.services.atd_stub.snippets import from_picture
+from sonarpost.services.atd_stub.text_file import contact_text, read_contact, write_snippet
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.image_files import read_image, write_tiff

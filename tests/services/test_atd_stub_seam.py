@@ -11,12 +11,12 @@ from conftest import eventually
 from seams import RANGE_M, SAMPLES, START_S, Box, cut_into, held_of, near, run, survey_of
 from two_frequencies import with_second_frequency
 
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.seam import SeamLook, last_pings, pack, unpack
-from services.atd_stub.service import AtdStubService
-from services.atd_stub.snippets import from_survey
 from sonarpost import keys
 from sonarpost.messages import Snippet
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.seam import SeamLook, last_pings, pack, unpack
+from sonarpost.services.atd_stub.service import AtdStubService
+from sonarpost.services.atd_stub.snippets import from_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 from sonarpost.sonar.xtf_reader import read_xtf
 from sonarpost.sonar.xtf_writer import write_xtf

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from services.atd_stub.seam import Origin, SeamLook, pack, unpack
+from sonarpost.services.atd_stub.seam import Origin, SeamLook, pack, unpack
 from sonarpost.sonar.survey import Side
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "atd_stub" / "seam-format-1.hex"

@@ -8,10 +8,10 @@ import pytest
 from seams import RANGE_M, SAMPLES, Box, cut_into, near, run, survey_of
 from two_frequencies import files_of, with_second_frequency
 
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.seam import pack, unpack
-from services.atd_stub.snippets import from_survey
 from sonarpost.detect.line import follows
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.seam import pack, unpack
+from sonarpost.services.atd_stub.snippets import from_survey
 from sonarpost.sonar.survey import Side
 from sonarpost.sonar.xtf_reader import read_xtf
 from sonarpost.sonar.xtf_writer import write_xtf

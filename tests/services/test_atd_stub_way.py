@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY, eventually
 
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.pool import ContactPool
-from services.atd_stub.service import AtdStubService
-from services.atd_stub.way import STALE_S, WayToTheWater
 from sonarpost import keys, wire
 from sonarpost.messages import Contact, Health, QueuedImage, QueueState, Raster, Snippet
 from sonarpost.runtime.effects import Effects
 from sonarpost.runtime.store import Store
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.pool import ContactPool
+from sonarpost.services.atd_stub.service import AtdStubService
+from sonarpost.services.atd_stub.way import STALE_S, WayToTheWater
 from sonarpost.sonar.image_files import write_tiff
 
 KEY = keys.contact_detected("uuv-1")
@@ -276,7 +276,7 @@ def test_killed_again_and_again_it_sends_every_contact_once(crew, router, tmp_pa
         "poll_s = 0.05\nsettle_s = 0.0\nmax_on_the_way = 8\n"
     )
     rng = random.Random(5)
-    command = [sys.executable, "-m", "services.atd_stub", "--config", str(config)]
+    command = [sys.executable, "-m", "sonarpost.services.atd_stub", "--config", str(config)]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY / "common")}
     for life in range(kills + 1):
         process = subprocess.Popen(command, cwd=REPOSITORY, stderr=subprocess.DEVNULL, env=environment)

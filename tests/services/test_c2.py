@@ -11,11 +11,11 @@ import pytest
 from conftest import eventually
 from records import decision_record, picture_record
 
-from services.c2.config import C2Config
-from services.c2.service import C2Service
 from sonarpost import keys, wire
 from sonarpost.files import AtomicFiles
 from sonarpost.messages import Contact, Raster, ReconstructedImage, Relayed
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
 from sonarpost.sonar.image_files import read_image
 
 

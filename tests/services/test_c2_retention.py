@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from records import picture_record
 
-from services.c2.archive import Archive
-from services.c2.config import C2Config
 from sonarpost.errors import KeptFileError
 from sonarpost.messages import Decision, Raster
 from sonarpost.runtime.shore_files import find_picture, to_remove
 from sonarpost.runtime.shore_index import FILE_NAME, PictureRow, ShoreIndex
+from sonarpost.services.c2.archive import Archive
+from sonarpost.services.c2.config import C2Config
 
 DAY_S = 86400.0
 
@@ -214,9 +214,9 @@ def test_a_picture_is_found_by_name_and_newest_version():
 
 
 def test_the_service_removes_counts_and_logs(crew, platform, tmp_path, caplog):
-    from services.c2.service import C2Service
     from sonarpost import keys, wire
     from sonarpost.messages import Relayed
+    from sonarpost.services.c2.service import C2Service
 
     service = crew.start(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out", max_bytes=0)))
     relay = crew.neighbour("vessel-1", "relay")

@@ -8,15 +8,15 @@ import zenoh
 from chain.tcp_proxy import TcpProxy
 from conftest import eventually, free_port
 
-from services.c2.config import C2Config
-from services.c2.service import C2Service
-from services.relay.config import RelayConfig
-from services.relay.service import RelayService
 from sonarpost import keys
 from sonarpost.errors import KeptFileError
 from sonarpost.messages import Advice, Command, Decision, TaskingState
 from sonarpost.runtime.session import router_config
 from sonarpost.runtime.shore_index import ShoreIndex
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
+from sonarpost.services.relay.config import RelayConfig
+from sonarpost.services.relay.service import RelayService
 
 ADVICE, COMMAND = keys.tasking_advice("vessel-1"), keys.tasking_command("vessel-1")
 

@@ -23,7 +23,7 @@ PAIRS = [(file, service) for file, services in PLATFORMS.items() for service in 
 
 
 def table_of(service: str) -> type[ServiceConfig]:
-    module = importlib.import_module(f"services.{service}.config")
+    module = importlib.import_module(f"sonarpost.services.{service}.config")
     found = [
         t
         for _, t in inspect.getmembers(module, inspect.isclass)

@@ -14,10 +14,6 @@ import pytest
 import zenoh
 from conftest import eventually, publish_once
 
-from services.console.config import ConsoleConfig
-from services.console.service import ConsoleService
-from services.relay.config import RelayConfig
-from services.relay.service import RelayService
 from sonarpost import keys, wire
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import (
@@ -35,6 +31,10 @@ from sonarpost.messages import (
 )
 from sonarpost.runtime.picture_files import write_picture
 from sonarpost.runtime.process import main
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.service import ConsoleService
+from sonarpost.services.relay.config import RelayConfig
+from sonarpost.services.relay.service import RelayService
 
 PASSWORD = "correct horse battery"
 VESSEL = "vessel-1"
@@ -121,7 +121,7 @@ class Page:
 
 @pytest.fixture(autouse=True)
 def cheap_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.console.users.COST", 2**4)
+    monkeypatch.setattr("sonarpost.services.console.users.COST", 2**4)
 
 
 @pytest.fixture
@@ -194,7 +194,7 @@ def test_how_far_a_decision_has_come_is_watched(crew, start, client):
 
 
 def test_a_relay_with_nothing_waiting_means_that_decisions_are_ashore(start, client, crew, monkeypatch):
-    monkeypatch.setattr("services.console.service.ASHORE_MARGIN_S", -1.0)
+    monkeypatch.setattr("sonarpost.services.console.service.ASHORE_MARGIN_S", -1.0)
     relay = crew.neighbour(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
     console = start(decision_consumers=("relay",))
     put(client, keys.image_reconstructed(VESSEL), picture())

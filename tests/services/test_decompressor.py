@@ -13,9 +13,6 @@ import pytest
 from conftest import eventually
 from PIL import Image
 
-from services.decompressor import service as decompressor
-from services.decompressor.config import DecompressorConfig
-from services.decompressor.service import DecompressorService
 from sonarpost import keys
 from sonarpost.catalogue.store import Catalogue, open_catalogue, save
 from sonarpost.codec.interface import StreamHeader
@@ -29,6 +26,9 @@ from sonarpost.link.paper_sender import plan_packets
 from sonarpost.messages import AcousticFrame, ReconstructedImage
 from sonarpost.runtime.picture_files import picture_name
 from sonarpost.runtime.service import Effects
+from sonarpost.services.decompressor import service as decompressor
+from sonarpost.services.decompressor.config import DecompressorConfig
+from sonarpost.services.decompressor.service import DecompressorService
 from sonarpost.sonar.image_files import read_image
 
 IN, OUT = keys.acoustic_rx("vessel-1"), keys.image_reconstructed("vessel-1")
@@ -396,7 +396,7 @@ def test_two_catalogues_that_look_alike_on_the_link_are_refused(platform, tmp_pa
         database = TileDatabase(10, tiles, np.zeros(100, np.uint8), np.ones((1, 100), np.int16))
         names.append(str(tmp_path / f"{number}.tiles"))
         save(tmp_path / f"{number}.tiles", Catalogue(database, {}))
-    monkeypatch.setattr("services.decompressor.decoder.catalogue_tag", lambda tiles: 0x1234)
+    monkeypatch.setattr("sonarpost.services.decompressor.decoder.catalogue_tag", lambda tiles: 0x1234)
     with pytest.raises(CatalogueError, match="0x1234"):
         DecompressorService(platform("vessel-1"), DecompressorConfig(catalogues=tuple(names)))
     DecompressorService(platform("vessel-1"), DecompressorConfig(catalogues=(names[0], names[0]))).store.close()

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from conftest import eventually
 
-from services.decompressor.config import DecompressorConfig
-from services.decompressor.service import DecompressorService
 from sonarpost import keys
 from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.registry import CodecResources, default_registry
@@ -28,6 +26,8 @@ from sonarpost.link.v1_sender import Sender
 from sonarpost.messages import AcousticFrame, ReconstructedImage
 from sonarpost.runtime.service import Effects
 from sonarpost.security.acoustic_key import read_key
+from sonarpost.services.decompressor.config import DecompressorConfig
+from sonarpost.services.decompressor.service import DecompressorService
 
 IN, OUT = keys.acoustic_rx("vessel-1"), keys.image_reconstructed("vessel-1")
 CONTACT = ContactSummary(height_px=40, width_px=60, lat_deg=56.4, lon_deg=-5.6, time_utc_s=1_475_568_000.0)

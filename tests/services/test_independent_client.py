@@ -21,11 +21,11 @@ import numpy as np
 import pytest
 from conftest import eventually
 
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.service import AtdStubService
-from services.c2.config import C2Config
-from services.c2.service import C2Service
 from sonarpost.runtime.config import PlatformConfig
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.service import AtdStubService
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
 from sonarpost.sonar.image_files import write_tiff
 
 ZENOH = Path(sys.executable).with_name("zenoh")

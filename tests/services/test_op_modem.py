@@ -7,14 +7,14 @@ from conftest import eventually
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.op_modem import service as op_modem
-from services.op_modem.config import OpModemConfig
-from services.op_modem.service import OpModemService, quality_of
 from sonarpost import keys
 from sonarpost.messages import AcousticFrame
 from sonarpost.modem import nmea
 from sonarpost.modem.events import FrameReceived, PacketReceived
 from sonarpost.modem.statistics import LinkStatistics
+from sonarpost.services.op_modem import service as op_modem
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.service import OpModemService, quality_of
 
 RX = keys.acoustic_rx("vessel-1")
 

@@ -9,9 +9,6 @@ import pytest
 from conftest import eventually
 from pydantic import ValidationError
 
-from services.op_modem.config import OpModemConfig
-from services.op_modem.service import OpModemService
-from services.op_modem.speaking import Turn
 from sonarpost import keys, wire
 from sonarpost.errors import PayloadError
 from sonarpost.link import downlink as dl
@@ -31,6 +28,9 @@ from sonarpost.modem.micromodem import MicroModem
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
 from sonarpost.security.acoustic_key import read_key
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.service import OpModemService
+from sonarpost.services.op_modem.speaking import Turn
 
 VESSEL = "vessel-1"
 RX, DECISION, STATE = keys.acoustic_rx(VESSEL), keys.contact_decision(VESSEL), keys.acoustic_downlink(VESSEL)

@@ -121,8 +121,8 @@ def counters_in_code(sources: list[ast.AST]) -> set[str]:
 def made(name, platform, tmp_path):
     """The service, made and not started, and the type of its table."""
     service_name, config_name, _ = SERVICES[name]
-    config_type = getattr(importlib.import_module(f"services.{name}.config"), config_name)
-    service_type = getattr(importlib.import_module(f"services.{name}.service"), service_name)
+    config_type = getattr(importlib.import_module(f"sonarpost.services.{name}.config"), config_name)
+    service_type = getattr(importlib.import_module(f"sonarpost.services.{name}.service"), service_name)
     given = {"port": str(tmp_path / "port"), "site": "x"}
     fields = config_type.model_fields
     # The port of a modem is a text; another's has a default.

@@ -7,10 +7,10 @@ import pytest
 from conftest import eventually
 from records import decision_record, picture_record
 
-from services.relay.config import RelayConfig
-from services.relay.service import RelayService
 from sonarpost import keys, wire
 from sonarpost.messages import Raster, Relayed
+from sonarpost.services.relay.config import RelayConfig
+from sonarpost.services.relay.service import RelayService
 
 IMAGES, DECISIONS = keys.image_reconstructed("vessel-1"), keys.contact_decision("vessel-1")
 INBOX = keys.shore_inbox("vessel-1")

@@ -31,7 +31,7 @@ def relay_process(router, tmp_path):
 
     def start():
         process = subprocess.Popen(
-            [sys.executable, "-m", "services.relay", "--config", str(config)],
+            [sys.executable, "-m", "sonarpost.services.relay", "--config", str(config)],
             cwd=REPOSITORY,
             stderr=subprocess.DEVNULL,
             env={**os.environ, "PYTHONPATH": str(REPOSITORY / "common")},

@@ -12,11 +12,11 @@ from conftest import eventually, free_port
 from pydantic import ValidationError
 from records import decision_record, picture_record
 
-from services.relay.config import RelayConfig, UpstreamOptions
-from services.relay.service import RelayService, topic_of
 from sonarpost import keys
 from sonarpost.messages import Raster, Relayed
 from sonarpost.runtime.session import client_config, router_config
+from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
+from sonarpost.services.relay.service import RelayService, topic_of
 
 IMAGES, DECISIONS = keys.image_reconstructed("vessel-1"), keys.contact_decision("vessel-1")
 

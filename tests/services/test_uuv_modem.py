@@ -12,10 +12,6 @@ from conftest import eventually
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.op_modem.config import OpModemConfig
-from services.op_modem.service import OpModemService
-from services.uuv_modem.config import UuvModemConfig
-from services.uuv_modem.service import UuvModemService, summary_of
 from sonarpost import keys
 from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.registry import CodecResources, default_registry
@@ -25,6 +21,10 @@ from sonarpost.link.paper_sender import plan_packets
 from sonarpost.messages import AcousticFrame, Contact, EncodedImage
 from sonarpost.modem import nmea
 from sonarpost.modem.rates import RATES
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.service import OpModemService
+from sonarpost.services.uuv_modem.config import UuvModemConfig
+from sonarpost.services.uuv_modem.service import UuvModemService, summary_of
 from sonarpost.sim.acoustic_channel import AcousticChannel
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite
 from sonarpost.sim.water_physics import Position

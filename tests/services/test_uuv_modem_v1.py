@@ -10,10 +10,6 @@ import numpy as np
 import pytest
 from conftest import eventually
 
-from services.op_modem.config import OpModemConfig
-from services.op_modem.service import OpModemService
-from services.uuv_modem.config import UuvModemConfig
-from services.uuv_modem.service import UuvModemService
 from sonarpost import keys, wire
 from sonarpost.link.downlink import Confirmation, Data, Judgement, Outcome, Refine, Resend, Revisit, Wider, pack, unpack
 from sonarpost.link.paper_format import format_image_id
@@ -36,6 +32,10 @@ from sonarpost.messages import (
 from sonarpost.modem.rates import RATES
 from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.store import Store
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.service import OpModemService
+from sonarpost.services.uuv_modem.config import UuvModemConfig
+from sonarpost.services.uuv_modem.service import UuvModemService
 
 IN, OUT = keys.image_encoded("uuv-1"), keys.message_outgoing("uuv-1")
 RX, QUEUE = keys.acoustic_rx("vessel-1"), keys.acoustic_queue("uuv-1")

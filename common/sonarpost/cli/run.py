@@ -23,9 +23,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run_service(parsed: argparse.Namespace) -> int:
-    """Run the service's own module, as `python -m services.NAME` does."""
-    sys.argv = [f"services.{parsed.service}", "--config", str(parsed.config)]
-    module = importlib.import_module(f"services.{parsed.service}.__main__")
+    """Run the service's own module, as `python -m sonarpost.services.NAME` does."""
+    sys.argv = [f"sonarpost.services.{parsed.service}", "--config", str(parsed.config)]
+    module = importlib.import_module(f"sonarpost.services.{parsed.service}.__main__")
     status: int = module.run()
     return status
 

@@ -9,7 +9,7 @@ import importlib
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
     # Commands know services by name only: the console brings its own options.
-    command = importlib.import_module("services.console.panel_command")
+    command = importlib.import_module("sonarpost.services.console.panel_command")
     summary = "how well people recognise decoded pictures: a blind forced choice"
     parser = subparsers.add_parser("survey-panel", help=summary, description=__doc__)
     command.add_options(parser)

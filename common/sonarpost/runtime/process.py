@@ -35,7 +35,9 @@ def main(service_type: type[Service[C]], config_type: type[C], arguments: Sequen
         config_type: Type of its configuration table.
         arguments: Command line, normally the process's own.
     """
-    parser = argparse.ArgumentParser(prog=f"python -m services.{service_type.NAME}", description=service_type.__doc__)
+    parser = argparse.ArgumentParser(
+        prog=f"python -m sonarpost.services.{service_type.NAME}", description=service_type.__doc__
+    )
     parser.add_argument("--config", type=Path, required=True, help="TOML file of the platform")
     path: Path = parser.parse_args(arguments).config
     try:

@@ -11,9 +11,9 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, sync_playwright
 
-from services.console.app import ConsoleApp
-from services.console.server import WebServer
-from services.console.users import Users
+from sonarpost.services.console.app import ConsoleApp
+from sonarpost.services.console.server import WebServer
+from sonarpost.services.console.users import Users
 
 SMALL = {"width": 1366, "height": 768}
 PATIENCE_MS = 20_000

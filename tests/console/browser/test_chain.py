@@ -12,24 +12,24 @@ import pytest
 import zenoh
 from conftest import eventually
 
-from services.c2.config import C2Config
-from services.c2.service import C2Service
-from services.console.config import ConsoleConfig
-from services.console.service import ConsoleService
-from services.console.users import FILE_NAME, Users
-from services.decompressor.config import DecompressorConfig
-from services.decompressor.service import DecompressorService
-from services.op_modem.config import OpModemConfig
-from services.op_modem.service import OpModemService
-from services.relay.config import RelayConfig
-from services.relay.service import RelayService
-from services.uuv_modem.config import UuvModemConfig
-from services.uuv_modem.service import UuvModemService
 from sonarpost import keys, wire
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.messages import Command, Contact, Decision, EncodedImage, Raster, Record
 from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.service import Effects, Service
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.service import ConsoleService
+from sonarpost.services.console.users import FILE_NAME, Users
+from sonarpost.services.decompressor.config import DecompressorConfig
+from sonarpost.services.decompressor.service import DecompressorService
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.service import OpModemService
+from sonarpost.services.relay.config import RelayConfig
+from sonarpost.services.relay.service import RelayService
+from sonarpost.services.uuv_modem.config import UuvModemConfig
+from sonarpost.services.uuv_modem.service import UuvModemService
 from sonarpost.sim.acoustic_channel import AcousticChannel
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite
 from sonarpost.sim.survey import SurveySpec, simulate_survey

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.console.panel import Answers, Folders, PanelApp
-from services.console.server import WebServer
+from sonarpost.services.console.panel import Answers, Folders, PanelApp
+from sonarpost.services.console.server import WebServer
 
 PICTURES = 4
 

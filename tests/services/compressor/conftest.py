@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from services.compressor.config import CompressorConfig
-from services.compressor.service import CompressorService
 from sonarpost import keys
 from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq import IndexPacking
 from sonarpost.messages import EncodedImage
+from sonarpost.services.compressor.config import CompressorConfig
+from sonarpost.services.compressor.service import CompressorService
 
 OUT = keys.image_encoded("uuv-1")
 

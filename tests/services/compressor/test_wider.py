@@ -8,17 +8,17 @@ import pytest
 from conftest import eventually
 from records import command_record
 
-from services.atd_stub.config import AtdStubConfig
-from services.atd_stub.record import of_detection
-from services.atd_stub.seam import Origin
-from services.compressor.wide import wider
-from services.op_modem.station import order_of
-from services.uuv_modem.config import UuvModemConfig
-from services.uuv_modem.orders import OrderBook
 from sonarpost import keys
 from sonarpost.detect.contacts import detect
 from sonarpost.link import downlink as dl
 from sonarpost.messages import Contact, Snippet
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.record import of_detection
+from sonarpost.services.atd_stub.seam import Origin
+from sonarpost.services.compressor.wide import wider
+from sonarpost.services.op_modem.station import order_of
+from sonarpost.services.uuv_modem.config import UuvModemConfig
+from sonarpost.services.uuv_modem.orders import OrderBook
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 
 IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")

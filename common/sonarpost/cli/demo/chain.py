@@ -117,7 +117,7 @@ class Chain:
 
     def _module(self, name: str) -> tuple[str, ...]:
         if name not in ROUTERS:
-            return (f"services.{name}", "--config", str(self.settings.config_file(name)))
+            return (f"sonarpost.services.{name}", "--config", str(self.settings.config_file(name)))
         uuv, vessel, shore = (f"tcp/127.0.0.1:{port}" for port in self.settings.router_ports)
         listen = {"router-uuv": uuv, "router-vessel": vessel, "router-shore": shore}[name]
         link: tuple[str, ...] = ()
