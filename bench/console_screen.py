@@ -22,8 +22,8 @@ from playwright.sync_api import Page, sync_playwright
 
 from sonarpost import keys, wire
 from sonarpost.cli.demo.settings import free_ports
+from sonarpost.config import PlatformConfig
 from sonarpost.messages import ReconstructedImage
-from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.session import client_config, router_config
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService

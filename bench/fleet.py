@@ -40,8 +40,8 @@ from noise import noise_picture
 
 from sonarpost import keys
 from sonarpost.cli.demo.settings import free_ports
+from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import ReconstructedImage, Record
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.process import EXIT_WITH_PARENT
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.session import client_config

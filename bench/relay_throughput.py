@@ -41,9 +41,9 @@ from noise import noise_picture
 
 from sonarpost import keys, wire
 from sonarpost.cli.demo.settings import free_ports
+from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.logs import set_up
 from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
-from sonarpost.runtime.logs import set_up
 from sonarpost.runtime.schedule import CHUNK_BYTES, WINDOW, WINDOW_BYTES
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.session import client_config, router_config

@@ -14,7 +14,7 @@ from hypothesis import settings
 from xdist.remote import Producer
 from xdist.scheduler import LoadFileScheduling
 
-from sonarpost.runtime.config import PlatformConfig
+from sonarpost.config import PlatformConfig
 from sonarpost.runtime.session import client_config, router_config
 
 REPOSITORY = Path(__file__).resolve().parents[1]

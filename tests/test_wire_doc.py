@@ -20,9 +20,9 @@ from conftest import REPOSITORY, eventually
 from golden.zenoh.samples import RECORD_TYPES, SAMPLES
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Contact, Decision, Record, Snippet
 from sonarpost.runtime import handoff, handoff_batch, outbox, schedule, transaction
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.handoff import Reply, attachment
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.transaction import OutboxItem

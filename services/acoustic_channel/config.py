@@ -9,8 +9,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from sonarpost.config import ServiceConfig
 from sonarpost.modem.rates import RATES
-from sonarpost.runtime.config import ServiceConfig
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.water_chance import TailDamage

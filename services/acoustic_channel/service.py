@@ -8,9 +8,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
+from sonarpost.config import PlatformConfig
+from sonarpost.logs import kv
 from sonarpost.messages import Record
-from sonarpost.runtime.config import PlatformConfig
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.sim.acoustic_channel import AcousticChannel

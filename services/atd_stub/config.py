@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX
-from sonarpost.runtime.config import ServiceConfig
+from sonarpost.config import ServiceConfig
 from sonarpost.sonar.options import ErrorBudget, Mounting, SurveyOptions
 
 SidePx = Annotated[int, Field(ge=MIN_SIDE_PX, le=MAX_SIDE_PX)]

@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig
 from sonarpost.errors import HandoffError, PayloadError
+from sonarpost.logs import kv
 from sonarpost.messages import Health, QueueState, Snippet
-from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.effects import Effects
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.store import Store
 from sonarpost.services.atd_stub.pool import ContactPool
 from sonarpost.services.atd_stub.way import COMPRESSOR, MODEM, WayToTheWater

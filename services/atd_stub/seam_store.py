@@ -6,9 +6,9 @@ import logging
 from collections.abc import Mapping
 
 from sonarpost import wire
+from sonarpost.logs import kv
 from sonarpost.messages import Snippet
 from sonarpost.runtime.effects import Effects
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.store import Store
 from sonarpost.services.atd_stub.seam import Seam, pack, unpack
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import msgpack
 
+from sonarpost.config import PlatformConfig
 from sonarpost.errors import HandoffError, SurveyFileError
 from sonarpost.files import write_atomically
+from sonarpost.logs import kv
 from sonarpost.messages import Record, Snippet
-from sonarpost.runtime.config import PlatformConfig
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.transaction import OutboxItem, Transaction
 from sonarpost.services.atd_stub import snippets

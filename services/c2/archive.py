@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from sonarpost import keys
 from sonarpost.errors import PayloadError
 from sonarpost.files import AtomicFiles
+from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.picture_files import add_picture, picture_name
 from sonarpost.runtime.shore_files import (
     add_missing,

@@ -5,9 +5,9 @@ from typing import Annotated
 
 from pydantic import Field
 
+from sonarpost.config import ServiceConfig
 from sonarpost.keys import SHORE
 from sonarpost.messages import PlatformId
-from sonarpost.runtime.config import ServiceConfig
 
 
 class C2Config(ServiceConfig):

@@ -11,11 +11,11 @@ from dataclasses import replace
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig
 from sonarpost.errors import HandoffError, PayloadError
+from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
 from sonarpost.runtime import hello
-from sonarpost.runtime.config import PlatformConfig
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects, InterruptedByStopError, Service
 from sonarpost.runtime.shore_files import decision_file_name
 from sonarpost.runtime.transaction import InboxItem, OutboxItem, Transaction, queue_of

@@ -5,7 +5,7 @@ from typing import Annotated
 from pydantic import Field
 
 from sonarpost.codec.vq import IndexPacking
-from sonarpost.runtime.config import ServiceConfig
+from sonarpost.config import ServiceConfig
 
 
 class CompressorConfig(ServiceConfig):

@@ -11,11 +11,11 @@ from sonarpost import keys, wire
 from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.interface import Codec
 from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.config import PlatformConfig
 from sonarpost.link.paper_format import format_image_id
 from sonarpost.link.v1_preview import MAX_NUMBER
+from sonarpost.logs import kv
 from sonarpost.messages import Command, CommandKind, EncodedImage, Record, Snippet
-from sonarpost.runtime.config import PlatformConfig
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.services.compressor.config import CompressorConfig
 from sonarpost.services.compressor.kept import Kept, KeptPictures

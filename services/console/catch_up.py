@@ -12,8 +12,8 @@ from pydantic import ValidationError
 
 from sonarpost.errors import BadInputError, KeptFileError
 from sonarpost.export.accepted import DECISIONS, SideCar
+from sonarpost.logs import kv
 from sonarpost.messages import Decision, Raster, ReconstructedImage
-from sonarpost.runtime.logs import kv
 from sonarpost.sonar.image_files import read_image
 
 log = logging.getLogger(__name__)

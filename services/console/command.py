@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sonarpost.config import load
 from sonarpost.errors import ConfigError
-from sonarpost.runtime.config import load
 from sonarpost.services.console.app import ConsoleApp
 from sonarpost.services.console.board import Board
 from sonarpost.services.console.config import ConsoleConfig

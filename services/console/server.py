@@ -10,9 +10,9 @@ import threading
 import uvicorn
 from starlette.types import ASGIApp
 
+from sonarpost.config import TlsConfig
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.runtime.config import TlsConfig
-from sonarpost.runtime.logs import kv
+from sonarpost.logs import kv
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,9 @@ from typing import TypeVar
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig
 from sonarpost.errors import BadInputError, ConfigError, HandoffError, PayloadError
+from sonarpost.logs import kv
 from sonarpost.messages import (
     AcousticFrame,
     Advice,
@@ -25,8 +27,6 @@ from sonarpost.messages import (
     Record,
     TaskingState,
 )
-from sonarpost.runtime.config import PlatformConfig
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.transaction import OutboxItem, Transaction
 from sonarpost.services.console.app import ConsoleApp

@@ -9,7 +9,7 @@ import time
 from starlette.responses import Response
 from starlette.routing import Route
 
-from sonarpost.runtime.logs import kv
+from sonarpost.logs import kv
 from sonarpost.services.console.people import Actor, Side
 from sonarpost.services.console.rows import Json
 from sonarpost.services.console.users import MAX_PASSWORD, MIN_PASSWORD, Attempts, Session, Users

@@ -15,8 +15,8 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from sonarpost.errors import BadInputError, HandoffError
+from sonarpost.logs import kv
 from sonarpost.review.measuring import NotMeasurableError
-from sonarpost.runtime.logs import kv
 from sonarpost.services.console.arrivals import NoSuchError
 from sonarpost.services.console.decisions import ConflictError
 from sonarpost.services.console.people import Act, Actor, Side

@@ -5,8 +5,8 @@ from typing import Annotated
 
 from pydantic import Field
 
+from sonarpost.config import ServiceConfig
 from sonarpost.messages import PlatformId
-from sonarpost.runtime.config import ServiceConfig
 from sonarpost.services.decompressor.hearing import LinkName
 
 ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]

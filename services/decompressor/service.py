@@ -8,14 +8,14 @@ import time
 from collections.abc import Iterable, Mapping
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig
 from sonarpost.errors import BadInputError, ConfigError, HandoffError
 from sonarpost.link.paper_events import ContactOnly, FrameRejected, ImageReady
 from sonarpost.link.seal import AcousticSeal
 from sonarpost.link.seal_key import Direction
 from sonarpost.link.v1_events import ContactUpdate, FrameRefused
+from sonarpost.logs import concerning, kv
 from sonarpost.messages import AcousticFrame, ReconstructedImage, Record
-from sonarpost.runtime.config import PlatformConfig
-from sonarpost.runtime.logs import concerning, kv
 from sonarpost.runtime.picture_files import write_picture
 from sonarpost.runtime.service import RETRY_AFTER_S, Effects, Service
 from sonarpost.runtime.transaction import InboxItem

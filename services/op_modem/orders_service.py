@@ -11,16 +11,16 @@ from contextlib import contextmanager
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig
 from sonarpost.errors import FrameError, HandoffError, PayloadError
 from sonarpost.link.orders import OpenOrder
 from sonarpost.link.seal import AcousticSeal
 from sonarpost.link.seal_key import Direction
 from sonarpost.link.vessel import Packet
+from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame, Command, Decision, ReceivedMessage, Record
 from sonarpost.modem.events import FrameReceived, PacketFailed, PacketReceived, PacketSent
 from sonarpost.modem.rates import RATES
-from sonarpost.runtime.config import PlatformConfig
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import Effects
 from sonarpost.runtime.transaction import InboxItem

@@ -11,14 +11,14 @@ from collections.abc import Mapping
 from pydantic import ValidationError
 
 from sonarpost import keys
+from sonarpost.config import PlatformConfig
 from sonarpost.errors import HandoffError
+from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame, LinkQuality
 from sonarpost.modem.events import Event, FrameHeard, FrameReceived, PacketFailed, PacketReceived, PacketSent
 from sonarpost.modem.rates import RATES
 from sonarpost.modem.statistics import LinkStatistics
 from sonarpost.runtime.concern import image_of_frame
-from sonarpost.runtime.config import PlatformConfig
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.service import Effects
 from sonarpost.services.op_modem.arriving import pack, unpack
 from sonarpost.services.op_modem.config import OpModemConfig

@@ -7,9 +7,9 @@ from typing import Annotated
 
 from pydantic import Field, field_validator
 
+from sonarpost.config import ServiceConfig
 from sonarpost.keys import SHORE
 from sonarpost.messages import PlatformId
-from sonarpost.runtime.config import ServiceConfig
 
 ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 

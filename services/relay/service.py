@@ -10,11 +10,11 @@ from collections.abc import Collection, Mapping, Sequence
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig
 from sonarpost.errors import PayloadError
+from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
-from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.lane import Lane
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.room import Room
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.session import open_with_retry

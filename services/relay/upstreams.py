@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 import zenoh
 
 from sonarpost import keys
+from sonarpost.logs import kv
 from sonarpost.runtime.lane import Lane
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.transaction import consumer_of, queue_of
 from sonarpost.services.relay.config import UpstreamOptions
 

@@ -10,6 +10,7 @@ from typing import Final
 
 from sonarpost import wire
 from sonarpost.codec.interface import StreamHeader
+from sonarpost.config import PlatformConfig
 from sonarpost.errors import BadInputError, FrameError
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.downlink import (
@@ -33,10 +34,9 @@ from sonarpost.link.v1_feedback import unpack_mini
 from sonarpost.link.v1_frame import BLOCKS
 from sonarpost.link.v1_objects import MAX_STREAM_BYTES
 from sonarpost.link.v1_receiver import Receiver
+from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
 from sonarpost.modem.rates import RATES
-from sonarpost.runtime.config import PlatformConfig
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.store import Store
 from sonarpost.runtime.transaction import Transaction
 from sonarpost.security.acoustic_key import read_key

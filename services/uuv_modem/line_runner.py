@@ -12,6 +12,7 @@ from typing import Final
 from sonarpost import wire
 from sonarpost.errors import BadInputError, HandoffError
 from sonarpost.link.medium import Medium
+from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
 from sonarpost.modem.events import (
     Event,
@@ -23,7 +24,6 @@ from sonarpost.modem.events import (
     Polled,
 )
 from sonarpost.modem.rates import RATES
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.line import VehicleLine

@@ -11,8 +11,10 @@ import msgpack
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_sender import Packet, plan_packets
+from sonarpost.logs import kv
 from sonarpost.messages import (
     AcousticFrame,
     Contact,
@@ -24,9 +26,7 @@ from sonarpost.messages import (
 )
 from sonarpost.modem.events import Event, PacketFailed, PacketSent
 from sonarpost.modem.rates import RATES
-from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.inbox import NotNowError
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import Effects, InterruptedByStopError
 from sonarpost.runtime.transaction import InboxItem

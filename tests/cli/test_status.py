@@ -28,8 +28,8 @@ from sonarpost import keys, wire
 from sonarpost.cli.main import main
 from sonarpost.cli.status import show
 from sonarpost.cli.status.rows import age_text, bytes_text, is_well, rows_of
+from sonarpost.config import PlatformConfig
 from sonarpost.messages import Health
-from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.fleet import FleetState, Seen
 from sonarpost.runtime.session import router_config
 

@@ -12,7 +12,7 @@ import tomllib
 import pytest
 from conftest import REPOSITORY
 
-from sonarpost.runtime.config import SERVICES
+from sonarpost.config import SERVICES
 
 COMPOSE = REPOSITORY / "docker-compose.yml"
 PLATFORMS = {"uuv": "uuv", "vessel": "vessel", "shore": "shore", "sim": "sim"}

@@ -15,8 +15,8 @@ from conftest import eventually
 from console.conftest import PASSWORD
 
 from sonarpost.cli.main import main
+from sonarpost.config import TlsConfig
 from sonarpost.errors import ConfigError
-from sonarpost.runtime.config import TlsConfig
 from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
 from sonarpost.services.console.server import WebServer
 from sonarpost.services.console.training import VESSEL, Training

@@ -10,10 +10,10 @@ from conftest import eventually
 from export.make import FIRST_UTC_S, decision, image, keep, mission
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig
 from sonarpost.errors import KeptFileError
 from sonarpost.export.accepted import load_accepted
 from sonarpost.messages import Relayed
-from sonarpost.runtime.config import PlatformConfig
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 

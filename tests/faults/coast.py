@@ -33,8 +33,8 @@ from faults.feeder import VESSEL, Feeder
 from PIL import Image
 
 from sonarpost import wire
+from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Health, ReconstructedImage
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.process import EXIT_WITH_PARENT
 from sonarpost.runtime.session import open_with_retry
 

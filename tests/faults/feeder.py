@@ -8,8 +8,8 @@ import numpy as np
 from records import picture_record
 
 from sonarpost import keys
+from sonarpost.config import ServiceConfig
 from sonarpost.messages import Raster, ReconstructedImage
-from sonarpost.runtime.config import ServiceConfig
 from sonarpost.runtime.service import Effects, Service
 
 VESSEL = "vessel-1"

@@ -12,13 +12,12 @@ from golden.zenoh.samples import COMPLETE_IMAGE, SAMPLES
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost import keys, wire
+from sonarpost import keys, logs, wire
+from sonarpost.config import PlatformConfig
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_sender import plan_packets
 from sonarpost.messages import AcousticFrame, Contact, Decision, Raster, Relayed, Snippet
-from sonarpost.runtime import logs
 from sonarpost.runtime.concern import Concern, concern_of_payload
-from sonarpost.runtime.config import PlatformConfig
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 

@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field, model_validator
 
+from sonarpost import config
+from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.errors import ConfigError
-from sonarpost.runtime import config
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
-from sonarpost.runtime.toml_lines import key_lines
+from sonarpost.toml_lines import key_lines
 
 
 class Kind(StrEnum):

@@ -13,10 +13,10 @@ import zenoh
 from conftest import eventually
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.messages import Decision, Record
 from sonarpost.runtime import handoff
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.handoff import CHUNK_BYTES, Reply
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.store import Store

@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Decision, Record
 from sonarpost.runtime import handoff
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.handoff import CHUNK_BYTES, Reply
 from sonarpost.runtime.handoff_batch import (
     MAX_RECORDS,

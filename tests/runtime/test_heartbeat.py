@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from conftest import eventually
 
+from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Health, Record
 from sonarpost.runtime import healthcheck, heartbeat
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.healthcheck import ailment, check
 from sonarpost.runtime.heartbeat import Heartbeat
 from sonarpost.runtime.service import Effects, Service

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.runtime import logs
-from sonarpost.runtime.logs import JsonFormatter, TextFormatter, kv
+from sonarpost import logs
+from sonarpost.logs import JsonFormatter, TextFormatter, kv
 
 
 def record(message: str = "Picture stored", /, *args: object, **fields: object) -> logging.LogRecord:

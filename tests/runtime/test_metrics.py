@@ -16,8 +16,8 @@ from prometheus_client.openmetrics.exposition import generate_latest as openmetr
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
+from sonarpost.config import PlatformConfig
 from sonarpost.messages import Health
-from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.fleet import FleetState, Seen
 from sonarpost.runtime.metrics import MAX_VALUES, FleetCollector, registry_of
 from sonarpost.services.c2.config import C2Config

@@ -24,7 +24,7 @@ TINY = """
 import sys, threading
 from collections.abc import Mapping
 from sonarpost.messages import Decision, Record
-from sonarpost.runtime.config import ServiceConfig
+from sonarpost.config import ServiceConfig
 from sonarpost.runtime.process import main
 from sonarpost.runtime.service import Effects, Service
 

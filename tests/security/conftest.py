@@ -17,7 +17,7 @@ import pytest
 import zenoh
 from conftest import eventually, free_port
 
-from sonarpost.runtime.config import TlsConfig
+from sonarpost.config import TlsConfig
 from sonarpost.runtime.session import client_config
 from sonarpost.security.fleet import Fleet
 from sonarpost.security.router_config import Wanted, router_json5

@@ -9,8 +9,8 @@ import pytest
 from conftest import eventually, free_port
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Advice, Command, Decision, Record
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.reach import Reach, ask_shore, try_endpoint, why_no_answer
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.session import open_with_retry

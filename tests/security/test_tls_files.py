@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives import serialization
 
+from sonarpost import config
+from sonarpost.config import ServiceConfig
 from sonarpost.errors import ConfigError
-from sonarpost.runtime import config
-from sonarpost.runtime.config import ServiceConfig
 from sonarpost.runtime.tls import OwnTls
 from sonarpost.security import tls_files
 from sonarpost.security.fleet import Fleet

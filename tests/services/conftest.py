@@ -18,8 +18,8 @@ import zenoh
 from conftest import eventually, publish_once
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Contact, Health, Raster, Record, Snippet
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.sim.acoustic_channel import AcousticChannel
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite

@@ -22,10 +22,10 @@ from pydantic import ValidationError
 
 from sonarpost import keys, wire
 from sonarpost.cli import modem_emulator
+from sonarpost.config import PlatformConfig
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import Health
 from sonarpost.modem import nmea
-from sonarpost.runtime.config import PlatformConfig
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.services.acoustic_channel.service import AcousticChannel, AcousticChannelService
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite

@@ -12,11 +12,11 @@ from conftest import eventually
 from golden.zenoh.samples import BARE_CONTACT, FULL_CONTACT
 
 from sonarpost import keys
+from sonarpost.config import load
 from sonarpost.detect.contacts import FilterScores, detect
 from sonarpost.detect.ground_snippet import ground_picture
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.messages import Contact, Raster, Snippet
-from sonarpost.runtime.config import load
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.folder import FileSeen, SettledFiles, look_at
 from sonarpost.services.atd_stub.record import of_detection

@@ -10,8 +10,8 @@ import tomllib
 import pytest
 from conftest import REPOSITORY
 
+from sonarpost.config import SERVICES, ServiceConfig, load
 from sonarpost.errors import ConfigError
-from sonarpost.runtime.config import SERVICES, ServiceConfig, load
 from sonarpost.runtime.modem_service import ModemServiceConfig
 
 PLATFORMS = {

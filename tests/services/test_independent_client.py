@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from conftest import eventually
 
-from sonarpost.runtime.config import PlatformConfig
+from sonarpost.config import PlatformConfig
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.service import AtdStubService
 from sonarpost.services.c2.config import C2Config

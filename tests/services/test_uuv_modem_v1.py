@@ -11,6 +11,7 @@ import pytest
 from conftest import eventually
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig
 from sonarpost.link.downlink import Confirmation, Data, Judgement, Outcome, Refine, Resend, Revisit, Wider, pack, unpack
 from sonarpost.link.paper_format import format_image_id
 from sonarpost.link.seal import AcousticSeal
@@ -30,7 +31,6 @@ from sonarpost.messages import (
     QueueState,
 )
 from sonarpost.modem.rates import RATES
-from sonarpost.runtime.config import PlatformConfig
 from sonarpost.runtime.store import Store
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService

@@ -6,8 +6,8 @@ import argparse
 import os
 from pathlib import Path
 
+from sonarpost.config import PlatformConfig, TlsConfig, load
 from sonarpost.errors import ConfigError
-from sonarpost.runtime.config import PlatformConfig, TlsConfig, load
 
 DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
 

@@ -10,9 +10,9 @@ from types import FrameType
 
 from prometheus_client import start_http_server
 
+from sonarpost import logs
 from sonarpost.cli.fleet_options import add_router_options, router_of
 from sonarpost.errors import PortError
-from sonarpost.runtime import logs
 from sonarpost.runtime.fleet import Fleet, FleetWatcher
 from sonarpost.runtime.metrics import FleetCollector, registry_of
 

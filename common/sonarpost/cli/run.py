@@ -7,8 +7,9 @@ import importlib
 import sys
 from pathlib import Path
 
-from sonarpost.runtime import logs, router
-from sonarpost.runtime.config import SERVICES
+from sonarpost import logs
+from sonarpost.config import SERVICES
+from sonarpost.runtime import router
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -16,10 +16,10 @@ from typing import Final
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.config import TlsConfig
 from sonarpost.errors import BadInputError, PayloadError
+from sonarpost.logs import kv
 from sonarpost.messages import Health
-from sonarpost.runtime.config import TlsConfig
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.session import open_with_retry
 
 log = logging.getLogger(__name__)

@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sonarpost.files import write_atomically
+from sonarpost.logs import kv
 from sonarpost.messages import Health
-from sonarpost.runtime.logs import kv
 
 log = logging.getLogger(__name__)
 

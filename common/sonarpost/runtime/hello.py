@@ -14,7 +14,7 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.errors import BadInputError, PayloadError
-from sonarpost.runtime.logs import kv
+from sonarpost.logs import kv
 
 log = logging.getLogger(__name__)
 

@@ -9,12 +9,12 @@ from typing import Annotated, TypeVar
 
 from pydantic import Field
 
+from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.logs import kv
 from sonarpost.modem import events as ev
 from sonarpost.modem.config import MicroModemConfig
 from sonarpost.modem.events import Event
 from sonarpost.modem.micromodem import MicroModem
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
 from sonarpost.runtime.service import Service

@@ -9,8 +9,8 @@ from collections.abc import Callable
 import zenoh
 
 from sonarpost.errors import HandoffError
+from sonarpost.logs import kv
 from sonarpost.runtime.lane import PRIORITIES, REPLY_TIMEOUT_S, Lane, Settled
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.schedule import PROBE_WINDOW, WINDOW
 from sonarpost.runtime.sender import BACK_OFF_S, Sender
 from sonarpost.runtime.store import Store

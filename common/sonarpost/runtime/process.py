@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 
+from sonarpost import config, logs
 from sonarpost.errors import ConfigError, SonarpostError
-from sonarpost.runtime import config, logs
 from sonarpost.runtime.service import C, Service
 
 log = logging.getLogger(__name__)

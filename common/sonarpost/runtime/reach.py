@@ -16,9 +16,9 @@ from enum import Enum
 import zenoh
 
 from sonarpost import keys
+from sonarpost.config import TlsConfig
 from sonarpost.errors import PayloadError
 from sonarpost.runtime import hello
-from sonarpost.runtime.config import TlsConfig
 
 _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?P<host>\[[^]]+\]|[^:\[\]]+):(?P<port>[0-9]{1,5})(?P<options>[?#;].*)?")
 TIMEOUT_S = 3.0

@@ -20,8 +20,8 @@ from types import FrameType
 
 import zenoh
 
+from sonarpost import logs
 from sonarpost.errors import ConfigError, SonarpostError
-from sonarpost.runtime import logs
 from sonarpost.runtime.process import exit_with_parent
 from sonarpost.runtime.router_watch import watched_router
 from sonarpost.runtime.session import router_config

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import zenoh
 
 from sonarpost.errors import HandoffError, PayloadError
+from sonarpost.logs import kv
 from sonarpost.runtime import handoff_batch, lane
 from sonarpost.runtime.concern import concern_of_payload
 from sonarpost.runtime.handoff import Reply
 from sonarpost.runtime.lane import Lane, Settled
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.schedule import MAX_WINDOW_BYTES, WINDOW, Piece, Schedule, Transfer
 from sonarpost.runtime.store import Store
 from sonarpost.runtime.transaction import OutboxItem

@@ -22,14 +22,14 @@ from typing import ClassVar, Generic, TypeVar
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.errors import BadInputError, HandoffError
+from sonarpost.logs import concerning_later, kv
 from sonarpost.messages import Health, Record, ServiceState
 from sonarpost.runtime.concern import Concern
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.effects import Effects
 from sonarpost.runtime.heartbeat import Heartbeat
 from sonarpost.runtime.inbox import Inbox
-from sonarpost.runtime.logs import concerning_later, kv
 from sonarpost.runtime.outbox import Lane, Outbox
 from sonarpost.runtime.room import HANDLING_RESERVE_BYTES, Room
 from sonarpost.runtime.session import open_with_retry

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import zenoh
 
-from sonarpost.runtime.config import TlsConfig
-from sonarpost.runtime.logs import kv
+from sonarpost.config import TlsConfig
+from sonarpost.logs import kv
 from sonarpost.runtime.reach import try_endpoint
 
 log = logging.getLogger(__name__)

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 
 from sonarpost.errors import KeptFileError
 from sonarpost.export.accepted import DECISIONS, SideCar
+from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.picture_files import picture_name
 from sonarpost.runtime.shore_index import DecisionRow, PictureRow, ShoreIndex
 

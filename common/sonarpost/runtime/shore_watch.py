@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import zenoh
 
+from sonarpost.config import TlsConfig
+from sonarpost.logs import kv
 from sonarpost.runtime import reach
-from sonarpost.runtime.config import TlsConfig
-from sonarpost.runtime.logs import kv
 from sonarpost.runtime.reach import Outcome, Reach
 
 log = logging.getLogger(__name__)

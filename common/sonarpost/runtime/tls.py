@@ -6,8 +6,8 @@ import logging
 import time
 from collections.abc import Mapping
 
-from sonarpost.runtime.config import TlsConfig
-from sonarpost.runtime.logs import kv
+from sonarpost.config import TlsConfig
+from sonarpost.logs import kv
 from sonarpost.security import tls_files
 
 log = logging.getLogger(__name__)

@@ -14,8 +14,8 @@ from conftest import eventually
 
 from sonarpost import keys, wire
 from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Command, Contact, Decision, EncodedImage, Raster, Record
-from sonarpost.runtime.config import PlatformConfig, ServiceConfig
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service

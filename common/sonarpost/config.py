@@ -16,9 +16,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import to_json
 
 from sonarpost.errors import ConfigError
+from sonarpost.logs import LogFormat
 from sonarpost.messages import PlatformId
-from sonarpost.runtime.logs import LogFormat
-from sonarpost.runtime.toml_lines import key_lines
+from sonarpost.toml_lines import key_lines
 from sonarpost.wire import expected_text
 
 ENVIRONMENT_PREFIX = "SONARPOST_"
