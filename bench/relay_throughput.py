@@ -44,7 +44,7 @@ from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.logs import set_up
 from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
-from sonarpost.runtime.schedule import CHUNK_BYTES, WINDOW, WINDOW_BYTES
+from sonarpost.delivery.scheduler import CHUNK_BYTES, WINDOW, WINDOW_BYTES
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.session import client_config, router_config
 from sonarpost.services.relay.config import RelayConfig

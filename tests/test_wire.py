@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from sonarpost import wire
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Contact, Health, Raster, Record
-from sonarpost.runtime.handoff import Reply, attachment, parse_chunk
-from sonarpost.runtime.handoff_batch import pack_replies, parse_query, unpack_replies
-from sonarpost.runtime.transaction import OutboxItem
+from sonarpost.delivery.protocol import Reply, attachment, parse_chunk
+from sonarpost.delivery.batch_protocol import pack_replies, parse_query, unpack_replies
+from sonarpost.delivery.transaction import OutboxItem
 
 GOLDEN = Path(__file__).parent / "golden" / "zenoh"
 BY_TYPE = {t.TYPE: t for t in RECORD_TYPES}

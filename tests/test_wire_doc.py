@@ -22,10 +22,10 @@ from golden.zenoh.samples import RECORD_TYPES, SAMPLES
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Contact, Decision, Record, Snippet
-from sonarpost.runtime import handoff, handoff_batch, outbox, schedule, transaction
-from sonarpost.runtime.handoff import Reply, attachment
+from sonarpost.delivery import (protocol as handoff, batch_protocol as handoff_batch, outbox, scheduler as schedule, transaction)
+from sonarpost.delivery.protocol import Reply, attachment
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.runtime.transaction import OutboxItem
+from sonarpost.delivery.transaction import OutboxItem
 from sonarpost.services.c2.service import ADVICE_PRIORITY, COMMAND_PRIORITY
 from sonarpost.services.relay.service import DECISION_PRIORITY, DETAIL_PRIORITY, PREVIEW_PRIORITY
 

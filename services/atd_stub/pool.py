@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 
 from sonarpost import wire
 from sonarpost.messages import Snippet
-from sonarpost.runtime.effects import Effects
-from sonarpost.runtime.store import Store
+from sonarpost.delivery.unit_of_work import Effects
+from sonarpost.delivery.store import Store
 
 _PREFIX = "pool:"
 _GREATEST_CONFIDENCE = 2.0

@@ -18,7 +18,7 @@ from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Re
 from sonarpost.runtime import hello
 from sonarpost.runtime.service import Effects, InterruptedByStopError, Service
 from sonarpost.runtime.shore_files import decision_file_name
-from sonarpost.runtime.transaction import InboxItem, OutboxItem, Transaction, queue_of
+from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction, queue_of
 from sonarpost.services.c2 import tasking
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config

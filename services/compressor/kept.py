@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import msgpack
 
 from sonarpost.errors import PayloadError
-from sonarpost.runtime.effects import Effects
-from sonarpost.runtime.store import Store
+from sonarpost.delivery.unit_of_work import Effects
+from sonarpost.delivery.store import Store
 
 _INDEX = "kept"
 _PICTURE = "kept/"

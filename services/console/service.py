@@ -28,7 +28,7 @@ from sonarpost.messages import (
     TaskingState,
 )
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.runtime.transaction import OutboxItem, Transaction
+from sonarpost.delivery.transaction import OutboxItem, Transaction
 from sonarpost.services.console.app import ConsoleApp
 from sonarpost.services.console.asking import Table
 from sonarpost.services.console.board import Board, Unsent

@@ -18,7 +18,7 @@ from sonarpost.logs import concerning, kv
 from sonarpost.messages import AcousticFrame, ReconstructedImage, Record
 from sonarpost.runtime.picture_files import write_picture
 from sonarpost.runtime.service import RETRY_AFTER_S, Effects, Service
-from sonarpost.runtime.transaction import InboxItem
+from sonarpost.delivery.transaction import InboxItem
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.decoder import Decoder, image_id_of

@@ -23,7 +23,7 @@ from sonarpost.modem.events import FrameReceived, PacketFailed, PacketReceived, 
 from sonarpost.modem.rates import RATES
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import Effects
-from sonarpost.runtime.transaction import InboxItem
+from sonarpost.delivery.transaction import InboxItem
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.speaking import Turn

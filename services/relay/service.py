@@ -14,12 +14,12 @@ from sonarpost.config import PlatformConfig
 from sonarpost.errors import PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
-from sonarpost.runtime.lane import Lane
-from sonarpost.runtime.room import Room
+from sonarpost.delivery.queue_policy import Lane
+from sonarpost.delivery.disk_reserve import Room
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.runtime.session import open_with_retry
 from sonarpost.runtime.shore_watch import ShoreWatch, Site
-from sonarpost.runtime.transaction import InboxItem, Topic
+from sonarpost.delivery.transaction import InboxItem, Topic
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.upstreams import Upstream, is_upstream_queue
 

@@ -10,8 +10,8 @@ import zenoh
 
 from sonarpost import keys
 from sonarpost.logs import kv
-from sonarpost.runtime.lane import Lane
-from sonarpost.runtime.transaction import consumer_of, queue_of
+from sonarpost.delivery.queue_policy import Lane
+from sonarpost.delivery.transaction import consumer_of, queue_of
 from sonarpost.services.relay.config import UpstreamOptions
 
 log = logging.getLogger(__name__)

@@ -37,8 +37,8 @@ from sonarpost.link.v1_receiver import Receiver
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
 from sonarpost.modem.rates import RATES
-from sonarpost.runtime.store import Store
-from sonarpost.runtime.transaction import Transaction
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import Transaction
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.line_store import LineStore

@@ -8,8 +8,8 @@ from typing import Final
 
 import msgpack
 
-from sonarpost.runtime.store import Store
-from sonarpost.runtime.transaction import Transaction
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import Transaction
 
 _PREFIX: Final = "v1/"
 ARRIVAL: Final = "arrival/"

@@ -26,10 +26,10 @@ from sonarpost.messages import (
 )
 from sonarpost.modem.events import Event, PacketFailed, PacketSent
 from sonarpost.modem.rates import RATES
-from sonarpost.runtime.inbox import NotNowError
+from sonarpost.delivery.inbox import NotNowError
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import Effects, InterruptedByStopError
-from sonarpost.runtime.transaction import InboxItem
+from sonarpost.delivery.transaction import InboxItem
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.line import VehicleLine
 from sonarpost.services.uuv_modem.line_runner import TAKEN, LineRunner

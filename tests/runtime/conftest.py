@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sonarpost.runtime.store import Store
+from sonarpost.delivery.store import Store
 
 
 @pytest.fixture

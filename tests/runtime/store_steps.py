@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sonarpost.runtime.store import Store
-from sonarpost.runtime.transaction import Transaction
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import Transaction
 
 ORIGIN = b"o" * 16
 

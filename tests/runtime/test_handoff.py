@@ -16,11 +16,11 @@ from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.messages import Decision, Record
-from sonarpost.runtime import handoff
-from sonarpost.runtime.handoff import CHUNK_BYTES, Reply
+from sonarpost.delivery import protocol as handoff
+from sonarpost.delivery.protocol import CHUNK_BYTES, Reply
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.runtime.store import Store
-from sonarpost.runtime.transaction import OutboxItem
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import OutboxItem
 
 KEY = keys.contact_decision("vessel-1")
 

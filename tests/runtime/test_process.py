@@ -18,7 +18,7 @@ from conftest import REPOSITORY, eventually
 
 from sonarpost import keys, wire
 from sonarpost.messages import Health
-from sonarpost.runtime.store import Store
+from sonarpost.delivery.store import Store
 
 TINY = """
 import sys, threading

@@ -6,8 +6,8 @@ from collections import namedtuple
 
 import pytest
 
-from sonarpost.runtime.inbox import NotNowError
-from sonarpost.runtime.room import Room
+from sonarpost.delivery.inbox import NotNowError
+from sonarpost.delivery.disk_reserve import Room
 
 DiskUsage = namedtuple("DiskUsage", "total used free")
 RECORD = bytes(100_000)
@@ -16,7 +16,7 @@ RECORD = bytes(100_000)
 @pytest.fixture
 def disk(monkeypatch):
     free = [0]
-    monkeypatch.setattr("sonarpost.runtime.room.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
+    monkeypatch.setattr("sonarpost.delivery.disk_reserve.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
     return free
 
 

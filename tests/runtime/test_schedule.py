@@ -6,22 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.runtime.handoff import CHUNK_BYTES
-from sonarpost.runtime.pacing import TokenBucket
-from sonarpost.runtime.schedule import (
-    KEPT_FOR_URGENT,
-    MAX_WINDOW_BYTES,
-    MIN_PIECE_BYTES,
-    OVERHEAD_BYTES,
-    PIECE_S,
-    PROBE_WINDOW,
-    WINDOW,
-    WINDOW_BYTES,
-    Piece,
-    Schedule,
-    piece_bytes_for,
-)
-from sonarpost.runtime.transaction import OutboxItem
+from sonarpost.delivery.protocol import CHUNK_BYTES
+from sonarpost.delivery.token_bucket import TokenBucket
+from sonarpost.delivery.scheduler import (KEPT_FOR_URGENT, MAX_WINDOW_BYTES, MIN_PIECE_BYTES, OVERHEAD_BYTES, PIECE_S, PROBE_WINDOW, WINDOW, WINDOW_BYTES, Piece, Schedule, piece_bytes_for)
+from sonarpost.delivery.transaction import OutboxItem
 
 
 def item(seq: int, size: int = 100, priority: int = 6) -> OutboxItem:

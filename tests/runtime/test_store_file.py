@@ -11,7 +11,7 @@ import pytest
 from runtime.store_steps import send
 
 from sonarpost.errors import HandoffError
-from sonarpost.runtime.store import Store
+from sonarpost.delivery.store import Store
 
 
 def test_a_closed_store_says_so(tmp_path: Path) -> None:
@@ -29,7 +29,7 @@ def test_records_are_on_the_disk_when_a_transaction_ends(store: Store) -> None:
 
 def test_a_store_belongs_to_one_process_at_a_time(tmp_path: Path) -> None:
     path = tmp_path / "s.db"
-    script = f"from pathlib import Path; from sonarpost.runtime.store import Store; Store(Path({str(path)!r}))"
+    script = f"from pathlib import Path; from sonarpost.delivery.store import Store; Store(Path({str(path)!r}))"
     store = Store(path)
     other = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert "HandoffError" in other.stderr

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runtime.store_steps import ORIGIN
 
-from sonarpost.runtime.store import Store
+from sonarpost.delivery.store import Store
 
 
 def test_a_record_waits_until_it_is_done(tmp_path: Path) -> None:

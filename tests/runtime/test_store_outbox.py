@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runtime.store_steps import fail_within, send
 
-from sonarpost.runtime.store import Store
-from sonarpost.runtime.transaction import OutboxItem
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import OutboxItem
 
 
 def test_what_is_owed_is_as_it_was_given(store: Store) -> None:
@@ -79,8 +79,8 @@ def test_what_was_refused_is_kept_with_its_reason(store: Store) -> None:
 def test_of_what_was_refused_the_latest_are_kept_and_the_beginning_of_each(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sonarpost.runtime.transaction.REFUSED_KEPT", 5)
-    monkeypatch.setattr("sonarpost.runtime.transaction.REFUSED_BYTES", 3)
+    monkeypatch.setattr("sonarpost.delivery.transaction.REFUSED_KEPT", 5)
+    monkeypatch.setattr("sonarpost.delivery.transaction.REFUSED_BYTES", 3)
     for number in range(12):
         with store.transaction() as tx:
             tx.refuse("in", "k", b"%02d and more" % number, "no")

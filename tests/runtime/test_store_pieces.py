@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runtime.store_steps import ORIGIN
 
-from sonarpost.runtime.store import Store
-from sonarpost.runtime.transaction import Chunk
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import Chunk
 
 
 def pieces(data: bytes, *cuts: int, seq: int = 1) -> list[Chunk]:
@@ -96,7 +96,7 @@ def test_accepting_a_record_forgets_its_pieces(store: Store) -> None:
 
 
 def test_only_the_pieces_touched_last_are_kept(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sonarpost.runtime.transaction.PARTIALS_KEPT", 3)
+    monkeypatch.setattr("sonarpost.delivery.transaction.PARTIALS_KEPT", 3)
     firsts = {seq: pieces(b"0123456789", 4, seq=seq) for seq in range(1, 5)}
     for seq in (1, 2, 3):
         assert add(store, firsts[seq][0]) == 4

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from runtime.store_steps import ORIGIN, fail_within, send
 
 from sonarpost.errors import HandoffError
-from sonarpost.runtime import rows
-from sonarpost.runtime.store import Store
-from sonarpost.runtime.transaction import Transaction
+from sonarpost.delivery import rows
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import Transaction
 
 
 def test_state_is_remembered_replaced_and_forgotten(tmp_path: Path) -> None:
@@ -45,7 +45,7 @@ KILLED = """
 import itertools, sys
 from pathlib import Path
 from sonarpost.runtime import rows
-from sonarpost.runtime.store import Store
+from sonarpost.delivery.store import Store
 store = Store(Path(sys.argv[1]))
 first = int(store.get_state("n") or b"0") + 1
 for n in itertools.count(first):

@@ -14,8 +14,8 @@ from conftest import REPOSITORY, eventually
 
 from sonarpost import keys, wire
 from sonarpost.messages import Contact, Health, QueuedImage, QueueState, Raster, Snippet
-from sonarpost.runtime.effects import Effects
-from sonarpost.runtime.store import Store
+from sonarpost.delivery.unit_of_work import Effects
+from sonarpost.delivery.store import Store
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.pool import ContactPool
 from sonarpost.services.atd_stub.service import AtdStubService

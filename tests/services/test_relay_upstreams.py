@@ -173,7 +173,7 @@ def test_below_the_reserve_pictures_wait_with_their_senders_and_decisions_are_ta
     begin, c2, source, monkeypatch, refused
 ):
     free = [20_000_000]
-    monkeypatch.setattr("sonarpost.runtime.room.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
+    monkeypatch.setattr("sonarpost.delivery.disk_reserve.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
     shore = c2()
     service = begin(disk_reserve_bytes=50_000_000)
     source.owe(IMAGES, "relay", image("AAAA"))
@@ -190,7 +190,7 @@ def test_below_the_reserve_pictures_wait_with_their_senders_and_decisions_are_ta
 def test_below_the_reserve_a_plain_publication_of_a_picture_is_refused_aloud(begin, c2, publish, monkeypatch):
     from sonarpost import wire
 
-    monkeypatch.setattr("sonarpost.runtime.room.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, 20_000_000))
+    monkeypatch.setattr("sonarpost.delivery.disk_reserve.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, 20_000_000))
     service = begin(disk_reserve_bytes=50_000_000)
     publish(IMAGES, wire.encode(image()))
     eventually(lambda: service.health().counters.get("records_refused") == 1)

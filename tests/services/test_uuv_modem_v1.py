@@ -31,7 +31,7 @@ from sonarpost.messages import (
     QueueState,
 )
 from sonarpost.modem.rates import RATES
-from sonarpost.runtime.store import Store
+from sonarpost.delivery.store import Store
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService
 from sonarpost.services.uuv_modem.config import UuvModemConfig

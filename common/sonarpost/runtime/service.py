@@ -27,15 +27,15 @@ from sonarpost.errors import BadInputError, HandoffError
 from sonarpost.logs import concerning_later, kv
 from sonarpost.messages import Health, Record, ServiceState
 from sonarpost.runtime.concern import Concern
-from sonarpost.runtime.effects import Effects
+from sonarpost.delivery.unit_of_work import Effects
 from sonarpost.runtime.heartbeat import Heartbeat
-from sonarpost.runtime.inbox import Inbox
-from sonarpost.runtime.outbox import Lane, Outbox
-from sonarpost.runtime.room import HANDLING_RESERVE_BYTES, Room
+from sonarpost.delivery.inbox import Inbox
+from sonarpost.delivery.outbox import Lane, Outbox
+from sonarpost.delivery.disk_reserve import HANDLING_RESERVE_BYTES, Room
 from sonarpost.runtime.session import open_with_retry
-from sonarpost.runtime.store import Store
+from sonarpost.delivery.store import Store
 from sonarpost.runtime.tls import OwnTls
-from sonarpost.runtime.transaction import InboxItem, OutboxItem, Transaction
+from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction
 
 __all__ = ["Effects", "InterruptedByStopError", "Service"]
 

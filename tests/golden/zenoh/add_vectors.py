@@ -20,9 +20,9 @@ sys.path.insert(0, str(FOLDER.parents[1]))
 from golden.zenoh.samples import SAMPLES  # noqa: E402  # the line above makes it importable
 
 from sonarpost import wire  # noqa: E402
-from sonarpost.runtime import handoff_batch  # noqa: E402
-from sonarpost.runtime.handoff import Reply, attachment  # noqa: E402
-from sonarpost.runtime.store import OutboxItem  # noqa: E402
+from sonarpost.delivery import batch_protocol as handoff_batch  # noqa: E402
+from sonarpost.delivery.protocol import Reply, attachment  # noqa: E402
+from sonarpost.delivery.store import OutboxItem  # noqa: E402
 
 
 def plain(value: object) -> object:

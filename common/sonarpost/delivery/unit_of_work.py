@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from sonarpost import wire
 from sonarpost.messages import Record
-from sonarpost.runtime.transaction import Topic, Transaction
+from sonarpost.delivery.transaction import Topic, Transaction
 
 
 class Effects:

@@ -7,9 +7,9 @@ import sqlite3
 import time
 from collections.abc import Iterable, Set
 
-from sonarpost.runtime import rows
-from sonarpost.runtime.items import QUEUE_MARK, Chunk, InboxItem, OutboxItem, Topic, consumer_of, queue_of
-from sonarpost.runtime.seen import Seen
+from sonarpost.delivery import rows
+from sonarpost.delivery.items import QUEUE_MARK, Chunk, InboxItem, OutboxItem, Topic, consumer_of, queue_of
+from sonarpost.delivery.duplicate_window import Seen
 
 __all__ = ["QUEUE_MARK", "Chunk", "InboxItem", "OutboxItem", "Topic", "Transaction", "consumer_of", "queue_of"]
 

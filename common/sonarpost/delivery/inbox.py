@@ -15,10 +15,10 @@ from sonarpost import keys
 from sonarpost.errors import BadInputError, HandoffError, PayloadError
 from sonarpost.logs import concerning_later, kv
 from sonarpost.runtime.concern import concern_of_payload
-from sonarpost.runtime.handoff import MAX_RECORD_BYTES, Reply
-from sonarpost.runtime.handoff_batch import MAX_RECORDS, pack_replies, parse_query
-from sonarpost.runtime.store import Store
-from sonarpost.runtime.transaction import Chunk, Transaction
+from sonarpost.delivery.protocol import MAX_RECORD_BYTES, Reply
+from sonarpost.delivery.batch_protocol import MAX_RECORDS, pack_replies, parse_query
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import Chunk, Transaction
 
 log = logging.getLogger(__name__)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import shutil
 
-from sonarpost.runtime.inbox import NotNowError
-from sonarpost.runtime.store import Store
+from sonarpost.delivery.inbox import NotNowError
+from sonarpost.delivery.store import Store
 
 HANDLING_RESERVE_BYTES = 8_388_608
 """What handling needs on the disk to get rid of what is there: to delete is to write, into the write-ahead log."""

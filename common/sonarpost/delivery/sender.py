@@ -13,13 +13,13 @@ import zenoh
 
 from sonarpost.errors import HandoffError, PayloadError
 from sonarpost.logs import kv
-from sonarpost.runtime import handoff_batch, lane
+from sonarpost.delivery import batch_protocol as handoff_batch, queue_policy as lane
 from sonarpost.runtime.concern import concern_of_payload
-from sonarpost.runtime.handoff import Reply
-from sonarpost.runtime.lane import Lane, Settled
-from sonarpost.runtime.schedule import MAX_WINDOW_BYTES, WINDOW, Piece, Schedule, Transfer
-from sonarpost.runtime.store import Store
-from sonarpost.runtime.transaction import OutboxItem
+from sonarpost.delivery.protocol import Reply
+from sonarpost.delivery.queue_policy import Lane, Settled
+from sonarpost.delivery.scheduler import MAX_WINDOW_BYTES, WINDOW, Piece, Schedule, Transfer
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import OutboxItem
 
 log = logging.getLogger(__name__)
 

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import IO
 
 from sonarpost.errors import HandoffError
-from sonarpost.runtime import rows, store_schema
-from sonarpost.runtime.store_schema import SCHEMA_VERSION
-from sonarpost.runtime.transaction import QUEUE_MARK, InboxItem, OutboxItem, Transaction
+from sonarpost.delivery import rows, store_schema
+from sonarpost.delivery.store_schema import SCHEMA_VERSION
+from sonarpost.delivery.transaction import QUEUE_MARK, InboxItem, OutboxItem, Transaction
 
 log = logging.getLogger(__name__)
 

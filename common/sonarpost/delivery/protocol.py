@@ -14,7 +14,7 @@ import msgpack
 
 from sonarpost import wire
 from sonarpost.errors import PayloadError
-from sonarpost.runtime.items import Chunk, OutboxItem, consumer_of
+from sonarpost.delivery.items import Chunk, OutboxItem, consumer_of
 
 CHUNK_BYTES = 32 * 1024
 MAX_RECORD_BYTES = 8 * 1024 * 1024

@@ -10,10 +10,10 @@ import zenoh
 
 from sonarpost.errors import HandoffError
 from sonarpost.logs import kv
-from sonarpost.runtime.lane import PRIORITIES, REPLY_TIMEOUT_S, Lane, Settled
-from sonarpost.runtime.schedule import PROBE_WINDOW, WINDOW
-from sonarpost.runtime.sender import BACK_OFF_S, Sender
-from sonarpost.runtime.store import Store
+from sonarpost.delivery.queue_policy import PRIORITIES, REPLY_TIMEOUT_S, Lane, Settled
+from sonarpost.delivery.scheduler import PROBE_WINDOW, WINDOW
+from sonarpost.delivery.sender import BACK_OFF_S, Sender
+from sonarpost.delivery.store import Store
 
 __all__ = ["BACK_OFF_S", "PRIORITIES", "PROBE_WINDOW", "REPLY_TIMEOUT_S", "WINDOW", "Lane", "Outbox"]
 

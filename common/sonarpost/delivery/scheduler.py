@@ -12,10 +12,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import islice
 
-from sonarpost.runtime.handoff import CHUNK_BYTES
-from sonarpost.runtime.handoff_batch import MAX_RECORDS, RECORD_OVERHEAD_BYTES
-from sonarpost.runtime.items import OutboxItem
-from sonarpost.runtime.pacing import TokenBucket
+from sonarpost.delivery.protocol import CHUNK_BYTES
+from sonarpost.delivery.batch_protocol import MAX_RECORDS, RECORD_OVERHEAD_BYTES
+from sonarpost.delivery.items import OutboxItem
+from sonarpost.delivery.token_bucket import TokenBucket
 
 WINDOW = 128
 """Most queries in flight: twice what a consumer commits with one write, so that it never waits for the next."""

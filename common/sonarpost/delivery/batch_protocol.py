@@ -13,9 +13,9 @@ import msgpack
 
 from sonarpost import wire
 from sonarpost.errors import PayloadError
-from sonarpost.runtime import handoff
-from sonarpost.runtime.handoff import CHUNK_BYTES, Reply
-from sonarpost.runtime.items import Chunk, OutboxItem, consumer_of
+from sonarpost.delivery import protocol as handoff
+from sonarpost.delivery.protocol import CHUNK_BYTES, Reply
+from sonarpost.delivery.items import Chunk, OutboxItem, consumer_of
 
 BATCH_VERSION = 2
 MAX_RECORDS = 128

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import zenoh
 
 from sonarpost import keys
-from sonarpost.runtime import handoff, handoff_batch
-from sonarpost.runtime.schedule import Piece
-from sonarpost.runtime.transaction import OutboxItem, Transaction, consumer_of
+from sonarpost.delivery import protocol as handoff, batch_protocol as handoff_batch
+from sonarpost.delivery.scheduler import Piece
+from sonarpost.delivery.transaction import OutboxItem, Transaction, consumer_of
 
 REPLY_TIMEOUT_S = 5.0
 PRIORITIES = {
