@@ -84,7 +84,7 @@ HEALTHCHECK --interval=10s --timeout=5s --start-period=40s --retries=3 \
     CMD ["python", "-m", "sonarpost.runtime.healthcheck"]
 
 FROM runtime AS router
-ENTRYPOINT ["python", "-m", "sonarpost.runtime.router"]
+ENTRYPOINT ["python", "-m", "sonarpost.bus.router"]
 CMD ["--listen", "tcp/0.0.0.0:7447"]
 HEALTHCHECK NONE
 

@@ -24,7 +24,7 @@ from sonarpost import keys, wire
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig
 from sonarpost.messages import ReconstructedImage
-from sonarpost.runtime.session import client_config, router_config
+from sonarpost.bus.session import client_config, router_config
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
 from sonarpost.services.console.training import VESSEL, Training

@@ -44,7 +44,7 @@ from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import ReconstructedImage, Record
 from sonarpost.runtime.process import EXIT_WITH_PARENT
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.runtime.session import client_config
+from sonarpost.bus.session import client_config
 from sonarpost.runtime.shore_index import ShoreIndex
 
 SETTLE_S = 120.0
@@ -210,7 +210,7 @@ def fleet(folder: Path, vessels: Sequence[str]) -> Iterator[tuple[Processes, dic
         f'out_dir = "{folder / "out"}"\n'
     )
     try:
-        processes.start("router-shore", "-m", "sonarpost.runtime.router", "--listen", shore)
+        processes.start("router-shore", "-m", "sonarpost.bus.router", "--listen", shore)
         processes.start("c2", "-m", "sonarpost.services.c2", "--config", str(folder / "shore.toml"))
         for vessel, endpoint in endpoints.items():
             file = folder / f"{vessel}.toml"
@@ -218,7 +218,7 @@ def fleet(folder: Path, vessels: Sequence[str]) -> Iterator[tuple[Processes, dic
                 f'[platform]\nid = "{vessel}"\nrouter = ["{endpoint}"]\nstate_dir = "{folder / vessel}"\n[relay]\n'
             )
             processes.start(
-                f"router-{vessel}", "-m", "sonarpost.runtime.router", "--listen", endpoint, "--connect", shore
+                f"router-{vessel}", "-m", "sonarpost.bus.router", "--listen", endpoint, "--connect", shore
             )
             processes.start(f"relay-{vessel}", "-m", "sonarpost.services.relay", "--config", str(file))
         yield processes, endpoints, shore

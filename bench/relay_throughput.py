@@ -46,7 +46,7 @@ from sonarpost.logs import set_up
 from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
 from sonarpost.delivery.scheduler import CHUNK_BYTES, WINDOW, WINDOW_BYTES
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.runtime.session import client_config, router_config
+from sonarpost.bus.session import client_config, router_config
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 

@@ -15,7 +15,7 @@ from xdist.remote import Producer
 from xdist.scheduler import LoadFileScheduling
 
 from sonarpost.config import PlatformConfig
-from sonarpost.runtime.session import client_config, router_config
+from sonarpost.bus.session import client_config, router_config
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

@@ -15,7 +15,7 @@ from sonarpost.config import PlatformConfig
 from sonarpost.errors import HandoffError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
-from sonarpost.runtime import hello
+from sonarpost.bus import presence as hello
 from sonarpost.runtime.service import Effects, InterruptedByStopError, Service
 from sonarpost.runtime.shore_files import decision_file_name
 from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction, queue_of

@@ -17,8 +17,8 @@ from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Re
 from sonarpost.delivery.queue_policy import Lane
 from sonarpost.delivery.disk_reserve import Room
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.runtime.session import open_with_retry
-from sonarpost.runtime.shore_watch import ShoreWatch, Site
+from sonarpost.bus.session import open_with_retry
+from sonarpost.bus.site_monitor import ShoreWatch, Site
 from sonarpost.delivery.transaction import InboxItem, Topic
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.upstreams import Upstream, is_upstream_queue

@@ -16,7 +16,7 @@ import pytest
 from conftest import REPOSITORY
 
 from sonarpost.errors import ConfigError
-from sonarpost.runtime import router
+from sonarpost.bus import router
 from sonarpost.security.fleet import Fleet
 from sonarpost.security.index import FleetIndex
 

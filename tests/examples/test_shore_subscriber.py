@@ -19,7 +19,7 @@ from PIL import Image
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.messages import Decision, Raster, ReconstructedImage, Relayed
-from sonarpost.runtime.session import client_config
+from sonarpost.bus.session import client_config
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 
@@ -30,7 +30,7 @@ EXAMPLE = REPOSITORY / "examples" / "shore_subscriber.py"
 def router() -> Iterator[str]:
     """A router in a process of its own."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    command = [sys.executable, "-m", "sonarpost.runtime.router", "--listen", endpoint]
+    command = [sys.executable, "-m", "sonarpost.bus.router", "--listen", endpoint]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
 
         def answers() -> bool:

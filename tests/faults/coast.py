@@ -36,7 +36,7 @@ from sonarpost import wire
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Health, ReconstructedImage
 from sonarpost.runtime.process import EXIT_WITH_PARENT
-from sonarpost.runtime.session import open_with_retry
+from sonarpost.bus.session import open_with_retry
 
 SHORE = "shore-1"
 PROCESSES = ("router-vessel", "router-shore", "relay", "c2")
@@ -126,9 +126,9 @@ class Coast:
         launch = list(self.options.launcher.get(name, (sys.executable, "-m")))
         if name == "router-vessel":
             shore = f"tcp/127.0.0.1:{self.link.port}" if self.link else self._endpoint("router-shore")
-            return [*launch, "sonarpost.runtime.router", "--listen", self._endpoint(name), "--connect", shore]
+            return [*launch, "sonarpost.bus.router", "--listen", self._endpoint(name), "--connect", shore]
         if name == "router-shore":
-            return [*prefix, *launch, "sonarpost.runtime.router", "--listen", self._endpoint(name)]
+            return [*prefix, *launch, "sonarpost.bus.router", "--listen", self._endpoint(name)]
         return [*prefix, *launch, f"sonarpost.services.{name}", "--config", str(self.folder / f"{name}.toml")]
 
     def start(self, name: str) -> None:

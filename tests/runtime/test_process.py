@@ -326,7 +326,7 @@ def test_without_the_variable_a_service_outlives_its_starter(tmp_path: Path, rou
 
 def router_process(*arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "sonarpost.runtime.router", *arguments],
+        [sys.executable, "-m", "sonarpost.bus.router", *arguments],
         stderr=subprocess.PIPE,
         text=True,
         cwd=REPOSITORY,

@@ -16,8 +16,8 @@ import zenoh
 from conftest import REPOSITORY, eventually, free_port
 
 from sonarpost.errors import ConfigError
-from sonarpost.runtime import router
-from sonarpost.runtime.session import client_config
+from sonarpost.bus import router
+from sonarpost.bus.session import client_config
 
 Start = Callable[..., subprocess.Popen[str]]
 
@@ -39,7 +39,7 @@ def start() -> Iterator[Start]:
 
     def start_one(*arguments: str) -> subprocess.Popen[str]:
         process = subprocess.Popen(
-            [sys.executable, "-m", "sonarpost.runtime.router", *arguments],
+            [sys.executable, "-m", "sonarpost.bus.router", *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

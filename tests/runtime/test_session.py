@@ -11,8 +11,8 @@ import pytest
 import zenoh
 from conftest import eventually, free_port
 
-from sonarpost.runtime import session
-from sonarpost.runtime.session import client_config, open_with_retry, router_config
+from sonarpost.bus import session
+from sonarpost.bus.session import client_config, open_with_retry, router_config
 
 
 def setting(config: zenoh.Config, path: str) -> object:

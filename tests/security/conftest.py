@@ -18,7 +18,7 @@ import zenoh
 from conftest import eventually, free_port
 
 from sonarpost.config import TlsConfig
-from sonarpost.runtime.session import client_config
+from sonarpost.bus.session import client_config
 from sonarpost.security.fleet import Fleet
 from sonarpost.security.router_config import Wanted, router_json5
 
@@ -34,7 +34,7 @@ class Router:
 
     def __init__(self, config: Path) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "sonarpost.runtime.router", "--config", str(config)],
+            [sys.executable, "-m", "sonarpost.bus.router", "--config", str(config)],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,

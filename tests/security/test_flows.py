@@ -11,9 +11,9 @@ from conftest import eventually, free_port
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Advice, Command, Decision, Record
-from sonarpost.runtime.reach import Reach, ask_shore, try_endpoint, why_no_answer
+from sonarpost.bus.connectivity import Reach, ask_shore, try_endpoint, why_no_answer
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.runtime.session import open_with_retry
+from sonarpost.bus.session import open_with_retry
 from sonarpost.security.router_config import Wanted
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service

@@ -6,7 +6,7 @@ import zenoh
 from conftest import eventually
 
 from sonarpost import keys
-from sonarpost.runtime.session import client_config
+from sonarpost.bus.session import client_config
 
 
 def arrives(world, ashore: zenoh.Session, session: zenoh.Session, key: str) -> None:

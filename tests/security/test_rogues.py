@@ -10,8 +10,8 @@ from conftest import eventually, free_port
 
 from sonarpost import keys, wire
 from sonarpost.messages import Health
-from sonarpost.runtime.reach import Reach, try_endpoint
-from sonarpost.runtime.session import client_config
+from sonarpost.bus.connectivity import Reach, try_endpoint
+from sonarpost.bus.session import client_config
 from sonarpost.security.router_config import Wanted
 from tests.security.conftest import tls_of
 

@@ -11,7 +11,7 @@ from conftest import eventually, free_port
 from sonarpost import keys
 from sonarpost.errors import KeptFileError
 from sonarpost.messages import Advice, Command, Decision, TaskingState
-from sonarpost.runtime.session import router_config
+from sonarpost.bus.session import router_config
 from sonarpost.runtime.shore_index import ShoreIndex
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sonarpost import logs
 from sonarpost.config import SERVICES
-from sonarpost.runtime import router
+from sonarpost.bus import router
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -20,7 +20,7 @@ from sonarpost.config import TlsConfig
 from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Health
-from sonarpost.runtime.session import open_with_retry
+from sonarpost.bus.session import open_with_retry
 
 log = logging.getLogger(__name__)
 

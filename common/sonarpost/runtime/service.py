@@ -32,9 +32,9 @@ from sonarpost.runtime.heartbeat import Heartbeat
 from sonarpost.delivery.inbox import Inbox
 from sonarpost.delivery.outbox import Lane, Outbox
 from sonarpost.delivery.disk_reserve import HANDLING_RESERVE_BYTES, Room
-from sonarpost.runtime.session import open_with_retry
+from sonarpost.bus.session import open_with_retry
 from sonarpost.delivery.store import Store
-from sonarpost.runtime.tls import OwnTls
+from sonarpost.bus.tls import OwnTls
 from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction
 
 __all__ = ["Effects", "InterruptedByStopError", "Service"]

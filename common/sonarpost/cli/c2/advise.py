@@ -18,7 +18,7 @@ from sonarpost.cli.fleet_options import add_router_options, router_of
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import Advice, Command, CommandKind, Record, Verdict
 from sonarpost.delivery.client import hand_over
-from sonarpost.runtime.session import open_with_retry
+from sonarpost.bus.session import open_with_retry
 from sonarpost.wire import expected_text
 
 CONSUMER = "c2"

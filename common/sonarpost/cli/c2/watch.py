@@ -17,7 +17,7 @@ from sonarpost.cli.c2.options import add_site, printable, time_text
 from sonarpost.cli.fleet_options import add_router_options, router_of
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Decision, ReconstructedImage, Record, TaskingState
-from sonarpost.runtime.session import open_with_retry
+from sonarpost.bus.session import open_with_retry
 
 LOOK_S = 0.2
 GONE_AFTER_S = 1.0

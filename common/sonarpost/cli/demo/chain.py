@@ -124,4 +124,4 @@ class Chain:
         if name == "router-vessel":
             port = self.settings.shore_port_for_vessel or self.settings.router_ports[2]
             link = ("--connect", f"tcp/127.0.0.1:{port}")
-        return ("sonarpost.runtime.router", "--listen", listen, *link)
+        return ("sonarpost.bus.router", "--listen", listen, *link)

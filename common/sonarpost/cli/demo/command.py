@@ -79,7 +79,7 @@ def run(parsed: argparse.Namespace) -> int:
     """Run the demo; return 0 when everything the water let through is ashore, unchanged."""
     console = Console(stderr=True)
     # The routers start at the same time as those who look for them; that they are not there at once is no news.
-    logging.getLogger("sonarpost.runtime.session").setLevel(logging.ERROR)
+    logging.getLogger("sonarpost.bus.session").setLevel(logging.ERROR)
     started = time.monotonic()
     inputs = _inputs(parsed)
     folder = _fresh_folder(parsed.out)

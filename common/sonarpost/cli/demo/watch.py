@@ -21,7 +21,7 @@ from sonarpost.link.v1_events import ContactUpdate
 from sonarpost.link.v1_receiver import Receiver
 from sonarpost.messages import AcousticFrame, EncodedImage, Health, QueueState, ReconstructedImage, Record, Snippet
 from sonarpost.modem.rates import RATES
-from sonarpost.runtime.session import open_with_retry
+from sonarpost.bus.session import open_with_retry
 
 log = logging.getLogger(__name__)
 

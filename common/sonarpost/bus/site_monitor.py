@@ -15,8 +15,8 @@ import zenoh
 
 from sonarpost.config import TlsConfig
 from sonarpost.logs import kv
-from sonarpost.runtime import reach
-from sonarpost.runtime.reach import Outcome, Reach
+from sonarpost.bus import connectivity as reach
+from sonarpost.bus.connectivity import Outcome, Reach
 
 log = logging.getLogger(__name__)
 

@@ -23,8 +23,8 @@ import zenoh
 from sonarpost import logs
 from sonarpost.errors import ConfigError, SonarpostError
 from sonarpost.runtime.process import exit_with_parent
-from sonarpost.runtime.router_watch import watched_router
-from sonarpost.runtime.session import router_config
+from sonarpost.bus.router_monitor import watched_router
+from sonarpost.bus.session import router_config
 
 log = logging.getLogger(__name__)
 
@@ -129,8 +129,8 @@ def _shown(config: zenoh.Config, key: str) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run with `python -m sonarpost.runtime.router [--config FILE] [--listen ENDPOINT…] [--connect ENDPOINT…]`."""
-    parser = argparse.ArgumentParser(prog="python -m sonarpost.runtime.router", description=__doc__)
+    """Run with `python -m sonarpost.bus.router [--config FILE] [--listen ENDPOINT…] [--connect ENDPOINT…]`."""
+    parser = argparse.ArgumentParser(prog="python -m sonarpost.bus.router", description=__doc__)
     add_arguments(parser)
     parsed = parser.parse_args(arguments)
     exit_with_parent()

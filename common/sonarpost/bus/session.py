@@ -11,7 +11,7 @@ import zenoh
 
 from sonarpost.config import TlsConfig
 from sonarpost.logs import kv
-from sonarpost.runtime.reach import try_endpoint
+from sonarpost.bus.connectivity import try_endpoint
 
 log = logging.getLogger(__name__)
 

@@ -9,8 +9,8 @@ from typing import TextIO
 
 import zenoh
 
-from sonarpost.runtime import zenoh_log
-from sonarpost.runtime.zenoh_log import Event, ZenohLog
+from sonarpost.bus import zenoh_log
+from sonarpost.bus.zenoh_log import Event, ZenohLog
 
 
 class LogCapture:
