@@ -81,7 +81,7 @@ WORKDIR /var/lib/sonarpost
 ENTRYPOINT ["sonarpost-entrypoint"]
 CMD ["sonarpost", "--help"]
 HEALTHCHECK --interval=10s --timeout=5s --start-period=40s --retries=3 \
-    CMD ["python", "-m", "sonarpost.runtime.healthcheck"]
+    CMD ["python", "-m", "sonarpost.monitoring.healthcheck"]
 
 FROM runtime AS router
 ENTRYPOINT ["python", "-m", "sonarpost.bus.router"]

@@ -8,7 +8,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from sonarpost.messages import AcousticFrame, Health, QueueState
-from sonarpost.runtime.fleet import Fleet, Seen
+from sonarpost.monitoring.fleet import Fleet, Seen
 from sonarpost.services.console.rows import Json
 
 PACKETS_KEPT = 20

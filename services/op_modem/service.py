@@ -18,7 +18,7 @@ from sonarpost.messages import AcousticFrame, LinkQuality
 from sonarpost.modem.events import Event, FrameHeard, FrameReceived, PacketFailed, PacketReceived, PacketSent
 from sonarpost.modem.rates import RATES
 from sonarpost.modem.statistics import LinkStatistics
-from sonarpost.runtime.concern import image_of_frame
+from sonarpost.monitoring.log_context import image_of_frame
 from sonarpost.runtime.service import Effects
 from sonarpost.services.op_modem.arriving import pack, unpack
 from sonarpost.services.op_modem.config import OpModemConfig

@@ -30,7 +30,7 @@ from sonarpost.cli.status import show
 from sonarpost.cli.status.rows import age_text, bytes_text, is_well, rows_of
 from sonarpost.config import PlatformConfig
 from sonarpost.messages import Health
-from sonarpost.runtime.fleet import FleetState, Seen
+from sonarpost.monitoring.fleet import FleetState, Seen
 from sonarpost.bus.session import router_config
 
 NAMES = ("uuv_modem", "acoustic_channel", "op_modem", "decompressor")

@@ -8,7 +8,7 @@ import re
 from cli.test_status import FLEET, on_terminal
 from conftest import REPOSITORY
 
-from sonarpost.runtime.metrics import FleetCollector
+from sonarpost.monitoring.metrics import FleetCollector
 
 DOCS = REPOSITORY / "docs"
 PAGE = (DOCS / "observability.md").read_text(encoding="utf-8")

@@ -17,7 +17,7 @@ from sonarpost.config import PlatformConfig
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_sender import plan_packets
 from sonarpost.messages import AcousticFrame, Contact, Decision, Raster, Relayed, Snippet
-from sonarpost.runtime.concern import Concern, concern_of_payload
+from sonarpost.monitoring.log_context import Concern, concern_of_payload
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 

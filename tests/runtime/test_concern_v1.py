@@ -11,7 +11,7 @@ from sonarpost.link.seal import AcousticSeal
 from sonarpost.link.seal_key import Direction, SealKey
 from sonarpost.link.v1_config import SenderConfig
 from sonarpost.link.v1_sender import Sender
-from sonarpost.runtime.concern import image_of_frame
+from sonarpost.monitoring.log_context import image_of_frame
 
 
 def frames(frame_bytes: int, *numbers: int, seal: AcousticSeal | None = None) -> list[bytes]:

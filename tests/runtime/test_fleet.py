@@ -8,8 +8,8 @@ import pytest
 
 from sonarpost import keys, wire
 from sonarpost.messages import Health
-from sonarpost.runtime import fleet as fleet_module
-from sonarpost.runtime.fleet import Fleet
+from sonarpost.monitoring import fleet as fleet_module
+from sonarpost.monitoring.fleet import Fleet
 
 
 def health(platform: str = "uuv-1", service: str = "c2", **changes: Any) -> Health:

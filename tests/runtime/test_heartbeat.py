@@ -15,9 +15,9 @@ from conftest import eventually
 
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Health, Record
-from sonarpost.runtime import healthcheck, heartbeat
-from sonarpost.runtime.healthcheck import ailment, check
-from sonarpost.runtime.heartbeat import Heartbeat
+from sonarpost.monitoring import healthcheck, heartbeat
+from sonarpost.monitoring.healthcheck import ailment, check
+from sonarpost.monitoring.heartbeat import Heartbeat
 from sonarpost.runtime.service import Effects, Service
 
 NOW_S = 1000.0
@@ -162,7 +162,7 @@ def test_a_running_service_beats_and_the_command_finds_it_well(
     try:
         eventually(path.exists, 10, "a heartbeat")
         done = subprocess.run(
-            [sys.executable, "-m", "sonarpost.runtime.healthcheck"],
+            [sys.executable, "-m", "sonarpost.monitoring.healthcheck"],
             env={**os.environ, heartbeat.VARIABLE: str(path)},
             capture_output=True,
             text=True,

@@ -18,8 +18,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from sonarpost.config import PlatformConfig
 from sonarpost.messages import Health
-from sonarpost.runtime.fleet import FleetState, Seen
-from sonarpost.runtime.metrics import MAX_VALUES, FleetCollector, registry_of
+from sonarpost.monitoring.fleet import FleetState, Seen
+from sonarpost.monitoring.metrics import MAX_VALUES, FleetCollector, registry_of
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 

@@ -13,8 +13,8 @@ from prometheus_client import start_http_server
 from sonarpost import logs
 from sonarpost.cli.fleet_options import add_router_options, router_of
 from sonarpost.errors import PortError
-from sonarpost.runtime.fleet import Fleet, FleetWatcher
-from sonarpost.runtime.metrics import FleetCollector, registry_of
+from sonarpost.monitoring.fleet import Fleet, FleetWatcher
+from sonarpost.monitoring.metrics import FleetCollector, registry_of
 
 log = logging.getLogger(__name__)
 

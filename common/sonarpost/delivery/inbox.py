@@ -14,7 +14,7 @@ import zenoh
 from sonarpost import keys
 from sonarpost.errors import BadInputError, HandoffError, PayloadError
 from sonarpost.logs import concerning_later, kv
-from sonarpost.runtime.concern import concern_of_payload
+from sonarpost.monitoring.log_context import concern_of_payload
 from sonarpost.delivery.protocol import MAX_RECORD_BYTES, Reply
 from sonarpost.delivery.batch_protocol import MAX_RECORDS, pack_replies, parse_query
 from sonarpost.delivery.store import Store

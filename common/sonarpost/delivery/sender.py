@@ -14,7 +14,7 @@ import zenoh
 from sonarpost.errors import HandoffError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.delivery import batch_protocol as handoff_batch, queue_policy as lane
-from sonarpost.runtime.concern import concern_of_payload
+from sonarpost.monitoring.log_context import concern_of_payload
 from sonarpost.delivery.protocol import Reply
 from sonarpost.delivery.queue_policy import Lane, Settled
 from sonarpost.delivery.scheduler import MAX_WINDOW_BYTES, WINDOW, Piece, Schedule, Transfer

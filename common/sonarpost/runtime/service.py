@@ -26,9 +26,9 @@ from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.errors import BadInputError, HandoffError
 from sonarpost.logs import concerning_later, kv
 from sonarpost.messages import Health, Record, ServiceState
-from sonarpost.runtime.concern import Concern
+from sonarpost.monitoring.log_context import Concern
 from sonarpost.delivery.unit_of_work import Effects
-from sonarpost.runtime.heartbeat import Heartbeat
+from sonarpost.monitoring.heartbeat import Heartbeat
 from sonarpost.delivery.inbox import Inbox
 from sonarpost.delivery.outbox import Lane, Outbox
 from sonarpost.delivery.disk_reserve import HANDLING_RESERVE_BYTES, Room

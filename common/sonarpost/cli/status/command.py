@@ -19,7 +19,7 @@ from sonarpost.cli.fleet_options import add_router_options, router_of
 from sonarpost.cli.status import show
 from sonarpost.cli.status.rows import is_well, rows_of
 from sonarpost.errors import ConfigError
-from sonarpost.runtime.fleet import FleetState, FleetWatcher
+from sonarpost.monitoring.fleet import FleetState, FleetWatcher
 
 EXIT_NOT_WELL = 1
 _LOOK_S = 0.05

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from sonarpost.runtime.fleet import FleetState, Seen
+from sonarpost.monitoring.fleet import FleetState, Seen
 
 Mood = Literal["good", "bad", "doubtful", "gone"]
 

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sonarpost.cli.status.rows import HEADINGS, Mood, Row
-from sonarpost.runtime.fleet import FleetState
+from sonarpost.monitoring.fleet import FleetState
 
 _STYLES: dict[Mood, str] = {"good": "", "bad": "bold red", "doubtful": "yellow", "gone": "dim"}
 _RIGHT = ("HEARD", "IN", "OUT", "DISK")

@@ -1,4 +1,4 @@
-"""`python -m sonarpost.runtime.healthcheck`: tells whether the service that writes the heartbeat file is well.
+"""`python -m sonarpost.monitoring.healthcheck`: tells whether the service that writes the heartbeat file is well.
 
 Exit status 0 when it is, 1 with the reason on standard output when it is not:
 

@@ -14,7 +14,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from sonarpost.runtime.fleet import FleetState, Seen
+from sonarpost.monitoring.fleet import FleetState, Seen
 
 LABELS: Final = ("platform", "service")
 STATES: Final = ("starting", "ok", "degraded", "stopping")
