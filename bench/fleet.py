@@ -45,7 +45,7 @@ from sonarpost.messages import ReconstructedImage, Record
 from sonarpost.runtime.process import EXIT_WITH_PARENT
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.bus.session import client_config
-from sonarpost.runtime.shore_index import ShoreIndex
+from sonarpost.archive.shore_index import ShoreIndex
 
 SETTLE_S = 120.0
 SAMPLE_S = 5.0

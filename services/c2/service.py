@@ -17,7 +17,7 @@ from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
 from sonarpost.bus import presence as hello
 from sonarpost.runtime.service import Effects, InterruptedByStopError, Service
-from sonarpost.runtime.shore_files import decision_file_name
+from sonarpost.archive.shore_files import decision_file_name
 from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction, queue_of
 from sonarpost.services.c2 import tasking
 from sonarpost.services.c2.archive import Archive

@@ -9,7 +9,7 @@ import msgpack
 from sonarpost import keys, wire
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Advice, Command, DeliveryState, TaskingKind, TaskingState
-from sonarpost.runtime.shore_index import TaskingRow
+from sonarpost.archive.shore_index import TaskingRow
 
 PREFIX = "tasking/"
 

@@ -24,7 +24,7 @@ from sonarpost.export.geojson import geojson_bytes
 from sonarpost.export.kml import kmz_bytes
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review import rendering
-from sonarpost.runtime.picture_files import side_car
+from sonarpost.archive.image_files import side_car
 from sonarpost.services.console.board import Board
 from sonarpost.services.console.contact_routes import filter_of
 from sonarpost.services.console.contacts import Filter, list_contacts

@@ -16,7 +16,7 @@ from sonarpost.link.seal_key import Direction
 from sonarpost.link.v1_events import ContactUpdate, FrameRefused
 from sonarpost.logs import concerning, kv
 from sonarpost.messages import AcousticFrame, ReconstructedImage, Record
-from sonarpost.runtime.picture_files import write_picture
+from sonarpost.archive.image_files import write_picture
 from sonarpost.runtime.service import RETRY_AFTER_S, Effects, Service
 from sonarpost.delivery.transaction import InboxItem
 from sonarpost.security.acoustic_key import read_key

@@ -26,7 +26,7 @@ from sonarpost.export.kml import kml_bytes, kmz_bytes, write_kml, write_kmz
 from sonarpost.export.properties import COLUMNS
 from sonarpost.export.text import csv_text, html_text, xml_text
 from sonarpost.messages import Decision, Raster
-from sonarpost.runtime.picture_files import side_car
+from sonarpost.archive.image_files import side_car
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "export"
 KML = "{http://www.opengis.net/kml/2.2}"

@@ -12,7 +12,7 @@ from sonarpost import keys
 from sonarpost.errors import KeptFileError
 from sonarpost.messages import Advice, Command, Decision, TaskingState
 from sonarpost.bus.session import router_config
-from sonarpost.runtime.shore_index import ShoreIndex
+from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.services.relay.config import RelayConfig

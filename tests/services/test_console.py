@@ -29,7 +29,7 @@ from sonarpost.messages import (
     Relayed,
     TaskingState,
 )
-from sonarpost.runtime.picture_files import write_picture
+from sonarpost.archive.image_files import write_picture
 from sonarpost.runtime.process import main
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService

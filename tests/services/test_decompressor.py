@@ -24,7 +24,7 @@ from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_format import ContactFrame, parse_frame
 from sonarpost.link.paper_sender import plan_packets
 from sonarpost.messages import AcousticFrame, ReconstructedImage
-from sonarpost.runtime.picture_files import picture_name
+from sonarpost.archive.image_files import picture_name
 from sonarpost.runtime.service import Effects
 from sonarpost.services.decompressor import service as decompressor
 from sonarpost.services.decompressor.config import DecompressorConfig

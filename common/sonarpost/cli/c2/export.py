@@ -16,7 +16,7 @@ from sonarpost.export.cot_sender import CotSender, TlsFiles
 from sonarpost.export.csv_table import write_csv
 from sonarpost.export.geojson import write_geojson
 from sonarpost.export.kml import write_kml, write_kmz
-from sonarpost.runtime.shore_index import ShoreIndex
+from sonarpost.archive.shore_index import ShoreIndex
 
 FORMATS = ("geojson", "kml", "kmz", "csv")
 EXIT_INCOMPLETE = 1

@@ -8,8 +8,8 @@ from pathlib import Path
 from sonarpost.cli.c2.options import add_out_dir
 from sonarpost.errors import KeptFileError
 from sonarpost.files import write_atomically
-from sonarpost.runtime.shore_files import files_of, find_picture
-from sonarpost.runtime.shore_index import ShoreIndex
+from sonarpost.archive.shore_files import files_of, find_picture
+from sonarpost.archive.shore_index import ShoreIndex
 
 
 def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

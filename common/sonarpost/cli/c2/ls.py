@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sonarpost.cli.c2.options import add_out_dir, printable, since_of, time_text
-from sonarpost.runtime.shore_index import DecisionRow, PictureRow, ShoreIndex, TaskingRow
+from sonarpost.archive.shore_index import DecisionRow, PictureRow, ShoreIndex, TaskingRow
 
 PIPED_WIDTH = 160
 

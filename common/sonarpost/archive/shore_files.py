@@ -13,8 +13,8 @@ from sonarpost.errors import KeptFileError
 from sonarpost.export.accepted import DECISIONS, SideCar
 from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage
-from sonarpost.runtime.picture_files import picture_name
-from sonarpost.runtime.shore_index import DecisionRow, PictureRow, ShoreIndex
+from sonarpost.archive.image_files import picture_name
+from sonarpost.archive.shore_index import DecisionRow, PictureRow, ShoreIndex
 
 log = logging.getLogger(__name__)
 
