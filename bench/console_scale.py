@@ -22,9 +22,9 @@ from pathlib import Path
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig
-from sonarpost.bus.session import client_config, router_config
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
 from sonarpost.services.console.training import VESSEL, Training

@@ -21,10 +21,10 @@ import zenoh
 from playwright.sync_api import Page, sync_playwright
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig
 from sonarpost.messages import ReconstructedImage
-from sonarpost.bus.session import client_config, router_config
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
 from sonarpost.services.console.training import VESSEL, Training

@@ -39,13 +39,13 @@ import zenoh
 from noise import noise_picture
 
 from sonarpost import keys
+from sonarpost.archive.shore_index import ShoreIndex
+from sonarpost.bus.session import client_config
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import ReconstructedImage, Record
-from sonarpost.runtime.process import EXIT_WITH_PARENT
+from sonarpost.parent_process import EXIT_WITH_PARENT
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.bus.session import client_config
-from sonarpost.archive.shore_index import ShoreIndex
 
 SETTLE_S = 120.0
 SAMPLE_S = 5.0
@@ -217,9 +217,7 @@ def fleet(folder: Path, vessels: Sequence[str]) -> Iterator[tuple[Processes, dic
             file.write_text(
                 f'[platform]\nid = "{vessel}"\nrouter = ["{endpoint}"]\nstate_dir = "{folder / vessel}"\n[relay]\n'
             )
-            processes.start(
-                f"router-{vessel}", "-m", "sonarpost.bus.router", "--listen", endpoint, "--connect", shore
-            )
+            processes.start(f"router-{vessel}", "-m", "sonarpost.bus.router", "--listen", endpoint, "--connect", shore)
             processes.start(f"relay-{vessel}", "-m", "sonarpost.services.relay", "--config", str(file))
         yield processes, endpoints, shore
     finally:

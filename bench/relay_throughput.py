@@ -40,13 +40,13 @@ import zenoh
 from noise import noise_picture
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.delivery.scheduler import CHUNK_BYTES, WINDOW, WINDOW_BYTES
 from sonarpost.logs import set_up
 from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
-from sonarpost.delivery.scheduler import CHUNK_BYTES, WINDOW, WINDOW_BYTES
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.bus.session import client_config, router_config
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 

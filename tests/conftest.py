@@ -14,8 +14,8 @@ from hypothesis import settings
 from xdist.remote import Producer
 from xdist.scheduler import LoadFileScheduling
 
-from sonarpost.config import PlatformConfig
 from sonarpost.bus.session import client_config, router_config
+from sonarpost.config import PlatformConfig
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost import wire
+from sonarpost.delivery.batch_protocol import pack_replies, parse_query, unpack_replies
+from sonarpost.delivery.protocol import Reply, attachment, parse_chunk
+from sonarpost.delivery.transaction import OutboxItem
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Contact, Health, Raster, Record
-from sonarpost.delivery.protocol import Reply, attachment, parse_chunk
-from sonarpost.delivery.batch_protocol import pack_replies, parse_query, unpack_replies
-from sonarpost.delivery.transaction import OutboxItem
 
 GOLDEN = Path(__file__).parent / "golden" / "zenoh"
 BY_TYPE = {t.TYPE: t for t in RECORD_TYPES}

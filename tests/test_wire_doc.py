@@ -21,11 +21,14 @@ from golden.zenoh.samples import RECORD_TYPES, SAMPLES
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.messages import Contact, Decision, Record, Snippet
-from sonarpost.delivery import (protocol as handoff, batch_protocol as handoff_batch, outbox, scheduler as schedule, transaction)
+from sonarpost.delivery import batch_protocol as handoff_batch
+from sonarpost.delivery import outbox, transaction
+from sonarpost.delivery import protocol as handoff
+from sonarpost.delivery import scheduler as schedule
 from sonarpost.delivery.protocol import Reply, attachment
-from sonarpost.runtime.service import Effects, Service
 from sonarpost.delivery.transaction import OutboxItem
+from sonarpost.messages import Contact, Decision, Record, Snippet
+from sonarpost.runtime.service import Effects, Service
 from sonarpost.services.c2.service import ADVICE_PRIORITY, COMMAND_PRIORITY
 from sonarpost.services.relay.service import DECISION_PRIORITY, DETAIL_PRIORITY, PREVIEW_PRIORITY
 

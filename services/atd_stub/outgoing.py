@@ -11,11 +11,11 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.unit_of_work import Effects
 from sonarpost.errors import HandoffError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Health, QueueState, Snippet
-from sonarpost.delivery.unit_of_work import Effects
-from sonarpost.delivery.store import Store
 from sonarpost.services.atd_stub.pool import ContactPool
 from sonarpost.services.atd_stub.way import COMPRESSOR, MODEM, WayToTheWater
 

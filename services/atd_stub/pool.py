@@ -7,9 +7,9 @@ import threading
 from collections.abc import Callable, Sequence
 
 from sonarpost import wire
-from sonarpost.messages import Snippet
-from sonarpost.delivery.unit_of_work import Effects
 from sonarpost.delivery.store import Store
+from sonarpost.delivery.unit_of_work import Effects
+from sonarpost.messages import Snippet
 
 _PREFIX = "pool:"
 _GREATEST_CONFIDENCE = 2.0

@@ -6,10 +6,10 @@ import logging
 from collections.abc import Mapping
 
 from sonarpost import wire
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.unit_of_work import Effects
 from sonarpost.logs import kv
 from sonarpost.messages import Snippet
-from sonarpost.delivery.unit_of_work import Effects
-from sonarpost.delivery.store import Store
 from sonarpost.services.atd_stub.seam import Seam, pack, unpack
 
 log = logging.getLogger(__name__)

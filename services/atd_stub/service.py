@@ -11,12 +11,12 @@ from pathlib import Path
 import msgpack
 
 from sonarpost.config import PlatformConfig
+from sonarpost.delivery.transaction import OutboxItem, Transaction
 from sonarpost.errors import HandoffError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.logs import kv
 from sonarpost.messages import Record, Snippet
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.delivery.transaction import OutboxItem, Transaction
 from sonarpost.services.atd_stub import snippets
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.folder import FileSeen, SettledFiles, content_hash, look_at, printable

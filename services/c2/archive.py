@@ -9,13 +9,20 @@ import time
 from collections.abc import Sequence
 
 from sonarpost import keys
+from sonarpost.archive.image_files import add_picture, picture_name
+from sonarpost.archive.shore_files import (
+    add_missing,
+    decision_file_name,
+    remove_files,
+    remove_unfinished,
+    row_of_image,
+    to_remove,
+)
+from sonarpost.archive.shore_index import DecisionRow, PictureRow, ShoreIndex, TaskingRow
 from sonarpost.errors import PayloadError
 from sonarpost.files import AtomicFiles
 from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage
-from sonarpost.archive.image_files import add_picture, picture_name
-from sonarpost.archive.shore_files import (add_missing, decision_file_name, remove_files, remove_unfinished, row_of_image, to_remove)
-from sonarpost.archive.shore_index import DecisionRow, PictureRow, ShoreIndex, TaskingRow
 from sonarpost.services.c2.config import C2Config
 
 log = logging.getLogger(__name__)

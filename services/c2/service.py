@@ -11,14 +11,14 @@ from dataclasses import replace
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.archive.shore_files import decision_file_name
+from sonarpost.bus import presence as hello
 from sonarpost.config import PlatformConfig
+from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction, queue_of
 from sonarpost.errors import HandoffError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
-from sonarpost.bus import presence as hello
 from sonarpost.runtime.service import Effects, InterruptedByStopError, Service
-from sonarpost.archive.shore_files import decision_file_name
-from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction, queue_of
 from sonarpost.services.c2 import tasking
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config

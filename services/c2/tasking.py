@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import msgpack
 
 from sonarpost import keys, wire
+from sonarpost.archive.shore_index import TaskingRow
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Advice, Command, DeliveryState, TaskingKind, TaskingState
-from sonarpost.archive.shore_index import TaskingRow
 
 PREFIX = "tasking/"
 

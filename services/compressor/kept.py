@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import msgpack
 
-from sonarpost.errors import PayloadError
-from sonarpost.delivery.unit_of_work import Effects
 from sonarpost.delivery.store import Store
+from sonarpost.delivery.unit_of_work import Effects
+from sonarpost.errors import PayloadError
 
 _INDEX = "kept"
 _PICTURE = "kept/"

@@ -17,6 +17,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from sonarpost import wire
+from sonarpost.archive.image_files import side_car
 from sonarpost.export.accepted import Accepted, AcceptedContact, SideCar
 from sonarpost.export.cot import cot_events
 from sonarpost.export.csv_table import csv_bytes
@@ -24,7 +25,6 @@ from sonarpost.export.geojson import geojson_bytes
 from sonarpost.export.kml import kmz_bytes
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review import rendering
-from sonarpost.archive.image_files import side_car
 from sonarpost.services.console.board import Board
 from sonarpost.services.console.contact_routes import filter_of
 from sonarpost.services.console.contacts import Filter, list_contacts

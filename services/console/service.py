@@ -13,6 +13,7 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
+from sonarpost.delivery.transaction import OutboxItem, Transaction
 from sonarpost.errors import BadInputError, ConfigError, HandoffError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import (
@@ -28,7 +29,6 @@ from sonarpost.messages import (
     TaskingState,
 )
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.delivery.transaction import OutboxItem, Transaction
 from sonarpost.services.console.app import ConsoleApp
 from sonarpost.services.console.asking import Table
 from sonarpost.services.console.board import Board, Unsent

@@ -8,7 +8,9 @@ import time
 from collections.abc import Iterable, Mapping
 
 from sonarpost import keys, wire
+from sonarpost.archive.image_files import write_picture
 from sonarpost.config import PlatformConfig
+from sonarpost.delivery.transaction import InboxItem
 from sonarpost.errors import BadInputError, ConfigError, HandoffError
 from sonarpost.link.paper_events import ContactOnly, FrameRejected, ImageReady
 from sonarpost.link.seal import AcousticSeal
@@ -16,9 +18,7 @@ from sonarpost.link.seal_key import Direction
 from sonarpost.link.v1_events import ContactUpdate, FrameRefused
 from sonarpost.logs import concerning, kv
 from sonarpost.messages import AcousticFrame, ReconstructedImage, Record
-from sonarpost.archive.image_files import write_picture
 from sonarpost.runtime.service import RETRY_AFTER_S, Effects, Service
-from sonarpost.delivery.transaction import InboxItem
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.decoder import Decoder, image_id_of

@@ -12,6 +12,7 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
+from sonarpost.delivery.transaction import InboxItem
 from sonarpost.errors import FrameError, HandoffError, PayloadError
 from sonarpost.link.orders import OpenOrder
 from sonarpost.link.seal import AcousticSeal
@@ -23,7 +24,6 @@ from sonarpost.modem.events import FrameReceived, PacketFailed, PacketReceived, 
 from sonarpost.modem.rates import RATES
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import Effects
-from sonarpost.delivery.transaction import InboxItem
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.speaking import Turn

@@ -10,16 +10,16 @@ from collections.abc import Collection, Mapping, Sequence
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import open_with_retry
+from sonarpost.bus.site_monitor import ShoreWatch, Site
 from sonarpost.config import PlatformConfig
+from sonarpost.delivery.disk_reserve import Room
+from sonarpost.delivery.queue_policy import Lane
+from sonarpost.delivery.transaction import InboxItem, Topic
 from sonarpost.errors import PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
-from sonarpost.delivery.queue_policy import Lane
-from sonarpost.delivery.disk_reserve import Room
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.bus.session import open_with_retry
-from sonarpost.bus.site_monitor import ShoreWatch, Site
-from sonarpost.delivery.transaction import InboxItem, Topic
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.upstreams import Upstream, is_upstream_queue
 

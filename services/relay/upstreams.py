@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 import zenoh
 
 from sonarpost import keys
-from sonarpost.logs import kv
 from sonarpost.delivery.queue_policy import Lane
 from sonarpost.delivery.transaction import consumer_of, queue_of
+from sonarpost.logs import kv
 from sonarpost.services.relay.config import UpstreamOptions
 
 log = logging.getLogger(__name__)

@@ -11,6 +11,8 @@ from typing import Final
 from sonarpost import wire
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.config import PlatformConfig
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import BadInputError, FrameError
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.downlink import (
@@ -37,8 +39,6 @@ from sonarpost.link.v1_receiver import Receiver
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
 from sonarpost.modem.rates import RATES
-from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import Transaction
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.line_store import LineStore

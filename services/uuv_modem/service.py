@@ -12,6 +12,8 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
+from sonarpost.delivery.inbox import NotNowError
+from sonarpost.delivery.transaction import InboxItem
 from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_sender import Packet, plan_packets
 from sonarpost.logs import kv
@@ -26,10 +28,8 @@ from sonarpost.messages import (
 )
 from sonarpost.modem.events import Event, PacketFailed, PacketSent
 from sonarpost.modem.rates import RATES
-from sonarpost.delivery.inbox import NotNowError
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import Effects, InterruptedByStopError
-from sonarpost.delivery.transaction import InboxItem
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.line import VehicleLine
 from sonarpost.services.uuv_modem.line_runner import TAKEN, LineRunner

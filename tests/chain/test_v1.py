@@ -11,10 +11,10 @@ import zenoh
 from chain.conftest import RunningChain
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.demo.account import settle
 from sonarpost.cli.demo.settings import UUV, VESSEL
 from sonarpost.messages import Command
-from sonarpost.bus.session import open_with_retry
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 

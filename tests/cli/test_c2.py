@@ -17,12 +17,12 @@ from conftest import eventually, free_port, publish_once
 from records import picture_record
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import router_config
 from sonarpost.cli.c2.ls import join, select
 from sonarpost.cli.c2.options import printable, since_of
 from sonarpost.cli.main import main
 from sonarpost.errors import ConfigError
 from sonarpost.messages import Advice, Contact, Decision, Raster, TaskingState
-from sonarpost.bus.session import router_config
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service

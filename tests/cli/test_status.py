@@ -25,13 +25,13 @@ from conftest import eventually, free_port
 from rich.console import Console
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import router_config
 from sonarpost.cli.main import main
 from sonarpost.cli.status import show
 from sonarpost.cli.status.rows import age_text, bytes_text, is_well, rows_of
 from sonarpost.config import PlatformConfig
 from sonarpost.messages import Health
 from sonarpost.monitoring.fleet import FleetState, Seen
-from sonarpost.bus.session import router_config
 
 NAMES = ("uuv_modem", "acoustic_channel", "op_modem", "decompressor")
 

@@ -15,8 +15,8 @@ from types import ModuleType
 import pytest
 from conftest import REPOSITORY
 
-from sonarpost.errors import ConfigError
 from sonarpost.bus import router
+from sonarpost.errors import ConfigError
 from sonarpost.security.fleet import Fleet
 from sonarpost.security.index import FleetIndex
 

@@ -17,9 +17,9 @@ from export.make import decision, image
 from PIL import Image
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import client_config
 from sonarpost.config import PlatformConfig
 from sonarpost.messages import Decision, Raster, ReconstructedImage, Relayed
-from sonarpost.bus.session import client_config
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 

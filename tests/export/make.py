@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from sonarpost.archive.image_files import write_picture
+from sonarpost.archive.shore_files import decision_file_name
 from sonarpost.export.accepted import Accepted
 from sonarpost.export.cot import cot_events
 from sonarpost.export.csv_table import csv_bytes
 from sonarpost.export.geojson import geojson_bytes
 from sonarpost.export.kml import kml_bytes
 from sonarpost.messages import Contact, Decision, Raster, ReconstructedImage
-from sonarpost.archive.image_files import write_picture
-from sonarpost.archive.shore_files import decision_file_name
 
 FIRST_UTC_S = 1476262801.25
 

@@ -18,6 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from sonarpost.archive.image_files import side_car
 from sonarpost.export.accepted import Accepted, AcceptedContact, SideCar, load_accepted
 from sonarpost.export.cot import CotOptions, cot_event, cot_events, cot_type
 from sonarpost.export.csv_table import csv_bytes, write_csv
@@ -26,7 +27,6 @@ from sonarpost.export.kml import kml_bytes, kmz_bytes, write_kml, write_kmz
 from sonarpost.export.properties import COLUMNS
 from sonarpost.export.text import csv_text, html_text, xml_text
 from sonarpost.messages import Decision, Raster
-from sonarpost.archive.image_files import side_car
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "export"
 KML = "{http://www.opengis.net/kml/2.2}"

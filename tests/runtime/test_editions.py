@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.errors import PayloadError
 from sonarpost.delivery.protocol import attachment, parse_chunk
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import OutboxItem, Topic, consumer_of, queue_of
+from sonarpost.errors import PayloadError
 
 
 def send(store: Store, topic: str, edition: int, *, priority: int = 6, queue: str = "c2", size: int = 3) -> int:

@@ -14,13 +14,13 @@ from conftest import eventually
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.errors import BadInputError, PayloadError
-from sonarpost.messages import Decision, Record
 from sonarpost.delivery import protocol as handoff
 from sonarpost.delivery.protocol import CHUNK_BYTES, Reply
-from sonarpost.runtime.service import Effects, Service
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import OutboxItem
+from sonarpost.errors import BadInputError, PayloadError
+from sonarpost.messages import Decision, Record
+from sonarpost.runtime.service import Effects, Service
 
 KEY = keys.contact_decision("vessel-1")
 

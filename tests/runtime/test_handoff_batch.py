@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.errors import PayloadError
-from sonarpost.messages import Decision, Record
 from sonarpost.delivery import protocol as handoff
-from sonarpost.delivery.protocol import CHUNK_BYTES, Reply
 from sonarpost.delivery.batch_protocol import MAX_RECORDS, attachment, pack_replies, parse_query, unpack_replies
 from sonarpost.delivery.inbox import NotNowError
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.delivery.protocol import CHUNK_BYTES, Reply
 from sonarpost.delivery.transaction import Chunk, OutboxItem
+from sonarpost.errors import PayloadError
+from sonarpost.messages import Decision, Record
+from sonarpost.runtime.service import Effects, Service
 
 KEY = keys.contact_decision("vessel-1")
 WHERE = keys.handoff(KEY, "consumer")

@@ -13,9 +13,9 @@ from golden.zenoh.samples import COMPLETE_IMAGE, DAMAGED_IMAGE
 from golden.zenoh.strategies import images
 from hypothesis import given, settings
 
-from sonarpost.messages import Raster, ReconstructedImage
 from sonarpost.archive import image_files as picture_files
 from sonarpost.archive.image_files import picture_name, side_car, write_picture
+from sonarpost.messages import Raster, ReconstructedImage
 from sonarpost.sonar.image_files import read_image
 
 NAME = "uuv-1_20161012T090001Z_00A7_v1"

@@ -17,8 +17,8 @@ import zenoh
 from conftest import REPOSITORY, eventually
 
 from sonarpost import keys, wire
-from sonarpost.messages import Health
 from sonarpost.delivery.store import Store
+from sonarpost.messages import Health
 
 TINY = """
 import sys, threading

@@ -6,8 +6,8 @@ from collections import namedtuple
 
 import pytest
 
-from sonarpost.delivery.inbox import NotNowError
 from sonarpost.delivery.disk_reserve import Room
+from sonarpost.delivery.inbox import NotNowError
 
 DiskUsage = namedtuple("DiskUsage", "total used free")
 RECORD = bytes(100_000)

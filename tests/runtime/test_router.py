@@ -15,9 +15,9 @@ import pytest
 import zenoh
 from conftest import REPOSITORY, eventually, free_port
 
-from sonarpost.errors import ConfigError
 from sonarpost.bus import router
 from sonarpost.bus.session import client_config
+from sonarpost.errors import ConfigError
 
 Start = Callable[..., subprocess.Popen[str]]
 

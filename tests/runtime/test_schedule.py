@@ -7,8 +7,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.delivery.protocol import CHUNK_BYTES
+from sonarpost.delivery.scheduler import (
+    KEPT_FOR_URGENT,
+    MAX_WINDOW_BYTES,
+    MIN_PIECE_BYTES,
+    OVERHEAD_BYTES,
+    PIECE_S,
+    PROBE_WINDOW,
+    WINDOW,
+    WINDOW_BYTES,
+    Piece,
+    Schedule,
+    piece_bytes_for,
+)
 from sonarpost.delivery.token_bucket import TokenBucket
-from sonarpost.delivery.scheduler import (KEPT_FOR_URGENT, MAX_WINDOW_BYTES, MIN_PIECE_BYTES, OVERHEAD_BYTES, PIECE_S, PROBE_WINDOW, WINDOW, WINDOW_BYTES, Piece, Schedule, piece_bytes_for)
 from sonarpost.delivery.transaction import OutboxItem
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from runtime.store_steps import send
 
-from sonarpost.errors import HandoffError
 from sonarpost.delivery.store import Store
+from sonarpost.errors import HandoffError
 
 
 def test_a_closed_store_says_so(tmp_path: Path) -> None:

@@ -16,10 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from runtime.store_steps import ORIGIN, fail_within, send
 
-from sonarpost.errors import HandoffError
 from sonarpost.delivery import rows
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
+from sonarpost.errors import HandoffError
 
 
 def test_state_is_remembered_replaced_and_forgotten(tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ import pytest
 import zenoh
 from conftest import eventually, free_port
 
-from sonarpost.config import TlsConfig
 from sonarpost.bus.session import client_config
+from sonarpost.config import TlsConfig
 from sonarpost.security.fleet import Fleet
 from sonarpost.security.router_config import Wanted, router_json5
 

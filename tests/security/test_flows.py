@@ -9,11 +9,11 @@ import pytest
 from conftest import eventually, free_port
 
 from sonarpost import keys, wire
+from sonarpost.bus.connectivity import Reach, ask_shore, try_endpoint, why_no_answer
+from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Advice, Command, Decision, Record
-from sonarpost.bus.connectivity import Reach, ask_shore, try_endpoint, why_no_answer
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.bus.session import open_with_retry
 from sonarpost.security.router_config import Wanted
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service

@@ -9,9 +9,9 @@ import zenoh
 from conftest import eventually, free_port
 
 from sonarpost import keys, wire
-from sonarpost.messages import Health
 from sonarpost.bus.connectivity import Reach, try_endpoint
 from sonarpost.bus.session import client_config
+from sonarpost.messages import Health
 from sonarpost.security.router_config import Wanted
 from tests.security.conftest import tls_of
 

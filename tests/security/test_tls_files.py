@@ -12,9 +12,9 @@ import pytest
 from cryptography.hazmat.primitives import serialization
 
 from sonarpost import config
+from sonarpost.bus.tls import OwnTls
 from sonarpost.config import ServiceConfig
 from sonarpost.errors import ConfigError
-from sonarpost.bus.tls import OwnTls
 from sonarpost.security import tls_files
 from sonarpost.security.fleet import Fleet
 from tests.security.conftest import tls_of

@@ -6,11 +6,11 @@ import msgpack
 import pytest
 import zenoh
 
-from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.bus import presence as hello
 from sonarpost.bus.presence import Hello
 from sonarpost.bus.router_monitor import MAX_TOLD, Refusals, platform_and_sites
 from sonarpost.bus.zenoh_log import Denied, Remark, Stranger, TlsRejected, ZenohLog
+from sonarpost.errors import BadInputError, PayloadError
 
 ACL = "zenoh::net::routing::interceptor::access_control"
 ZID = "7aa9d969cdd8c646d5214fff498d40ab"

@@ -13,9 +13,9 @@ import pytest
 from conftest import REPOSITORY, eventually
 
 from sonarpost import keys, wire
-from sonarpost.messages import Contact, Health, QueuedImage, QueueState, Raster, Snippet
-from sonarpost.delivery.unit_of_work import Effects
 from sonarpost.delivery.store import Store
+from sonarpost.delivery.unit_of_work import Effects
+from sonarpost.messages import Contact, Health, QueuedImage, QueueState, Raster, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.pool import ContactPool
 from sonarpost.services.atd_stub.service import AtdStubService

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from records import picture_record
 
-from sonarpost.errors import KeptFileError
-from sonarpost.messages import Decision, Raster
 from sonarpost.archive.shore_files import find_picture, to_remove
 from sonarpost.archive.shore_index import FILE_NAME, PictureRow, ShoreIndex
+from sonarpost.errors import KeptFileError
+from sonarpost.messages import Decision, Raster
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 

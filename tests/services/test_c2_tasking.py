@@ -9,10 +9,10 @@ from chain.tcp_proxy import TcpProxy
 from conftest import eventually, free_port
 
 from sonarpost import keys
+from sonarpost.archive.shore_index import ShoreIndex
+from sonarpost.bus.session import router_config
 from sonarpost.errors import KeptFileError
 from sonarpost.messages import Advice, Command, Decision, TaskingState
-from sonarpost.bus.session import router_config
-from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.services.relay.config import RelayConfig

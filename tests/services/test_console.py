@@ -15,6 +15,7 @@ import zenoh
 from conftest import eventually, publish_once
 
 from sonarpost import keys, wire
+from sonarpost.archive.image_files import write_picture
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import (
     AcousticFrame,
@@ -29,7 +30,6 @@ from sonarpost.messages import (
     Relayed,
     TaskingState,
 )
-from sonarpost.archive.image_files import write_picture
 from sonarpost.runtime.process import main
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService

@@ -14,6 +14,7 @@ from conftest import eventually
 from PIL import Image
 
 from sonarpost import keys
+from sonarpost.archive.image_files import picture_name
 from sonarpost.catalogue.store import Catalogue, open_catalogue, save
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.registry import CodecResources, default_registry
@@ -24,7 +25,6 @@ from sonarpost.link.contact_record import ContactSummary
 from sonarpost.link.paper_format import ContactFrame, parse_frame
 from sonarpost.link.paper_sender import plan_packets
 from sonarpost.messages import AcousticFrame, ReconstructedImage
-from sonarpost.archive.image_files import picture_name
 from sonarpost.runtime.service import Effects
 from sonarpost.services.decompressor import service as decompressor
 from sonarpost.services.decompressor.config import DecompressorConfig

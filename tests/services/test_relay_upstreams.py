@@ -13,8 +13,8 @@ from pydantic import ValidationError
 from records import decision_record, picture_record
 
 from sonarpost import keys
-from sonarpost.messages import Raster, Relayed
 from sonarpost.bus.session import client_config, router_config
+from sonarpost.messages import Raster, Relayed
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
 from sonarpost.services.relay.service import RelayService, topic_of
 

@@ -12,6 +12,7 @@ from conftest import eventually
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
+from sonarpost.delivery.store import Store
 from sonarpost.link.downlink import Confirmation, Data, Judgement, Outcome, Refine, Resend, Revisit, Wider, pack, unpack
 from sonarpost.link.paper_format import format_image_id
 from sonarpost.link.seal import AcousticSeal
@@ -31,7 +32,6 @@ from sonarpost.messages import (
     QueueState,
 )
 from sonarpost.modem.rates import RATES
-from sonarpost.delivery.store import Store
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService
 from sonarpost.services.uuv_modem.config import UuvModemConfig

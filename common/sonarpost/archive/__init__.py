@@ -1,1 +1,1 @@
-"""TODO-DOC."""
+"""Images and decisions on disk: files, side-cars, and the index of the shore site."""

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from sonarpost.archive.image_files import picture_name
+from sonarpost.archive.shore_index import DecisionRow, PictureRow, ShoreIndex
 from sonarpost.errors import KeptFileError
 from sonarpost.export.accepted import DECISIONS, SideCar
 from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage
-from sonarpost.archive.image_files import picture_name
-from sonarpost.archive.shore_index import DecisionRow, PictureRow, ShoreIndex
 
 log = logging.getLogger(__name__)
 

@@ -1,1 +1,1 @@
-"""TODO-DOC."""
+"""Zenoh sessions, the embedded router, TLS, and the connectivity of sites."""

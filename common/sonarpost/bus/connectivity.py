@@ -16,9 +16,9 @@ from enum import Enum
 import zenoh
 
 from sonarpost import keys
+from sonarpost.bus import presence as hello
 from sonarpost.config import TlsConfig
 from sonarpost.errors import PayloadError
-from sonarpost.bus import presence as hello
 
 _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?P<host>\[[^]]+\]|[^:\[\]]+):(?P<port>[0-9]{1,5})(?P<options>[?#;].*)?")
 TIMEOUT_S = 3.0

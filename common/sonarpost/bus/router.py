@@ -21,10 +21,10 @@ from types import FrameType
 import zenoh
 
 from sonarpost import logs
-from sonarpost.errors import ConfigError, SonarpostError
-from sonarpost.runtime.process import exit_with_parent
 from sonarpost.bus.router_monitor import watched_router
 from sonarpost.bus.session import router_config
+from sonarpost.errors import ConfigError, SonarpostError
+from sonarpost.parent_process import exit_with_parent
 
 log = logging.getLogger(__name__)
 

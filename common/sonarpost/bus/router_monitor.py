@@ -19,12 +19,12 @@ from pathlib import Path
 import zenoh
 
 from sonarpost import keys, wire
-from sonarpost.errors import BadInputError, HandoffError
-from sonarpost.logs import kv
-from sonarpost.messages import Health, ServiceState
 from sonarpost.bus import presence as hello
 from sonarpost.bus.log_capture import LogCapture
 from sonarpost.bus.zenoh_log import Denied, Event, Remark, Stranger, TlsRejected
+from sonarpost.errors import BadInputError, HandoffError
+from sonarpost.logs import kv
+from sonarpost.messages import Health, ServiceState
 from sonarpost.security import tls_files
 from sonarpost.security.tls_files import OwnCertificate
 

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 import zenoh
 
+from sonarpost.bus.connectivity import try_endpoint
 from sonarpost.config import TlsConfig
 from sonarpost.logs import kv
-from sonarpost.bus.connectivity import try_endpoint
 
 log = logging.getLogger(__name__)
 

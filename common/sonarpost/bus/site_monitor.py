@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import zenoh
 
-from sonarpost.config import TlsConfig
-from sonarpost.logs import kv
 from sonarpost.bus import connectivity as reach
 from sonarpost.bus.connectivity import Outcome, Reach
+from sonarpost.config import TlsConfig
+from sonarpost.logs import kv
 
 log = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 from sonarpost import logs
-from sonarpost.config import SERVICES
 from sonarpost.bus import router
+from sonarpost.config import SERVICES
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

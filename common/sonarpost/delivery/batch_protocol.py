@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import msgpack
 
 from sonarpost import wire
-from sonarpost.errors import PayloadError
 from sonarpost.delivery import protocol as handoff
-from sonarpost.delivery.protocol import CHUNK_BYTES, Reply
 from sonarpost.delivery.items import Chunk, OutboxItem, consumer_of
+from sonarpost.delivery.protocol import CHUNK_BYTES, Reply
+from sonarpost.errors import PayloadError
 
 BATCH_VERSION = 2
 MAX_RECORDS = 128

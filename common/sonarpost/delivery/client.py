@@ -9,11 +9,11 @@ import uuid
 import zenoh
 
 from sonarpost import keys, wire
-from sonarpost.errors import HandoffError, PayloadError
-from sonarpost.messages import Record
 from sonarpost.delivery import protocol as handoff
 from sonarpost.delivery.protocol import CHUNK_BYTES, Reply
 from sonarpost.delivery.transaction import OutboxItem
+from sonarpost.errors import HandoffError, PayloadError
+from sonarpost.messages import Record
 
 TRY_S = 2.0
 PAUSE_S = 0.2

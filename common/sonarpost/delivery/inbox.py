@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import zenoh
 
 from sonarpost import keys
+from sonarpost.delivery.batch_protocol import MAX_RECORDS, pack_replies, parse_query
+from sonarpost.delivery.protocol import MAX_RECORD_BYTES, Reply
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import Chunk, Transaction
 from sonarpost.errors import BadInputError, HandoffError, PayloadError
 from sonarpost.logs import concerning_later, kv
 from sonarpost.monitoring.log_context import concern_of_payload
-from sonarpost.delivery.protocol import MAX_RECORD_BYTES, Reply
-from sonarpost.delivery.batch_protocol import MAX_RECORDS, pack_replies, parse_query
-from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import Chunk, Transaction
 
 log = logging.getLogger(__name__)
 

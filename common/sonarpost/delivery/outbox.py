@@ -8,12 +8,12 @@ from collections.abc import Callable
 
 import zenoh
 
-from sonarpost.errors import HandoffError
-from sonarpost.logs import kv
 from sonarpost.delivery.queue_policy import PRIORITIES, REPLY_TIMEOUT_S, Lane, Settled
 from sonarpost.delivery.scheduler import PROBE_WINDOW, WINDOW
 from sonarpost.delivery.sender import BACK_OFF_S, Sender
 from sonarpost.delivery.store import Store
+from sonarpost.errors import HandoffError
+from sonarpost.logs import kv
 
 __all__ = ["BACK_OFF_S", "PRIORITIES", "PROBE_WINDOW", "REPLY_TIMEOUT_S", "WINDOW", "Lane", "Outbox"]
 

@@ -13,8 +13,8 @@ from typing import Literal
 import msgpack
 
 from sonarpost import wire
-from sonarpost.errors import PayloadError
 from sonarpost.delivery.items import Chunk, OutboxItem, consumer_of
+from sonarpost.errors import PayloadError
 
 CHUNK_BYTES = 32 * 1024
 MAX_RECORD_BYTES = 8 * 1024 * 1024

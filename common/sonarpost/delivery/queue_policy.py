@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import zenoh
 
 from sonarpost import keys
-from sonarpost.delivery import protocol as handoff, batch_protocol as handoff_batch
+from sonarpost.delivery import batch_protocol as handoff_batch
+from sonarpost.delivery import protocol as handoff
 from sonarpost.delivery.scheduler import Piece
 from sonarpost.delivery.transaction import OutboxItem, Transaction, consumer_of
 

@@ -12,9 +12,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import islice
 
-from sonarpost.delivery.protocol import CHUNK_BYTES
 from sonarpost.delivery.batch_protocol import MAX_RECORDS, RECORD_OVERHEAD_BYTES
 from sonarpost.delivery.items import OutboxItem
+from sonarpost.delivery.protocol import CHUNK_BYTES
 from sonarpost.delivery.token_bucket import TokenBucket
 
 WINDOW = 128

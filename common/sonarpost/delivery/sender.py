@@ -11,15 +11,16 @@ from dataclasses import dataclass
 
 import zenoh
 
-from sonarpost.errors import HandoffError, PayloadError
-from sonarpost.logs import kv
-from sonarpost.delivery import batch_protocol as handoff_batch, queue_policy as lane
-from sonarpost.monitoring.log_context import concern_of_payload
+from sonarpost.delivery import batch_protocol as handoff_batch
+from sonarpost.delivery import queue_policy as lane
 from sonarpost.delivery.protocol import Reply
 from sonarpost.delivery.queue_policy import Lane, Settled
 from sonarpost.delivery.scheduler import MAX_WINDOW_BYTES, WINDOW, Piece, Schedule, Transfer
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import OutboxItem
+from sonarpost.errors import HandoffError, PayloadError
+from sonarpost.logs import kv
+from sonarpost.monitoring.log_context import concern_of_payload
 
 log = logging.getLogger(__name__)
 

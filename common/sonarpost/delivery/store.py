@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from sonarpost.errors import HandoffError
 from sonarpost.delivery import rows, store_schema
 from sonarpost.delivery.store_schema import SCHEMA_VERSION
 from sonarpost.delivery.transaction import QUEUE_MARK, InboxItem, OutboxItem, Transaction
+from sonarpost.errors import HandoffError
 
 log = logging.getLogger(__name__)
 

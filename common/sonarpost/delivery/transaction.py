@@ -8,8 +8,8 @@ import time
 from collections.abc import Iterable, Set
 
 from sonarpost.delivery import rows
-from sonarpost.delivery.items import QUEUE_MARK, Chunk, InboxItem, OutboxItem, Topic, consumer_of, queue_of
 from sonarpost.delivery.duplicate_window import Seen
+from sonarpost.delivery.items import QUEUE_MARK, Chunk, InboxItem, OutboxItem, Topic, consumer_of, queue_of
 
 __all__ = ["QUEUE_MARK", "Chunk", "InboxItem", "OutboxItem", "Topic", "Transaction", "consumer_of", "queue_of"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from sonarpost import wire
-from sonarpost.messages import Record
 from sonarpost.delivery.transaction import Topic, Transaction
+from sonarpost.messages import Record
 
 
 class Effects:

@@ -1,1 +1,1 @@
-"""TODO-DOC."""
+"""Health records, heartbeat files, metrics, and the state of the fleet."""

@@ -16,11 +16,11 @@ from typing import Final
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import open_with_retry
 from sonarpost.config import TlsConfig
 from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Health
-from sonarpost.bus.session import open_with_retry
 
 log = logging.getLogger(__name__)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import ctypes
 import logging
 import os
 import signal
@@ -15,13 +14,12 @@ from types import FrameType
 
 from sonarpost import config, logs
 from sonarpost.errors import ConfigError, SonarpostError
+from sonarpost.parent_process import exit_with_parent
 from sonarpost.runtime.service import C, Service
 
 log = logging.getLogger(__name__)
 
 SHUTDOWN_S = 2.5
-EXIT_WITH_PARENT = "SONARPOST_EXIT_WITH_PARENT"
-_PR_SET_PDEATHSIG = 1
 EXIT_DEFECT = 1
 EXIT_CONFIG = 2
 EXIT_STUCK = 3
@@ -75,17 +73,6 @@ def _run(service: Service[C]) -> int:
         service.stop()
         guard.cancel()
     return EXIT_DEFECT if service.failed else 0
-
-
-def exit_with_parent() -> None:
-    """End this process when the one that started it ends, if the environment asks for it (the demo does; Linux)."""
-    parent = os.environ.get(EXIT_WITH_PARENT)
-    if parent is None or not sys.platform.startswith("linux"):
-        return
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != int(parent):
-        # It ended before the request above was in force.
-        os._exit(EXIT_DEFECT)
 
 
 def _give_up() -> None:

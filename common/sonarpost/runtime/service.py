@@ -22,20 +22,20 @@ from typing import ClassVar, Generic, TypeVar
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import open_with_retry
+from sonarpost.bus.tls import OwnTls
 from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.delivery.disk_reserve import HANDLING_RESERVE_BYTES, Room
+from sonarpost.delivery.inbox import Inbox
+from sonarpost.delivery.outbox import Lane, Outbox
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction
+from sonarpost.delivery.unit_of_work import Effects
 from sonarpost.errors import BadInputError, HandoffError
 from sonarpost.logs import concerning_later, kv
 from sonarpost.messages import Health, Record, ServiceState
-from sonarpost.monitoring.log_context import Concern
-from sonarpost.delivery.unit_of_work import Effects
 from sonarpost.monitoring.heartbeat import Heartbeat
-from sonarpost.delivery.inbox import Inbox
-from sonarpost.delivery.outbox import Lane, Outbox
-from sonarpost.delivery.disk_reserve import HANDLING_RESERVE_BYTES, Room
-from sonarpost.bus.session import open_with_retry
-from sonarpost.delivery.store import Store
-from sonarpost.bus.tls import OwnTls
-from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction
+from sonarpost.monitoring.log_context import Concern
 
 __all__ = ["Effects", "InterruptedByStopError", "Service"]
 

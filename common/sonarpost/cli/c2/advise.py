@@ -13,12 +13,12 @@ import zenoh
 from pydantic import ValidationError
 
 from sonarpost import keys
+from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.c2.options import add_site
 from sonarpost.cli.fleet_options import add_router_options, router_of
+from sonarpost.delivery.client import hand_over
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import Advice, Command, CommandKind, Record, Verdict
-from sonarpost.delivery.client import hand_over
-from sonarpost.bus.session import open_with_retry
 from sonarpost.wire import expected_text
 
 CONSUMER = "c2"

@@ -8,6 +8,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.cli.c2.options import add_out_dir, since_of
 from sonarpost.errors import BadInputError, ConfigError
 from sonarpost.export.accepted import Accepted, AcceptedContact, load_accepted
@@ -16,7 +17,6 @@ from sonarpost.export.cot_sender import CotSender, TlsFiles
 from sonarpost.export.csv_table import write_csv
 from sonarpost.export.geojson import write_geojson
 from sonarpost.export.kml import write_kml, write_kmz
-from sonarpost.archive.shore_index import ShoreIndex
 
 FORMATS = ("geojson", "kml", "kmz", "csv")
 EXIT_INCOMPLETE = 1

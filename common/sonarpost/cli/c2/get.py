@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sonarpost.archive.shore_files import files_of, find_picture
+from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.cli.c2.options import add_out_dir
 from sonarpost.errors import KeptFileError
 from sonarpost.files import write_atomically
-from sonarpost.archive.shore_files import files_of, find_picture
-from sonarpost.archive.shore_index import ShoreIndex
 
 
 def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

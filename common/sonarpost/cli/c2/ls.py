@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sonarpost.cli.c2.options import add_out_dir, printable, since_of, time_text
 from sonarpost.archive.shore_index import DecisionRow, PictureRow, ShoreIndex, TaskingRow
+from sonarpost.cli.c2.options import add_out_dir, printable, since_of, time_text
 
 PIPED_WIDTH = 160
 

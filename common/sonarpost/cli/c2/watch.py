@@ -13,11 +13,11 @@ from collections.abc import Callable
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.c2.options import add_site, printable, time_text
 from sonarpost.cli.fleet_options import add_router_options, router_of
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Decision, ReconstructedImage, Record, TaskingState
-from sonarpost.bus.session import open_with_retry
 
 LOOK_S = 0.2
 GONE_AFTER_S = 1.0

@@ -11,6 +11,7 @@ from typing import TypeVar
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
 from sonarpost.errors import FrameError, PayloadError, PortError
 from sonarpost.link.contact_record import ContactSummary
@@ -21,7 +22,6 @@ from sonarpost.link.v1_events import ContactUpdate
 from sonarpost.link.v1_receiver import Receiver
 from sonarpost.messages import AcousticFrame, EncodedImage, Health, QueueState, ReconstructedImage, Record, Snippet
 from sonarpost.modem.rates import RATES
-from sonarpost.bus.session import open_with_retry
 
 log = logging.getLogger(__name__)
 
