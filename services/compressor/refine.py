@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.interface import Codec, Extensible
-from sonarpost.link.v1_objects import MAX_STREAM_BYTES
+from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
 
 Picture = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 

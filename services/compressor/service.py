@@ -12,8 +12,8 @@ from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.interface import Codec
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.config import PlatformConfig
-from sonarpost.link.paper_format import format_image_id
-from sonarpost.link.v1_preview import MAX_NUMBER
+from sonarpost.link.frames.paper.frame import format_image_id
+from sonarpost.link.frames.v1.preview import MAX_NUMBER
 from sonarpost.logs import kv
 from sonarpost.messages import Command, CommandKind, EncodedImage, Record, Snippet
 from sonarpost.runtime.service import Effects, Service

@@ -13,11 +13,11 @@ from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.tiles import TileDatabase
 from sonarpost.codec.vq import catalogue_tag
 from sonarpost.errors import CatalogueError, StreamError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.downlink import image_of_number
-from sonarpost.link.paper_events import ContactOnly, ImageReady
-from sonarpost.link.paper_format import HalfName
-from sonarpost.link.v1_events import ContactUpdate
+from sonarpost.link.downlink.messages import image_of_number
+from sonarpost.link.events import ContactUpdate
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.events import ContactOnly, ImageReady
+from sonarpost.link.frames.paper.frame import HalfName
 from sonarpost.messages import Contact, Raster, ReconstructedImage
 
 

@@ -8,14 +8,14 @@ from typing import Literal
 import msgpack
 
 from sonarpost.errors import FrameError
-from sonarpost.link.paper_events import Event as PaperEvent
-from sonarpost.link.paper_format import parse_frame
-from sonarpost.link.paper_receiver import PairingReceiver
-from sonarpost.link.seal import AcousticSeal
-from sonarpost.link.v1_config import ReceiverConfig
-from sonarpost.link.v1_events import ContactUpdate, FrameRefused
-from sonarpost.link.v1_events import Event as V1Event
-from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.config import ReceiverConfig
+from sonarpost.link.events import ContactUpdate, FrameRefused
+from sonarpost.link.events import Event as V1Event
+from sonarpost.link.frames.paper.events import Event as PaperEvent
+from sonarpost.link.frames.paper.frame import parse_frame
+from sonarpost.link.frames.paper.receiver import PairingReceiver
+from sonarpost.link.receiver import Receiver
 
 LinkName = Literal["v1", "paper"]
 Event = PaperEvent | ContactUpdate | FrameRefused

@@ -12,10 +12,10 @@ from sonarpost.archive.image_files import write_picture
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.transaction import InboxItem
 from sonarpost.errors import BadInputError, ConfigError, HandoffError
-from sonarpost.link.paper_events import ContactOnly, FrameRejected, ImageReady
-from sonarpost.link.seal import AcousticSeal
-from sonarpost.link.seal_key import Direction
-from sonarpost.link.v1_events import ContactUpdate, FrameRefused
+from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.key import Direction
+from sonarpost.link.events import ContactUpdate, FrameRefused
+from sonarpost.link.frames.paper.events import ContactOnly, FrameRejected, ImageReady
 from sonarpost.logs import concerning, kv
 from sonarpost.messages import AcousticFrame, ReconstructedImage, Record
 from sonarpost.runtime.service import RETRY_AFTER_S, Effects, Service

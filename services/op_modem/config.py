@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sonarpost.link.medium import Slots
-from sonarpost.link.v1_config import ReceiverConfig
+from sonarpost.link.config import ReceiverConfig
+from sonarpost.link.mac import Slots
 from sonarpost.messages import PlatformId
 from sonarpost.modem.rates import RATES
 from sonarpost.runtime.modem_service import ModemServiceConfig

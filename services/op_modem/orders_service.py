@@ -14,10 +14,10 @@ from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.transaction import InboxItem
 from sonarpost.errors import FrameError, HandoffError, PayloadError
-from sonarpost.link.orders import OpenOrder
-from sonarpost.link.seal import AcousticSeal
-from sonarpost.link.seal_key import Direction
-from sonarpost.link.vessel import Packet
+from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.key import Direction
+from sonarpost.link.downlink.commands import OpenOrder
+from sonarpost.link.downlink.vessel_endpoint import Packet
 from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame, Command, Decision, ReceivedMessage, Record
 from sonarpost.modem.events import FrameReceived, PacketFailed, PacketReceived, PacketSent

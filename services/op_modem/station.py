@@ -5,11 +5,11 @@ from __future__ import annotations
 import msgpack
 
 from sonarpost.errors import FrameError, PayloadError
-from sonarpost.link import downlink as dl
-from sonarpost.link.orders import MOST_OPEN, OpenOrder, OrderBook
-from sonarpost.link.seal import AcousticSeal
-from sonarpost.link.v1_frame import segments_room
-from sonarpost.link.vessel import VesselLink
+from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.downlink import messages as dl
+from sonarpost.link.downlink.commands import MOST_OPEN, OpenOrder, OrderBook
+from sonarpost.link.downlink.vessel_endpoint import VesselLink
+from sonarpost.link.frames.v1.frame import segments_room
 from sonarpost.messages import Command, Decision, DownlinkState
 from sonarpost.modem.rates import RATES
 from sonarpost.services.op_modem.config import OpModemConfig

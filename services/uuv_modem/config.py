@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sonarpost.link.medium import Continuous, Medium, OnPoll, RandomAccess, Slots
-from sonarpost.link.queue import QueueConfig
+from sonarpost.link.mac import Continuous, Medium, OnPoll, RandomAccess, Slots
+from sonarpost.link.queue.transmit_queue import QueueConfig
 from sonarpost.modem.rates import RATES
 from sonarpost.runtime.modem_service import ModemServiceConfig
 

@@ -14,8 +14,9 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import BadInputError, FrameError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.downlink import (
+from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.key import Direction
+from sonarpost.link.downlink.messages import (
     Confirmation,
     Data,
     DownlinkOrder,
@@ -27,15 +28,14 @@ from sonarpost.link.downlink import (
     pack,
     unpack,
 )
-from sonarpost.link.queue import AcousticQueue, PictureName
-from sonarpost.link.queue_state import export_queue, restore_queue, salvage_queue
-from sonarpost.link.seal import AcousticSeal
-from sonarpost.link.seal_key import Direction
-from sonarpost.link.v1_events import FrameRefused, MessageReceived, ReportReceived
-from sonarpost.link.v1_feedback import unpack_mini
-from sonarpost.link.v1_frame import BLOCKS
-from sonarpost.link.v1_objects import MAX_STREAM_BYTES
-from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.events import FrameRefused, MessageReceived, ReportReceived
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.v1.feedback import unpack_mini
+from sonarpost.link.frames.v1.frame import BLOCKS
+from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
+from sonarpost.link.queue.state import export_queue, restore_queue, salvage_queue
+from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName
+from sonarpost.link.receiver import Receiver
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
 from sonarpost.modem.rates import RATES

@@ -11,7 +11,7 @@ from typing import Final
 
 from sonarpost import wire
 from sonarpost.errors import BadInputError, HandoffError
-from sonarpost.link.medium import Medium
+from sonarpost.link.mac import Medium
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
 from sonarpost.modem.events import (

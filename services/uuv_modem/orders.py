@@ -8,7 +8,7 @@ from typing import Final
 
 from sonarpost import keys
 from sonarpost.errors import FrameError
-from sonarpost.link.downlink import (
+from sonarpost.link.downlink.messages import (
     DownlinkOrder,
     Judgement,
     Outcome,
@@ -20,7 +20,7 @@ from sonarpost.link.downlink import (
     pack,
     record_id_of,
 )
-from sonarpost.link.v1_state import read_list
+from sonarpost.link.receiver_state import read_list
 from sonarpost.messages import Command, CommandKind, Decision, Record
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 

@@ -14,8 +14,8 @@ from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.inbox import NotNowError
 from sonarpost.delivery.transaction import InboxItem
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.paper_sender import Packet, plan_packets
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.sender import Packet, plan_packets
 from sonarpost.logs import kv
 from sonarpost.messages import (
     AcousticFrame,

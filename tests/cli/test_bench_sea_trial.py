@@ -16,7 +16,7 @@ from sonarpost.cli.bench.sea_trial import SIZES_PX, Cell, claims, measure, table
 from sonarpost.cli.bench.sea_trial_rig import Delivered, Rig, Sample, cross
 from sonarpost.cli.main import main
 from sonarpost.codec.vq import IndexPacking, VqCodec
-from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.sim.water import Water
 from sonarpost.sim.water_config import WaterConfig
 from sonarpost.sim.water_file import make_water

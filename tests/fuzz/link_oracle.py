@@ -13,8 +13,8 @@ from typing import Final
 from link import v1_fuzz
 from modem.fuzz import ENDS, LIKELY, Fuzz, real_lines
 
-from sonarpost.link.v1_events import ContactUpdate, MessageReceived
-from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.events import ContactUpdate, MessageReceived
+from sonarpost.link.receiver import Receiver
 from sonarpost.modem import nmea
 from sonarpost.modem.config import MicroModemConfig
 from sonarpost.modem.micromodem import MicroModem

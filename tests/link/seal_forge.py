@@ -15,7 +15,7 @@ import time
 from link.seal_world import VEHICLE, vehicle_seal, vessel_seal
 
 from sonarpost.errors import FrameError
-from sonarpost.link.seal_key import SealSettings
+from sonarpost.link.auth.key import SealSettings
 
 
 def forge(rng: random.Random, recorded: list[bytes], added: int) -> bytes:

@@ -7,9 +7,9 @@ from dataclasses import asdict
 
 from link.v1_golden import FOLDER
 
-from sonarpost.link.seal import AcousticSeal
-from sonarpost.link.seal_key import Direction, SealSettings, parse_key
-from sonarpost.link.v1_frame import Segment, SegmentKind, Symbol, SymbolKind, pack_segments, pack_symbol
+from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.key import Direction, SealSettings, parse_key
+from sonarpost.link.frames.v1.frame import Segment, SegmentKind, Symbol, SymbolKind, pack_segments, pack_symbol
 
 KEY = "7d0a4c1fe2b39586a1c4d7f00918273645546372819fa0becdacebfa1d2e3f40"
 CASES = (

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 
-from sonarpost.link.seal import AcousticSeal
-from sonarpost.link.seal_key import Direction, SealKey, SealSettings
+from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.key import Direction, SealKey, SealSettings
 
 VEHICLE, VESSEL = 3, 1
 

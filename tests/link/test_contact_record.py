@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
-from sonarpost.link.contact_record import RECORD_SIZE, ContactSummary
+from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary
 from sonarpost.sonar.survey import Side
 
 

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
-from sonarpost.link import downlink as dl
-from sonarpost.link.v1_frame import Segment, SegmentKind, pack_segments, parse_frame
+from sonarpost.link.downlink import messages as dl
+from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments, parse_frame
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "acoustic-v1" / "messages.json"
 SAMPLES: dict[str, dl.Content] = {

@@ -7,7 +7,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.link.intervals import Ranges, add_range, count_positions, covered_within, gaps_within
+from sonarpost.link.coding.byte_ranges import Ranges, add_range, count_positions, covered_within, gaps_within
 
 SPAN = st.tuples(st.integers(0, 40), st.integers(0, 40)).map(lambda p: (min(p), max(p)))
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.medium import Continuous, OnPoll, RandomAccess, Slots
+from sonarpost.link.mac import Continuous, OnPoll, RandomAccess, Slots
 
 TIMES = st.floats(1e9, 2e9)
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from sonarpost.codec.interface import COMMON_SIDES_PX, StreamHeader, tag_length
 from sonarpost.errors import FrameError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.paper_format import (
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import (
     CONTACT_FRAME_SIZE,
     HALF_PREFIX_SIZE,
     MAX_HALF_HEADER_SIZE,

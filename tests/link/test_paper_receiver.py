@@ -14,9 +14,9 @@ import pytest
 
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import FrameError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.paper_format import ContactFrame, HalfFrame, format_image_id, half_bounds
-from sonarpost.link.paper_receiver import (
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, format_image_id, half_bounds
+from sonarpost.link.frames.paper.receiver import (
     ContactOnly,
     Event,
     FrameRejected,

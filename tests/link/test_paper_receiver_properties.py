@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import FrameError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.intervals import Ranges
-from sonarpost.link.paper_format import ContactFrame, HalfFrame, parse_frame
-from sonarpost.link.paper_receiver import ContactOnly, Event, FrameRejected, ImageReady, PairingReceiver
-from sonarpost.link.paper_sender import plan_packets
+from sonarpost.link.coding.byte_ranges import Ranges
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, parse_frame
+from sonarpost.link.frames.paper.receiver import ContactOnly, Event, FrameRejected, ImageReady, PairingReceiver
+from sonarpost.link.frames.paper.sender import plan_packets
 
 RATES = [(1, 32), (3, 64), (2, 256), (6, 32)]
 CONTACT = ContactSummary(height_px=80, width_px=140, lat_deg=44.7, lon_deg=-63.6, confidence=1.5)

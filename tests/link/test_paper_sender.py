@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import FrameError, StreamError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.paper_format import ContactFrame, HalfFrame, half_bounds, parse_frame
-from sonarpost.link.paper_receiver import ImageReady, PairingReceiver
-from sonarpost.link.paper_sender import Packet, body_capacity_bytes, plan_packets
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, half_bounds, parse_frame
+from sonarpost.link.frames.paper.receiver import ImageReady, PairingReceiver
+from sonarpost.link.frames.paper.sender import Packet, body_capacity_bytes, plan_packets
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "link" / "paper_packets.json").read_text())["plans"]
 RATES = {0: (1, 32), 1: (3, 64), 2: (3, 64), 3: (2, 256), 4: (2, 256), 5: (8, 256), 6: (6, 32)}

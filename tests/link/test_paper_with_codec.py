@@ -7,9 +7,9 @@ import pytest
 
 from sonarpost.codec.tiles import TileDatabase, cut_tiles
 from sonarpost.codec.vq import VqCodec
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.paper_receiver import ImageReady, PairingReceiver
-from sonarpost.link.paper_sender import Packet, plan_packets
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.receiver import ImageReady, PairingReceiver
+from sonarpost.link.frames.paper.sender import Packet, plan_packets
 
 HEIGHT_PX, WIDTH_PX, TILE_PX = 80, 140, 10
 CONTACT = ContactSummary(height_px=HEIGHT_PX, width_px=WIDTH_PX, lat_deg=44.7, lon_deg=-63.6)

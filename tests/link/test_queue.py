@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.errors import ConfigError, FrameError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.queue import AcousticQueue, PictureName, QueueConfig
-from sonarpost.link.queue_state import export_queue, restore_queue
-from sonarpost.link.v1_events import ContactUpdate, MessageReceived
-from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.events import ContactUpdate, MessageReceived
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.queue.state import export_queue, restore_queue
+from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName, QueueConfig
+from sonarpost.link.receiver import Receiver
 from sonarpost.modem.rates import RATES
 
 CONTACT = ContactSummary(height_px=80, width_px=80, lat_deg=56.4, lon_deg=-5.6, confidence=1.5)

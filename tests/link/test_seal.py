@@ -12,15 +12,15 @@ from link.seal_world import VEHICLE, VESSEL, key, skip, vehicle_seal, vessel_sea
 from link.v1_world import contact, stream
 
 from sonarpost.errors import ConfigError, FrameError
-from sonarpost.link.bounds import Channel
-from sonarpost.link.seal import RESERVED, AcousticSeal, SealCounts
-from sonarpost.link.seal_key import Direction, SealSettings
-from sonarpost.link.seal_window import WINDOW, ReplayWindow
-from sonarpost.link.v1_config import SenderConfig
-from sonarpost.link.v1_events import ContactUpdate, FrameRefused, ReportReceived
-from sonarpost.link.v1_frame import Symbol, SymbolKind, checksum, pack_symbol, parse_frame
-from sonarpost.link.v1_receiver import Receiver
-from sonarpost.link.v1_sender import Sender
+from sonarpost.link.auth.authentication import RESERVED, AcousticSeal, SealCounts
+from sonarpost.link.auth.key import Direction, SealSettings
+from sonarpost.link.auth.replay_window import WINDOW, ReplayWindow
+from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.config import SenderConfig
+from sonarpost.link.events import ContactUpdate, FrameRefused, ReportReceived
+from sonarpost.link.frames.v1.frame import Symbol, SymbolKind, checksum, pack_symbol, parse_frame
+from sonarpost.link.receiver import Receiver
+from sonarpost.link.sender import Sender
 
 ALL_SETTINGS = [
     SealSettings(counter, tag, encrypt) for counter, tag, encrypt in itertools.product((1, 2), (4, 6, 8), (False, True))

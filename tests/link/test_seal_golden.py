@@ -13,12 +13,12 @@ from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 from link import seal_golden
 from link.v1_golden import FOLDER
 
-from sonarpost.link.seal import RESERVED, AcousticSeal
-from sonarpost.link.seal_key import Direction, SealSettings, parse_key
-from sonarpost.link.seal_window import WINDOW
-from sonarpost.link.v1_config import SenderConfig
-from sonarpost.link.v1_frame import Segment, SegmentKind, Symbol, checksum, parse_frame
-from sonarpost.link.v1_sender import Sender
+from sonarpost.link.auth.authentication import RESERVED, AcousticSeal
+from sonarpost.link.auth.key import Direction, SealSettings, parse_key
+from sonarpost.link.auth.replay_window import WINDOW
+from sonarpost.link.config import SenderConfig
+from sonarpost.link.frames.v1.frame import Segment, SegmentKind, Symbol, checksum, parse_frame
+from sonarpost.link.sender import Sender
 from sonarpost.modem.rates import RATES
 
 SEAL = AcousticSeal(parse_key(seal_golden.KEY, "golden"), 3, Direction.FROM_VEHICLE)

@@ -9,7 +9,7 @@ import pytest
 from link.seal_world import key
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.seal_key import Direction, SealKey, SealSettings, parse_key
+from sonarpost.link.auth.key import Direction, SealKey, SealSettings, parse_key
 from sonarpost.security.acoustic_key import read_key
 
 SECRET = bytes(range(100, 132))

@@ -8,9 +8,9 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from link.seal_world import VEHICLE, key, vehicle_seal, vessel_seal
 
 from sonarpost.errors import FrameError
-from sonarpost.link.seal import RESERVED, AcousticSeal
-from sonarpost.link.seal_key import Direction, SealSettings
-from sonarpost.link.seal_window import WINDOW, ReplayWindow
+from sonarpost.link.auth.authentication import RESERVED, AcousticSeal
+from sonarpost.link.auth.key import Direction, SealSettings
+from sonarpost.link.auth.replay_window import WINDOW, ReplayWindow
 
 NEAR = SealSettings().counter_step - WINDOW
 

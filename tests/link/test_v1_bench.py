@@ -19,7 +19,7 @@ from sonarpost.cli.bench.link_schemes import (
     run_v1,
 )
 from sonarpost.cli.main import main
-from sonarpost.link.bounds import Channel
+from sonarpost.link.coding.channel_capacity import Channel
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.bounds import (
+from sonarpost.link.coding.channel_capacity import (
     Channel,
     erasure_bound_frames,
     frames_for,

@@ -6,10 +6,11 @@ import re
 import zlib
 from pathlib import Path
 
-from sonarpost.link.bounds import Channel
-from sonarpost.link.v1_config import ReceiverConfig, SenderConfig
-from sonarpost.link.v1_feedback import WINDOW, Feedback
-from sonarpost.link.v1_frame import (
+from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.coding.redundancy_plan import PREVIEWS_UNSEEN
+from sonarpost.link.config import ReceiverConfig, SenderConfig
+from sonarpost.link.frames.v1.feedback import WINDOW, Feedback
+from sonarpost.link.frames.v1.frame import (
     BLOCKS,
     HEADER_BYTES,
     PADDED_LENGTHS,
@@ -19,9 +20,8 @@ from sonarpost.link.v1_frame import (
     checksum,
     parse_frame,
 )
-from sonarpost.link.v1_messages import MAX_MESSAGE_BYTES
-from sonarpost.link.v1_plan import PREVIEWS_UNSEEN
-from sonarpost.link.v1_preview import Preview, entry_shape
+from sonarpost.link.frames.v1.preview import Preview, entry_shape
+from sonarpost.link.sender_messages import MAX_MESSAGE_BYTES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire-acoustic-v1.md").read_text(encoding="utf-8")
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
-from sonarpost.link import fec
+from sonarpost.link.coding import erasure_code as fec
 
 
 @pytest.mark.parametrize("count", [1, 2, 16, 100, 223, 254])

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
-from sonarpost.link.v1_frame import (
+from sonarpost.link.frames.v1.frame import (
     PADDED_LENGTHS,
     Segment,
     SegmentKind,
@@ -111,7 +111,7 @@ def test_segments_that_cannot_be_packed(listed: list[Segment], frame_bytes: int)
 
 
 def with_checksum(covered: bytes) -> bytes:
-    from sonarpost.link.v1_frame import checksum
+    from sonarpost.link.frames.v1.frame import checksum
 
     return checksum(covered).to_bytes(2, "big") + covered
 

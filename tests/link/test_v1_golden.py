@@ -10,12 +10,12 @@ import pytest
 from link import v1_golden
 
 from sonarpost.errors import FrameError
-from sonarpost.link import fec
-from sonarpost.link.v1_frame import parse_frame
-from sonarpost.link.v1_layers import Layering, recover_layer, recover_layering
-from sonarpost.link.v1_objects import Message, Pieces, unpack_object
-from sonarpost.link.v1_preview import Preview
-from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.coding import erasure_code as fec
+from sonarpost.link.frames.v1.frame import parse_frame
+from sonarpost.link.frames.v1.layers import Layering, recover_layer, recover_layering
+from sonarpost.link.frames.v1.payload_objects import Message, Pieces, unpack_object
+from sonarpost.link.frames.v1.preview import Preview
+from sonarpost.link.receiver import Receiver
 
 
 def golden(name: str) -> Any:

@@ -10,14 +10,22 @@ import pytest
 from link.v1_world import VEHICLE, World, contact, stream
 
 from sonarpost.errors import ConfigError, FrameError, StreamError
-from sonarpost.link.bounds import Channel, erasure_bound_frames
-from sonarpost.link.v1_config import ReceiverConfig, SenderConfig
-from sonarpost.link.v1_events import ContactUpdate, FrameRefused
-from sonarpost.link.v1_feedback import Feedback, Request
-from sonarpost.link.v1_frame import Segment, SegmentKind, Symbol, SymbolKind, pack_segments, pack_symbol, parse_frame
-from sonarpost.link.v1_receiver import Receiver
-from sonarpost.link.v1_sender import Sender
-from sonarpost.link.v1_sender_state import export_sender, restore_sender
+from sonarpost.link.coding.channel_capacity import Channel, erasure_bound_frames
+from sonarpost.link.config import ReceiverConfig, SenderConfig
+from sonarpost.link.events import ContactUpdate, FrameRefused
+from sonarpost.link.frames.v1.feedback import Feedback, Request
+from sonarpost.link.frames.v1.frame import (
+    Segment,
+    SegmentKind,
+    Symbol,
+    SymbolKind,
+    pack_segments,
+    pack_symbol,
+    parse_frame,
+)
+from sonarpost.link.receiver import Receiver
+from sonarpost.link.sender import Sender
+from sonarpost.link.sender_state import export_sender, restore_sender
 
 SIZES = (32, 64, 256, 100)
 

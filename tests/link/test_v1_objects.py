@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.v1_feedback import Feedback, Request, pack_mini, unpack_mini
-from sonarpost.link.v1_layers import Layering, layered_symbols, recover_layer, recover_layering
-from sonarpost.link.v1_objects import Message, Piece, Pieces, unpack_object
-from sonarpost.link.v1_preview import Preview, contact_link, entry_shape, next_number
-from sonarpost.link.v1_reports import LossMeter
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.v1.feedback import Feedback, Request, pack_mini, unpack_mini
+from sonarpost.link.frames.v1.layers import Layering, layered_symbols, recover_layer, recover_layering
+from sonarpost.link.frames.v1.payload_objects import Message, Piece, Pieces, unpack_object
+from sonarpost.link.frames.v1.preview import Preview, contact_link, entry_shape, next_number
+from sonarpost.link.sender_feedback import LossMeter
 
 CONTACT = ContactSummary(lat_deg=44.7, lon_deg=-63.6, confidence=1.0).rounded()
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sonarpost.errors import ConfigError, StreamError
-from sonarpost.link.bounds import Channel
-from sonarpost.link.v1_gain import GroupGain, quality_curve
-from sonarpost.link.v1_plan import (
+from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.coding.rate_distortion import GroupGain, quality_curve
+from sonarpost.link.coding.redundancy_plan import (
     arrivals,
     best_rate,
     copies,

@@ -12,11 +12,11 @@ from link import v1_fuzz
 from link.v1_world import VEHICLE, contact, stream
 
 from sonarpost.errors import FrameError
-from sonarpost.link.bounds import Channel
-from sonarpost.link.v1_config import ReceiverConfig, SenderConfig
-from sonarpost.link.v1_events import ContactUpdate, Event, FrameRefused, MessageReceived
-from sonarpost.link.v1_receiver import Receiver
-from sonarpost.link.v1_sender import Sender
+from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.config import ReceiverConfig, SenderConfig
+from sonarpost.link.events import ContactUpdate, Event, FrameRefused, MessageReceived
+from sonarpost.link.receiver import Receiver
+from sonarpost.link.sender import Sender
 
 
 @st.composite

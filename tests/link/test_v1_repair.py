@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from link.v1_world import VEHICLE, contact, stream
 
-from sonarpost.link.intervals import count_positions
-from sonarpost.link.queue import AcousticQueue, PictureName, QueueConfig
-from sonarpost.link.queue_state import export_queue, restore_queue
-from sonarpost.link.v1_events import ContactUpdate, MessageReceived
-from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.coding.byte_ranges import count_positions
+from sonarpost.link.events import ContactUpdate, MessageReceived
+from sonarpost.link.queue.state import export_queue, restore_queue
+from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName, QueueConfig
+from sonarpost.link.receiver import Receiver
 from sonarpost.modem.rates import RATES
 
 VESSEL = 1

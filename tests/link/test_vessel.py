@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from sonarpost.errors import FrameError
-from sonarpost.link import downlink as dl
-from sonarpost.link.bounds import Channel
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.orders import MOST_OPEN, OpenOrder, OrderBook, OrderState
-from sonarpost.link.v1_config import ReceiverConfig, SenderConfig
-from sonarpost.link.v1_events import MessageReceived, ReportReceived
-from sonarpost.link.v1_frame import Segment, SegmentKind, pack_segments
-from sonarpost.link.v1_receiver import Receiver
-from sonarpost.link.v1_sender import Sender
-from sonarpost.link.vessel import VesselLink
+from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.config import ReceiverConfig, SenderConfig
+from sonarpost.link.downlink import messages as dl
+from sonarpost.link.downlink.commands import MOST_OPEN, OpenOrder, OrderBook, OrderState
+from sonarpost.link.downlink.vessel_endpoint import VesselLink
+from sonarpost.link.events import MessageReceived, ReportReceived
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
+from sonarpost.link.receiver import Receiver
+from sonarpost.link.sender import Sender
 
 UUV, VESSEL = 3, 1
 LASTING_S = 3600.0

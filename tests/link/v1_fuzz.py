@@ -11,12 +11,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.v1_config import ReceiverConfig, SenderConfig
-from sonarpost.link.v1_events import ContactUpdate, MessageReceived
-from sonarpost.link.v1_frame import checksum
-from sonarpost.link.v1_receiver import Receiver
-from sonarpost.link.v1_sender import Sender
+from sonarpost.link.config import ReceiverConfig, SenderConfig
+from sonarpost.link.events import ContactUpdate, MessageReceived
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.v1.frame import checksum
+from sonarpost.link.receiver import Receiver
+from sonarpost.link.sender import Sender
 
 SMALL = ReceiverConfig(max_sources=3, max_contacts=20, block_memory_s=300.0, contact_memory_s=900.0)
 MESSAGE = b"status: "

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from sonarpost.link import fec
-from sonarpost.link.bounds import Channel
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.v1_config import SenderConfig
-from sonarpost.link.v1_events import ContactUpdate, Event, FrameRefused, MessageReceived, ReportReceived
-from sonarpost.link.v1_feedback import Feedback, Request, pack_mini
-from sonarpost.link.v1_frame import (
+from sonarpost.link.coding import erasure_code as fec
+from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.config import SenderConfig
+from sonarpost.link.events import ContactUpdate, Event, FrameRefused, MessageReceived, ReportReceived
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.v1.feedback import Feedback, Request, pack_mini
+from sonarpost.link.frames.v1.frame import (
     Content,
     Segment,
     SegmentKind,
@@ -27,11 +27,11 @@ from sonarpost.link.v1_frame import (
     pack_segments,
     pack_symbol,
 )
-from sonarpost.link.v1_layers import Layering, layered_symbols
-from sonarpost.link.v1_objects import Message, Piece, Pieces
-from sonarpost.link.v1_preview import Preview
-from sonarpost.link.v1_receiver import Receiver
-from sonarpost.link.v1_sender import Sender
+from sonarpost.link.frames.v1.layers import Layering, layered_symbols
+from sonarpost.link.frames.v1.payload_objects import Message, Piece, Pieces
+from sonarpost.link.frames.v1.preview import Preview
+from sonarpost.link.receiver import Receiver
+from sonarpost.link.sender import Sender
 from sonarpost.sonar.survey import Side
 
 FOLDER = Path(__file__).parents[1] / "golden" / "acoustic-v1"

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.v1_config import ReceiverConfig, SenderConfig
-from sonarpost.link.v1_events import ContactUpdate, Event, FrameRefused, MessageReceived, ReportReceived
-from sonarpost.link.v1_receiver import Receiver
-from sonarpost.link.v1_sender import Sender
+from sonarpost.link.config import ReceiverConfig, SenderConfig
+from sonarpost.link.events import ContactUpdate, Event, FrameRefused, MessageReceived, ReportReceived
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.receiver import Receiver
+from sonarpost.link.sender import Sender
 
 VEHICLE = 3
 VESSEL = 1

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from sonarpost import keys, logs, wire
 from sonarpost.config import PlatformConfig
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.paper_sender import plan_packets
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.messages import AcousticFrame, Contact, Decision, Raster, Relayed, Snippet
 from sonarpost.monitoring.log_context import Concern, concern_of_payload
 from sonarpost.services.relay.config import RelayConfig

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.downlink import image_of_number
-from sonarpost.link.seal import AcousticSeal
-from sonarpost.link.seal_key import Direction, SealKey
-from sonarpost.link.v1_config import SenderConfig
-from sonarpost.link.v1_sender import Sender
+from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.key import Direction, SealKey
+from sonarpost.link.config import SenderConfig
+from sonarpost.link.downlink.messages import image_of_number
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.sender import Sender
 from sonarpost.monitoring.log_context import image_of_frame
 
 

@@ -21,9 +21,9 @@ from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.tiles import TileDatabase
 from sonarpost.codec.vq import catalogue_tag
 from sonarpost.errors import CatalogueError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.paper_format import ContactFrame, parse_frame
-from sonarpost.link.paper_sender import plan_packets
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import ContactFrame, parse_frame
+from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.messages import AcousticFrame, ReconstructedImage
 from sonarpost.runtime.service import Effects
 from sonarpost.services.decompressor import service as decompressor

@@ -13,16 +13,16 @@ from sonarpost import keys
 from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.errors import ConfigError
-from sonarpost.link.bounds import Channel
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.downlink import image_of_number
-from sonarpost.link.paper_sender import plan_packets
-from sonarpost.link.seal import AcousticSeal
-from sonarpost.link.seal_key import Direction
-from sonarpost.link.v1_config import SenderConfig
-from sonarpost.link.v1_frame import Segment, SegmentKind, pack_segments
-from sonarpost.link.v1_preview import ENTRY_HEAD_BYTES, Preview
-from sonarpost.link.v1_sender import Sender
+from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.key import Direction
+from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.config import SenderConfig
+from sonarpost.link.downlink.messages import image_of_number
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.sender import plan_packets
+from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
+from sonarpost.link.frames.v1.preview import ENTRY_HEAD_BYTES, Preview
+from sonarpost.link.sender import Sender
 from sonarpost.messages import AcousticFrame, ReconstructedImage
 from sonarpost.runtime.service import Effects
 from sonarpost.security.acoustic_key import read_key

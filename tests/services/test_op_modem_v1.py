@@ -11,16 +11,16 @@ from pydantic import ValidationError
 
 from sonarpost import keys, wire
 from sonarpost.errors import PayloadError
-from sonarpost.link import downlink as dl
-from sonarpost.link.bounds import Channel
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.seal import AcousticSeal
-from sonarpost.link.seal_key import Direction
-from sonarpost.link.v1_config import SenderConfig
-from sonarpost.link.v1_events import MessageReceived, ReportReceived
-from sonarpost.link.v1_frame import Segment, SegmentKind, pack_segments
-from sonarpost.link.v1_receiver import Receiver
-from sonarpost.link.v1_sender import Sender
+from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.key import Direction
+from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.config import SenderConfig
+from sonarpost.link.downlink import messages as dl
+from sonarpost.link.events import MessageReceived, ReportReceived
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
+from sonarpost.link.receiver import Receiver
+from sonarpost.link.sender import Sender
 from sonarpost.messages import AcousticFrame, Command, Decision, DownlinkState, ReceivedMessage
 from sonarpost.modem.config import MicroModemConfig
 from sonarpost.modem.events import FrameReceived, PacketReceived

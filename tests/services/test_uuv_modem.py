@@ -16,8 +16,8 @@ from sonarpost import keys
 from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.errors import ConfigError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.paper_sender import plan_packets
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.messages import AcousticFrame, Contact, EncodedImage
 from sonarpost.modem import nmea
 from sonarpost.modem.rates import RATES

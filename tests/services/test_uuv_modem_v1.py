@@ -13,15 +13,26 @@ from conftest import eventually
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.store import Store
-from sonarpost.link.downlink import Confirmation, Data, Judgement, Outcome, Refine, Resend, Revisit, Wider, pack, unpack
-from sonarpost.link.paper_format import format_image_id
-from sonarpost.link.seal import AcousticSeal
-from sonarpost.link.seal_key import Direction, SealKey
-from sonarpost.link.v1_config import SenderConfig
-from sonarpost.link.v1_events import ContactUpdate, FrameRefused, MessageReceived
-from sonarpost.link.v1_frame import checksum
-from sonarpost.link.v1_receiver import Receiver
-from sonarpost.link.v1_sender import Sender
+from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.key import Direction, SealKey
+from sonarpost.link.config import SenderConfig
+from sonarpost.link.downlink.messages import (
+    Confirmation,
+    Data,
+    Judgement,
+    Outcome,
+    Refine,
+    Resend,
+    Revisit,
+    Wider,
+    pack,
+    unpack,
+)
+from sonarpost.link.events import ContactUpdate, FrameRefused, MessageReceived
+from sonarpost.link.frames.paper.frame import format_image_id
+from sonarpost.link.frames.v1.frame import checksum
+from sonarpost.link.receiver import Receiver
+from sonarpost.link.sender import Sender
 from sonarpost.messages import (
     AcousticFrame,
     Command,

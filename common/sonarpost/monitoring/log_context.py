@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping
 
 from sonarpost import wire
 from sonarpost.errors import BadInputError, FrameError, PayloadError
-from sonarpost.link.downlink import image_of_number
-from sonarpost.link.paper_format import parse_frame
-from sonarpost.link.v1_frame import Content, SegmentKind, Symbol, SymbolKind, parse_symbol
-from sonarpost.link.v1_frame import parse_frame as parse_v1_frame
-from sonarpost.link.v1_preview import Preview, entry_shape
+from sonarpost.link.downlink.messages import image_of_number
+from sonarpost.link.frames.paper.frame import parse_frame
+from sonarpost.link.frames.v1.frame import Content, SegmentKind, Symbol, SymbolKind, parse_symbol
+from sonarpost.link.frames.v1.frame import parse_frame as parse_v1_frame
+from sonarpost.link.frames.v1.preview import Preview, entry_shape
 from sonarpost.messages import AcousticFrame, Record, Relayed
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.seal_key import SealKey, parse_key
+from sonarpost.link.auth.key import SealKey, parse_key
 
 _MAX_BYTES: Final = 256
 

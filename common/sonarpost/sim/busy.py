@@ -13,13 +13,13 @@ from typing import Final
 import numpy as np
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.medium import Continuous
-from sonarpost.link.orders import OrderBook
-from sonarpost.link.queue import AcousticQueue, PictureName, QueueConfig
-from sonarpost.link.v1_events import ReportReceived
-from sonarpost.link.v1_receiver import Receiver
-from sonarpost.link.vessel import Packet, VesselLink
+from sonarpost.link.downlink.commands import OrderBook
+from sonarpost.link.downlink.vessel_endpoint import Packet, VesselLink
+from sonarpost.link.events import ReportReceived
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.mac import Continuous
+from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName, QueueConfig
+from sonarpost.link.receiver import Receiver
 from sonarpost.modem.config import MicroModemConfig
 from sonarpost.modem.events import Event, FrameHeard, FrameReceived, PacketFailed, PacketSent
 from sonarpost.modem.micromodem import MicroModem

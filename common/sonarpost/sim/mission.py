@@ -14,14 +14,14 @@ import msgpack
 import numpy as np
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.medium import Slots
-from sonarpost.link.queue import AcousticQueue, PictureName, QueueConfig
-from sonarpost.link.queue_state import export_queue, restore_queue
-from sonarpost.link.v1_config import ReceiverConfig
-from sonarpost.link.v1_events import ContactUpdate, Event, MessageReceived
-from sonarpost.link.v1_feedback import Feedback
-from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.config import ReceiverConfig
+from sonarpost.link.events import ContactUpdate, Event, MessageReceived
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.v1.feedback import Feedback
+from sonarpost.link.mac import Slots
+from sonarpost.link.queue.state import export_queue, restore_queue
+from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName, QueueConfig
+from sonarpost.link.receiver import Receiver
 from sonarpost.modem.rates import RATES
 
 _SLOT_S: Final = 7.5

@@ -11,7 +11,7 @@ from sonarpost import keys, wire
 from sonarpost.codec.interface import StreamHeader, to_uint8
 from sonarpost.codec.vq import IndexPacking
 from sonarpost.errors import CatalogueError, ConfigError
-from sonarpost.link.paper_format import format_image_id, is_image_id
+from sonarpost.link.frames.paper.frame import format_image_id, is_image_id
 from sonarpost.messages import Contact, EncodedImage, Raster, Snippet
 from sonarpost.services.compressor.config import CompressorConfig
 from sonarpost.services.compressor.service import IMAGE_IDS, CompressorService

@@ -10,7 +10,7 @@ from records import command_record
 
 from sonarpost import keys
 from sonarpost.detect.contacts import detect
-from sonarpost.link import downlink as dl
+from sonarpost.link.downlink import messages as dl
 from sonarpost.messages import Contact, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.record import of_detection

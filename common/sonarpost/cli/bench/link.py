@@ -26,8 +26,8 @@ from sonarpost.cli.bench.link_schemes import (
 )
 from sonarpost.cli.bench.pictures import PictureSet, read_folder, simulated_pictures
 from sonarpost.errors import ConfigError
-from sonarpost.link.bounds import Channel, erasure_bound_frames
-from sonarpost.link.v1_frame import MAX_FRAME_BYTES, MIN_FRAME_BYTES
+from sonarpost.link.coding.channel_capacity import Channel, erasure_bound_frames
+from sonarpost.link.frames.v1.frame import MAX_FRAME_BYTES, MIN_FRAME_BYTES
 
 _Row = dict[str, object]
 _Scheme = Callable[[Sequence[LinkPicture], Codecs, Setting], Outcome]

@@ -13,7 +13,7 @@ from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import Image, Mask
 from sonarpost.codec.quality import psnr_db, ssim
 from sonarpost.codec.vq import IndexPacking, VqCodec
-from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.frames.contact_record import ContactSummary
 
 PSNR_LIMIT_DB: Final = 60.0
 GREY: Final = 128

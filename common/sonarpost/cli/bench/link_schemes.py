@@ -9,16 +9,16 @@ from typing import Final
 import numpy as np
 
 from sonarpost.cli.bench.link_pictures import GREY, Codecs, LinkPicture, Quality, judge
-from sonarpost.link.bounds import Channel, received_distribution
-from sonarpost.link.contact_record import RECORD_SIZE
-from sonarpost.link.paper_events import ContactOnly, ImageReady
-from sonarpost.link.paper_format import format_image_id
-from sonarpost.link.paper_receiver import PairingReceiver
-from sonarpost.link.paper_sender import plan_packets
-from sonarpost.link.v1_config import ReceiverConfig, SenderConfig
-from sonarpost.link.v1_events import ContactUpdate, ReportReceived
-from sonarpost.link.v1_receiver import Receiver
-from sonarpost.link.v1_sender import Sender
+from sonarpost.link.coding.channel_capacity import Channel, received_distribution
+from sonarpost.link.config import ReceiverConfig, SenderConfig
+from sonarpost.link.events import ContactUpdate, ReportReceived
+from sonarpost.link.frames.contact_record import RECORD_SIZE
+from sonarpost.link.frames.paper.events import ContactOnly, ImageReady
+from sonarpost.link.frames.paper.frame import format_image_id
+from sonarpost.link.frames.paper.receiver import PairingReceiver
+from sonarpost.link.frames.paper.sender import plan_packets
+from sonarpost.link.receiver import Receiver
+from sonarpost.link.sender import Sender
 
 SEQUENTIAL_HEADER_BYTES: Final = 4
 """Checksum, picture and place: what a plain stream needs a frame."""

@@ -17,7 +17,7 @@ from sonarpost.cli.bench.pictures import BenchPicture, simulated_pictures
 from sonarpost.cli.bench.sea_trial_rig import Delivered, Sample, cross
 from sonarpost.codec.vq import IndexPacking, VqCodec
 from sonarpost.errors import ConfigError
-from sonarpost.link.contact_record import ContactSummary
+from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.sim.water_file import make_water
 
 BOUNDARY_M: Final = 130

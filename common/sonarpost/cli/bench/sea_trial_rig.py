@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.paper_format import format_image_id
-from sonarpost.link.paper_receiver import ContactOnly, Event, ImageReady, PairingReceiver
-from sonarpost.link.paper_sender import Packet, plan_packets
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import format_image_id
+from sonarpost.link.frames.paper.receiver import ContactOnly, Event, ImageReady, PairingReceiver
+from sonarpost.link.frames.paper.sender import Packet, plan_packets
 from sonarpost.modem.config import MicroModemConfig
 from sonarpost.modem.events import FrameReceived, ModemReady, PacketFailed, PacketSent
 from sonarpost.modem.micromodem import MicroModem

@@ -10,10 +10,10 @@ from pathlib import Path
 
 from sonarpost.cli.demo.settings import UUV_ADDRESS, ChainSettings
 from sonarpost.errors import FrameError
-from sonarpost.link.downlink import image_of_number
-from sonarpost.link.paper_format import ContactFrame, HalfFrame, parse_frame
-from sonarpost.link.v1_events import ContactUpdate
-from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.downlink.messages import image_of_number
+from sonarpost.link.events import ContactUpdate
+from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, parse_frame
+from sonarpost.link.receiver import Receiver
 
 
 @dataclass

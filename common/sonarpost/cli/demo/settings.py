@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sonarpost.link.v1_frame import HEADER_BYTES
+from sonarpost.link.frames.v1.frame import HEADER_BYTES
 from sonarpost.modem.rates import RATES
 
 UUV, VESSEL, SHORE, WATER = "uuv-1", "vessel-1", "shore-1", "water"

@@ -14,12 +14,12 @@ from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
 from sonarpost.errors import FrameError, PayloadError, PortError
-from sonarpost.link.contact_record import ContactSummary
-from sonarpost.link.downlink import image_of_number, number_of_image
-from sonarpost.link.paper_format import parse_frame
-from sonarpost.link.paper_sender import plan_packets
-from sonarpost.link.v1_events import ContactUpdate
-from sonarpost.link.v1_receiver import Receiver
+from sonarpost.link.downlink.messages import image_of_number, number_of_image
+from sonarpost.link.events import ContactUpdate
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import parse_frame
+from sonarpost.link.frames.paper.sender import plan_packets
+from sonarpost.link.receiver import Receiver
 from sonarpost.messages import AcousticFrame, EncodedImage, Health, QueueState, ReconstructedImage, Record, Snippet
 from sonarpost.modem.rates import RATES
 

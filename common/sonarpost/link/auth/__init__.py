@@ -1,0 +1,1 @@
+"""Authentication and encryption of acoustic frames: keys, tags, replay window."""

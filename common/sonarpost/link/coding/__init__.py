@@ -1,0 +1,1 @@
+"""Erasure code, blocks, redundancy plan and channel capacity."""

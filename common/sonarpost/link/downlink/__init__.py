@@ -1,0 +1,1 @@
+"""Commands, decisions and other messages from the vessel to vehicles, and their confirmations."""

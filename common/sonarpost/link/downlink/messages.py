@@ -1,0 +1,378 @@
+"""What commands, decisions, their confirmations and other traffic look like inside messages of the v1 link.
+
+A v1 message is bytes to the link; its first byte says what they are. Everything but free data fits the 27 bytes that a
+message has in a frame of 32. docs/wire-acoustic-v1.md, "Inside messages", gives the tables.
+
+An order (a command or a decision) has a token of 32 bits. The vehicle knows a repeated order by its token and content,
+and confirms every copy of it: the order or its confirmation may be lost, the outcome is the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final, Literal, TypeVar
+
+from sonarpost.errors import FrameError
+from sonarpost.link.frames.paper.frame import format_image_id
+from sonarpost.link.frames.v1.preview import MAX_NUMBER
+from sonarpost.messages import Verdict
+
+SMALLEST_ROOM_BYTES: Final = 27
+"""Bytes of a message in a frame of 32 bytes without a tag."""
+ALL_THERE_IS: Final = 0
+"""As `Refine.stream_bytes`: as much of the picture as the vehicle has."""
+
+_WHERE: Final = "acoustic message"
+_MAX_U32: Final = 2**32 - 1
+_DEGREE_STEPS: Final = 10_000_000
+_CONFIDENCE_STEPS: Final = 254
+_NO_CONFIDENCE: Final = 255
+_MOST_VERSION: Final = 255
+
+_HEAD = struct.Struct(">BII")
+_REFINE = struct.Struct(">HH")
+_NUMBER = struct.Struct(">H")
+_REVISIT = struct.Struct(">ii")
+_DECISION = struct.Struct(">HBBB")
+_OUTCOME = struct.Struct(">IB")
+
+
+class MessageKind(IntEnum):
+    """The first byte of a message."""
+
+    REFINE = 0x01
+    RESEND = 0x02
+    REVISIT = 0x03
+    DECISION = 0x04
+    WIDER = 0x05
+    CONFIRMATION = 0x08
+    DATA = 0x10
+
+
+_ORDERS: Final = (
+    MessageKind.REFINE,
+    MessageKind.RESEND,
+    MessageKind.REVISIT,
+    MessageKind.DECISION,
+    MessageKind.WIDER,
+)
+
+
+class Outcome(IntEnum):
+    """What became of an order on the vehicle.
+
+    TAKEN: it is on the vehicle's disk, and its consumers get it.
+    UNKNOWN_IMAGE: the vehicle no longer has this image.
+    UNSUPPORTED: nobody on the vehicle takes such orders.
+    """
+
+    TAKEN = 0
+    UNKNOWN_IMAGE = 1
+    UNSUPPORTED = 2
+
+
+_T = TypeVar("_T")
+_VERDICTS: Final[tuple[Verdict, ...]] = ("mine_like", "not_mine_like", "unsure")
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """Base of what the vessel asks or tells.
+
+    Attributes:
+        token: 0..2^32-1, see `token_of`.
+        issued_utc_s: When it was issued, whole seconds since 1970-01-01 UTC, to 2106.
+
+    Raises:
+        FrameError: A value out of range (so do the others).
+    """
+
+    token: int
+    issued_utc_s: int
+
+    def __post_init__(self) -> None:
+        _check("token", self.token, 0, _MAX_U32)
+        _check("issued_utc_s", self.issued_utc_s, 0, _MAX_U32)
+
+
+@dataclass(frozen=True, slots=True)
+class Refine(Order):
+    """More detail of a picture.
+
+    Attributes:
+        number: Of the contact, 1..65535.
+        stream_bytes: So many bytes of its stream, 1..65535; `ALL_THERE_IS` for all.
+    """
+
+    number: int
+    stream_bytes: int = ALL_THERE_IS
+
+    def __post_init__(self) -> None:
+        Order.__post_init__(self)
+        _check("number", self.number, 1, MAX_NUMBER)
+        _check("stream_bytes", self.stream_bytes, 0, 65535)
+
+
+@dataclass(frozen=True, slots=True)
+class Resend(Order):
+    """A picture again, from its beginning. `number`: of the contact, 1..65535."""
+
+    number: int
+
+    def __post_init__(self) -> None:
+        Order.__post_init__(self)
+        _check("number", self.number, 1, MAX_NUMBER)
+
+
+@dataclass(frozen=True, slots=True)
+class Wider(Order):
+    """More of the seabed around a contact, as a picture of its own. `number`: of the contact, 1..65535."""
+
+    number: int
+
+    def __post_init__(self) -> None:
+        Order.__post_init__(self)
+        _check("number", self.number, 1, MAX_NUMBER)
+
+
+@dataclass(frozen=True, slots=True)
+class Revisit(Order):
+    """Go there again.
+
+    Attributes:
+        lat_deg: WGS 84, -90..90; travels in steps of 1e-7 degree.
+        lon_deg: WGS 84, -180..180; the same.
+    """
+
+    lat_deg: float
+    lon_deg: float
+
+    def __post_init__(self) -> None:
+        Order.__post_init__(self)
+        _check("lat_deg", self.lat_deg, -90, 90)
+        _check("lon_deg", self.lon_deg, -180, 180)
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement(Order):
+    """What an operator decided about a picture. The remark and the operator's name do not travel.
+
+    Attributes:
+        number: Of the contact, 1..65535.
+        version: Of the picture, from 1; beyond 254 travels as 255.
+        verdict: The verdict.
+        confidence: 0..1 in steps of 1/254, None if not given.
+        mlo_class: Class of mine-like object; cut off between characters where the frame ends. Empty if not classified.
+    """
+
+    number: int
+    version: int
+    verdict: Verdict
+    confidence: float | None = None
+    mlo_class: str = ""
+
+    def __post_init__(self) -> None:
+        Order.__post_init__(self)
+        _check("number", self.number, 1, MAX_NUMBER)
+        _check("version", self.version, 1, 2**63)
+        if self.confidence is not None:
+            _check("confidence", self.confidence, 0, 1)
+        if self.verdict not in _VERDICTS:
+            raise FrameError(_WHERE, "verdict", self.verdict, ", ".join(_VERDICTS))
+
+
+@dataclass(frozen=True, slots=True)
+class Confirmation:
+    """What became of orders. `outcomes`: token and outcome of each, at least one."""
+
+    outcomes: tuple[tuple[int, Outcome], ...]
+
+    def __post_init__(self) -> None:
+        _check("outcomes", len(self.outcomes), 1, 800)
+        for token, _ in self.outcomes:
+            _check("token", token, 0, _MAX_U32)
+
+
+@dataclass(frozen=True, slots=True)
+class Data:
+    """Any other traffic. `data`: at least one byte."""
+
+    data: bytes
+
+    def __post_init__(self) -> None:
+        _check("data", len(self.data), 1, 4095)
+
+
+DownlinkOrder = Refine | Resend | Revisit | Judgement | Wider
+Content = DownlinkOrder | Confirmation | Data
+
+
+def pack(content: Content, room_bytes: int = SMALLEST_ROOM_BYTES) -> bytes:
+    """Return the bytes of a message.
+
+    Args:
+        content: What it says.
+        room_bytes: Longest that is wanted; only a judgement's class is cut to it.
+
+    Raises:
+        FrameError: It does not fit.
+    """
+    packed = _packed(content, room_bytes)
+    if len(packed) > room_bytes and not isinstance(content, Data):
+        raise FrameError(_WHERE, "length", len(packed), f"at most {room_bytes} bytes")
+    return packed
+
+
+def _packed(content: Content, room_bytes: int) -> bytes:
+    match content:
+        case Data():
+            return bytes([MessageKind.DATA]) + content.data
+        case Confirmation():
+            return bytes([MessageKind.CONFIRMATION]) + b"".join(_OUTCOME.pack(*each) for each in content.outcomes)
+        case Refine():
+            return _head(MessageKind.REFINE, content) + _REFINE.pack(content.number, content.stream_bytes)
+        case Resend() | Wider():
+            kind = MessageKind.RESEND if isinstance(content, Resend) else MessageKind.WIDER
+            return _head(kind, content) + _NUMBER.pack(content.number)
+        case Revisit():
+            degrees = (round(value * _DEGREE_STEPS) for value in (content.lat_deg, content.lon_deg))
+            return _head(MessageKind.REVISIT, content) + _REVISIT.pack(*degrees)
+        case Judgement():
+            confidence = _NO_CONFIDENCE if content.confidence is None else round(content.confidence * _CONFIDENCE_STEPS)
+            fixed = _head(MessageKind.DECISION, content) + _DECISION.pack(
+                content.number, min(content.version, _MOST_VERSION), _VERDICTS.index(content.verdict), confidence
+            )
+            return fixed + _shortened(content.mlo_class, room_bytes - len(fixed))
+
+
+def _head(kind: MessageKind, order: Order) -> bytes:
+    return _HEAD.pack(kind, order.token, order.issued_utc_s)
+
+
+def _shortened(text: str, most_bytes: int) -> bytes:
+    return text.encode()[: max(0, most_bytes)].decode(errors="ignore").encode()
+
+
+def unpack(data: bytes, where: str = _WHERE) -> Content:
+    """Parse the bytes of a message.
+
+    Raises:
+        FrameError: An unknown kind, a wrong length, or a value out of range.
+    """
+    kind = data[0] if data else -1
+    if kind == MessageKind.DATA:
+        return _made(where, lambda: Data(data[1:]))
+    if kind == MessageKind.CONFIRMATION:
+        return _confirmation(data[1:], where)
+    if kind not in _ORDERS:
+        raise FrameError(where, "kind", kind, ", ".join(f"{int(known):#04x}" for known in MessageKind))
+    if len(data) < _HEAD.size:
+        raise FrameError(where, "length", len(data), f"at least {_HEAD.size} bytes")
+    _, token, issued = _HEAD.unpack_from(data)
+    body = data[_HEAD.size :]
+    return _made(where, lambda: _order(MessageKind(kind), token, issued, body))
+
+
+def _order(kind: MessageKind, token: int, issued: int, body: bytes) -> DownlinkOrder:
+    if kind == MessageKind.REFINE:
+        number, stream_bytes = _fields(_REFINE, body)
+        return Refine(token, issued, number, stream_bytes)
+    if kind in (MessageKind.RESEND, MessageKind.WIDER):
+        (number,) = _fields(_NUMBER, body)
+        return (Resend if kind == MessageKind.RESEND else Wider)(token, issued, number)
+    if kind == MessageKind.REVISIT:
+        lat, lon = _fields(_REVISIT, body)
+        return Revisit(token, issued, lat / _DEGREE_STEPS, lon / _DEGREE_STEPS)
+    number, version, verdict, confidence = _fields(_DECISION, body[: _DECISION.size])
+    if verdict >= len(_VERDICTS):
+        raise FrameError(_WHERE, "verdict", verdict, f"0..{len(_VERDICTS) - 1}")
+    sure = None if confidence == _NO_CONFIDENCE else confidence / _CONFIDENCE_STEPS
+    try:
+        text = body[_DECISION.size :].decode()
+    except UnicodeDecodeError as error:
+        raise FrameError(_WHERE, "mlo_class", body[_DECISION.size :], "UTF-8") from error
+    return Judgement(token, issued, number, version, _VERDICTS[verdict], sure, text)
+
+
+def _fields(layout: struct.Struct, body: bytes) -> tuple[int, ...]:
+    if len(body) != layout.size:
+        raise FrameError(_WHERE, "length", len(body), f"{layout.size} bytes after the head")
+    return layout.unpack(body)
+
+
+def _confirmation(body: bytes, where: str) -> Confirmation:
+    if not body or len(body) % _OUTCOME.size:
+        raise FrameError(where, "length", len(body), f"a multiple of {_OUTCOME.size} bytes after the kind")
+    found: list[tuple[int, Outcome]] = []
+    for token, outcome in _OUTCOME.iter_unpack(body):
+        if outcome not in tuple(Outcome):
+            raise FrameError(where, "outcome", outcome, "0..2")
+        found.append((token, Outcome(outcome)))
+    return _made(where, lambda: Confirmation(tuple(found)))
+
+
+def _made(where: str, make: Callable[[], _T]) -> _T:
+    """Return what `make` makes; its errors name `where`."""
+    try:
+        return make()
+    except FrameError as error:
+        raise FrameError(where, error.field, error.value, error.expected) from error
+
+
+def confirmations(
+    outcomes: Sequence[tuple[int, Outcome]], room_bytes: int = SMALLEST_ROOM_BYTES
+) -> tuple[Confirmation, ...]:
+    """Return outcomes as few messages of at most `room_bytes` each."""
+    each = max(1, (room_bytes - 1) // _OUTCOME.size)
+    return tuple(Confirmation(tuple(outcomes[at : at + each])) for at in range(0, len(outcomes), each))
+
+
+def token_of(record_id: str, kind: Literal["command", "decision"], attempt: int = 0) -> int:
+    """Return the token of a record: the same each time, so that a record asked twice is one order.
+
+    Args:
+        record_id: Its `command_id` or `decision_id`.
+        kind: Which of them.
+        attempt: Counted up by a sender that finds the token taken by another record.
+    """
+    digest = hashlib.sha256(f"{kind}\0{record_id}\0{attempt}".encode()).digest()
+    return int.from_bytes(digest[:4], "big")
+
+
+def record_id_of(source: int, token: int) -> str:
+    """Return the identifier that an order has on the vehicle: the modem it came from and its token."""
+    return f"a{source}-{token:08x}"
+
+
+def number_of_image(image_id: str) -> int:
+    """Return the contact number, 1..65535, of an image identifier.
+
+    Identifiers count to 36^4, contact numbers to 65535, one by one both. `image_of_number` gives the identifier back
+    where the vehicle counts from 0001 to 1EKF.
+
+    Raises:
+        FrameError: It is no identifier.
+    """
+    if len(image_id) != 4 or not all(c in "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ" for c in image_id):
+        raise FrameError(_WHERE, "image_id", image_id, "four of 0-9 and A-Z")
+    return (int(image_id, 36) - 1) % MAX_NUMBER + 1
+
+
+def image_of_number(number: int) -> str:
+    """Return the identifier of a contact number: four digits to the base 36, 0001 to 1EKF.
+
+    Raises:
+        FrameError: It is not 1..65535.
+    """
+    _check("number", number, 1, MAX_NUMBER)
+    return format_image_id(number)
+
+
+def _check(name: str, value: float, low: float, high: float) -> None:
+    if not (math.isfinite(value) and low <= value <= high):
+        raise FrameError(_WHERE, name, value, f"{low}..{high}")

@@ -1,0 +1,1 @@
+"""Frames, previews, layers, payload objects and feedback of wire format v1."""

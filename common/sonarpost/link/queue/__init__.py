@@ -1,0 +1,1 @@
+"""The transmit queue of the vehicle: priorities, expiry, fairness, choice of rate."""
