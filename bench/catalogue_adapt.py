@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.adapt import Quality, adapt, measure, split
-from sonarpost.catalogue.plan import TrainingImage
-from sonarpost.catalogue.store import NOMINAL_TILE_PX, load_nominal
-from sonarpost.catalogue.windows import stretch
+from sonarpost.codec.vq.adaptation import Quality, adapt, measure, split
+from sonarpost.codec.vq.codebook import NOMINAL_TILE_PX, load_nominal
+from sonarpost.codec.vq.patches import stretch
+from sonarpost.codec.vq.training_config import TrainingImage
 from sonarpost.sonar.image_files import read_image
 
 HEIGHT_PX, WIDTH_PX = 140, 80

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.catalogue.store import load
-from sonarpost.catalogue.windows import stretch
+from sonarpost.codec.vq.codebook import load
+from sonarpost.codec.vq.patches import stretch
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.image_files import write_tiff

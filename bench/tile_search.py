@@ -26,10 +26,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.store import load_nominal
-from sonarpost.catalogue.windows import stretch
 from sonarpost.codec.interface import to_uint8
-from sonarpost.codec.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, Tiles, cut_tiles
+from sonarpost.codec.vq.codebook import load_nominal
+from sonarpost.codec.vq.patches import stretch
+from sonarpost.codec.vq.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, Tiles, cut_tiles
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.image_files import read_image

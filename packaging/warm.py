@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 import sonarpost
-from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import Image
 from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.codec.vq.codebook import open_catalogue
 
 # Nobody installs plots on a vehicle.
 OPTIONAL = ("matplotlib", "pillow_jxl")

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from sonarpost.codec.vq import IndexPacking
+from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.config import ServiceConfig
 
 

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from sonarpost import keys, wire
-from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.interface import Codec
 from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.codec.vq.codebook import open_catalogue
 from sonarpost.config import PlatformConfig
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.link.frames.v1.preview import MAX_NUMBER

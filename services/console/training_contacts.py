@@ -10,10 +10,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import Codec, Decoded, StreamHeader
-from sonarpost.codec.vq import VqCodec
+from sonarpost.codec.vq.codebook import open_catalogue
+from sonarpost.codec.vq.codec import VqCodec
 from sonarpost.messages import Contact, Raster, ReconstructedImage
 from sonarpost.review.local import moved
 from sonarpost.sim.seabed import SeabedKind

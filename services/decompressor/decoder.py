@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.interface import Codec, Decoded, Mask, StreamHeader
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.tiles import TileDatabase
-from sonarpost.codec.vq import catalogue_tag
+from sonarpost.codec.vq.codebook import open_catalogue
+from sonarpost.codec.vq.codec import catalogue_tag
+from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CatalogueError, StreamError
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.events import ContactUpdate

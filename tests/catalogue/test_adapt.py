@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonarpost.catalogue.adapt import EQUAL_PSNR_DB, adapt, measure, split
-from sonarpost.catalogue.plan import TrainingImage
-from sonarpost.codec.tiles import TileDatabase, cut_tiles
+from sonarpost.codec.vq.adaptation import EQUAL_PSNR_DB, adapt, measure, split
+from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
+from sonarpost.codec.vq.training_config import TrainingImage
 from sonarpost.errors import ConfigError
 
 

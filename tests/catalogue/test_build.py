@@ -8,18 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.catalogue.build import build
-from sonarpost.catalogue.growing import GrowingTiles
-from sonarpost.catalogue.journal import MAGIC, EntryKind, Journal, JournalEntry
-from sonarpost.catalogue.plan import (
-    Progress,
-    Round,
-    TrainingImage,
-    rms_distance,
-    spread,
-)
-from sonarpost.catalogue.refine import refine
-from sonarpost.codec.tiles import TileDatabase, cut_tiles
+from sonarpost.codec.vq.build_journal import MAGIC, EntryKind, Journal, JournalEntry
+from sonarpost.codec.vq.builder import build
+from sonarpost.codec.vq.incremental import GrowingTiles
+from sonarpost.codec.vq.refinement import refine
+from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
+from sonarpost.codec.vq.training_config import Progress, Round, TrainingImage, rms_distance, spread
 from sonarpost.errors import CatalogueError, ConfigError
 
 ALWAYS, NEVER = 1e9, -1e9

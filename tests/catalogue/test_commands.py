@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.catalogue.nominal import Recipe
-from sonarpost.catalogue.plan import Round
-from sonarpost.catalogue.store import load, load_nominal
-from sonarpost.catalogue.windows import WindowPlan, cut_line
 from sonarpost.cli import catalogue, encode
 from sonarpost.cli.catalogue import nominal
 from sonarpost.cli.catalogue.build import parse_rounds
+from sonarpost.cli.catalogue.default_codebooks import Recipe
 from sonarpost.cli.catalogue.progress import ProgressDisplay
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.tiles import cut_tiles
+from sonarpost.codec.vq.codebook import load, load_nominal
+from sonarpost.codec.vq.patches import WindowPlan, cut_line
+from sonarpost.codec.vq.tiles import cut_tiles
+from sonarpost.codec.vq.training_config import Round
 from sonarpost.errors import CatalogueError, ConfigError, SonarpostError, StreamError
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonarpost.catalogue.compare import compare, principal_angles_deg
-from sonarpost.codec.tiles import TileDatabase
+from sonarpost.codec.vq.comparison import compare, principal_angles_deg
+from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CatalogueError
 
 

@@ -6,8 +6,8 @@ import io
 
 from rich.console import Console
 
-from sonarpost.catalogue.plan import PassProgress, Progress
 from sonarpost.cli.catalogue.progress import ProgressDisplay
+from sonarpost.codec.vq.training_config import PassProgress, Progress
 
 
 def progress(done: int, whole: int = 100, round_number: int = 0) -> Progress:

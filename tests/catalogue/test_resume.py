@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.catalogue.build import build
-from sonarpost.catalogue.growing import GrowingTiles
-from sonarpost.catalogue.journal import EntryKind, Journal, JournalEntry
-from sonarpost.catalogue.plan import PassProgress, Progress, Round, TrainingImage, fingerprint, rms_distance
+from sonarpost.codec.vq.build_journal import EntryKind, Journal, JournalEntry
+from sonarpost.codec.vq.builder import build
+from sonarpost.codec.vq.incremental import GrowingTiles
+from sonarpost.codec.vq.training_config import PassProgress, Progress, Round, TrainingImage, fingerprint, rms_distance
 from sonarpost.errors import CatalogueError
 
 ROUNDS = (Round(1e9, rms_distance(45, 8)), Round(1e9, rms_distance(40, 8), 4))

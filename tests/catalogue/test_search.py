@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.catalogue.store import load_nominal
-from sonarpost.codec import tile_search as module
-from sonarpost.codec.tile_search import NearestSearch, rounding_bound
-from sonarpost.codec.tiles import TileDatabase
+from sonarpost.codec.vq import tile_search as module
+from sonarpost.codec.vq.codebook import load_nominal
+from sonarpost.codec.vq.tile_search import NearestSearch, rounding_bound
+from sonarpost.codec.vq.tiles import TileDatabase
 
 
 def plainly(vectors: np.ndarray, queries: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.catalogue.store import (
+from sonarpost.codec.vq.codebook import (
     NOMINAL_TILE_PX,
     Catalogue,
     from_bytes,
@@ -23,8 +23,8 @@ from sonarpost.catalogue.store import (
     save,
     to_bytes,
 )
-from sonarpost.codec.tiles import TileDatabase
-from sonarpost.codec.vq import VqCodec, catalogue_tag
+from sonarpost.codec.vq.codec import VqCodec, catalogue_tag
+from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CatalogueError
 
 

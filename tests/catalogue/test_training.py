@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.catalogue.humminbird import humminbird_lines, read_channel
-from sonarpost.catalogue.nominal import RECIPES, Recipe, build_nominal, humminbird_images
-from sonarpost.catalogue.plan import Round
-from sonarpost.catalogue.store import to_bytes
-from sonarpost.catalogue.windows import Tone, WindowPlan, cut_around, cut_line, reduce_line, shuffled, stretch
+from sonarpost.cli.catalogue.default_codebooks import RECIPES, Recipe, build_nominal, humminbird_images
+from sonarpost.cli.catalogue.humminbird_lines import humminbird_lines, read_channel
+from sonarpost.codec.vq.codebook import to_bytes
+from sonarpost.codec.vq.patches import Tone, WindowPlan, cut_around, cut_line, reduce_line, shuffled, stretch
+from sonarpost.codec.vq.training_config import Round
 from sonarpost.errors import CatalogueError, SonarpostError
 from sonarpost.sonar.image_files import write_png
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sonarpost.catalogue.store import Catalogue, save
 from sonarpost.cli import bench
 from sonarpost.cli.bench import measure as measuring
 from sonarpost.cli.bench.curves import RateDifference
@@ -24,7 +23,8 @@ from sonarpost.cli.bench.report import json_line
 from sonarpost.cli.bench.sdvd import sdvd_crops, survey_line
 from sonarpost.codec.interface import Decoded, StreamHeader
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.tiles import TileDatabase
+from sonarpost.codec.vq.codebook import Catalogue, save
+from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CatalogueError, ConfigError, SonarpostError, StreamError, SurveyFileError
 from sonarpost.sonar.image_files import write_png, write_tiff
 

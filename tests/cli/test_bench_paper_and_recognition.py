@@ -18,7 +18,7 @@ from sonarpost.cli.bench.paper_figures import FIG2, PIXELS, TABLE2, contact_pict
 from sonarpost.cli.bench.pictures import BenchPicture
 from sonarpost.cli.bench.statistics import auc
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.tiles import cut_tiles
+from sonarpost.codec.vq.tiles import cut_tiles
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.image_files import write_png
@@ -175,8 +175,8 @@ def test_streams_with_grain_are_judged_within_the_same_budget(
 
 def test_grain_is_added_at_the_strength_asked_for() -> None:
     from sonarpost.cli.bench.grain import grainy_twin, with_grain
+    from sonarpost.codec.baselines.spiht import SpihtCodec
     from sonarpost.codec.emb.codec import EmbCodec
-    from sonarpost.codec.spiht import SpihtCodec
 
     plain, twin = EmbCodec(), grainy_twin(EmbCodec())
     assert isinstance(twin, EmbCodec)

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from sonarpost.catalogue.store import load_nominal
 from sonarpost.cli.bench import sea_trial
 from sonarpost.cli.bench.pictures import simulated_pictures
 from sonarpost.cli.bench.sea_trial import SIZES_PX, Cell, claims, measure, table
 from sonarpost.cli.bench.sea_trial_rig import Delivered, Rig, Sample, cross
 from sonarpost.cli.main import main
-from sonarpost.codec.vq import IndexPacking, VqCodec
+from sonarpost.codec.vq.codebook import load_nominal
+from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.sim.water import Water
 from sonarpost.sim.water_config import WaterConfig

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image as Pillow
 
-from sonarpost.codec.avif_file import avif_file, check_frame, frame_of, sequence_size
+from sonarpost.codec.baselines.avif_file import avif_file, check_frame, frame_of, sequence_size
+from sonarpost.codec.baselines.still_images import ModernCodec, ModernFormat
 from sonarpost.codec.interface import StreamHeader
-from sonarpost.codec.modern import ModernCodec, ModernFormat
 from sonarpost.errors import ConfigError, StreamError
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "modern"

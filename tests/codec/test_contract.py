@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.catalogue.store import load
 from sonarpost.codec.interface import Codec, Decoded, StreamHeader, model_tag
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq import IndexPacking
+from sonarpost.codec.vq.codebook import load
+from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.errors import StreamError
 
 RESOURCES = CodecResources(load(Path(__file__).parents[1] / "golden" / "vq" / "small.tiles").tiles)

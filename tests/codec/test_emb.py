@@ -162,7 +162,7 @@ def test_the_model_file_is_checked() -> None:
     from importlib.resources import files
 
     for name, model in zip(SHIPPED, all_shipped(), strict=True):
-        raw = files("sonarpost.codec").joinpath("data", name).read_bytes()
+        raw = files("sonarpost.codec.emb").joinpath("data", name).read_bytes()
         assert parse(raw).identity == hashlib.sha256(raw).hexdigest() == model.identity
         with pytest.raises(StreamError, match="magic"):
             parse(b"x" + raw)

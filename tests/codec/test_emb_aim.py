@@ -10,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from sonarpost.codec.emb import aim, transform
+from sonarpost.codec.emb import perceptual_weights as aim
+from sonarpost.codec.emb import transform
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.coder import PLAIN_SCALE, State
 from sonarpost.codec.emb.layout import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, layout
-from sonarpost.codec.emb.likeness import likeness
 from sonarpost.codec.emb.model import all_structure
-from sonarpost.codec.emb.side import Box
+from sonarpost.codec.emb.side_info import Box
+from sonarpost.codec.emb.similarity import likeness
 from sonarpost.codec.quality import ms_ssim, psnr_db
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.errors import StreamError

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.coder import Coder
-from sonarpost.codec.emb.grain import make_grain, measure_grain
 from sonarpost.codec.emb.layout import layout
 from sonarpost.codec.emb.model import Model, all_structure, shipped
 from sonarpost.codec.emb.region import INSIDE, OUTSIDE, fill_unknown, weights
-from sonarpost.codec.emb.side import Box, Side, read_side, write_side
+from sonarpost.codec.emb.side_info import Box, Side, read_side, write_side
+from sonarpost.codec.emb.speckle_synthesis import make_grain, measure_grain
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import StreamError
 

@@ -7,14 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.codec.emb import fit, transform
+from sonarpost.codec.emb import rate_distortion_opt as fit
+from sonarpost.codec.emb import transform
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.coder import Coder
-from sonarpost.codec.emb.fit import Wanted
 from sonarpost.codec.emb.layout import layout
+from sonarpost.codec.emb.rate_distortion_opt import Wanted
 from sonarpost.codec.emb.region import OUTSIDE, weights
 from sonarpost.codec.emb.search import Writer, Written, beside
-from sonarpost.codec.emb.side import Box, Side
+from sonarpost.codec.emb.side_info import Box, Side
 from sonarpost.codec.interface import Extensible, StreamHeader
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import StreamError

@@ -8,6 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sonarpost.codec.emb import kernel
+from sonarpost.codec.emb.bitplanes import PASSES, known_plane
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.coder import State
 from sonarpost.codec.emb.layout import (
@@ -25,7 +26,6 @@ from sonarpost.codec.emb.layout import (
     layout,
 )
 from sonarpost.codec.emb.model import shipped
-from sonarpost.codec.emb.planes import PASSES, known_plane
 from sonarpost.codec.emb.transform import STRENGTHS
 
 MODEL = shipped()

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pictures import picture, sdvd_crops
 
-from sonarpost.codec.huffman import HuffmanCodec
-from sonarpost.codec.huffman_code import MAX_CODE_BITS, canonical_codes, code_lengths
+from sonarpost.codec.baselines.huffman import HuffmanCodec
+from sonarpost.codec.baselines.huffman_code import MAX_CODE_BITS, canonical_codes, code_lengths
 from sonarpost.codec.interface import StreamHeader, arrived_body
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError, StreamError

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from pictures import picture, sdvd_crops
 from PIL import Image as Pillow
 
-from sonarpost.codec import jpeg2000
+from sonarpost.codec.baselines import jpeg2000
+from sonarpost.codec.baselines.jpeg2000 import Jpeg2000Codec, codestream, main_header, packets_of
 from sonarpost.codec.interface import StreamHeader
-from sonarpost.codec.jpeg2000 import Jpeg2000Codec, codestream, main_header, packets_of
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError, StreamError
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from pictures import picture
 from PIL import Image as Pillow
 
-from sonarpost.codec import modern
+from sonarpost.codec.baselines import still_images as modern
+from sonarpost.codec.baselines.still_images import ModernCodec, ModernFormat, jpegxl_size
 from sonarpost.codec.interface import StreamHeader
-from sonarpost.codec.modern import ModernCodec, ModernFormat, jpegxl_size
 from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.registry import BUILTINS, CodecRegistry, CodecResources
 from sonarpost.errors import ConfigError, StreamError

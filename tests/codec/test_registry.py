@@ -17,8 +17,8 @@ from sonarpost.codec.registry import (
     default_registry,
     load_plugins,
 )
-from sonarpost.codec.tiles import TileDatabase
-from sonarpost.codec.vq import IndexPacking, VqCodec, catalogue_tag
+from sonarpost.codec.vq.codec import IndexPacking, VqCodec, catalogue_tag
+from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import ConfigError, StreamError
 
 TILES = TileDatabase.from_tiles(8, np.random.default_rng(0).integers(0, 256, (50, 64), dtype=np.uint8))

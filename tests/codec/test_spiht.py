@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pictures import picture, sdvd_crops
 
-from sonarpost.codec import spiht
+from sonarpost.codec.baselines import spiht
+from sonarpost.codec.baselines.spiht import NATURAL_MAXLOOP, SpihtCodec
+from sonarpost.codec.baselines.spiht_passes import MAX_PLANES, UNIT, PictureAnswers, StreamAnswers, run_passes
+from sonarpost.codec.baselines.spiht_wavelet import FRACTION_BITS, forest_of, inverse, transform
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.spiht import NATURAL_MAXLOOP, SpihtCodec
-from sonarpost.codec.spiht_passes import MAX_PLANES, UNIT, PictureAnswers, StreamAnswers, run_passes
-from sonarpost.codec.spiht_wavelet import FRACTION_BITS, forest_of, inverse, transform
 from sonarpost.errors import ConfigError, StreamError
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "spiht"

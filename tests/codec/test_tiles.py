@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sonarpost.codec.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, cut_tiles, join_tiles, principal_basis
+from sonarpost.codec.vq.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, cut_tiles, join_tiles, principal_basis
 from sonarpost.errors import CatalogueError
 
 

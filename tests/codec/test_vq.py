@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.catalogue.store import load
 from sonarpost.codec.interface import Codec, StreamHeader
-from sonarpost.codec.tiles import TileDatabase, cut_tiles
-from sonarpost.codec.vq import IndexPacking, VqCodec, catalogue_tag, pack_indices, unpack_indices
+from sonarpost.codec.vq.codebook import load
+from sonarpost.codec.vq.codec import IndexPacking, VqCodec, catalogue_tag, pack_indices, unpack_indices
+from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
 from sonarpost.errors import ConfigError, StreamError
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "vq"

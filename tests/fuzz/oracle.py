@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.catalogue.store import load
 from sonarpost.codec.interface import COMMON_SIDES_PX, Codec, Mask, StreamHeader, model_tag
 from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.codec.vq.codebook import load
 from sonarpost.errors import StreamError
 
 GOLDEN = Path(__file__).parents[1] / "golden"

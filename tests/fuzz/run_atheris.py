@@ -32,7 +32,7 @@ except ImportError:
 
 # Functions that numba compiles must not be instrumented.
 COMPILED = [
-    "sonarpost.codec.tile_search",
+    "sonarpost.codec.vq.tile_search",
     *(f"sonarpost.codec.emb.{name}" for name in ("aim", "enhance", "fit", "kernel", "likeness", "transform")),
 ]
 
@@ -40,8 +40,8 @@ with atheris.instrument_imports(include=["sonarpost", "fuzz"], exclude=COMPILED)
     from fuzz.oracle import check, codec_for, codec_ids, stream_of
     from fuzz.seeds import as_input, golden_streams, new_streams
 
-    from sonarpost.codec import huffman, jpeg2000, modern, spiht, vq  # noqa: F401
     from sonarpost.codec.emb import codec as emb  # noqa: F401
+    from sonarpost.codec.vq import codec as vq  # noqa: F401
 
 MAX_INPUT_BYTES = 1200
 DEFAULTS = {"-max_len": MAX_INPUT_BYTES, "-timeout": 10, "-rss_limit_mb": 2048, "-print_final_stats": 1}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonarpost.codec.tiles import TileDatabase, cut_tiles
-from sonarpost.codec.vq import VqCodec
+from sonarpost.codec.vq.codec import VqCodec
+from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.receiver import ImageReady, PairingReceiver
 from sonarpost.link.frames.paper.sender import Packet, plan_packets

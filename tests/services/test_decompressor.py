@@ -15,11 +15,11 @@ from PIL import Image
 
 from sonarpost import keys
 from sonarpost.archive.image_files import picture_name
-from sonarpost.catalogue.store import Catalogue, open_catalogue, save
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.tiles import TileDatabase
-from sonarpost.codec.vq import catalogue_tag
+from sonarpost.codec.vq.codebook import Catalogue, open_catalogue, save
+from sonarpost.codec.vq.codec import catalogue_tag
+from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CatalogueError
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame, parse_frame

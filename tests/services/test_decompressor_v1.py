@@ -10,8 +10,8 @@ import pytest
 from conftest import eventually
 
 from sonarpost import keys
-from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.codec.vq.codebook import open_catalogue
 from sonarpost.errors import ConfigError
 from sonarpost.link.auth.authentication import AcousticSeal
 from sonarpost.link.auth.key import Direction

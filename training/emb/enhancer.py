@@ -1,7 +1,7 @@
 """Train the decoder's enhancer on pictures that were coded and decoded, and write its weights.
 
     python training/emb/enhancer.py --pool /tmp/emb/pool.npz \
-        --model /tmp/emb/contexts.model --out common/sonarpost/codec/data/emb.model --steps 12000
+        --model /tmp/emb/contexts.model --out common/sonarpost/codec/emb/data/emb.model --steps 12000
 
 Loss: squared error relative to that of the picture as decoded, minus a little of the multi-scale structural similarity.
 """

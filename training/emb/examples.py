@@ -6,13 +6,13 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import kernel, transform
+from sonarpost.codec.emb.bitplanes import STEPS, code_planes, extra_planes
 from sonarpost.codec.emb.coder import PLAIN_SCALE, Coder, State
-from sonarpost.codec.emb.fit import Wanted, wanted_of
 from sonarpost.codec.emb.layout import layout
 from sonarpost.codec.emb.model import SECOND, Model, model_of
-from sonarpost.codec.emb.planes import STEPS, code_planes, extra_planes
+from sonarpost.codec.emb.rate_distortion_opt import Wanted, wanted_of
 from sonarpost.codec.emb.region import weights
-from sonarpost.codec.emb.side import MEAN_STEP, Side
+from sonarpost.codec.emb.side_info import MEAN_STEP, Side
 
 Rows = npt.NDArray[np.int16]
 

@@ -1,6 +1,6 @@
 """Make the model that training for `emb-structure` begins with: one of `emb`, and the aim beside it.
 
-    python training/emb/structure.py --model common/sonarpost/codec/data/emb-2.model --out /tmp/emb/structure.model
+    python training/emb/structure.py --model common/sonarpost/codec/emb/data/emb-2.model --out /tmp/emb/structure.model
 
 The scales were chosen on validation pictures; see docs/codec.md.
 """
@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb.aim import CONTRASTS, STILL_GREY2
 from sonarpost.codec.emb.model import AIMED, read_arrays
+from sonarpost.codec.emb.perceptual_weights import CONTRASTS, STILL_GREY2
 
 LEVELS = (0.9, 0.3, 0.6, 1.0, 1.0, 0.9, 0.9)
 """Of the lowest band, then of the other bands of level 1 (the finest) to 6."""

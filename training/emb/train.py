@@ -1,6 +1,6 @@
 """Train the context networks and write the model file.
 
-    python training/emb/train.py --pool /tmp/emb/pool.npz --out common/sonarpost/codec/data/emb.model
+    python training/emb/train.py --pool /tmp/emb/pool.npz --out common/sonarpost/codec/emb/data/emb.model
 
 Needs jax and optax (CPU), which the package itself does not.
 """

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.catalogue.store import nominal_for_tag, open_catalogue
 from sonarpost.codec.interface import Codec, StreamHeader
 from sonarpost.codec.registry import CodecRegistry, CodecResources, default_registry
-from sonarpost.codec.vq import IndexPacking
+from sonarpost.codec.vq.codebook import nominal_for_tag, open_catalogue
+from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.errors import SonarpostError, StreamError
 from sonarpost.files import write_atomically
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff

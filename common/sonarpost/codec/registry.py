@@ -15,13 +15,13 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
 from sonarpost.codec import emb
-from sonarpost.codec.huffman import HuffmanCodec
+from sonarpost.codec.baselines.huffman import HuffmanCodec
+from sonarpost.codec.baselines.jpeg2000 import Jpeg2000Codec
+from sonarpost.codec.baselines.spiht import SpihtCodec
+from sonarpost.codec.baselines.still_images import ModernCodec, ModernFormat
 from sonarpost.codec.interface import Codec, StreamHeader, model_tag, tag_length
-from sonarpost.codec.jpeg2000 import Jpeg2000Codec
-from sonarpost.codec.modern import ModernCodec, ModernFormat
-from sonarpost.codec.spiht import SpihtCodec
-from sonarpost.codec.tiles import TileDatabase
-from sonarpost.codec.vq import IndexPacking, VqCodec
+from sonarpost.codec.vq.codec import IndexPacking, VqCodec
+from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import ConfigError, StreamError
 
 ENTRY_POINT_GROUP = "sonarpost.codecs"

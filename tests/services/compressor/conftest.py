@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from sonarpost import keys
-from sonarpost.catalogue.store import open_catalogue
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq import IndexPacking
+from sonarpost.codec.vq.codebook import open_catalogue
+from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.messages import EncodedImage
 from sonarpost.services.compressor.config import CompressorConfig
 from sonarpost.services.compressor.service import CompressorService

@@ -9,7 +9,7 @@ from conftest import eventually
 
 from sonarpost import keys, wire
 from sonarpost.codec.interface import StreamHeader, to_uint8
-from sonarpost.codec.vq import IndexPacking
+from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.errors import CatalogueError, ConfigError
 from sonarpost.link.frames.paper.frame import format_image_id, is_image_id
 from sonarpost.messages import Contact, EncodedImage, Raster, Snippet

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from sonarpost.codec.interface import Image
 from sonarpost.codec.quality import fom, psnr_db
-from sonarpost.codec.tiles import BASIS_SCALE, Tiles, cut_tiles, join_tiles, principal_basis
+from sonarpost.codec.vq.tiles import BASIS_SCALE, Tiles, cut_tiles, join_tiles, principal_basis
 
 TILE_PX: Final = 20
 DIMENSIONS: Final = tuple(range(10, 101, 10))

@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.store import NOMINAL_TILE_PX, load_nominal
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import Image, Mask
 from sonarpost.codec.quality import psnr_db, ssim
-from sonarpost.codec.vq import IndexPacking, VqCodec
+from sonarpost.codec.vq.codebook import NOMINAL_TILE_PX, load_nominal
+from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.link.frames.contact_record import ContactSummary
 
 PSNR_LIMIT_DB: Final = 60.0

@@ -11,12 +11,12 @@ from typing import Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.store import NOMINAL_TILE_PX, open_catalogue
 from sonarpost.cli.bench.pictures import BenchPicture
 from sonarpost.codec.interface import Codec, Image
 from sonarpost.codec.quality import ms_ssim, psnr_db, ssim
 from sonarpost.codec.registry import CodecRegistry, CodecResources
-from sonarpost.codec.vq import IndexPacking
+from sonarpost.codec.vq.codebook import NOMINAL_TILE_PX, open_catalogue
+from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.errors import ConfigError, StreamError
 
 Values = npt.NDArray[np.float64]

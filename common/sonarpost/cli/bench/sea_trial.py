@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from sonarpost.catalogue.store import load_nominal
 from sonarpost.cli.bench.codecs import say
 from sonarpost.cli.bench.pictures import BenchPicture, simulated_pictures
 from sonarpost.cli.bench.sea_trial_rig import Delivered, Sample, cross
-from sonarpost.codec.vq import IndexPacking, VqCodec
+from sonarpost.codec.vq.codebook import load_nominal
+from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.errors import ConfigError
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.sim.water_file import make_water

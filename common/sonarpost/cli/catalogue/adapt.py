@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from sonarpost.catalogue.adapt import Quality, adapt, measure, split
-from sonarpost.catalogue.plan import MAX_TILES
-from sonarpost.catalogue.store import Catalogue, open_catalogue, save
 from sonarpost.cli.catalogue.images import training_images
 from sonarpost.cli.catalogue.info import print_facts
 from sonarpost.cli.catalogue.progress import ProgressDisplay
+from sonarpost.codec.vq.adaptation import Quality, adapt, measure, split
+from sonarpost.codec.vq.codebook import Catalogue, open_catalogue, save
+from sonarpost.codec.vq.training_config import MAX_TILES
 
 EXIT_SOME_FAILED = 1
 

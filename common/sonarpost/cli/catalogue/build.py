@@ -8,13 +8,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from sonarpost.catalogue.build import build
-from sonarpost.catalogue.plan import MAX_TILES, Round, rms_distance
-from sonarpost.catalogue.store import Catalogue, open_catalogue, save
 from sonarpost.cli.catalogue.images import training_images
 from sonarpost.cli.catalogue.info import show
 from sonarpost.cli.catalogue.progress import ProgressDisplay
-from sonarpost.codec.tiles import MAX_DIMS
+from sonarpost.codec.vq.builder import build
+from sonarpost.codec.vq.codebook import Catalogue, open_catalogue, save
+from sonarpost.codec.vq.tiles import MAX_DIMS
+from sonarpost.codec.vq.training_config import MAX_TILES, Round, rms_distance
 from sonarpost.errors import CatalogueError, ConfigError
 
 DEFAULT_ROUNDS = "39:16"

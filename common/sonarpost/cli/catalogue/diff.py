@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from sonarpost.catalogue.compare import OneSide, compare
-from sonarpost.catalogue.store import open_catalogue
 from sonarpost.cli.catalogue.info import print_facts
+from sonarpost.codec.vq.codebook import open_catalogue
+from sonarpost.codec.vq.comparison import OneSide, compare
 
 EXIT_DIFFERENT = 1
 

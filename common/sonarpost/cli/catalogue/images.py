@@ -7,9 +7,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from sonarpost.catalogue.plan import TrainingImage
 from sonarpost.codec.interface import to_uint8
-from sonarpost.codec.tiles import Tiles
+from sonarpost.codec.vq.tiles import Tiles
+from sonarpost.codec.vq.training_config import TrainingImage
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.image_files import read_image
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from sonarpost.catalogue.store import Catalogue, open_catalogue
-from sonarpost.codec.vq import catalogue_tag
+from sonarpost.codec.vq.codebook import Catalogue, open_catalogue
+from sonarpost.codec.vq.codec import catalogue_tag
 
 
 def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

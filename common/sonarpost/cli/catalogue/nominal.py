@@ -9,11 +9,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from sonarpost.catalogue.nominal import RECIPES, Recipe, build_nominal, humminbird_images
-from sonarpost.catalogue.plan import TrainingImage
-from sonarpost.catalogue.store import load, save
-from sonarpost.catalogue.windows import Line, WindowPlan, cut_around, cut_line
+from sonarpost.cli.catalogue.default_codebooks import RECIPES, Recipe, build_nominal, humminbird_images
 from sonarpost.cli.catalogue.progress import ProgressDisplay
+from sonarpost.codec.vq.codebook import load, save
+from sonarpost.codec.vq.patches import Line, WindowPlan, cut_around, cut_line
+from sonarpost.codec.vq.training_config import TrainingImage
 from sonarpost.errors import ConfigError
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from sonarpost.catalogue.plan import PassProgress, Progress
+from sonarpost.codec.vq.training_config import PassProgress, Progress
 
 LINE_EVERY_S = 10.0
 

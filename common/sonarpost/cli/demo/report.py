@@ -9,13 +9,13 @@ from typing import Literal
 from rich.console import Console
 from rich.table import Table
 
-from sonarpost.catalogue.store import open_catalogue
 from sonarpost.cli.demo.account import Result
 from sonarpost.cli.demo.settings import ChainSettings
 from sonarpost.cli.demo.sheet import SheetRow, write_sheet
 from sonarpost.cli.demo.watch import Watcher
 from sonarpost.codec.interface import Decoded
 from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.codec.vq.codebook import open_catalogue
 from sonarpost.messages import EncodedImage, ReconstructedImage
 
 _COLUMNS: tuple[tuple[str, Literal["left", "right"]], ...] = (

@@ -13,16 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import CODEC_ID, NAME, STRUCTURE_ID, STRUCTURE_NAME, transform
+from sonarpost.codec.emb.bitplanes import held
 from sonarpost.codec.emb.coder import State, error_by_length
-from sonarpost.codec.emb.fit import wanted_of
-from sonarpost.codec.emb.grain import make_grain, measure_grain
+from sonarpost.codec.emb.decode import Plain, picture_of, plain_of, read_body, usable
 from sonarpost.codec.emb.layout import layout
 from sonarpost.codec.emb.model import Model, all_shipped, all_structure, shipped
-from sonarpost.codec.emb.planes import held
-from sonarpost.codec.emb.reading import Plain, picture_of, plain_of, read_body, usable
+from sonarpost.codec.emb.rate_distortion_opt import wanted_of
 from sonarpost.codec.emb.region import fill_unknown, weights
 from sonarpost.codec.emb.search import MAX_BODY_BYTES, Writer
-from sonarpost.codec.emb.side import MEAN_STEP, Box, Side
+from sonarpost.codec.emb.side_info import MEAN_STEP, Box, Side
+from sonarpost.codec.emb.speckle_synthesis import make_grain, measure_grain
 from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, check_image, model_tag, to_uint8
 from sonarpost.errors import StreamError
 

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import kernel as k
-from sonarpost.codec.emb.aim import CONTRASTS, LEVELS, Aim
+from sonarpost.codec.emb.perceptual_weights import CONTRASTS, LEVELS, Aim
 from sonarpost.errors import StreamError
 
 I32 = npt.NDArray[np.int32]
@@ -182,7 +182,7 @@ def parse(raw: bytes, where: str = "emb model") -> Model:
 
 
 def _read(names: tuple[str, ...]) -> tuple[Model, ...]:
-    data = files("sonarpost.codec").joinpath("data")
+    data = files("sonarpost.codec.emb").joinpath("data")
     return tuple(parse(data.joinpath(name).read_bytes(), name) for name in names)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb.layout import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, Layout
-from sonarpost.codec.emb.side import SIXTEENTHS, Box
+from sonarpost.codec.emb.side_info import SIXTEENTHS, Box
 from sonarpost.codec.interface import Image, Mask
 from sonarpost.errors import StreamError
 

@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
+from sonarpost.codec.emb.bitplanes import STEPS, code_planes, extra_planes, known_plane
 from sonarpost.codec.emb.coder import Coder, State
-from sonarpost.codec.emb.fit import Wanted
-from sonarpost.codec.emb.likeness import likeness
+from sonarpost.codec.emb.decode import grey_of
 from sonarpost.codec.emb.model import Model
-from sonarpost.codec.emb.planes import STEPS, code_planes, extra_planes, known_plane
-from sonarpost.codec.emb.reading import grey_of
-from sonarpost.codec.emb.side import Box, Side, write_side
+from sonarpost.codec.emb.rate_distortion_opt import Wanted
+from sonarpost.codec.emb.side_info import Box, Side, write_side
+from sonarpost.codec.emb.similarity import likeness
 from sonarpost.codec.interface import MAX_SIDE_PX
 
 I64 = npt.NDArray[np.int64]

@@ -54,7 +54,7 @@ MAX_SEGMENT_BYTES: Final = 255
 
 
 class FrameSeal(Protocol):
-    """A hook that authenticates frames, and may encrypt them. `sonarpost.link.auth.authentication` has the one that is used."""
+    """Authenticates frames and may encrypt them; implemented by `sonarpost.link.auth.authentication`."""
 
     @property
     def size(self) -> int:

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sonarpost.catalogue.growing import GrowingTiles
-from sonarpost.catalogue.plan import TrainingImage, pixels_hash
-from sonarpost.codec.tiles import TileDatabase, Tiles, cut_tiles
+from sonarpost.codec.vq.incremental import GrowingTiles
+from sonarpost.codec.vq.tiles import TileDatabase, Tiles, cut_tiles
+from sonarpost.codec.vq.training_config import TrainingImage, pixels_hash
 
 _BATCH_TILES = 4096
 

@@ -26,7 +26,7 @@ import numpy.typing as npt
 from PIL import Image as Pillow
 from PIL import features
 
-from sonarpost.codec.avif_file import avif_file, check_frame, frame_of
+from sonarpost.codec.baselines.avif_file import avif_file, check_frame, frame_of
 from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, arrived_body, check_image, to_uint8
 from sonarpost.errors import ConfigError, StreamError
 

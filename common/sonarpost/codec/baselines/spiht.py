@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from sonarpost.codec.baselines.spiht_passes import MAX_PLANES, EndOfBits, PictureAnswers, StreamAnswers, run_passes
+from sonarpost.codec.baselines.spiht_wavelet import Forest, Integers, forest_of, inverse, transform
 from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, arrived_body, check_image, to_uint8
-from sonarpost.codec.spiht_passes import MAX_PLANES, EndOfBits, PictureAnswers, StreamAnswers, run_passes
-from sonarpost.codec.spiht_wavelet import Forest, Integers, forest_of, inverse, transform
 from sonarpost.errors import ConfigError, StreamError
 
 CODEC_ID = 0x04

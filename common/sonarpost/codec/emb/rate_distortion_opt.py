@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
 from sonarpost.codec.emb._jit import compiled
-from sonarpost.codec.emb.aim import Aim, expected, start_scales
 from sonarpost.codec.emb.coder import PLAIN_SCALE
 from sonarpost.codec.emb.layout import HEIGHT, HH, HL, LEVEL, LH, LL, ORIENT, WIDTH, Layout, cells_of
+from sonarpost.codec.emb.perceptual_weights import Aim, expected, start_scales
 from sonarpost.codec.emb.region import OUTSIDE
 
 Plane = npt.NDArray[np.int64]

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from sonarpost.codec.spiht_wavelet import FRACTION_BITS, Forest, Integers
+from sonarpost.codec.baselines.spiht_wavelet import FRACTION_BITS, Forest, Integers
 
 MAX_PLANES = 20
 """The energy of 512 x 512 px keeps every coefficient below plane 18."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.tile_search import BLOCK_TILES, NearestSearch, empty_blocks, fill_blocks, squared_norms
-from sonarpost.codec.tiles import Tiles
+from sonarpost.codec.vq.tile_search import BLOCK_TILES, NearestSearch, empty_blocks, fill_blocks, squared_norms
+from sonarpost.codec.vq.tiles import Tiles
 
 _CENTRE = 128
 _QUERY_ROWS = 256

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.plan import TrainingImage
+from sonarpost.codec.vq.training_config import TrainingImage
 
 Picture = npt.NDArray[np.uint8]
 Line = npt.NDArray[np.float32]

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.huffman_code import Bits, EndOfBitsError, read_symbols
-from sonarpost.codec.huffman_levels import (
+from sonarpost.codec.baselines.huffman_code import Bits, EndOfBitsError, read_symbols
+from sonarpost.codec.baselines.huffman_levels import (
     FULL_SCALE,
     MAX_CHOSEN_LEVELS,
     chosen_levels,

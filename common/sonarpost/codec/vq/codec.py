@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.interface import Decoded, Mask, StreamHeader, check_image, model_tag, to_uint8
-from sonarpost.codec.tiles import TileDatabase, cut_tiles, join_tiles, tile_grid
+from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles, join_tiles, tile_grid
 from sonarpost.errors import ConfigError, StreamError
 
 MAX_BODY_BYTES = 0xFFFF

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.growing import GrowingTiles
-from sonarpost.codec.tiles import TileDatabase
+from sonarpost.codec.vq.incremental import GrowingTiles
+from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CatalogueError
 
 

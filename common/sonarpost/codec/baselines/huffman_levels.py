@@ -1,6 +1,6 @@
 """The picture level of `huffman`: which grey levels, in which resolution.
 
-How they are written is told in `sonarpost.codec.huffman`.
+How they are written is told in `sonarpost.codec.baselines.huffman`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from PIL import Image as Pillow
 from scipy import ndimage
 
-from sonarpost.codec.huffman_code import Bits, Integers, canonical_codes, code_lengths, differences, gamma
+from sonarpost.codec.baselines.huffman_code import Bits, Integers, canonical_codes, code_lengths, differences, gamma
 from sonarpost.codec.interface import Image, Mask
 from sonarpost.errors import StreamError
 

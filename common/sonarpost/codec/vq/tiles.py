@@ -8,7 +8,7 @@ Mean and basis are held as **integers** (the basis in units of 1/4096), so proje
 integers that float64 holds exactly: they are the same, and so are the indices, whatever the processor or the
 linear-algebra library. A stream encoded on one machine is byte for byte the stream of any other.
 
-The search itself is `sonarpost.codec.tile_search`.
+The search itself is `sonarpost.codec.vq.tile_search`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.tile_search import LEADING, Distances, Indices, NearestSearch
+from sonarpost.codec.vq.tile_search import LEADING, Distances, Indices, NearestSearch
 from sonarpost.errors import CatalogueError
 
 MIN_TILE_PX = 4

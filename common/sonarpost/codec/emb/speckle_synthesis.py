@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
 from sonarpost.codec.emb.layout import HH, LEVEL, LL, ORIENT, Layout, cells_of
-from sonarpost.codec.emb.side import GRAIN_BANDS
+from sonarpost.codec.emb.side_info import GRAIN_BANDS
 from sonarpost.codec.interface import Image
 
 Flat = npt.NDArray[np.int32]

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.windows import Line
+from sonarpost.codec.vq.patches import Line
 from sonarpost.errors import CatalogueError
 from sonarpost.sonar.image_files import read_image
 

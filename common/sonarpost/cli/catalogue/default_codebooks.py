@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sonarpost.catalogue.build import Told, build
-from sonarpost.catalogue.humminbird import humminbird_lines
-from sonarpost.catalogue.plan import Round, TrainingImage, rms_distance
-from sonarpost.catalogue.store import Catalogue
-from sonarpost.catalogue.windows import WindowPlan, cut_line, shuffled
+from sonarpost.cli.catalogue.humminbird_lines import humminbird_lines
+from sonarpost.codec.vq.builder import Told, build
+from sonarpost.codec.vq.codebook import Catalogue
+from sonarpost.codec.vq.patches import WindowPlan, cut_line, shuffled
+from sonarpost.codec.vq.training_config import Round, TrainingImage, rms_distance
 
 SOURCES = (
     "sonarpost's own survey simulator; "

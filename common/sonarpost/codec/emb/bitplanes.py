@@ -7,12 +7,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb import aim, kernel, transform
+from sonarpost.codec.emb import kernel, transform
+from sonarpost.codec.emb import perceptual_weights as aim
 from sonarpost.codec.emb.coder import PLAIN_SCALE, Coder, State
 from sonarpost.codec.emb.layout import HEIGHT, HL, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH
 from sonarpost.codec.emb.model import Model
 from sonarpost.codec.emb.region import OUTSIDE, weights
-from sonarpost.codec.emb.side import MAX_EXTRA, Box, Side
+from sonarpost.codec.emb.side_info import MAX_EXTRA, Box, Side
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]

@@ -8,12 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
+from sonarpost.codec.emb.bitplanes import code_planes, known_plane, situation
 from sonarpost.codec.emb.coder import Coder, State
 from sonarpost.codec.emb.enhance import enhanced
 from sonarpost.codec.emb.layout import Layout
 from sonarpost.codec.emb.model import Model
-from sonarpost.codec.emb.planes import code_planes, known_plane, situation
-from sonarpost.codec.emb.side import Side, read_side
+from sonarpost.codec.emb.side_info import Side, read_side
 from sonarpost.codec.interface import Image, Mask
 from sonarpost.errors import StreamError
 

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.codec.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase
-from sonarpost.codec.vq import catalogue_tag
+from sonarpost.codec.vq.codec import catalogue_tag
+from sonarpost.codec.vq.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase
 from sonarpost.errors import CatalogueError
 from sonarpost.files import write_atomically
 
@@ -148,7 +148,7 @@ def load_nominal(tile_px: int) -> Catalogue:
         raise CatalogueError("nominal catalogues", "tile_px", tile_px, sizes)
     name = f"nominal-{tile_px}.tiles"
     try:
-        data = (resources.files("sonarpost.catalogue") / "data" / name).read_bytes()
+        data = (resources.files("sonarpost.codec.vq") / "data" / name).read_bytes()
     except OSError as error:
         raise CatalogueError(name, "", str(error), "the file installed with the package") from error
     return from_bytes(data, name)

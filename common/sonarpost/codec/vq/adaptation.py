@@ -28,11 +28,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.growing import GrowingTiles
-from sonarpost.catalogue.plan import MAX_TILES, TrainingImage
-from sonarpost.catalogue.refine import refine_once
 from sonarpost.codec.quality import fom, psnr_db
-from sonarpost.codec.tiles import TileDatabase, Tiles, cut_tiles, join_tiles
+from sonarpost.codec.vq.incremental import GrowingTiles
+from sonarpost.codec.vq.refinement import refine_once
+from sonarpost.codec.vq.tiles import TileDatabase, Tiles, cut_tiles, join_tiles
+from sonarpost.codec.vq.training_config import MAX_TILES, TrainingImage
 from sonarpost.errors import ConfigError
 
 _STEPS = 8

@@ -23,9 +23,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.catalogue.growing import GrowingTiles
-from sonarpost.catalogue.journal import EntryKind, Journal, JournalEntry
-from sonarpost.catalogue.plan import (
+from sonarpost.codec.quality import FigureOfMerit, fom
+from sonarpost.codec.vq.build_journal import EntryKind, Journal, JournalEntry
+from sonarpost.codec.vq.incremental import GrowingTiles
+from sonarpost.codec.vq.refinement import refine_once, without_doubles
+from sonarpost.codec.vq.tiles import TileDatabase, Tiles, cut_tiles, join_tiles
+from sonarpost.codec.vq.training_config import (
     MAX_TILES,
     PassProgress,
     Progress,
@@ -37,9 +40,6 @@ from sonarpost.catalogue.plan import (
     pixels_hash,
     spread,
 )
-from sonarpost.catalogue.refine import refine_once, without_doubles
-from sonarpost.codec.quality import FigureOfMerit, fom
-from sonarpost.codec.tiles import TileDatabase, Tiles, cut_tiles, join_tiles
 from sonarpost.errors import CatalogueError
 
 Told = Callable[[Progress | PassProgress], None]

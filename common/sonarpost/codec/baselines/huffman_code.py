@@ -1,6 +1,6 @@
 """The bit level of `huffman`: code lengths, canonical codes, the bits of a body.
 
-How a body is laid out is told in `sonarpost.codec.huffman`.
+How a body is laid out is told in `sonarpost.codec.baselines.huffman`.
 """
 
 from __future__ import annotations

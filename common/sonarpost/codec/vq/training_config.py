@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.tiles import MAX_TILE_PX, MIN_TILE_PX, TileDatabase
+from sonarpost.codec.vq.tiles import MAX_TILE_PX, MIN_TILE_PX, TileDatabase
 from sonarpost.errors import ConfigError
 
 MAX_TILES = 15_992

@@ -25,7 +25,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from sonarpost.codec.tiles import Tiles
+from sonarpost.codec.vq.tiles import Tiles
 from sonarpost.errors import CatalogueError
 
 MAGIC = b"SPJOURNAL2\n"

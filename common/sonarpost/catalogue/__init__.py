@@ -1,1 +1,0 @@
-"""The shared tile database: built (Table IV), stored, identified by hash, loaded."""

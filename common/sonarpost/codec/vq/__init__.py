@@ -1,0 +1,1 @@
+"""The paper's codec: vector quantisation with a shared codebook of tiles, and the tools that build codebooks."""
