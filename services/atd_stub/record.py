@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from sonarpost.codec.interface import MIN_SIDE_PX
-from sonarpost.detect.contacts import Detection
-from sonarpost.detect.ground_snippet import ground_picture
-from sonarpost.detect.snippet import cut_snippet, cut_wide
+from sonarpost.detection.contacts import Detection
+from sonarpost.detection.ground_snippet import ground_picture
+from sonarpost.detection.snippet import cut_snippet, cut_wide
 from sonarpost.messages import Contact, Raster, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.seam import Origin

@@ -14,7 +14,7 @@ from typing import Final
 import msgpack
 import numpy as np
 
-from sonarpost.detect.looks import Look, Sameness
+from sonarpost.detection.association import Look, Sameness
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 

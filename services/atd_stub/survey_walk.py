@@ -9,8 +9,8 @@ from itertools import chain
 from typing import Final
 
 from sonarpost import wire
-from sonarpost.detect.contacts import Detection, detect
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.contacts import Detection, detect
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.record import of_detection

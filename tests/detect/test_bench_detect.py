@@ -16,7 +16,7 @@ from sonarpost.cli.bench.detect_tiles import TileScore, tile_auc, tile_scores
 from sonarpost.cli.bench.detect_truth import Scale, object_at
 from sonarpost.cli.bench.measure import subjects
 from sonarpost.codec.registry import default_registry
-from sonarpost.detect.contacts import detect
+from sonarpost.detection.contacts import detect
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import TruthObject

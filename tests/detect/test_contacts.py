@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from pyproj import Geod
 
-from sonarpost.detect.contacts import MINE_LIKE, detect
-from sonarpost.detect.settings import DetectorSettings
-from sonarpost.detect.snippet import cut_snippet
+from sonarpost.detection.contacts import MINE_LIKE, detect
+from sonarpost.detection.settings import DetectorSettings
+from sonarpost.detection.snippet import cut_snippet
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.bottom_track import track_bottom

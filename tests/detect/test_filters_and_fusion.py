@@ -7,16 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.detect.candidates import Candidate, FilterScores, candidates, geometry_score
-from sonarpost.detect.clutter import clutter_levels
-from sonarpost.detect.contacts import CLUTTER, MINE_LIKE, classify, height_from_shadow_m
-from sonarpost.detect.fusion import FILTERS, FusionModel, fused_confidences, log_scores, shipped_model, suppress
-from sonarpost.detect.highlight_shadow import matched_response, peaks
-from sonarpost.detect.measure import Measured, measure
-from sonarpost.detect.preprocess import preprocess
-from sonarpost.detect.settings import DetectorSettings
-from sonarpost.detect.structures import structures
-from sonarpost.detect.texture import TextureMap
+from sonarpost.detection.candidates import Candidate, FilterScores, candidates, geometry_score
+from sonarpost.detection.clutter import clutter_levels
+from sonarpost.detection.contacts import CLUTTER, MINE_LIKE, classify, height_from_shadow_m
+from sonarpost.detection.fusion import FILTERS, FusionModel, fused_confidences, log_scores, shipped_model, suppress
+from sonarpost.detection.highlight_shadow import matched_response, peaks
+from sonarpost.detection.measure import Measured, measure
+from sonarpost.detection.preprocess import preprocess
+from sonarpost.detection.settings import DetectorSettings
+from sonarpost.detection.structures import structures
+from sonarpost.detection.texture import TextureMap
 from sonarpost.sonar.survey import Side
 
 SETTINGS = DetectorSettings()

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from sonarpost.detect.contacts import detect
-from sonarpost.detect.line import LineDetector, follows
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.contacts import detect
+from sonarpost.detection.settings import DetectorSettings
+from sonarpost.detection.stream import LineDetector, follows
 from sonarpost.sonar.survey import ChannelPing, Side
 
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from sonarpost.detect.contacts import detect
-from sonarpost.detect.looks import UNKNOWN_ALONG_M, Look, Sameness
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.association import UNKNOWN_ALONG_M, Look, Sameness
+from sonarpost.detection.contacts import detect
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import Side
 
 LOOK = Look(Side.PORT, 50, 46, 54, 11.0, 0.1)

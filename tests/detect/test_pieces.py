@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonarpost.detect.contacts import detect
-from sonarpost.detect.ground_snippet import cut_ground_snippet
-from sonarpost.detect.piece import Piece, piece_grid
-from sonarpost.detect.pieces import best_of_piece
+from sonarpost.detection.contacts import detect
+from sonarpost.detection.ground_snippet import cut_ground_snippet
+from sonarpost.detection.image_confidence import best_of_piece
+from sonarpost.detection.image_detector import Piece, piece_grid
 from sonarpost.sonar.survey import Side
 
 

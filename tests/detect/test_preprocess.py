@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.detect.preprocess import preprocess
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.preprocess import preprocess
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 SETTINGS = DetectorSettings()

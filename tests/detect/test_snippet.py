@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.detect.contacts import detect
-from sonarpost.detect.snippet import cut_snippet, cut_wide, to_grey
+from sonarpost.detection.contacts import detect
+from sonarpost.detection.snippet import cut_snippet, cut_wide, to_grey
 from sonarpost.sonar.survey import ChannelPing, Side
 
 

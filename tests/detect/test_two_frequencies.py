@@ -9,13 +9,13 @@ import pytest
 from two_frequencies import read_both, with_second_frequency
 
 from sonarpost.cli.bench.detect_codecs import confidence_with
-from sonarpost.detect.contacts import detect
-from sonarpost.detect.ground_snippet import cut_ground_snippet, ground_picture
-from sonarpost.detect.line import LineDetector, follows
-from sonarpost.detect.plot import annotated_waterfall
-from sonarpost.detect.preprocess import preprocess
-from sonarpost.detect.settings import DetectorSettings
-from sonarpost.detect.snippet import cut_snippet, cut_wide
+from sonarpost.detection.contacts import detect
+from sonarpost.detection.ground_snippet import cut_ground_snippet, ground_picture
+from sonarpost.detection.plot import annotated_waterfall
+from sonarpost.detection.preprocess import preprocess
+from sonarpost.detection.settings import DetectorSettings
+from sonarpost.detection.snippet import cut_snippet, cut_wide
+from sonarpost.detection.stream import LineDetector, follows
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.ground_range import MAX_COLUMNS

@@ -10,8 +10,8 @@ import pytest
 from conftest import eventually
 
 from sonarpost import keys
-from sonarpost.detect.contacts import detect
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.contacts import detect
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub import service as atd_stub
 from sonarpost.services.atd_stub.config import AtdStubConfig

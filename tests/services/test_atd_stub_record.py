@@ -13,8 +13,8 @@ from golden.zenoh.samples import BARE_CONTACT, FULL_CONTACT
 
 from sonarpost import keys
 from sonarpost.config import load
-from sonarpost.detect.contacts import FilterScores, detect
-from sonarpost.detect.ground_snippet import ground_picture
+from sonarpost.detection.contacts import FilterScores, detect
+from sonarpost.detection.ground_snippet import ground_picture
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.messages import Contact, Raster, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig

@@ -8,7 +8,7 @@ import pytest
 from seams import RANGE_M, SAMPLES, Box, cut_into, near, run, survey_of
 from two_frequencies import files_of, with_second_frequency
 
-from sonarpost.detect.line import follows
+from sonarpost.detection.stream import follows
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.seam import pack, unpack
 from sonarpost.services.atd_stub.snippets import from_survey

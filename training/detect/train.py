@@ -1,6 +1,6 @@
 """Fit the weights of the detector's fusion to simulated surveys, and to nothing else.
 
-    python training/detect/train.py --cache /tmp/detect --out common/sonarpost/detect/fusion.json
+    python training/detect/train.py --cache /tmp/detect --out common/sonarpost/detection/fusion.json
 
 48 surveys of 1000 pings, eight of each seabed, with four mine-like and six other objects each; range, altitude, speed
 and sample type vary. Seeds 1000 to 1007; the evaluation (`sonarpost bench detect`) uses seeds from 5000 on. The result
@@ -26,11 +26,11 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 
 from sonarpost.cli.bench.detect_truth import Scale, object_at
-from sonarpost.detect.candidates import Candidate, candidates
-from sonarpost.detect.clutter import clutter_levels
-from sonarpost.detect.fusion import FILTERS, FusionModel, fused_confidences, log_scores, suppress
-from sonarpost.detect.preprocess import LevelGrid, preprocess
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.candidates import Candidate, candidates
+from sonarpost.detection.clutter import clutter_levels
+from sonarpost.detection.fusion import FILTERS, FusionModel, fused_confidences, log_scores, suppress
+from sonarpost.detection.preprocess import LevelGrid, preprocess
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.files import write_atomically
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SimulatedSurvey, SurveySpec, TruthObject, simulate_survey

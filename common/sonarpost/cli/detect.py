@@ -12,11 +12,11 @@ from pathlib import Path
 from PIL import Image
 
 from sonarpost.cli.detect_record import FoundIn, contact_json
-from sonarpost.detect.ground_snippet import cut_ground_snippet
-from sonarpost.detect.line import LineContact, LineDetector
-from sonarpost.detect.plot import annotated_waterfall
-from sonarpost.detect.settings import DetectorSettings
-from sonarpost.detect.snippet import cut_snippet
+from sonarpost.detection.ground_snippet import cut_ground_snippet
+from sonarpost.detection.plot import annotated_waterfall
+from sonarpost.detection.settings import DetectorSettings
+from sonarpost.detection.snippet import cut_snippet
+from sonarpost.detection.stream import LineContact, LineDetector
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
 from sonarpost.sonar.options import SurveyOptions, load_options

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 
-from sonarpost.detect.line import LineContact
+from sonarpost.detection.stream import LineContact
 from sonarpost.sonar.survey import Survey
 
 

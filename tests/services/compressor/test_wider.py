@@ -9,7 +9,7 @@ from conftest import eventually
 from records import command_record
 
 from sonarpost import keys
-from sonarpost.detect.contacts import detect
+from sonarpost.detection.contacts import detect
 from sonarpost.link.downlink import messages as dl
 from sonarpost.messages import Contact, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig

@@ -18,9 +18,9 @@ import numpy.typing as npt
 from sonarpost.cli.bench.detect_simulated import JudgedFile
 from sonarpost.cli.bench.measure import Subject, code
 from sonarpost.codec.interface import Image
-from sonarpost.detect.contacts import Detection, detect
-from sonarpost.detect.settings import DetectorSettings
-from sonarpost.detect.snippet import HIGH_PERCENTILE, LOW_PERCENTILE, Snippet, cut_snippet
+from sonarpost.detection.contacts import Detection, detect
+from sonarpost.detection.settings import DetectorSettings
+from sonarpost.detection.snippet import HIGH_PERCENTILE, LOW_PERCENTILE, Snippet, cut_snippet
 from sonarpost.sonar.survey import ChannelPing, Survey
 
 HEIGHT_PX: Final = 80

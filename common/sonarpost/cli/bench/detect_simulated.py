@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.cli.bench.detect_truth import Scale, object_at
-from sonarpost.detect.contacts import Detection, detect
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.contacts import Detection, detect
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, TruthObject, simulate_survey
 from sonarpost.sonar.survey import Survey

@@ -14,8 +14,8 @@ from sonarpost.cli.bench.pictures import JPEG_SUFFIXES, read_jpeg
 from sonarpost.cli.bench.sdvd import survey_line
 from sonarpost.cli.bench.statistics import Interval, auc, bootstrap_weights, interval
 from sonarpost.codec.interface import to_uint8
-from sonarpost.detect.piece import Piece
-from sonarpost.detect.pieces import best_of_piece
+from sonarpost.detection.image_confidence import best_of_piece
+from sonarpost.detection.image_detector import Piece
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.image_files import read_image
 

@@ -12,8 +12,8 @@ import numpy as np
 from sonarpost.cli.bench.measure import PSNR_LIMIT_DB, Coded, Subject, code
 from sonarpost.codec.interface import Image
 from sonarpost.codec.quality import psnr_db, ssim
-from sonarpost.detect.contacts import detect
-from sonarpost.detect.snippet import cut_snippet
+from sonarpost.detection.contacts import detect
+from sonarpost.detection.snippet import cut_snippet
 from sonarpost.errors import SurveyFileError
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey

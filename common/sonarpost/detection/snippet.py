@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.detect.contacts import Detection
+from sonarpost.detection.contacts import Detection
 from sonarpost.sonar.survey import Side, Survey
 
 SNIPPET_HEIGHT_PX = 100

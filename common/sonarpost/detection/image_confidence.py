@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sonarpost.detect.candidates import FilterScores, candidates
-from sonarpost.detect.fusion import fused_confidences
-from sonarpost.detect.piece import Piece, piece_grid
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.candidates import FilterScores, candidates
+from sonarpost.detection.fusion import fused_confidences
+from sonarpost.detection.image_detector import Piece, piece_grid
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import Side
 
 
@@ -16,7 +16,7 @@ class PieceFinding:
     """The place of a piece of which the detector is surest.
 
     Attributes:
-        confidence: 0 to 2, see `sonarpost.detect.fusion`.
+        confidence: 0 to 2, see `sonarpost.detection.fusion`.
         scores: What each filter says.
         side: Where the shadow falls: to the right (starboard) or to the left (port).
         row: Row of the highlight's middle in the picture.

@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from sonarpost.detect.highlight_shadow import matched_response, peaks
-from sonarpost.detect.measure import Measured, measure
-from sonarpost.detect.preprocess import LevelGrid
-from sonarpost.detect.settings import DetectorSettings
-from sonarpost.detect.texture import TextureMap
+from sonarpost.detection.highlight_shadow import matched_response, peaks
+from sonarpost.detection.measure import Measured, measure
+from sonarpost.detection.preprocess import LevelGrid
+from sonarpost.detection.settings import DetectorSettings
+from sonarpost.detection.texture import TextureMap
 
 _MOST_PER_KILOPING: Final = 250
 
@@ -24,7 +24,7 @@ class FilterScores:
         cfar: Highlight over the ring of seabed around it, in the ring's deviations.
         shadow: Depth of the shadow below that ring, in the same, times the part of it that is dark.
         texture: Distance of the texture, where highlight and shadow meet, from that of the seabed around
-            (`sonarpost.detect.texture`).
+            (`sonarpost.detection.texture`).
         geometry: 0 to 1, how well highlight and shadow have the proportions of a compact object, see `geometry_score`.
     """
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
-from sonarpost.detect.contacts import MINE_LIKE, Detection
-from sonarpost.detect.snippet import to_grey
+from sonarpost.detection.contacts import MINE_LIKE, Detection
+from sonarpost.detection.snippet import to_grey
 from sonarpost.sonar.survey import Side, Survey
 
 _COLOURS = {MINE_LIKE: (255, 80, 60)}

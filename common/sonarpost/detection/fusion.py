@@ -6,7 +6,7 @@ sure as it can be, so that one filter cannot outvote the rest. A logistic model 
     evidence = sum of weight * x
     share = 1 / (1 + exp(-(offset + evidence - clutter_weight * clutter)))        confidence = 2 * share
 
-where `clutter` is the evidence that places around reach by chance (`sonarpost.detect.clutter`). No weight is below 0,
+where `clutter` is the evidence that places around reach by chance (`sonarpost.detection.clutter`). No weight is below 0,
 so the confidence never falls when a score rises. The weights, in `fusion.json` beside this module, are fitted to
 simulated surveys only (`training/detect/train.py`), so that `share` is about the share of contacts of that confidence
 that truly are objects on the bottom: half of those at 1.0. The paper's confidence has the same range (0.0 to 2.0, a
@@ -25,11 +25,11 @@ from typing import Final
 
 import numpy as np
 
-from sonarpost.detect.candidates import Candidate, FilterScores
-from sonarpost.detect.clutter import Numbers, clutter_levels
-from sonarpost.detect.measure import Measured
-from sonarpost.detect.preprocess import LevelGrid
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.candidates import Candidate, FilterScores
+from sonarpost.detection.clutter import Numbers, clutter_levels
+from sonarpost.detection.measure import Measured
+from sonarpost.detection.preprocess import LevelGrid
+from sonarpost.detection.settings import DetectorSettings
 
 FILTERS: Final = ("matched", "cfar", "shadow", "texture", "geometry")
 """Names of the scores, in the order of the weights."""
@@ -93,7 +93,7 @@ def log_scores(scores: FilterScores) -> tuple[float, ...]:
 @cache
 def shipped_model() -> FusionModel:
     """Return the model that comes with the package."""
-    table = json.loads(files("sonarpost.detect").joinpath("fusion.json").read_text("utf-8"))
+    table = json.loads(files("sonarpost.detection").joinpath("fusion.json").read_text("utf-8"))
     weights = tuple(float(table["weights"][name]) for name in FILTERS)
     return FusionModel(float(table["offset"]), weights, float(table["clutter_weight"]), float(table["clutter_floor"]))
 

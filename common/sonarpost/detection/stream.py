@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from sonarpost.detect.contacts import Detection, detect
-from sonarpost.detect.looks import Look, Sameness
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.association import Look, Sameness
+from sonarpost.detection.contacts import Detection, detect
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.geometry import ping_spacing_m
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.survey import Ping, Side, Survey

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from sonarpost.detect.highlight_shadow import Peak
-from sonarpost.detect.preprocess import LevelGrid
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.highlight_shadow import Peak
+from sonarpost.detection.preprocess import LevelGrid
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import FloatImage
 
 # A shadow may be broken by speckle for this much of its own length before it ends.

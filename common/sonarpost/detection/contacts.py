@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from sonarpost.detect.candidates import Candidate, FilterScores, candidates
-from sonarpost.detect.fusion import fused_confidences, suppress
-from sonarpost.detect.preprocess import FloatVector, LevelGrid, preprocess
-from sonarpost.detect.settings import DetectorSettings
-from sonarpost.detect.structures import is_within, structures
+from sonarpost.detection.candidates import Candidate, FilterScores, candidates
+from sonarpost.detection.fusion import fused_confidences, suppress
+from sonarpost.detection.preprocess import FloatVector, LevelGrid, preprocess
+from sonarpost.detection.settings import DetectorSettings
+from sonarpost.detection.structures import is_within, structures
 from sonarpost.sonar.bottom_track import altitudes_m
 from sonarpost.sonar.geometry import Position, sample_slant_range_m, slant_to_ground_range_m
 from sonarpost.sonar.georeference import georeference
@@ -43,7 +43,7 @@ class Detection:
         shadow_m: Length of the shadow on the slant-range picture, from the highlight's outer edge.
         height_m: shadow x altitude / (slant range + shadow), by similar triangles over a flat bottom.
         shadow_is_cut: True when the recording ends before the shadow; `shadow_m` and `height_m` are then lower bounds.
-        confidence: 0 to 2, see `sonarpost.detect.fusion`.
+        confidence: 0 to 2, see `sonarpost.detection.fusion`.
         scores: The filters' own scores.
         atd_class: "mine-like" or "clutter", see `classify`.
         pixel_along_m: Travel between two pings.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.bottom_track import altitudes_m
 from sonarpost.sonar.geometry import ping_spacing_m
 from sonarpost.sonar.survey import FloatImage, Side, Survey

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from sonarpost.detect.preprocess import LevelGrid
+from sonarpost.detection.preprocess import LevelGrid
 from sonarpost.sonar.survey import FloatImage, Side
 
 Picture = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]

@@ -16,9 +16,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.detect.measure import Measured
-from sonarpost.detect.preprocess import LevelGrid
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.measure import Measured
+from sonarpost.detection.preprocess import LevelGrid
+from sonarpost.detection.settings import DetectorSettings
 
 Numbers = npt.NDArray[np.float64]
 

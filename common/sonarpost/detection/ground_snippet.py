@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.detect.contacts import Detection
-from sonarpost.detect.snippet import to_grey
+from sonarpost.detection.contacts import Detection
+from sonarpost.detection.snippet import to_grey
 from sonarpost.sonar.geometry import ground_to_slant_range_m
 from sonarpost.sonar.ground_range import MAX_COLUMNS, ground_range_image, means_between
 from sonarpost.sonar.survey import FloatImage, Survey

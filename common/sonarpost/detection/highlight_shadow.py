@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.detect.boxes import BoxMeans, in_noise_units
-from sonarpost.detect.preprocess import LevelGrid
-from sonarpost.detect.settings import DetectorSettings
+from sonarpost.detection.integral_image import BoxMeans, in_noise_units
+from sonarpost.detection.preprocess import LevelGrid
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import FloatImage
 
 

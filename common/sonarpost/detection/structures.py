@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from sonarpost.detect.candidates import Candidate, FilterScores
-from sonarpost.detect.measure import Measured
-from sonarpost.detect.preprocess import LevelGrid
+from sonarpost.detection.candidates import Candidate, FilterScores
+from sonarpost.detection.measure import Measured
+from sonarpost.detection.preprocess import LevelGrid
 
 _SMOOTH_M: Final = 0.4
 _DARK_LEVEL: Final = -1.3

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from sonarpost.detect.preprocess import LevelGrid
+from sonarpost.detection.preprocess import LevelGrid
 
 Features = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
