@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
-from sonarpost.sonar.xtf_reader import read_xtf
 from sonarpost.sonar.xtf_writer import write_xtf
 
 FIRST_HZ, SECOND_HZ = 400e3, 900e3

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from sonarpost.config import ServiceConfig
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.water_chance import TailDamage

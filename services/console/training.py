@@ -23,7 +23,7 @@ from sonarpost.messages import (
     QueueState,
     ReconstructedImage,
 )
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.services.console.board import Board
 from sonarpost.services.console.fleet import frame_event
 from sonarpost.services.console.place_routes import fleet

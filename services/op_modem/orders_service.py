@@ -20,8 +20,8 @@ from sonarpost.link.downlink.commands import OpenOrder
 from sonarpost.link.downlink.vessel_endpoint import Packet
 from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame, Command, Decision, ReceivedMessage, Record
-from sonarpost.modem.events import FrameReceived, PacketFailed, PacketReceived, PacketSent
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.events import FrameReceived, PacketFailed, PacketReceived, PacketSent
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import Effects
 from sonarpost.security.acoustic_key import read_key

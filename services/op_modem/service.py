@@ -15,9 +15,9 @@ from sonarpost.config import PlatformConfig
 from sonarpost.errors import HandoffError
 from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame, LinkQuality
-from sonarpost.modem.events import Event, FrameHeard, FrameReceived, PacketFailed, PacketReceived, PacketSent
-from sonarpost.modem.rates import RATES
-from sonarpost.modem.statistics import LinkStatistics
+from sonarpost.modem.micromodem.events import Event, FrameHeard, FrameReceived, PacketFailed, PacketReceived, PacketSent
+from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem.statistics import LinkStatistics
 from sonarpost.monitoring.log_context import image_of_frame
 from sonarpost.runtime.service import Effects
 from sonarpost.services.op_modem.arriving import pack, unpack

@@ -14,7 +14,7 @@ from sonarpost.errors import BadInputError, HandoffError
 from sonarpost.link.mac import Medium
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
-from sonarpost.modem.events import (
+from sonarpost.modem.micromodem.events import (
     Event,
     FrameHeard,
     FrameReceived,
@@ -23,7 +23,7 @@ from sonarpost.modem.events import (
     PacketSent,
     Polled,
 )
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.line import VehicleLine

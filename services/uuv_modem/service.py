@@ -26,8 +26,8 @@ from sonarpost.messages import (
     QueueState,
     Record,
 )
-from sonarpost.modem.events import Event, PacketFailed, PacketSent
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.events import Event, PacketFailed, PacketSent
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import Effects, InterruptedByStopError
 from sonarpost.services.uuv_modem.config import UuvModemConfig

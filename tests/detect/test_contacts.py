@@ -16,7 +16,7 @@ from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.bottom_track import track_bottom
 from sonarpost.sonar.geometry import Position, offset_between_m
-from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.readers.registry import read_survey
 from sonarpost.sonar.survey import Ping, Side, Survey
 
 

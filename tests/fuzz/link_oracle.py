@@ -15,9 +15,9 @@ from modem.fuzz import ENDS, LIKELY, Fuzz, real_lines
 
 from sonarpost.link.events import ContactUpdate, MessageReceived
 from sonarpost.link.receiver import Receiver
-from sonarpost.modem import nmea
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.micromodem import MicroModem
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
 
 VEHICLE: Final = 3
 STRANGER: Final = 4

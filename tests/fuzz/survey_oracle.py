@@ -14,7 +14,7 @@ from sonar.makers import MAKERS
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.georeference import georeference
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.readers import open_survey
+from sonarpost.sonar.readers.registry import open_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 FILES = (

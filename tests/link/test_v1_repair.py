@@ -14,7 +14,7 @@ from sonarpost.link.events import ContactUpdate, MessageReceived
 from sonarpost.link.queue.state import export_queue, restore_queue
 from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName, QueueConfig
 from sonarpost.link.receiver import Receiver
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 
 VESSEL = 1
 

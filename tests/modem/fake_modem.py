@@ -7,11 +7,11 @@ from collections import Counter
 from collections.abc import Callable
 from itertools import count
 
-from sonarpost.modem import nmea
-from sonarpost.modem.events import Event, FrameHeard
-from sonarpost.modem.micromodem import MicroModem
-from sonarpost.modem.rates import RATES
-from sonarpost.modem.sentences import Cycle
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import Event, FrameHeard
+from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem.sentences import Cycle
 
 Loses = Callable[[nmea.Sentence, int], bool]
 

@@ -15,10 +15,10 @@ import time
 from dataclasses import dataclass, field
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem import nmea
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import PacketFailed, PacketSent, RequestDone, RequestFailed
-from sonarpost.modem.micromodem import MicroModem
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import PacketFailed, PacketSent, RequestDone, RequestFailed
 from tests.modem.two_drivers import TwoDrivers
 
 KINDS = (

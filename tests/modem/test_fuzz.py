@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.modem import nmea
+from sonarpost.modem.micromodem import nmea
 from tests.modem.fuzz import Fuzz, parse_alone
 
 

@@ -3,10 +3,10 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.modem import nmea
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import PacketFailed, PacketSent
-from sonarpost.modem.micromodem import MicroModem
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import PacketFailed, PacketSent
 from tests.modem.fake_modem import FakeModem
 
 KINDS = ["CAREV", "CACFG", "CACLK", "CACYC", "CADRQ", "CATXD", "CATXP", "CATXF", "CAXST", "CARXP", "CARXD", "CAMSG",

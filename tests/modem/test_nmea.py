@@ -6,8 +6,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem import nmea
-from sonarpost.modem.nmea import MAX_SENTENCE_BYTES, LineAssembler, Sentence
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.nmea import MAX_SENTENCE_BYTES, LineAssembler, Sentence
 
 
 def _split(body: str) -> Sentence:

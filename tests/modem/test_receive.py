@@ -4,8 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import (
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import (
     FrameAcknowledged,
     FrameReceived,
     ModemReady,
@@ -16,7 +17,6 @@ from sonarpost.modem.events import (
     SentenceRejected,
     StatisticsReceived,
 )
-from sonarpost.modem.micromodem import MicroModem
 from tests.modem.fake_modem import FakeModem
 
 CONFIG = MicroModemConfig(address=1)

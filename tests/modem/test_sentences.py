@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem import nmea
-from sonarpost.modem.nmea import Sentence
-from sonarpost.modem.sentences import (
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.nmea import Sentence
+from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
     Cycle,
     DataAccepted,
@@ -20,8 +20,8 @@ from sonarpost.modem.sentences import (
     TransmitData,
     TransmitMark,
 )
-from sonarpost.modem.settings import ClockSetting, ModemComplaint, Revision, Setting, SettingQuery
-from sonarpost.modem.statistics import LinkStatistics, TransmitStatistics, format_stamp
+from sonarpost.modem.micromodem.settings import ClockSetting, ModemComplaint, Revision, Setting, SettingQuery
+from sonarpost.modem.micromodem.statistics import LinkStatistics, TransmitStatistics, format_stamp
 
 RECORDS = [
     (b"$CCCYC,0,3,1,4,0,2", Cycle(3, 1, 4, False, 2)),

@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError, SentenceError
-from sonarpost.modem import nmea
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import (
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import (
     ClockConfirmed,
     FailureReason,
     FlexibleDataReceived,
@@ -30,9 +31,8 @@ from sonarpost.modem.events import (
     SettingRefused,
     StatisticsReceived,
 )
-from sonarpost.modem.micromodem import MicroModem
-from sonarpost.modem.sentences import ReceivedData
-from sonarpost.modem.short_sentences import (
+from sonarpost.modem.micromodem.sentences import ReceivedData
+from sonarpost.modem.micromodem.short_sentences import (
     FlexibleData,
     FlexiblePart,
     MiniPacket,

@@ -4,8 +4,9 @@ from datetime import UTC, datetime
 import pytest
 
 from sonarpost.errors import ConfigError
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import (
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import (
     ClockConfirmed,
     FailureReason,
     ModemReady,
@@ -17,8 +18,7 @@ from sonarpost.modem.events import (
     SentenceRejected,
     SettingRefused,
 )
-from sonarpost.modem.micromodem import MicroModem
-from sonarpost.modem.supervisor import Phase
+from sonarpost.modem.micromodem.supervisor import Phase
 from tests.modem.fake_modem import FakeModem, nth_of
 
 CONFIG = MicroModemConfig(address=3)

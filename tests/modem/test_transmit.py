@@ -3,9 +3,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
-from sonarpost.modem import nmea
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import (
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import (
     FailureReason,
     FrameAcknowledged,
     ModemComplained,
@@ -17,8 +18,7 @@ from sonarpost.modem.events import (
     PacketSent,
     SentenceRejected,
 )
-from sonarpost.modem.micromodem import MicroModem
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 from tests.modem.fake_modem import FakeModem, Loses, never, nth_of
 
 CONFIG = MicroModemConfig(address=3)

@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import pytest
 
-from sonarpost.modem import nmea
-from sonarpost.modem.events import (
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.events import (
     FlexibleDataReceived,
     FrameReceived,
     MiniPacketReceived,
@@ -23,7 +23,7 @@ from sonarpost.modem.events import (
     RequestDone,
     RequestFailed,
 )
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.sim.water_config import WaterConfig
 from tests.modem.two_drivers import Spoil, TwoDrivers, cut, double, drop, garble, kinds_of
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from sonarpost.modem import nmea
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import Event
-from sonarpost.modem.micromodem import MicroModem
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import Event
 from sonarpost.sim.acoustic_world import AcousticWorld, ModemPlace
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.water_config import WaterConfig

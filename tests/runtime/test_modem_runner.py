@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 
 from sonarpost.errors import FrameError, PortError
-from sonarpost.modem import nmea
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import (
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import (
     ClockConfirmed,
     Event,
     FailureReason,
@@ -27,7 +28,6 @@ from sonarpost.modem.events import (
     PingAnswered,
     RequestDone,
 )
-from sonarpost.modem.micromodem import MicroModem
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
 from sonarpost.sim.acoustic_channel import AcousticChannel

@@ -25,7 +25,7 @@ from sonarpost.cli import modem_emulator
 from sonarpost.config import PlatformConfig
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import Health
-from sonarpost.modem import nmea
+from sonarpost.modem.micromodem import nmea
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.services.acoustic_channel.service import AcousticChannel, AcousticChannelService
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite

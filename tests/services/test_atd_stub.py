@@ -18,7 +18,7 @@ from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.folder import FileSeen, SettledFiles, look_at
 from sonarpost.services.atd_stub.service import AtdStubService
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff
-from sonarpost.sonar.xtf_reader import read_xtf
+from sonarpost.sonar.readers.xtf import read_xtf
 
 KEY = keys.contact_detected("uuv-1")
 THRESHOLD = 0.3

@@ -28,7 +28,7 @@ from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.image_files import read_image, write_tiff
 from sonarpost.sonar.options import ErrorBudget, Mounting
-from sonarpost.sonar.readers import open_survey
+from sonarpost.sonar.readers.registry import open_survey
 from sonarpost.sonar.source import gather
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf

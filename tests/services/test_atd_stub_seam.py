@@ -17,8 +17,8 @@ from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.seam import SeamLook, last_pings, pack, unpack
 from sonarpost.services.atd_stub.service import AtdStubService
 from sonarpost.services.atd_stub.snippets import from_survey
+from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
-from sonarpost.sonar.xtf_reader import read_xtf
 from sonarpost.sonar.xtf_writer import write_xtf
 
 KEY = keys.contact_detected("uuv-1")

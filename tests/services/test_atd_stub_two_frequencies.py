@@ -12,8 +12,8 @@ from sonarpost.detection.stream import follows
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.seam import pack, unpack
 from sonarpost.services.atd_stub.snippets import from_survey
+from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import Side
-from sonarpost.sonar.xtf_reader import read_xtf
 from sonarpost.sonar.xtf_writer import write_xtf
 
 SECOND = pytest.mark.parametrize(

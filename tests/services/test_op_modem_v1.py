@@ -22,9 +22,9 @@ from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
 from sonarpost.link.receiver import Receiver
 from sonarpost.link.sender import Sender
 from sonarpost.messages import AcousticFrame, Command, Decision, DownlinkState, ReceivedMessage
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import FrameReceived, PacketReceived
-from sonarpost.modem.micromodem import MicroModem
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import FrameReceived, PacketReceived
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
 from sonarpost.security.acoustic_key import read_key

@@ -12,7 +12,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 
-from sonarpost.modem import nmea
+from sonarpost.modem.micromodem import nmea
 
 FRAMES = (1, 3, 3, 2, 2, 8)
 FRAME_BYTES = (32, 64, 64, 256, 256, 256)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from conftest import eventually
 
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.sim.acoustic_channel import AcousticChannel
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite
 from sonarpost.sim.water_physics import Position

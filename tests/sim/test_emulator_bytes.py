@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.modem import nmea
+from sonarpost.modem.micromodem import nmea
 from sonarpost.sim.micromodem import Micromodem
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.serial_pace import SerialPace

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 from tests.sim.emulator_bench import Bench, cst
 
 

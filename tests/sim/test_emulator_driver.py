@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import (
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import (
     Event,
     ModemComplained,
     ModemRebooted,
@@ -15,8 +16,7 @@ from sonarpost.modem.events import (
     PacketSent,
     SentenceRejected,
 )
-from sonarpost.modem.micromodem import MicroModem
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 from tests.sim.emulator_bench import Bench
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sonarpost.modem import nmea
+from sonarpost.modem.micromodem import nmea
 from sonarpost.sim.acoustic_world import AcousticWorld, ModemPlace
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.water_config import WaterConfig

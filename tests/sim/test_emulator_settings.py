@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sonarpost.modem import nmea
+from sonarpost.modem.micromodem import nmea
 from sonarpost.sim.micromodem import Micromodem
 from sonarpost.sim.micromodem_config import ModemConfig
 from tests.sim.emulator_bench import START_UTC_S, Bench

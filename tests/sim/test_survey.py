@@ -16,8 +16,8 @@ from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sim.survey_echo import SonarSettings, Track, echo_intensity, received
 from sonarpost.sim.targets import MINE_LIKE_KINDS, ObjectKind, SeabedObject, place_object
 from sonarpost.sonar.geometry import Position, offset_between_m, ping_spacing_m, sample_position
+from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import Side
-from sonarpost.sonar.xtf_reader import read_xtf
 
 SMALL = SurveySpec(seed=5, pings=180, samples=512, seabed=SeabedKind.SAND, targets=2, clutter=2)
 SETTINGS = SonarSettings(samples=1024, range_m=30.0, ping_spacing_m=0.1)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.sim.clock import TimeScale
 from sonarpost.sim.water import Water
 from sonarpost.sim.water_chance import Dice, TailDamage, damage_tail

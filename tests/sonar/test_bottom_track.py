@@ -9,8 +9,8 @@ import pytest
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.bottom_track import altitudes_m, track_bottom
+from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
-from sonarpost.sonar.xtf_reader import read_xtf
 
 
 def survey_of(rows: np.ndarray, range_m: float = 30.0) -> Survey:

@@ -23,8 +23,8 @@ from sonarpost.sonar.geometry import (
     sample_slant_range_m,
     slant_to_ground_range_m,
 )
+from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
-from sonarpost.sonar.xtf_reader import read_xtf
 
 
 def geodesic(origin: Position, bearing_deg: float, distance_m: float) -> Position:

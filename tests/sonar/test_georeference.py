@@ -13,7 +13,7 @@ from pyproj import Geod
 from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
 from sonarpost.sonar.georeference import georeference
 from sonarpost.sonar.options import ErrorBudget, Mounting, SurveyOptions
-from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.readers.registry import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 
 NO_ERRORS = dict.fromkeys(ErrorBudget.model_fields, 0.0)

@@ -13,8 +13,8 @@ from pyxtf import XTFPingHeader
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import ChannelPing, Side
-from sonarpost.sonar.xtf_reader import read_xtf
 from sonarpost.sonar.xtf_writer import write_xtf
 
 HEADER, PACKET = 1024, 512

@@ -19,7 +19,7 @@ from PIL import Image
 from sonarpost.detection.snippet import to_grey
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
-from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.readers.registry import read_survey
 
 Floats = npt.NDArray[np.float64]
 SEED = 20240611

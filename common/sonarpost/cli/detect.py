@@ -20,7 +20,7 @@ from sonarpost.detection.stream import LineContact, LineDetector
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
 from sonarpost.sonar.options import SurveyOptions, load_options
-from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.readers.registry import read_survey
 
 _HEADER = (
     "  n  conf  class      side       ping  sample  range_m  length_m  width_m  shadow_m  height_m  position"

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 
 from sonarpost.errors import ConfigError
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.sim.acoustic_channel import AcousticChannel
 from sonarpost.sim.channel_config import ChannelConfig, ModemSite
 from sonarpost.sim.micromodem_config import ModemConfig

@@ -1,1 +1,1 @@
-"""NMEA sentences and the Micro-Modem driver, as pure state machines."""
+"""Acoustic modem drivers, as pure state machines."""

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from datetime import datetime
 
 from sonarpost.errors import PortError
-from sonarpost.modem.events import Event, Polled
-from sonarpost.modem.micromodem import MicroModem
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import Event, Polled
 from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialLink
 
 log = logging.getLogger(__name__)

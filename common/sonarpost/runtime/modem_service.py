@@ -11,10 +11,10 @@ from pydantic import Field
 
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.logs import kv
-from sonarpost.modem import events as ev
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import Event
-from sonarpost.modem.micromodem import MicroModem
+from sonarpost.modem.micromodem import events as ev
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import Event
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
 from sonarpost.runtime.service import Service

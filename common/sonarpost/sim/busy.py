@@ -20,10 +20,10 @@ from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.mac import Continuous
 from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName, QueueConfig
 from sonarpost.link.receiver import Receiver
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import Event, FrameHeard, FrameReceived, PacketFailed, PacketSent
-from sonarpost.modem.micromodem import MicroModem
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import Event, FrameHeard, FrameReceived, PacketFailed, PacketSent
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.sim.acoustic_world import AcousticWorld, ModemPlace
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.water_config import WaterConfig

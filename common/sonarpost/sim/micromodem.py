@@ -28,7 +28,7 @@ from collections.abc import Callable
 from datetime import datetime
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem import nmea
+from sonarpost.modem.micromodem import nmea
 from sonarpost.sim import micromodem_commands as commands
 from sonarpost.sim.micromodem_config import VERSIONS, ModemConfig, Output, Report
 from sonarpost.sim.micromodem_hearing import Listener

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from sonarpost.modem import nmea
+from sonarpost.modem.micromodem import nmea
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.micromodem_sentences import Heard, PacketType, ReceiveMode, receive_statistics
 from sonarpost.sim.micromodem_settings import ModemClock, Settings

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from sonarpost.modem import nmea
+from sonarpost.modem.micromodem import nmea
 from sonarpost.sim import micromodem_commands as commands
 from sonarpost.sim.micromodem_settings import ModemClock, Settings
 from sonarpost.sim.micromodem_transmitter import BusyError, Transmitter

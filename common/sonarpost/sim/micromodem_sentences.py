@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum
 
-from sonarpost.modem import nmea
+from sonarpost.modem.micromodem import nmea
 
 CARRIER_HZ = 25000
 BANDWIDTH_HZ = 5000

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem import nmea
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.sim import micromodem_commands as commands
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.micromodem_hearing import packet_type

@@ -22,7 +22,7 @@ from sonarpost.link.mac import Slots
 from sonarpost.link.queue.state import export_queue, restore_queue
 from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName, QueueConfig
 from sonarpost.link.receiver import Receiver
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 
 _SLOT_S: Final = 7.5
 _GUARD_S: Final = 1.0

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.sim.water import Water
 from sonarpost.sim.water_config import WaterConfig
 from sonarpost.sim.water_file import PRESETS, make_water, read_water

@@ -17,7 +17,7 @@ from sonarpost.detection.snippet import cut_snippet
 from sonarpost.errors import SurveyFileError
 from sonarpost.sim.seabed import SeabedKind
 from sonarpost.sim.survey import SurveySpec, simulate_survey
-from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.readers.registry import read_survey
 from sonarpost.sonar.survey import Survey
 
 HEIGHT_PX: Final = 49

@@ -14,10 +14,10 @@ from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.link.frames.paper.receiver import ContactOnly, Event, ImageReady, PairingReceiver
 from sonarpost.link.frames.paper.sender import Packet, plan_packets
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import FrameReceived, ModemReady, PacketFailed, PacketSent
-from sonarpost.modem.micromodem import MicroModem
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import FrameReceived, ModemReady, PacketFailed, PacketSent
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.sim.acoustic_world import AcousticWorld, ModemPlace
 from sonarpost.sim.micromodem_config import ModemConfig
 from sonarpost.sim.water_config import WaterConfig

@@ -21,7 +21,7 @@ from sonarpost.link.frames.paper.frame import parse_frame
 from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.link.receiver import Receiver
 from sonarpost.messages import AcousticFrame, EncodedImage, Health, QueueState, ReconstructedImage, Record, Snippet
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.rates import RATES
 
 log = logging.getLogger(__name__)
 

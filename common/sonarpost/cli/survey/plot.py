@@ -13,7 +13,7 @@ from sonarpost.cli.survey.track_picture import draw_track, thinned_track
 from sonarpost.cli.survey.waterfall_picture import MAX_ROWS, draw_waterfall, evened, reduce_survey
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
-from sonarpost.sonar.readers import open_survey
+from sonarpost.sonar.readers.registry import open_survey
 
 _MOST_ROWS = 20_000
 

@@ -31,9 +31,9 @@ from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position
 from sonarpost.sonar.image_files import GreyImage, read_image
 from sonarpost.sonar.navigation_check import Rows
-from sonarpost.sonar.open_file import OpenFile
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection
+from sonarpost.sonar.readers.open_file import OpenFile
 from sonarpost.sonar.source import StreamedSource
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Ping, Side
 

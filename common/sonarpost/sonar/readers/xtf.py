@@ -11,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 from pyxtf import XTFPacketStart
 
-from sonarpost.sonar.open_file import OpenFile, Walk
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection
+from sonarpost.sonar.readers.open_file import OpenFile, Walk
+from sonarpost.sonar.readers.xtf_navigation import NAV_UNITS_METRES, NavigationCleaner, NavigationRecord
+from sonarpost.sonar.readers.xtf_records import HEADER_BYTES, Attitude, PingParser, attitude_of, read_header, text_of
 from sonarpost.sonar.source import StreamedSource, gather
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
-from sonarpost.sonar.xtf_navigation import NAV_UNITS_METRES, NavigationCleaner, NavigationRecord
-from sonarpost.sonar.xtf_records import HEADER_BYTES, Attitude, PingParser, attitude_of, read_header, text_of
 
 PACKET_MAGIC: Final = 0xFACE
 SONAR_PACKET: Final = 0

@@ -8,12 +8,12 @@ from enum import Enum, auto
 from typing import ClassVar
 
 from sonarpost.errors import FrameError
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import FailureReason, PacketFailed, PacketSent
-from sonarpost.modem.fields import MAX_ADDRESS
-from sonarpost.modem.nmea import Sentence
-from sonarpost.modem.rates import RATES
-from sonarpost.modem.sentences import (
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.events import FailureReason, PacketFailed, PacketSent
+from sonarpost.modem.micromodem.fields import MAX_ADDRESS
+from sonarpost.modem.micromodem.nmea import Sentence
+from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
     Cycle,
     DataAccepted,
@@ -21,8 +21,8 @@ from sonarpost.modem.sentences import (
     TransmitData,
     TransmitMark,
 )
-from sonarpost.modem.settings import ModemComplaint
-from sonarpost.modem.statistics import TransmitStatistics
+from sonarpost.modem.micromodem.settings import ModemComplaint
+from sonarpost.modem.micromodem.statistics import TransmitStatistics
 
 _FSK_MINI_PACKET = 2
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import ClassVar
 
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import (
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.events import (
     Event,
     FailureReason,
     FlexibleDataReceived,
@@ -17,9 +17,9 @@ from sonarpost.modem.events import (
     PingHeard,
     RequestFailed,
 )
-from sonarpost.modem.nmea import Sentence
-from sonarpost.modem.requests import Request, RequestExchange, RequestKind
-from sonarpost.modem.short_sentences import MiniPacket, MiniReply, Ping, PingReply, ReceivedFlexibleData
+from sonarpost.modem.micromodem.nmea import Sentence
+from sonarpost.modem.micromodem.requests import Request, RequestExchange, RequestKind
+from sonarpost.modem.micromodem.short_sentences import MiniPacket, MiniReply, Ping, PingReply, ReceivedFlexibleData
 
 
 class Requester:

@@ -13,12 +13,12 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.humminbird import HumminbirdSource
 from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.readers.humminbird import HumminbirdSource
+from sonarpost.sonar.readers.waterfall_images import WaterfallSource
+from sonarpost.sonar.readers.xtf import XtfSource
 from sonarpost.sonar.source import SurveySource, gather
 from sonarpost.sonar.survey import Survey
-from sonarpost.sonar.waterfall import WaterfallSource
-from sonarpost.sonar.xtf_reader import XtfSource
 
 SurveyReader = Callable[[Path, SurveyOptions], SurveySource]
 

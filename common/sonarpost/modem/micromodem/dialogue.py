@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum, auto
 
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.nmea import Sentence
-from sonarpost.modem.settings import ClockSetting, Setting, SettingQuery
-from sonarpost.modem.short_sentences import TimeSetting
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.nmea import Sentence
+from sonarpost.modem.micromodem.settings import ClockSetting, Setting, SettingQuery
+from sonarpost.modem.micromodem.short_sentences import TimeSetting
 
 _OPTIONAL_TRIES = 2
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.fields import FieldReader
-from sonarpost.modem.nmea import Sentence
+from sonarpost.modem.micromodem.fields import FieldReader
+from sonarpost.modem.micromodem.nmea import Sentence
 
 MAX_MINI_BITS = 0x1FFF
 """A user mini-packet carries 13 bits."""

@@ -11,8 +11,8 @@ import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-from sonarpost.modem.fields import FieldReader
-from sonarpost.modem.nmea import Sentence
+from sonarpost.modem.micromodem.fields import FieldReader
+from sonarpost.modem.micromodem.nmea import Sentence
 
 FIRST_VERSIONED = 6
 """First version of `CACST` that tells its version."""

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from datetime import datetime
 from enum import Enum, auto
 
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.dialogue import Command, Dialogue, Progress, clock_command, query_command, set_command
-from sonarpost.modem.events import (
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.dialogue import Command, Dialogue, Progress, clock_command, query_command, set_command
+from sonarpost.modem.micromodem.events import (
     ClockConfirmed,
     Event,
     ModemReady,
@@ -17,9 +17,9 @@ from sonarpost.modem.events import (
     OtherSentence,
     SettingRefused,
 )
-from sonarpost.modem.nmea import Sentence
-from sonarpost.modem.settings import ClockSetting, Revision, Setting
-from sonarpost.modem.short_sentences import TimeSetting
+from sonarpost.modem.micromodem.nmea import Sentence
+from sonarpost.modem.micromodem.settings import ClockSetting, Revision, Setting
+from sonarpost.modem.micromodem.short_sentences import TimeSetting
 
 
 class Phase(Enum):

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sonarpost.modem.fields import FieldReader
-from sonarpost.modem.nmea import Sentence
+from sonarpost.modem.micromodem.fields import FieldReader
+from sonarpost.modem.micromodem.nmea import Sentence
 
 _MAX_FRAME_NUMBER = 255
 _MAX_BYTES = 65535

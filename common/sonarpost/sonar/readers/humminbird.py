@@ -31,8 +31,8 @@ import numpy as np
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position
 from sonarpost.sonar.navigation_check import Rows
-from sonarpost.sonar.open_file import OpenFile, Walk
 from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.readers.open_file import OpenFile, Walk
 from sonarpost.sonar.source import StreamedSource
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 

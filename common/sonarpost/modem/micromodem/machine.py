@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import (
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.events import (
     Event,
     FailureReason,
     FrameAcknowledged,
@@ -21,15 +21,12 @@ from sonarpost.modem.events import (
     Polled,
     SentenceRejected,
 )
-from sonarpost.modem.listener import Listener
-from sonarpost.modem.nmea import LineAssembler, Sentence
-from sonarpost.modem.rates import RATES
-from sonarpost.modem.requester import Requester, is_modems_fault
-from sonarpost.modem.requests import (
-    Request,
-    RequestKind,
-)
-from sonarpost.modem.sentences import (
+from sonarpost.modem.micromodem.listener import Listener
+from sonarpost.modem.micromodem.nmea import LineAssembler, Sentence
+from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem.requester import Requester, is_modems_fault
+from sonarpost.modem.micromodem.requests import Request, RequestKind
+from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
     Cycle,
     DataAccepted,
@@ -40,10 +37,10 @@ from sonarpost.modem.sentences import (
     TransmitData,
     TransmitMark,
 )
-from sonarpost.modem.settings import ModemComplaint, Revision
-from sonarpost.modem.statistics import TransmitStatistics
-from sonarpost.modem.supervisor import Phase, Supervisor
-from sonarpost.modem.transmit import Packet, TransmitCycle, check_packet
+from sonarpost.modem.micromodem.settings import ModemComplaint, Revision
+from sonarpost.modem.micromodem.statistics import TransmitStatistics
+from sonarpost.modem.micromodem.supervisor import Phase, Supervisor
+from sonarpost.modem.micromodem.transmit import Packet, TransmitCycle, check_packet
 
 
 class Machine:

@@ -6,7 +6,7 @@ import math
 import re
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.nmea import Sentence
+from sonarpost.modem.micromodem.nmea import Sentence
 
 MAX_ADDRESS = 127
 """Highest modem address (`SRC` is 0..127)."""

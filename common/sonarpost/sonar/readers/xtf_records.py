@@ -25,7 +25,7 @@ from typing import Final
 import numpy as np
 from pyxtf import XTFAttitudeData, XTFChanInfo, XTFFileHeader, XTFPingChanHeader, XTFPingHeader
 
-from sonarpost.sonar.open_file import OpenFile, Walk
+from sonarpost.sonar.readers.open_file import OpenFile, Walk
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Samples, Side
 
 FILE_MAGIC: Final = 0x7B

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.fields import FieldReader
-from sonarpost.modem.nmea import Sentence
+from sonarpost.modem.micromodem.fields import FieldReader
+from sonarpost.modem.micromodem.nmea import Sentence
 
 _MAX_SETTING = 2**31
 _INTEGER = re.compile(r"[+-]?[0-9]{1,10}")

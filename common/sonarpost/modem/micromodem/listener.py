@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import Event, FrameHeard, ModemSaid, SentenceRejected, StatisticsReceived
-from sonarpost.modem.nmea import Sentence
-from sonarpost.modem.receive import Reception
-from sonarpost.modem.sentences import Cycle, ModemMessage, ReceivedData
-from sonarpost.modem.statistics import LinkStatistics
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.events import Event, FrameHeard, ModemSaid, SentenceRejected, StatisticsReceived
+from sonarpost.modem.micromodem.nmea import Sentence
+from sonarpost.modem.micromodem.receive import Reception
+from sonarpost.modem.micromodem.sentences import Cycle, ModemMessage, ReceivedData
+from sonarpost.modem.micromodem.statistics import LinkStatistics
 
 _NO_CYCLE = frozenset({2, 4, 5})
 """Packet types that carry no frames of a cycle: mini-packets and flexible data."""

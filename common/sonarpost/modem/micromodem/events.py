@@ -7,11 +7,11 @@ from datetime import datetime
 from enum import StrEnum
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.nmea import Sentence
-from sonarpost.modem.sentences import ModemMessage
-from sonarpost.modem.settings import ModemComplaint
-from sonarpost.modem.short_sentences import ReceivedFlexibleData
-from sonarpost.modem.statistics import LinkStatistics, TransmitStatistics
+from sonarpost.modem.micromodem.nmea import Sentence
+from sonarpost.modem.micromodem.sentences import ModemMessage
+from sonarpost.modem.micromodem.settings import ModemComplaint
+from sonarpost.modem.micromodem.short_sentences import ReceivedFlexibleData
+from sonarpost.modem.micromodem.statistics import LinkStatistics, TransmitStatistics
 
 
 class FailureReason(StrEnum):

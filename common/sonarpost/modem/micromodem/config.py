@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 
 from sonarpost.errors import ConfigError
-from sonarpost.modem.fields import MAX_ADDRESS
-from sonarpost.modem.rates import RATES
+from sonarpost.modem.micromodem.fields import MAX_ADDRESS
+from sonarpost.modem.micromodem.rates import RATES
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import FrameReceived, PacketReceived
-from sonarpost.modem.sentences import Cycle, ReceivedData
-from sonarpost.modem.statistics import LinkStatistics
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.events import FrameReceived, PacketReceived
+from sonarpost.modem.micromodem.sentences import Cycle, ReceivedData
+from sonarpost.modem.micromodem.statistics import LinkStatistics
 
 _FSK_MINI_PACKET = 2
 

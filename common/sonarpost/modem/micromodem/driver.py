@@ -13,22 +13,11 @@ from collections.abc import Callable, Sequence
 from datetime import datetime
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.events import (
-    Event,
-    FailureReason,
-    Polled,
-    SentenceRejected,
-)
-from sonarpost.modem.machine import Machine
-from sonarpost.modem.requests import (
-    RequestKind,
-    flexible_command,
-    mini_command,
-    ping_command,
-    poll_command,
-)
-from sonarpost.modem.supervisor import Phase
-from sonarpost.modem.transmit import Packet, check_packet
+from sonarpost.modem.micromodem.events import Event, FailureReason, Polled, SentenceRejected
+from sonarpost.modem.micromodem.machine import Machine
+from sonarpost.modem.micromodem.requests import RequestKind, flexible_command, mini_command, ping_command, poll_command
+from sonarpost.modem.micromodem.supervisor import Phase
+from sonarpost.modem.micromodem.transmit import Packet, check_packet
 
 
 class MicroModem(Machine):

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from sonarpost.errors import FrameError
-from sonarpost.modem.config import MicroModemConfig
-from sonarpost.modem.events import FailureReason, RequestDone, RequestFailed
-from sonarpost.modem.fields import MAX_ADDRESS
-from sonarpost.modem.nmea import Sentence
-from sonarpost.modem.rates import RATES
-from sonarpost.modem.sentences import Cycle
-from sonarpost.modem.settings import ModemComplaint
-from sonarpost.modem.short_sentences import MAX_MINI_BITS, FlexibleData, MiniPacket, Ping
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.events import FailureReason, RequestDone, RequestFailed
+from sonarpost.modem.micromodem.fields import MAX_ADDRESS
+from sonarpost.modem.micromodem.nmea import Sentence
+from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem.sentences import Cycle
+from sonarpost.modem.micromodem.settings import ModemComplaint
+from sonarpost.modem.micromodem.short_sentences import MAX_MINI_BITS, FlexibleData, MiniPacket, Ping
 
 FLEXIBLE_RATES = (1, 3, 5)
 FLEXIBLE_BYTES = 2048

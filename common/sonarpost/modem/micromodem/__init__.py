@@ -1,0 +1,1 @@
+"""Driver of the WHOI Micro-Modem: NMEA sentences and pure state machines."""
