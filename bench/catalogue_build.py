@@ -23,8 +23,8 @@ import numpy as np
 
 from sonarpost.codec.vq.codebook import load
 from sonarpost.codec.vq.patches import stretch
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import write_tiff
 
 LIMIT_S = 300.0

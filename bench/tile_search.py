@@ -30,8 +30,8 @@ from sonarpost.codec.interface import to_uint8
 from sonarpost.codec.vq.codebook import load_nominal
 from sonarpost.codec.vq.patches import stretch
 from sonarpost.codec.vq.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, Tiles, cut_tiles
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import read_image
 
 HEIGHT_PX, WIDTH_PX = 140, 80

@@ -11,12 +11,12 @@ from pydantic import Field, model_validator
 
 from sonarpost.config import ServiceConfig
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.sim.channel_config import ChannelConfig, ModemSite
-from sonarpost.sim.micromodem_config import ModemConfig
-from sonarpost.sim.water_chance import TailDamage
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_file import make_water
-from sonarpost.sim.water_physics import Position
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_presets import make_water
+from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
+from sonarpost.simulation.channel.random_draws import TailDamage
+from sonarpost.simulation.modem.config import ModemConfig
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 

@@ -1,6 +1,6 @@
 """Runs the emulated modems and their water beside the other services.
 
-The channel itself is `sonarpost.sim.acoustic_channel.AcousticChannel`, which needs neither this process nor Zenoh.
+The channel itself, `sonarpost.simulation.channel.emulator.AcousticChannel`, needs neither this process nor Zenoh.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from sonarpost.logs import kv
 from sonarpost.messages import Record
 from sonarpost.runtime.service import Effects, Service
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
-from sonarpost.sim.acoustic_channel import AcousticChannel
+from sonarpost.simulation.channel.emulator import AcousticChannel
 
 __all__ = ["AcousticChannel", "AcousticChannelService"]
 

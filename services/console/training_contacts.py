@@ -16,8 +16,8 @@ from sonarpost.codec.vq.codebook import open_catalogue
 from sonarpost.codec.vq.codec import VqCodec
 from sonarpost.messages import Contact, Raster, ReconstructedImage
 from sonarpost.review.local import moved
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SurveySpec, TruthObject, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Survey
 
 HEIGHT_PX, WIDTH_PX = 80, 140

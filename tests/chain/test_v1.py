@@ -15,7 +15,7 @@ from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.demo.account import settle
 from sonarpost.cli.demo.settings import UUV, VESSEL
 from sonarpost.messages import Command
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
 pytestmark = pytest.mark.chain

@@ -17,10 +17,10 @@ from sonarpost.cli.main import main
 from sonarpost.codec.vq.codebook import load_nominal
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.sim.water import Water
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_file import make_water
-from sonarpost.sim.water_records import ArrivalEnded, ArrivalStarted, Fate
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_events import ArrivalEnded, ArrivalStarted, Fate
+from sonarpost.simulation.channel.channel_presets import make_water
+from sonarpost.simulation.channel.propagation import Water
 
 
 @pytest.fixture(scope="module")

@@ -18,9 +18,9 @@ from sonarpost.cli.bench.measure import subjects
 from sonarpost.codec.registry import default_registry
 from sonarpost.detection.contacts import detect
 from sonarpost.errors import ConfigError, SurveyFileError
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import TruthObject
-from sonarpost.sim.targets import ObjectKind
+from sonarpost.simulation.seabed.survey import TruthObject
+from sonarpost.simulation.seabed.targets import ObjectKind
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Side, Survey
 
 

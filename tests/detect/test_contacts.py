@@ -12,8 +12,8 @@ from pyproj import Geod
 from sonarpost.detection.contacts import MINE_LIKE, detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.snippet import cut_snippet
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.bottom_track import track_bottom
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.readers.registry import read_survey

@@ -16,8 +16,8 @@ from sonarpost.detection.preprocess import preprocess
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.snippet import cut_snippet, cut_wide
 from sonarpost.detection.stream import LineDetector, follows
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.ground_range import MAX_COLUMNS
 from sonarpost.sonar.survey import Side
 

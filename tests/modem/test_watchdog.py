@@ -24,7 +24,7 @@ from sonarpost.modem.micromodem.events import (
     RequestFailed,
 )
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.sim.water_config import WaterConfig
+from sonarpost.simulation.channel.channel_config import WaterConfig
 from tests.modem.two_drivers import Spoil, TwoDrivers, cut, double, drop, garble, kinds_of
 
 READY_S = 30.0

@@ -9,10 +9,10 @@ from sonarpost.modem.micromodem import nmea
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import Event
-from sonarpost.sim.acoustic_world import AcousticWorld, ModemPlace
-from sonarpost.sim.micromodem_config import ModemConfig
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_physics import Position
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_simulator import AcousticWorld, ModemPlace
+from sonarpost.simulation.modem.config import ModemConfig
 
 Spoil = Callable[[bytes], bytes]
 

@@ -30,9 +30,9 @@ from sonarpost.modem.micromodem.events import (
 )
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
-from sonarpost.sim.acoustic_channel import AcousticChannel
-from sonarpost.sim.channel_config import ChannelConfig, ModemSite
-from sonarpost.sim.water_physics import Position
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.emulator import AcousticChannel
+from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
 
 CONFIG = MicroModemConfig(address=3, settings=())
 

@@ -21,11 +21,11 @@ from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Contact, Health, Raster, Record, Snippet
 from sonarpost.runtime.service import Effects, Service
-from sonarpost.sim.acoustic_channel import AcousticChannel
-from sonarpost.sim.channel_config import ChannelConfig, ModemSite
-from sonarpost.sim.survey import SurveySpec, simulate_survey
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_physics import Position
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.emulator import AcousticChannel
+from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
 PlatformMaker = Callable[[str], PlatformConfig]

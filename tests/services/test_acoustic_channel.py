@@ -28,10 +28,10 @@ from sonarpost.messages import Health
 from sonarpost.modem.micromodem import nmea
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.services.acoustic_channel.service import AcousticChannel, AcousticChannelService
-from sonarpost.sim.channel_config import ChannelConfig, ModemSite
-from sonarpost.sim.micromodem_config import ModemConfig
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_physics import Position
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
+from sonarpost.simulation.modem.config import ModemConfig
 
 SITES = (ModemSite(1), ModemSite(2, Position(150.0)))
 SCALE = 100.0

@@ -24,7 +24,7 @@ from sonarpost.services.atd_stub.seam import Origin
 from sonarpost.services.atd_stub.service import AtdStubService
 from sonarpost.services.atd_stub.snippets import from_picture
 from sonarpost.services.atd_stub.text_file import contact_text, read_contact, write_snippet
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.image_files import read_image, write_tiff
 from sonarpost.sonar.options import ErrorBudget, Mounting

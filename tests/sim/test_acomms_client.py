@@ -14,9 +14,9 @@ import pytest
 from conftest import eventually
 
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.sim.acoustic_channel import AcousticChannel
-from sonarpost.sim.channel_config import ChannelConfig, ModemSite
-from sonarpost.sim.water_physics import Position
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.emulator import AcousticChannel
+from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
 
 with warnings.catch_warnings():
     # Strings of that package have escapes that Python no longer likes; it shows when the package is compiled.

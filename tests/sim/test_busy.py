@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sonarpost.errors import ConfigError
-from sonarpost.sim.busy import BusySpec, run_busy
+from sonarpost.simulation.mission.utilisation import BusySpec, run_busy
 
 
 def test_at_rate_5_the_water_is_busy_and_every_report_is_heard() -> None:

@@ -11,14 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import ConfigError
-from sonarpost.sim.water import Water
-from sonarpost.sim.water_chance import TailDamage
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_fading import Fading
-from sonarpost.sim.water_file import make_water, read_water
-from sonarpost.sim.water_physics import Position, absorption_db_per_km, noise_db_per_hz
-from sonarpost.sim.water_records import ArrivalEnded, Fate, Outcome, Packet, PacketKind
-from sonarpost.sim.water_table import RANGES_M, deliver, table
+from sonarpost.simulation.channel.acoustics import Position, absorption_db_per_km, noise_db_per_hz
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_events import ArrivalEnded, Fate, Outcome, Packet, PacketKind
+from sonarpost.simulation.channel.channel_presets import make_water, read_water
+from sonarpost.simulation.channel.delivery_table import RANGES_M, deliver, table
+from sonarpost.simulation.channel.fading import Fading
+from sonarpost.simulation.channel.propagation import Water
+from sonarpost.simulation.channel.random_draws import TailDamage
 
 
 def send(sea: Water, count: int, now: float, airtime_s: float) -> ArrivalEnded:

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.modem.micromodem import nmea
-from sonarpost.sim.micromodem import Micromodem
-from sonarpost.sim.micromodem_config import ModemConfig
-from sonarpost.sim.serial_pace import SerialPace
-from sonarpost.sim.water_records import Transmission
+from sonarpost.simulation.channel.channel_events import Transmission
+from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.modem.emulator import Micromodem
+from sonarpost.simulation.modem.serial_timing import SerialPace
 from tests.sim.emulator_bench import START_UTC_S, Bench
 
 

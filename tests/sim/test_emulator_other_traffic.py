@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from sonarpost.modem.micromodem import nmea
-from sonarpost.sim.acoustic_world import AcousticWorld, ModemPlace
-from sonarpost.sim.micromodem_config import ModemConfig
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_physics import Position
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_simulator import AcousticWorld, ModemPlace
+from sonarpost.simulation.modem.config import ModemConfig
 from tests.sim.emulator_bench import START_UTC_S, Bench
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from sonarpost.modem.micromodem import nmea
-from sonarpost.sim.micromodem import Micromodem
-from sonarpost.sim.micromodem_config import ModemConfig
+from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.modem.emulator import Micromodem
 from tests.sim.emulator_bench import START_UTC_S, Bench
 
 

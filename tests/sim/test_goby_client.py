@@ -7,10 +7,10 @@ from datetime import UTC, datetime
 
 import pytest
 
-from sonarpost.sim.acoustic_world import AcousticWorld, ModemPlace
-from sonarpost.sim.micromodem_config import ModemConfig
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_physics import Position
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_simulator import AcousticWorld, ModemPlace
+from sonarpost.simulation.modem.config import ModemConfig
 from tests.sim.goby_host import FRAME_BYTES, Delivery, GobyHost
 
 RANGE_M = 150.0

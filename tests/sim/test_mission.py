@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sonarpost.errors import ConfigError
-from sonarpost.sim.mission import MissionSpec, Traffic, run_mission
+from sonarpost.simulation.mission.mission import MissionSpec, Traffic, run_mission
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from sonarpost.sim.seabed import Seabed, SeabedKind, make_seabed
-from sonarpost.sim.targets import (
+from sonarpost.simulation.seabed.targets import (
     CLUTTER_KINDS,
     MINE_LIKE_KINDS,
     ObjectKind,
@@ -15,6 +14,7 @@ from sonarpost.sim.targets import (
     random_object,
     surface_height_m,
 )
+from sonarpost.simulation.seabed.terrain import Seabed, SeabedKind, make_seabed
 
 
 def strip(kind: SeabedKind, seed: int = 4, cell_m: float = 0.1) -> Seabed:

@@ -11,10 +11,10 @@ from scipy.ndimage import uniform_filter
 
 from sonarpost.cli.simulate import add_parser
 from sonarpost.errors import ConfigError
-from sonarpost.sim.seabed import Seabed, SeabedKind
-from sonarpost.sim.survey import SurveySpec, simulate_survey
-from sonarpost.sim.survey_echo import SonarSettings, Track, echo_intensity, received
-from sonarpost.sim.targets import MINE_LIKE_KINDS, ObjectKind, SeabedObject, place_object
+from sonarpost.simulation.seabed.echo import SonarSettings, Track, echo_intensity, received
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.targets import MINE_LIKE_KINDS, ObjectKind, SeabedObject, place_object
+from sonarpost.simulation.seabed.terrain import Seabed, SeabedKind
 from sonarpost.sonar.geometry import Position, offset_between_m, ping_spacing_m, sample_position
 from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import Side

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.sim.clock import TimeScale
-from sonarpost.sim.water import Water
-from sonarpost.sim.water_chance import Dice, TailDamage, damage_tail
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_physics import Position, frame_error_rate
-from sonarpost.sim.water_records import ArrivalEnded, ArrivalStarted, Fate, Outcome, Packet, PacketKind
+from sonarpost.simulation.channel.acoustics import Position, frame_error_rate
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_events import ArrivalEnded, ArrivalStarted, Fate, Outcome, Packet, PacketKind
+from sonarpost.simulation.channel.propagation import Water
+from sonarpost.simulation.channel.random_draws import Dice, TailDamage, damage_tail
+from sonarpost.simulation.time_scale import TimeScale
 
 PINNED_UNIFORM = 0.13411210046500488
 PINNED_NOISE = "daef2330"

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.bottom_track import altitudes_m, track_bottom
 from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey

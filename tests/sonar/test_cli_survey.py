@@ -15,7 +15,7 @@ from sonar.makers import MAKERS, make_xtf
 from sonarpost.cli.main import main
 from sonarpost.cli.survey.track_picture import thinned_track
 from sonarpost.cli.survey.waterfall_picture import SIDE_PX, evened, nice_step, reduce_survey
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import HeldSource

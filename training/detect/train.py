@@ -32,8 +32,8 @@ from sonarpost.detection.fusion import FILTERS, FusionModel, fused_confidences, 
 from sonarpost.detection.preprocess import LevelGrid, preprocess
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.files import write_atomically
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SimulatedSurvey, SurveySpec, TruthObject, simulate_survey
+from sonarpost.simulation.seabed.survey import SimulatedSurvey, SurveySpec, TruthObject, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.bottom_track import altitudes_m
 
 Floats = npt.NDArray[np.float64]

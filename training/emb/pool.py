@@ -17,8 +17,8 @@ import numpy.typing as npt
 from PIL import Image
 
 from sonarpost.detection.snippet import to_grey
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.readers.registry import read_survey
 
 Floats = npt.NDArray[np.float64]

@@ -13,12 +13,12 @@ from types import FrameType
 
 from sonarpost.errors import ConfigError
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.sim.acoustic_channel import AcousticChannel
-from sonarpost.sim.channel_config import ChannelConfig, ModemSite
-from sonarpost.sim.micromodem_config import ModemConfig
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_file import PRESETS, make_water, read_water
-from sonarpost.sim.water_physics import Position
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_presets import PRESETS, make_water, read_water
+from sonarpost.simulation.channel.emulator import AcousticChannel
+from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
+from sonarpost.simulation.modem.config import ModemConfig
 
 WATCH_S = 0.2
 EXIT_FAILED = 1

@@ -8,8 +8,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from sonarpost.files import write_atomically
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SimulatedSurvey, SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SimulatedSurvey, SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.xtf_writer import write_xtf
 
 TRUTH_SCHEMA = 1

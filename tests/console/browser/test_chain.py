@@ -30,11 +30,11 @@ from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService
-from sonarpost.sim.acoustic_channel import AcousticChannel
-from sonarpost.sim.channel_config import ChannelConfig, ModemSite
-from sonarpost.sim.survey import SurveySpec, simulate_survey
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_physics import Position
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.emulator import AcousticChannel
+from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 
 TIME_SCALE = 60.0
 VEHICLES = {"3": "uuv-1"}

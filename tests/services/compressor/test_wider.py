@@ -19,7 +19,7 @@ from sonarpost.services.compressor.wide import wider
 from sonarpost.services.op_modem.station import order_of
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.orders import OrderBook
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 
 IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
 

@@ -27,8 +27,8 @@ from sonarpost.cli.bench.detect_simulated import (
 from sonarpost.cli.bench.detect_tiles import TileScore, tile_auc, tile_scores
 from sonarpost.cli.bench.report import aligned
 from sonarpost.errors import ConfigError
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.targets import MINE_LIKE_KINDS
+from sonarpost.simulation.seabed.targets import MINE_LIKE_KINDS
+from sonarpost.simulation.seabed.terrain import SeabedKind
 
 OPERATING_POINT: Final = 1.0
 PLAIN: Final = (SeabedKind.SAND, SeabedKind.MUD, SeabedKind.GRAVEL)

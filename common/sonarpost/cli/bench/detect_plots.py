@@ -12,8 +12,8 @@ from sonarpost.cli.bench.detect_codecs import CodecEffect
 from sonarpost.cli.bench.detect_simulated import JudgedFile, reliability, roc
 from sonarpost.cli.bench.detect_tiles import TileScore, tile_auc
 from sonarpost.cli.bench.figures import new_figure, save_figure
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.targets import MINE_LIKE_KINDS
+from sonarpost.simulation.seabed.targets import MINE_LIKE_KINDS
+from sonarpost.simulation.seabed.terrain import SeabedKind
 
 _MOST_ALARMS: Final = 6.0
 

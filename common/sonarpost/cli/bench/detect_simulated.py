@@ -13,8 +13,8 @@ import numpy.typing as npt
 from sonarpost.cli.bench.detect_truth import Scale, object_at
 from sonarpost.detection.contacts import Detection, detect
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SurveySpec, TruthObject, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Survey
 
 Floats = npt.NDArray[np.float64]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from sonarpost.sim.survey import TruthObject
+from sonarpost.simulation.seabed.survey import TruthObject
 from sonarpost.sonar.survey import Side
 
 NEAR_M: Final = 1.5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from sonarpost.sim.busy import BusySpec, run_busy
+from sonarpost.simulation.mission.utilisation import BusySpec, run_busy
 
 
 def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import statistics
 
-from sonarpost.sim.mission import Account, MissionSpec, run_mission
+from sonarpost.simulation.mission.mission import Account, MissionSpec, run_mission
 
 
 def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -15,8 +15,8 @@ from sonarpost.codec.quality import psnr_db, ssim
 from sonarpost.detection.contacts import detect
 from sonarpost.detection.snippet import cut_snippet
 from sonarpost.errors import SurveyFileError
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.readers.registry import read_survey
 from sonarpost.sonar.survey import Survey
 

@@ -16,8 +16,8 @@ from PIL import Image as PillowImage
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX, Image, to_uint8
 from sonarpost.detection.snippet import to_grey
 from sonarpost.errors import ConfigError, SurveyFileError
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import MAX_FILE_BYTES, MAX_PIXELS, read_image
 
 JPEG_SUFFIXES: Final = (".jpg", ".jpeg")

@@ -18,7 +18,7 @@ from sonarpost.codec.vq.codebook import load_nominal
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.errors import ConfigError
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.sim.water_file import make_water
+from sonarpost.simulation.channel.channel_presets import make_water
 
 BOUNDARY_M: Final = 130
 """Where the paper's trial turns."""

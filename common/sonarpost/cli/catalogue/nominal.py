@@ -15,8 +15,8 @@ from sonarpost.codec.vq.codebook import load, save
 from sonarpost.codec.vq.patches import Line, WindowPlan, cut_around, cut_line
 from sonarpost.codec.vq.training_config import TrainingImage
 from sonarpost.errors import ConfigError
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 
 # A simulated ping is 10 cm of track and a sample 3 cm of range: averaging three samples makes pixels square.
 SIMULATED_REDUCTIONS = ((1, 1), (1, 2), (1, 3), (2, 3), (2, 6), (1, 4), (3, 6))

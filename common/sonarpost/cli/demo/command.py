@@ -19,8 +19,8 @@ from sonarpost.cli.demo.settings import ChainSettings, free_ports
 from sonarpost.cli.demo.watch import Watcher
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.sim.seabed import SeabedKind
-from sonarpost.sim.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.readers.registry import SUPPORTED_SUFFIXES
 from sonarpost.sonar.xtf_writer import write_xtf
 

@@ -1,7 +1,7 @@
 """An emulated WHOI Micro-Modem as a pure state machine.
 
 Bytes from the host and `now` (simulated seconds) in, bytes for the host and packets for the water out. It reads no
-clock and owns no port; `sonarpost.sim.acoustic_world` joins several of them to one water.
+clock and owns no port; `sonarpost.simulation.channel.channel_simulator` joins several of them to one water.
 
 Choices where hardware documents are silent, and where hosts should not lean on more:
 
@@ -29,13 +29,13 @@ from datetime import datetime
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem import nmea
-from sonarpost.sim import micromodem_commands as commands
-from sonarpost.sim.micromodem_config import VERSIONS, ModemConfig, Output, Report
-from sonarpost.sim.micromodem_hearing import Listener
-from sonarpost.sim.micromodem_navigation import Navigator, TravelTimes
-from sonarpost.sim.micromodem_settings import ModemClock, Settings
-from sonarpost.sim.micromodem_transmitter import BusyError, Transmitter
-from sonarpost.sim.water_records import ArrivalEnded, ArrivalStarted, Packet
+from sonarpost.simulation.channel.channel_events import ArrivalEnded, ArrivalStarted, Packet
+from sonarpost.simulation.modem import commands
+from sonarpost.simulation.modem.config import VERSIONS, ModemConfig, Output, Report
+from sonarpost.simulation.modem.navigation import Navigator, TravelTimes
+from sonarpost.simulation.modem.reception import Listener
+from sonarpost.simulation.modem.settings import ModemClock, Settings
+from sonarpost.simulation.modem.transmitter import BusyError, Transmitter
 
 _ERROR_FRAMING, _ERROR_UNKNOWN, _ERROR_FIELD, _ERROR_BUSY = 1, 2, 3, 4
 _UNPRINTABLE = re.compile(r"[^ -~]|[$*,]")

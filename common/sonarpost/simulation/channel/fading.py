@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 
-from sonarpost.sim.water_chance import Dice
+from sonarpost.simulation.channel.random_draws import Dice
 
 
 class Fading:

@@ -24,11 +24,11 @@ from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import Event, FrameHeard, FrameReceived, PacketFailed, PacketSent
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.sim.acoustic_world import AcousticWorld, ModemPlace
-from sonarpost.sim.micromodem_config import ModemConfig
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_physics import Position
-from sonarpost.sim.water_records import Transmission
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_events import Transmission
+from sonarpost.simulation.channel.channel_simulator import AcousticWorld, ModemPlace
+from sonarpost.simulation.modem.config import ModemConfig
 
 _VESSEL: Final = 1
 _VEHICLE: Final = 3

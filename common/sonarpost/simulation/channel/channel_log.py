@@ -28,8 +28,8 @@ from pathlib import Path
 from typing import IO
 
 from sonarpost.errors import PortError
-from sonarpost.sim.micromodem_config import Report
-from sonarpost.sim.water_records import Fate, FrameArrival
+from sonarpost.simulation.channel.channel_events import Fate, FrameArrival
+from sonarpost.simulation.modem.config import Report
 
 log = logging.getLogger(__name__)
 

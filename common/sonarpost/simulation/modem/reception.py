@@ -12,10 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from sonarpost.modem.micromodem import nmea
-from sonarpost.sim.micromodem_config import ModemConfig
-from sonarpost.sim.micromodem_sentences import Heard, PacketType, ReceiveMode, receive_statistics
-from sonarpost.sim.micromodem_settings import ModemClock, Settings
-from sonarpost.sim.water_records import ArrivalEnded, Fate, FrameArrival, Outcome, Packet, PacketKind
+from sonarpost.simulation.channel.channel_events import ArrivalEnded, Fate, FrameArrival, Outcome, Packet, PacketKind
+from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.modem.sentences import Heard, PacketType, ReceiveMode, receive_statistics
+from sonarpost.simulation.modem.settings import ModemClock, Settings
 
 _GOOD = frozenset({Fate.DELIVERED, Fate.DAMAGED})
 _NOT_MINE = "addressed to another modem"

@@ -18,13 +18,13 @@ from enum import Enum
 from typing import IO
 
 from sonarpost.errors import PortError
-from sonarpost.sim.acoustic_world import AcousticWorld, ModemPlace
-from sonarpost.sim.channel_config import ChannelConfig, Device
-from sonarpost.sim.clock import TimeScale
-from sonarpost.sim.host_ports import HostPort, PtyPort, TcpPort
-from sonarpost.sim.micromodem_config import Output, Report
-from sonarpost.sim.water_log import Totals, WaterLog
-from sonarpost.sim.water_physics import Position
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.channel_log import Totals, WaterLog
+from sonarpost.simulation.channel.channel_simulator import AcousticWorld, ModemPlace
+from sonarpost.simulation.channel.emulator_config import ChannelConfig, Device
+from sonarpost.simulation.modem.config import Output, Report
+from sonarpost.simulation.modem.host_ports import HostPort, PtyPort, TcpPort
+from sonarpost.simulation.time_scale import TimeScale
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
-from sonarpost.sim.seabed import SAND_BACKSCATTER, Seabed
+from sonarpost.simulation.seabed.terrain import SAND_BACKSCATTER, Seabed
 
 FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]

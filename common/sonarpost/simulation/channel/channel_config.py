@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from sonarpost.sim.water_chance import TailDamage
-from sonarpost.sim.water_physics import SPHERICAL_DB_PER_DECADE, absorption_db_per_km, noise_db_per_hz
+from sonarpost.simulation.channel.acoustics import SPHERICAL_DB_PER_DECADE, absorption_db_per_km, noise_db_per_hz
+from sonarpost.simulation.channel.random_draws import TailDamage
 
 _BOUNDS: Mapping[str, tuple[float, float]] = MappingProxyType(
     {

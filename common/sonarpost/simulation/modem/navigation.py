@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from sonarpost.modem.micromodem import nmea
-from sonarpost.sim import micromodem_commands as commands
-from sonarpost.sim.micromodem_settings import ModemClock, Settings
-from sonarpost.sim.micromodem_transmitter import BusyError, Transmitter
-from sonarpost.sim.water_records import Packet, PacketKind
+from sonarpost.simulation.channel.channel_events import Packet, PacketKind
+from sonarpost.simulation.modem import commands
+from sonarpost.simulation.modem.settings import ModemClock, Settings
+from sonarpost.simulation.modem.transmitter import BusyError, Transmitter
 
 PING_S = 0.01
 

@@ -12,9 +12,16 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
 from sonarpost.errors import ConfigError
-from sonarpost.sim.seabed import Seabed, SeabedKind, make_seabed
-from sonarpost.sim.survey_echo import FloatImage, SonarSettings, Track, echo_intensity, received
-from sonarpost.sim.targets import CLUTTER_KINDS, MINE_LIKE_KINDS, ObjectKind, SeabedObject, place_object, random_object
+from sonarpost.simulation.seabed.echo import FloatImage, SonarSettings, Track, echo_intensity, received
+from sonarpost.simulation.seabed.targets import (
+    CLUTTER_KINDS,
+    MINE_LIKE_KINDS,
+    ObjectKind,
+    SeabedObject,
+    place_object,
+    random_object,
+)
+from sonarpost.simulation.seabed.terrain import Seabed, SeabedKind, make_seabed
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.survey import ChannelPing, Ping, Samples, Side, Survey
 

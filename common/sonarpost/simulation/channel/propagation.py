@@ -23,11 +23,9 @@ import heapq
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from sonarpost.sim.water_chance import Dice, damage_tail
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_fading import Fading
-from sonarpost.sim.water_physics import Position, frame_error_rate, transmission_loss_db
-from sonarpost.sim.water_records import (
+from sonarpost.simulation.channel.acoustics import Position, frame_error_rate, transmission_loss_db
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_events import (
     ArrivalEnded,
     ArrivalStarted,
     Fate,
@@ -36,6 +34,8 @@ from sonarpost.sim.water_records import (
     Packet,
     Transmission,
 )
+from sonarpost.simulation.channel.fading import Fading
+from sonarpost.simulation.channel.random_draws import Dice, damage_tail
 
 DETECTION_SNR_DB = -12.0
 """With `range_loss`, packets weaker than this are not noticed at all."""

@@ -1,4 +1,4 @@
-"""What a water does by range and rate, as a table: `python -m sonarpost.sim.water_table --preset sea-trial`.
+"""Delivery by range and rate as a table: `python -m sonarpost.simulation.channel.delivery_table --preset sea-trial`.
 
 Every figure is a count over packets sent through the water one after the other, nothing is computed beside it.
 """
@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.sim.water import Water
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_file import PRESETS, make_water, read_water
-from sonarpost.sim.water_physics import Position
-from sonarpost.sim.water_records import ArrivalEnded, Fate, Packet, PacketKind
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_events import ArrivalEnded, Fate, Packet, PacketKind
+from sonarpost.simulation.channel.channel_presets import PRESETS, make_water, read_water
+from sonarpost.simulation.channel.propagation import Water
 
 RANGES_M = (2, 30, 60, 90, 110, 120, 130, 140, 160, 200, 250, 300)
 GAP_S = 10.0

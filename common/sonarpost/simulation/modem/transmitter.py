@@ -14,12 +14,12 @@ from dataclasses import dataclass, field
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem import nmea
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.sim import micromodem_commands as commands
-from sonarpost.sim.micromodem_config import ModemConfig
-from sonarpost.sim.micromodem_hearing import packet_type
-from sonarpost.sim.micromodem_sentences import Sent, transmit_statistics
-from sonarpost.sim.micromodem_settings import ModemClock, Settings
-from sonarpost.sim.water_records import ArrivalEnded, Outcome, Packet, PacketKind
+from sonarpost.simulation.channel.channel_events import ArrivalEnded, Outcome, Packet, PacketKind
+from sonarpost.simulation.modem import commands
+from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.modem.reception import packet_type
+from sonarpost.simulation.modem.sentences import Sent, transmit_statistics
+from sonarpost.simulation.modem.settings import ModemClock, Settings
 
 _ANSWERS = frozenset({PacketKind.ACK, PacketKind.PING_REPLY, PacketKind.MINI_REPLY})
 _WITH_STATISTICS = frozenset({PacketKind.DATA, PacketKind.CYCLE, PacketKind.FLEXIBLE})

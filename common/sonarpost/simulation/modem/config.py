@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.sim.water_records import ArrivalEnded
+from sonarpost.simulation.channel.channel_events import ArrivalEnded
 
 VERSIONS: Mapping[int, str] = MappingProxyType({1: "0.93.0.09", 2: "2.0.27087"})
 """What `CAREV` says by generation: four parts the first, three the second."""

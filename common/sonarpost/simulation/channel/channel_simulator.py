@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
 
-from sonarpost.sim.micromodem import Micromodem
-from sonarpost.sim.micromodem_config import ModemConfig, Output, Report
-from sonarpost.sim.serial_pace import SerialPace
-from sonarpost.sim.water import Water
-from sonarpost.sim.water_config import WaterConfig
-from sonarpost.sim.water_physics import Position
-from sonarpost.sim.water_records import ArrivalStarted, Transmission
+from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_events import ArrivalStarted, Transmission
+from sonarpost.simulation.channel.propagation import Water
+from sonarpost.simulation.modem.config import ModemConfig, Output, Report
+from sonarpost.simulation.modem.emulator import Micromodem
+from sonarpost.simulation.modem.serial_timing import SerialPace
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 from sonarpost.errors import ConfigError
-from sonarpost.sim.water_chance import TailDamage
-from sonarpost.sim.water_config import WaterConfig
+from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.random_draws import TailDamage
 
 Value = float | int | bool | str
 

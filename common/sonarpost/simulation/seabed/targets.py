@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.sim.seabed import Seabed
+from sonarpost.simulation.seabed.terrain import Seabed
 
 FloatMap = npt.NDArray[np.float32]
 

@@ -1,1 +1,0 @@
-"""The simulated world: seabed and survey, water, emulated modems."""

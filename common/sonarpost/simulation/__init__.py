@@ -1,0 +1,1 @@
+"""Simulation: Micro-Modems, the acoustic channel, the seabed with its survey, and missions."""

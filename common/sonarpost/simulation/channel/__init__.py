@@ -1,0 +1,1 @@
+"""The simulated acoustic channel: propagation, loss, fading, and its event log."""

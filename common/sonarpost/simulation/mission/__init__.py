@@ -1,0 +1,1 @@
+"""Simulated missions of several vehicles on simulated time."""

@@ -1,0 +1,1 @@
+"""Simulated seabeds with objects, and side-scan surveys of them with known truth."""
