@@ -3,8 +3,8 @@
 A line is recorded file after file, and a long file is looked at piece after piece; what lies near a cut is looked at
 twice. Two ask here, and differ beyond it on purpose:
 
-- `sonarpost.detection.stream`, for commands, has whole files in memory. It withholds contacts near the end of a file; when the
-  next file is there they are forgotten, as that end is looked at once more. The detector's settings say what is near.
+- `sonarpost.detection.stream`, for commands, has whole files in memory. It withholds contacts near the end of a file; when
+  the next file is there they are forgotten, as that end is looked at once more. The settings say what is near.
 - atd_stub has pieces of files of any length, and answers for each contact over restarts. What waits at a file's end is
   replaced by the same contact seen whole, and sent as it is where the second look does not see it.
 """
