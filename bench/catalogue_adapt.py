@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.vq.adaptation import Quality, adapt, measure, split
-from sonarpost.codec.vq.codebook import NOMINAL_TILE_PX, load_nominal
+from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split
+from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, load_default
 from sonarpost.codec.vq.patches import stretch
 from sonarpost.codec.vq.training_config import TrainingImage
 from sonarpost.sonar.image_files import read_image
@@ -52,7 +52,7 @@ def main() -> int:
         if not images:
             print(f"catalogue_adapt: no {pattern} in {args.data}", file=sys.stderr)
             return 2
-        for tile_px in NOMINAL_TILE_PX:
+        for tile_px in DEFAULT_TILE_PX:
             good &= _row(title, images, tile_px)
     return 0 if good else 1
 
@@ -75,7 +75,7 @@ def _image(name: str, pixels: npt.NDArray[np.uint8]) -> TrainingImage:
 
 
 def _row(title: str, images: list[TrainingImage], tile_px: int) -> bool:
-    base = load_nominal(tile_px).tiles
+    base = load_default(tile_px).tiles
     training, held_out = split(images)
     start_s = time.process_time()
     adapted = adapt(base, training)
@@ -91,7 +91,7 @@ def _row(title: str, images: list[TrainingImage], tile_px: int) -> bool:
     return new_psnr > psnr
 
 
-def _means(measured: list[Quality]) -> tuple[float, float]:
+def _means(measured: list[CodebookQuality]) -> tuple[float, float]:
     return float(np.mean([q.psnr_db for q in measured])), float(np.mean([q.fom for q in measured]))
 
 

@@ -45,7 +45,7 @@ from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import ReconstructedImage, Record
 from sonarpost.parent_process import EXIT_WITH_PARENT
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Service, UnitOfWork
 
 SETTLE_S = 120.0
 SAMPLE_S = 5.0
@@ -58,7 +58,7 @@ class Load(Service[ServiceConfig]):
     NAME = "load"
     PUBLISH = False
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """It takes nothing."""
         raise NotImplementedError
 
@@ -78,7 +78,7 @@ def run_load(endpoint: str, folder: Path, vessel: str, vehicles: Sequence[int], 
     due = sorted((rng.uniform(0, every_s) + n * every_s, v, n) for v in vehicles for n in range(int(seconds / every_s)))
     for at_s, vehicle, number in due:
         load.stopping.wait(max(0.0, began_s + at_s - time.monotonic()))
-        effects = Effects()
+        effects = UnitOfWork()
         effects.send(
             keys.image_reconstructed(vessel), "relay", picture(vessel, vehicle, number, time.time()), priority=5
         )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sonarpost.messages import Raster, ReconstructedImage
+from sonarpost.messages import Pixels, ReconstructedImage
 
 SHAPE = (100, 300)
 """Height and width in pixels: 30 kB."""
@@ -16,7 +16,7 @@ def noise_picture(
     vessel_id: str, vehicle_id: str, image_id: str, seed: int | Sequence[int], first_frame_utc_s: float
 ) -> ReconstructedImage:
     """Return a picture that has arrived whole; the same seed gives the same pixels."""
-    raster = Raster.from_array(np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8))
+    raster = Pixels.from_array(np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8))
     return ReconstructedImage(
         vessel_id=vessel_id,
         vehicle_id=vehicle_id,

@@ -46,7 +46,7 @@ from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.scheduler import CHUNK_BYTES, WINDOW, WINDOW_BYTES
 from sonarpost.logs import set_up
 from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
@@ -68,7 +68,7 @@ class Sink(Service[ServiceConfig]):
         """What vessels relay."""
         return {keys.shore_inbox_all(): Relayed}
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Nothing: the record is on the disk already."""
 
 

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.interface import to_uint8
-from sonarpost.codec.vq.codebook import load_nominal
+from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.patches import stretch
 from sonarpost.codec.vq.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, Tiles, cut_tiles
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
@@ -57,7 +57,7 @@ def main() -> int:
         print("tile_search: faiss is not installed here: pip install faiss-cpu", file=sys.stderr)
         return 2
     faiss.omp_set_num_threads(1)
-    database = load_nominal(10).tiles
+    database = load_default(10).tiles
     pictures = [cut_tiles(picture, 10) for picture in _pictures(args.images, args.pictures)]
     if not pictures:
         print(f"tile_search: no picture of {HEIGHT_PX} x {WIDTH_PX} px or more in {args.images}", file=sys.stderr)

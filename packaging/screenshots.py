@@ -24,7 +24,7 @@ from sonarpost.services.console.board import Board
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.contacts import Filter
 from sonarpost.services.console.database import Database
-from sonarpost.services.console.decisions import Judgement
+from sonarpost.services.console.decisions import DecisionInput
 from sonarpost.services.console.people import Actor
 from sonarpost.services.console.rows import Json
 from sonarpost.services.console.server import WebServer
@@ -58,7 +58,7 @@ class Scene:
         version = whole["versions"][-1]
         screen = OnScreen(version["version"], version["sha256"], "raw")
         revision = whole["contact"]["revision"]
-        self.board.decide(contact_id, Judgement(revision, screen, verdict, confidence, mlo_class, remark), BOB)  # type: ignore[arg-type]
+        self.board.decide(contact_id, DecisionInput(revision, screen, verdict, confidence, mlo_class, remark), BOB)  # type: ignore[arg-type]
 
     @contextmanager
     def page(self, size: tuple[int, int], theme: str, contact_id: str = "") -> Iterator[Page]:

@@ -18,7 +18,7 @@ import sonarpost
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import Image
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq.codebook import open_catalogue
+from sonarpost.codec.vq.codebook import open_codebook
 
 # Nobody installs plots on a vehicle.
 OPTIONAL = ("matplotlib", "pillow_jxl")
@@ -41,7 +41,7 @@ def pictures() -> Iterable[Image]:
 def code(picture: Image) -> None:
     """Encode and decode with all codecs of the registry that are installed."""
     registry = default_registry()
-    tiles = open_catalogue("nominal-10").tiles
+    tiles = open_codebook("nominal-10").tiles
     for name in registry.names():
         codec = registry.create(name, CodecResources(tiles))
         # The comparison codecs cannot always squeeze a picture into a small budget.

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from sonarpost.messages import Command, Decision, Raster, ReconstructedImage
+from sonarpost.messages import Command, Decision, Pixels, ReconstructedImage
 
 FIRST_S = 1_700_000_000.0
 
 
-def picture_record(picture: Raster, **changes: object) -> ReconstructedImage:
+def picture_record(picture: Pixels, **changes: object) -> ReconstructedImage:
     """Return a picture that has arrived whole on vessel-1; any field may be given another value."""
     fields: dict[str, object] = {
         "vessel_id": "vessel-1",

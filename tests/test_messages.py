@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 from pydantic import ValidationError
 
 from sonarpost.errors import BadInputError
-from sonarpost.messages import Command, Contact, Raster, ReconstructedImage, Record
+from sonarpost.messages import Command, Contact, Pixels, ReconstructedImage, Record
 
 NAN, INF = math.nan, math.inf
 LONG = "x" * 2001
@@ -313,7 +313,7 @@ pictures = st.one_of(
 
 @given(pictures)
 def test_a_raster_gives_back_the_array_it_was_made_of(image: Any) -> None:
-    raster = Raster.from_array(image)
+    raster = Pixels.from_array(image)
     back = raster.to_array()
     assert back.dtype == (np.uint8 if image.dtype.itemsize == 1 else np.uint16)
     assert back.dtype.isnative
@@ -325,9 +325,9 @@ def test_a_raster_gives_back_the_array_it_was_made_of(image: Any) -> None:
 
 def test_pixels_lie_row_by_row_and_little_endian() -> None:
     image = np.array([[1, 2], [0x1234, 0xFFFE]], dtype=">u2")
-    assert Raster.from_array(image).data == bytes.fromhex("0100 0200 3412 feff")
-    assert Raster.from_array(image.T).data == bytes.fromhex("0100 3412 0200 feff")
-    assert Raster.from_array(np.arange(12, dtype=np.uint8).reshape(3, 4)[::2, ::-2]).data == bytes([3, 1, 11, 9])
+    assert Pixels.from_array(image).data == bytes.fromhex("0100 0200 3412 feff")
+    assert Pixels.from_array(image.T).data == bytes.fromhex("0100 3412 0200 feff")
+    assert Pixels.from_array(np.arange(12, dtype=np.uint8).reshape(3, 4)[::2, ::-2]).data == bytes([3, 1, 11, 9])
 
 
 @pytest.mark.parametrize(
@@ -346,18 +346,18 @@ def test_pixels_lie_row_by_row_and_little_endian() -> None:
 )
 def test_an_array_that_is_no_picture_is_refused(image: Any) -> None:
     with pytest.raises(BadInputError, match="expected rows and columns of uint8 or uint16"):
-        Raster.from_array(image)
+        Pixels.from_array(image)
 
 
 @pytest.mark.parametrize("shape", [(0, 4), (4, 0), (4097, 1), (1, 4097)])
 def test_an_array_of_a_size_no_raster_has_is_refused(shape: tuple[int, int]) -> None:
     with pytest.raises(ValidationError):
-        Raster.from_array(np.zeros(shape, np.uint8))
+        Pixels.from_array(np.zeros(shape, np.uint8))
 
 
 @given(hnp.arrays(np.bool_, hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=11)))
 def test_the_mask_says_which_pixels_are_missing(missing: Any) -> None:
-    picture = Raster.from_array(np.zeros(missing.shape, np.uint8))
+    picture = Pixels.from_array(np.zeros(missing.shape, np.uint8))
     fields = COMPLETE_IMAGE.model_dump() | {
         "picture": picture,
         "picture_sha256": picture.sha256,

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 
 from sonarpost import wire
 from sonarpost.delivery.batch_protocol import pack_replies, parse_query, unpack_replies
-from sonarpost.delivery.protocol import Reply, attachment, parse_chunk
+from sonarpost.delivery.protocol import AckReply, attachment, parse_chunk
 from sonarpost.delivery.transaction import OutboxItem
 from sonarpost.errors import PayloadError
-from sonarpost.messages import Contact, Health, Raster, Record
+from sonarpost.messages import Contact, Health, Pixels, Record
 
 GOLDEN = Path(__file__).parent / "golden" / "zenoh"
 BY_TYPE = {t.TYPE: t for t in RECORD_TYPES}
@@ -76,7 +76,7 @@ def test_old_handoff_messages_parse_for_ever_and_are_made_alike_today() -> None:
     made = handoff_samples()
     for name, vector in vectors("handoff-reply").items():
         payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
-        reply = Reply.unpack(payload, KEY)
+        reply = AckReply.unpack(payload, KEY)
         assert (reply.status, reply.next_offset, reply.reason) == (fields["status"], fields["next"], fields["reason"])
         assert reply.takes == fields.get("takes", 0)
         assert made["handoff-reply"][name] == payload == reply.pack(reply.takes)
@@ -242,8 +242,8 @@ def test_a_payload_above_the_limit_is_refused_unread(monkeypatch: pytest.MonkeyP
 
 
 def test_the_largest_raster_is_below_the_limit() -> None:
-    raster = Raster(height_px=4096, width_px=4096, bits=16, data=bytes(4096 * 4096 * 2))
-    assert wire.decode(Raster, wire.encode(raster), KEY) == raster
+    raster = Pixels(height_px=4096, width_px=4096, bits=16, data=bytes(4096 * 4096 * 2))
+    assert wire.decode(Pixels, wire.encode(raster), KEY) == raster
 
 
 # What an error says

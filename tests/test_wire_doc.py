@@ -25,10 +25,10 @@ from sonarpost.delivery import batch_protocol as handoff_batch
 from sonarpost.delivery import outbox, transaction
 from sonarpost.delivery import protocol as handoff
 from sonarpost.delivery import scheduler as schedule
-from sonarpost.delivery.protocol import Reply, attachment
+from sonarpost.delivery.protocol import AckReply, attachment
 from sonarpost.delivery.transaction import OutboxItem
 from sonarpost.messages import Contact, Decision, Record, Snippet
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.c2.service import ADVICE_PRIORITY, COMMAND_PRIORITY
 from sonarpost.services.relay.service import DECISION_PRIORITY, DETAIL_PRIORITY, PREVIEW_PRIORITY
 
@@ -192,10 +192,10 @@ def test_numbers_in_the_text_are_those_of_the_code() -> None:
 def test_attachment_and_reply_have_the_documented_fields() -> None:
     item = OutboxItem("relay", 6, "k", "", 4, b"", bytes(32))
     assert list(msgpack.unpackb(attachment(bytes(16), item, settled=5))) == list(table("The attachment"))
-    assert list(msgpack.unpackb(Reply("stored").pack(takes=2))) == list(table("The reply"))
+    assert list(msgpack.unpackb(AckReply("stored").pack(takes=2))) == list(table("The reply"))
     several = handoff_batch.attachment(bytes(16), [item], settled=5)
     assert list(msgpack.unpackb(several)) == list(table("Several records in one query"))
-    replies = handoff_batch.pack_replies([Reply("stored")])
+    replies = handoff_batch.pack_replies([AckReply("stored")])
     assert list(msgpack.unpackb(replies)) == list(table("Several records in one query", 1))
 
 
@@ -227,8 +227,8 @@ def test_the_hex_examples_are_the_bytes() -> None:
         "raster": wire.encode(SAMPLES["raster-16-bits"]),
         "decision": decision,
         "attachment": attachment(bytes(range(16)), item),
-        "reply": Reply("stored").pack(handoff_batch.MAX_RECORDS),
-        "more": Reply("more", 32768).pack(handoff_batch.MAX_RECORDS),
+        "reply": AckReply("stored").pack(handoff_batch.MAX_RECORDS),
+        "more": AckReply("more", 32768).pack(handoff_batch.MAX_RECORDS),
     }
     assert f"A decision, {len(decision)} bytes:" in TEXT
     assert f"with those {len(decision)} bytes" in TEXT
@@ -266,7 +266,7 @@ class Taker(Service[ServiceConfig]):
     def consumes(self) -> Mapping[str, type[Record]]:
         return {self.key: self.takes}
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         self.got.append(record)
 
 
@@ -389,12 +389,12 @@ def test_the_handing_over_program_sends_long_records_in_pieces_and_learns_of_a_r
 class Producer(Service[ServiceConfig]):
     NAME = "decider"
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         raise AssertionError("takes nothing")
 
 
 def owe(producer: Producer, consumer: str, number: int) -> None:
-    effects = Effects()
+    effects = UnitOfWork()
     fields = SAMPLES["decision-bare"].model_dump() | {"decision_id": f"d{number}"}
     effects.send(DecisionTaker.key, consumer, Decision(**fields))
     producer.commit(effects)
@@ -480,13 +480,13 @@ def test_the_bytes_of_the_page_are_a_conversation(client: zenoh.Session, platfor
         # Refused for its content: remembered, so that asking again does not refuse it a second time.
         bad = msgpack.packb({"type": "decision", "v": 9})
         item = OutboxItem("relay", 2, "k", "", 4, bad, hashlib.sha256(bad).digest())
-        first, again = (Reply.unpack(ask(bad, attachment(bytes(range(16)), item)), "k") for _ in range(2))
-        assert first == Reply("refused", reason=f"{DecisionTaker.key}: v: got 9, expected 1")
+        first, again = (AckReply.unpack(ask(bad, attachment(bytes(range(16)), item)), "k") for _ in range(2))
+        assert first == AckReply("refused", reason=f"{DecisionTaker.key}: v: got 9, expected 1")
         assert again.status == "refused"
         assert "refused before" in again.reason
         assert taker.store.refused_count() == 1
         # Refused for its attachment, or for having none: nothing to remember it by.
-        refused = Reply.unpack(ask(hex_block("decision"), None), "k")
+        refused = AckReply.unpack(ask(hex_block("decision"), None), "k")
         assert refused.status == "refused"
         assert f"{selector}: payload: got b''" in refused.reason
         assert taker.store.refused_count() == 1

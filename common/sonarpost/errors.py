@@ -61,11 +61,11 @@ class ConfigError(BadInputError):
     """A configuration file or an environment override is wrong."""
 
 
-class CatalogueError(BadInputError):
+class CodebookError(BadInputError):
     """A tile catalogue cannot be read, or is not the one the other end used."""
 
 
-class KeptFileError(BadInputError):
+class StoredFileError(BadInputError):
     """A record that c2 keeps as a file cannot be read back, or is not what its place promises."""
 
 
@@ -73,5 +73,5 @@ class PortError(SonarpostError):
     """A serial port or socket cannot be opened, or went away."""
 
 
-class HandoffError(SonarpostError):
+class DeliveryError(SonarpostError):
     """The durable store refused a record (full disk, damaged database)."""

@@ -25,8 +25,8 @@ def kv(**fields: object) -> dict[str, object]:
 _NEEDS_QUOTES = re.compile(r"[ \"'=]").search
 
 
-class concerning_later:  # noqa: N801  # a context manager, read as a verb like `concerning`
-    """As `concerning`, with fields that are looked for only if a line is logged inside."""
+class lazy_log_context:  # noqa: N801  # a context manager, read as a verb like `log_context`
+    """As `log_context`, with fields that are looked for only if a line is logged inside."""
 
     def __init__(self, find: Callable[[], Mapping[str, object]]) -> None:
         self._find = find
@@ -47,15 +47,15 @@ class concerning_later:  # noqa: N801  # a context manager, read as a verb like 
         return self._found
 
 
-_concerned: ContextVar[Mapping[str, object] | concerning_later] = ContextVar("concerned", default=MappingProxyType({}))
+_concerned: ContextVar[Mapping[str, object] | lazy_log_context] = ContextVar("concerned", default=MappingProxyType({}))
 
 
-def _known(concerned: Mapping[str, object] | concerning_later) -> Mapping[str, object]:
-    return concerned.fields() if isinstance(concerned, concerning_later) else concerned
+def _known(concerned: Mapping[str, object] | lazy_log_context) -> Mapping[str, object]:
+    return concerned.fields() if isinstance(concerned, lazy_log_context) else concerned
 
 
 @contextmanager
-def concerning(**fields: object) -> Iterator[None]:
+def log_context(**fields: object) -> Iterator[None]:
     """Put these fields into every line that is logged inside, in this thread; None is not known and left out.
 
     `vehicle` and `image_id` name a picture on every platform, `contact_id` a contact on the vehicle: whoever logs about

@@ -52,7 +52,7 @@ class Record(BaseModel):
     VERSION: ClassVar[int] = 1
 
 
-class Raster(Record):
+class Pixels(Record):
     """A grey picture: rows along-track, columns across-track, row by row, little endian."""
 
     TYPE: ClassVar[str] = "raster"
@@ -74,7 +74,7 @@ class Raster(Record):
         return data
 
     @classmethod
-    def from_array(cls, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> Raster:
+    def from_array(cls, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> Pixels:
         """Make a raster of an array.
 
         Args:
@@ -149,9 +149,9 @@ class Snippet(Record):
     TYPE: ClassVar[str] = "snippet"
 
     contact: Contact
-    picture: Raster
+    picture: Pixels
     source: Text = ""
-    wide: Raster | None = None
+    wide: Pixels | None = None
 
 
 class EncodedImage(Record):
@@ -220,7 +220,7 @@ class ReconstructedImage(Record):
     contact: Contact | None
     codec: Annotated[str, Field(max_length=40)]
     model: ModelHash
-    picture: Raster
+    picture: Pixels
     picture_sha256: Sha256
     complete: bool
     missing_fraction: Fraction
@@ -237,7 +237,7 @@ class ReconstructedImage(Record):
     @classmethod
     def _is_of_the_picture(cls, sha256: str, info: ValidationInfo) -> str:
         picture = info.data.get("picture")
-        if isinstance(picture, Raster) and picture.sha256 != sha256:
+        if isinstance(picture, Pixels) and picture.sha256 != sha256:
             raise ValueError(f"{picture.sha256}, the sha256 of the picture's bytes")
         return sha256
 
@@ -245,7 +245,7 @@ class ReconstructedImage(Record):
     @classmethod
     def _fits_the_picture(cls, mask: bytes, info: ValidationInfo) -> bytes:
         picture = info.data.get("picture")
-        if isinstance(picture, Raster):
+        if isinstance(picture, Pixels):
             size = (picture.height_px * picture.width_px + 7) // 8
             if len(mask) not in (0, size):
                 raise ValueError(f"0 or {size} bytes, not {len(mask)}")

@@ -12,8 +12,8 @@ from pydantic import Field, model_validator
 from sonarpost.config import ServiceConfig
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
-from sonarpost.simulation.channel.channel_presets import make_water
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.channel_presets import make_channel
 from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
 from sonarpost.simulation.channel.random_draws import TailDamage
 from sonarpost.simulation.modem.config import ModemConfig
@@ -53,7 +53,7 @@ class TransponderTable(ServiceConfig):
     depth_m: float = 0.0
 
 
-_OF_WATER = tuple(field.name for field in fields(WaterConfig))
+_OF_WATER = tuple(field.name for field in fields(ChannelParameters))
 
 
 class AcousticChannelConfig(ServiceConfig):
@@ -156,7 +156,7 @@ class AcousticChannelConfig(ServiceConfig):
         }
         if "tail_damage_kind" in given:
             given["tail_damage_kind"] = self.tail_damage_kind.value
-        water = make_water(given | {"preset": self.preset}, "acoustic_channel")
+        water = make_channel(given | {"preset": self.preset}, "acoustic_channel")
         template = ModemConfig(
             address=0,
             generation=self.generation,

@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from sonarpost.config import PlatformConfig
 from sonarpost.logs import kv
 from sonarpost.messages import Record
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
-from sonarpost.simulation.channel.emulator import AcousticChannel
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 
-__all__ = ["AcousticChannel", "AcousticChannelService"]
+__all__ = ["AcousticChannelService", "ChannelEmulator"]
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ class AcousticChannelService(Service[AcousticChannelConfig]):
 
     def __init__(self, platform: PlatformConfig, config: AcousticChannelConfig) -> None:
         super().__init__(platform, config)
-        self._channel = AcousticChannel(config.channel())
+        self._channel = ChannelEmulator(config.channel())
         try:
             self._channel.start()
         except BaseException:
@@ -41,7 +41,7 @@ class AcousticChannelService(Service[AcousticChannelConfig]):
         for device in self._channel.devices():
             log.info("Modem ready", extra=kv(modem=device.modem, address=device.address, device=device.device))
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Never called, as this service consumes no records."""
         raise NotImplementedError(f"acoustic_channel consumes no records, and got one on {key}")
 

@@ -12,8 +12,8 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.unit_of_work import Effects
-from sonarpost.errors import HandoffError, PayloadError
+from sonarpost.delivery.unit_of_work import UnitOfWork
+from sonarpost.errors import DeliveryError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Health, QueueState, Snippet
 from sonarpost.services.atd_stub.pool import ContactPool
@@ -38,7 +38,7 @@ class Outgoing:
         commit: Commits effects, in one transaction.
     """
 
-    def __init__(self, platform: PlatformConfig, store: Store, most: int, commit: Callable[[Effects], None]) -> None:
+    def __init__(self, platform: PlatformConfig, store: Store, most: int, commit: Callable[[UnitOfWork], None]) -> None:
         self._vehicle = platform.id
         self._store = store
         self._most = most
@@ -92,11 +92,11 @@ class Outgoing:
         """Let `run` look whether there is something to do."""
         self._wanted.set()
 
-    def add(self, effects: Effects, ready: Sequence[Snippet]) -> None:
+    def add(self, effects: UnitOfWork, ready: Sequence[Snippet]) -> None:
         """Commit effects, and with them contacts that are ready.
 
         Raises:
-            HandoffError: The store cannot be written; nothing was kept.
+            DeliveryError: The store cannot be written; nothing was kept.
         """
         with self._pool.lock:
             committed = self._pool.add(effects, [wire.encode(snippet) for snippet in ready])
@@ -113,7 +113,7 @@ class Outgoing:
                 return
             try:
                 self._let_go()
-            except HandoffError as error:
+            except DeliveryError as error:
                 if not self.trouble:
                     log.exception("Contacts cannot be handed on")
                 self.trouble = str(error)
@@ -129,14 +129,14 @@ class Outgoing:
             room = self._way.room(self._store.outbox_depth(), self._most, time.monotonic())
             if not room:
                 return
-            effects = Effects()
+            effects = UnitOfWork()
             count, committed = self._pool.release(effects, room, self._owe)
             effects.put_state(_RELEASED, b"1")
             self._commit(effects)
             committed()
         log.debug("Contacts handed on", extra=kv(contacts=count, waiting=len(self._pool)))
 
-    def _owe(self, effects: Effects, payload: bytes) -> None:
+    def _owe(self, effects: UnitOfWork, payload: bytes) -> None:
         effects.send_payload(keys.contact_detected(self._vehicle), COMPRESSOR, payload, Snippet)
 
 

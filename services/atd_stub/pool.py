@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 from sonarpost import wire
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.unit_of_work import Effects
+from sonarpost.delivery.unit_of_work import UnitOfWork
 from sonarpost.messages import Snippet
 
 _PREFIX = "pool:"
@@ -32,7 +32,7 @@ class ContactPool:
     def __len__(self) -> int:
         return len(self._names)
 
-    def add(self, effects: Effects, payloads: Sequence[bytes]) -> Callable[[], None]:
+    def add(self, effects: UnitOfWork, payloads: Sequence[bytes]) -> Callable[[], None]:
         """Keep snippets, given as their records' bytes; return what is to be called when the effects are committed."""
         names = []
         for payload in payloads:
@@ -49,7 +49,7 @@ class ContactPool:
         return committed
 
     def release(
-        self, effects: Effects, most: int, send: Callable[[Effects, bytes], None]
+        self, effects: UnitOfWork, most: int, send: Callable[[UnitOfWork, bytes], None]
     ) -> tuple[int, Callable[[], None]]:
         """Let the most confident go; return how many, and what is to be called when the effects are committed.
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from sonarpost.codec.interface import MIN_SIDE_PX
 from sonarpost.detection.contacts import Detection
-from sonarpost.detection.ground_snippet import ground_picture
-from sonarpost.detection.snippet import cut_snippet, cut_wide
-from sonarpost.messages import Contact, Raster, Snippet
+from sonarpost.detection.ground_snippet import ground_projected_image
+from sonarpost.detection.snippet import cut_expanded, cut_snippet
+from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.seam import Origin
 from sonarpost.sonar.georeference import georeference
@@ -30,12 +30,12 @@ def of_detection(survey: Survey, found: Detection, origin: Origin, vehicle_id: s
     picture, along_m, across_m = cut.image, cut.pixel_along_m, cut.pixel_across_m
     wide = None
     if config.snippet_pixel_m > 0:
-        ground = ground_picture(survey, found, *size, config.snippet_pixel_m)
+        ground = ground_projected_image(survey, found, *size, config.snippet_pixel_m)
         if ground is not None:
             picture, along_m, across_m = ground, config.snippet_pixel_m, config.snippet_pixel_m
-            wide = ground_picture(survey, found, *size, 2 * config.snippet_pixel_m)
+            wide = ground_projected_image(survey, found, *size, 2 * config.snippet_pixel_m)
     if picture is cut.image:
-        wide = cut_wide(survey, found, *size)
+        wide = cut_expanded(survey, found, *size)
     place = georeference(
         survey.pings[found.ping_index],
         found.side,
@@ -73,7 +73,7 @@ def of_detection(survey: Survey, found: Detection, origin: Origin, vehicle_id: s
     )
     return Snippet(
         contact=contact,
-        picture=Raster.from_array(picture),
+        picture=Pixels.from_array(picture),
         source=origin.source,
-        wide=None if wide is None or min(wide.shape) < MIN_SIDE_PX else Raster.from_array(wide),
+        wide=None if wide is None or min(wide.shape) < MIN_SIDE_PX else Pixels.from_array(wide),
     )

@@ -14,12 +14,12 @@ from typing import Final
 import msgpack
 import numpy as np
 
-from sonarpost.detection.association import Look, Sameness
+from sonarpost.detection.association import AssociationRule, DetectionPosition
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 
 FORMAT: Final = 1
-_SAMENESS: Final = Sameness(along_m=3.0, across_m=math.nextafter(3.0, math.inf), overlapping=True)
+_SAMENESS: Final = AssociationRule(along_m=3.0, across_m=math.nextafter(3.0, math.inf), overlapping=True)
 """Contacts nearer to each other than 3 m are one, as within a file; across-track at 3 m too."""
 _LEAST_GAP_S: Final = 1.0
 _GAP_INTERVALS: Final = 3.0
@@ -44,7 +44,7 @@ class Origin:
 
 
 @dataclass(frozen=True, slots=True)
-class SeamLook(Look):
+class SeamLook(DetectionPosition):
     """A contact as it was seen in one look, and what waits with it.
 
     Attributes:
@@ -53,7 +53,7 @@ class SeamLook(Look):
 
     held: bytes | None = None
 
-    def is_same(self, other: Look) -> bool:
+    def is_same(self, other: DetectionPosition) -> bool:
         """Tell whether both are looks at one object."""
         return _SAMENESS.holds(self, other, abs(self.slant_range_m - other.slant_range_m))
 

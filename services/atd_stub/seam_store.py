@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from sonarpost import wire
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.unit_of_work import Effects
+from sonarpost.delivery.unit_of_work import UnitOfWork
 from sonarpost.logs import kv
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub.seam import Seam, pack, unpack
@@ -42,7 +42,7 @@ class SeamStore:
         """Return the seams by sonar."""
         return {seam.sonar_id: seam for seam in self._seams.values()}
 
-    def keep(self, effects: Effects, seam: Seam | None, *, joined: bool) -> tuple[Snippet, ...]:
+    def keep(self, effects: UnitOfWork, seam: Seam | None, *, joined: bool) -> tuple[Snippet, ...]:
         """Keep a file's end in place of the one before it.
 
         Args:
@@ -67,7 +67,7 @@ class SeamStore:
             effects.delete_state(oldest)
         return tuple(snippet for each in gone for snippet in _held(each))
 
-    def end(self, effects: Effects, now_utc_s: float, wait_s: float) -> tuple[Snippet, ...]:
+    def end(self, effects: UnitOfWork, now_utc_s: float, wait_s: float) -> tuple[Snippet, ...]:
         """Return what has waited long enough; it is held no more. A clock that was set back does not prolong that."""
         self._next = dict(self._seams)
         freed: list[Snippet] = []

@@ -12,11 +12,11 @@ import msgpack
 
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.transaction import OutboxItem, Transaction
-from sonarpost.errors import HandoffError, SurveyFileError
+from sonarpost.errors import DeliveryError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.logs import kv
 from sonarpost.messages import Record, Snippet
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.atd_stub import snippets
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.folder import FileSeen, SettledFiles, content_hash, look_at, printable
@@ -50,7 +50,7 @@ class AtdStubService(Service[AtdStubConfig]):
         self._outgoing = Outgoing(platform, self.store, config.max_on_the_way, self.commit)
         self._seams = SeamStore(self.store)
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Refuse: nothing is sent to this service."""
         raise NotImplementedError("atd_stub consumes no records")
 
@@ -93,7 +93,7 @@ class AtdStubService(Service[AtdStubConfig]):
             try:
                 self._end_seams()
                 self._look()
-            except (OSError, HandoffError) as error:
+            except (OSError, DeliveryError) as error:
                 self.problem(f"{type(error).__name__}: {error}")
             else:
                 self.problem("")
@@ -143,7 +143,7 @@ class AtdStubService(Service[AtdStubConfig]):
                 return False
             self._quarantine(path, content, str(error))
             return True
-        except (OSError, HandoffError):
+        except (OSError, DeliveryError):
             raise
         except Exception as error:
             # A defect of ours must not stop the files behind this one.
@@ -157,7 +157,7 @@ class AtdStubService(Service[AtdStubConfig]):
         return True
 
     def _hand_on(self, path: Path, content: str, found: Finding, seconds: float) -> None:
-        effects = Effects()
+        effects = UnitOfWork()
         effects.put_state(
             _state_name(content), msgpack.packb({"file": printable(path.name), "contacts": found.contacts})
         )
@@ -172,7 +172,7 @@ class AtdStubService(Service[AtdStubConfig]):
         for warning in found.warnings:
             log.warning("Met in the survey", extra=kv(file=path.name, what=printable(warning)))
 
-    def _commit_contacts(self, effects: Effects, ready: tuple[Snippet, ...]) -> None:
+    def _commit_contacts(self, effects: UnitOfWork, ready: tuple[Snippet, ...]) -> None:
         """Commit effects, and contacts that are ready to go, whose files are written before."""
         if self.config.snippet_dir is not None:
             for snippet in ready:
@@ -192,7 +192,7 @@ class AtdStubService(Service[AtdStubConfig]):
 
     def _end_seams(self) -> None:
         """Let go what waited long enough for a file that has not come."""
-        effects = Effects()
+        effects = UnitOfWork()
         freed = self._seams.end(effects, time.time(), self.config.seam_wait_s)
         if freed:
             log.info("No file goes on where the last one ended", extra=kv(contacts=len(freed)))
@@ -216,7 +216,7 @@ class AtdStubService(Service[AtdStubConfig]):
         """Remember a bad file, so that it is looked at once, and move it aside with its reason."""
         reason = printable(reason)
         log.error("File quarantined", extra=kv(file=path.name, reason=reason))
-        effects = Effects()
+        effects = UnitOfWork()
         effects.put_state(_state_name(content), msgpack.packb({"file": printable(path.name), "refused": reason}))
         effects.count("files_quarantined")
         self.commit(effects)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sonarpost.codec.interface import check_image
 from sonarpost.errors import StreamError, SurveyFileError
-from sonarpost.messages import Contact, Raster, Snippet
+from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.folder import printable
 from sonarpost.services.atd_stub.seam import Origin, Seam
@@ -61,4 +61,4 @@ def from_picture(path: Path, content: str, vehicle_id: str) -> Finding:
     contact = (
         read_contact(text, contact_id, vehicle_id) if known else Contact(contact_id=contact_id, vehicle_id=vehicle_id)
     )
-    return Finding((Snippet(contact=contact, picture=Raster.from_array(picture), source=printable(path.name)),), 1)
+    return Finding((Snippet(contact=contact, picture=Pixels.from_array(picture), source=printable(path.name)),), 1)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 
 from sonarpost import keys
-from sonarpost.archive.image_files import add_picture, picture_name
+from sonarpost.archive.image_files import add_image, image_file_name
 from sonarpost.archive.shore_files import (
     add_missing,
     decision_file_name,
@@ -18,7 +18,7 @@ from sonarpost.archive.shore_files import (
     row_of_image,
     to_remove,
 )
-from sonarpost.archive.shore_index import DecisionRow, PictureRow, ShoreIndex, TaskingRow
+from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, TaskingRow
 from sonarpost.errors import PayloadError
 from sonarpost.files import AtomicFiles
 from sonarpost.logs import kv
@@ -65,8 +65,8 @@ class Archive:
         """Write a picture's files, to be flushed, and index it; tell whether it was new."""
         index = self.index()
         with self._lock:
-            path, new = add_picture(self._files, self._out_dir / image.vessel_id, image)
-            if new or not index.has_picture(image.vessel_id, picture_name(image)):
+            path, new = add_image(self._files, self._out_dir / image.vessel_id, image)
+            if new or not index.has_picture(image.vessel_id, image_file_name(image)):
                 self._images.append((image, relayed_utc_s))
         log.info(
             "Picture accepted" if new else "Picture known already",
@@ -127,7 +127,7 @@ class Archive:
             decisions, self._decisions = self._decisions, []
             files, self._files = self._files, AtomicFiles()
             files.commit()
-            rows: list[PictureRow | DecisionRow] = [row_of_image(self._out_dir, i, at) for i, at in images]
+            rows: list[ImageRow | DecisionRow] = [row_of_image(self._out_dir, i, at) for i, at in images]
             rows += [DecisionRow.of(decision, time.time()) for decision in decisions]
             if rows:
                 self.index().put(rows)
@@ -136,7 +136,7 @@ class Archive:
         """Index advice and commands with their states."""
         self.index().put(rows)
 
-    def apply_retention(self, now_utc_s: float) -> list[PictureRow]:
+    def apply_retention(self, now_utc_s: float) -> list[ImageRow]:
         """Remove what is too old or too much; return what was removed."""
         if self._config.retain_days is None and self._config.max_bytes is None:
             return []

@@ -15,10 +15,10 @@ from sonarpost.archive.shore_files import decision_file_name
 from sonarpost.bus import presence as hello
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction, queue_of
-from sonarpost.errors import HandoffError, PayloadError
+from sonarpost.errors import DeliveryError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
-from sonarpost.runtime.service import Effects, InterruptedByStopError, Service
+from sonarpost.runtime.service import Service, ServiceStoppingError, UnitOfWork
 from sonarpost.services.c2 import tasking
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
@@ -85,7 +85,7 @@ class C2Service(Service[C2Config]):
             raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
         self._known(vessel, key, record)
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Keep and show what a vessel relays; owe a vessel what is for it."""
         if isinstance(record, Relayed):
             inner = self._open(record)
@@ -111,21 +111,21 @@ class C2Service(Service[C2Config]):
             raise PayloadError(envelope.key, "vessel_id", inner.vessel_id, vessel)
         return inner
 
-    def _keep_image(self, image: ReconstructedImage, relayed_utc_s: float, effects: Effects) -> None:
+    def _keep_image(self, image: ReconstructedImage, relayed_utc_s: float, effects: UnitOfWork) -> None:
         new = self._archive.keep_image(image, relayed_utc_s)
         effects.count("images_stored" if new else "images_repeated")
         self._to_show.append((keys.shore_image(image.vessel_id, self.config.site), image))
 
-    def _keep_decision(self, decision: Decision, effects: Effects) -> None:
+    def _keep_decision(self, decision: Decision, effects: UnitOfWork) -> None:
         new = self._archive.keep_decision(decision)
         effects.count("decisions_stored" if new else "decisions_repeated")
         self._to_show.append((keys.shore_decision(decision.vessel_id, self.config.site), decision))
 
-    def commit_all(self, handled: Sequence[tuple[Effects, InboxItem | None]]) -> int:
+    def commit_all(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """Commit when the files of all are on the disk and have been shown.
 
         Raises:
-            OSError, HandoffError: They cannot be written now; all are handled again.
+            OSError, DeliveryError: They cannot be written now; all are handled again.
         """
         try:
             self._archive.flush()
@@ -154,7 +154,7 @@ class C2Service(Service[C2Config]):
         tasking.refuse_another(Tasking.unpack(kept), record, key)
         return True
 
-    def _pass_down(self, vessel: str, key: str, record: Advice | Command, effects: Effects) -> None:
+    def _pass_down(self, vessel: str, key: str, record: Advice | Command, effects: UnitOfWork) -> None:
         if self._known(vessel, key, record):
             effects.count("tasking_repeated")
             return
@@ -200,9 +200,9 @@ class C2Service(Service[C2Config]):
             try:
                 self._show_changed()
                 self._background_problem.pop("tasking", None)
-            except (OSError, HandoffError) as error:
+            except (OSError, DeliveryError) as error:
                 self._background_problem["tasking"] = f"{type(error).__name__}: {error}"
-            except InterruptedByStopError:
+            except ServiceStoppingError:
                 return
             self._changed.wait(RETRY_S)
 
@@ -229,7 +229,7 @@ class C2Service(Service[C2Config]):
         """Begin to remove what is too old, and to show how far advice and commands have come."""
         self.spawn(self._retain, "retention")
         self.spawn(self._show_states, "tasking")
-        hello.answer_vessels(self.session, self.platform.id, self.NAME, self.config.site)
+        hello.declare_presence(self.session, self.platform.id, self.NAME, self.config.site)
 
     def on_stop(self) -> None:
         """Wake what waits."""
@@ -272,5 +272,5 @@ class C2Service(Service[C2Config]):
         except zenoh.ZError as error:
             if self.stopping.is_set():
                 # The session closed under us: the record is shown after the next start.
-                raise InterruptedByStopError from error
+                raise ServiceStoppingError from error
             log.warning("Record not shown to the shore", extra=kv(key=key, error=str(error)))

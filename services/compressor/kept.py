@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import msgpack
 
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.unit_of_work import Effects
+from sonarpost.delivery.unit_of_work import UnitOfWork
 from sonarpost.errors import PayloadError
 
 _INDEX = "kept"
@@ -16,7 +16,7 @@ _PICTURE = "kept/"
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class CachedImage:
     """What is kept of a picture.
 
     Attributes:
@@ -30,7 +30,7 @@ class Kept:
     wider_id: str = ""
 
 
-class KeptPictures:
+class EncodeCache:
     """Encoded images and the snippets they were made of, by image identifier.
 
     Args:
@@ -48,7 +48,7 @@ class KeptPictures:
         packed = self._store.get_state(_INDEX)
         return {} if packed is None else {str(name): float(at) for name, at in msgpack.unpackb(packed)}
 
-    def keep(self, effects: Effects, pictures: Mapping[str, Kept], now_utc_s: float) -> None:
+    def keep(self, effects: UnitOfWork, pictures: Mapping[str, CachedImage], now_utc_s: float) -> None:
         """Keep pictures, and forget with the same transaction what is too old or too much.
 
         Args:
@@ -71,7 +71,7 @@ class KeptPictures:
                 packed = msgpack.packb([kept.image, kept.snippet, kept.wider_id])
                 effects.put_state(_PICTURE + image_id, packed)
 
-    def find(self, image_id: str) -> Kept | None:
+    def find(self, image_id: str) -> CachedImage | None:
         """Return what is kept of a picture, None where that is nothing.
 
         Raises:
@@ -82,8 +82,8 @@ class KeptPictures:
             return None
         match msgpack.unpackb(packed):
             case [bytes(image), bytes(snippet)]:  # of a version without wider pictures
-                return Kept(image, snippet)
+                return CachedImage(image, snippet)
             case [bytes(image), bytes(snippet), str(wider_id)]:
-                return Kept(image, snippet, wider_id)
+                return CachedImage(image, snippet, wider_id)
             case other:
                 raise PayloadError(f"compressor.db: {_PICTURE}{image_id}", "", other, "an image and a snippet")

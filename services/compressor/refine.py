@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.interface import Codec, Extensible
+from sonarpost.codec.interface import Codec, ExtensibleCodec
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
 
-Picture = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+EncodedPicture = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 
-def encode(codec: Codec, picture: Picture, budget_bytes: int, refine_bytes: int) -> bytes:
+def encode(codec: Codec, picture: EncodedPicture, budget_bytes: int, refine_bytes: int) -> bytes:
     """Return the stream to keep of a picture; `handed` is what others get of it.
 
     Args:
@@ -23,7 +23,7 @@ def encode(codec: Codec, picture: Picture, budget_bytes: int, refine_bytes: int)
     Raises:
         StreamError: As the codec's `encode`.
     """
-    if not isinstance(codec, Extensible):
+    if not isinstance(codec, ExtensibleCodec):
         return codec.encode(picture, budget_bytes or None)
     stream = codec.encode(picture, budget_bytes + 1 if budget_bytes else None)
     if refine_bytes > len(stream):
@@ -36,13 +36,13 @@ def handed(codec: Codec, stream: bytes) -> bytes:
 
     So every longer stream begins with what receivers have of it.
     """
-    return stream[:-1] if isinstance(codec, Extensible) else stream
+    return stream[:-1] if isinstance(codec, ExtensibleCodec) else stream
 
 
-def refined(codec: Codec, stream: bytes, picture: Picture) -> bytes:
+def refined(codec: Codec, stream: bytes, picture: EncodedPicture) -> bytes:
     """Return a stream of up to twice the length that goes on where a kept one ends, or the same where there is none."""
     wanted = min(2 * len(stream), MAX_STREAM_BYTES + 1)
-    if isinstance(codec, Extensible):
+    if isinstance(codec, ExtensibleCodec):
         return codec.extend(stream, picture, wanted)
     longer = codec.encode(picture, min(wanted, MAX_STREAM_BYTES))
     return longer if len(longer) > len(stream) and longer.startswith(stream) else stream

@@ -10,15 +10,15 @@ from dataclasses import replace
 from sonarpost import keys, wire
 from sonarpost.codec.interface import Codec
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq.codebook import open_catalogue
+from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.config import PlatformConfig
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.link.frames.v1.preview import MAX_NUMBER
 from sonarpost.logs import kv
 from sonarpost.messages import Command, CommandKind, EncodedImage, Record, Snippet
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.compressor.config import CompressorConfig
-from sonarpost.services.compressor.kept import Kept, KeptPictures
+from sonarpost.services.compressor.kept import CachedImage, EncodeCache
 from sonarpost.services.compressor.refine import encode, handed, refined
 from sonarpost.services.compressor.wide import wider
 
@@ -43,10 +43,10 @@ class CompressorService(Service[CompressorConfig]):
 
     def __init__(self, platform: PlatformConfig, config: CompressorConfig) -> None:
         # Before the store is opened: what is wrong with the configuration leaves nothing open behind it.
-        tiles = open_catalogue(config.catalogue).tiles
+        tiles = open_codebook(config.catalogue).tiles
         self._codec: Codec = default_registry().create(config.codec, CodecResources(tiles, config.packing))
         super().__init__(platform, config)
-        self._kept = KeptPictures(self.store, config.keep_pictures, config.keep_s)
+        self._kept = EncodeCache(self.store, config.keep_pictures, config.keep_s)
         log.info("Codec ready", extra=kv(codec=self._codec.name, model=self._codec.model_hash[:16]))
 
     def consumes(self) -> Mapping[str, type[Record]]:
@@ -54,7 +54,7 @@ class CompressorService(Service[CompressorConfig]):
         commands = {keys.command(self.platform.id, kind): Command for kind in ("refine", "resend", "wider")}
         return {keys.contact_detected(self.platform.id): Snippet, **commands}
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Encode a snippet, or a picture again, and owe the stream to uuv_modem."""
         if isinstance(record, Command):
             self._answer(record, effects)
@@ -64,7 +64,9 @@ class CompressorService(Service[CompressorConfig]):
         if self.config.keep_pictures:
             self._kept.keep(effects, {image_id: kept}, time.time())
 
-    def _encode(self, snippet: Snippet, effects: Effects, payload: bytes, priority: int = 4) -> tuple[str, Kept]:
+    def _encode(
+        self, snippet: Snippet, effects: UnitOfWork, payload: bytes, priority: int = 4
+    ) -> tuple[str, CachedImage]:
         """Owe uuv_modem the stream of a new picture; return its identifier and what may be kept of it.
 
         Args:
@@ -103,9 +105,9 @@ class CompressorService(Service[CompressorConfig]):
                 encode_ms=round(1000 * (time.perf_counter() - started), 1),
             ),
         )
-        return image.image_id, Kept(wire.encode(image.model_copy(update={"stream": whole})), payload)
+        return image.image_id, CachedImage(wire.encode(image.model_copy(update={"stream": whole})), payload)
 
-    def _answer(self, command: Command, effects: Effects) -> None:
+    def _answer(self, command: Command, effects: UnitOfWork) -> None:
         """Give a picture again, finer or wider where that was asked for."""
         image_id = command.image_id or ""
         found = self._kept.find(image_id)
@@ -117,7 +119,7 @@ class CompressorService(Service[CompressorConfig]):
         else:
             self._give_again(command.kind, image_id, found, effects)
 
-    def _widen(self, image_id: str, found: Kept, effects: Effects) -> None:
+    def _widen(self, image_id: str, found: CachedImage, effects: UnitOfWork) -> None:
         """Give more of the seabed around a contact as a picture of its own, the same one whenever it is asked for."""
         before = self._kept.find(found.wider_id) if found.wider_id else None
         if before is not None:
@@ -133,7 +135,7 @@ class CompressorService(Service[CompressorConfig]):
         effects.count("images_widened")
         log.info("Wider picture given", extra=kv(image_id=image_id, wider_id=wider_id))
 
-    def _give_again(self, kind: CommandKind, image_id: str, found: Kept, effects: Effects) -> None:
+    def _give_again(self, kind: CommandKind, image_id: str, found: CachedImage, effects: UnitOfWork) -> None:
         """Give a picture again; finer where that was asked for and its stream can go on where it ended.
 
         What a stream has more than the link has sent of it, the link sends by itself: this is for what it has not.

@@ -20,7 +20,7 @@ from sonarpost.services.console.arrivals import Arrivals, NoSuchError
 from sonarpost.services.console.asking import ID_COLUMN, Table
 from sonarpost.services.console.audit import OnScreen
 from sonarpost.services.console.contacts import Filter
-from sonarpost.services.console.decisions import Judgement
+from sonarpost.services.console.decisions import DecisionInput
 from sonarpost.services.console.measures import Line, measured
 from sonarpost.services.console.people import Actor
 from sonarpost.services.console.rows import (
@@ -145,7 +145,7 @@ class Board(Arrivals):
 
     # What people do
 
-    def decide(self, contact_id: str, judgement: Judgement, actor: Actor) -> Json:
+    def decide(self, contact_id: str, judgement: DecisionInput, actor: Actor) -> Json:
         """Write a decision down, to be sent; return it with the contact.
 
         Raises:

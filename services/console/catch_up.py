@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from sonarpost.errors import BadInputError, KeptFileError
+from sonarpost.errors import BadInputError, StoredFileError
 from sonarpost.export.accepted import DECISIONS, SideCar
 from sonarpost.logs import kv
-from sonarpost.messages import Decision, Raster, ReconstructedImage
+from sonarpost.messages import Decision, Pixels, ReconstructedImage
 from sonarpost.sonar.image_files import read_image
 
 log = logging.getLogger(__name__)
@@ -53,14 +53,16 @@ def _text(path: Path) -> bytes:
     with path.open("rb") as file:
         text = file.read(_MAX_FILE_BYTES + 1)
     if len(text) > _MAX_FILE_BYTES:
-        raise KeptFileError(str(path), "size", f"more than {_MAX_FILE_BYTES} bytes", f"at most {_MAX_FILE_BYTES} bytes")
+        raise StoredFileError(
+            str(path), "size", f"more than {_MAX_FILE_BYTES} bytes", f"at most {_MAX_FILE_BYTES} bytes"
+        )
     return text
 
 
 def _picture(path: Path) -> ReconstructedImage:
     text = _text(path)
     car = SideCar.model_validate_json(text)
-    picture = Raster.from_array(read_image(path.with_suffix(".tiff")))
+    picture = Pixels.from_array(read_image(path.with_suffix(".tiff")))
     mask = np.zeros((picture.height_px, picture.width_px), np.bool_)
     said = json.loads(text)
     rows = said.get("missing_rows") or []

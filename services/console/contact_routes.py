@@ -19,7 +19,7 @@ from sonarpost.services.console.arrivals import NoSuchError
 from sonarpost.services.console.audit import OnScreen
 from sonarpost.services.console.board import Board
 from sonarpost.services.console.contacts import REVIEWS, SORTS, Filter
-from sonarpost.services.console.decisions import Judgement
+from sonarpost.services.console.decisions import DecisionInput
 from sonarpost.services.console.measures import Line
 from sonarpost.services.console.web import Body, Call, Gate, RefusedError, json_answer
 
@@ -209,7 +209,7 @@ class ContactRoutes:
 
     def _decide(self, call: Call) -> Response:
         given = call.parsed(_Decide)
-        judgement = Judgement(
+        judgement = DecisionInput(
             given.revision,
             OnScreen(given.version, given.sha256, given.layer),
             given.verdict,

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sonarpost.errors import HandoffError
+from sonarpost.errors import DeliveryError
 
 VERSION = 1
 
@@ -92,7 +92,7 @@ class Database:
     """The file, for several threads; one transaction at a time.
 
     Raises:
-        HandoffError: The file cannot be opened, or is of another version.
+        DeliveryError: The file cannot be opened, or is of another version.
     """
 
     def __init__(self, path: Path) -> None:
@@ -107,31 +107,31 @@ class Database:
             version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
             if version not in (0, VERSION):
                 self._db.close()
-                raise HandoffError(f"{path}: console database of version {version}, expected {VERSION}")
+                raise DeliveryError(f"{path}: console database of version {version}, expected {VERSION}")
             if version == 0:
                 self._db.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version={VERSION}; COMMIT;")
         except (OSError, sqlite3.Error) as error:
-            raise HandoffError(f"{path}: cannot be opened as the console's database: {error}") from error
+            raise DeliveryError(f"{path}: cannot be opened as the console's database: {error}") from error
 
     @contextmanager
     def reading(self) -> Iterator[sqlite3.Connection]:
         """Open the connection for reading.
 
         Raises:
-            HandoffError: The database cannot be read.
+            DeliveryError: The database cannot be read.
         """
         with self._lock:
             try:
                 yield self._db
             except sqlite3.Error as error:
-                raise HandoffError(f"{self.path}: {error}") from error
+                raise DeliveryError(f"{self.path}: {error}") from error
 
     @contextmanager
     def writing(self) -> Iterator[sqlite3.Connection]:
         """Open a transaction: on the disk when the block ends, rolled back when it raises.
 
         Raises:
-            HandoffError: The database refused (a full disk); nothing of the block was kept.
+            DeliveryError: The database refused (a full disk); nothing of the block was kept.
         """
         with self._lock:
             try:
@@ -142,7 +142,7 @@ class Database:
                 if self._db.in_transaction:
                     self._db.execute("ROLLBACK")
                 if isinstance(error, sqlite3.Error):
-                    raise HandoffError(f"{self.path}: {error}") from error
+                    raise DeliveryError(f"{self.path}: {error}") from error
                 raise
 
     def close(self) -> None:

@@ -32,7 +32,7 @@ class ConflictError(SonarpostError):
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class DecisionInput:
     """What somebody decides, and on what.
 
     Attributes:
@@ -49,7 +49,12 @@ class Judgement:
 
 
 def decide(
-    db: sqlite3.Connection, contact_id: str, judgement: Judgement, actor: Actor, now_utc_s: float, ends: tuple[str, str]
+    db: sqlite3.Connection,
+    contact_id: str,
+    judgement: DecisionInput,
+    actor: Actor,
+    now_utc_s: float,
+    ends: tuple[str, str],
 ) -> str:
     """Write a decision down, to be sent; return its identifier.
 

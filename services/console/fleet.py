@@ -8,7 +8,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from sonarpost.messages import AcousticFrame, Health, QueueState
-from sonarpost.monitoring.fleet import Fleet, Seen
+from sonarpost.monitoring.fleet import FleetTracker, ServiceStatus
 from sonarpost.services.console.rows import Json
 
 PACKETS_KEPT = 20
@@ -40,7 +40,7 @@ class FleetPanel:
     """
 
     def __init__(self, stale_s: float) -> None:
-        self.services = Fleet()
+        self.services = FleetTracker()
         self._stale_s = stale_s
         self._lock = threading.Lock()
         self._heard: dict[str, _Heard] = {}
@@ -148,7 +148,7 @@ def _queue(queue: _Queue, now_s: float, stale_s: float) -> Json:
     return {**body, "age_s": age_s, "stale": age_s > stale_s, "images": images}
 
 
-def _service(seen: Seen) -> Json:
+def _service(seen: ServiceStatus) -> Json:
     health: Health | None = seen.health
     stale = seen.age_s is None or seen.age_s > SILENT_S
     state = "silent" if health is None or (stale and health.state != "stopping") else health.state

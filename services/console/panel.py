@@ -19,7 +19,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from sonarpost.errors import ConfigError, HandoffError
+from sonarpost.errors import ConfigError, DeliveryError
 from sonarpost.review import rendering
 from sonarpost.review.panel import NONE_OF_THEM, Answer, Decoded, Trial, results, trials_for
 from sonarpost.services.console.app import STATIC, not_routed, page_file, static_routes
@@ -82,7 +82,7 @@ class Answers:
     """What was answered, on the disk; nothing is answered twice.
 
     Raises:
-        HandoffError: The file cannot be opened.
+        DeliveryError: The file cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -94,7 +94,7 @@ class Answers:
             self._db.execute("PRAGMA synchronous=FULL")
             self._db.executescript(f"BEGIN; {_SCHEMA} COMMIT;")
         except (OSError, sqlite3.Error) as error:
-            raise HandoffError(f"{path}: cannot be opened as a panel: {error}") from error
+            raise DeliveryError(f"{path}: cannot be opened as a panel: {error}") from error
 
     def setting(self, name: str, initial: bytes) -> bytes:
         """Return what the panel was begun with, `initial` for a new one."""
@@ -112,7 +112,7 @@ class Answers:
         """Keep an answer; False where there is one already.
 
         Raises:
-            HandoffError: It cannot be kept now.
+            DeliveryError: It cannot be kept now.
         """
         chosen = "" if choice == NONE_OF_THEM else trial.choices[choice]
         row = (
@@ -131,7 +131,7 @@ class Answers:
                 added = self._db.execute("INSERT OR IGNORE INTO answer VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
                 return added.rowcount == 1
         except sqlite3.Error as error:
-            raise HandoffError(f"{self.path}: {error}") from error
+            raise DeliveryError(f"{self.path}: {error}") from error
 
     def all(self) -> list[Answer]:
         """Return every answer."""

@@ -14,7 +14,7 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.transaction import OutboxItem, Transaction
-from sonarpost.errors import BadInputError, ConfigError, HandoffError, PayloadError
+from sonarpost.errors import BadInputError, ConfigError, DeliveryError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import (
     AcousticFrame,
@@ -28,7 +28,7 @@ from sonarpost.messages import (
     Record,
     TaskingState,
 )
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.console.app import ConsoleApp
 from sonarpost.services.console.asking import Table
 from sonarpost.services.console.board import Board, Unsent
@@ -67,7 +67,7 @@ class ConsoleService(Service[ConsoleConfig]):
     Raises:
         ConfigError: TLS is wanted and the platform has no certificate.
         PortError: The address cannot be listened on.
-        HandoffError: A database cannot be opened.
+        DeliveryError: A database cannot be opened.
     """
 
     NAME = "console"
@@ -114,7 +114,7 @@ class ConsoleService(Service[ConsoleConfig]):
             if key not in expected:
                 raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Keep what has come; a second time it changes nothing."""
         if isinstance(record, ReconstructedImage):
             effects.count("images_taken" if self.board.take_image(record) else "images_repeated")
@@ -136,13 +136,13 @@ class ConsoleService(Service[ConsoleConfig]):
                 for item in self.board.unsent():
                     self._send(item)
                 self._send_problem = ""
-            except (OSError, HandoffError) as error:
+            except (OSError, DeliveryError) as error:
                 self._send_problem = f"{type(error).__name__}: {error}"
                 log.error("Not handed on, trying again", extra=kv(reason=str(error)))
             self._wake.wait(TICK_S)
 
     def _send(self, item: Unsent) -> None:
-        effects = Effects()
+        effects = UnitOfWork()
         record, vessel, site = item.record, item.vessel_id, self.config.site
         if isinstance(record, Decision):
             for consumer in self.config.decision_consumers:
@@ -217,7 +217,7 @@ class ConsoleService(Service[ConsoleConfig]):
             except BadInputError as error:
                 self.count("records_ignored")
                 log.warning("Record ignored", extra=kv(reason=str(error)))
-            except HandoffError as error:
+            except DeliveryError as error:
                 log.error("Record not kept", extra=kv(reason=str(error)))
 
         self.session.declare_subscriber(key, on_sample)
@@ -230,7 +230,7 @@ class ConsoleService(Service[ConsoleConfig]):
         if self._on_vessel and key == keys.health(self.platform.id, "relay"):
             try:
                 self._on_relay(wire.decode(Health, payload, key))
-            except (BadInputError, HandoffError) as error:
+            except (BadInputError, DeliveryError) as error:
                 log.warning("Relay's health not used", extra=kv(reason=str(error)))
 
     def _on_relay(self, health: Health) -> None:
@@ -262,7 +262,7 @@ class ConsoleService(Service[ConsoleConfig]):
             self.board.fleet.services.set_alive(None, time.monotonic())
             try:
                 self.board.hub.publish("fleet", fleet(self.board))
-            except HandoffError as error:
+            except DeliveryError as error:
                 log.error("Fleet not told", extra=kv(reason=str(error)))
 
     def _catch_up(self) -> None:
@@ -273,7 +273,7 @@ class ConsoleService(Service[ConsoleConfig]):
                 new = self.board.take_images([record for record in some if isinstance(record, ReconstructedImage)])
                 new += sum(self.board.take_decision(record) for record in some if isinstance(record, Decision))
                 self.count("records_caught_up", new)
-        except HandoffError as error:
+        except DeliveryError as error:
             log.error("What c2 keeps is not taken, the next start tries again", extra=kv(reason=str(error)))
 
     # Life

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb.codec import EmbCodec
-from sonarpost.codec.interface import Codec, Decoded, StreamHeader
-from sonarpost.codec.vq.codebook import open_catalogue
+from sonarpost.codec.interface import Codec, DecodedImage, StreamHeader
+from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.codec import VqCodec
-from sonarpost.messages import Contact, Raster, ReconstructedImage
+from sonarpost.messages import Contact, Pixels, ReconstructedImage
 from sonarpost.review.local import moved
 from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
@@ -46,7 +46,7 @@ class Simulated:
 
     contact: Contact
     image_id: str
-    versions: tuple[tuple[int, int, int, Decoded], ...]
+    versions: tuple[tuple[int, int, int, DecodedImage], ...]
     codec: str
     model: str
     original: npt.NDArray[np.uint8]
@@ -76,7 +76,7 @@ class Simulated:
         )
 
     def _codec(self) -> Codec:
-        return EmbCodec() if self.codec == EmbCodec().name else VqCodec(open_catalogue("nominal-10").tiles)
+        return EmbCodec() if self.codec == EmbCodec().name else VqCodec(open_codebook("nominal-10").tiles)
 
     def more(self, *, refine: bool) -> Simulated:
         """Return it with one version more: what was lacking, or to refine a stream of twice the length."""
@@ -91,7 +91,7 @@ class Simulated:
     def record(self, vessel_id: str, step: int, first_utc_s: float, now_utc_s: float) -> ReconstructedImage:
         """Return the record of a version, from 0, as a decompressor would give it out."""
         received, total, frames, decoded = self.versions[step]
-        picture = Raster.from_array(decoded.image)
+        picture = Pixels.from_array(decoded.image)
         missing = decoded.missing
         return ReconstructedImage(
             vessel_id=vessel_id,
@@ -126,7 +126,7 @@ def simulated_contacts(seed: int, first_utc_s: float) -> Iterator[Simulated]:
         first_utc_s: Time of the first ping.
     """
     chance = random.Random(seed)  # noqa: S311  nothing secret comes of it
-    codecs: tuple[Codec, Codec] = (EmbCodec(), VqCodec(open_catalogue("nominal-10").tiles))
+    codecs: tuple[Codec, Codec] = (EmbCodec(), VqCodec(open_codebook("nominal-10").tiles))
     line = number = 0
     made: list[Simulated] = []
     while line < _LINES:
@@ -237,7 +237,7 @@ def _contact(survey: Survey, thing: TruthObject, vehicle: str, chance: random.Ra
 
 def _versions(
     codec: Codec, picture: npt.NDArray[np.uint8], *, lacking: bool
-) -> tuple[tuple[int, int, int, Decoded], ...]:
+) -> tuple[tuple[int, int, int, DecodedImage], ...]:
     if isinstance(codec, EmbCodec):
         stream = codec.encode(picture, _BYTES)
         # A picture that is refined with every packet; a few never get the last one.

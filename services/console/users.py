@@ -17,7 +17,7 @@ from pathlib import Path
 from cryptography.exceptions import InvalidKey
 from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
 
-from sonarpost.errors import BadInputError, HandoffError
+from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.services.console.people import ROLES, Role
 
 FILE_NAME = "console-users.db"
@@ -71,7 +71,7 @@ class Users:
         clock: UTC seconds.
 
     Raises:
-        HandoffError: The file cannot be opened.
+        DeliveryError: The file cannot be opened.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Users:
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.executescript(f"BEGIN; {_SCHEMA} COMMIT;")
         except (OSError, sqlite3.Error) as error:
-            raise HandoffError(f"{path}: cannot be opened as the console's users: {error}") from error
+            raise DeliveryError(f"{path}: cannot be opened as the console's users: {error}") from error
 
     @contextmanager
     def _access(self) -> Iterator[sqlite3.Connection]:
@@ -103,7 +103,7 @@ class Users:
             try:
                 yield self._db
             except sqlite3.Error as error:
-                raise HandoffError(f"{self.path}: {error}") from error
+                raise DeliveryError(f"{self.path}: {error}") from error
 
     def close(self) -> None:
         """Close the file."""

@@ -14,7 +14,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from sonarpost.errors import BadInputError, HandoffError
+from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.logs import kv
 from sonarpost.review.measuring import NotMeasurableError
 from sonarpost.services.console.arrivals import NoSuchError
@@ -175,7 +175,7 @@ class Gate:
             raise RefusedError(404, "not_found", str(error), error.field) from error
         except BadInputError as error:
             raise RefusedError(400, "bad_request", str(error), error.field) from error
-        except (HandoffError, OSError) as error:
+        except (DeliveryError, OSError) as error:
             log.error("Request not served", extra=kv(path=request.url.path, reason=str(error)))
             raise RefusedError(503, "not_now", "the console cannot write or read its disk at the moment") from error
         except Exception as error:

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sonarpost.codec.interface import Codec, Decoded, Mask, StreamHeader
+from sonarpost.codec.interface import Codec, DecodedImage, Mask, StreamHeader
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq.codebook import open_catalogue
-from sonarpost.codec.vq.codec import catalogue_tag
+from sonarpost.codec.vq.codebook import open_codebook
+from sonarpost.codec.vq.codec import codebook_tag
 from sonarpost.codec.vq.tiles import TileDatabase
-from sonarpost.errors import CatalogueError, StreamError
+from sonarpost.errors import CodebookError, StreamError
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.events import ContactUpdate
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.events import ContactOnly, ImageReady
 from sonarpost.link.frames.paper.frame import HalfName
-from sonarpost.messages import Contact, Raster, ReconstructedImage
+from sonarpost.messages import Contact, Pixels, ReconstructedImage
 
 
 class Decoder:
@@ -29,24 +29,24 @@ class Decoder:
         catalogues: Names or files of tile catalogues.
 
     Raises:
-        CatalogueError: A catalogue cannot be read, or two have the same tag.
+        CodebookError: A catalogue cannot be read, or two have the same tag.
     """
 
     def __init__(self, vessel_id: str, catalogues: Sequence[str]) -> None:
         self._vessel_id = vessel_id
         self._tiles: dict[int, TileDatabase] = {}
         for name in catalogues:
-            tiles = open_catalogue(name).tiles
-            tag = catalogue_tag(tiles)
+            tiles = open_codebook(name).tiles
+            tag = codebook_tag(tiles)
             if tag in self._tiles and self._tiles[tag].identity != tiles.identity:
-                raise CatalogueError(name, "identity", tiles.identity, f"a tag other than {tag:#06x}, which is taken")
+                raise CodebookError(name, "identity", tiles.identity, f"a tag other than {tag:#06x}, which is taken")
             self._tiles[tag] = tiles
 
     def image(self, event: ImageReady, vehicle_id: str) -> ReconstructedImage:
         """Decode an image, or what there is of it.
 
         Raises:
-            CatalogueError: It was made with a catalogue that is not at hand.
+            CodebookError: It was made with a catalogue that is not at hand.
             StreamError: It cannot be decoded.
         """
         codec = self._codec(event.header, event)
@@ -62,7 +62,7 @@ class Decoder:
         Nothing is filled in: what an embedded codec shows of each pixel is what the stream says of it so far.
 
         Raises:
-            CatalogueError: It was made with a catalogue that is not at hand.
+            CodebookError: It was made with a catalogue that is not at hand.
             StreamError: It cannot be decoded.
         """
         if not _has_header(event.stream):
@@ -77,7 +77,7 @@ class Decoder:
 
     def _without_picture(self, event: ContactOnly | ContactUpdate, vehicle_id: str) -> ReconstructedImage:
         shape = (event.contact.height_px or 16, event.contact.width_px or 16)
-        decoded = Decoded(np.zeros(shape, dtype=np.uint8), np.ones(shape, dtype=np.bool_))
+        decoded = DecodedImage(np.zeros(shape, dtype=np.uint8), np.ones(shape, dtype=np.bool_))
         return self._record(event, vehicle_id, decoded, None, ["only the contact record arrived"])
 
     def _codec(self, header: StreamHeader, event: ImageReady | ContactUpdate) -> Codec:
@@ -89,18 +89,18 @@ class Decoder:
             if tiles is None:
                 own = ", ".join(f"{known:#06x}" for known in self._tiles)
                 where = f"image {image_id_of(event)}"
-                raise CatalogueError(where, "model_tag", f"{tag:#06x}", f"a catalogue at hand: {own}")
+                raise CodebookError(where, "model_tag", f"{tag:#06x}", f"a catalogue at hand: {own}")
         return registry.create_for_stream(event.stream, CodecResources(tiles))
 
     def _record(
         self,
         event: ImageReady | ContactOnly | ContactUpdate,
         vehicle_id: str,
-        decoded: Decoded,
+        decoded: DecodedImage,
         codec: Codec | None,
         notes: Sequence[str],
     ) -> ReconstructedImage:
-        picture = Raster.from_array(decoded.image)
+        picture = Pixels.from_array(decoded.image)
         amount = _amount_of(event)
         return ReconstructedImage(
             vessel_id=self._vessel_id,

@@ -8,14 +8,14 @@ from typing import Literal
 import msgpack
 
 from sonarpost.errors import FrameError
-from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.events import ContactUpdate, FrameRefused
 from sonarpost.link.events import Event as V1Event
 from sonarpost.link.frames.paper.events import Event as PaperEvent
 from sonarpost.link.frames.paper.frame import parse_frame
-from sonarpost.link.frames.paper.receiver import PairingReceiver
-from sonarpost.link.receiver import Receiver
+from sonarpost.link.frames.paper.receiver import PaperReceiver
+from sonarpost.link.receiver import LinkReceiver
 
 LinkName = Literal["v1", "paper"]
 Event = PaperEvent | ContactUpdate | FrameRefused
@@ -24,7 +24,7 @@ MEMORY_S = 6 * 3600.0
 _PAPER, _V1, _SEAL = "receiver", "receiver-v1", "seal"
 
 
-class Hearing:
+class FrameReceivers:
     """Hears vehicles that speak either format, each frame by itself.
 
     A frame is of `v1` if its checksum is right, and of `paper` if it is not and its fields have a meaning there. A
@@ -39,12 +39,14 @@ class Hearing:
 
     STATES = (_PAPER, _V1, _SEAL)
 
-    def __init__(self, links: Sequence[LinkName], pairing_timeout_s: float, seal: AcousticSeal | None = None) -> None:
+    def __init__(
+        self, links: Sequence[LinkName], pairing_timeout_s: float, seal: FrameAuthenticator | None = None
+    ) -> None:
         memory_s = max(MEMORY_S, pairing_timeout_s)
         self._links = frozenset(links) - (frozenset() if seal is None else {"paper"})
         self.seal = seal
-        self.paper = PairingReceiver(pairing_timeout_s, memory_s=memory_s)
-        self.v1 = Receiver(ReceiverConfig(contact_memory_s=memory_s), seal=seal)
+        self.paper = PaperReceiver(pairing_timeout_s, memory_s=memory_s)
+        self.v1 = LinkReceiver(ReceiverConfig(contact_memory_s=memory_s), seal=seal)
         self._changed: set[str] = set()
 
     def accept(self, source: int, frame: bytes, now: float) -> list[Event]:
@@ -69,7 +71,7 @@ class Hearing:
     def changes(self) -> dict[str, bytes]:
         """Return the states that changed since the last call, by name, to be kept."""
         changed, self._changed = self._changed, set()
-        kept: dict[str, PairingReceiver | Receiver | AcousticSeal] = {_PAPER: self.paper, _V1: self.v1}
+        kept: dict[str, PaperReceiver | LinkReceiver | FrameAuthenticator] = {_PAPER: self.paper, _V1: self.v1}
         if self.seal is not None:
             kept[_SEAL] = self.seal
         return {name: bytes(msgpack.packb(kept[name].snapshot())) for name in sorted(changed)}

@@ -8,21 +8,21 @@ import time
 from collections.abc import Iterable, Mapping
 
 from sonarpost import keys, wire
-from sonarpost.archive.image_files import write_picture
+from sonarpost.archive.image_files import write_image
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.transaction import InboxItem
-from sonarpost.errors import BadInputError, ConfigError, HandoffError
-from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.errors import BadInputError, ConfigError, DeliveryError
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
 from sonarpost.link.events import ContactUpdate, FrameRefused
-from sonarpost.link.frames.paper.events import ContactOnly, FrameRejected, ImageReady
-from sonarpost.logs import concerning, kv
+from sonarpost.link.frames.paper.events import ContactOnly, ImageReady, PaperFrameRejected
+from sonarpost.logs import kv, log_context
 from sonarpost.messages import AcousticFrame, ReconstructedImage, Record
-from sonarpost.runtime.service import RETRY_AFTER_S, Effects, Service
+from sonarpost.runtime.service import RETRY_AFTER_S, Service, UnitOfWork
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.decoder import Decoder, image_id_of
-from sonarpost.services.decompressor.hearing import Event, Hearing
+from sonarpost.services.decompressor.hearing import Event, FrameReceivers
 
 log = logging.getLogger(__name__)
 
@@ -62,10 +62,10 @@ class DecompressorService(Service[DecompressorConfig]):
         self._lock = threading.Lock()
         self._in_step = False
 
-    def _new_hearing(self) -> Hearing:
+    def _new_hearing(self) -> FrameReceivers:
         # It seals nothing: its address, which counters belong to, is of no account.
-        seal = None if self._key is None else AcousticSeal(self._key, 0, Direction.TO_VEHICLE)
-        return Hearing(self.config.links, self.config.pairing_timeout_s, seal)
+        seal = None if self._key is None else FrameAuthenticator(self._key, 0, Direction.TO_VEHICLE)
+        return FrameReceivers(self.config.links, self.config.pairing_timeout_s, seal)
 
     def consumes(self) -> Mapping[str, type[Record]]:
         """Frames this vessel's modem received."""
@@ -76,14 +76,14 @@ class DecompressorService(Service[DecompressorConfig]):
         self._last_frame_s = time.monotonic()
         self.spawn(self._watch_deadlines, "pairing")
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Give a frame to the receiver and act on what follows."""
         assert isinstance(record, AcousticFrame)
         self._last_frame_s = time.monotonic()
         self._load()
         self._follow(self._hearing.accept(record.source, record.data, record.time_utc_s), effects)
 
-    def commit(self, effects: Effects, item: InboxItem | None = None) -> None:
+    def commit(self, effects: UnitOfWork, item: InboxItem | None = None) -> None:
         """Commit; only then does the receiver in memory stand for the one on the disk."""
         super().commit(effects, item)
         self._in_step = True
@@ -96,7 +96,7 @@ class DecompressorService(Service[DecompressorConfig]):
         """Go back to the last committed state when memory may be ahead of it."""
         if not self._in_step:
             self._hearing = self._new_hearing()
-            self._hearing.restore({name: self.store.get_state(name) for name in Hearing.STATES})
+            self._hearing.restore({name: self.store.get_state(name) for name in FrameReceivers.STATES})
         self._in_step = False
 
     def _watch_deadlines(self) -> None:
@@ -104,7 +104,7 @@ class DecompressorService(Service[DecompressorConfig]):
             try:
                 with self._lock:
                     self._poll()
-            except (OSError, HandoffError) as error:
+            except (OSError, DeliveryError) as error:
                 # Not `problem`: the thread that handles frames says through it that frames can be handled.
                 self._pairing_problem = f"{type(error).__name__}: {error}"
                 log.exception("Picture not given out, trying again")
@@ -120,7 +120,7 @@ class DecompressorService(Service[DecompressorConfig]):
             # own times by which the receiver ends the waiting.
             return
         self._load()
-        effects = Effects()
+        effects = UnitOfWork()
         events = self._hearing.poll(time.time())
         if events:
             self._follow(events, effects)
@@ -128,9 +128,9 @@ class DecompressorService(Service[DecompressorConfig]):
         self._in_step = True
         self._pairing_problem = ""
 
-    def _follow(self, events: Iterable[Event], effects: Effects) -> None:
+    def _follow(self, events: Iterable[Event], effects: UnitOfWork) -> None:
         for event in events:
-            if isinstance(event, (FrameRejected, FrameRefused)):
+            if isinstance(event, (PaperFrameRejected, FrameRefused)):
                 effects.count("frames_rejected")
                 log.warning("Frame rejected", extra=kv(source=event.source, reason=str(event.reason)))
             else:
@@ -138,12 +138,12 @@ class DecompressorService(Service[DecompressorConfig]):
         for name, state in self._hearing.changes().items():
             effects.put_state(name, state)
 
-    def _give_out(self, event: Picture, effects: Effects) -> None:
+    def _give_out(self, event: Picture, effects: UnitOfWork) -> None:
         vehicle = self.config.vehicles.get(str(event.source), f"modem-{event.source}")
-        with concerning(vehicle=vehicle, image_id=image_id_of(event)):
+        with log_context(vehicle=vehicle, image_id=image_id_of(event)):
             self._give_out_of(event, vehicle, effects)
 
-    def _give_out_of(self, event: Picture, vehicle: str, effects: Effects) -> None:
+    def _give_out_of(self, event: Picture, vehicle: str, effects: UnitOfWork) -> None:
         try:
             image = self._decode(event, vehicle)
         except BadInputError as error:
@@ -155,7 +155,7 @@ class DecompressorService(Service[DecompressorConfig]):
             log.exception("Image not decoded")
             self._keep_apart_image(event, vehicle, f"{type(error).__name__}: {error}", effects)
             return
-        path, _ = write_picture(self.config.out_dir, image)
+        path, _ = write_image(self.config.out_dir, image)
         payload, key = wire.encode(image), keys.image_reconstructed(self.platform.id)
         for consumer in self.config.picture_consumers:
             effects.send_payload(key, consumer, payload, ReconstructedImage, priority=5)
@@ -171,7 +171,7 @@ class DecompressorService(Service[DecompressorConfig]):
             ),
         )
 
-    def _keep_apart_image(self, event: Picture, vehicle: str, reason: str, effects: Effects) -> None:
+    def _keep_apart_image(self, event: Picture, vehicle: str, reason: str, effects: UnitOfWork) -> None:
         effects.count("images_undecodable")
         body = b"" if isinstance(event, ContactOnly) else event.stream
         effects.keep_apart(f"image {vehicle}/{image_id_of(event)}", body, reason)

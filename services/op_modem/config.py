@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from sonarpost.link.config import ReceiverConfig
-from sonarpost.link.mac import Slots
+from sonarpost.link.mac import Tdma
 from sonarpost.messages import PlatformId
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.runtime.modem_service import ModemServiceConfig
@@ -78,9 +78,9 @@ class OpModemConfig(ModemServiceConfig):
             raise ValueError(f"slot_s - guard_s of at least {packet_s} s, a packet of downlink_rate")
         return self
 
-    def slots(self) -> Slots:
+    def slots(self) -> Tdma:
         """Return the slots of "tdma"."""
-        return Slots(self.frame_s, self.slot_start_s, self.slot_s, self.guard_s)
+        return Tdma(self.frame_s, self.slot_start_s, self.slot_s, self.guard_s)
 
     def receiver_config(self) -> ReceiverConfig:
         """Return when reports are due."""

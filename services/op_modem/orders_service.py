@@ -13,21 +13,21 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.transaction import InboxItem
-from sonarpost.errors import FrameError, HandoffError, PayloadError
-from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.errors import DeliveryError, FrameError, PayloadError
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
-from sonarpost.link.downlink.commands import OpenOrder
-from sonarpost.link.downlink.vessel_endpoint import Packet
+from sonarpost.link.downlink.commands import PendingCommand
+from sonarpost.link.downlink.vessel_endpoint import DownlinkPacket
 from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame, Command, Decision, ReceivedMessage, Record
 from sonarpost.modem.micromodem.events import FrameReceived, PacketFailed, PacketReceived, PacketSent
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.runtime.modem_service import ModemService
-from sonarpost.runtime.service import Effects
+from sonarpost.runtime.service import UnitOfWork
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.op_modem.config import OpModemConfig
-from sonarpost.services.op_modem.speaking import Turn
-from sonarpost.services.op_modem.station import Station
+from sonarpost.services.op_modem.speaking import TransmitGate
+from sonarpost.services.op_modem.station import VesselStation
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ TICK_S = 0.1
 EVERYBODY = 127
 
 
-class SpeakingService(ModemService[OpModemConfig]):
+class DownlinkService(ModemService[OpModemConfig]):
     """A vessel's modem service as far as it speaks; what it hears is told to it by its subclass.
 
     Raises:
@@ -49,15 +49,15 @@ class SpeakingService(ModemService[OpModemConfig]):
         self._key = None if platform.acoustic_key_file is None else read_key(platform.acoustic_key_file)
         super().__init__(platform, config)
         self._arriving: list[FrameReceived] = []
-        self._turn = Turn(config)
+        self._turn = TransmitGate(config)
         self._speaks = config.link == "v1"
         # The station belongs to whoever holds this lock; `_in_step`: it is as it is on the disk.
         self._station_lock = threading.RLock()
         self._station = self._new_station()
         self._in_step = False
-        self._under_way: tuple[int, Packet] | None = None
+        self._under_way: tuple[int, DownlinkPacket] | None = None
         self._link_problem = ""
-        self._asked: list[OpenOrder] = []
+        self._asked: list[PendingCommand] = []
 
     def begin_speaking(self) -> None:
         """Show what is still open, and speak from now on."""
@@ -69,12 +69,12 @@ class SpeakingService(ModemService[OpModemConfig]):
         self._show(still_open, time.time())
         self.spawn(self._speak, "speak")
 
-    def _new_station(self) -> Station:
+    def _new_station(self) -> VesselStation:
         seal = None
         if self._key is not None:
             limit = int(self.store.get_state(_SEAL_LIMIT + self._key.fingerprint) or b"0")
-            seal = AcousticSeal(self._key, self.config.address, Direction.TO_VEHICLE, first_counter=limit)
-        return Station(self.platform.id, self.config, seal)
+            seal = FrameAuthenticator(self._key, self.config.address, Direction.TO_VEHICLE, first_counter=limit)
+        return VesselStation(self.platform.id, self.config, seal)
 
     def consumes(self) -> Mapping[str, type[Record]]:
         """Commands and decisions for vehicles; nothing where the vessel only listens."""
@@ -92,7 +92,7 @@ class SpeakingService(ModemService[OpModemConfig]):
         # Without the lock: this is called within a transaction, and who holds the lock may be waiting for one.
         self._station.check(record, key)
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Take an order; the same record once more changes nothing."""
         assert isinstance(record, (Command, Decision))
         now = time.time()
@@ -112,7 +112,7 @@ class SpeakingService(ModemService[OpModemConfig]):
             asked, now = tuple(self._asked), time.time()
         self._show(asked, now)
 
-    def commit(self, effects: Effects, item: InboxItem | None = None) -> None:
+    def commit(self, effects: UnitOfWork, item: InboxItem | None = None) -> None:
         """Commit; only then does the station in memory stand for the one on the disk."""
         with self._station_lock:
             super().commit(effects, item)
@@ -135,11 +135,11 @@ class SpeakingService(ModemService[OpModemConfig]):
             log.error("The state of the link cannot be read, it begins anew", extra=kv(reason=str(error)))
             self._station = self._new_station()
 
-    def _keep_station(self, effects: Effects) -> None:
+    def _keep_station(self, effects: UnitOfWork) -> None:
         effects.put_state(_STATION, self._station.snapshot())
 
     @contextmanager
-    def _station_step(self) -> Iterator[Station]:
+    def _station_step(self) -> Iterator[VesselStation]:
         """Lend the station for a step that ends with a commit; where it does not, the next one begins from the disk."""
         with self._station_lock:
             self._load()
@@ -150,7 +150,7 @@ class SpeakingService(ModemService[OpModemConfig]):
             try:
                 self._expire_orders()
                 self._speak_once()
-            except (OSError, HandoffError) as error:
+            except (OSError, DeliveryError) as error:
                 self._link_problem = f"{type(error).__name__}: {error}"
                 self._turn.failed(time.monotonic())
             except FrameError as error:
@@ -169,7 +169,7 @@ class SpeakingService(ModemService[OpModemConfig]):
                 return
             with self._station_step() as station:
                 expired = station.book.expire(now)
-                effects = Effects()
+                effects = UnitOfWork()
                 effects.count("orders_expired", len(expired))
                 self._keep_station(effects)
                 self.commit(effects)
@@ -193,14 +193,14 @@ class SpeakingService(ModemService[OpModemConfig]):
         with self._station_step() as station:
             self._reserve_counters(station)
             packet = station.link.packet(rate.frames, rate.frame_bytes, now)
-            effects = Effects()
+            effects = UnitOfWork()
             self._keep_station(effects)
             self.commit(effects)
             if packet is not None:
                 packet_id = self.modem.send_packet(packet.address, rate.number, packet.frames)
                 self._under_way = (packet_id, packet)
 
-    def _reserve_counters(self, station: Station) -> None:
+    def _reserve_counters(self, station: VesselStation) -> None:
         """Make the counters of seals durable before they are used."""
         seal = station.seal
         if seal is None or self._key is None or (limit := seal.wanted_limit) is None:
@@ -232,21 +232,21 @@ class SpeakingService(ModemService[OpModemConfig]):
         self._show_frames(event, now)
         self._show(changed, now)
 
-    def _packet_was_sent(self, packet: Packet, now: float) -> tuple[OpenOrder, ...]:
+    def _packet_was_sent(self, packet: DownlinkPacket, now: float) -> tuple[PendingCommand, ...]:
         with self._station_step() as station:
             changed = station.link.sent(packet, now)
-            effects = Effects()
+            effects = UnitOfWork()
             effects.count("packets_sent")
             effects.count("reports_sent", int(packet.reports))
             self._keep_station(effects)
             try:
                 self.commit(effects)
-            except HandoffError as error:
+            except DeliveryError as error:
                 # It was sent, and is sent again: the vehicle takes an order once.
                 log.warning("What was sent is not on the disk", extra=kv(error=str(error)))
         return changed
 
-    def _show(self, orders: Iterable[OpenOrder], now: float) -> None:
+    def _show(self, orders: Iterable[PendingCommand], now: float) -> None:
         """Publish how far orders have come."""
         for order in orders:
             state = self._station.state_of(order, now)
@@ -294,10 +294,10 @@ class SpeakingService(ModemService[OpModemConfig]):
         """Return what is wrong with the port, the modem, or what is to be sent."""
         return super().trouble() or self._link_problem
 
-    def _hear(self, packet: PacketReceived, heard_utc_s: float, effects: Effects) -> tuple[OpenOrder, ...]:
+    def _hear(self, packet: PacketReceived, heard_utc_s: float, effects: UnitOfWork) -> tuple[PendingCommand, ...]:
         """Give the station the frames that were for this vessel; return the orders that changed by them."""
         self._load()
-        changed: list[OpenOrder] = []
+        changed: list[PendingCommand] = []
         for frame in packet.frames:
             if frame.dest not in (self.config.address, EVERYBODY) or not 0 <= frame.src < EVERYBODY:
                 continue
@@ -309,7 +309,7 @@ class SpeakingService(ModemService[OpModemConfig]):
         self._keep_station(effects)
         return tuple(changed)
 
-    def _take_message(self, source: int, data: bytes, heard_utc_s: float, effects: Effects) -> None:
+    def _take_message(self, source: int, data: bytes, heard_utc_s: float, effects: UnitOfWork) -> None:
         record = ReceivedMessage(
             vessel_id=self.platform.id,
             vehicle_id=self.config.name_of(source),

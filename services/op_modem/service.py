@@ -12,17 +12,24 @@ from pydantic import ValidationError
 
 from sonarpost import keys
 from sonarpost.config import PlatformConfig
-from sonarpost.errors import HandoffError
+from sonarpost.errors import DeliveryError
 from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame, LinkQuality
-from sonarpost.modem.micromodem.events import Event, FrameHeard, FrameReceived, PacketFailed, PacketReceived, PacketSent
+from sonarpost.modem.micromodem.events import (
+    Event,
+    FrameOverheard,
+    FrameReceived,
+    PacketFailed,
+    PacketReceived,
+    PacketSent,
+)
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.modem.micromodem.statistics import LinkStatistics
-from sonarpost.monitoring.log_context import image_of_frame
-from sonarpost.runtime.service import Effects
+from sonarpost.monitoring.log_context import image_ids_of_frame
+from sonarpost.runtime.service import UnitOfWork
 from sonarpost.services.op_modem.arriving import pack, unpack
 from sonarpost.services.op_modem.config import OpModemConfig
-from sonarpost.services.op_modem.orders_service import SpeakingService
+from sonarpost.services.op_modem.orders_service import DownlinkService
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +40,7 @@ MAX_UNSAVED = 10_000
 MAX_FRAMES = 8
 
 
-class OpModemService(SpeakingService):
+class OpModemService(DownlinkService):
     """The vessel's end of the acoustic link.
 
     Every frame the modem delivers is taken, also one addressed to somebody else: a picture overheard is a picture.
@@ -77,7 +84,7 @@ class OpModemService(SpeakingService):
         """Take a packet, whose frames come with it, and before its end each of them."""
         if isinstance(event, (PacketSent, PacketFailed)):
             self._packet_is_over(event)
-        elif isinstance(event, FrameHeard):
+        elif isinstance(event, FrameOverheard):
             self._turn.heard(time.monotonic())
             self._arriving.append(event.frame)
             self._keep_arriving()
@@ -105,7 +112,7 @@ class OpModemService(SpeakingService):
         try:
             with self.store.transaction() as tx:
                 tx.put_state(_ARRIVING, pack(self._arriving, time.time()))
-        except HandoffError as error:
+        except DeliveryError as error:
             # They are in memory, and come with their packet; a disk that is full is told then.
             log.warning("Frames of an unfinished packet are not on the disk", extra=kv(error=str(error)))
 
@@ -123,7 +130,7 @@ class OpModemService(SpeakingService):
                 while self._unsaved:
                     self._commit_packet(*self._unsaved[0])
                     self._unsaved.popleft()
-            except HandoffError as error:
+            except DeliveryError as error:
                 self.problem(str(error))
                 return
         self.problem("")
@@ -138,7 +145,7 @@ class OpModemService(SpeakingService):
         if not packet.frames:
             return
         number = int(self.store.get_state(_PACKETS) or b"0") + 1
-        effects = Effects()
+        effects = UnitOfWork()
         key = keys.acoustic_rx(self.platform.id)
         with self._station_lock:
             changed = self._hear(packet, heard_utc_s, effects) if self._speaks else ()
@@ -156,7 +163,7 @@ class OpModemService(SpeakingService):
         )
 
     def _commit_frames(
-        self, packet: PacketReceived, number: int, heard_utc_s: float, effects: Effects, key: str
+        self, packet: PacketReceived, number: int, heard_utc_s: float, effects: UnitOfWork, key: str
     ) -> None:
         for frame in packet.frames:
             try:
@@ -190,7 +197,7 @@ class OpModemService(SpeakingService):
 
 def _images_of(packet: PacketReceived) -> list[str]:
     """Return the images a packet's frames belong to, as far as their wire format says it."""
-    named = [image_of_frame(frame.data) for frame in packet.frames]
+    named = [image_ids_of_frame(frame.data) for frame in packet.frames]
     return sorted({image_id for names in named if names is not None for image_id in names.split(",")})
 
 

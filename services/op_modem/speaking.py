@@ -14,7 +14,7 @@ _WAIT_AFTER_FAILURE_S = 2.0
 
 
 @dataclass
-class Turn:
+class TransmitGate:
     """Knows when it is the vessel's turn. All times in seconds of one clock, `utc_s` of slots apart.
 
     Attributes:

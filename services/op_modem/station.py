@@ -5,10 +5,10 @@ from __future__ import annotations
 import msgpack
 
 from sonarpost.errors import FrameError, PayloadError
-from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.downlink import messages as dl
-from sonarpost.link.downlink.commands import MOST_OPEN, OpenOrder, OrderBook
-from sonarpost.link.downlink.vessel_endpoint import VesselLink
+from sonarpost.link.downlink.commands import MAX_PENDING, CommandTracker, PendingCommand
+from sonarpost.link.downlink.vessel_endpoint import VesselEndpoint
 from sonarpost.link.frames.v1.frame import segments_room
 from sonarpost.messages import Command, Decision, DownlinkState
 from sonarpost.modem.micromodem.rates import RATES
@@ -18,7 +18,7 @@ _MESSAGE_OVERHEAD_BYTES = 3  # kind, length and number of a message segment
 LATEST_UTC_S = 2**32 - 1
 
 
-class Station:
+class VesselStation:
     """Owns the link, its orders and its seal. Belongs to whoever holds the service's lock.
 
     Args:
@@ -27,15 +27,15 @@ class Station:
         seal: Authenticates frames, if there is a key.
     """
 
-    def __init__(self, vessel_id: str, config: OpModemConfig, seal: AcousticSeal | None = None) -> None:
+    def __init__(self, vessel_id: str, config: OpModemConfig, seal: FrameAuthenticator | None = None) -> None:
         self._vessel_id = vessel_id
         self._config = config
         self.seal = seal
-        book = OrderBook(config.retry_s)
-        self.link = VesselLink(book, config.receiver_config(), seal=seal, feedback=config.feedback)
+        book = CommandTracker(config.retry_s)
+        self.link = VesselEndpoint(book, config.receiver_config(), seal=seal, feedback=config.feedback)
 
     @property
-    def book(self) -> OrderBook:
+    def book(self) -> CommandTracker:
         """The orders."""
         return self.link.book
 
@@ -51,10 +51,10 @@ class Station:
         issued = _issued_utc_s(record)
         if issued > LATEST_UTC_S:
             raise PayloadError(where, "time", issued, f"a time to {LATEST_UTC_S} s")
-        if len(self.book.open_orders) >= MOST_OPEN:
-            raise PayloadError(where, "", f"{MOST_OPEN} open orders", "one at most fewer")
+        if len(self.book.open_orders) >= MAX_PENDING:
+            raise PayloadError(where, "", f"{MAX_PENDING} open orders", "one at most fewer")
 
-    def ask(self, record: Command | Decision, now: float) -> OpenOrder | None:
+    def ask(self, record: Command | Decision, now: float) -> PendingCommand | None:
         """Take a command or a decision; None when it is known already.
 
         Raises:
@@ -72,7 +72,7 @@ class Station:
         message = dl.pack(order_of(record, token), self.message_room)
         # A clock ashore that is ahead of ours must not make an order last longer.
         expires_at = min(_issued_utc_s(record), now) + self._config.order_lifetime_s
-        order = OpenOrder(kind, record_id, record.vehicle_id, address, token, message, now, expires_at)
+        order = PendingCommand(kind, record_id, record.vehicle_id, address, token, message, now, expires_at)
         return self.book.ask(order, now)
 
     @property
@@ -81,7 +81,7 @@ class Station:
         frame_bytes = RATES[self._config.downlink_rate].frame_bytes
         return min(255, segments_room(frame_bytes, self.seal)) - _MESSAGE_OVERHEAD_BYTES
 
-    def state_of(self, order: OpenOrder, now: float) -> DownlinkState:
+    def state_of(self, order: PendingCommand, now: float) -> DownlinkState:
         """Return the record of how far an order has come."""
         return DownlinkState.model_validate(
             {
@@ -120,7 +120,7 @@ class Station:
             self.seal.restore(seal)
 
 
-def order_of(record: Command | Decision, token: int) -> dl.DownlinkOrder:
+def order_of(record: Command | Decision, token: int) -> dl.DownlinkCommand:
     """Return what goes through the water.
 
     Raises:
@@ -129,18 +129,18 @@ def order_of(record: Command | Decision, token: int) -> dl.DownlinkOrder:
     issued = int(_issued_utc_s(record))
     if isinstance(record, Decision):
         number = dl.number_of_image(record.image_id)
-        return dl.Judgement(
+        return dl.DecisionMessage(
             token, issued, number, record.image_version, record.verdict, record.confidence, record.mlo_class or ""
         )
     if record.kind == "revisit":
         assert record.lat_deg is not None
         assert record.lon_deg is not None
-        return dl.Revisit(token, issued, record.lat_deg, record.lon_deg)
+        return dl.RevisitMessage(token, issued, record.lat_deg, record.lon_deg)
     assert record.image_id is not None
     number = dl.number_of_image(record.image_id)
     if record.kind == "refine":
-        return dl.Refine(token, issued, number)
-    return (dl.Wider if record.kind == "wider" else dl.Resend)(token, issued, number)
+        return dl.RefineMessage(token, issued, number)
+    return (dl.ExpandMessage if record.kind == "wider" else dl.ResendMessage)(token, issued, number)
 
 
 def _issued_utc_s(record: Command | Decision) -> float:

@@ -11,15 +11,15 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
-from sonarpost.bus.site_monitor import ShoreWatch, Site
+from sonarpost.bus.site_monitor import SiteConnectivity, SiteMonitor
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.disk_reserve import Room
-from sonarpost.delivery.queue_policy import Lane
+from sonarpost.delivery.disk_reserve import DiskReserve
+from sonarpost.delivery.queue_policy import QueuePolicy
 from sonarpost.delivery.transaction import InboxItem, Topic
 from sonarpost.errors import PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.upstreams import Upstream, is_upstream_queue
 
@@ -49,14 +49,14 @@ class RelayService(Service[RelayConfig]):
         self._upstreams = {upstream.queue: upstream for upstream in upstreams}
         # By queue: where the site takes what this vessel sends.
         self._inboxes = {queue: keys.shore_inbox(platform.id, u.site) for queue, u in self._upstreams.items()}
-        self._watch = ShoreWatch(platform.id, [self._site(u) for u in self._upstreams.values()], platform.tls)
-        self._picture_room = Room(self.store, config.disk_reserve_bytes, "pictures wait with their senders")
+        self._watch = SiteMonitor(platform.id, [self._site(u) for u in self._upstreams.values()], platform.tls)
+        self._picture_room = DiskReserve(self.store, config.disk_reserve_bytes, "pictures wait with their senders")
 
-    def _site(self, upstream: Upstream) -> Site:
+    def _site(self, upstream: Upstream) -> SiteConnectivity:
         """Return how a site is asked whether it is reached: on the session that leads to it."""
         if upstream.own_router:
-            return Site(upstream.site, lambda: upstream.session, upstream.own_router)
-        return Site(upstream.site, lambda: self.session, self.platform.upstream)
+            return SiteConnectivity(upstream.site, lambda: upstream.session, upstream.own_router)
+        return SiteConnectivity(upstream.site, lambda: self.session, self.platform.upstream)
 
     def _open_session(self, endpoints: Sequence[str], stop: threading.Event) -> zenoh.Session | None:
         return open_with_retry(endpoints, stop, self.platform.tls)
@@ -99,7 +99,7 @@ class RelayService(Service[RelayConfig]):
         if not consumers:
             raise PayloadError(key, "", f"nobody who takes it on {self.platform.id}", f"a name in [relay] {option}")
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Owe the record to every site, or to every consumer on the vessel."""
         if isinstance(record, Advice):
             for consumer in self.config.advice_consumers:
@@ -113,7 +113,7 @@ class RelayService(Service[RelayConfig]):
             assert isinstance(record, (ReconstructedImage, Decision))
             self._send_ashore(key, record, effects)
 
-    def _send_ashore(self, key: str, record: ReconstructedImage | Decision, effects: Effects) -> None:
+    def _send_ashore(self, key: str, record: ReconstructedImage | Decision, effects: UnitOfWork) -> None:
         vessel = self.platform.id
         envelope = Relayed(vessel_id=vessel, key=key, payload=effects.payload, relayed_utc_s=time.time())
         payload = wire.encode(envelope)
@@ -127,7 +127,7 @@ class RelayService(Service[RelayConfig]):
         effects.count(f"{record.TYPE}s_relayed")
         log.info("Owed to the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
 
-    def commit_all(self, handled: Sequence[tuple[Effects, InboxItem | None]]) -> int:
+    def commit_all(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """Commit, then keep each site's queue within its quota."""
         superseded = super().commit_all(handled)
         if superseded:
@@ -149,13 +149,13 @@ class RelayService(Service[RelayConfig]):
                 extra=kv(site=upstream.site, pictures=dropped, max_bytes=max_bytes),
             )
 
-    def lane(self, queue: str) -> Lane:
+    def lane(self, queue: str) -> QueuePolicy:
         """Return how a queue is sent: to a site, or to a consumer on the vessel."""
         if not is_upstream_queue(queue):
             wanted = {*self.config.advice_consumers, *self.config.command_consumers}
-            return Lane(held=queue not in wanted)
+            return QueuePolicy(held=queue not in wanted)
         upstream = self._upstreams.get(queue)
-        return Lane(held=True) if upstream is None else upstream.lane()
+        return QueuePolicy(held=True) if upstream is None else upstream.lane()
 
     def on_start(self) -> None:
         """Look for the sites' own routers; say what waits for sites that are gone."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import zenoh
 
 from sonarpost import keys
-from sonarpost.delivery.queue_policy import Lane
+from sonarpost.delivery.queue_policy import QueuePolicy
 from sonarpost.delivery.transaction import consumer_of, queue_of
 from sonarpost.logs import kv
 from sonarpost.services.relay.config import UpstreamOptions
@@ -52,10 +52,10 @@ class Upstream:
         self._stop = threading.Event()
         self._lock = threading.Lock()
 
-    def lane(self) -> Lane:
+    def lane(self) -> QueuePolicy:
         """Return how the queue is sent: c2 shows accepted records ashore, a second copy would only load the radio."""
         own = (lambda: self._session) if self._config.router else None
-        return Lane(session=own, publish=False, bytes_per_s=self._config.bandwidth_bytes_per_s)
+        return QueuePolicy(session=own, publish=False, bytes_per_s=self._config.bandwidth_bytes_per_s)
 
     @property
     def session(self) -> zenoh.Session | None:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sonarpost.link.mac import Continuous, Medium, OnPoll, RandomAccess, Slots
+from sonarpost.link.mac import Continuous, Csma, MediumAccess, Polled, Tdma
 from sonarpost.link.queue.transmit_queue import QueueConfig
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.runtime.modem_service import ModemServiceConfig
@@ -89,17 +89,17 @@ class UuvModemConfig(ModemServiceConfig):
             raise ValueError(f"slot_s - guard_s of at least {longest_s} s, the longest packet")
         return self
 
-    def new_medium(self) -> Medium:
+    def new_medium(self) -> MediumAccess:
         """Return the policy of medium access."""
         match self.medium:
             case "continuous":
                 return Continuous(self.listen_every_s, self.listen_s, self.quiet_s)
             case "tdma":
-                return Slots(self.frame_s, self.slot_start_s, self.slot_s, self.guard_s)
+                return Tdma(self.frame_s, self.slot_start_s, self.slot_s, self.guard_s)
             case "poll":
-                return OnPoll()
+                return Polled()
             case "random":
-                return RandomAccess(self.mean_wait_s, quiet_s=self.quiet_s, seed=self.address)
+                return Csma(self.mean_wait_s, quiet_s=self.quiet_s, seed=self.address)
 
     def queue_config(self) -> QueueConfig:
         """Return how the queue behaves."""

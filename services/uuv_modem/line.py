@@ -14,35 +14,35 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import BadInputError, FrameError
-from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
 from sonarpost.link.downlink.messages import (
-    Confirmation,
-    Data,
-    DownlinkOrder,
-    Outcome,
-    Refine,
-    Revisit,
+    CommandOutcome,
+    ConfirmationMessage,
+    DataMessage,
+    DownlinkCommand,
+    RefineMessage,
+    RevisitMessage,
     confirmations,
     number_of_image,
     pack,
     unpack,
 )
-from sonarpost.link.events import FrameRefused, MessageReceived, ReportReceived
+from sonarpost.link.events import FeedbackReceived, FrameRefused, MessageReceived
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.feedback import unpack_mini
 from sonarpost.link.frames.v1.frame import BLOCKS
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
 from sonarpost.link.queue.state import export_queue, restore_queue, salvage_queue
-from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName
-from sonarpost.link.receiver import Receiver
+from sonarpost.link.queue.transmit_queue import ImageName, TransmitQueue
+from sonarpost.link.receiver import LinkReceiver
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.line_store import LineStore
-from sonarpost.services.uuv_modem.orders import Handed, OrderBook
+from sonarpost.services.uuv_modem.orders import CommandRecord, ReceivedCommands
 
 log = logging.getLogger(__name__)
 
@@ -56,14 +56,14 @@ Summarise = Callable[[EncodedImage], ContactSummary]
 
 
 @dataclass(frozen=True, slots=True)
-class UnderWay:
+class PendingPacket:
     """A packet that was chosen and has not gone, as far as is known."""
 
     rate: int
     frames: tuple[bytes, ...]
 
 
-class VehicleLine:
+class VehicleEndpoint:
     """What of the v1 link has to be kept, and every change of it that is kept together.
 
     Args:
@@ -91,30 +91,30 @@ class VehicleLine:
         self.count = count
         self._parts = LineStore(store)
         self.seal = self._new_seal(platform)
-        self.under_way: UnderWay | None = None
-        self._to_hand: list[Handed] = []
-        self._outcomes: list[tuple[int, Outcome]] = []
+        self.under_way: PendingPacket | None = None
+        self._to_hand: list[CommandRecord] = []
+        self._outcomes: list[tuple[int, CommandOutcome]] = []
         self._taken: list[str] = []
         self._begin_anew(platform.id)
 
-    def _new_seal(self, platform: PlatformConfig) -> AcousticSeal | None:
+    def _new_seal(self, platform: PlatformConfig) -> FrameAuthenticator | None:
         if platform.acoustic_key_file is None:
             return None
         key = read_key(platform.acoustic_key_file)
         # A limit belongs to its key: with another key the counters begin at 0 again, and come back with the old one.
         self._limit_name = _LIMIT + key.fingerprint
         limit = int(self._store.get_state(self._limit_name) or b"0")
-        return AcousticSeal(key, self._config.address, Direction.FROM_VEHICLE, first_counter=limit)
+        return FrameAuthenticator(key, self._config.address, Direction.FROM_VEHICLE, first_counter=limit)
 
     def _begin_anew(self, platform_id: str) -> None:
         first_block = self._store.origin[0]
         self.queue = self._new_queue(first_block)
-        self.receiver = Receiver(seal=self.seal)
-        self.orders = OrderBook(platform_id, self._config)
+        self.receiver = LinkReceiver(seal=self.seal)
+        self.orders = ReceivedCommands(platform_id, self._config)
         self.under_way = None
 
-    def _new_queue(self, first_block: int) -> AcousticQueue:
-        return AcousticQueue(self._config.queue_config(), first_block=first_block, seal=self.seal)
+    def _new_queue(self, first_block: int) -> TransmitQueue:
+        return TransmitQueue(self._config.queue_config(), first_block=first_block, seal=self.seal)
 
     def load(self, platform_id: str, now: float) -> None:
         """Go on where the last process was.
@@ -153,11 +153,11 @@ class VehicleLine:
             self.orders.restore(parts.get(_ORDERS, {}))
         except BadInputError as error:
             reasons[_ORDERS] = str(error)
-            self.orders = OrderBook(platform_id, self._config)
+            self.orders = ReceivedCommands(platform_id, self._config)
         match parts.get(_PACKET, {}):
             case {"rate": int(rate), "frames": [*listed]} if rate in RATES:
                 frames = tuple(frame for frame in listed if isinstance(frame, bytes))
-                self.under_way = UnderWay(rate, frames) if frames else None
+                self.under_way = PendingPacket(rate, frames) if frames else None
         seal_state = parts.get(_SEAL)
         try:
             if self.seal is not None and seal_state and seal_state.get("key") == self.seal.snapshot()["key"]:
@@ -224,14 +224,14 @@ class VehicleLine:
             self.queue.add_message(
                 record.message_id,
                 record.source,
-                pack(Data(record.data)),
+                pack(DataMessage(record.data)),
                 now,
                 priority=record.priority,
                 lifetime_s=left_s,
             )
             return
         number = number_of_image(record.image_id)
-        name_of_it = PictureName(record.image_id, record.contact.contact_id)
+        name_of_it = ImageName(record.image_id, record.contact.contact_id)
         self.queue.add_picture(number, name_of_it, self._summarise(record), record.stream, now)
 
     def accepted(self, most: int = 64) -> list[tuple[str, bytes]]:
@@ -250,7 +250,7 @@ class VehicleLine:
         for frame in frames:
             for event in self.receiver.accept(source, frame, now):
                 match event:
-                    case ReportReceived():
+                    case FeedbackReceived():
                         self._report(event, now)
                     case MessageReceived():
                         self._message(event, now)
@@ -269,7 +269,7 @@ class VehicleLine:
         self.queue.on_mini(block, needed, now, source)
         self.count("reports_received")
 
-    def _report(self, event: ReportReceived, now: float) -> None:
+    def _report(self, event: FeedbackReceived, now: float) -> None:
         self.count("reports_received")
         try:
             self.queue.on_report(event.report, now, event.source)
@@ -284,13 +284,13 @@ class VehicleLine:
             self.count("orders_refused")
             log.warning("Message refused", extra=kv(reason=str(error)))
             return
-        if isinstance(content, (Confirmation, Data)):
+        if isinstance(content, (ConfirmationMessage, DataMessage)):
             log.info("Message of no use to a vehicle", extra=kv(source=event.source, kind=type(content).__name__))
             return
         self._order(event.source, content, now)
 
-    def _order(self, source: int, order: DownlinkOrder, now: float) -> None:
-        known = None if isinstance(order, Revisit) else self.queue.names.get(order.number)
+    def _order(self, source: int, order: DownlinkCommand, now: float) -> None:
+        known = None if isinstance(order, RevisitMessage) else self.queue.names.get(order.number)
         outcome, handed = self.orders.take(source, order, known.image_id if known else None)
         self._outcomes.append((order.token, outcome))
         if handed is None:
@@ -298,7 +298,7 @@ class VehicleLine:
         self.count("orders_taken")
         log.info("Order taken", extra=kv(source=source, key=handed.key, outcome=outcome.name.lower()))
         # What is here already need not be asked of anybody.
-        if isinstance(order, Refine) and self.queue.refine(order.number, order.stream_bytes, now):
+        if isinstance(order, RefineMessage) and self.queue.refine(order.number, order.stream_bytes, now):
             return
         self._to_hand.append(handed)
 
@@ -324,7 +324,7 @@ class VehicleLine:
 
     # Into the water
 
-    def choose(self, now: float, most_frames: int | None = None) -> UnderWay | None:
+    def choose(self, now: float, most_frames: int | None = None) -> PendingPacket | None:
         """Choose the next packet; it is under way from then on, and must be saved before it is sent.
 
         Raises:
@@ -335,7 +335,7 @@ class VehicleLine:
         self._reserve_counters()
         frames = self.queue.next_packet(now, most_frames)
         if frames:
-            self.under_way = UnderWay(self.queue.rate, frames)
+            self.under_way = PendingPacket(self.queue.rate, frames)
         return self.under_way
 
     def _reserve_counters(self) -> None:
@@ -350,4 +350,4 @@ class VehicleLine:
         if self.under_way is None:
             return
         left = tuple(frame for frame in self.under_way.frames if frame not in frames)
-        self.under_way = UnderWay(self.under_way.rate, left) if left else None
+        self.under_way = PendingPacket(self.under_way.rate, left) if left else None

@@ -10,13 +10,13 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from sonarpost import wire
-from sonarpost.errors import BadInputError, HandoffError
-from sonarpost.link.mac import Medium
+from sonarpost.errors import BadInputError, DeliveryError
+from sonarpost.link.mac import MediumAccess
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
 from sonarpost.modem.micromodem.events import (
     Event,
-    FrameHeard,
+    FrameOverheard,
     FrameReceived,
     MiniPacketReceived,
     PacketFailed,
@@ -26,18 +26,18 @@ from sonarpost.modem.micromodem.events import (
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.services.uuv_modem.config import UuvModemConfig
-from sonarpost.services.uuv_modem.line import VehicleLine
+from sonarpost.services.uuv_modem.line import VehicleEndpoint
 
 log = logging.getLogger(__name__)
 
 LONGEST_WAIT_S: Final = 0.2
 _LEAST_WAIT_S: Final = 0.005
-TAKEN = (PacketSent, PacketFailed, FrameReceived, FrameHeard, MiniPacketReceived)
+TAKEN = (PacketSent, PacketFailed, FrameReceived, FrameOverheard, MiniPacketReceived)
 """Events of the modem that the link acts on."""
 
 
 class LineRunner:
-    """Drives a `VehicleLine` and a modem.
+    """Drives a `VehicleEndpoint` and a modem.
 
     Args:
         line: Used by nobody else while `run` runs, but for its `arrival_name` and `check`.
@@ -53,10 +53,10 @@ class LineRunner:
 
     def __init__(
         self,
-        line: VehicleLine,
+        line: VehicleEndpoint,
         modem: ModemRunner,
         config: UuvModemConfig,
-        medium: Medium,
+        medium: MediumAccess,
         stopping: threading.Event,
         *,
         show: Callable[[PacketSent], None],
@@ -107,7 +107,7 @@ class LineRunner:
             try:
                 wait_s = self._turn(time.time())
                 self._problem("")
-            except HandoffError as error:
+            except DeliveryError as error:
                 # What has changed is in memory and is written with the next attempt; nothing is sent before.
                 self._problem(str(error))
                 wait_s = LONGEST_WAIT_S
@@ -130,7 +130,7 @@ class LineRunner:
                 self._packet_sent(event, now)
             case PacketFailed():
                 self._packet_failed(event, now)
-            case FrameHeard():
+            case FrameOverheard():
                 self._medium.heard(now)
             case FrameReceived(dest=dest) if dest == self._config.address:
                 self._line.hear(event.src, [event.data], now)

@@ -9,13 +9,13 @@ from typing import Final
 from sonarpost import keys
 from sonarpost.errors import FrameError
 from sonarpost.link.downlink.messages import (
-    DownlinkOrder,
-    Judgement,
-    Outcome,
-    Refine,
-    Resend,
-    Revisit,
-    Wider,
+    CommandOutcome,
+    DecisionMessage,
+    DownlinkCommand,
+    ExpandMessage,
+    RefineMessage,
+    ResendMessage,
+    RevisitMessage,
     image_of_number,
     pack,
     record_id_of,
@@ -29,7 +29,7 @@ _VESSEL_BY_SOUND: Final = "vessel"
 
 
 @dataclass(frozen=True, slots=True)
-class Handed:
+class CommandRecord:
     """A record and whom it is for."""
 
     key: str
@@ -38,7 +38,7 @@ class Handed:
 
 
 @dataclass(eq=False)
-class OrderBook:
+class ReceivedCommands:
     """The orders of late, and what became of them.
 
     Attributes:
@@ -49,9 +49,11 @@ class OrderBook:
 
     platform_id: str
     config: UuvModemConfig
-    known: dict[tuple[int, bytes], Outcome] = field(default_factory=dict)
+    known: dict[tuple[int, bytes], CommandOutcome] = field(default_factory=dict)
 
-    def take(self, source: int, order: DownlinkOrder, image_id: str | None) -> tuple[Outcome, Handed | None]:
+    def take(
+        self, source: int, order: DownlinkCommand, image_id: str | None
+    ) -> tuple[CommandOutcome, CommandRecord | None]:
         """Return what becomes of an order, and the record for its consumers if it is new.
 
         Args:
@@ -63,13 +65,13 @@ class OrderBook:
         if name in self.known:
             return self.known[name], None
         handed = self._handed(source, order, image_id)
-        outcome = Outcome.TAKEN if handed.consumers else Outcome.UNSUPPORTED
+        outcome = CommandOutcome.TAKEN if handed.consumers else CommandOutcome.UNSUPPORTED
         self.known[name] = outcome
         while len(self.known) > _REMEMBERED:
             del self.known[next(iter(self.known))]
         return outcome, handed if handed.consumers else None
 
-    def _handed(self, source: int, order: DownlinkOrder, image_id: str | None) -> Handed:
+    def _handed(self, source: int, order: DownlinkCommand, image_id: str | None) -> CommandRecord:
         kind = kind_of(order)
         consumers = {
             "revisit": self.config.revisit_consumers,
@@ -77,17 +79,21 @@ class OrderBook:
         }.get(kind, self.config.refine_consumers)
         record_id = record_id_of(source, order.token)
         record: Record
-        if isinstance(order, Judgement):
+        if isinstance(order, DecisionMessage):
             record = self._decision(record_id, order, image_id)
         else:
             record = self._command(record_id, source, order, image_id)
-        return Handed(keys.command(self.platform_id, kind), record, consumers)
+        return CommandRecord(keys.command(self.platform_id, kind), record, consumers)
 
     def _command(
-        self, record_id: str, source: int, order: Refine | Resend | Revisit | Wider, image_id: str | None
+        self,
+        record_id: str,
+        source: int,
+        order: RefineMessage | ResendMessage | RevisitMessage | ExpandMessage,
+        image_id: str | None,
     ) -> Command:
         lat_deg = lon_deg = None
-        if isinstance(order, Revisit):
+        if isinstance(order, RevisitMessage):
             image_id, lat_deg, lon_deg = None, order.lat_deg, order.lon_deg
         else:
             image_id = image_id or image_of_number(order.number)
@@ -102,7 +108,7 @@ class OrderBook:
             issued_utc_s=float(order.issued_utc_s),
         )
 
-    def _decision(self, record_id: str, order: Judgement, image_id: str | None) -> Decision:
+    def _decision(self, record_id: str, order: DecisionMessage, image_id: str | None) -> Decision:
         return Decision(
             decision_id=record_id,
             vessel_id=_VESSEL_BY_SOUND,
@@ -126,24 +132,24 @@ class OrderBook:
         Raises:
             FrameError: It is no such map.
         """
-        known: dict[tuple[int, bytes], Outcome] = {}
+        known: dict[tuple[int, bytes], CommandOutcome] = {}
         for entry in read_list(part, "known"):
             match entry:
-                case [int(source), bytes(order), int(outcome)] if outcome in tuple(Outcome):
-                    known[source, order] = Outcome(outcome)
+                case [int(source), bytes(order), int(outcome)] if outcome in tuple(CommandOutcome):
+                    known[source, order] = CommandOutcome(outcome)
                 case _:
                     raise FrameError("uuv_modem state", "orders", entry, "[modem, order, outcome]")
         self.known = known
 
 
 _COMMANDS: Final[dict[type, CommandKind]] = {
-    Refine: "refine",
-    Resend: "resend",
-    Revisit: "revisit",
-    Wider: "wider",
+    RefineMessage: "refine",
+    ResendMessage: "resend",
+    RevisitMessage: "revisit",
+    ExpandMessage: "wider",
 }
 
 
-def kind_of(order: DownlinkOrder) -> str:
+def kind_of(order: DownlinkCommand) -> str:
     """Return the last part of the key that an order is handed on with."""
-    return "decision" if isinstance(order, Judgement) else _COMMANDS[type(order)]
+    return "decision" if isinstance(order, DecisionMessage) else _COMMANDS[type(order)]

@@ -12,7 +12,7 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.inbox import NotNowError
+from sonarpost.delivery.inbox import RetryLaterError
 from sonarpost.delivery.transaction import InboxItem
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.sender import Packet, plan_packets
@@ -29,9 +29,9 @@ from sonarpost.messages import (
 from sonarpost.modem.micromodem.events import Event, PacketFailed, PacketSent
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.runtime.modem_service import ModemService
-from sonarpost.runtime.service import Effects, InterruptedByStopError
+from sonarpost.runtime.service import ServiceStoppingError, UnitOfWork
 from sonarpost.services.uuv_modem.config import UuvModemConfig
-from sonarpost.services.uuv_modem.line import VehicleLine
+from sonarpost.services.uuv_modem.line import VehicleEndpoint
 from sonarpost.services.uuv_modem.line_runner import TAKEN, LineRunner
 from sonarpost.sonar.survey import Side
 
@@ -58,7 +58,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
         super().__init__(platform, config)
         self._outcomes: queue.Queue[PacketSent | PacketFailed] = queue.Queue()
         self._packet_number = 0
-        self._line: VehicleLine | None = None
+        self._line: VehicleEndpoint | None = None
         self._line_trouble = ""
         self._runner: LineRunner | None = None
         if config.link == "v1":
@@ -68,8 +68,8 @@ class UuvModemService(ModemService[UuvModemConfig]):
                 self.store.close()
                 raise
 
-    def _new_line(self) -> tuple[VehicleLine, LineRunner]:
-        line = VehicleLine(self.platform, self.config, self.store, _summary_of_image, self.count)
+    def _new_line(self) -> tuple[VehicleEndpoint, LineRunner]:
+        line = VehicleEndpoint(self.platform, self.config, self.store, _summary_of_image, self.count)
         runner = LineRunner(
             line,
             self.modem,
@@ -101,7 +101,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
     def admit(self, key: str) -> None:
         """Leave messages with their programs while too many wait."""
         if self._line is not None and key == keys.message_outgoing(self.platform.id) and not self._line.queue.has_room:
-            raise NotNowError(f"{key}: {self.config.max_messages} messages wait already")
+            raise RetryLaterError(f"{key}: {self.config.max_messages} messages wait already")
 
     def on_start(self) -> None:
         """Open the port, and go on with what was under way."""
@@ -110,7 +110,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
             self._line.load(self.platform.id, time.time())
             self.spawn(self._runner.run, "link")
 
-    def commit_all(self, handled: Sequence[tuple[Effects, InboxItem | None]]) -> int:
+    def commit_all(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """As the base does, and wake the link."""
         superseded = super().commit_all(handled)
         if self._runner is not None:
@@ -140,7 +140,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
             log.error("The link waits", extra=kv(reason=detail))
         self._line_trouble = detail
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Queue a record, or with the paper's link send an image, however long it takes."""
         if self._line is not None:
             effects.put_state(self._line.arrival_name(), effects.payload)
@@ -196,7 +196,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
             self.count("packets_failed")
             log.warning("Packet not sent, trying again", extra=kv(reason=outcome.reason, maybe=outcome.maybe_sent))
             if self.stopping.wait(self.config.retry_s):
-                raise InterruptedByStopError
+                raise ServiceStoppingError
 
     def _wait_for(self, packet_id: int) -> PacketSent | PacketFailed:
         while not self.stopping.is_set():
@@ -206,7 +206,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
                 continue
             if outcome.packet_id == packet_id:
                 return outcome
-        raise InterruptedByStopError
+        raise ServiceStoppingError
 
     def _show(self, sent: PacketSent) -> None:
         """Publish the frames for observers."""

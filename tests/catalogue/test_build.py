@@ -10,11 +10,11 @@ import pytest
 
 from sonarpost.codec.vq.build_journal import MAGIC, EntryKind, Journal, JournalEntry
 from sonarpost.codec.vq.builder import build
-from sonarpost.codec.vq.incremental import GrowingTiles
+from sonarpost.codec.vq.incremental import IncrementalTileSet
 from sonarpost.codec.vq.refinement import refine
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
-from sonarpost.codec.vq.training_config import Progress, Round, TrainingImage, rms_distance, spread
-from sonarpost.errors import CatalogueError, ConfigError
+from sonarpost.codec.vq.training_config import BuildProgress, Round, TrainingImage, rms_distance, spread
+from sonarpost.errors import CodebookError, ConfigError
 
 ALWAYS, NEVER = 1e9, -1e9
 
@@ -93,7 +93,7 @@ def test_only_tiles_farther_than_the_distance_are_added_and_count_at_once() -> N
 
 
 def test_rounds_look_again_at_fewer_images() -> None:
-    told: list[Progress] = []
+    told: list[BuildProgress] = []
     pictures = [flat(level) for level in (0, 20, 40, 60)]
     rounds = [Round(ALWAYS, rms_distance(50, 8)), Round(ALWAYS, rms_distance(10, 8), 2)]
     database = build(training(*pictures), 8, rounds, progress=told.append)
@@ -112,7 +112,7 @@ def test_rounds_look_again_at_fewer_images() -> None:
 
 
 def test_it_stops_at_the_most_tiles_in_the_middle_of_an_image() -> None:
-    told: list[Progress] = []
+    told: list[BuildProgress] = []
     database = build(
         training(flat(0, 30), flat(60, 90, 120), flat(200)), 8, [Round(ALWAYS, 0.0)], max_tiles=4, progress=told.append
     )
@@ -155,9 +155,9 @@ def test_a_killed_build_goes_on_to_the_same_catalogue(tmp_path: Path, killed_aft
     rounds = [Round(ALWAYS, rms_distance(45, 8)), Round(ALWAYS, rms_distance(40, 8), 4)]
     whole = build(training(*pictures), 8, rounds)
     journal = tmp_path / "part.journal"
-    told: list[Progress] = []
+    told: list[BuildProgress] = []
 
-    def kill(progress: Progress) -> None:
+    def kill(progress: BuildProgress) -> None:
         told.append(progress)
         if len(told) == killed_after:
             raise Killed
@@ -167,11 +167,11 @@ def test_a_killed_build_goes_on_to_the_same_catalogue(tmp_path: Path, killed_aft
     data = journal.read_bytes()
     for torn in (0, 3):  # the last record whole, and cut off while it was written
         journal.write_bytes(data[: len(data) - torn])
-        worked_on: list[Progress] = []
+        worked_on: list[BuildProgress] = []
         resumed = build(training(*pictures), 8, rounds, journal_path=journal, progress=worked_on.append)
         assert resumed.identity == whole.identity
         assert len(worked_on) == 10 - killed_after + (1 if torn else 0)
-    again: list[Progress] = []
+    again: list[BuildProgress] = []
     assert build(training(*pictures), 8, rounds, journal_path=journal, progress=again.append).identity == whole.identity
     assert again == []
 
@@ -203,16 +203,16 @@ def test_a_journal_of_another_build_or_no_journal_is_refused(tmp_path: Path) -> 
     pictures = training(image(0), image(1))
     build(pictures, 8, [Round(ALWAYS, 100.0)], journal_path=journal)
     before = journal.read_bytes()
-    with pytest.raises(CatalogueError, match="plan"):
+    with pytest.raises(CodebookError, match="plan"):
         build(pictures, 8, [Round(ALWAYS, 101.0)], journal_path=journal)
-    with pytest.raises(CatalogueError, match="plan"):
+    with pytest.raises(CodebookError, match="plan"):
         build(pictures[::-1], 8, [Round(ALWAYS, 100.0)], journal_path=journal)
     assert journal.read_bytes() == before
     journal.write_bytes(b"some other file of the user's")
-    with pytest.raises(CatalogueError, match="magic"):
+    with pytest.raises(CodebookError, match="magic"):
         build(pictures, 8, [Round(ALWAYS, 100.0)], journal_path=journal)
     assert journal.read_bytes() == b"some other file of the user's"
-    with pytest.raises(CatalogueError, match="read and written"):
+    with pytest.raises(CodebookError, match="read and written"):
         build(pictures, 8, [Round(ALWAYS, 100.0)], journal_path=tmp_path / "absent" / "journal")
 
 
@@ -242,7 +242,7 @@ def test_the_growing_search_is_exact_as_it_grows(tile_px: int) -> None:
     tiles = np.where(rng.random((5000, tile_px**2)) < 0.5, rng.integers(0, 256, (5000, tile_px**2)), 255).astype(
         np.uint8
     )
-    growing = GrowingTiles(tile_px, 5000)
+    growing = IncrementalTileSet(tile_px, 5000)
     for start in range(0, 5000, 700):
         growing.append(tiles[start : start + 700])
     assert np.array_equal(growing.tiles(), tiles)

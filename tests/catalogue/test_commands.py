@@ -15,11 +15,11 @@ from sonarpost.cli.catalogue.build import parse_rounds
 from sonarpost.cli.catalogue.default_codebooks import Recipe
 from sonarpost.cli.catalogue.progress import ProgressDisplay
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.vq.codebook import load, load_nominal
-from sonarpost.codec.vq.patches import WindowPlan, cut_line
+from sonarpost.codec.vq.codebook import load, load_default
+from sonarpost.codec.vq.patches import PatchPlan, cut_line
 from sonarpost.codec.vq.tiles import cut_tiles
 from sonarpost.codec.vq.training_config import Round
-from sonarpost.errors import CatalogueError, ConfigError, SonarpostError, StreamError
+from sonarpost.errors import CodebookError, ConfigError, SonarpostError, StreamError
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff
 
 Run = Callable[..., int]
@@ -150,7 +150,7 @@ def test_wrong_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Path
 
 def test_a_nominal_catalogue_can_be_left_unrefined(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     speckle = 60 * np.random.default_rng(4).rayleigh(1.0, (200, 200))
-    images = list(cut_line("x", speckle.astype(np.float32), WindowPlan(copies=2)))
+    images = list(cut_line("x", speckle.astype(np.float32), PatchPlan(copies=2)))
     monkeypatch.setattr(nominal, "humminbird_images", lambda _: images)
     monkeypatch.setattr(nominal, "simulated_images", lambda _: iter(()))
     monkeypatch.setattr(nominal, "RECIPES", (Recipe(10, 80, (Round(100.0, 60.0),), 2),))
@@ -178,7 +178,7 @@ def test_the_codecs_are_listed(run: Run, capsys: pytest.CaptureFixture[str]) -> 
 def test_info_shows_a_shipped_catalogue(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("catalogue", "info", "nominal-10") == 0
     shown = capsys.readouterr().out
-    assert load_nominal(10).tiles.identity in shown
+    assert load_default(10).tiles.identity in shown
     assert "10 x 10 px" in shown
     assert run("catalogue") == 0
     assert "build" in capsys.readouterr().out
@@ -193,7 +193,7 @@ def test_a_catalogue_is_built_from_a_folder_and_used(run: Run, folder: Path, tmp
     assert built.tiles.tile_px == 8
     assert not out.with_name("mine.tiles.journal").exists()
     assert run("encode", folder / "a.tiff", "--catalogue", out) == 0
-    with pytest.raises(CatalogueError, match="the catalogue it was made with"):
+    with pytest.raises(CodebookError, match="the catalogue it was made with"):
         run("decode", folder / "a.vq")
     assert run("decode", folder / "a.vq", "--catalogue", out) == 0
     # The first image's tiles are all in the catalogue, so it comes back as it was.
@@ -218,7 +218,7 @@ def test_a_stopped_build_is_resumed_only_when_asked(run: Run, folder: Path, tmp_
         with pytest.raises(KeyboardInterrupt):
             run(*arguments)
     assert out.with_name("mine.tiles.journal").exists()
-    with pytest.raises(CatalogueError, match="--resume"):
+    with pytest.raises(CodebookError, match="--resume"):
         run(*arguments)
     assert run(*arguments, "--resume") == 0
     assert out.read_bytes() == expected
@@ -247,7 +247,7 @@ def test_catalogues_are_compared(run: Run, folder: Path, tmp_path: Path, capsys:
     assert load(other).tiles.identity in told
     assert "only in A      0 tiles" in told
     assert f"{len(load(one).tiles)} tiles have the same number in both" in told
-    with pytest.raises(CatalogueError, match="tile_px"):
+    with pytest.raises(CodebookError, match="tile_px"):
         run("catalogue", "diff", one, "nominal-10")
 
 

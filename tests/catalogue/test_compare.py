@@ -7,7 +7,7 @@ import pytest
 
 from sonarpost.codec.vq.comparison import compare, principal_angles_deg
 from sonarpost.codec.vq.tiles import TileDatabase
-from sonarpost.errors import CatalogueError
+from sonarpost.errors import CodebookError
 
 
 def database(seed: int, count: int = 60, tile_px: int = 8) -> TileDatabase:
@@ -68,5 +68,5 @@ def test_a_basis_sees_the_variance_that_lies_in_it() -> None:
 
 
 def test_other_tile_sizes_cannot_be_compared() -> None:
-    with pytest.raises(CatalogueError, match="tile_px"):
+    with pytest.raises(CodebookError, match="tile_px"):
         compare(database(0), database(0, tile_px=9))

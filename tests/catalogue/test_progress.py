@@ -7,11 +7,11 @@ import io
 from rich.console import Console
 
 from sonarpost.cli.catalogue.progress import ProgressDisplay
-from sonarpost.codec.vq.training_config import PassProgress, Progress
+from sonarpost.codec.vq.training_config import BuildProgress, RefinementProgress
 
 
-def progress(done: int, whole: int = 100, round_number: int = 0) -> Progress:
-    return Progress(round_number, 2, done, done, whole, "name", 30.0, 5, 10 * done)
+def progress(done: int, whole: int = 100, round_number: int = 0) -> BuildProgress:
+    return BuildProgress(round_number, 2, done, done, whole, "name", 30.0, 5, 10 * done)
 
 
 def test_a_log_gets_a_line_now_and_then() -> None:
@@ -22,8 +22,8 @@ def test_a_log_gets_a_line_now_and_then() -> None:
             display.build(progress(done))
             now[0] += 1.0
         display.build(progress(1, round_number=1))
-        display.build(PassProgress(1, 3, 50, 100, float("nan")))
-        display.build(PassProgress(1, 3, 100, 100, 12.345))
+        display.build(RefinementProgress(1, 3, 50, 100, float("nan")))
+        display.build(RefinementProgress(1, 3, 100, 100, 12.345))
     lines = out.getvalue().splitlines()
     assert lines[:2] == ["round 1 of 2: 1 of 100, 10 tiles", "round 1 of 2: 11 of 100, 110 tiles"]
     assert lines[10:] == [
@@ -42,6 +42,6 @@ def test_a_terminal_gets_a_bar_that_leaves_nothing_but_lines() -> None:
         display._bar.refresh()
         assert "50/100" in out.getvalue()
         assert "round 1 of 2 500 tiles" in out.getvalue()
-        display.build(PassProgress(1, 1, 100, 100, 1.0))
+        display.build(RefinementProgress(1, 1, 100, 100, 1.0))
     assert "the error was 1.00" in out.getvalue()
     assert "\n50 of 100" not in out.getvalue()

@@ -10,9 +10,16 @@ import pytest
 
 from sonarpost.codec.vq.build_journal import EntryKind, Journal, JournalEntry
 from sonarpost.codec.vq.builder import build
-from sonarpost.codec.vq.incremental import GrowingTiles
-from sonarpost.codec.vq.training_config import PassProgress, Progress, Round, TrainingImage, fingerprint, rms_distance
-from sonarpost.errors import CatalogueError
+from sonarpost.codec.vq.incremental import IncrementalTileSet
+from sonarpost.codec.vq.training_config import (
+    BuildProgress,
+    RefinementProgress,
+    Round,
+    TrainingImage,
+    fingerprint,
+    rms_distance,
+)
+from sonarpost.errors import CodebookError
 
 ROUNDS = (Round(1e9, rms_distance(45, 8)), Round(1e9, rms_distance(40, 8), 4))
 CHANGED = "remove the journal to start anew"
@@ -45,9 +52,9 @@ def run_until(folder: Folder, journal: Path, passes: int, stop: int) -> None:
     """Build until `stop` records are written, then die."""
     written = [0]
 
-    def told(progress: Progress | PassProgress) -> None:
+    def told(progress: BuildProgress | RefinementProgress) -> None:
         # A pass tells of its images before its record is written, and of its error when it is.
-        if isinstance(progress, Progress) or not np.isnan(progress.rms):
+        if isinstance(progress, BuildProgress) or not np.isnan(progress.rms):
             written[0] += 1
             if written[0] == stop:
                 raise Killed
@@ -65,11 +72,11 @@ def test_a_build_killed_anywhere_in_rounds_or_refinement_goes_on_to_the_same(tmp
     with Journal(journal, fingerprint(folder.images(), 8, ROUNDS, 15_992, None), 64) as written:
         kinds = [entry.kind for entry in written.entries()]
     assert kinds == [EntryKind.IMAGE] * min(stop, 10) + [EntryKind.PASS] * max(0, stop - 10)
-    told: list[Progress | PassProgress] = []
+    told: list[BuildProgress | RefinementProgress] = []
     resumed = build(folder.images(), 8, ROUNDS, passes=3, journal_path=journal, progress=told.append)
     assert resumed.identity == whole.identity
-    assert len([p for p in told if isinstance(p, Progress)]) == max(0, 10 - stop)
-    assert len({p.number for p in told if isinstance(p, PassProgress)}) == 3 - max(0, stop - 10)
+    assert len([p for p in told if isinstance(p, BuildProgress)]) == max(0, 10 - stop)
+    assert len({p.number for p in told if isinstance(p, RefinementProgress)}) == 3 - max(0, stop - 10)
 
 
 def test_more_passes_may_be_asked_of_a_finished_journal(tmp_path: Path) -> None:
@@ -89,14 +96,14 @@ def test_an_image_that_changed_since_it_was_learned_from_is_refused_by_name(tmp_
     before = journal.read_bytes()
     folder.pixels[2] = folder.pixels[2].copy()
     folder.pixels[2][5, 5] ^= 1
-    with pytest.raises(CatalogueError, match=CHANGED) as caught:
+    with pytest.raises(CodebookError, match=CHANGED) as caught:
         build(folder.images(), 8, ROUNDS, journal_path=journal)
     assert (caught.value.where, caught.value.field) == ("image 2", "pixels")
     assert journal.read_bytes() == before
     # One turned on its side has the same bytes but is another image.
     folder.pixels[2] = image(2)
     folder.pixels[1] = folder.pixels[1].reshape(20, 80)
-    with pytest.raises(CatalogueError, match=CHANGED):
+    with pytest.raises(CodebookError, match=CHANGED):
         build(folder.images(), 8, ROUNDS, journal_path=journal)
     folder.pixels[1] = image(1)
     folder.pixels[5] = image(77)  # not learned from yet
@@ -109,18 +116,18 @@ def test_images_that_changed_since_a_pass_are_refused(tmp_path: Path) -> None:
     journal = tmp_path / "journal"
     build(folder.images(), 8, rounds, passes=1, journal_path=journal)
     folder.pixels[5] = image(78)
-    with pytest.raises(CatalogueError, match="pass"):
+    with pytest.raises(CodebookError, match="pass"):
         build(folder.images(), 8, rounds, passes=2, journal_path=journal)
 
 
 def test_an_image_that_changes_between_rounds_is_refused() -> None:
     folder = Folder(4)
 
-    def told(progress: Progress | PassProgress) -> None:
-        if isinstance(progress, Progress) and (progress.round_number, progress.image_number) == (0, 3):
+    def told(progress: BuildProgress | RefinementProgress) -> None:
+        if isinstance(progress, BuildProgress) and (progress.round_number, progress.image_number) == (0, 3):
             folder.pixels[1] = image(79)
 
-    with pytest.raises(CatalogueError, match="image 1"):
+    with pytest.raises(CodebookError, match="image 1"):
         build(folder.images(), 8, ROUNDS, progress=told)
 
 
@@ -128,7 +135,7 @@ def test_a_journal_that_names_an_image_there_is_not_is_refused(tmp_path: Path) -
     folder = Folder(2)
     with Journal(tmp_path / "journal", fingerprint(folder.images(), 8, ROUNDS, 15_992, None), 64) as journal:
         journal.append(JournalEntry(EntryKind.IMAGE, 0, 2, bytes(32), np.zeros((1, 64), np.uint8)))
-    with pytest.raises(CatalogueError, match="number of images"):
+    with pytest.raises(CodebookError, match="number of images"):
         build(folder.images(), 8, ROUNDS, journal_path=tmp_path / "journal")
 
 
@@ -175,7 +182,7 @@ def test_memory_stays_within_what_is_documented() -> None:
 
 
 def test_a_picture_larger_than_any_snippet_is_searched_in_parts() -> None:
-    growing = GrowingTiles(8, 4096)
+    growing = IncrementalTileSet(8, 4096)
     rng = np.random.default_rng(0)
     growing.append(rng.integers(0, 256, (4096, 64), dtype=np.uint8))
     queries = rng.integers(0, 256, (30_000, 64), dtype=np.uint8)
@@ -191,7 +198,7 @@ def test_a_picture_larger_than_any_snippet_is_searched_in_parts() -> None:
 def test_a_picture_of_several_chunks_is_added_tile_by_tile() -> None:
     rng = np.random.default_rng(1)
     tiles = rng.integers(0, 24, (1500, 16), dtype=np.uint8)
-    growing = GrowingTiles(4, 10_000)
+    growing = IncrementalTileSet(4, 10_000)
     added = growing.add_far(tiles, np.full(1500, np.inf), 24.0)
     expected: list[np.ndarray] = []
     for tile in tiles.astype(np.int64):

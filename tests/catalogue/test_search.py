@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.codec.vq import tile_search as module
-from sonarpost.codec.vq.codebook import load_nominal
+from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.tile_search import NearestSearch, rounding_bound
 from sonarpost.codec.vq.tiles import TileDatabase
 
@@ -97,7 +97,7 @@ def test_far_blocks_are_spared(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_shipped_catalogue_is_searched_exactly() -> None:
-    database = load_nominal(10).tiles
+    database = load_default(10).tiles
     rng = np.random.default_rng(2)
     noise = np.clip(60 * rng.rayleigh(1.0, (60, 100)), 0, 255).astype(np.uint8)
     flat = np.repeat(np.arange(0, 256, 51, dtype=np.uint8)[:, None], 100, axis=1)

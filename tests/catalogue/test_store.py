@@ -13,24 +13,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.codec.vq.codebook import (
-    NOMINAL_TILE_PX,
-    Catalogue,
+    DEFAULT_TILE_PX,
+    Codebook,
+    default_for_tag,
     from_bytes,
     load,
-    load_nominal,
-    nominal_for_tag,
-    open_catalogue,
+    load_default,
+    open_codebook,
     save,
     to_bytes,
 )
-from sonarpost.codec.vq.codec import VqCodec, catalogue_tag
+from sonarpost.codec.vq.codec import VqCodec, codebook_tag
 from sonarpost.codec.vq.tiles import TileDatabase
-from sonarpost.errors import CatalogueError
+from sonarpost.errors import CodebookError
 
 
-def small() -> Catalogue:
+def small() -> Codebook:
     tiles = np.random.default_rng(0).integers(0, 256, (7, 16), dtype=np.uint8)
-    return Catalogue(TileDatabase.from_tiles(4, tiles, 3), {"name": "klein", "source": "Rauschen, für den Test"})
+    return Codebook(TileDatabase.from_tiles(4, tiles, 3), {"name": "klein", "source": "Rauschen, für den Test"})
 
 
 def test_saved_and_loaded_it_is_the_same(tmp_path: Path) -> None:
@@ -41,7 +41,7 @@ def test_saved_and_loaded_it_is_the_same(tmp_path: Path) -> None:
     assert loaded.notes == small().notes
     assert to_bytes(loaded) == path.read_bytes()
     assert [p.name for p in tmp_path.iterdir()] == ["a.tiles"]
-    assert open_catalogue(str(path)).tiles.identity == loaded.tiles.identity
+    assert open_codebook(str(path)).tiles.identity == loaded.tiles.identity
 
 
 def test_the_layout_is_the_documented_one() -> None:
@@ -64,13 +64,13 @@ def test_any_damage_is_a_catalogue_error(data: st.DataObject) -> None:
         damaged[data.draw(st.integers(0, len(good) - 1))] ^= data.draw(st.integers(1, 255))
     damaged = damaged[: data.draw(st.integers(0, len(good)))] + data.draw(st.binary(max_size=9))
     if bytes(damaged) != good:
-        with pytest.raises(CatalogueError):
+        with pytest.raises(CodebookError):
             from_bytes(bytes(damaged), "damaged")
 
 
 @pytest.mark.parametrize("length", [0, 1, 8, 21, 22, 53, 54, 100, -33, -1])
 def test_a_cut_file_is_refused(length: int) -> None:
-    with pytest.raises(CatalogueError):
+    with pytest.raises(CodebookError):
         from_bytes(to_bytes(small())[:length], "cut")
 
 
@@ -97,7 +97,7 @@ def with_right_hash(data: bytes) -> bytes:
 def test_a_wrong_field_is_named_even_under_a_right_hash(offset: int, value: bytes, field: str) -> None:
     data = bytearray(to_bytes(small()))
     data[offset : offset + len(value)] = value
-    with pytest.raises(CatalogueError) as caught:
+    with pytest.raises(CodebookError) as caught:
         from_bytes(with_right_hash(bytes(data)), "x.tiles")
     assert caught.value.field == field
     assert caught.value.where == "x.tiles"
@@ -105,23 +105,23 @@ def test_a_wrong_field_is_named_even_under_a_right_hash(offset: int, value: byte
 
 @pytest.mark.parametrize("notes", [b"[1]", b'{"a": 1}', b"null", b"[" * 9999])
 def test_notes_that_are_not_strings_by_name_are_refused(notes: bytes) -> None:
-    data = to_bytes(Catalogue(small().tiles, {}))
+    data = to_bytes(Codebook(small().tiles, {}))
     changed = data[:18] + len(notes).to_bytes(4, "big") + notes + data[24:]
-    with pytest.raises(CatalogueError, match="notes"):
+    with pytest.raises(CodebookError, match="notes"):
         from_bytes(with_right_hash(changed), "x")
 
 
 def test_notes_beyond_bounds_are_refused() -> None:
-    with pytest.raises(CatalogueError, match="notes"):
-        to_bytes(Catalogue(small().tiles, {"a": "x" * (1 << 20)}))
+    with pytest.raises(CodebookError, match="notes"):
+        to_bytes(Codebook(small().tiles, {"a": "x" * (1 << 20)}))
 
 
 def test_a_file_that_cannot_be_read_or_written_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CatalogueError, match=r"absent\.tiles"):
+    with pytest.raises(CodebookError, match=r"absent\.tiles"):
         load(tmp_path / "absent.tiles")
-    with pytest.raises(CatalogueError):
+    with pytest.raises(CodebookError):
         load(tmp_path)
-    with pytest.raises(CatalogueError, match="nowhere"):
+    with pytest.raises(CodebookError, match="nowhere"):
         save(tmp_path / "nowhere" / "a.tiles", small())
 
 
@@ -134,34 +134,34 @@ def test_a_failed_write_leaves_the_old_catalogue(tmp_path: Path, monkeypatch: py
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(CatalogueError, match="No space"):
-        save(path, Catalogue(small().tiles, {}))
+    with pytest.raises(CodebookError, match="No space"):
+        save(path, Codebook(small().tiles, {}))
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.tiles"]
 
 
-@pytest.mark.parametrize("tile_px", NOMINAL_TILE_PX)
+@pytest.mark.parametrize("tile_px", DEFAULT_TILE_PX)
 def test_the_shipped_catalogues_are_whole_and_fit_14_bits(tile_px: int) -> None:
-    catalogue = load_nominal(tile_px)
+    catalogue = load_default(tile_px)
     assert catalogue.tiles.tile_px == tile_px
     assert 1000 <= len(catalogue.tiles) <= 15_992
     assert catalogue.tiles.dims == 70
     assert "public domain" in catalogue.notes["source"]
     assert len(np.unique(catalogue.tiles.tiles, axis=0)) == len(catalogue.tiles)
     assert VqCodec(catalogue.tiles).model_hash == catalogue.tiles.identity
-    assert open_catalogue(f"nominal-{tile_px}") is catalogue
+    assert open_codebook(f"nominal-{tile_px}") is catalogue
 
 
 def test_a_shipped_catalogue_is_found_by_the_tag_in_a_stream() -> None:
-    tags = {tile_px: catalogue_tag(load_nominal(tile_px).tiles) for tile_px in NOMINAL_TILE_PX}
+    tags = {tile_px: codebook_tag(load_default(tile_px).tiles) for tile_px in DEFAULT_TILE_PX}
     assert len(set(tags.values())) == len(tags)
     for tile_px, tag in tags.items():
-        assert nominal_for_tag(tag) is load_nominal(tile_px)
+        assert default_for_tag(tag) is load_default(tile_px)
     unknown = next(tag for tag in range(9) if tag not in tags.values())
-    with pytest.raises(CatalogueError, match="nominal-10"):
-        nominal_for_tag(unknown)
+    with pytest.raises(CodebookError, match="nominal-10"):
+        default_for_tag(unknown)
 
 
 def test_there_is_no_other_nominal_size() -> None:
-    with pytest.raises(CatalogueError, match="10 or 20"):
-        load_nominal(15)
+    with pytest.raises(CodebookError, match="10 or 20"):
+        load_default(15)

@@ -12,9 +12,9 @@ import pytest
 from sonarpost.cli.catalogue.default_codebooks import RECIPES, Recipe, build_nominal, humminbird_images
 from sonarpost.cli.catalogue.humminbird_lines import humminbird_lines, read_channel
 from sonarpost.codec.vq.codebook import to_bytes
-from sonarpost.codec.vq.patches import Tone, WindowPlan, cut_around, cut_line, reduce_line, shuffled, stretch
+from sonarpost.codec.vq.patches import PatchPlan, ToneMapping, cut_around, cut_line, reduce_line, shuffled, stretch
 from sonarpost.codec.vq.training_config import Round
-from sonarpost.errors import CatalogueError, SonarpostError
+from sonarpost.errors import CodebookError, SonarpostError
 from sonarpost.sonar.image_files import write_png
 
 DATA = Path(os.environ.get("SONARPOST_DATA", Path(__file__).parents[3] / "shared" / "data"))
@@ -35,10 +35,10 @@ def recording(folder: Path, channel: str, pings: list[np.ndarray]) -> None:
 
 
 def test_a_tone_is_its_curve() -> None:
-    assert Tone(1.0, 1.0).table().tolist() == list(range(256))
-    dark = Tone(2.0, 0.5).table()
+    assert ToneMapping(1.0, 1.0).table().tolist() == list(range(256))
+    dark = ToneMapping(2.0, 0.5).table()
     assert (dark[0], dark[255], dark[128]) == (0, 128, 32)
-    assert Tone(1.0, 3.0).table()[-1] == 255
+    assert ToneMapping(1.0, 3.0).table()[-1] == 255
 
 
 def test_stretching_puts_the_percentiles_at_the_ends() -> None:
@@ -63,20 +63,22 @@ def test_windows_avoid_what_was_not_recorded_and_what_is_flat() -> None:
     values = line()
     values[:, 160:] = np.nan
     values[:80, :80] = 40.0
-    plan = WindowPlan(reductions=((1, 1),), tones=(Tone(1.0, 1.0),))
+    plan = PatchPlan(reductions=((1, 1),), tones=(ToneMapping(1.0, 1.0),))
     places = {image.name.split(" at ")[1].split(" #")[0] for image in cut_line("x", values, plan)}
     assert places == {"0,80", "80,0", "80,80", "160,0", "160,80"}
     assert all(image.load().shape == (80, 80) for image in cut_line("x", values, plan))
 
 
 def test_windows_are_limited_repeated_in_other_tones_and_mirrored() -> None:
-    plan = WindowPlan(reductions=((1, 1), (2, 2)), per_reduction=1, copies=3)
+    plan = PatchPlan(reductions=((1, 1), (2, 2)), per_reduction=1, copies=3)
     images = list(cut_line("x", line(), plan))
     assert len(images) == 6
     assert len({image.name for image in images}) == 6
     assert len({image.load().tobytes() for image in images}) == 6
     plain = list(
-        cut_line("x", line(), WindowPlan(reductions=((1, 1),), per_reduction=1, tones=(Tone(1.0, 1.0),), copies=4))
+        cut_line(
+            "x", line(), PatchPlan(reductions=((1, 1),), per_reduction=1, tones=(ToneMapping(1.0, 1.0),), copies=4)
+        )
     )
     first = plain[0].load()
     for image, expected in zip(plain, (first, first[::-1], first[:, ::-1], first[::-1, ::-1]), strict=True):
@@ -86,16 +88,16 @@ def test_windows_are_limited_repeated_in_other_tones_and_mirrored() -> None:
 def test_windows_around_an_object_show_it() -> None:
     values = line()
     values[140:150, 120:135] = 2000.0
-    plan = WindowPlan(reductions=((1, 1), (2, 1), (9, 9)), copies=3)
+    plan = PatchPlan(reductions=((1, 1), (2, 1), (9, 9)), copies=3)
     images = list(cut_around("x", values, [(145, 127)], plan))
     assert len(images) == 6  # reduced nine times the line is smaller than a window
     assert all((image.load() > 100).sum() > 40 for image in images)
-    corner = list(cut_around("x", values, [(0, 0), (299, 259)], WindowPlan(reductions=((1, 1),))))
+    corner = list(cut_around("x", values, [(0, 0), (299, 259)], PatchPlan(reductions=((1, 1),))))
     assert [image.load().shape for image in corner] == [(80, 80), (80, 80)]
 
 
 def test_the_order_depends_on_names_alone() -> None:
-    images = list(cut_line("x", line(), WindowPlan()))
+    images = list(cut_line("x", line(), PatchPlan()))
     assert [i.name for i in shuffled(images)] == [i.name for i in shuffled(images[::-1])]
     assert [i.name for i in shuffled(images)] != [i.name for i in images]
 
@@ -125,28 +127,28 @@ def test_damaged_recordings_are_catalogue_errors(tmp_path: Path) -> None:
     data, index = son.read_bytes(), idx.read_bytes()
     for position in (0, 61, 62, 66):
         son.write_bytes(data[:96] + data[96 : 96 + position] + b"\x77" + data[97 + position :])
-        with pytest.raises(CatalogueError, match="ping 1"):
+        with pytest.raises(CodebookError, match="ping 1"):
             read_channel(son)
     for length in range(len(data)):
         son.write_bytes(data[:length])
-        with pytest.raises(CatalogueError):
+        with pytest.raises(CodebookError):
             read_channel(son)
     son.write_bytes(data)
     for bad in (b"", index[:-1], struct.pack(">II", 0, 0xFFFFFFFF)):
         idx.write_bytes(bad)
-        with pytest.raises(CatalogueError):
+        with pytest.raises(CodebookError):
             read_channel(son)
     idx.unlink()
-    with pytest.raises(CatalogueError, match="IDX"):
+    with pytest.raises(CodebookError, match="IDX"):
         read_channel(son)
 
 
 def test_a_missing_or_ambiguous_channel_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CatalogueError, match="B002"):
+    with pytest.raises(CodebookError, match="B002"):
         humminbird_lines(tmp_path)
     for name in ("a_B002.png", "b_B002.png"):
         write_png(tmp_path / name, np.ones((4, 4), np.uint8))
-    with pytest.raises(CatalogueError, match="b_B002"):
+    with pytest.raises(CodebookError, match="b_B002"):
         humminbird_lines(tmp_path)
     (tmp_path / "a_B002.png").write_bytes(b"no image")
     (tmp_path / "b_B002.png").unlink()
@@ -155,7 +157,7 @@ def test_a_missing_or_ambiguous_channel_is_named(tmp_path: Path) -> None:
 
 
 def test_a_nominal_catalogue_is_the_same_bytes_in_any_order_of_its_images() -> None:
-    images = list(cut_line("x", line(), WindowPlan(copies=2)))
+    images = list(cut_line("x", line(), PatchPlan(copies=2)))
     recipe = Recipe(10, 200, (Round(39.0, 400.0, 10), Round(100.0, 60.0)), 2)
     one, other = build_nominal(recipe, images), build_nominal(recipe, images[::-1])
     assert to_bytes(one) == to_bytes(other)

@@ -21,11 +21,11 @@ from sonarpost.cli.bench.measure import Subject, code, measure
 from sonarpost.cli.bench.pictures import BenchPicture, read_folder, simulated_pictures
 from sonarpost.cli.bench.report import json_line
 from sonarpost.cli.bench.sdvd import sdvd_crops, survey_line
-from sonarpost.codec.interface import Decoded, StreamHeader
+from sonarpost.codec.interface import DecodedImage, StreamHeader
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.vq.codebook import Catalogue, save
+from sonarpost.codec.vq.codebook import Codebook, save
 from sonarpost.codec.vq.tiles import TileDatabase
-from sonarpost.errors import CatalogueError, ConfigError, SonarpostError, StreamError, SurveyFileError
+from sonarpost.errors import CodebookError, ConfigError, SonarpostError, StreamError, SurveyFileError
 from sonarpost.sonar.image_files import write_png, write_tiff
 
 Run = Callable[..., int]
@@ -77,13 +77,13 @@ class Halving:
                 return header + bytes([block]) + means.astype(np.uint8).tobytes()
         raise StreamError("halving", "budget_bytes", budget_bytes, "more")
 
-    def decode(self, stream: bytes, received: np.ndarray | None = None) -> Decoded:
+    def decode(self, stream: bytes, received: np.ndarray | None = None) -> DecodedImage:
         header = StreamHeader.unpack(stream)
         block = stream[header.size]
         rows, columns = -(-header.height_px // block), -(-header.width_px // block)
         means = np.frombuffer(stream, np.uint8, offset=header.size + 1).reshape(rows, columns)
         image = means.repeat(block, 0).repeat(block, 1)[: header.height_px, : header.width_px]
-        return Decoded(np.ascontiguousarray(image), np.zeros(image.shape, np.bool_))
+        return DecodedImage(np.ascontiguousarray(image), np.zeros(image.shape, np.bool_))
 
 
 ROW_KEYS = {"codec", "budget", "bytes", "psnr", "ssim", "msssim", "encode_ms", "decode_ms"}
@@ -142,7 +142,7 @@ def test_of_vq_the_best_catalogue_that_fits_a_budget_counts(folder: Path, tmp_pa
 def test_vq_is_measured_with_any_catalogue(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tiles = np.random.default_rng(3).integers(0, 256, (9, 400), np.uint8)
     own = tmp_path / "own.tiles"
-    save(own, Catalogue(TileDatabase.from_tiles(20, tiles), {}))
+    save(own, Codebook(TileDatabase.from_tiles(20, tiles), {}))
     found = {}
     for catalogue in (own, "nominal-20"):
         options = ("--images", folder, "--codecs", "vq", "--budgets", "90", "--json")
@@ -150,7 +150,7 @@ def test_vq_is_measured_with_any_catalogue(folder: Path, tmp_path: Path, capsys:
         (found[catalogue],) = json.loads(capsys.readouterr().out)["results"]
     assert found[own]["bytes"] == found["nominal-20"]["bytes"]
     assert found[own]["psnr"] < found["nominal-20"]["psnr"] - 1  # nine tiles of noise
-    with pytest.raises(CatalogueError, match=r"absent\.tiles"):
+    with pytest.raises(CodebookError, match=r"absent\.tiles"):
         run("codecs", "--images", folder, "--codecs", "vq", "--catalogues", tmp_path / "absent.tiles")
 
 
@@ -244,10 +244,12 @@ def test_an_embedded_stream_is_made_once_and_cut() -> None:
             budgets.append(budget_bytes)
             return StreamHeader(self.codec_id, 0xAB, *image.shape).pack() + bytes(range(100))
 
-        def decode(self, stream: bytes, received: np.ndarray | None = None) -> Decoded:
+        def decode(self, stream: bytes, received: np.ndarray | None = None) -> DecodedImage:
             header = StreamHeader.unpack(stream)
             level = len(stream) - header.size
-            return Decoded(np.full((header.height_px, header.width_px), level, np.uint8), np.zeros((1, 1), np.bool_))
+            return DecodedImage(
+                np.full((header.height_px, header.width_px), level, np.uint8), np.zeros((1, 1), np.bool_)
+            )
 
     coded = code(Subject(Cut(), is_embedded=True), snippet(0), [3, 30, 60])
     assert budgets == [60]

@@ -14,18 +14,18 @@ from sonarpost.cli.bench.pictures import simulated_pictures
 from sonarpost.cli.bench.sea_trial import SIZES_PX, Cell, claims, measure, table
 from sonarpost.cli.bench.sea_trial_rig import Delivered, Rig, Sample, cross
 from sonarpost.cli.main import main
-from sonarpost.codec.vq.codebook import load_nominal
+from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_events import ArrivalEnded, ArrivalStarted, Fate
-from sonarpost.simulation.channel.channel_presets import make_water
-from sonarpost.simulation.channel.propagation import Water
+from sonarpost.simulation.channel.channel_presets import make_channel
+from sonarpost.simulation.channel.propagation import ChannelModel
 
 
 @pytest.fixture(scope="module")
 def samples() -> list[Sample]:
-    codec = VqCodec(load_nominal(20).tiles, IndexPacking.ASCII5)
+    codec = VqCodec(load_default(20).tiles, IndexPacking.ASCII5)
     pictures = simulated_pictures(6, 3, 140).pictures
     return [
         Sample(codec.encode(p.pixels[:80]), ContactSummary(lat_deg=44.0, lon_deg=-63.0, time_utc_s=1.4e9 + n))
@@ -35,28 +35,28 @@ def samples() -> list[Sample]:
 
 @pytest.mark.parametrize("rate", [1, 4])
 def test_in_still_water_everything_arrives(samples: list[Sample], rate: int) -> None:
-    found = cross(WaterConfig(), 300.0, rate, samples)
+    found = cross(ChannelParameters(), 300.0, rate, samples)
     frames = 12 * (3 if rate == 1 else 2)
     assert found == Delivered(12, 12, 0, frames, frames, 6, 6, 0, 0)
 
 
 def test_beyond_hearing_nothing_arrives(samples: list[Sample]) -> None:
-    found = cross(make_water({"preset": "sea-trial"}, "test"), 300.0, 1, samples)
+    found = cross(make_channel({"preset": "sea-trial"}, "test"), 300.0, 1, samples)
     assert found == Delivered(12, 0, 0, 36, 0, 6, 0, 0, 0)
 
 
 def test_what_is_counted_is_what_the_water_let_through(samples: list[Sample], monkeypatch: pytest.MonkeyPatch) -> None:
     """The water's own account of every frame agrees with what came out at the far driver."""
     resolved: list[ArrivalEnded] = []
-    inner = Water.poll
+    inner = ChannelModel.poll
 
-    def poll(self: Water, now: float) -> list[ArrivalStarted | ArrivalEnded]:
+    def poll(self: ChannelModel, now: float) -> list[ArrivalStarted | ArrivalEnded]:
         happened = inner(self, now)
         resolved.extend(event for event in happened if isinstance(event, ArrivalEnded))
         return happened
 
-    monkeypatch.setattr(Water, "poll", poll)
-    found = cross(make_water({"frame_loss": 0.3, "packet_loss": 0.1, "seed": 4}, "test"), 50.0, 1, samples)
+    monkeypatch.setattr(ChannelModel, "poll", poll)
+    found = cross(make_channel({"frame_loss": 0.3, "packet_loss": 0.1, "seed": 4}, "test"), 50.0, 1, samples)
     fates = [[frame.fate for frame in event.frames] for event in resolved if event.frames]
     assert len(fates) == found.packets == 12
     assert sum(fate is Fate.DELIVERED for packet in fates for fate in packet) == found.good_frames
@@ -70,7 +70,7 @@ def test_what_is_counted_is_what_the_water_let_through(samples: list[Sample], mo
 
 
 def test_a_packet_comes_out_as_it_went_in() -> None:
-    rig = Rig(WaterConfig(), 100.0)
+    rig = Rig(ChannelParameters(), 100.0)
     before = rig.now
     heard = rig.send((b"one", b"two" * 20), 1)
     assert [frame.data for frame in heard] == [b"one", b"two" * 20]

@@ -22,7 +22,7 @@ from sonarpost.cli.c2.ls import join, select
 from sonarpost.cli.c2.options import printable, since_of
 from sonarpost.cli.main import main
 from sonarpost.errors import ConfigError
-from sonarpost.messages import Advice, Contact, Decision, Raster, TaskingState
+from sonarpost.messages import Advice, Contact, Decision, Pixels, TaskingState
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
@@ -31,7 +31,7 @@ FIRST_S = 1_700_000_000.0
 
 
 def image(image_id="AAAA", version=1, vehicle="uuv-1", vessel="vessel-1", first_frame_utc_s=FIRST_S):
-    picture = Raster(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
+    picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
     return picture_record(
         picture,
         vessel_id=vessel,

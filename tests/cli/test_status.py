@@ -31,7 +31,7 @@ from sonarpost.cli.status import show
 from sonarpost.cli.status.rows import age_text, bytes_text, is_well, rows_of
 from sonarpost.config import PlatformConfig
 from sonarpost.messages import Health
-from sonarpost.monitoring.fleet import FleetState, Seen
+from sonarpost.monitoring.fleet import FleetState, ServiceStatus
 
 NAMES = ("uuv_modem", "acoustic_channel", "op_modem", "decompressor")
 
@@ -49,9 +49,9 @@ def health(platform: str = "vessel-1", service: str = "op_modem", **changes: Any
     return Health(**(fields | changes))
 
 
-def seen(record: Health | None, age_s: float | None = 1.2, *, alive: bool | None = True) -> Seen:
+def seen(record: Health | None, age_s: float | None = 1.2, *, alive: bool | None = True) -> ServiceStatus:
     platform, service = (record.platform_id, record.service) if record else ("vessel-1", "relay")
-    return Seen(platform, service, record, age_s if record else None, alive)
+    return ServiceStatus(platform, service, record, age_s if record else None, alive)
 
 
 MODEM = health(
@@ -110,7 +110,7 @@ def test_long_names_are_folded_and_not_cut() -> None:
 
 
 def test_old_data_looks_old() -> None:
-    def mood(state: Seen, *, connected: bool = True) -> tuple[str, str]:
+    def mood(state: ServiceStatus, *, connected: bool = True) -> tuple[str, str]:
         (row,) = rows_of(FleetState((state,), connected, 0), 15.0)
         return row.state, row.mood
 
@@ -123,7 +123,7 @@ def test_old_data_looks_old() -> None:
 
 
 def test_well_is_everybody_and_somebody() -> None:
-    def well(*services: Seen, connected: bool = True) -> bool:
+    def well(*services: ServiceStatus, connected: bool = True) -> bool:
         state = FleetState(services, connected, 0)
         return is_well(rows_of(state, 15.0), state)
 

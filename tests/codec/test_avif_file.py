@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from PIL import Image as Pillow
 
 from sonarpost.codec.baselines.avif_file import avif_file, check_frame, frame_of, sequence_size
-from sonarpost.codec.baselines.still_images import ModernCodec, ModernFormat
+from sonarpost.codec.baselines.still_images import StillImageCodec, StillImageFormat
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import ConfigError, StreamError
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "modern"
 SIZES = [(16, 16), (17, 33), (49, 113), (80, 80), (384, 384), (385, 384), (16, 512), (512, 16), (512, 512)]
-pytestmark = pytest.mark.skipif(not ModernFormat.AVIF.available, reason="no AVIF in this Pillow")
+pytestmark = pytest.mark.skipif(not StillImageFormat.AVIF.available, reason="no AVIF in this Pillow")
 
 
 def texture(height_px: int, width_px: int) -> np.ndarray:
@@ -43,13 +43,13 @@ def test_the_file_is_written_anew_to_the_byte_without_271(size: tuple[int, int])
 
 def test_small_budgets_are_met() -> None:
     image = (texture(80, 80) // 16 + 100).astype(np.uint8)
-    stream = ModernCodec(ModernFormat.AVIF).encode(image, 100)
+    stream = StillImageCodec(StillImageFormat.AVIF).encode(image, 100)
     assert len(stream) <= 100
-    assert ModernCodec(ModernFormat.AVIF).decode(stream).image.shape == (80, 80)
+    assert StillImageCodec(StillImageFormat.AVIF).decode(stream).image.shape == (80, 80)
 
 
 def test_whole_files_of_earlier_releases_decode_like_what_is_sent_now() -> None:
-    codec = ModernCodec(ModernFormat.AVIF)
+    codec = StillImageCodec(StillImageFormat.AVIF)
     for path in sorted(GOLDEN.glob("avif-*.hex")):
         if path.stem.endswith("picture"):
             continue
@@ -66,7 +66,7 @@ def test_another_file_is_refused() -> None:
         frame_of(written(texture(20, 20), 30), (20, 21))
     header = StreamHeader(0x06, 0, 80, 80).pack()
     with pytest.raises(StreamError, match="size"):
-        ModernCodec(ModernFormat.AVIF).decode(header + written(texture(80, 64), 30))
+        StillImageCodec(StillImageFormat.AVIF).decode(header + written(texture(80, 64), 30))
 
 
 def test_only_one_sequence_header_and_frame_of_the_right_size_reaches_the_decoder() -> None:

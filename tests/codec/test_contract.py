@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.codec.interface import Codec, Decoded, StreamHeader, model_tag
+from sonarpost.codec.interface import Codec, DecodedImage, StreamHeader, model_tag
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import load
 from sonarpost.codec.vq.codec import IndexPacking
@@ -39,7 +39,7 @@ def snippet(height_px: int, width_px: int, seed: int = 0) -> np.ndarray:
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def check_decoded(decoded: Decoded, height_px: int, width_px: int) -> None:
+def check_decoded(decoded: DecodedImage, height_px: int, width_px: int) -> None:
     assert decoded.image.shape == decoded.missing.shape == (height_px, width_px)
     assert decoded.image.dtype == np.uint8
     assert decoded.missing.dtype == np.bool_

@@ -17,7 +17,7 @@ from sonarpost.codec.emb.coder import PLAIN_SCALE, State
 from sonarpost.codec.emb.layout import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, layout
 from sonarpost.codec.emb.model import all_structure
 from sonarpost.codec.emb.side_info import Box
-from sonarpost.codec.emb.similarity import likeness
+from sonarpost.codec.emb.similarity import structural_similarity
 from sonarpost.codec.quality import ms_ssim, psnr_db
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.errors import StreamError
@@ -103,10 +103,10 @@ def test_likeness_orders_pictures_as_ms_ssim_does() -> None:
     shown = [ndimage.gaussian_filter(picture.astype(float), sigma) for sigma in (0.7, 1.5, 3.0, 6.0)]
     shown += [picture + rng.normal(0, strength, picture.shape) for strength in (5, 20, 60)]
     shown = [np.clip(np.rint(s), 0, 255).astype(np.int64) for s in shown]
-    ours = [likeness(picture, s) for s in shown]
+    ours = [structural_similarity(picture, s) for s in shown]
     theirs = [ms_ssim(picture.astype(np.uint8), s.astype(np.uint8)) for s in shown]
     assert np.array_equal(np.argsort(ours), np.argsort(theirs))
-    assert likeness(picture, picture) == pytest.approx(2.0**28, rel=0.001)
+    assert structural_similarity(picture, picture) == pytest.approx(2.0**28, rel=0.001)
 
 
 @settings(max_examples=60)
@@ -117,7 +117,7 @@ def test_likeness_does_not_overflow(seed: int, height_px: int, width_px: int, is
     picture = 255 * rng.integers(0, 2, (height_px // cell + 1, width_px // cell + 1)).astype(np.int64)
     picture = picture.repeat(cell, 0).repeat(cell, 1)[:height_px, :width_px]
     other = 255 - picture if is_inverse else picture
-    found = likeness(picture, other)
+    found = structural_similarity(picture, other)
     assert found <= 2**28
     if not is_inverse:
         assert found >= 2**28 * 0.999

@@ -16,8 +16,8 @@ from sonarpost.codec.emb.coder import Coder
 from sonarpost.codec.emb.layout import layout
 from sonarpost.codec.emb.model import Model, all_structure, shipped
 from sonarpost.codec.emb.region import INSIDE, OUTSIDE, fill_unknown, weights
-from sonarpost.codec.emb.side_info import Box, Side, read_side, write_side
-from sonarpost.codec.emb.speckle_synthesis import make_grain, measure_grain
+from sonarpost.codec.emb.side_info import Box, SideInfo, read_side, write_side
+from sonarpost.codec.emb.speckle_synthesis import measure_speckle, synthesise_speckle
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import StreamError
 
@@ -61,7 +61,7 @@ def test_side_information_comes_back_and_its_prefixes_say_less(
     if corners:
         (top, bottom), (left, right) = sorted(corners[:2]), sorted(corners[2:])
         box = Box(top, left, bottom, right)
-    side = Side(mean_index, step, box, grain, extra)
+    side = SideInfo(mean_index, step, box, grain, extra)
     coder = Coder.writer(40)
     write_side(coder, shipped(), side)
     body = coder.finish()
@@ -149,23 +149,23 @@ def test_grain_is_a_layer_of_its_own() -> None:
 def test_grain_restores_the_strength_of_the_texture() -> None:
     image = speckled()
     lay = layout(80, 80)
-    levels = measure_grain(image, lay)
+    levels = measure_speckle(image, lay)
     assert len(levels) == 8
     decoded = CODEC.decode(CODEC.encode(image, 64)).image
-    full = np.clip(decoded + make_grain(decoded, lay, levels), 0, 255).astype(np.uint8)
+    full = np.clip(decoded + synthesise_speckle(decoded, lay, levels), 0, 255).astype(np.uint8)
     assert abs(full[60:].std() / image[60:].std() - 1) < 0.3
     assert decoded[60:].std() < 0.6 * image[60:].std()
     # Two levels are a factor of two in strength.
     softer = (image.astype(int) // 2 + int(image.mean()) // 2).astype(np.uint8)
-    difference = np.array(levels[:4]) - measure_grain(softer, lay)[:4]
+    difference = np.array(levels[:4]) - measure_speckle(softer, lay)[:4]
     assert np.all((difference >= 1) & (difference <= 3))
 
 
 def test_a_flat_picture_has_no_grain() -> None:
     lay = layout(64, 64)
     flat = np.full((64, 64), 90, np.uint8)
-    assert measure_grain(flat, lay) == (0,) * 8
-    assert not make_grain(flat, lay, (0,) * 8).any()
+    assert measure_speckle(flat, lay) == (0,) * 8
+    assert not synthesise_speckle(flat, lay, (0,) * 8).any()
 
 
 @given(seed=st.integers(0, 2**16), length=st.integers(3, 80))

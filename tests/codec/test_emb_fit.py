@@ -12,11 +12,11 @@ from sonarpost.codec.emb import transform
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.coder import Coder
 from sonarpost.codec.emb.layout import layout
-from sonarpost.codec.emb.rate_distortion_opt import Wanted
+from sonarpost.codec.emb.rate_distortion_opt import TargetCoefficients
 from sonarpost.codec.emb.region import OUTSIDE, weights
-from sonarpost.codec.emb.search import Writer, Written, beside
-from sonarpost.codec.emb.side_info import Box, Side
-from sonarpost.codec.interface import Extensible, StreamHeader
+from sonarpost.codec.emb.search import EncodedTrial, TrialEncoder, beside
+from sonarpost.codec.emb.side_info import Box, SideInfo
+from sonarpost.codec.interface import ExtensibleCodec, StreamHeader
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import StreamError
 
@@ -70,7 +70,7 @@ def test_the_reach_is_the_wavelets_own_norm(size: tuple[int, int]) -> None:
 def test_as_many_fitted_coefficients_show_more_of_the_picture(body_bytes: int) -> None:
     image = contact()
     plane, lay = plane_of(image), layout(*image.shape)
-    wanted = fit.wanted_of(plane, lay, weights(lay, None), body_bytes)
+    wanted = fit.target_coefficients(plane, lay, weights(lay, None), body_bytes)
     error = []
     for coefficients in (wanted.plain, wanted.targets):
         least = np.partition(np.abs(coefficients), -body_bytes)[-body_bytes]
@@ -83,7 +83,7 @@ def test_the_box_weighs_in_both() -> None:
     image = contact()
     plane, lay = plane_of(image), layout(*image.shape)
     halves = weights(lay, Box(4, 4, 7, 7))
-    plain, boxed = (fit.wanted_of(plane, lay, w, 60) for w in (weights(lay, None), halves))
+    plain, boxed = (fit.target_coefficients(plane, lay, w, 60) for w in (weights(lay, None), halves))
     assert np.array_equal(boxed.plain, plain.plain.astype(np.int64) * halves // OUTSIDE)
     strong = (halves > OUTSIDE) & (np.abs(plain.plain) > 3000)
     assert np.abs(boxed.targets[strong]).mean() > 1.3 * np.abs(plain.targets[strong]).mean()
@@ -91,7 +91,7 @@ def test_the_box_weighs_in_both() -> None:
 
 @pytest.mark.parametrize("short", [12, 22, 64, 100])
 def test_a_stream_goes_on_as_it_began(short: int) -> None:
-    assert isinstance(CODEC, Extensible)
+    assert isinstance(CODEC, ExtensibleCodec)
     for seed in range(4):
         image = contact(64, 56, seed)
         stream = CODEC.encode(image, short)
@@ -205,14 +205,14 @@ def test_a_searched_step_is_the_best_of_those_tried(
     budget: int, size: tuple[int, int], tries: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried: list[tuple[int, int]] = []
-    write = Writer.write
+    write = TrialEncoder.write
 
-    def watched(self: Writer, wanted: Wanted, side: Side) -> Written:
+    def watched(self: TrialEncoder, wanted: TargetCoefficients, side: SideInfo) -> EncodedTrial:
         written = write(self, wanted, side)
         tried.append((written.error, side.step))
         return written
 
-    monkeypatch.setattr(Writer, "write", watched)
+    monkeypatch.setattr(TrialEncoder, "write", watched)
     image = contact(*size)
     stream = EmbCodec().encode(image, budget)
     assert len({step for _, step in tried}) == len(tried) == tries

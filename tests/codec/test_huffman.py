@@ -14,7 +14,7 @@ from pictures import picture, sdvd_crops
 
 from sonarpost.codec.baselines.huffman import HuffmanCodec
 from sonarpost.codec.baselines.huffman_code import MAX_CODE_BITS, canonical_codes, code_lengths
-from sonarpost.codec.interface import StreamHeader, arrived_body
+from sonarpost.codec.interface import StreamHeader, received_body
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError, StreamError
 
@@ -211,7 +211,7 @@ def test_a_gap_ends_what_is_used() -> None:
     received = np.ones(len(stream) - 5, np.bool_)
     received[100:110] = False
     stream = codec.encode(image)
-    header, body, notes = arrived_body(stream, None, 0x01, "huffman")
+    header, body, notes = received_body(stream, None, 0x01, "huffman")
     received = np.ones(len(body), np.bool_)
     received[100:110] = False
     decoded = codec.decode(stream, received)

@@ -13,7 +13,7 @@ from pictures import picture
 from PIL import Image as Pillow
 
 from sonarpost.codec.baselines import still_images as modern
-from sonarpost.codec.baselines.still_images import ModernCodec, ModernFormat, jpegxl_size
+from sonarpost.codec.baselines.still_images import StillImageCodec, StillImageFormat, jpegxl_size
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.registry import BUILTINS, CodecRegistry, CodecResources
@@ -22,38 +22,38 @@ from sonarpost.errors import ConfigError, StreamError
 GOLDEN = Path(__file__).parents[1] / "golden" / "modern"
 
 
-def with_library(wanted: ModernFormat) -> object:
+def with_library(wanted: StillImageFormat) -> object:
     absent = pytest.mark.skipif(not wanted.available, reason=f"{wanted.value} needs {wanted.needs}")
     return pytest.param(wanted, id=wanted.value, marks=absent)
 
 
-EVERY = pytest.mark.parametrize("wanted", [with_library(wanted) for wanted in ModernFormat])
+EVERY = pytest.mark.parametrize("wanted", [with_library(wanted) for wanted in StillImageFormat])
 
 
 def body(stream: bytes) -> bytes:
     return stream[StreamHeader.unpack(stream).size :]
 
 
-def golden_names(wanted: ModernFormat) -> list[str]:
+def golden_names(wanted: StillImageFormat) -> list[str]:
     return sorted(path.stem for path in GOLDEN.glob(f"{wanted.value}-*.hex") if not path.stem.endswith("picture"))
 
 
 @EVERY
-def test_golden_streams_are_read_for_ever(wanted: ModernFormat) -> None:
+def test_golden_streams_are_read_for_ever(wanted: StillImageFormat) -> None:
     names = golden_names(wanted)
     assert len(names) == 3
     for name in names:
         stream = bytes.fromhex((GOLDEN / f"{name}.hex").read_text())
         expected = np.frombuffer(bytes.fromhex((GOLDEN / f"{name}-picture.hex").read_text()), np.uint8)
-        decoded = ModernCodec(wanted).decode(stream)
+        decoded = StillImageCodec(wanted).decode(stream)
         # WebP and AVIF decode to the bit, but are turned into grey by way of RGB; JPEG XL is floating point.
         assert np.abs(decoded.image.ravel().astype(int) - expected).max() <= 2
         assert not decoded.missing.any()
 
 
 @EVERY
-def test_the_best_that_fits_is_sent(wanted: ModernFormat) -> None:
-    codec, image = ModernCodec(wanted), picture(80, 80)
+def test_the_best_that_fits_is_sent(wanted: StillImageFormat) -> None:
+    codec, image = StillImageCodec(wanted), picture(80, 80)
     quality = []
     for budget in (1200, 2000, 3500):
         stream = codec.encode(image, budget)
@@ -64,38 +64,38 @@ def test_the_best_that_fits_is_sent(wanted: ModernFormat) -> None:
 
 
 @EVERY
-def test_a_budget_is_kept_to_the_byte(wanted: ModernFormat) -> None:
+def test_a_budget_is_kept_to_the_byte(wanted: StillImageFormat) -> None:
     image = picture(48, 48)
     for quality in (20, 49, 60):
-        length = len(ModernCodec(wanted, quality).encode(image))
-        assert len(ModernCodec(wanted).encode(image, length)) <= length
-        assert len(ModernCodec(wanted).encode(image, length - 1)) < length
+        length = len(StillImageCodec(wanted, quality).encode(image))
+        assert len(StillImageCodec(wanted).encode(image, length)) <= length
+        assert len(StillImageCodec(wanted).encode(image, length - 1)) < length
 
 
 def test_no_quality_that_fits_is_much_better_than_the_one_sent() -> None:
-    if not ModernFormat.WEBP.available:
+    if not StillImageFormat.WEBP.available:
         pytest.skip("no WebP in this Pillow")
     image = picture(48, 64)
-    streams = [ModernCodec(ModernFormat.WEBP, quality).encode(image) for quality in range(100)]
-    reached = [psnr_db(image, ModernCodec(ModernFormat.WEBP).decode(stream).image) for stream in streams]
+    streams = [StillImageCodec(StillImageFormat.WEBP, quality).encode(image) for quality in range(100)]
+    reached = [psnr_db(image, StillImageCodec(StillImageFormat.WEBP).decode(stream).image) for stream in streams]
     for budget in (400, 700, 1500):
         best = max(db for db, stream in zip(reached, streams, strict=True) if len(stream) <= budget)
-        sent = ModernCodec(ModernFormat.WEBP).encode(image, budget)
-        assert psnr_db(image, ModernCodec(ModernFormat.WEBP).decode(sent).image) > best - 0.5
+        sent = StillImageCodec(StillImageFormat.WEBP).encode(image, budget)
+        assert psnr_db(image, StillImageCodec(StillImageFormat.WEBP).decode(sent).image) > best - 0.5
 
 
 @EVERY
-def test_a_budget_below_the_lowest_quality_is_refused(wanted: ModernFormat) -> None:
+def test_a_budget_below_the_lowest_quality_is_refused(wanted: StillImageFormat) -> None:
     for budget in (0, 22, 60):
         with pytest.raises(StreamError, match=f"codec {wanted.value}: budget_bytes"):
-            ModernCodec(wanted).encode(picture(80, 80), budget)
+            StillImageCodec(wanted).encode(picture(80, 80), budget)
 
 
 @EVERY
-def test_more_quality_is_a_nearer_picture(wanted: ModernFormat) -> None:
+def test_more_quality_is_a_nearer_picture(wanted: StillImageFormat) -> None:
     image = picture(64, 100)
     met = [
-        psnr_db(image, ModernCodec(wanted, quality).decode(ModernCodec(wanted, quality).encode(image)).image)
+        psnr_db(image, StillImageCodec(wanted, quality).decode(StillImageCodec(wanted, quality).encode(image)).image)
         for quality in (5, 50, 99)
     ]
     assert met == sorted(met)
@@ -104,33 +104,33 @@ def test_more_quality_is_a_nearer_picture(wanted: ModernFormat) -> None:
 
 @EVERY
 @pytest.mark.parametrize("quality", [-1, 100])
-def test_a_quality_out_of_bounds_is_refused(wanted: ModernFormat, quality: int) -> None:
+def test_a_quality_out_of_bounds_is_refused(wanted: StillImageFormat, quality: int) -> None:
     with pytest.raises(ConfigError, match="quality"):
-        ModernCodec(wanted, quality)
+        StillImageCodec(wanted, quality)
 
 
 @EVERY
 @pytest.mark.parametrize("size", [(16, 16), (17, 31), (16, 512), (511, 33)])
-def test_every_size_comes_back(wanted: ModernFormat, size: tuple[int, int]) -> None:
+def test_every_size_comes_back(wanted: StillImageFormat, size: tuple[int, int]) -> None:
     image = picture(*size)
-    decoded = ModernCodec(wanted).decode(ModernCodec(wanted).encode(image))
+    decoded = StillImageCodec(wanted).decode(StillImageCodec(wanted).encode(image))
     assert psnr_db(image, decoded.image) > 18
 
 
 @EVERY
-def test_a_picture_of_another_size_is_refused(wanted: ModernFormat) -> None:
-    if wanted is ModernFormat.WEBP:
+def test_a_picture_of_another_size_is_refused(wanted: StillImageFormat) -> None:
+    if wanted is StillImageFormat.WEBP:
         pytest.skip("its size is the stream header's and is not sent twice")
-    stream = ModernCodec(wanted).encode(picture(60, 80))
+    stream = StillImageCodec(wanted).encode(picture(60, 80))
     with pytest.raises(StreamError, match="size"):
-        ModernCodec(wanted).decode(StreamHeader(wanted.codec_id, 0, 80, 60).pack() + body(stream))
+        StillImageCodec(wanted).decode(StreamHeader(wanted.codec_id, 0, 80, 60).pack() + body(stream))
 
 
 @EVERY
 def test_cut_or_damaged_is_a_picture_or_refused_and_nothing_is_printed(
-    wanted: ModernFormat, capfd: pytest.CaptureFixture[str]
+    wanted: StillImageFormat, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    codec = ModernCodec(wanted, 5)
+    codec = StillImageCodec(wanted, 5)
     stream = codec.encode(picture(33, 47))
     refused = 0
     for at in range(5, len(stream), 3):
@@ -148,17 +148,17 @@ def test_cut_or_damaged_is_a_picture_or_refused_and_nothing_is_printed(
 @EVERY
 @given(junk=st.binary(max_size=200))
 @settings(max_examples=40, deadline=None)
-def test_any_body_is_a_picture_or_refused(wanted: ModernFormat, junk: bytes) -> None:
+def test_any_body_is_a_picture_or_refused(wanted: StillImageFormat, junk: bytes) -> None:
     try:
-        decoded = ModernCodec(wanted).decode(StreamHeader(wanted.codec_id, 0, 48, 32).pack() + junk)
+        decoded = StillImageCodec(wanted).decode(StreamHeader(wanted.codec_id, 0, 48, 32).pack() + junk)
     except StreamError:
         return
     assert decoded.image.shape == (48, 32)
 
 
 @EVERY
-def test_a_gap_leaves_nothing_and_says_so(wanted: ModernFormat) -> None:
-    codec = ModernCodec(wanted)
+def test_a_gap_leaves_nothing_and_says_so(wanted: StillImageFormat) -> None:
+    codec = StillImageCodec(wanted)
     stream = codec.encode(picture(48, 48))
     received = np.ones(len(body(stream)), np.bool_)
     assert np.array_equal(codec.decode(stream, received).image, codec.decode(stream).image)
@@ -172,16 +172,16 @@ def test_a_gap_leaves_nothing_and_says_so(wanted: ModernFormat) -> None:
 
 
 @EVERY
-def test_the_registry_has_it(wanted: ModernFormat) -> None:
+def test_the_registry_has_it(wanted: StillImageFormat) -> None:
     codec = CodecRegistry(BUILTINS).create(wanted.value, CodecResources())
     assert (codec.name, codec.codec_id) == (wanted.value, wanted.codec_id)
 
 
-@pytest.mark.parametrize("wanted", list(ModernFormat), ids=lambda wanted: wanted.value)
-def test_an_absent_library_is_named(wanted: ModernFormat, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ModernFormat, "available", property(lambda _: False))
+@pytest.mark.parametrize("wanted", list(StillImageFormat), ids=lambda wanted: wanted.value)
+def test_an_absent_library_is_named(wanted: StillImageFormat, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(StillImageFormat, "available", property(lambda _: False))
     with pytest.raises(ConfigError, match=wanted.needs):
-        ModernCodec(wanted)
+        StillImageCodec(wanted)
     registry = CodecRegistry(spec for spec in BUILTINS if spec.name != wanted.value)
     with pytest.raises(ConfigError, match=wanted.needs):
         registry.create(wanted.value, CodecResources())
@@ -193,7 +193,7 @@ def test_an_absent_library_is_named(wanted: ModernFormat, monkeypatch: pytest.Mo
 
 
 def test_a_webp_body_is_the_file_without_27_bytes() -> None:
-    if not ModernFormat.WEBP.available:
+    if not StillImageFormat.WEBP.available:
         pytest.skip("no WebP in this Pillow")
     for quality in range(10, 90, 10):
         file = io.BytesIO()
@@ -217,7 +217,7 @@ def test_the_long_form_of_a_jpeg_xl_size_is_read(height_px: int, width_px: int) 
 
 
 def test_the_sizes_in_jpeg_xl_streams_are_read() -> None:
-    names = golden_names(ModernFormat.JPEGXL)
+    names = golden_names(StillImageFormat.JPEGXL)
     assert len(names) == 3
     for name in names:
         stream = bytes.fromhex((GOLDEN / f"{name}.hex").read_text())
@@ -225,11 +225,11 @@ def test_the_sizes_in_jpeg_xl_streams_are_read() -> None:
         assert jpegxl_size(body(stream)) == (header.height_px, header.width_px)
 
 
-@pytest.mark.skipif(not ModernFormat.JPEGXL.available, reason="no pillow-jxl-plugin")
+@pytest.mark.skipif(not StillImageFormat.JPEGXL.available, reason="no pillow-jxl-plugin")
 def test_a_jpeg_xl_codestream_of_another_size_is_refused_before_it_is_decoded() -> None:
     header = StreamHeader(0x05, 0, 80, 80).pack()
     with pytest.raises(StreamError, match=r"size: got \(536870912, 80\)"):
-        ModernCodec(ModernFormat.JPEGXL).decode(header + size_header(1 << 29, 80) + bytes(40))
+        StillImageCodec(StillImageFormat.JPEGXL).decode(header + size_header(1 << 29, 80) + bytes(40))
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff\x0a", b"\0" * 40, b"\0\0\0\x0cJXL \r\n\x87\n" + bytes(20)])

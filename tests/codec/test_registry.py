@@ -17,7 +17,7 @@ from sonarpost.codec.registry import (
     default_registry,
     load_plugins,
 )
-from sonarpost.codec.vq.codec import IndexPacking, VqCodec, catalogue_tag
+from sonarpost.codec.vq.codec import IndexPacking, VqCodec, codebook_tag
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import ConfigError, StreamError
 
@@ -107,8 +107,8 @@ def test_a_codec_with_a_catalogue_takes_an_id_whose_streams_can_name_it(registry
 @pytest.mark.parametrize("codec_id", [0x14, 0x1F, 0x80, 0xFF])
 def test_a_registered_codec_with_a_catalogue_finds_it_by_the_tag(registry: CodecRegistry, codec_id: int) -> None:
     registry.register(CodecSpec("other", (codec_id,), make_nothing, needs_tiles=True))
-    header = StreamHeader(codec_id, catalogue_tag(TILES), 16, 24)
-    assert StreamHeader.unpack(header.pack()).model_tag == catalogue_tag(TILES)
+    header = StreamHeader(codec_id, codebook_tag(TILES), 16, 24)
+    assert StreamHeader.unpack(header.pack()).model_tag == codebook_tag(TILES)
 
 
 def test_a_plug_in_is_registered_like_a_codec_of_ours(registry: CodecRegistry) -> None:

@@ -13,7 +13,7 @@ from pictures import picture, sdvd_crops
 
 from sonarpost.codec.baselines import spiht
 from sonarpost.codec.baselines.spiht import NATURAL_MAXLOOP, SpihtCodec
-from sonarpost.codec.baselines.spiht_passes import MAX_PLANES, UNIT, PictureAnswers, StreamAnswers, run_passes
+from sonarpost.codec.baselines.spiht_passes import MAX_PLANES, UNIT, DecoderTests, EncoderTests, run_passes
 from sonarpost.codec.baselines.spiht_wavelet import FRACTION_BITS, forest_of, inverse, transform
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.quality import psnr_db
@@ -92,10 +92,10 @@ def test_after_a_plane_no_coefficient_is_further_off_than_its_step(
     image = (np.random.default_rng(seed).rayleigh(40, size)).clip(0, 255).astype(np.uint8)
     forest = forest_of(*size)
     flat = transform(image, 100, forest)
-    picture_ = PictureAnswers(flat, phase, forest, None)
+    picture_ = EncoderTests(flat, phase, forest, None)
     planes = range(picture_.planes - 1, max(picture_.planes - 1 - loops, -1), -1)
     run_passes(forest, planes, picture_.tests())
-    stream = StreamAnswers(bytes(picture_.bits), forest)
+    stream = DecoderTests(bytes(picture_.bits), forest)
     run_passes(forest, planes, stream.tests())
     step = (4 + phase) * UNIT << planes[-1]
     rebuilt = stream.coefficients(phase)

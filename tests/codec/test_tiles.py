@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sonarpost.codec.vq.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, cut_tiles, join_tiles, principal_basis
-from sonarpost.errors import CatalogueError
+from sonarpost.errors import CodebookError
 
 
 def random_tiles(count: int, tile_px: int, seed: int = 0) -> np.ndarray:
@@ -155,7 +155,7 @@ def test_a_database_cannot_be_changed_behind_its_identity() -> None:
     ],
 )
 def test_a_wrong_shape_or_type_is_refused_by_name(field: str, make) -> None:
-    with pytest.raises(CatalogueError) as caught:
+    with pytest.raises(CodebookError) as caught:
         make(random_tiles(6, 4))
     assert caught.value.field == field
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sonarpost.codec.interface import Codec, StreamHeader
 from sonarpost.codec.vq.codebook import load
-from sonarpost.codec.vq.codec import IndexPacking, VqCodec, catalogue_tag, pack_indices, unpack_indices
+from sonarpost.codec.vq.codec import IndexPacking, VqCodec, codebook_tag, pack_indices, unpack_indices
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
 from sonarpost.errors import ConfigError, StreamError
 
@@ -182,8 +182,8 @@ def test_a_catalogue_of_another_identity_is_named_with_both_tags(tiles: TileData
     stream = VqCodec(other).encode(picture(20, 20))
     with pytest.raises(StreamError, match="another identity") as caught:
         VqCodec(tiles).decode(stream)
-    assert f"{catalogue_tag(other):#06x}" in str(caught.value)
-    assert f"{catalogue_tag(tiles):#06x}" in str(caught.value)
+    assert f"{codebook_tag(other):#06x}" in str(caught.value)
+    assert f"{codebook_tag(tiles):#06x}" in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -232,9 +232,9 @@ def test_a_stream_starts_with_four_bytes_or_seven(
 
 
 def test_the_tag_is_the_same_for_every_packing_and_begins_the_identity(tiles: TileDatabase) -> None:
-    assert f"{catalogue_tag(tiles):04x}" == tiles.identity[:4]
+    assert f"{codebook_tag(tiles):04x}" == tiles.identity[:4]
     tags = {StreamHeader.unpack(VqCodec(tiles, packing).encode(picture(20, 20))).model_tag for packing in PACKINGS}
-    assert tags == {catalogue_tag(tiles)}
+    assert tags == {codebook_tag(tiles)}
 
 
 @pytest.mark.parametrize("received", [np.ones(6, np.bool_), np.ones((7, 1), np.bool_), np.ones(7, np.uint8)])

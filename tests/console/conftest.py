@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from sonarpost.messages import Contact, Raster, ReconstructedImage
+from sonarpost.messages import Contact, Pixels, ReconstructedImage
 from sonarpost.services.console.app import ConsoleApp
 from sonarpost.services.console.board import Board
 from sonarpost.services.console.config import ConsoleConfig
@@ -43,7 +43,7 @@ def picture_record(
     if missing_rows:
         mask[-missing_rows:] = True
         pixels[mask] = 0
-    picture = Raster.from_array(pixels)
+    picture = Pixels.from_array(pixels)
     fields: dict[str, Any] = {
         "altitude_m": 5.0,
         "ground_range_m": 12.0,

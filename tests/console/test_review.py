@@ -12,13 +12,13 @@ from console.conftest import FIRST_UTC_S, picture_record
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sonarpost.errors import HandoffError
+from sonarpost.errors import DeliveryError
 from sonarpost.messages import Advice, Decision, DownlinkState
 from sonarpost.review.grouping import Place, nearest_group
 from sonarpost.services.console.asking import is_news
 from sonarpost.services.console.audit import OnScreen
 from sonarpost.services.console.contacts import Filter
-from sonarpost.services.console.decisions import ConflictError, Judgement
+from sonarpost.services.console.decisions import ConflictError, DecisionInput
 from sonarpost.services.console.people import Actor
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
@@ -157,7 +157,9 @@ def test_of_many_at_the_same_moment_one_decides(console):
 
     def decide(name: str) -> bool:
         try:
-            console.board.decide(ID, Judgement(0, screen, "unsure", None, None, name), Actor(name, "operator", "here"))
+            console.board.decide(
+                ID, DecisionInput(0, screen, "unsure", None, None, name), Actor(name, "operator", "here")
+            )
         except ConflictError as error:
             return error.decision is None
         return True
@@ -225,7 +227,7 @@ def test_the_audit_cannot_be_changed(console):
     console.board.take_image(picture_record())
     console.decide(console.browser("anna"), ID)
     for change in ("UPDATE audit SET user = 'bo'", "DELETE FROM audit"):
-        with pytest.raises(HandoffError, match="only added to"), console.board.database.writing() as db:
+        with pytest.raises(DeliveryError, match="only added to"), console.board.database.writing() as db:
             db.execute(change)
     with console.board.database.reading() as db, pytest.raises(sqlite3.Error, match="only added to"):
         db.execute("DELETE FROM audit")

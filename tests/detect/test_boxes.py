@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sonarpost.detection.integral_image import BoxMeans, in_noise_units
+from sonarpost.detection.integral_image import IntegralImage, in_noise_units
 
 values = st.one_of(st.floats(-100, 100, width=32), st.just(float("nan")))
 
@@ -20,7 +20,7 @@ values = st.one_of(st.floats(-100, 100, width=32), st.just(float("nan")))
 )
 def test_means_are_those_of_the_plain_definition(image, top, left, height, width):
     bottom, right = min(top + height, 4), min(left + width, 5)
-    got = BoxMeans(image, (3, 4)).mean((top, bottom), (left, right), 0.5)
+    got = IntegralImage(image, (3, 4)).mean((top, bottom), (left, right), 0.5)
     rows, columns = image.shape
     for r in range(rows):
         for c in range(columns):
@@ -35,7 +35,7 @@ def test_means_are_those_of_the_plain_definition(image, top, left, height, width
 @pytest.mark.parametrize(("rows", "columns"), [((0, 0), (0, 1)), ((0, 1), (2, 1)), ((-3, 1), (0, 1)), ((0, 1), (0, 5))])
 def test_a_box_that_is_empty_or_reaches_too_far_is_refused(rows, columns):
     with pytest.raises(ValueError, match="expected a non-empty span"):
-        BoxMeans(np.ones((4, 4), np.float32), (2, 3)).mean(rows, columns)
+        IntegralImage(np.ones((4, 4), np.float32), (2, 3)).mean(rows, columns)
 
 
 def test_noise_comes_out_with_unit_deviation_wherever_its_level_and_strength_change():

@@ -8,7 +8,7 @@ import pytest
 
 from sonarpost.detection.contacts import detect
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.stream import LineDetector, follows
+from sonarpost.detection.stream import StreamDetector, follows
 from sonarpost.sonar.survey import ChannelPing, Side
 
 
@@ -22,7 +22,7 @@ def cut(survey, *seams):
 
 
 def all_of(files, settings=None):
-    detector = LineDetector(settings)
+    detector = StreamDetector(settings)
     found = [contact for survey in files for contact in detector.feed(survey)]
     return [*found, *detector.finish()]
 
@@ -57,7 +57,7 @@ def test_every_contact_of_a_line_is_told_once_whatever_its_files(make_survey):
 
 def test_what_is_near_the_end_waits_for_the_next_file_or_the_end_of_the_line(make_survey):
     survey = make_survey({"ping": 60}, {"ping": 175})
-    detector = LineDetector()
+    detector = StreamDetector()
     (early,) = detector.feed(survey)
     assert early.ping == pytest.approx(60, abs=3)
     (late,) = detector.finish()

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.detection.contacts import detect
-from sonarpost.detection.snippet import cut_snippet, cut_wide, to_grey
+from sonarpost.detection.snippet import cut_expanded, cut_snippet, to_grey
 from sonarpost.sonar.survey import ChannelPing, Side
 
 
@@ -106,7 +106,7 @@ def test_a_window_of_one_value_is_mid_grey_and_an_unknown_one_black():
 @pytest.mark.parametrize("change", [{"ping_index": 200}, {"ping_index": -1}, {"sample": 512}])
 def test_a_detection_of_another_survey_is_refused(found, change):
     survey, detection = found
-    for cut in (cut_snippet, cut_wide):
+    for cut in (cut_snippet, cut_expanded):
         with pytest.raises(ValueError, match="expected inside 200 pings of 512 samples"):
             cut(survey, replace(detection, **change), 80, 100)
 
@@ -125,7 +125,7 @@ def fours(image):
 def test_the_wide_picture_is_twice_the_ground_around_the_same_middle(found):
     survey, detection = found
     narrow = cut_snippet(survey, detection, 40, 60)
-    wide = cut_wide(survey, detection, 40, 60)
+    wide = cut_expanded(survey, detection, 40, 60)
     top, left = narrow.first_ping_index - 20, narrow.first_sample - 30
     values = fours(survey.waterfall(Side.STARBOARD)[top : top + 80, left : left + 120])
     root = np.sqrt(values)
@@ -137,7 +137,7 @@ def test_the_wide_picture_is_twice_the_ground_around_the_same_middle(found):
 @given(ping=st.integers(0, 199), sample=st.integers(0, 511), height=st.integers(1, 210), width=st.integers(1, 600))
 def test_the_wide_picture_keeps_within_the_recording(found, ping, sample, height, width):
     survey, detection = found
-    wide = cut_wide(survey, replace(detection, ping_index=ping, sample=sample), height, width)
+    wide = cut_expanded(survey, replace(detection, ping_index=ping, sample=sample), height, width)
     if height >= 200 or width >= 512:
         assert wide is None, "there is no more ground than the snippet shows"
     else:
@@ -147,11 +147,11 @@ def test_the_wide_picture_keeps_within_the_recording(found, ping, sample, height
 def test_samples_a_ping_does_not_have_do_not_darken_the_wide_picture(found):
     survey, detection = found
     pings = list(survey.pings)
-    whole = cut_wide(survey, detection, 40, 60)
+    whole = cut_expanded(survey, detection, 40, 60)
     top = cut_snippet(survey, detection, 40, 60).first_ping_index - 20
     for row in (top + 10, top + 11, top + 20):
         pings[row] = replace(pings[row], channels=())
-    holed = cut_wide(replace(survey, pings=tuple(pings)), detection, 40, 60)
+    holed = cut_expanded(replace(survey, pings=tuple(pings)), detection, 40, 60)
     assert not holed[5].any(), "both of its pings are absent"
     # One of two pings is there: its mean stands, unhalved.
     assert abs(float(holed[10].mean()) - float(whole[10].mean())) < 15

@@ -10,12 +10,12 @@ from two_frequencies import read_both, with_second_frequency
 
 from sonarpost.cli.bench.detect_codecs import confidence_with
 from sonarpost.detection.contacts import detect
-from sonarpost.detection.ground_snippet import cut_ground_snippet, ground_picture
+from sonarpost.detection.ground_snippet import cut_ground_snippet, ground_projected_image
 from sonarpost.detection.plot import annotated_waterfall
 from sonarpost.detection.preprocess import preprocess
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.snippet import cut_snippet, cut_wide
-from sonarpost.detection.stream import LineDetector, follows
+from sonarpost.detection.snippet import cut_expanded, cut_snippet
+from sonarpost.detection.stream import StreamDetector, follows
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.ground_range import MAX_COLUMNS
@@ -91,18 +91,20 @@ def test_its_pictures_too(sample, samples, range_m, make_survey, tmp_path):
     ):
         assert (other.first_sample, other.target_column) == (one.first_sample, one.target_column)
         np.testing.assert_array_equal(other.image16, one.image16)
-    np.testing.assert_array_equal(cut_wide(both, found, 80, 140), cut_wide(alone, found, 80, 140))
+    np.testing.assert_array_equal(cut_expanded(both, found, 80, 140), cut_expanded(alone, found, 80, 140))
     np.testing.assert_array_equal(cut_ground_snippet(both, found).image, cut_ground_snippet(alone, found).image)
-    np.testing.assert_array_equal(ground_picture(both, found, 80, 140, 0.1), ground_picture(alone, found, 80, 140, 0.1))
+    np.testing.assert_array_equal(
+        ground_projected_image(both, found, 80, 140, 0.1), ground_projected_image(alone, found, 80, 140, 0.1)
+    )
 
 
 def test_a_second_frequency_of_long_range_does_not_forbid_small_pixels(make_survey, tmp_path):
     alone, both = read_both(make_survey({}), tmp_path, 512, 8000.0)
     (found,) = detect(alone)
     pixel_m = 8000.0 / MAX_COLUMNS / 2
-    picture = ground_picture(alone, found, 8, 14, pixel_m)
+    picture = ground_projected_image(alone, found, 8, 14, pixel_m)
     assert picture is not None
-    np.testing.assert_array_equal(ground_picture(both, found, 8, 14, pixel_m), picture)
+    np.testing.assert_array_equal(ground_projected_image(both, found, 8, 14, pixel_m), picture)
 
 
 def test_a_sample_that_only_the_second_frequency_has_is_not_of_the_survey(make_survey):
@@ -123,7 +125,7 @@ def test_contacts_are_drawn_where_they_are(samples, range_m, make_survey, tmp_pa
 def test_a_line_of_several_files_too(samples, range_m, make_survey, tmp_path):
     found = []
     for survey in read_both(make_survey({}), tmp_path, samples, range_m):
-        detector = LineDetector()
+        detector = StreamDetector()
         files = (replace(survey, pings=survey.pings[:98]), replace(survey, pings=survey.pings[98:]))
         contacts = [contact for file in files for contact in detector.feed(file)] + list(detector.finish())
         found.append([(contact.file, contact.ping, contact.detection) for contact in contacts])

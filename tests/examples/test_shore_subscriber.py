@@ -19,7 +19,7 @@ from PIL import Image
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config
 from sonarpost.config import PlatformConfig
-from sonarpost.messages import Decision, Raster, ReconstructedImage, Relayed
+from sonarpost.messages import Decision, Pixels, ReconstructedImage, Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 
@@ -76,8 +76,8 @@ def test_it_prints_contacts_and_decisions_and_saves_pictures(router: str, c2: C2
     command = [sys.executable, "-I", str(EXAMPLE), router, str(saved)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         eventually(lambda: publisher.matching_status.matching, what="the example's subscription")
-        relay(c2, image("0001", picture=Raster.from_array(wide)))
-        relay(c2, image("0002", picture=Raster.from_array(grey), version=2).model_copy(update={"contact": None}))
+        relay(c2, image("0001", picture=Pixels.from_array(wide)))
+        relay(c2, image("0002", picture=Pixels.from_array(grey), version=2).model_copy(update={"contact": None}))
         relay(c2, decision("0001", verdict="mine_like"))
         assert process.stdout is not None
         lines = [process.stdout.readline() for _ in range(3)]

@@ -8,21 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from sonarpost.archive.image_files import write_picture
+from sonarpost.archive.image_files import write_image
 from sonarpost.archive.shore_files import decision_file_name
 from sonarpost.export.accepted import Accepted
 from sonarpost.export.cot import cot_events
 from sonarpost.export.csv_table import csv_bytes
 from sonarpost.export.geojson import geojson_bytes
 from sonarpost.export.kml import kml_bytes
-from sonarpost.messages import Contact, Decision, Raster, ReconstructedImage
+from sonarpost.messages import Contact, Decision, Pixels, ReconstructedImage
 
 FIRST_UTC_S = 1476262801.25
 
 
 def image(image_id: str = "00A7", contact: dict[str, Any] | None = None, **changes: Any) -> ReconstructedImage:
     pixels = np.arange(16 * 24, dtype=np.uint16).astype(np.uint8).reshape(16, 24)
-    picture = changes.pop("picture", None) or Raster.from_array(pixels)
+    picture = changes.pop("picture", None) or Pixels.from_array(pixels)
     vehicle_id = changes.get("vehicle_id", "uuv-1")
     known = {
         "lat_deg": 41.52513339,
@@ -82,7 +82,7 @@ def keep(out_dir: Path, *records: ReconstructedImage | Decision) -> Path:
     for record in records:
         folder = out_dir / record.vessel_id
         if isinstance(record, ReconstructedImage):
-            write_picture(folder, record)
+            write_image(folder, record)
             continue
         decisions = folder / "decisions"
         decisions.mkdir(parents=True, exist_ok=True)

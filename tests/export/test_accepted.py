@@ -11,7 +11,7 @@ from export.make import FIRST_UTC_S, decision, image, keep, mission
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
-from sonarpost.errors import KeptFileError
+from sonarpost.errors import StoredFileError
 from sonarpost.export.accepted import load_accepted
 from sonarpost.messages import Relayed
 from sonarpost.services.c2.config import C2Config
@@ -126,7 +126,7 @@ def test_files_that_are_being_written_and_strange_files_are_left(tmp_path: Path)
 
 
 def test_a_folder_that_is_not_there_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(KeptFileError, match=r"nowhere.*the folder that c2 keeps"):
+    with pytest.raises(StoredFileError, match=r"nowhere.*the folder that c2 keeps"):
         load_accepted(tmp_path / "nowhere")
 
 

@@ -26,7 +26,7 @@ from sonarpost.export.geojson import geojson, geojson_bytes, write_geojson
 from sonarpost.export.kml import kml_bytes, kmz_bytes, write_kml, write_kmz
 from sonarpost.export.properties import COLUMNS
 from sonarpost.export.text import csv_text, html_text, xml_text
-from sonarpost.messages import Decision, Raster
+from sonarpost.messages import Decision, Pixels
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "export"
 KML = "{http://www.opengis.net/kml/2.2}"
@@ -160,7 +160,7 @@ def test_a_picture_lies_as_it_was_seen(
 ) -> None:
     pixels = np.zeros((16, 24), np.uint8)
     pixels[0, 0] = 255
-    record = image(contact={"channel": channel, "heading_deg": heading_deg}, picture=Raster.from_array(pixels))
+    record = image(contact={"channel": channel, "heading_deg": heading_deg}, picture=Pixels.from_array(pixels))
     data, _ = kmz_bytes(load_accepted(keep(tmp_path, record)))
     archive = zipfile.ZipFile(io.BytesIO(data))
     (name,) = (n for n in archive.namelist() if n.startswith("overlays/"))
@@ -193,7 +193,7 @@ def test_a_picture_of_which_it_is_not_known_how_it_lies_is_not_laid(tmp_path: Pa
 
 def test_sixteen_bits_become_eight(tmp_path: Path) -> None:
     pixels = np.array([[0, 500, 1000]], np.uint16)
-    data, _ = kmz_bytes(load_accepted(keep(tmp_path, image(picture=Raster.from_array(pixels)))))
+    data, _ = kmz_bytes(load_accepted(keep(tmp_path, image(picture=Pixels.from_array(pixels)))))
     archive = zipfile.ZipFile(io.BytesIO(data))
     (name,) = (n for n in archive.namelist() if n.startswith("pictures/"))
     assert np.asarray(Image.open(io.BytesIO(archive.read(name)))).tolist() == [[0, 127, 255]]

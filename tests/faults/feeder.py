@@ -9,8 +9,8 @@ from records import picture_record
 
 from sonarpost import keys
 from sonarpost.config import ServiceConfig
-from sonarpost.messages import Raster, ReconstructedImage
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.messages import Pixels, ReconstructedImage
+from sonarpost.runtime.service import Service, UnitOfWork
 
 VESSEL = "vessel-1"
 
@@ -20,7 +20,7 @@ def make_image(
 ) -> ReconstructedImage:
     """Return a picture of noise that no other number, mission or version has."""
     rng = np.random.default_rng([mission, number, version])
-    raster = Raster.from_array(rng.integers(0, 256, shape, dtype=np.uint8))
+    raster = Pixels.from_array(rng.integers(0, 256, shape, dtype=np.uint8))
     return picture_record(
         raster,
         vehicle_id=f"uuv-{number % 3 + 1}",
@@ -36,12 +36,12 @@ class Feeder(Service[ServiceConfig]):
 
     NAME = "feeder"
 
-    def handle(self, key: str, record: object, effects: Effects) -> None:
+    def handle(self, key: str, record: object, effects: UnitOfWork) -> None:
         raise AssertionError("the feeder takes nothing")
 
     def owe(self, images: Iterable[ReconstructedImage]) -> None:
         """Commit pictures for the relay."""
-        effects = Effects()
+        effects = UnitOfWork()
         for image in images:
             effects.send(keys.image_reconstructed(VESSEL), "relay", image, priority=5)
         self.commit(effects)

@@ -14,7 +14,7 @@ from link import v1_fuzz
 from modem.fuzz import ENDS, LIKELY, Fuzz, real_lines
 
 from sonarpost.link.events import ContactUpdate, MessageReceived
-from sonarpost.link.receiver import Receiver
+from sonarpost.link.receiver import LinkReceiver
 from sonarpost.modem.micromodem import nmea
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
@@ -50,7 +50,7 @@ def check_receiver(data: bytes) -> int:
     Raises:
         AssertionError: Something that must hold does not.
     """
-    receiver, now, shown = Receiver(v1_fuzz.SMALL), 0.0, 0
+    receiver, now, shown = LinkReceiver(v1_fuzz.SMALL), 0.0, 0
     for kind, body in _steps(data):
         now += (0.0, 1.0, 70.0, 4000.0)[kind >> 2 & 3]
         if kind & 3 == 0:
@@ -69,7 +69,7 @@ def check_receiver(data: bytes) -> int:
                 assert report is None or len(report.pack()) <= 19
             receiver.mini_report(source)
     v1_fuzz.check_bounds(receiver)
-    restored = Receiver(v1_fuzz.SMALL)
+    restored = LinkReceiver(v1_fuzz.SMALL)
     restored.restore(receiver.snapshot())
     assert restored.snapshot() == receiver.snapshot()
     return shown

@@ -15,7 +15,7 @@ import time
 from link.seal_world import VEHICLE, vehicle_seal, vessel_seal
 
 from sonarpost.errors import FrameError
-from sonarpost.link.auth.key import SealSettings
+from sonarpost.link.auth.key import AuthenticationSettings
 
 
 def forge(rng: random.Random, recorded: list[bytes], added: int) -> bytes:
@@ -43,7 +43,7 @@ def run(frames: int, seed: int, *, encrypt: bool, farther: int) -> dict[str, flo
         farther: How many counters farther ahead the receiver has left to try for each frame.
     """
     rng = random.Random(seed)
-    settings = SealSettings(encrypt=encrypt)
+    settings = AuthenticationSettings(encrypt=encrypt)
     start = settings.lifetime_frames - settings.counter_step * (farther + 1)
     vehicle, vessel = vehicle_seal(settings, first_counter=start), vessel_seal(settings)
     recorded = [vehicle.seal(b"\x80" + rng.randbytes(56)) for _ in range(100)]

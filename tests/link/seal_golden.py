@@ -7,18 +7,18 @@ from dataclasses import asdict
 
 from link.v1_golden import FOLDER
 
-from sonarpost.link.auth.authentication import AcousticSeal
-from sonarpost.link.auth.key import Direction, SealSettings, parse_key
+from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.auth.key import AuthenticationSettings, Direction, parse_key
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, Symbol, SymbolKind, pack_segments, pack_symbol
 
 KEY = "7d0a4c1fe2b39586a1c4d7f00918273645546372819fa0becdacebfa1d2e3f40"
 CASES = (
-    (SealSettings(), 3, Direction.FROM_VEHICLE, 0),
-    (SealSettings(), 3, Direction.FROM_VEHICLE, 1000),
-    (SealSettings(), 1, Direction.TO_VEHICLE, 5),
-    (SealSettings(encrypt=True), 3, Direction.FROM_VEHICLE, 255),
-    (SealSettings(2, 8), 127, Direction.FROM_VEHICLE, 65537),
-    (SealSettings(2, 6, encrypt=True), 0, Direction.TO_VEHICLE, 2**28 - 1),
+    (AuthenticationSettings(), 3, Direction.FROM_VEHICLE, 0),
+    (AuthenticationSettings(), 3, Direction.FROM_VEHICLE, 1000),
+    (AuthenticationSettings(), 1, Direction.TO_VEHICLE, 5),
+    (AuthenticationSettings(encrypt=True), 3, Direction.FROM_VEHICLE, 255),
+    (AuthenticationSettings(2, 8), 127, Direction.FROM_VEHICLE, 65537),
+    (AuthenticationSettings(2, 6, encrypt=True), 0, Direction.TO_VEHICLE, 2**28 - 1),
 )
 
 
@@ -27,7 +27,7 @@ def make() -> dict[str, object]:
     key = parse_key(KEY, "golden")
     frames = []
     for settings, source, direction, counter in CASES:
-        seal = AcousticSeal(key, source, direction, settings, first_counter=counter)
+        seal = FrameAuthenticator(key, source, direction, settings, first_counter=counter)
         seal.grant(counter + 1)
         if direction == Direction.FROM_VEHICLE:
             symbol = Symbol(SymbolKind.OBJECT, 5, 17, 40, bytes(range(59 - settings.size)))

@@ -4,29 +4,35 @@ from __future__ import annotations
 
 import hashlib
 
-from sonarpost.link.auth.authentication import AcousticSeal
-from sonarpost.link.auth.key import Direction, SealKey, SealSettings
+from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.auth.key import AcousticKey, AuthenticationSettings, Direction
 
 VEHICLE, VESSEL = 3, 1
 
 
-def key(name: str) -> SealKey:
-    return SealKey(hashlib.sha256(name.encode()).digest())
+def key(name: str) -> AcousticKey:
+    return AcousticKey(hashlib.sha256(name.encode()).digest())
 
 
 def vehicle_seal(
-    settings: SealSettings | None = None, *, name: str = "fleet", address: int = VEHICLE, first_counter: int = 0
-) -> AcousticSeal:
-    seal = AcousticSeal(key(name), address, Direction.FROM_VEHICLE, settings, first_counter=first_counter)
+    settings: AuthenticationSettings | None = None,
+    *,
+    name: str = "fleet",
+    address: int = VEHICLE,
+    first_counter: int = 0,
+) -> FrameAuthenticator:
+    seal = FrameAuthenticator(key(name), address, Direction.FROM_VEHICLE, settings, first_counter=first_counter)
     seal.grant(seal.settings.lifetime_frames)
     return seal
 
 
-def vessel_seal(settings: SealSettings | None = None, *, name: str = "fleet", address: int = VESSEL) -> AcousticSeal:
-    return AcousticSeal(key(name), address, Direction.TO_VEHICLE, settings)
+def vessel_seal(
+    settings: AuthenticationSettings | None = None, *, name: str = "fleet", address: int = VESSEL
+) -> FrameAuthenticator:
+    return FrameAuthenticator(key(name), address, Direction.TO_VEHICLE, settings)
 
 
-def skip(seal: AcousticSeal, frames: int) -> None:
+def skip(seal: FrameAuthenticator, frames: int) -> None:
     """Let so many frames be lost."""
     for _ in range(frames):
         seal.seal(b"\x80lost")

@@ -16,15 +16,17 @@ from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments, 
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "acoustic-v1" / "messages.json"
 SAMPLES: dict[str, dl.Content] = {
-    "refine-192": dl.Refine(0x01020304, 1_790_000_000, 7, 192),
-    "refine-all": dl.Refine(0xFFFFFFFF, 1_790_000_001, 65535),
-    "resend": dl.Resend(0, 0, 1),
-    "revisit": dl.Revisit(5, 1_790_000_002, -41.5251234, 170.6712345),
-    "decision": dl.Judgement(6, 1_790_000_003, 300, 4, "not_mine_like", 0.5, "Manta"),
-    "decision-bare": dl.Judgement(7, 4_294_967_295, 300, 300, "unsure"),
-    "confirmation": dl.Confirmation(((1, dl.Outcome.TAKEN), (2**32 - 1, dl.Outcome.UNKNOWN_IMAGE))),
-    "wider": dl.Wider(0x0A0B0C0D, 1_790_000_004, 7),
-    "data": dl.Data(b"\x00status"),
+    "refine-192": dl.RefineMessage(0x01020304, 1_790_000_000, 7, 192),
+    "refine-all": dl.RefineMessage(0xFFFFFFFF, 1_790_000_001, 65535),
+    "resend": dl.ResendMessage(0, 0, 1),
+    "revisit": dl.RevisitMessage(5, 1_790_000_002, -41.5251234, 170.6712345),
+    "decision": dl.DecisionMessage(6, 1_790_000_003, 300, 4, "not_mine_like", 0.5, "Manta"),
+    "decision-bare": dl.DecisionMessage(7, 4_294_967_295, 300, 300, "unsure"),
+    "confirmation": dl.ConfirmationMessage(
+        ((1, dl.CommandOutcome.TAKEN), (2**32 - 1, dl.CommandOutcome.UNKNOWN_IMAGE))
+    ),
+    "wider": dl.ExpandMessage(0x0A0B0C0D, 1_790_000_004, 7),
+    "data": dl.DataMessage(b"\x00status"),
 }
 
 
@@ -40,17 +42,17 @@ def test_golden_bytes(name: str) -> None:
 numbers = st.integers(1, 65535)
 heads = {"token": st.integers(0, 2**32 - 1), "issued_utc_s": st.integers(0, 2**32 - 1)}
 orders = st.one_of(
-    st.builds(dl.Refine, **heads, number=numbers, stream_bytes=st.integers(0, 65535)),
-    st.builds(dl.Resend, **heads, number=numbers),
-    st.builds(dl.Wider, **heads, number=numbers),
+    st.builds(dl.RefineMessage, **heads, number=numbers, stream_bytes=st.integers(0, 65535)),
+    st.builds(dl.ResendMessage, **heads, number=numbers),
+    st.builds(dl.ExpandMessage, **heads, number=numbers),
     st.builds(
-        dl.Revisit,
+        dl.RevisitMessage,
         **heads,
         lat_deg=st.integers(-900_000_000, 900_000_000).map(lambda n: n / 1e7),
         lon_deg=st.integers(-1_800_000_000, 1_800_000_000).map(lambda n: n / 1e7),
     ),
     st.builds(
-        dl.Judgement,
+        dl.DecisionMessage,
         **heads,
         number=numbers,
         version=st.integers(1, 255),
@@ -62,7 +64,7 @@ orders = st.one_of(
 
 
 @given(orders)
-def test_every_order_fits_a_frame_of_32_bytes_and_comes_back(order: dl.DownlinkOrder) -> None:
+def test_every_order_fits_a_frame_of_32_bytes_and_comes_back(order: dl.DownlinkCommand) -> None:
     message = Segment(SegmentKind.MESSAGE, b"\x05" + dl.pack(order))
     (segment,) = parse_frame(pack_segments([message], 32))
     assert isinstance(segment, Segment)
@@ -71,9 +73,9 @@ def test_every_order_fits_a_frame_of_32_bytes_and_comes_back(order: dl.DownlinkO
 
 @given(st.text(max_size=60), st.integers(14, 60))
 def test_a_class_is_cut_between_characters(text: str, room_bytes: int) -> None:
-    packed = dl.pack(dl.Judgement(1, 2, 3, 1, "unsure", None, text), room_bytes)
+    packed = dl.pack(dl.DecisionMessage(1, 2, 3, 1, "unsure", None, text), room_bytes)
     found = dl.unpack(packed)
-    assert isinstance(found, dl.Judgement)
+    assert isinstance(found, dl.DecisionMessage)
     assert len(packed) <= room_bytes
     assert text.startswith(found.mlo_class)
     lost = text[len(found.mlo_class) :]
@@ -119,7 +121,7 @@ def test_wrong_messages_name_the_field(packed: bytes, field: str) -> None:
 
 
 def test_confirmations_fill_messages() -> None:
-    outcomes = [(token, dl.Outcome.TAKEN) for token in range(12)]
+    outcomes = [(token, dl.CommandOutcome.TAKEN) for token in range(12)]
     made = dl.confirmations(outcomes)
     assert [len(each.outcomes) for each in made] == [5, 5, 2]
     assert [pair for each in made for pair in each.outcomes] == outcomes

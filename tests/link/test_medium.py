@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.mac import Continuous, OnPoll, RandomAccess, Slots
+from sonarpost.link.mac import Continuous, Csma, Polled, Tdma
 
 TIMES = st.floats(1e9, 2e9)
 
@@ -45,7 +45,7 @@ def test_continuous_without_listening_never_waits_but_for_others():
 
 @given(now=TIMES, packet_s=st.floats(0.5, 9.0), start_s=st.floats(0, 40.0))
 def test_a_packet_in_a_slot_ends_before_its_guard(now, packet_s, start_s):
-    medium = Slots(60.0, start_s, 12.0, 2.0)
+    medium = Tdma(60.0, start_s, 12.0, 2.0)
     wait_s = medium.wait_s(packet_s, now)
     assert wait_s is not None
     assert 0 <= wait_s <= 60.0
@@ -60,7 +60,7 @@ def test_no_two_stations_in_slots_meet(now, packet_s, stations):
     slot_s, travel_s = 8.0, 1.0
     sent = []
     for n in range(stations):
-        medium = Slots(stations * slot_s, n * slot_s, slot_s, 2.0)
+        medium = Tdma(stations * slot_s, n * slot_s, slot_s, 2.0)
         start = now + (medium.wait_s(packet_s, now) or 0.0)
         sent.append((start, start + packet_s + travel_s))
     sent.sort()
@@ -68,11 +68,11 @@ def test_no_two_stations_in_slots_meet(now, packet_s, stations):
 
 
 def test_a_slot_that_is_too_short_says_so():
-    assert Slots(60.0, 0.0, 5.0, 1.0).wait_s(6.0, 0.0) is None
+    assert Tdma(60.0, 0.0, 5.0, 1.0).wait_s(6.0, 0.0) is None
 
 
 def test_who_is_polled_never_begins():
-    medium = OnPoll()
+    medium = Polled()
     medium.sent(0.0, 1.0)
     medium.heard(2.0)
     assert medium.wait_s(1.0, 1e6) is None
@@ -80,7 +80,7 @@ def test_who_is_polled_never_begins():
 
 @given(seed=st.integers(0, 1000), mean_s=st.floats(0.1, 100.0))
 def test_random_access_waits_between_none_and_twice_the_mean(seed, mean_s):
-    medium = RandomAccess(mean_s, quiet_s=0.0, seed=seed)
+    medium = Csma(mean_s, quiet_s=0.0, seed=seed)
     now, waits = 1e9, []
     for _ in range(60):
         medium.sent(now - 1.0, now)
@@ -93,7 +93,7 @@ def test_random_access_waits_between_none_and_twice_the_mean(seed, mean_s):
 
 
 def test_random_access_defers_to_others_and_survives_a_clock_that_is_set_back():
-    medium = RandomAccess(1.0, quiet_s=4.0, seed=1)
+    medium = Csma(1.0, quiet_s=4.0, seed=1)
     medium.sent(0.0, 1000.0)
     medium.heard(1003.0)
     assert medium.wait_s(6.0, 1003.0) == 4.0
@@ -103,12 +103,12 @@ def test_random_access_defers_to_others_and_survives_a_clock_that_is_set_back():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: Slots(10.0, 5.0, 6.0, 0.0),
-        lambda: Slots(10.0, 0.0, 5.0, 6.0),
+        lambda: Tdma(10.0, 5.0, 6.0, 0.0),
+        lambda: Tdma(10.0, 0.0, 5.0, 6.0),
         lambda: Continuous(0.0, 1.0),
         lambda: Continuous(1.0, -1.0),
-        lambda: RandomAccess(-1.0),
-        lambda: RandomAccess(float("nan")),
+        lambda: Csma(-1.0),
+        lambda: Csma(float("nan")),
     ],
 )
 def test_times_out_of_range_are_named(make):

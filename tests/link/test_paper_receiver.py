@@ -21,8 +21,8 @@ from sonarpost.link.frames.paper.receiver import (
     Event,
     FrameRejected,
     ImageReady,
-    PairingReceiver,
-    ReceiverCounts,
+    PaperReceiver,
+    PaperReceiverCounts,
 )
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "link" / "paper_receiver.json").read_text())["scenarios"]
@@ -81,7 +81,7 @@ def describe(event: Event) -> dict[str, Any]:
 
 @pytest.mark.parametrize("case", GOLDEN, ids=[c["name"] for c in GOLDEN])
 def test_golden_scenarios(case: dict[str, Any]) -> None:
-    receiver = PairingReceiver(case["timeout_s"])
+    receiver = PaperReceiver(case["timeout_s"])
     for step in case["steps"]:
         if "frame" in step:
             events = receiver.accept(step["source"], bytes.fromhex(step["frame"]), step["at"])
@@ -91,7 +91,7 @@ def test_golden_scenarios(case: dict[str, Any]) -> None:
 
 
 def test_an_event_carries_times_stream_and_mask_for_the_decoder() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     assert receiver.accept(2, piece(0, 2), 10) == []
     assert receiver.accept(2, contact(), 11) == []
     assert receiver.accept(2, piece(5, 8), 12) == []
@@ -106,7 +106,7 @@ def test_an_event_carries_times_stream_and_mask_for_the_decoder() -> None:
 
 
 def test_the_wait_counts_from_the_last_frame_that_added_something() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, piece(0, 2), 0)
     receiver.accept(2, piece(2, 3), 50)
     receiver.accept(2, piece(0, 3), 100)  # nothing new
@@ -118,7 +118,7 @@ def test_the_wait_counts_from_the_last_frame_that_added_something() -> None:
 
 
 def test_accept_first_gives_out_what_is_due() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, half("top"), 0)
     first, second = images(receiver.accept(2, half("bottom"), 1000))
     assert (first.version, first.complete) == (1, False)
@@ -126,7 +126,7 @@ def test_accept_first_gives_out_what_is_due() -> None:
 
 
 def test_a_late_frame_does_not_push_out_the_image_that_waits() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, half("top", "00A7"), 0)
     (old,) = images(receiver.accept(2, half("top", "00A8"), 1))
     assert old.image_id == "00A7"
@@ -137,7 +137,7 @@ def test_a_late_frame_does_not_push_out_the_image_that_waits() -> None:
 
 
 def test_an_image_reopened_by_a_late_frame_is_given_out_with_the_next_image() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, piece(0, 2), 0)
     assert [e.version for e in images(receiver.accept(2, half("top", "00A8"), 1))] == [1]
     assert receiver.accept(2, piece(2, 3), 2) == []
@@ -147,13 +147,13 @@ def test_an_image_reopened_by_a_late_frame_is_given_out_with_the_next_image() ->
 
 @pytest.mark.parametrize("image_ids", [["00A7"], ["00A8"]])
 def test_a_contact_frame_pushes_nothing_out(image_ids: list[str]) -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, half("top"), 0)
     assert [e for i in image_ids for e in receiver.accept(2, contact(i), 1)] == []
 
 
 def test_a_half_of_another_image_leaves_a_contact_record_waiting_for_its_picture() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, contact("00A7"), 0)
     assert receiver.accept(2, half("top", "00A8"), 1) == []
     (event,) = receiver.poll(60)
@@ -162,7 +162,7 @@ def test_a_half_of_another_image_leaves_a_contact_record_waiting_for_its_picture
 
 
 def test_a_second_different_contact_record_is_counted_and_the_first_stays() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     other = dataclasses.replace(CONTACT, lat_deg=45.0)
     receiver.accept(2, contact(), 0)
     receiver.accept(2, contact(record=other), 1)
@@ -171,11 +171,11 @@ def test_a_second_different_contact_record_is_counted_and_the_first_stays() -> N
     assert isinstance(event, ContactOnly)
     assert event.contact == CONTACT
     assert event.conflicts == 1
-    assert receiver.counts == ReceiverCounts(frames=3, duplicates=2, conflicts=1, contacts_only=1)
+    assert receiver.counts == PaperReceiverCounts(frames=3, duplicates=2, conflicts=1, contacts_only=1)
 
 
 def test_bytes_that_are_there_stay_when_a_repetition_says_otherwise() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, piece(0, 3), 0)
     damaged = HalfFrame("top", "00A7", 1, 9, HEADER, b"\xa2\x00\xa4\xa5").pack()
     receiver.accept(2, damaged, 1)
@@ -186,7 +186,7 @@ def test_bytes_that_are_there_stay_when_a_repetition_says_otherwise() -> None:
 
 def test_the_checked_contact_record_decides_between_stream_headers() -> None:
     wrong = StreamHeader(0x10, 0xBEEF, 113, 48)
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, HalfFrame("top", "00A7", 0, 9, wrong, BODY[:2]).pack(), 0)
     receiver.accept(2, HalfFrame("top", "00A7", 2, 9, wrong, BODY[2:4]).pack(), 1)
     receiver.accept(2, half("top"), 2)
@@ -198,7 +198,7 @@ def test_the_checked_contact_record_decides_between_stream_headers() -> None:
 
 def test_more_frames_outvote_more_bytes() -> None:
     wrong = StreamHeader(0x10, 0xBEEF, 113, 48)
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, half("top", header=wrong), 0)
     receiver.accept(2, piece(0, 1), 1)
     receiver.accept(2, piece(1, 2), 2)
@@ -208,7 +208,7 @@ def test_more_frames_outvote_more_bytes() -> None:
 
 def test_a_header_outvoted_after_it_was_given_out_is_corrected_by_a_new_version() -> None:
     wrong = StreamHeader(0x10, 0xBEEF, 113, 48)
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, half("top", header=wrong), 0)
     assert [e.header for e in images(receiver.poll(60))] == [wrong]
     assert receiver.accept(2, half("top"), 61) == []  # a draw: the first one stays, nothing new to give out
@@ -218,18 +218,18 @@ def test_a_header_outvoted_after_it_was_given_out_is_corrected_by_a_new_version(
 
 
 def test_a_fourth_stream_header_is_refused() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     for width in (49, 50, 51):
         assert receiver.accept(2, half("top", header=dataclasses.replace(HEADER, width_px=width)), 0) == []
     (event,) = receiver.accept(2, half("top", header=dataclasses.replace(HEADER, width_px=52)), 1)
     assert isinstance(event, FrameRejected)
     assert event.source == 2
     assert event.reason.field == "stream header"
-    assert receiver.counts == ReceiverCounts(frames=4, rejected=1, conflicts=3)
+    assert receiver.counts == PaperReceiverCounts(frames=4, rejected=1, conflicts=3)
 
 
 def test_frames_that_disagree_on_the_body_length_are_kept_apart() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     longer = HalfFrame("top", "00A7", 0, 300, HEADER, bytes(16)).pack()
     assert receiver.accept(2, longer, 0) == []
     assert receiver.accept(2, half("top"), 1) == []
@@ -240,23 +240,23 @@ def test_frames_that_disagree_on_the_body_length_are_kept_apart() -> None:
 
 
 def test_a_fourth_body_length_is_refused() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     for length in (9, 10, 11):
         assert receiver.accept(2, HalfFrame("top", "00A7", 0, length, HEADER, b"x").pack(), 0) == []
     (event,) = receiver.accept(2, HalfFrame("top", "00A7", 0, 12, HEADER, b"x").pack(), 1)
     assert isinstance(event, FrameRejected)
-    assert receiver.counts == ReceiverCounts(frames=4, rejected=1, conflicts=3)
+    assert receiver.counts == PaperReceiverCounts(frames=4, rejected=1, conflicts=3)
 
 
 @pytest.mark.parametrize("length", [0, 1])
 def test_an_image_without_a_bottom_half_is_complete_with_its_top(length: int) -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     (event,) = images(receiver.accept(2, half("top", body=BODY[:length]), 0))
     assert (event.complete, event.body, event.missing_halves) == (True, BODY[:length], ())
 
 
 def test_a_frame_without_body_bytes_announces_the_picture() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, half("bottom")[:16], 0)
     (event,) = images(receiver.poll(60))
     assert (event.received, event.body, event.missing_halves) == ((), bytes(9), ("top", "bottom"))
@@ -264,7 +264,7 @@ def test_a_frame_without_body_bytes_announces_the_picture() -> None:
 
 
 def test_an_identifier_used_again_much_later_is_a_new_image() -> None:
-    receiver = PairingReceiver(60, memory_s=3600)
+    receiver = PaperReceiver(60, memory_s=3600)
     receiver.accept(2, half("top"), 0)
     receiver.accept(2, half("bottom"), 1)
     assert receiver.accept(2, half("top"), 3601) == []
@@ -275,7 +275,7 @@ def test_an_identifier_used_again_much_later_is_a_new_image() -> None:
 
 
 def test_a_clock_that_is_set_back_does_not_hold_an_image() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, half("top"), 1_000_000)
     assert receiver.poll(500) == []
     assert receiver.next_deadline() == 560
@@ -283,16 +283,16 @@ def test_a_clock_that_is_set_back_does_not_hold_an_image() -> None:
 
 
 def test_a_clock_that_was_set_back_stays_so_over_a_restart() -> None:
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     receiver.accept(2, half("top"), 1_000_000)
     receiver.poll(500)
-    other = PairingReceiver(60)
+    other = PaperReceiver(60)
     other.restore(receiver.snapshot())
     assert other.next_deadline() == 560
 
 
 def test_a_clock_that_is_set_back_does_not_make_the_memory_longer() -> None:
-    receiver = PairingReceiver(60, memory_s=3600)
+    receiver = PaperReceiver(60, memory_s=3600)
     receiver.accept(2, half("top"), 1_000_000)
     receiver.accept(2, half("bottom"), 1_000_000)
     receiver.poll(500)
@@ -302,7 +302,7 @@ def test_a_clock_that_is_set_back_does_not_make_the_memory_longer() -> None:
 
 
 def test_memory_is_bounded_and_nothing_is_dropped_unsaid() -> None:
-    receiver = PairingReceiver(60, max_images=4)
+    receiver = PaperReceiver(60, max_images=4)
     events: list[Event] = []
     for number in range(50):
         frame = HalfFrame("top", format_image_id(number), 0, 65535, HEADER, b"x").pack()
@@ -315,7 +315,7 @@ def test_memory_is_bounded_and_nothing_is_dropped_unsaid() -> None:
 
 
 def test_making_room_forgets_what_was_given_out_before_what_waits() -> None:
-    receiver = PairingReceiver(60, max_images=2)
+    receiver = PaperReceiver(60, max_images=2)
     receiver.accept(1, half("top"), 0)
     receiver.accept(2, half("top"), 1)
     assert len(images(receiver.accept(2, half("bottom"), 2))) == 1
@@ -325,7 +325,7 @@ def test_making_room_forgets_what_was_given_out_before_what_waits() -> None:
 
 
 def test_contact_frames_alone_are_bounded_too() -> None:
-    receiver = PairingReceiver(60, max_images=3)
+    receiver = PaperReceiver(60, max_images=3)
     events = [e for n in range(10) for e in receiver.accept(2, contact(format_image_id(n)), n / 10)]
     assert [e.image_id for e in events if isinstance(e, ContactOnly)] == [format_image_id(n) for n in range(7)]
 
@@ -342,11 +342,11 @@ def test_contact_frames_alone_are_bounded_too() -> None:
 )
 def test_settings_that_cannot_work_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="timeout_s > 0"):
-        PairingReceiver(**settings)
+        PaperReceiver(**settings)
 
 
-def busy_receiver() -> PairingReceiver:
-    receiver = PairingReceiver(60)
+def busy_receiver() -> PaperReceiver:
+    receiver = PaperReceiver(60)
     receiver.accept(2, half("top"), 0)
     receiver.accept(2, half("bottom"), 1)
     receiver.accept(2, contact("00A8"), 2)
@@ -359,7 +359,7 @@ def busy_receiver() -> PairingReceiver:
 def test_the_state_survives_msgpack_and_is_the_same_state() -> None:
     receiver = busy_receiver()
     state = msgpack.unpackb(msgpack.packb(receiver.snapshot()))
-    other = PairingReceiver(60)
+    other = PaperReceiver(60)
     other.restore(state)
     assert other.snapshot() == receiver.snapshot()
     assert other.counts == receiver.counts
@@ -424,4 +424,4 @@ def test_too_many_candidates_in_a_state_are_refused() -> None:
     state: Any = busy_receiver().snapshot()
     state["images"][0]["candidates"] *= 4
     with pytest.raises(FrameError, match="candidates"):
-        PairingReceiver(60).restore(state)
+        PaperReceiver(60).restore(state)

@@ -16,7 +16,7 @@ from sonarpost.errors import FrameError
 from sonarpost.link.coding.byte_ranges import Ranges
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, parse_frame
-from sonarpost.link.frames.paper.receiver import ContactOnly, Event, FrameRejected, ImageReady, PairingReceiver
+from sonarpost.link.frames.paper.receiver import ContactOnly, Event, FrameRejected, ImageReady, PaperReceiver
 from sonarpost.link.frames.paper.sender import plan_packets
 
 RATES = [(1, 32), (3, 64), (2, 256), (6, 32)]
@@ -96,7 +96,7 @@ def reaches_the_end(frame: bytes) -> bool:
     return isinstance(parsed, ContactFrame) or parse_frame(frame + b"\0") == parsed
 
 
-def take(receiver: PairingReceiver, step: Step) -> list[Event]:
+def take(receiver: PaperReceiver, step: Step) -> list[Event]:
     if step.frame is None:
         return receiver.poll(step.at)
     return receiver.accept(step.source, step.frame, step.at)
@@ -157,7 +157,7 @@ def test_any_frames_in_any_order_give_right_bytes_and_every_version_once(
     delivery: tuple[list[Sent], list[Step]],
 ) -> None:
     images, steps = delivery
-    receiver, ledger = PairingReceiver(TIMEOUT_S), Ledger(images)
+    receiver, ledger = PaperReceiver(TIMEOUT_S), Ledger(images)
     for step in steps:
         parses = step.frame is None or ledger.deliver(step)
         events = take(receiver, step)
@@ -183,11 +183,11 @@ def test_any_frames_in_any_order_give_right_bytes_and_every_version_once(
 @given(deliveries(), st.integers(1, 4))
 def test_a_restart_at_every_point_changes_nothing(delivery: tuple[list[Sent], list[Step]], max_images: int) -> None:
     steps = [*delivery[1], Step(1e9, 0, None)]
-    steady = PairingReceiver(TIMEOUT_S, max_images=max_images)
-    restarted = PairingReceiver(TIMEOUT_S, max_images=max_images)
+    steady = PaperReceiver(TIMEOUT_S, max_images=max_images)
+    restarted = PaperReceiver(TIMEOUT_S, max_images=max_images)
     for step in steps:
         state = msgpack.unpackb(msgpack.packb(restarted.snapshot()))
-        restarted = PairingReceiver(TIMEOUT_S, max_images=max_images)
+        restarted = PaperReceiver(TIMEOUT_S, max_images=max_images)
         restarted.restore(state)
         assert comparable(take(restarted, step)) == comparable(take(steady, step))
         assert restarted.next_deadline() == steady.next_deadline()
@@ -217,7 +217,7 @@ def hostile_frames(draw: st.DrawFn) -> bytes:
 def test_hostile_frames_at_wild_times_never_raise_and_memory_stays_bounded(
     arrivals: list[tuple[int, bytes, float]],
 ) -> None:
-    receiver = PairingReceiver(TIMEOUT_S, max_images=3)
+    receiver = PaperReceiver(TIMEOUT_S, max_images=3)
     versions: dict[Key, int] = {}
     told: dict[Key, set[tuple[StreamHeader, int]]] = defaultdict(set)
     for source, frame, now in arrivals:

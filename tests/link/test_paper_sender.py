@@ -14,7 +14,7 @@ from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, half_bounds, parse_frame
-from sonarpost.link.frames.paper.receiver import ImageReady, PairingReceiver
+from sonarpost.link.frames.paper.receiver import ImageReady, PaperReceiver
 from sonarpost.link.frames.paper.sender import Packet, body_capacity_bytes, plan_packets
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "link" / "paper_packets.json").read_text())["plans"]
@@ -164,7 +164,7 @@ def test_capacity_for_a_header_that_there_is_not_is_refused(header_bytes: int) -
 @given(st.integers(0, 700), st.sampled_from(sorted(RATES)), st.sampled_from(sorted(HEADERS)))
 def test_a_picture_sent_without_loss_is_complete_with_its_position(length: int, rate: int, header_bytes: int) -> None:
     stream = make_stream(length, header_bytes)
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     plan = plan_packets("0K3P", stream, CONTACT, *RATES[rate])
     events = [e for packet in plan for frame in packet for e in receiver.accept(2, frame, 0)]
     (event,) = events  # one version: nothing that comes later was worth another

@@ -8,7 +8,7 @@ import pytest
 from sonarpost.codec.vq.codec import VqCodec
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.paper.receiver import ImageReady, PairingReceiver
+from sonarpost.link.frames.paper.receiver import ImageReady, PaperReceiver
 from sonarpost.link.frames.paper.sender import Packet, plan_packets
 
 HEIGHT_PX, WIDTH_PX, TILE_PX = 80, 140, 10
@@ -27,7 +27,7 @@ def codec(picture: np.ndarray) -> VqCodec:
 
 def send(packets: tuple[Packet, ...], lost: set[int]) -> ImageReady:
     """Hand over every packet but the lost ones, each as long after the one before as at rate 1."""
-    receiver = PairingReceiver(60)
+    receiver = PaperReceiver(60)
     events = []
     for number, packet in enumerate(packets):
         if number not in lost:

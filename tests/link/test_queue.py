@@ -12,8 +12,8 @@ from sonarpost.errors import ConfigError, FrameError
 from sonarpost.link.events import ContactUpdate, MessageReceived
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.queue.state import export_queue, restore_queue
-from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName, QueueConfig
-from sonarpost.link.receiver import Receiver
+from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, TransmitQueue
+from sonarpost.link.receiver import LinkReceiver
 from sonarpost.modem.micromodem.rates import RATES
 
 CONTACT = ContactSummary(height_px=80, width_px=80, lat_deg=56.4, lon_deg=-5.6, confidence=1.5)
@@ -23,15 +23,15 @@ def stream(number: int, length: int = 300) -> bytes:
     return np.random.default_rng(number).bytes(length)
 
 
-def filled(queue: AcousticQueue, pictures: int, now: float = 0.0) -> AcousticQueue:
+def filled(queue: TransmitQueue, pictures: int, now: float = 0.0) -> TransmitQueue:
     for number in range(1, pictures + 1):
-        assert queue.add_picture(number, PictureName(f"{number:04d}", f"c{number}"), CONTACT, stream(number), now)
+        assert queue.add_picture(number, ImageName(f"{number:04d}", f"c{number}"), CONTACT, stream(number), now)
     return queue
 
 
-def run(queue: AcousticQueue, seconds: float, *, now: float = 0.0, lost=lambda: False, receiver=None, reports=False):
+def run(queue: TransmitQueue, seconds: float, *, now: float = 0.0, lost=lambda: False, receiver=None, reports=False):
     """Send for so long; return events with times, and the time."""
-    receiver = receiver or Receiver()
+    receiver = receiver or LinkReceiver()
     found, end = [], now + seconds
     while now < end:
         packet = queue.next_packet(now)
@@ -54,8 +54,8 @@ def messages(events) -> list[bytes]:
 
 
 def test_every_contact_is_seen_before_the_detail_of_any():
-    queue = filled(AcousticQueue(QueueConfig(expected_loss=0.0)), 120)
-    receiver, now, first = Receiver(), 0.0, None
+    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0)), 120)
+    receiver, now, first = LinkReceiver(), 0.0, None
     seen: set[int] = set()
     while len(seen) < 120:
         for frame in queue.next_packet(now):
@@ -70,19 +70,19 @@ def test_every_contact_is_seen_before_the_detail_of_any():
 
 
 def test_messages_go_by_priority_and_an_urgent_one_waits_for_one_packet_at_most():
-    queue = filled(AcousticQueue(QueueConfig(expected_loss=0.0)), 20)
+    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0)), 20)
     for n in range(200):
         queue.add_message(f"m{n}", "status", b"%4d" % n * 10, 0.0, priority=5)
     run(queue, 30.0)
     queue.add_message("alarm", "safety", b"leak", 30.0, priority=1)
-    receiver = Receiver()
+    receiver = LinkReceiver()
     packet = queue.next_packet(30.0)
     first = [e for frame in packet for e in receiver.accept(3, frame, 30.0)]
     assert b"leak" in messages(first)
 
 
 def test_programs_of_one_priority_share_the_water_whatever_they_send():
-    queue = AcousticQueue(QueueConfig(expected_loss=0.0))
+    queue = TransmitQueue(QueueConfig(expected_loss=0.0))
     for n in range(600):
         queue.add_message(f"m{n}", "chatty", b"C" * 50, 0.0, priority=4, lifetime_s=1e5)
     for n in range(40):
@@ -96,10 +96,10 @@ def test_programs_of_one_priority_share_the_water_whatever_they_send():
 
 
 def test_pictures_keep_their_share_in_a_flood_and_a_flood_is_not_starved():
-    queue = filled(AcousticQueue(QueueConfig(expected_loss=0.0, picture_share=0.25)), 4)
+    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0, picture_share=0.25)), 4)
     for n in range(1500):
         queue.add_message(f"m{n}", "flood", b"F" * 55, 0.0, priority=1, lifetime_s=1e5)
-    receiver, now, pictures, frames = Receiver(), 0.0, 0, 0
+    receiver, now, pictures, frames = LinkReceiver(), 0.0, 0, 0
     while queue.open_numbers():
         for frame in queue.next_packet(now):
             pictures += not messages(receiver.accept(3, frame, now))
@@ -111,14 +111,14 @@ def test_pictures_keep_their_share_in_a_flood_and_a_flood_is_not_starved():
 
 def test_what_fills_only_gets_through_when_it_has_aged():
     def frames_until_it_goes(priority: int) -> float:
-        queue = AcousticQueue(QueueConfig(expected_loss=0.0, aging_s=600.0))
+        queue = TransmitQueue(QueueConfig(expected_loss=0.0, aging_s=600.0))
         queue.add_message("log", "logger", b"L" * 55, 0.0, priority=priority, lifetime_s=1e6)
         now, n = 0.0, 0
-        receiver = Receiver()
+        receiver = LinkReceiver()
         while True:
             n += 1
             if n % 2:  # never idle, and no room left
-                queue.add_picture(n, PictureName("0001", "c"), CONTACT, stream(n), now)
+                queue.add_picture(n, ImageName("0001", "c"), CONTACT, stream(n), now)
             for frame in queue.next_packet(now):
                 if messages(receiver.accept(3, frame, now)):
                     return now
@@ -129,7 +129,7 @@ def test_what_fills_only_gets_through_when_it_has_aged():
 
 
 def test_what_has_expired_is_not_sent_and_counted():
-    queue = AcousticQueue(QueueConfig())
+    queue = TransmitQueue(QueueConfig())
     queue.add_message("old", "s", b"old", 0.0, lifetime_s=10.0)
     assert not queue.add_message("older", "s", b"older", 0.0, lifetime_s=-1.0)
     queue.add_message("new", "s", b"new", 0.0, lifetime_s=100.0)
@@ -140,7 +140,7 @@ def test_what_has_expired_is_not_sent_and_counted():
 
 
 def test_a_message_given_twice_goes_once_and_two_programs_may_use_one_name():
-    queue = AcousticQueue(QueueConfig(expected_loss=0.0))
+    queue = TransmitQueue(QueueConfig(expected_loss=0.0))
     assert queue.add_message("1", "a", b"one", 0.0)
     assert not queue.add_message("1", "a", b"one", 0.0)
     assert queue.add_message("1", "b", b"two", 0.0)
@@ -150,10 +150,10 @@ def test_a_message_given_twice_goes_once_and_two_programs_may_use_one_name():
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.5])
 def test_with_reports_everything_arrives_whatever_is_lost(share):
-    queue = filled(AcousticQueue(QueueConfig(expected_loss=0.3)), 12)
+    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.3)), 12)
     for n in range(60):
         queue.add_message(f"m{n}", "s", b"%3d" % n * 5, 0.0, priority=4, lifetime_s=1e5)
-    receiver = Receiver()
+    receiver = LinkReceiver()
     run(queue, 6000.0, lost=losses(share), receiver=receiver, reports=True)
     state = {c["number"]: c for s in receiver.snapshot()["sources"] for c in s["contacts"]}
     assert set(state) == set(range(1, 13))
@@ -164,12 +164,12 @@ def test_with_reports_everything_arrives_whatever_is_lost(share):
 
 
 def test_a_receiver_that_falls_silent_stops_nothing():
-    queue = filled(AcousticQueue(QueueConfig(rates=(0, 1), first_rate=1, feedback_memory_s=300.0)), 30)
-    receiver = Receiver()
+    queue = filled(TransmitQueue(QueueConfig(rates=(0, 1), first_rate=1, feedback_memory_s=300.0)), 30)
+    receiver = LinkReceiver()
     _, now = run(queue, 300.0, receiver=receiver, reports=True)
     assert queue.sender.config.feedback
     for number in range(31, 61):
-        queue.add_picture(number, PictureName(f"{number:04d}", "c"), CONTACT, stream(number), now)
+        queue.add_picture(number, ImageName(f"{number:04d}", "c"), CONTACT, stream(number), now)
     _, now = run(queue, 12_000.0, now=now, receiver=receiver)
     assert not queue.sender.config.feedback
     assert queue.rate == 0
@@ -177,13 +177,13 @@ def test_a_receiver_that_falls_silent_stops_nothing():
 
 
 def test_the_rate_follows_the_loss():
-    queue = filled(AcousticQueue(QueueConfig(rates=(1, 5), first_rate=5, stream_bytes=4000)), 0)
-    receiver, now = Receiver(), 0.0
+    queue = filled(TransmitQueue(QueueConfig(rates=(1, 5), first_rate=5, stream_bytes=4000)), 0)
+    receiver, now = LinkReceiver(), 0.0
     rates = []
     lost = {1: losses(0.05), 5: losses(0.97)}
     for n in range(1, 200):
         if len(queue.open_numbers()) < 3:
-            queue.add_picture(n, PictureName("0001", "c"), CONTACT, stream(n, 2000), now)
+            queue.add_picture(n, ImageName("0001", "c"), CONTACT, stream(n, 2000), now)
         for frame in queue.next_packet(now):
             if not lost[queue.rate]():
                 receiver.accept(3, frame, now)
@@ -196,7 +196,7 @@ def test_the_rate_follows_the_loss():
 
 
 def test_expected_times_come_true():
-    queue = filled(AcousticQueue(QueueConfig(expected_loss=0.2)), 10)
+    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.2)), 10)
     queue.next_packet(0.0)
     told = {e.name.image_id: e for e in queue.expected(0.0)}
     assert set(told) == {f"{n:04d}" for n in range(1, 11)}
@@ -215,9 +215,9 @@ def test_expected_times_come_true():
     assert queue.expected(now) == []
 
 
-def copy_of(queue: AcousticQueue, seal=None) -> AcousticQueue:
+def copy_of(queue: TransmitQueue, seal=None) -> TransmitQueue:
     parts = {name: msgpack.packb(part) for name, part in export_queue(queue).items()}
-    again = AcousticQueue(queue.config, seal=seal)
+    again = TransmitQueue(queue.config, seal=seal)
     restore_queue(again, {name: msgpack.unpackb(data, strict_map_key=False) for name, data in parts.items()})
     return again
 
@@ -225,11 +225,11 @@ def copy_of(queue: AcousticQueue, seal=None) -> AcousticQueue:
 @settings(max_examples=25)
 @given(st.data())
 def test_a_queue_that_was_saved_and_taken_up_sends_what_it_would_have_sent(data):
-    queue = filled(AcousticQueue(QueueConfig(rates=(0, 1), first_rate=1)), data.draw(st.integers(0, 30)))
+    queue = filled(TransmitQueue(QueueConfig(rates=(0, 1), first_rate=1)), data.draw(st.integers(0, 30)))
     for n in range(data.draw(st.integers(0, 20))):
         priority = data.draw(st.integers(1, 7))
         queue.add_message(f"m{n}", "ab"[n % 2], bytes([n + 1]) * (n + 1), 0.0, priority=priority)
-    receiver = Receiver()
+    receiver = LinkReceiver()
     _, now = run(queue, data.draw(st.floats(0, 400)), receiver=receiver, reports=data.draw(st.booleans()))
     again = copy_of(queue)
     assert export_queue(again) == export_queue(queue)
@@ -240,7 +240,7 @@ def test_a_queue_that_was_saved_and_taken_up_sends_what_it_would_have_sent(data)
 
 
 def test_most_parts_do_not_change_with_a_packet():
-    queue = filled(AcousticQueue(QueueConfig()), 30)
+    queue = filled(TransmitQueue(QueueConfig()), 30)
     queue.next_packet(0.0)
     before = {name: msgpack.packb(part) for name, part in export_queue(queue).items()}
     queue.next_packet(7.0)
@@ -251,20 +251,20 @@ def test_most_parts_do_not_change_with_a_packet():
 
 
 def test_a_state_that_is_none_is_refused():
-    good = export_queue(filled(AcousticQueue(QueueConfig()), 3))
+    good = export_queue(filled(TransmitQueue(QueueConfig()), 3))
     core = dict(good["core"])
     for bad in ({}, {"core": {**core, "format": 2}}, {**good, "core": {**core, "rate": 9}}, {"core": core}):
         with pytest.raises(FrameError):
-            restore_queue(AcousticQueue(QueueConfig()), bad)
+            restore_queue(TransmitQueue(QueueConfig()), bad)
 
 
 def test_a_rate_that_is_no_longer_configured_is_left():
-    queue = filled(AcousticQueue(QueueConfig(rates=(5,), first_rate=5)), 5)
+    queue = filled(TransmitQueue(QueueConfig(rates=(5,), first_rate=5)), 5)
     queue.next_packet(0.0)
-    again = AcousticQueue(QueueConfig(rates=(1,), first_rate=1))
+    again = TransmitQueue(QueueConfig(rates=(1,), first_rate=1))
     restore_queue(again, export_queue(queue))
     assert again.rate == 1
-    receiver = Receiver()
+    receiver = LinkReceiver()
     events, _ = run(again, 600.0, receiver=receiver)
     assert {e.number for e in events if isinstance(e, ContactUpdate)} == {1, 2, 3, 4, 5}
 
@@ -280,13 +280,13 @@ def test_values_out_of_range_are_named(wrong):
 
 def test_a_rate_that_there_is_not_is_named():
     with pytest.raises(ConfigError, match="rate"):
-        AcousticQueue(QueueConfig(rates=(1,), first_rate=4))
+        TransmitQueue(QueueConfig(rates=(1,), first_rate=4))
 
 
 def test_a_longer_stream_of_a_picture_that_has_gone_brings_only_what_is_new():
-    queue = AcousticQueue(QueueConfig(expected_loss=0.0))
-    name, whole = PictureName("0001", "c1"), stream(1, 1200)
-    receiver = Receiver()
+    queue = TransmitQueue(QueueConfig(expected_loss=0.0))
+    name, whole = ImageName("0001", "c1"), stream(1, 1200)
+    receiver = LinkReceiver()
     queue.add_picture(1, name, CONTACT, whole[:300], 0.0)
     _, now = run(queue, 200.0, receiver=receiver)
     assert not queue.open_numbers()
@@ -299,8 +299,8 @@ def test_a_longer_stream_of_a_picture_that_has_gone_brings_only_what_is_new():
 
 
 def test_a_picture_that_is_given_again_goes_again_unless_it_waits():
-    queue = AcousticQueue(QueueConfig(expected_loss=0.0))
-    name = PictureName("0001", "c1")
+    queue = TransmitQueue(QueueConfig(expected_loss=0.0))
+    name = ImageName("0001", "c1")
     assert queue.add_picture(1, name, CONTACT, stream(1), 0.0)
     assert not queue.add_picture(1, name, CONTACT, stream(1), 0.0)
     _, now = run(queue, 200.0)
@@ -310,9 +310,9 @@ def test_a_picture_that_is_given_again_goes_again_unless_it_waits():
 
 
 def test_a_picture_of_which_more_is_here_is_refined_at_once():
-    queue = AcousticQueue(QueueConfig(expected_loss=0.0, frames_per_picture=3.0))
-    queue.add_picture(1, PictureName("0001", "c1"), CONTACT, stream(1, 900), 0.0)
-    receiver = Receiver()
+    queue = TransmitQueue(QueueConfig(expected_loss=0.0, frames_per_picture=3.0))
+    queue.add_picture(1, ImageName("0001", "c1"), CONTACT, stream(1, 900), 0.0)
+    receiver = LinkReceiver()
     _, now = run(queue, 200.0, receiver=receiver)
     assert queue.refine(1, 900, now)
     events, _ = run(queue, 600.0, now=now, receiver=receiver)
@@ -320,8 +320,8 @@ def test_a_picture_of_which_more_is_here_is_refined_at_once():
 
 
 def test_a_longer_stream_that_does_not_continue_what_was_sent_is_not_mixed_with_it():
-    queue = AcousticQueue(QueueConfig(expected_loss=0.0))
-    queue.add_picture(1, PictureName("0001", "c1"), CONTACT, stream(1, 300), 0.0)
+    queue = TransmitQueue(QueueConfig(expected_loss=0.0))
+    queue.add_picture(1, ImageName("0001", "c1"), CONTACT, stream(1, 300), 0.0)
     _, now = run(queue, 200.0)
-    assert not queue.add_picture(1, PictureName("0001", "c1"), CONTACT, stream(2, 600), now)
+    assert not queue.add_picture(1, ImageName("0001", "c1"), CONTACT, stream(2, 600), now)
     assert not queue.open_numbers()

@@ -12,23 +12,24 @@ from link.seal_world import VEHICLE, VESSEL, key, skip, vehicle_seal, vessel_sea
 from link.v1_world import contact, stream
 
 from sonarpost.errors import ConfigError, FrameError
-from sonarpost.link.auth.authentication import RESERVED, AcousticSeal, SealCounts
-from sonarpost.link.auth.key import Direction, SealSettings
+from sonarpost.link.auth.authentication import RESERVED, AuthenticationCounts, FrameAuthenticator
+from sonarpost.link.auth.key import AuthenticationSettings, Direction
 from sonarpost.link.auth.replay_window import WINDOW, ReplayWindow
-from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
-from sonarpost.link.events import ContactUpdate, FrameRefused, ReportReceived
+from sonarpost.link.events import ContactUpdate, FeedbackReceived, FrameRefused
 from sonarpost.link.frames.v1.frame import Symbol, SymbolKind, checksum, pack_symbol, parse_frame
-from sonarpost.link.receiver import Receiver
-from sonarpost.link.sender import Sender
+from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.sender import LinkSender
 
 ALL_SETTINGS = [
-    SealSettings(counter, tag, encrypt) for counter, tag, encrypt in itertools.product((1, 2), (4, 6, 8), (False, True))
+    AuthenticationSettings(counter, tag, encrypt)
+    for counter, tag, encrypt in itertools.product((1, 2), (4, 6, 8), (False, True))
 ]
 COVERED = b"\x80 a frame after its checksum"
 
 
-def refusal(seal: AcousticSeal, sealed: bytes, source: int = VEHICLE) -> str:
+def refusal(seal: FrameAuthenticator, sealed: bytes, source: int = VEHICLE) -> str:
     """The field of the error with which a frame is refused."""
     with pytest.raises(FrameError) as caught:
         seal.open(source, sealed)
@@ -36,7 +37,7 @@ def refusal(seal: AcousticSeal, sealed: bytes, source: int = VEHICLE) -> str:
 
 
 @pytest.mark.parametrize("settings", ALL_SETTINGS, ids=str)
-def test_a_sealed_frame_opens_and_costs_what_it_says(settings: SealSettings) -> None:
+def test_a_sealed_frame_opens_and_costs_what_it_says(settings: AuthenticationSettings) -> None:
     vehicle, vessel = vehicle_seal(settings), vessel_seal(settings)
     for covered in (COVERED, b"\x80", b"\x80" + bytes(300)):
         sealed = vehicle.seal(covered)
@@ -44,11 +45,11 @@ def test_a_sealed_frame_opens_and_costs_what_it_says(settings: SealSettings) -> 
         assert sealed[0] == 0x80
         assert (covered[1:] in sealed) == (not settings.encrypt or len(covered) == 1)
         assert vessel.open(VEHICLE, sealed) == covered
-    assert (vehicle.counts, vessel.counts) == (SealCounts(sealed=3), SealCounts(genuine=3))
+    assert (vehicle.counts, vessel.counts) == (AuthenticationCounts(sealed=3), AuthenticationCounts(genuine=3))
 
 
-@pytest.mark.parametrize("settings", [SealSettings(), SealSettings(encrypt=True)], ids=str)
-def test_every_bit_is_covered(settings: SealSettings) -> None:
+@pytest.mark.parametrize("settings", [AuthenticationSettings(), AuthenticationSettings(encrypt=True)], ids=str)
+def test_every_bit_is_covered(settings: AuthenticationSettings) -> None:
     sealed = vehicle_seal(settings).seal(COVERED)
     vessel = vessel_seal(settings)
     for bit in range(8 * len(sealed)):
@@ -64,9 +65,9 @@ def test_who_may_have_sealed_it_matters() -> None:
     vessel = vessel_seal()
     assert refusal(vessel, sealed, VEHICLE + 1) == "tag"  # another vehicle's
     assert refusal(vessel_seal(name="another key"), sealed) == "tag"
-    assert refusal(vessel_seal(SealSettings(encrypt=True)), sealed) == "tag"
-    assert refusal(vessel_seal(SealSettings(tag_bytes=6)), sealed) == "tag"
-    own = AcousticSeal(key("fleet"), VEHICLE, Direction.TO_VEHICLE)
+    assert refusal(vessel_seal(AuthenticationSettings(encrypt=True)), sealed) == "tag"
+    assert refusal(vessel_seal(AuthenticationSettings(tag_bytes=6)), sealed) == "tag"
+    own = FrameAuthenticator(key("fleet"), VEHICLE, Direction.TO_VEHICLE)
     own.grant(10)
     assert refusal(own, own.seal(COVERED)) == "tag"  # its own, come back
     for source in (-1, 128, 2**40):
@@ -84,7 +85,7 @@ def test_a_replay_is_told_from_a_forgery_however_old() -> None:
     for sealed in recorded[::100] + recorded[-70:]:
         assert refusal(vessel, sealed) == "counter"
     assert refusal(vessel, COVERED + b"\x07guess") == "tag"
-    assert vessel.counts == SealCounts(genuine=3000, replayed=100, forged=1)
+    assert vessel.counts == AuthenticationCounts(genuine=3000, replayed=100, forged=1)
 
 
 def test_late_frames_pass_once_if_the_window_still_knows_them() -> None:
@@ -98,8 +99,10 @@ def test_late_frames_pass_once_if_the_window_still_knows_them() -> None:
     assert vessel.counts.genuine == WINDOW
 
 
-@pytest.mark.parametrize(("settings", "bridged"), [(SealSettings(), 191), (SealSettings(2), 65471)], ids=str)
-def test_losses_cost_nothing_up_to_a_bound_and_one_frame_beyond(settings: SealSettings, bridged: int) -> None:
+@pytest.mark.parametrize(
+    ("settings", "bridged"), [(AuthenticationSettings(), 191), (AuthenticationSettings(2), 65471)], ids=str
+)
+def test_losses_cost_nothing_up_to_a_bound_and_one_frame_beyond(settings: AuthenticationSettings, bridged: int) -> None:
     assert bridged + 1 == settings.counter_step - WINDOW
     vehicle, vessel = vehicle_seal(settings), vessel_seal(settings)
     vessel.open(VEHICLE, vehicle.seal(COVERED))
@@ -112,11 +115,11 @@ def test_losses_cost_nothing_up_to_a_bound_and_one_frame_beyond(settings: SealSe
     skip(vehicle, bridged)  # nor need the second be the very next
     assert vessel.open(VEHICLE, vehicle.seal(COVERED)) == COVERED
     assert vessel.open(VEHICLE, vehicle.seal(COVERED)) == COVERED
-    assert vessel.counts == SealCounts(genuine=4, unconfirmed=2)
+    assert vessel.counts == AuthenticationCounts(genuine=4, unconfirmed=2)
 
 
 def test_a_receiver_without_memory_finds_any_counter_of_the_key() -> None:
-    last = SealSettings().lifetime_frames - 2
+    last = AuthenticationSettings().lifetime_frames - 2
     vehicle, vessel = vehicle_seal(first_counter=last), vessel_seal()
     assert refusal(vessel, vehicle.seal(COVERED)) == "counter"
     assert vessel.open(VEHICLE, vehicle.seal(COVERED)) == COVERED
@@ -128,7 +131,7 @@ def test_a_receiver_without_memory_finds_any_counter_of_the_key() -> None:
 def test_counters_are_used_once_whenever_the_sender_crashes() -> None:
     durable, used = 0, []
     for frames_until_crash in (0, 1, 31, 32, 33, 64, 65, 200, 0, 5):
-        seal = AcousticSeal(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=durable)
+        seal = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=durable)
         for _ in range(frames_until_crash):
             if (limit := seal.wanted_limit) is not None:
                 durable = limit
@@ -144,14 +147,14 @@ def test_counters_are_used_once_whenever_the_sender_crashes() -> None:
 
 
 def test_without_a_reservation_nothing_is_sealed() -> None:
-    seal = AcousticSeal(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
+    seal = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
     with pytest.raises(FrameError, match="a limit granted above it"):
         seal.seal(COVERED)
     seal.grant(1)
     seal.seal(COVERED)
     with pytest.raises(FrameError):
         seal.seal(COVERED)
-    for wrong in (0, SealSettings().lifetime_frames + 1):
+    for wrong in (0, AuthenticationSettings().lifetime_frames + 1):
         with pytest.raises(ConfigError, match="limit"):
             seal.grant(wrong)
 
@@ -171,12 +174,12 @@ def test_a_restarted_receiver_still_knows_what_it_took() -> None:
 
 
 def test_a_restored_sender_goes_on_behind_its_reservation() -> None:
-    vehicle = AcousticSeal(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
+    vehicle = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
     vehicle.grant(64)
     vessel = vessel_seal()
     vessel.open(VEHICLE, vehicle.seal(COVERED))
     older = vehicle.snapshot()
-    again = AcousticSeal(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=128)
+    again = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=128)
     again.restore(older)
     assert again.wanted_limit == 128 + RESERVED
     again.grant(128 + RESERVED)
@@ -211,7 +214,7 @@ def test_another_state_is_refused_and_changes_nothing(change: dict[str, object])
 
 
 def test_memory_is_of_genuine_senders_only() -> None:
-    vessel = vessel_seal(SealSettings(2))
+    vessel = vessel_seal(AuthenticationSettings(2))
     for source in range(128):
         assert refusal(vessel, COVERED + b"\0\0fake", source) == "tag"
     assert vessel.snapshot()["windows"] == []
@@ -224,10 +227,10 @@ def test_memory_is_of_genuine_senders_only() -> None:
 @pytest.mark.parametrize("wrong", [{"counter_bytes": 3}, {"counter_bytes": 0}, {"tag_bytes": 5}, {"tag_bytes": 16}])
 def test_settings_out_of_range_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
-        SealSettings(**wrong)  # type: ignore[arg-type]
+        AuthenticationSettings(**wrong)  # type: ignore[arg-type]
     for address, first in ((-1, 0), (128, 0), (1, -1), (1, 2**20 + 1)):
         with pytest.raises(ConfigError, match="acoustic seal"):
-            AcousticSeal(key("fleet"), address, Direction.FROM_VEHICLE, first_counter=first)
+            FrameAuthenticator(key("fleet"), address, Direction.FROM_VEHICLE, first_counter=first)
 
 
 def test_damage_is_told_from_a_wrong_seal() -> None:
@@ -240,7 +243,7 @@ def test_damage_is_told_from_a_wrong_seal() -> None:
         with pytest.raises(FrameError) as caught:
             parse_frame(sent, VEHICLE, vessel)
         assert caught.value.field == field
-    assert vessel.counts == SealCounts(forged=1)
+    assert vessel.counts == AuthenticationCounts(forged=1)
     padded = frame + bytes(192)
     assert parse_frame(padded, VEHICLE, vessel) == Symbol(SymbolKind.OBJECT, 1, 2, 3, bytes(54))
     with pytest.raises(FrameError, match=re.escape("one not taken yet")):
@@ -248,13 +251,13 @@ def test_damage_is_told_from_a_wrong_seal() -> None:
 
 
 @pytest.mark.parametrize("frame_bytes", [32, 64, 256])
-@pytest.mark.parametrize("settings", [SealSettings(), SealSettings(encrypt=True)], ids=str)
-def test_pictures_and_reports_travel_sealed(frame_bytes: int, settings: SealSettings) -> None:
+@pytest.mark.parametrize("settings", [AuthenticationSettings(), AuthenticationSettings(encrypt=True)], ids=str)
+def test_pictures_and_reports_travel_sealed(frame_bytes: int, settings: AuthenticationSettings) -> None:
     up, down = vehicle_seal(settings), vessel_seal(settings)
     down.grant(1000)
-    config = SenderConfig(frame_bytes=frame_bytes, channels=(Channel(0.2),), feedback=True, stream_bytes=200)
-    vehicle, hears = Sender(config, seal=up), Receiver(seal=up)
-    vessel, reports = Receiver(seal=down), Sender(SenderConfig(frame_bytes=32), seal=down)
+    config = SenderConfig(frame_bytes=frame_bytes, channels=(LossChannel(0.2),), feedback=True, stream_bytes=200)
+    vehicle, hears = LinkSender(config, seal=up), LinkReceiver(seal=up)
+    vessel, reports = LinkReceiver(seal=down), LinkSender(SenderConfig(frame_bytes=32), seal=down)
     pictures = {number: stream(number, 200) for number in range(1, 5)}
     for number, data in pictures.items():
         vehicle.add_picture(number, contact(number), data, 0.0)
@@ -278,7 +281,7 @@ def test_pictures_and_reports_travel_sealed(frame_bytes: int, settings: SealSett
             assert told is not None
             reports.add_report(told)
             (report,) = hears.accept(VESSEL, reports.next_frame(now) or b"", now)
-            assert isinstance(report, ReportReceived)
+            assert isinstance(report, FeedbackReceived)
             vehicle.on_report(report.report, now)
     assert vehicle.is_idle
     assert shown == pictures

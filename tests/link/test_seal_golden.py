@@ -13,15 +13,15 @@ from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 from link import seal_golden
 from link.v1_golden import FOLDER
 
-from sonarpost.link.auth.authentication import RESERVED, AcousticSeal
-from sonarpost.link.auth.key import Direction, SealSettings, parse_key
+from sonarpost.link.auth.authentication import RESERVED, FrameAuthenticator
+from sonarpost.link.auth.key import AuthenticationSettings, Direction, parse_key
 from sonarpost.link.auth.replay_window import WINDOW
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, Symbol, checksum, parse_frame
-from sonarpost.link.sender import Sender
+from sonarpost.link.sender import LinkSender
 from sonarpost.modem.micromodem.rates import RATES
 
-SEAL = AcousticSeal(parse_key(seal_golden.KEY, "golden"), 3, Direction.FROM_VEHICLE)
+SEAL = FrameAuthenticator(parse_key(seal_golden.KEY, "golden"), 3, Direction.FROM_VEHICLE)
 GOLDEN: dict[str, Any] = json.loads((FOLDER / "sealed.json").read_text(encoding="utf-8"))
 
 
@@ -60,8 +60,8 @@ def test_the_file_is_what_the_code_makes() -> None:
 @pytest.mark.parametrize("case", GOLDEN["frames"], ids=str)
 def test_another_implementation_seals_the_same(case: dict[str, Any]) -> None:
     frame = bytes.fromhex(case["frame"])
-    settings = SealSettings(case["counter_bytes"], case["tag_bytes"], case["encrypt"])
-    seal = AcousticSeal(parse_key(GOLDEN["key"], "golden"), 99, Direction(case["direction"]).opposite, settings)
+    settings = AuthenticationSettings(case["counter_bytes"], case["tag_bytes"], case["encrypt"])
+    seal = FrameAuthenticator(parse_key(GOLDEN["key"], "golden"), 99, Direction(case["direction"]).opposite, settings)
     # A receiver without memory takes a first frame only of a counter that is near; its neighbour's seal tells it that.
     newest = max(0, case["counter"] - 1)
     seal.restore(seal.snapshot() | {"windows": [[case["source"], newest, bytes(8)]]})
@@ -85,7 +85,7 @@ def test_another_implementation_seals_the_same(case: dict[str, Any]) -> None:
 def test_the_page_has_the_numbers_of_the_code() -> None:
     page = (Path(__file__).parents[2] / "docs" / "wire-acoustic-v1.md").read_text(encoding="utf-8")
     section = " ".join(page[page.index("## Authentication") : page.index("## What a receiver may show")].split())
-    one, two = SealSettings(), SealSettings(2)
+    one, two = AuthenticationSettings(), AuthenticationSettings(2)
     assert f"{one.size} by default" in section
     assert f"t = {one.tag_bytes} and c = {one.counter_bytes} unless said otherwise" in section
     assert (one.lifetime_frames, two.lifetime_frames) == (2**20, 2**28) == (4096 * 256, 4096 * 256**2)
@@ -101,5 +101,7 @@ def test_the_page_has_the_numbers_of_the_code() -> None:
         assert years < 1 / (chance * frames_per_s) / (365.25 * 86400) < years + 1
         assert 0.7 * percent < 100 * chance * frames_per_s * 30 * 86400 < percent
     for frame_bytes in (32, 64, 256):
-        bare, sealed = (Sender(SenderConfig(frame_bytes=frame_bytes), seal=seal).symbol_bytes for seal in (None, SEAL))
+        bare, sealed = (
+            LinkSender(SenderConfig(frame_bytes=frame_bytes), seal=seal).symbol_bytes for seal in (None, SEAL)
+        )
         assert f"{sealed} of {bare}" in section

@@ -9,7 +9,7 @@ import pytest
 from link.seal_world import key
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.auth.key import Direction, SealKey, SealSettings, parse_key
+from sonarpost.link.auth.key import AcousticKey, AuthenticationSettings, Direction, parse_key
 from sonarpost.security.acoustic_key import read_key
 
 SECRET = bytes(range(100, 132))
@@ -23,8 +23,8 @@ def write(path: Path, text: str, mode: int = 0o600) -> Path:
 
 def test_a_key_file_is_read(tmp_path: Path) -> None:
     for text in (SECRET.hex(), SECRET.hex().upper() + "\n", f"  {SECRET.hex()}\r\n"):
-        assert read_key(write(tmp_path / "acoustic.key", text)) == SealKey(SECRET)
-    assert read_key(write(tmp_path / "read-only.key", SECRET.hex(), 0o400)) == SealKey(SECRET)
+        assert read_key(write(tmp_path / "acoustic.key", text)) == AcousticKey(SECRET)
+    assert read_key(write(tmp_path / "read-only.key", SECRET.hex(), 0o400)) == AcousticKey(SECRET)
 
 
 @pytest.mark.parametrize(
@@ -57,16 +57,16 @@ def test_a_key_is_not_printed_and_has_a_fingerprint() -> None:
     assert SECRET.hex() not in repr(one)
     assert repr(SECRET) not in repr(one)
     assert len(one.fingerprint) == 8
-    assert one.fingerprint == SealKey(SECRET).fingerprint != key("another").fingerprint
+    assert one.fingerprint == AcousticKey(SECRET).fingerprint != key("another").fingerprint
     for length in (0, 31, 33):
         with pytest.raises(ConfigError, match="32 bytes"):
-            SealKey(bytes(length))
+            AcousticKey(bytes(length))
 
 
 def test_every_use_has_a_key_of_its_own() -> None:
-    one = SealKey(SECRET)
+    one = AcousticKey(SECRET)
     made = {
-        one.cipher(source, direction, SealSettings(counter, 8, encrypt)).encrypt(bytes(13), b"", b"same")
+        one.cipher(source, direction, AuthenticationSettings(counter, 8, encrypt)).encrypt(bytes(13), b"", b"same")
         for source in range(128)
         for direction in Direction
         for counter in (1, 2)

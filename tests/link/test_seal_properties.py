@@ -8,14 +8,14 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from link.seal_world import VEHICLE, key, vehicle_seal, vessel_seal
 
 from sonarpost.errors import FrameError
-from sonarpost.link.auth.authentication import RESERVED, AcousticSeal
-from sonarpost.link.auth.key import Direction, SealSettings
+from sonarpost.link.auth.authentication import RESERVED, FrameAuthenticator
+from sonarpost.link.auth.key import AuthenticationSettings, Direction
 from sonarpost.link.auth.replay_window import WINDOW, ReplayWindow
 
-NEAR = SealSettings().counter_step - WINDOW
+NEAR = AuthenticationSettings().counter_step - WINDOW
 
 
-def offered(seal: AcousticSeal, source: int, sealed: bytes) -> tuple[bytes, str]:
+def offered(seal: FrameAuthenticator, source: int, sealed: bytes) -> tuple[bytes, str]:
     """What a frame opens to, or the field of the error with which it is refused."""
     try:
         return seal.open(source, sealed), ""
@@ -35,8 +35,8 @@ class Attack(RuleBasedStateMachine):
         self.taken: set[int] = set()
         self.newest = -1
 
-    def start_vehicle(self) -> AcousticSeal:
-        return AcousticSeal(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=self.durable)
+    def start_vehicle(self) -> FrameAuthenticator:
+        return FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=self.durable)
 
     def record(self, data: bytes) -> tuple[int, bytes, bytes]:
         if (limit := self.vehicle.wanted_limit) is not None:
@@ -151,7 +151,7 @@ def test_the_nearest_counter_is_the_one_sent(newest: int, step: int, data: st.Da
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=300), st.integers(-5, 200), st.booleans())
 def test_any_bytes_are_refused(sealed: bytes, source: int, encrypt: bool) -> None:
-    chosen = SealSettings(encrypt=encrypt)
+    chosen = AuthenticationSettings(encrypt=encrypt)
     vessel = vessel_seal(chosen)
     assert offered(vessel, source, sealed) == (b"", "tag")
     assert vessel.counts.forged == 1

@@ -19,7 +19,7 @@ from sonarpost.cli.bench.link_schemes import (
     run_v1,
 )
 from sonarpost.cli.main import main
-from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.coding.channel_capacity import LossChannel
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +38,11 @@ def pictures(codecs: Codecs) -> list[LinkPicture]:
 
 
 def setting(loss: float, burst: float = 1.0) -> Setting:
-    return Setting(6, 64, Channel(loss, burst), group=24, depth=2, seed=3)
+    return Setting(6, 64, LossChannel(loss, burst), group=24, depth=2, seed=3)
 
 
 def test_the_water_loses_what_it_says_in_bursts_as_long_as_it_says() -> None:
-    water = Water(Channel(0.3, 5.0), 0)
+    water = Water(LossChannel(0.3, 5.0), 0)
     fates = np.array([water.passes() for _ in range(40_000)])
     assert 1 - fates.mean() == pytest.approx(0.3, abs=0.02)
     assert (~fates[:-1]).sum() / (~fates[:-1] & fates[1:]).sum() == pytest.approx(5.0, rel=0.1)
@@ -64,7 +64,7 @@ def test_without_loss_everything_arrives(codecs: Codecs, pictures: list[LinkPict
 
 
 def test_the_bound_is_the_mean_over_what_may_arrive(codecs: Codecs, pictures: list[LinkPicture]) -> None:
-    two = Setting(2, 64, Channel(0.5), group=24, depth=2, seed=0)
+    two = Setting(2, 64, LossChannel(0.5), group=24, depth=2, seed=0)
     (best, *_) = run_bound(pictures, codecs, two).delivered
     qualities = [pictures[0].quality(codecs.emb, n).psnr for n in (0, 39, 103)]
     assert best.quality.psnr == pytest.approx(0.25 * qualities[0] + 0.5 * qualities[1] + 0.25 * qualities[2])

@@ -6,7 +6,7 @@ import re
 import zlib
 from pathlib import Path
 
-from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.coding.redundancy_plan import PREVIEWS_UNSEEN
 from sonarpost.link.config import ReceiverConfig, SenderConfig
 from sonarpost.link.frames.v1.feedback import WINDOW, Feedback
@@ -56,7 +56,7 @@ def test_the_numbers_of_the_page_are_those_of_the_code() -> None:
     assert f"up to {MAX_MESSAGE_BYTES} bytes" in PAGE
     assert f"a frame of at most {2 + 2 + 3 + WINDOW} bytes" in PAGE
     assert f"at most {100 * PREVIEWS_UNSEEN:g} % of contacts" in PAGE
-    sender, receiver = SenderConfig(channels=(Channel(0.3),)), ReceiverConfig()
+    sender, receiver = SenderConfig(channels=(LossChannel(0.3),)), ReceiverConfig()
     assert f"with 6 frames a picture {sender.group_size}," in PAGE
     assert f"at most {sender.block_symbols} source symbols" in PAGE
     assert f"up to {100 * sender.uncertainty:g} % wrong" in PAGE

@@ -13,9 +13,9 @@ from sonarpost.errors import FrameError
 from sonarpost.link.coding import erasure_code as fec
 from sonarpost.link.frames.v1.frame import parse_frame
 from sonarpost.link.frames.v1.layers import Layering, recover_layer, recover_layering
-from sonarpost.link.frames.v1.payload_objects import Message, Pieces, unpack_object
+from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, unpack_object
 from sonarpost.link.frames.v1.preview import Preview
-from sonarpost.link.receiver import Receiver
+from sonarpost.link.receiver import LinkReceiver
 
 
 def golden(name: str) -> Any:
@@ -60,19 +60,19 @@ def test_the_objects_parse() -> None:
             entry["ended"],
         )
         assert preview.link == entry["link"]
-    below: Pieces | None = None
+    below: PieceList | None = None
     for entry, follows in zip(read["pieces"], (False, True, False), strict=True):
         pieces = unpack_object(bytes.fromhex(entry["object"]), below if follows else None)
-        assert isinstance(pieces, Pieces)
+        assert isinstance(pieces, PieceList)
         assert [[p.number, p.link, p.start, p.data.hex()] for p in pieces.pieces] == entry["pieces"]
         assert pieces.final == entry["final"]
         below = pieces
     (entry,) = read["messages"]
-    assert unpack_object(bytes.fromhex(entry["object"])) == Message(entry["number"], bytes.fromhex(entry["data"]))
+    assert unpack_object(bytes.fromhex(entry["object"])) == MessageObject(entry["number"], bytes.fromhex(entry["data"]))
 
 
 def test_the_receiver_reports_what_the_file_says() -> None:
-    read, receiver = golden("exchange"), Receiver()
+    read, receiver = golden("exchange"), LinkReceiver()
     for step in read["steps"]:
         events = receiver.accept(step["source"], bytes.fromhex(step["frame"]), step["at"])
         assert [v1_golden.describe_event(e) for e in events] == step["events"], step["at"]

@@ -10,10 +10,10 @@ import pytest
 from link.v1_world import VEHICLE, World, contact, stream
 
 from sonarpost.errors import ConfigError, FrameError, StreamError
-from sonarpost.link.coding.channel_capacity import Channel, erasure_bound_frames
+from sonarpost.link.coding.channel_capacity import LossChannel, erasure_bound_frames
 from sonarpost.link.config import ReceiverConfig, SenderConfig
 from sonarpost.link.events import ContactUpdate, FrameRefused
-from sonarpost.link.frames.v1.feedback import Feedback, Request
+from sonarpost.link.frames.v1.feedback import Feedback, FeedbackRequest
 from sonarpost.link.frames.v1.frame import (
     Segment,
     SegmentKind,
@@ -23,8 +23,8 @@ from sonarpost.link.frames.v1.frame import (
     pack_symbol,
     parse_frame,
 )
-from sonarpost.link.receiver import Receiver
-from sonarpost.link.sender import Sender
+from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.sender import LinkSender
 from sonarpost.link.sender_state import export_sender, restore_sender
 
 SIZES = (32, 64, 256, 100)
@@ -52,7 +52,7 @@ def test_a_broadcast_for_a_third_lost_shows_contacts_and_most_pictures(frame_byt
 
 
 def test_previews_of_every_contact_go_before_the_detail_of_any() -> None:
-    sender = Sender(SenderConfig())
+    sender = LinkSender(SenderConfig())
     for number in range(1, 25):
         sender.add_picture(number, contact(number), stream(number, 500), 0.0)
     kinds = [parse_frame(frame) for _ in range(30) if (frame := sender.next_frame(0.0))]
@@ -62,9 +62,9 @@ def test_previews_of_every_contact_go_before_the_detail_of_any() -> None:
 
 
 def test_receivers_with_good_and_bad_water_both_get_what_their_water_allows() -> None:
-    channels = (Channel(0.05), Channel(0.6))
+    channels = (LossChannel(0.05), LossChannel(0.6))
     config = SenderConfig(channels=channels, frames_per_picture=9.0)
-    sender, receivers = Sender(config), [Receiver(), Receiver()]
+    sender, receivers = LinkSender(config), [LinkReceiver(), LinkReceiver()]
     for number in range(1, 25):
         sender.add_picture(number, contact(number), stream(number, 900), 0.0)
     rng, kinds, got = np.random.default_rng(2), set(), [dict[int, int](), dict[int, int]()]
@@ -83,13 +83,13 @@ def test_receivers_with_good_and_bad_water_both_get_what_their_water_allows() ->
 
 
 def test_one_frame_shows_a_contact_and_a_coarse_picture() -> None:
-    sender, receiver = Sender(SenderConfig()), Receiver()
+    sender, receiver = LinkSender(SenderConfig()), LinkReceiver()
     for number in range(1, 11):
         sender.add_picture(number, contact(number), stream(number, 500), 0.0)
     for number in range(1, 11):
         frame = sender.next_frame(0.0)
         assert frame is not None
-        (event,) = Receiver().accept(VEHICLE, frame, 0.0)
+        (event,) = LinkReceiver().accept(VEHICLE, frame, 0.0)
         assert isinstance(event, ContactUpdate)
         assert (event.number, event.stream) == (number, stream(number, 500)[:30])
         assert receiver.accept(VEHICLE, frame, 0.0)
@@ -100,7 +100,7 @@ def test_with_feedback_all_is_complete_close_to_the_erasure_bound(loss: float, l
     ratios = []
     for seed in range(3):
         world = World.make(
-            loss, seed, channels=(Channel(loss),), feedback=True, stream_bytes=420, patience_s=600.0, frame_bytes=64
+            loss, seed, channels=(LossChannel(loss),), feedback=True, stream_bytes=420, patience_s=600.0, frame_bytes=64
         )
         world.add(120, 500)
         world.run()
@@ -113,7 +113,9 @@ def test_with_feedback_all_is_complete_close_to_the_erasure_bound(loss: float, l
 
 @pytest.mark.parametrize("frame_bytes", [32, 256])
 def test_feedback_completes_at_other_frame_sizes_and_with_bursts(frame_bytes: int) -> None:
-    world = World.make(0.5, 9, channels=(Channel(0.5, 4.0),), feedback=True, stream_bytes=300, frame_bytes=frame_bytes)
+    world = World.make(
+        0.5, 9, channels=(LossChannel(0.5, 4.0),), feedback=True, stream_bytes=300, frame_bytes=frame_bytes
+    )
     world.add(40, 300)
     world.run()
     assert all(world.latest[n].complete and world.latest[n].stream == world.sent[n] for n in range(1, 41))
@@ -121,7 +123,7 @@ def test_feedback_completes_at_other_frame_sizes_and_with_bursts(frame_bytes: in
 
 
 def test_messages_come_through_once_and_share_frames() -> None:
-    world = World.make(0.4, 5, channels=(Channel(0.4),))
+    world = World.make(0.4, 5, channels=(LossChannel(0.4),))
     world.add(4, 300)
     small = [b"status %d" % n for n in range(8)]
     for data in small:
@@ -133,7 +135,7 @@ def test_messages_come_through_once_and_share_frames() -> None:
 
 
 def test_several_messages_go_in_one_frame_and_contacts_fill_it() -> None:
-    sender = Sender(SenderConfig(frame_bytes=128, gather_s=100.0))
+    sender = LinkSender(SenderConfig(frame_bytes=128, gather_s=100.0))
     sender.add_picture(1, contact(1), stream(1, 300), 0.0)
     for data in (b"one", b"two"):
         sender.add_message(data, 0.0, times=1)
@@ -142,13 +144,13 @@ def test_several_messages_go_in_one_frame_and_contacts_fill_it() -> None:
     listed = parse_frame(frame)
     assert isinstance(listed, tuple)
     assert [s.kind for s in listed] == [SegmentKind.MESSAGE, SegmentKind.MESSAGE, SegmentKind.PREVIEW]
-    (event,) = [e for e in Receiver().accept(VEHICLE, frame, 0.0) if isinstance(e, ContactUpdate)]
+    (event,) = [e for e in LinkReceiver().accept(VEHICLE, frame, 0.0) if isinstance(e, ContactUpdate)]
     assert stream(1, 300).startswith(event.stream)
     assert len(event.stream) > 60
 
 
 def test_priorities_and_lifetimes() -> None:
-    sender = Sender(SenderConfig())
+    sender = LinkSender(SenderConfig())
     sender.add_picture(1, contact(1), stream(1, 300), 0.0)
     sender.add_message(b"late", 0.0, priority=-1, times=1)
     sender.add_message(b"expired", 0.0, lifetime_s=1.0)
@@ -162,7 +164,7 @@ def test_priorities_and_lifetimes() -> None:
 
 
 def test_copies_of_a_message_are_apart() -> None:
-    sender = Sender(SenderConfig(channels=(Channel(0.3, 3.0),)))
+    sender = LinkSender(SenderConfig(channels=(LossChannel(0.3, 3.0),)))
     for number in range(1, 11):
         sender.add_picture(number, contact(number), stream(number, 600), 0.0)
     sender.add_message(b"go", 0.0)
@@ -172,21 +174,21 @@ def test_copies_of_a_message_are_apart() -> None:
 
 
 def test_more_detail_than_planned_can_be_asked_for() -> None:
-    world = World.make(0.0, feedback=True, stream_bytes=100, channels=(Channel(0.0),))
+    world = World.make(0.0, feedback=True, stream_bytes=100, channels=(LossChannel(0.0),))
     world.add(3, 900)
     world.run()
     assert all(100 <= len(e.stream) < 200 and e.complete for e in world.latest.values())
-    world.sender.on_report(Request(2, 700), world.now)
+    world.sender.on_report(FeedbackRequest(2, 700), world.now)
     world.run()
     assert len(world.latest[2].stream) >= 700
     assert world.latest[2].complete
-    assert not world.sender.refine(Request(2, 100), world.now)
+    assert not world.sender.refine(FeedbackRequest(2, 100), world.now)
     with pytest.raises(FrameError, match="contact number"):
-        world.sender.refine(Request(77, 100), world.now)
+        world.sender.refine(FeedbackRequest(77, 100), world.now)
 
 
 def test_a_minipacket_asks_for_symbols() -> None:
-    sender, receiver = Sender(SenderConfig(feedback=True, channels=(Channel(0.0),))), Receiver()
+    sender, receiver = LinkSender(SenderConfig(feedback=True, channels=(LossChannel(0.0),))), LinkReceiver()
     sender.add_picture(1, contact(1), stream(1, 400), 0.0)
     frames = []
     while (frame := sender.next_frame(1.0)) is not None:
@@ -205,7 +207,7 @@ def test_a_minipacket_asks_for_symbols() -> None:
 
 def test_a_new_frame_size_keeps_what_fits_and_starts_again_what_does_not() -> None:
     for before, after in ((64, 256), (256, 64), (64, 32)):
-        world = World.make(0.0, frame_bytes=before, feedback=True, stream_bytes=300, channels=(Channel(0.0),))
+        world = World.make(0.0, frame_bytes=before, feedback=True, stream_bytes=300, channels=(LossChannel(0.0),))
         world.add(12, 300)
         world.run(most_frames=20)
         world.sender.resize(after)
@@ -214,7 +216,7 @@ def test_a_new_frame_size_keeps_what_fits_and_starts_again_what_does_not() -> No
 
 
 def test_numbers_of_blocks_and_contacts_wrap() -> None:
-    world = World.make(0.2, 3, channels=(Channel(0.2),), group_pictures=2, frames_per_picture=9.0)
+    world = World.make(0.2, 3, channels=(LossChannel(0.2),), group_pictures=2, frames_per_picture=9.0)
     number = 65500
     for _ in range(60):
         world.add(2, 200, first=number)
@@ -226,8 +228,11 @@ def test_numbers_of_blocks_and_contacts_wrap() -> None:
 
 
 def test_a_vehicle_that_starts_anew_does_not_mix_pictures() -> None:
-    receiver = Receiver()
-    first, second = Sender(SenderConfig(channels=(Channel(0.0),))), Sender(SenderConfig(channels=(Channel(0.0),)))
+    receiver = LinkReceiver()
+    first, second = (
+        LinkSender(SenderConfig(channels=(LossChannel(0.0),))),
+        LinkSender(SenderConfig(channels=(LossChannel(0.0),))),
+    )
     for number in range(1, 6):
         first.add_picture(number, contact(number), stream(number, 400), 0.0)
         second.add_picture(number, contact(number + 100), stream(number + 100, 400), 0.0)
@@ -247,9 +252,9 @@ def test_a_vehicle_that_starts_anew_does_not_mix_pictures() -> None:
 
 
 def test_vehicles_do_not_disturb_each_other() -> None:
-    receiver, senders = Receiver(), {}
+    receiver, senders = LinkReceiver(), {}
     for address in (3, 4, 5):
-        senders[address] = Sender(SenderConfig(channels=(Channel(0.0),)))
+        senders[address] = LinkSender(SenderConfig(channels=(LossChannel(0.0),)))
         for number in (1, 2):
             senders[address].add_picture(
                 number, contact(10 * address + number), stream(10 * address + number, 300), 0.0
@@ -265,14 +270,14 @@ def test_vehicles_do_not_disturb_each_other() -> None:
 
 
 def test_the_sender_goes_on_after_a_restart_at_every_frame() -> None:
-    def add_all(sender: Sender) -> None:
+    def add_all(sender: LinkSender) -> None:
         for number in range(1, 6):
             sender.add_picture(number, contact(number), stream(number, 300), 0.0)
         sender.add_message(b"hello", 0.0)
         sender.add_message(stream(7, 200), 0.0)
 
-    config = SenderConfig(feedback=True, channels=(Channel(0.3),))
-    steady, restarted = Sender(config), Sender(config)
+    config = SenderConfig(feedback=True, channels=(LossChannel(0.3),))
+    steady, restarted = LinkSender(config), LinkSender(config)
     add_all(steady)
     add_all(restarted)
     for step in range(90):
@@ -280,7 +285,7 @@ def test_the_sender_goes_on_after_a_restart_at_every_frame() -> None:
             for sender in (steady, restarted):
                 sender.on_feedback(Feedback(1, 30, (5, 2)), 40.0)
         state = msgpack.unpackb(msgpack.packb(export_sender(restarted)))
-        restarted = Sender(config)
+        restarted = LinkSender(config)
         restore_sender(restarted, state)
         assert restarted.next_frame(float(step)) == steady.next_frame(float(step))
     assert export_sender(restarted) == export_sender(steady)
@@ -290,7 +295,7 @@ def test_the_sender_goes_on_after_a_restart_at_every_frame() -> None:
     "change", [{"format": 2}, {"pictures": [{}]}, {"blocks": 3}, {"waiting": [9]}, {"meters": [[1, 7.0, [1, 1]]]}]
 )
 def test_a_state_that_no_sender_made_is_refused(change: dict[str, object]) -> None:
-    sender = Sender(SenderConfig())
+    sender = LinkSender(SenderConfig())
     sender.add_picture(1, contact(1), stream(1, 50), 0.0)
     state = {**export_sender(sender), **change}
     before = export_sender(sender)
@@ -300,7 +305,7 @@ def test_a_state_that_no_sender_made_is_refused(change: dict[str, object]) -> No
 
 
 def test_what_the_sender_refuses() -> None:
-    sender = Sender(SenderConfig())
+    sender = LinkSender(SenderConfig())
     sender.add_picture(1, contact(1), b"x", 0.0)
     with pytest.raises(FrameError, match="contact number"):
         sender.add_picture(1, contact(1), b"x", 0.0)
@@ -319,9 +324,9 @@ def test_what_the_sender_refuses() -> None:
 
 
 def test_memory_is_bounded() -> None:
-    receiver = Receiver(ReceiverConfig(max_sources=2, max_contacts=5))
+    receiver = LinkReceiver(ReceiverConfig(max_sources=2, max_contacts=5))
     for address in range(6):
-        sender = Sender(SenderConfig(channels=(Channel(0.0),)))
+        sender = LinkSender(SenderConfig(channels=(LossChannel(0.0),)))
         for number in range(1, 30):
             sender.add_picture(number, contact(number), stream(number, 90), 0.0)
         while (frame := sender.next_frame(0.0)) is not None:
@@ -336,7 +341,7 @@ def test_memory_is_bounded() -> None:
 
 def test_old_blocks_and_contacts_are_forgotten() -> None:
     config = ReceiverConfig(block_memory_s=10.0, contact_memory_s=100.0)
-    sender, receiver = Sender(SenderConfig()), Receiver(config)
+    sender, receiver = LinkSender(SenderConfig()), LinkReceiver(config)
     sender.add_picture(1, contact(1), stream(1, 300), 0.0)
     frame = sender.next_frame(0.0)
     assert frame is not None
@@ -349,14 +354,14 @@ def test_old_blocks_and_contacts_are_forgotten() -> None:
 
 def test_unknown_segments_are_told_and_do_not_hide_the_others() -> None:
     frame = pack_segments([Segment(25, b"new"), Segment(SegmentKind.MESSAGE, b"\x01hello")], 64)
-    refused, message = Receiver().accept(VEHICLE, frame, 0.0)
+    refused, message = LinkReceiver().accept(VEHICLE, frame, 0.0)
     assert isinstance(refused, FrameRefused)
     assert "segment kind" in str(refused.reason)
     assert getattr(message, "data", None) == b"hello"
 
 
 def test_one_frame_that_passed_damaged_does_not_replace_a_block() -> None:
-    sender, receiver = Sender(SenderConfig(channels=(Channel(0.0),), frames_per_picture=20.0)), Receiver()
+    sender, receiver = LinkSender(SenderConfig(channels=(LossChannel(0.0),), frames_per_picture=20.0)), LinkReceiver()
     sender.add_picture(1, contact(1), stream(1, 900), 0.0)
     frames = []
     while (frame := sender.next_frame(0.0)) is not None:
@@ -374,8 +379,8 @@ def test_one_frame_that_passed_damaged_does_not_replace_a_block() -> None:
 
 
 def test_a_block_goes_on_until_every_receiver_has_it() -> None:
-    sender = Sender(SenderConfig(feedback=True, channels=(Channel(0.4),), stream_bytes=300))
-    receivers = {address: Receiver() for address in (1, 2, 9)}
+    sender = LinkSender(SenderConfig(feedback=True, channels=(LossChannel(0.4),), stream_bytes=300))
+    receivers = {address: LinkReceiver() for address in (1, 2, 9)}
     latest: dict[tuple[int, int], ContactUpdate] = {}
     for number in range(1, 21):
         sender.add_picture(number, contact(number), stream(number, 300), 0.0)

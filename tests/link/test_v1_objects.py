@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import Feedback, Request, pack_mini, unpack_mini
+from sonarpost.link.frames.v1.feedback import Feedback, FeedbackRequest, pack_mini, unpack_mini
 from sonarpost.link.frames.v1.layers import Layering, layered_symbols, recover_layer, recover_layering
-from sonarpost.link.frames.v1.payload_objects import Message, Piece, Pieces, unpack_object
+from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, StreamPiece, unpack_object
 from sonarpost.link.frames.v1.preview import Preview, contact_link, entry_shape, next_number
 from sonarpost.link.sender_feedback import LossMeter
 
@@ -56,7 +56,7 @@ def test_how_entries_lie(symbol_bytes: int, entries: int, symbols: int, entry_by
 
 
 pieces = st.lists(
-    st.builds(Piece, st.integers(1, 65535), st.integers(0, 255), st.integers(0, 60000), st.binary(max_size=200)),
+    st.builds(StreamPiece, st.integers(1, 65535), st.integers(0, 255), st.integers(0, 60000), st.binary(max_size=200)),
     min_size=1,
     max_size=8,
 )
@@ -65,14 +65,16 @@ pieces = st.lists(
 @settings(max_examples=150, deadline=None)
 @given(pieces, st.booleans(), st.integers(0, 50), st.data())
 def test_pieces_and_the_layer_above_come_back(
-    listed: list[Piece], final: bool, spare: int, data: st.DataObject
+    listed: list[StreamPiece], final: bool, spare: int, data: st.DataObject
 ) -> None:
-    group = Pieces(tuple(listed), final)
+    group = PieceList(tuple(listed), final)
     length = group.overhead_bytes() + sum(len(p.data) for p in listed) + spare
     packed = group.pack(length)
     assert len(packed) == length
     assert unpack_object(packed) == group
-    above = Pieces(tuple(Piece(p.number, p.link, p.stop, data.draw(st.binary(max_size=9))) for p in listed), True)
+    above = PieceList(
+        tuple(StreamPiece(p.number, p.link, p.stop, data.draw(st.binary(max_size=9))) for p in listed), True
+    )
     length = above.overhead_bytes(group) + sum(len(p.data) for p in above.pieces)
     assert unpack_object(above.pack(length, group), group) == above
     with pytest.raises(FrameError):
@@ -84,17 +86,17 @@ def test_pieces_and_the_layer_above_come_back(
 def test_consecutive_contacts_with_one_start_cost_three_bytes_each() -> None:
     listed, number = [], 65534
     for _ in range(4):
-        listed.append(Piece(number, 9, 30, bytes(200)))
+        listed.append(StreamPiece(number, 9, 30, bytes(200)))
         number = next_number(number)
     assert [p.number for p in listed] == [65534, 65535, 1, 2]
-    group = Pieces(tuple(listed), final=True)
+    group = PieceList(tuple(listed), final=True)
     assert group.overhead_bytes() == 5 + 4 * 3 + 4
     assert unpack_object(group.pack(group.overhead_bytes() + 800)) == group
 
 
 def test_an_object_with_any_wrong_byte_is_refused() -> None:
-    packed = Message(3, b"status: fine").pack(30)
-    assert unpack_object(packed) == Message(3, b"status: fine")
+    packed = MessageObject(3, b"status: fine").pack(30)
+    assert unpack_object(packed) == MessageObject(3, b"status: fine")
     for place in range(30):
         with pytest.raises(FrameError, match="check"):
             unpack_object(packed[:place] + bytes([packed[place] ^ 64]) + packed[place + 1 :])
@@ -192,10 +194,10 @@ def test_thirteen_bits_only() -> None:
 
 
 def test_a_request_comes_back() -> None:
-    assert Request.unpack(Request(9, 700).pack()) == Request(9, 700)
+    assert FeedbackRequest.unpack(FeedbackRequest(9, 700).pack()) == FeedbackRequest(9, 700)
     for data in (b"", b"\0\0\0\5", bytes(5)):
         with pytest.raises(FrameError):
-            Request.unpack(data)
+            FeedbackRequest.unpack(data)
 
 
 def test_loss_is_measured_between_reports() -> None:

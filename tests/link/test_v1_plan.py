@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sonarpost.errors import ConfigError, StreamError
-from sonarpost.link.coding.channel_capacity import Channel
-from sonarpost.link.coding.rate_distortion import GroupGain, quality_curve
+from sonarpost.link.coding.channel_capacity import LossChannel
+from sonarpost.link.coding.rate_distortion import GroupDistortion, quality_curve
 from sonarpost.link.coding.redundancy_plan import (
     arrivals,
     best_rate,
@@ -29,7 +29,7 @@ def curve(scale: float, length: int = 400) -> np.ndarray:
 
 def test_bytes_go_where_they_gain_most() -> None:
     curves = [curve(0.1), curve(0.001), curve(0.03)]
-    gain = GroupGain.of(curves, [10, 10, 10])
+    gain = GroupDistortion.of(curves, [10, 10, 10])
     for total in (0, 5, 60, 200, 700):
         stops = gain.stops(total)
         assert sum(stops) - 30 == min(total, gain.total_bytes)
@@ -49,7 +49,7 @@ def test_bytes_go_where_they_gain_most() -> None:
 
 def test_a_curve_with_steps_is_used_by_its_hull() -> None:
     steps = quality_curve(100, np.repeat([4000.0, 3000.0, 1000.0, 900.0], [20, 30, 30, 21]))
-    gain = GroupGain.of([steps], [0])
+    gain = GroupDistortion.of([steps], [0])
     slopes = np.diff(gain.gain_by_step) / np.diff(gain.bytes_by_step)
     assert (np.diff(slopes) <= 1e-12).all()
     assert gain.total_bytes == 80
@@ -64,7 +64,7 @@ def test_estimates_that_make_no_sense_are_refused(error: list[float]) -> None:
 
 
 def test_layers_are_used_where_it_is_uncertain_how_much_arrives() -> None:
-    gain = GroupGain.of([curve(0.05, 2000)], [0])
+    gain = GroupDistortion.of([curve(0.05, 2000)], [0])
     arrive = np.zeros(81)
     arrive[[20, 60]] = 0.5
     plan = plan_layers(gain, 59, arrive, 8, 6)
@@ -80,8 +80,8 @@ def test_layers_are_used_where_it_is_uncertain_how_much_arrives() -> None:
 
 
 def test_the_plan_is_the_best_of_all_on_a_small_case() -> None:
-    gain = GroupGain.of([curve(0.05, 800)], [0])
-    arrive = arrivals(12, (Channel(0.3), Channel(0.6)), 1)
+    gain = GroupDistortion.of([curve(0.05, 800)], [0])
+    arrive = arrivals(12, (LossChannel(0.3), LossChannel(0.6)), 1)
     plan = plan_layers(gain, 32, arrive, 8, 6)
     at_least = np.cumsum(arrive[::-1])[::-1]
     best = 0.0
@@ -99,8 +99,8 @@ def test_the_plan_is_the_best_of_all_on_a_small_case() -> None:
 
 
 def test_without_layers_the_best_k_is_found() -> None:
-    gain = GroupGain.of([curve(0.05, 800)], [0])
-    arrive = arrivals(6, (Channel(0.3),), 1)
+    gain = GroupDistortion.of([curve(0.05, 800)], [0])
+    arrive = arrivals(6, (LossChannel(0.3),), 1)
     found = plan_whole(gain, 59, arrive, 12)
     assert found is not None
     at_least = np.cumsum(arrive[::-1])[::-1]
@@ -109,38 +109,38 @@ def test_without_layers_the_best_k_is_found() -> None:
 
 
 def test_too_few_frames_give_no_layers() -> None:
-    gain = GroupGain.of([curve(0.05)], [0])
-    assert plan_layers(gain, 59, arrivals(3, (Channel(0.1),), 1), 8, 6) is None
-    assert plan_layers(gain, 12, arrivals(30, (Channel(0.1),), 1), 8, 6) is None
+    gain = GroupDistortion.of([curve(0.05)], [0])
+    assert plan_layers(gain, 59, arrivals(3, (LossChannel(0.1),), 1), 8, 6) is None
+    assert plan_layers(gain, 12, arrivals(30, (LossChannel(0.1),), 1), 8, 6) is None
 
 
 def test_planning_a_group_takes_less_than_fifty_milliseconds_a_picture() -> None:
     curves = [curve(0.01 * (1 + n), 700) for n in range(24)]
-    arrive = arrivals(120, (Channel(0.3, 4.0),), 2)
-    plan_layers(GroupGain.of(curves[:2], [30] * 2), 59, arrive, 80, 29)
+    arrive = arrivals(120, (LossChannel(0.3, 4.0),), 2)
+    plan_layers(GroupDistortion.of(curves[:2], [30] * 2), 59, arrive, 80, 29)
     started = time.process_time()
-    assert plan_layers(GroupGain.of(curves, [30] * 24), 59, arrive, 80, 29) is not None
+    assert plan_layers(GroupDistortion.of(curves, [30] * 24), 59, arrive, 80, 29) is not None
     assert (time.process_time() - started) / 24 < 0.05
 
 
 def test_previews_get_more_frames_the_worse_the_water() -> None:
-    found = [preview_frames(24, Channel(loss)) for loss in (0.0, 0.1, 0.3, 0.5)]
+    found = [preview_frames(24, LossChannel(loss)) for loss in (0.0, 0.1, 0.3, 0.5)]
     assert found[0] == 24
     assert found == sorted(found)
-    assert preview_frames(24, Channel(0.3, 8.0)) > found[2]
-    assert preview_frames(24, Channel(0.9), limit=30) == 30
+    assert preview_frames(24, LossChannel(0.3, 8.0)) > found[2]
+    assert preview_frames(24, LossChannel(0.9), limit=30) == 30
 
 
 def test_copies() -> None:
-    assert [copies(Channel(loss)) for loss in (0.0, 0.1, 0.3, 0.5)] == [1, 2, 4, 7]
-    assert copies(Channel(0.95)) == 8
+    assert [copies(LossChannel(loss)) for loss in (0.0, 0.1, 0.3, 0.5)] == [1, 2, 4, 7]
+    assert copies(LossChannel(0.95)) == 8
 
 
 def test_symbols_to_send() -> None:
-    assert symbols_to_send(0, Channel(0.5), 1.0) == 0
-    assert symbols_to_send(50, Channel(0.0), 2.0) == 50
-    assert symbols_to_send(50, Channel(0.5), 0.0) == 100
-    assert 50 <= symbols_to_send(50, Channel(0.5), 2.0) < 100 < symbols_to_send(50, Channel(0.5), -2.0)
+    assert symbols_to_send(0, LossChannel(0.5), 1.0) == 0
+    assert symbols_to_send(50, LossChannel(0.0), 2.0) == 50
+    assert symbols_to_send(50, LossChannel(0.5), 0.0) == 100
+    assert 50 <= symbols_to_send(50, LossChannel(0.5), 2.0) < 100 < symbols_to_send(50, LossChannel(0.5), -2.0)
 
 
 def test_the_rate_that_carries_most() -> None:

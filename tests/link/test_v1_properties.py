@@ -12,18 +12,18 @@ from link import v1_fuzz
 from link.v1_world import VEHICLE, contact, stream
 
 from sonarpost.errors import FrameError
-from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import ReceiverConfig, SenderConfig
 from sonarpost.link.events import ContactUpdate, Event, FrameRefused, MessageReceived
-from sonarpost.link.receiver import Receiver
-from sonarpost.link.sender import Sender
+from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.sender import LinkSender
 
 
 @st.composite
 def deliveries(draw: st.DrawFn) -> list[tuple[float, bytes]]:
     """Frames of a sender with pictures and messages, some of them, in any order, some twice, some padded or cut."""
-    channels = draw(st.sampled_from([(Channel(0.0),), (Channel(0.3),), (Channel(0.05), Channel(0.6))]))
-    sender = Sender(
+    channels = draw(st.sampled_from([(LossChannel(0.0),), (LossChannel(0.3),), (LossChannel(0.05), LossChannel(0.6))]))
+    sender = LinkSender(
         SenderConfig(
             frame_bytes=draw(st.sampled_from([32, 64, 256])),
             channels=channels,
@@ -59,7 +59,7 @@ def comparable(events: list[Event]) -> list[Any]:
 @settings(max_examples=40, deadline=None)
 @given(deliveries())
 def test_what_is_shown_was_sent_and_grows(delivery: list[tuple[float, bytes]]) -> None:
-    receiver, known = Receiver(), dict[int, ContactUpdate]()
+    receiver, known = LinkReceiver(), dict[int, ContactUpdate]()
     for now, frame in delivery:
         for event in receiver.accept(VEHICLE, frame, now):
             if isinstance(event, MessageReceived):
@@ -81,10 +81,10 @@ def test_what_is_shown_was_sent_and_grows(delivery: list[tuple[float, bytes]]) -
 @given(deliveries())
 def test_a_restart_at_every_frame_changes_nothing(delivery: list[tuple[float, bytes]]) -> None:
     config = ReceiverConfig(max_contacts=4, block_memory_s=120.0)
-    steady, restarted = Receiver(config), Receiver(config)
+    steady, restarted = LinkReceiver(config), LinkReceiver(config)
     for now, frame in delivery:
         state = msgpack.unpackb(msgpack.packb(restarted.snapshot()))
-        restarted = Receiver(config)
+        restarted = LinkReceiver(config)
         restarted.restore(state)
         assert comparable(restarted.accept(VEHICLE, frame, now)) == comparable(steady.accept(VEHICLE, frame, now))
         assert restarted.report_is_due(VEHICLE, now) == steady.report_is_due(VEHICLE, now)
@@ -116,7 +116,7 @@ STATE_CHANGES: list[dict[str, object]] = [
 
 @pytest.mark.parametrize("change", STATE_CHANGES)
 def test_a_state_that_no_receiver_made_is_refused(change: dict[str, object]) -> None:
-    receiver = Receiver()
+    receiver = LinkReceiver()
     before = receiver.snapshot()
     with pytest.raises(FrameError, match="receiver state"):
         receiver.restore({**before, **change})
@@ -126,7 +126,7 @@ def test_a_state_that_no_receiver_made_is_refused(change: dict[str, object]) -> 
 @settings(max_examples=70, deadline=None)
 @given(st.data())
 def test_any_part_of_a_state_replaced_is_refused_or_taken_never_another_error(data: st.DataObject) -> None:
-    sender, receiver = Sender(SenderConfig(channels=(Channel(0.05), Channel(0.6)))), Receiver()
+    sender, receiver = LinkSender(SenderConfig(channels=(LossChannel(0.05), LossChannel(0.6)))), LinkReceiver()
     for number in (1, 2, 3):
         sender.add_picture(number, contact(number), stream(number, 300), 0.0)
     for _ in range(9):
@@ -141,7 +141,7 @@ def test_any_part_of_a_state_replaced_is_refused_or_taken_never_another_error(da
             continue
         place[key] = data.draw(st.sampled_from([None, -1, 3, 2.5, float("nan"), b"", b"xx", "x", [], {}, True, 10**30]))
         break
-    fresh = Receiver()
+    fresh = LinkReceiver()
     try:
         fresh.restore(state)
     except FrameError:

@@ -12,8 +12,8 @@ from link.v1_world import VEHICLE, contact, stream
 from sonarpost.link.coding.byte_ranges import count_positions
 from sonarpost.link.events import ContactUpdate, MessageReceived
 from sonarpost.link.queue.state import export_queue, restore_queue
-from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName, QueueConfig
-from sonarpost.link.receiver import Receiver
+from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, TransmitQueue
+from sonarpost.link.receiver import LinkReceiver
 from sonarpost.modem.micromodem.rates import RATES
 
 VESSEL = 1
@@ -26,15 +26,15 @@ class Exchange:
         rng = np.random.default_rng(5)
         self.lost: Callable[[], bool] = lambda: bool(rng.random() < loss)
         self.config = QueueConfig(expected_loss=max(loss, 0.05), **config)
-        self.queue = AcousticQueue(self.config)
-        self.receiver = Receiver()
+        self.queue = TransmitQueue(self.config)
+        self.receiver = LinkReceiver()
         self.streams: dict[int, bytes] = {}
         self.shown: dict[int, bytes] = {}
         self.now = 0.0
 
     def add(self, number: int, length: int = 300) -> None:
         self.streams[number] = stream(number, length)
-        name = PictureName(f"{number:04d}", f"c{number}")
+        name = ImageName(f"{number:04d}", f"c{number}")
         self.queue.add_picture(number, name, contact(number), self.streams[number], self.now)
 
     def run(self, seconds: float, *, reports: bool, water: bool = True) -> None:
@@ -59,7 +59,7 @@ class Exchange:
 
     def restart(self) -> None:
         parts = {name: msgpack.packb(part) for name, part in export_queue(self.queue).items()}
-        self.queue = AcousticQueue(self.config)
+        self.queue = TransmitQueue(self.config)
         restore_queue(self.queue, {n: msgpack.unpackb(p, strict_map_key=False) for n, p in parts.items()})
 
     @property
@@ -175,7 +175,7 @@ def test_a_state_of_before_there_were_repairs_is_taken_up() -> None:
     core["sent"] = [entry[:2] for entry in core["sent"]]  # type: ignore[attr-defined]
     for name in [n for n in parts if n.startswith("block/")]:
         parts[name].pop("spans")
-    exchange.queue = AcousticQueue(exchange.config)
+    exchange.queue = TransmitQueue(exchange.config)
     restore_queue(exchange.queue, parts)
     exchange.run(2 * 3600.0, reports=True)
     assert len(exchange.whole) == 3

@@ -15,8 +15,8 @@ from sonarpost.link.config import ReceiverConfig, SenderConfig
 from sonarpost.link.events import ContactUpdate, MessageReceived
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import checksum
-from sonarpost.link.receiver import Receiver
-from sonarpost.link.sender import Sender
+from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.sender import LinkSender
 
 SMALL = ReceiverConfig(max_sources=3, max_contacts=20, block_memory_s=300.0, contact_memory_s=900.0)
 MESSAGE = b"status: "
@@ -34,7 +34,7 @@ def genuine(seed: int) -> Iterator[bytes]:
     """Yield frames of a vehicle that goes on for ever, with every kind of content, sizes and settings changing."""
     rng, number = np.random.default_rng(seed), 0
     while True:
-        sender = Sender(
+        sender = LinkSender(
             SenderConfig(
                 frame_bytes=int(rng.choice([32, 64, 256])),
                 group_pictures=int(rng.integers(1, 9)),
@@ -101,7 +101,7 @@ def run(frames: int, seed: int = 0) -> dict[str, int]:
     source of their own, whose events are counted apart; of all others none may be wrong.
     """
     rng = np.random.default_rng(seed)
-    source, receiver, now = genuine(seed), Receiver(SMALL), 0.0
+    source, receiver, now = genuine(seed), LinkReceiver(SMALL), 0.0
     past: list[bytes] = []
     counts = {"frames": 0, "shown": 0, "wrong": 0, "forged": 0}
     for step in range(frames):
@@ -125,14 +125,14 @@ def run(frames: int, seed: int = 0) -> dict[str, int]:
             counts["wrong" if address == 3 else "forged"] += wrong
         if step % 5000 == 0:
             check_bounds(receiver)
-            restored = Receiver(SMALL)
+            restored = LinkReceiver(SMALL)
             restored.restore(receiver.snapshot())
             receiver = restored
     check_bounds(receiver)
     return counts
 
 
-def check_bounds(receiver: Receiver) -> None:
+def check_bounds(receiver: LinkReceiver) -> None:
     """Assert that memory is bounded."""
     sources = receiver.snapshot()["sources"]
     assert isinstance(sources, list)
@@ -145,7 +145,7 @@ def check_bounds(receiver: Receiver) -> None:
 
 def one_input(data: bytes) -> None:
     """Take frames from one string: a length byte, then a frame, with its checksum put right."""
-    receiver, at, now = Receiver(SMALL), 0, 0.0
+    receiver, at, now = LinkReceiver(SMALL), 0, 0.0
     while at < len(data):
         covered = data[at + 1 : at + 1 + data[at]]
         at += 1 + data[at]
@@ -155,7 +155,7 @@ def one_input(data: bytes) -> None:
     receiver.report(3, now)
     receiver.mini_report(3)
     check_bounds(receiver)
-    Receiver(SMALL).restore(receiver.snapshot())
+    LinkReceiver(SMALL).restore(receiver.snapshot())
 
 
 def main(arguments: list[str]) -> None:

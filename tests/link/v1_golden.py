@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from sonarpost.link.coding import erasure_code as fec
-from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
-from sonarpost.link.events import ContactUpdate, Event, FrameRefused, MessageReceived, ReportReceived
+from sonarpost.link.events import ContactUpdate, Event, FeedbackReceived, FrameRefused, MessageReceived
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import Feedback, Request, pack_mini
+from sonarpost.link.frames.v1.feedback import Feedback, FeedbackRequest, pack_mini
 from sonarpost.link.frames.v1.frame import (
     Content,
     Segment,
@@ -28,10 +28,10 @@ from sonarpost.link.frames.v1.frame import (
     pack_symbol,
 )
 from sonarpost.link.frames.v1.layers import Layering, layered_symbols
-from sonarpost.link.frames.v1.payload_objects import Message, Piece, Pieces
+from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, StreamPiece
 from sonarpost.link.frames.v1.preview import Preview
-from sonarpost.link.receiver import Receiver
-from sonarpost.link.sender import Sender
+from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.sender import LinkSender
 from sonarpost.sonar.survey import Side
 
 FOLDER = Path(__file__).parents[1] / "golden" / "acoustic-v1"
@@ -81,7 +81,7 @@ def describe_event(event: Event) -> dict[str, Any]:
             }
         case MessageReceived():
             return {"message": event.number, "data": event.data.hex()}
-        case ReportReceived(report=report):
+        case FeedbackReceived(report=report):
             return {"report": type(report).__name__, "data": report.pack().hex()}
         case FrameRefused():
             return {"refused": event.reason.field}
@@ -105,7 +105,7 @@ def frames() -> dict[str, Any]:
         ((Segment(SegmentKind.PREVIEW, Preview(9, CONTACT, counted(20)).pack(49)),), 64),
         ((Segment(SegmentKind.SYMBOL, Symbol(SymbolKind.OBJECT, 4, 3, 2, counted(27)).head() + counted(27)),), 64),
         ((Segment(SegmentKind.FEEDBACK, Feedback(3, 1000, (12, 0, 255)).pack()),), 32),
-        ((Segment(SegmentKind.REQUEST, Request(7, 700).pack()),), 32),
+        ((Segment(SegmentKind.REQUEST, FeedbackRequest(7, 700).pack()),), 32),
     ]
     good = [
         {"frame": (pack_symbol(c) if isinstance(c, Symbol) else pack_segments(c, size)).hex(), **describe_content(c)}
@@ -145,9 +145,9 @@ def codes() -> dict[str, Any]:
 
 
 def objects() -> dict[str, Any]:
-    base = Pieces((Piece(65535, 9, 30, counted(140)), Piece(1, 8, 30, counted(3))), final=False)
-    above = Pieces((Piece(65535, 9, 170, counted(2)), Piece(1, 8, 33, b"")), final=True)
-    apart = Pieces((Piece(7, 1, 0, counted(5)), Piece(9, 2, 300, counted(4))), final=True)
+    base = PieceList((StreamPiece(65535, 9, 30, counted(140)), StreamPiece(1, 8, 30, counted(3))), final=False)
+    above = PieceList((StreamPiece(65535, 9, 170, counted(2)), StreamPiece(1, 8, 33, b"")), final=True)
+    apart = PieceList((StreamPiece(7, 1, 0, counted(5)), StreamPiece(9, 2, 300, counted(4))), final=True)
     return {
         "previews": [
             {"number": p.number, "prefix": p.prefix.hex(), "ended": p.ended, "link": p.link, "entry": p.pack(59).hex()}
@@ -162,7 +162,9 @@ def objects() -> dict[str, Any]:
             }
             for g, data in ((base, base.pack(180)), (above, above.pack(14, base)), (apart, apart.pack(40)))
         ],
-        "messages": [{"number": 200, "data": counted(20).hex(), "object": Message(200, counted(20)).pack(54).hex()}],
+        "messages": [
+            {"number": 200, "data": counted(20).hex(), "object": MessageObject(200, counted(20)).pack(54).hex()}
+        ],
         "minipackets": [[block, needed, pack_mini(block, needed)] for block, needed in ((0, 0), (5, 17), (31, 255))],
     }
 
@@ -170,9 +172,13 @@ def objects() -> dict[str, Any]:
 def exchange() -> dict[str, Any]:
     """Frames with times, and what a receiver must report of them."""
     steps: list[dict[str, Any]] = []
-    receiver, rng = Receiver(), np.random.default_rng(1)
-    for channels, size in (((Channel(0.2),), 64), ((Channel(0.05), Channel(0.6)), 64), ((Channel(0.2),), 32)):
-        sender = Sender(SenderConfig(frame_bytes=size, channels=channels, frames_per_picture=9.0), first_block=30)
+    receiver, rng = LinkReceiver(), np.random.default_rng(1)
+    for channels, size in (
+        ((LossChannel(0.2),), 64),
+        ((LossChannel(0.05), LossChannel(0.6)), 64),
+        ((LossChannel(0.2),), 32),
+    ):
+        sender = LinkSender(SenderConfig(frame_bytes=size, channels=channels, frames_per_picture=9.0), first_block=30)
         source = 3 + len(channels) + size
         for number in range(1, 7):
             length = 250 if number % 2 else 12

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sonarpost.link.config import ReceiverConfig, SenderConfig
-from sonarpost.link.events import ContactUpdate, Event, FrameRefused, MessageReceived, ReportReceived
+from sonarpost.link.events import ContactUpdate, Event, FeedbackReceived, FrameRefused, MessageReceived
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.receiver import Receiver
-from sonarpost.link.sender import Sender
+from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.sender import LinkSender
 
 VEHICLE = 3
 VESSEL = 1
@@ -29,8 +29,8 @@ def stream(number: int, length: int) -> bytes:
 class World:
     """Sends frames of 1 s through water that loses those it says."""
 
-    sender: Sender
-    receiver: Receiver
+    sender: LinkSender
+    receiver: LinkReceiver
     passes: Callable[[], bool]
     feedback: bool = False
     now: float = 0.0
@@ -43,7 +43,7 @@ class World:
     def make(cls, loss: float, seed: int = 0, *, receiver: ReceiverConfig | None = None, **config: object) -> World:
         rng = np.random.default_rng(seed)
         made = SenderConfig(**config)  # type: ignore[arg-type]
-        return cls(Sender(made), Receiver(receiver), lambda: bool(rng.random() >= loss), feedback=made.feedback)
+        return cls(LinkSender(made), LinkReceiver(receiver), lambda: bool(rng.random() >= loss), feedback=made.feedback)
 
     def add(self, count: int, length: int, first: int = 1) -> None:
         for number in range(first, first + count):
@@ -51,7 +51,7 @@ class World:
             self.sender.add_picture(number, contact(number), self.sent[number], self.now)
 
     def run(self, most_frames: int = 100_000) -> None:
-        back, vessel = Receiver(), Sender(SenderConfig(frame_bytes=32))
+        back, vessel = LinkReceiver(), LinkSender(SenderConfig(frame_bytes=32))
         stop = self.now + most_frames
         while not self.sender.is_idle and self.now < stop:
             self.now += 1.0
@@ -72,7 +72,7 @@ class World:
             self.reports += 1
             if self.passes():
                 (event,) = back.accept(VESSEL, told, self.now)
-                assert isinstance(event, ReportReceived)
+                assert isinstance(event, FeedbackReceived)
                 self.sender.on_report(event.report, self.now)
 
     def take(self, frame: bytes) -> None:

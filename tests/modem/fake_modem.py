@@ -9,7 +9,7 @@ from itertools import count
 
 from sonarpost.modem.micromodem import nmea
 from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import Event, FrameHeard
+from sonarpost.modem.micromodem.events import Event, FrameOverheard
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.modem.micromodem.sentences import Cycle
 
@@ -43,7 +43,7 @@ class FakeModem:
         self.now = 0.0
         self.settings = {"SRC": "0", "CST": "0", "RXP": "0"}
         self.events: list[Event] = []
-        self.frames_heard: list[FrameHeard] = []
+        self.frames_heard: list[FrameOverheard] = []
         self.heard: list[nmea.Sentence] = []
         self.on_air: list[tuple[bytes, ...]] = []
         self.dead = False
@@ -70,8 +70,8 @@ class FakeModem:
 
     def _note(self, events: list[Event]) -> None:
         """Keep the events; a frame's first news apart from the packets' story."""
-        self.frames_heard += [event for event in events if isinstance(event, FrameHeard)]
-        self.events += [event for event in events if not isinstance(event, FrameHeard)]
+        self.frames_heard += [event for event in events if isinstance(event, FrameOverheard)]
+        self.events += [event for event in events if not isinstance(event, FrameOverheard)]
 
     def later(self, delay_s: float, action: Callable[[], None]) -> None:
         heapq.heappush(self._due, (self.now + delay_s, next(self._order), action))

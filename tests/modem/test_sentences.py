@@ -20,7 +20,7 @@ from sonarpost.modem.micromodem.sentences import (
     TransmitData,
     TransmitMark,
 )
-from sonarpost.modem.micromodem.settings import ClockSetting, ModemComplaint, Revision, Setting, SettingQuery
+from sonarpost.modem.micromodem.settings import ClockSetting, ConfigurationSetting, ErrorReport, Revision, SettingQuery
 from sonarpost.modem.micromodem.statistics import LinkStatistics, TransmitStatistics, format_stamp
 
 RECORDS = [
@@ -37,11 +37,11 @@ RECORDS = [
     (b"$CAACK,1,3,2,1", Acknowledgement(1, 3, 2)),
     (b"$CAMSG,BAD_CRC,2", ModemMessage("BAD_CRC", ("2",))),
     (b"$CAMSG,PACKET_TIMEOUT,3", ModemMessage("PACKET_TIMEOUT", ("3",))),
-    (b"$CACFG,SRC,1", Setting("SRC", "1")),
+    (b"$CACFG,SRC,1", ConfigurationSetting("SRC", "1")),
     (b"$CCCFQ,ALL", SettingQuery("ALL")),
     (b"$CAREV,000052,AUV,0.93.0.09", Revision("AUV", "0.93.0.09", "000052")),
-    (b"$CAERR,181807,NMEA,2,no such command", ModemComplaint("NMEA", 2, "no such command", "181807")),
-    (b"$CAERR,181807,DATA_TIMEOUT,2", ModemComplaint("DATA_TIMEOUT", 2, "", "181807")),
+    (b"$CAERR,181807,NMEA,2,no such command", ErrorReport("NMEA", 2, "no such command", "181807")),
+    (b"$CAERR,181807,DATA_TIMEOUT,2", ErrorReport("DATA_TIMEOUT", 2, "", "181807")),
     (b"$CCCLK,2016,10,12,9,0,5", ClockSetting(datetime(2016, 10, 12, 9, 0, 5, tzinfo=UTC))),
 ]
 
@@ -77,7 +77,7 @@ def test_echoes_are_the_command_under_another_name() -> None:
         (b"$CATXF,x", TransmitMark.parse, "nbytes"),
         (b"$CAACK,1,3,0,1", Acknowledgement.parse, "frame"),
         (b"$CAMSG,", ModemMessage.parse, "text"),
-        (b"$CACFG,,1", Setting.parse, "name"),
+        (b"$CACFG,,1", ConfigurationSetting.parse, "name"),
         (b"$CAREV,000052,", Revision.parse, "role"),
         (b"$CACLK,2016,2,30,0,0,0", ClockSetting.parse, "day"),
         (b"$CACLK,2016,13,1,0,0,0", ClockSetting.parse, "month"),
@@ -100,7 +100,8 @@ def test_wrong_fields_are_named(line: bytes, parse: Callable[[Sentence], object]
 PARSERS = {
     "CACYC": Cycle, "CADRQ": DataRequest, "CCTXD": TransmitData, "CATXD": DataAccepted, "CATXP": TransmitMark,
     "CARXP": ReceptionStarted, "CARXD": ReceivedData, "CAACK": Acknowledgement, "CAMSG": ModemMessage,
-    "CACFG": Setting, "CCCFQ": SettingQuery, "CAREV": Revision, "CAERR": ModemComplaint, "CACLK": ClockSetting,
+    "CACFG": ConfigurationSetting, "CCCFQ": SettingQuery,
+    "CAREV": Revision, "CAERR": ErrorReport, "CACLK": ClockSetting,
     "CACST": LinkStatistics, "CAXST": TransmitStatistics,
 }  # fmt: skip
 awkward = st.sampled_from(
@@ -189,9 +190,9 @@ def test_golden_transmit_statistics() -> None:
     ("value", "number"), [("1", 1), ("001", 1), ("-1", -1), ("1_0", None), ("2.5", None), ("", None), ("on", None)]
 )
 def test_values_of_settings(value: str, number: int | None) -> None:
-    assert Setting("name", value).number == number
+    assert ConfigurationSetting("name", value).number == number
 
 
 def test_dotted_setting_of_a_second_generation_modem() -> None:
-    got = Setting.parse(Sentence("CACFG", ("gps.parser.enable", "a", "b")))
+    got = ConfigurationSetting.parse(Sentence("CACFG", ("gps.parser.enable", "a", "b")))
     assert (got.name, got.value) == ("gps.parser.enable", "a,b")

@@ -23,7 +23,7 @@ from sonarpost.modem.micromodem.events import (
     PacketReceived,
     PacketSent,
     PingAnswered,
-    PingHeard,
+    PingOverheard,
     Polled,
     RequestDone,
     RequestFailed,
@@ -37,7 +37,7 @@ from sonarpost.modem.micromodem.short_sentences import (
     FlexiblePart,
     MiniPacket,
     MiniReply,
-    Ping,
+    PingCommand,
     PingReply,
     ReceivedFlexibleData,
     TimeSetting,
@@ -71,7 +71,7 @@ def tell(driver: MicroModem, *texts: str, now: float = 1.0) -> list[object]:
 @given(ADDRESS, ADDRESS, st.integers(0, 0x1FFF), st.binary(max_size=100), st.lists(PART, max_size=4))
 def test_what_is_written_is_read(src: int, dest: int, bits: int, data: bytes, parts: list[FlexiblePart]) -> None:
     for kind in ("CCMPC", "CAMPC", "CAMPA"):
-        assert Ping.parse(Ping(src, dest).sentence(kind)) == Ping(src, dest)
+        assert PingCommand.parse(PingCommand(src, dest).sentence(kind)) == PingCommand(src, dest)
     for kind in ("CCMUC", "CAMUC", "CAMUA"):
         assert MiniPacket.parse(MiniPacket(src, dest, bits).sentence(kind)) == MiniPacket(src, dest, bits)
     assert MiniReply.parse(MiniReply(src, dest).sentence()) == MiniReply(src, dest)
@@ -87,8 +87,8 @@ def test_what_is_written_is_read(src: int, dest: int, bits: int, data: bytes, pa
 @pytest.mark.parametrize(
     ("read", "text", "field"),
     [
-        (Ping, "CAMPA,1", "fields"),
-        (Ping, "CAMPA,1,128", "dest"),
+        (PingCommand, "CAMPA,1", "fields"),
+        (PingCommand, "CAMPA,1,128", "dest"),
         (PingReply, "CAMPR,1,2,soon", "travel time"),
         (PingReply, "CAMPR,1,2,-1", "travel time"),
         (MiniPacket, "CAMUA,1,2,2000", "bits"),
@@ -100,7 +100,7 @@ def test_what_is_written_is_read(src: int, dest: int, bits: int, data: bytes, pa
         (TimeSetting, "CATMS,0,2019-12-02 03:02:59", "time"),
     ],
 )
-def test_wrong_fields_are_named(read: type[Ping], text: str, field: str) -> None:
+def test_wrong_fields_are_named(read: type[PingCommand], text: str, field: str) -> None:
     with pytest.raises(SentenceError) as caught:
         read.parse(sentence(text))
     assert caught.value.field == field
@@ -117,7 +117,7 @@ def test_what_others_say_is_told() -> None:
     driver = ready()
     told = tell(driver, "CAMPA,2,1", "CAMUA,2,1,1ABC", "CAMPR,2,1,0.1000", "CAMUR,2,1", "CARDP,2,1,1,0,0,1;1;AA,")
     assert told[:4] == [
-        PingHeard(2, 1),
+        PingOverheard(2, 1),
         MiniPacketReceived(2, 1, 0x1ABC),
         PingAnswered(2, 1, 0.1),
         MiniPacketAnswered(2, 1),

@@ -9,7 +9,7 @@ from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import (
     FailureReason,
     FrameAcknowledged,
-    ModemComplained,
+    ModemError,
     ModemReady,
     ModemRebooted,
     ModemUnresponsive,
@@ -361,7 +361,7 @@ def test_complaint_of_the_modem_is_passed_on() -> None:
     modem = ready()
     modem.say("CAERR", "181807", "NMEA", 2, "no such thing")
     (complained,) = modem.events
-    assert isinstance(complained, ModemComplained)
+    assert isinstance(complained, ModemError)
     assert complained.complaint.number == 2
 
 

@@ -24,7 +24,7 @@ from sonarpost.modem.micromodem.events import (
     RequestFailed,
 )
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_config import ChannelParameters
 from tests.modem.two_drivers import Spoil, TwoDrivers, cut, double, drop, garble, kinds_of
 
 READY_S = 30.0
@@ -159,7 +159,7 @@ def test_a_restart_or_a_lost_port_at_any_moment_and_the_next_packet_goes(name: s
 
 @pytest.mark.parametrize("seed", range(12))
 def test_damage_to_any_frame_costs_that_frame(seed: int) -> None:
-    rig = TwoDrivers(water=WaterConfig(seed=seed, frame_loss=0.5))
+    rig = TwoDrivers(water=ChannelParameters(seed=seed, frame_loss=0.5))
     assert rig.run(READY_S, lambda: all(rig.got(n, ModemReady) for n in (1, 2)))
     frames = [bytes([n]) * 40 for n in range(1, 9)]
     for _ in range(3):

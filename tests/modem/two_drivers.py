@@ -10,8 +10,8 @@ from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import Event
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
-from sonarpost.simulation.channel.channel_simulator import AcousticWorld, ModemPlace
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
 from sonarpost.simulation.modem.config import ModemConfig
 
 Spoil = Callable[[bytes], bytes]
@@ -61,12 +61,12 @@ class TwoDrivers:
     spoil: Spoil = drop
     mishap: Callable[[TwoDrivers], None] | None = None
     generation: int = 2
-    water: WaterConfig = field(default_factory=WaterConfig)
+    water: ChannelParameters = field(default_factory=ChannelParameters)
     config: Callable[[int], MicroModemConfig] = MicroModemConfig
 
     def __post_init__(self) -> None:
         places = {n: ModemPlace(ModemConfig(n, self.generation), Position(150.0 * n)) for n in (1, 2)}
-        self.world = AcousticWorld(self.water, places)
+        self.world = ChannelSimulator(self.water, places)
         self.drivers = {n: MicroModem(self.config(n)) for n in (1, 2)}
         self.events: dict[int, list[Event]] = {1: [], 2: []}
         self.passed: list[Passed] = []

@@ -16,13 +16,13 @@ from sonarpost import keys, logs, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.sender import plan_packets
-from sonarpost.messages import AcousticFrame, Contact, Decision, Raster, Relayed, Snippet
-from sonarpost.monitoring.log_context import Concern, concern_of_payload
+from sonarpost.messages import AcousticFrame, Contact, Decision, Pixels, Relayed, Snippet
+from sonarpost.monitoring.log_context import LogContext, context_of_payload
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
 CONTACT = Contact(contact_id="line-7", vehicle_id="uuv-1")
-SNIPPET = Snippet(contact=CONTACT, picture=Raster(height_px=1, width_px=1, bits=8, data=b"\0"))
+SNIPPET = Snippet(contact=CONTACT, picture=Pixels(height_px=1, width_px=1, bits=8, data=b"\0"))
 IMAGE_KEY = keys.image_reconstructed("vessel-1")
 
 
@@ -37,11 +37,11 @@ def frame(data: bytes) -> bytes:
 
 def test_records_say_what_they_concern() -> None:
     whole = {"vehicle": "uuv-1", "image_id": "00A7", "contact_id": COMPLETE_IMAGE.contact.contact_id}  # type: ignore[union-attr]
-    assert concern_of_payload(wire.encode(SNIPPET), "k") == {"vehicle": "uuv-1", "contact_id": "line-7"}
-    assert concern_of_payload(wire.encode(COMPLETE_IMAGE), "k") == whole
-    assert concern_of_payload(relayed(wire.encode(COMPLETE_IMAGE)), "k") == whole
+    assert context_of_payload(wire.encode(SNIPPET), "k") == {"vehicle": "uuv-1", "contact_id": "line-7"}
+    assert context_of_payload(wire.encode(COMPLETE_IMAGE), "k") == whole
+    assert context_of_payload(relayed(wire.encode(COMPLETE_IMAGE)), "k") == whole
     decision = next(record for record in SAMPLES.values() if isinstance(record, Decision))
-    assert concern_of_payload(wire.encode(decision), "k") == {
+    assert context_of_payload(wire.encode(decision), "k") == {
         "vehicle": decision.vehicle_id,
         "image_id": decision.image_id,
     }
@@ -50,13 +50,13 @@ def test_records_say_what_they_concern() -> None:
 def test_a_frame_says_its_image_where_its_format_does() -> None:
     for packet in plan_packets("00A7", b"\x01\x02" + bytes(range(80)), ContactSummary(), 3, 64):
         for data in packet:
-            assert concern_of_payload(frame(data), "k") == {"image_id": "00A7"}
-    assert concern_of_payload(frame(b"\xff\xff"), "k") == {}
+            assert context_of_payload(frame(data), "k") == {"image_id": "00A7"}
+    assert context_of_payload(frame(b"\xff\xff"), "k") == {}
 
 
 @pytest.mark.parametrize("payload", [b"", b"\xc1", relayed(b"\xc1"), relayed(relayed(wire.encode(COMPLETE_IMAGE)))])
 def test_what_says_nothing_concerns_nobody(payload: bytes) -> None:
-    assert concern_of_payload(payload, "k") == {}
+    assert context_of_payload(payload, "k") == {}
 
 
 @given(
@@ -70,7 +70,7 @@ def test_what_says_nothing_concerns_nobody(payload: bytes) -> None:
     )
 )
 def test_fields_of_other_types_are_left_out(fields: dict[str, object]) -> None:
-    assert all(isinstance(value, str) for value in concern_of_payload(msgpack.packb(fields), "k").values())
+    assert all(isinstance(value, str) for value in context_of_payload(msgpack.packb(fields), "k").values())
 
 
 def test_a_refused_record_is_named_in_the_log(
@@ -95,8 +95,8 @@ def test_a_refused_record_is_named_in_the_log(
 @pytest.mark.parametrize("name", SAMPLES)
 def test_a_record_concerns_what_its_payload_does(name: str) -> None:
     payload = wire.encode(SAMPLES[name])
-    concern = Concern(payload, "k")
-    expected = concern_of_payload(payload, "k")
+    concern = LogContext(payload, "k")
+    expected = context_of_payload(payload, "k")
     assert concern.fields() == expected
     concern.record = SAMPLES[name]
     assert concern.fields() == expected

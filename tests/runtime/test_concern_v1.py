@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonarpost.link.auth.authentication import AcousticSeal
-from sonarpost.link.auth.key import Direction, SealKey
+from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.auth.key import AcousticKey, Direction
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.sender import Sender
-from sonarpost.monitoring.log_context import image_of_frame
+from sonarpost.link.sender import LinkSender
+from sonarpost.monitoring.log_context import image_ids_of_frame
 
 
-def frames(frame_bytes: int, *numbers: int, seal: AcousticSeal | None = None) -> list[bytes]:
-    sender = Sender(SenderConfig(frame_bytes=frame_bytes, gather_s=0.0), seal=seal)
+def frames(frame_bytes: int, *numbers: int, seal: FrameAuthenticator | None = None) -> list[bytes]:
+    sender = LinkSender(SenderConfig(frame_bytes=frame_bytes, gather_s=0.0), seal=seal)
     for number in numbers:
         sender.add_picture(number, ContactSummary(80, 80), np.random.default_rng(number).bytes(300), 0.0)
     found = []
@@ -26,39 +26,41 @@ def frames(frame_bytes: int, *numbers: int, seal: AcousticSeal | None = None) ->
 
 @pytest.mark.parametrize("frame_bytes", [64, 256])
 def test_frames_with_previews_name_their_pictures(frame_bytes: int) -> None:
-    named = {name for frame in frames(frame_bytes, 7, 8, 65535) for name in (image_of_frame(frame) or "").split(",")}
+    named = {
+        name for frame in frames(frame_bytes, 7, 8, 65535) for name in (image_ids_of_frame(frame) or "").split(",")
+    }
     assert named - {""} == {image_of_number(number) for number in (7, 8, 65535)}
 
 
 def test_several_pictures_of_a_frame_are_named_in_their_order() -> None:
-    assert image_of_frame(frames(256, 1, 2, 3)[0]) == "0001,0002,0003"
+    assert image_ids_of_frame(frames(256, 1, 2, 3)[0]) == "0001,0002,0003"
 
 
 def test_announced_contacts_are_named() -> None:
-    sender = Sender(SenderConfig(frame_bytes=64, gather_s=60.0, announce=True))
+    sender = LinkSender(SenderConfig(frame_bytes=64, gather_s=60.0, announce=True))
     sender.add_picture(5, ContactSummary(80, 80), b"a stream of some bytes, and more of it than that", 0.0)
     frame = sender.next_frame(0.0)
     assert frame is not None
-    assert image_of_frame(frame) == "0005"
+    assert image_ids_of_frame(frame) == "0005"
 
 
 def test_frames_of_detail_and_of_messages_name_none() -> None:
-    sender = Sender(SenderConfig())
+    sender = LinkSender(SenderConfig())
     sender.add_message(b"a message", 0.0)
     message = sender.next_frame(0.0)
     assert message is not None
-    assert image_of_frame(message) is None
-    assert image_of_frame(frames(64, 1, 2)[-1]) is None
+    assert image_ids_of_frame(message) is None
+    assert image_ids_of_frame(frames(64, 1, 2)[-1]) is None
 
 
 @pytest.mark.parametrize("cut", [0, 1, 5, 20, 63])
 def test_damaged_frames_name_none(cut: int) -> None:
     frame = frames(64, 9)[0]
-    assert image_of_frame(frame[:cut] + bytes([frame[cut] ^ 0x10]) + frame[cut + 1 :]) is None
+    assert image_ids_of_frame(frame[:cut] + bytes([frame[cut] ^ 0x10]) + frame[cut + 1 :]) is None
 
 
 def test_sealed_frames_say_nothing_without_the_key() -> None:
-    seal = AcousticSeal(SealKey(bytes(range(32))), 3, Direction.FROM_VEHICLE)
+    seal = FrameAuthenticator(AcousticKey(bytes(range(32))), 3, Direction.FROM_VEHICLE)
     assert seal.wanted_limit is not None
     seal.grant(seal.wanted_limit)
-    assert image_of_frame(frames(64, 9, seal=seal)[0]) is None
+    assert image_ids_of_frame(frames(64, 9, seal=seal)[0]) is None

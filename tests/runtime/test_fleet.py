@@ -9,7 +9,7 @@ import pytest
 from sonarpost import keys, wire
 from sonarpost.messages import Health
 from sonarpost.monitoring import fleet as fleet_module
-from sonarpost.monitoring.fleet import Fleet
+from sonarpost.monitoring.fleet import FleetTracker
 
 
 def health(platform: str = "uuv-1", service: str = "c2", **changes: Any) -> Health:
@@ -17,12 +17,12 @@ def health(platform: str = "uuv-1", service: str = "c2", **changes: Any) -> Heal
     return Health(platform_id=platform, service=service, **(fields | changes))
 
 
-def tell(fleet: Fleet, record: Health, now_s: float, key: str = "") -> None:
+def tell(fleet: FleetTracker, record: Health, now_s: float, key: str = "") -> None:
     fleet.take(key or keys.health(record.platform_id, record.service), wire.encode(record), now_s)
 
 
 def test_ages_count_from_arrival() -> None:
-    fleet = Fleet()
+    fleet = FleetTracker()
     tell(fleet, health(time_utc_s=4e9), 100.0)
     fleet.set_alive([keys.alive("uuv-1", "c2"), keys.alive("uuv-1", "relay")], 101.0)
     c2, relay = fleet.state(103.0).services
@@ -30,7 +30,7 @@ def test_ages_count_from_arrival() -> None:
 
 
 def test_without_a_router_nobody_is_known_to_live() -> None:
-    fleet = Fleet()
+    fleet = FleetTracker()
     tell(fleet, health(), 0.0)
     assert fleet.state(1.0).services[0].alive is None
     fleet.set_alive([], 1.0)
@@ -51,20 +51,20 @@ def test_without_a_router_nobody_is_known_to_live() -> None:
     ],
 )
 def test_what_cannot_be_used_is_counted_and_dropped(key: str, payload: bytes, caplog: pytest.LogCaptureFixture) -> None:
-    fleet = Fleet()
+    fleet = FleetTracker()
     fleet.take(key, payload, 0.0)
     assert (fleet.state(0.0).services, fleet.state(0.0).rejected) == ((), 1)
     assert "expected" in vars(caplog.records[0])["fields"]["reason"]
 
 
 def test_strangers_tokens_are_ignored() -> None:
-    fleet = Fleet()
+    fleet = FleetTracker()
     fleet.set_alive(["sonarpost/v1/uuv-1/alive/c2", "sonarpost/v1/uuv-1/alive/a/b", "x"], 0.0)
     assert [(s.platform, s.service) for s in fleet.state(0.0).services] == [("uuv-1", "c2")]
 
 
 def test_who_is_gone_is_forgotten_and_who_lives_is_not() -> None:
-    fleet = Fleet(forget_after_s=60.0)
+    fleet = FleetTracker(forget_after_s=60.0)
     for service in ("c2", "relay"):
         tell(fleet, health(service=service), 0.0)
     fleet.set_alive([keys.alive("uuv-1", "c2")], 60.0)
@@ -75,7 +75,7 @@ def test_who_is_gone_is_forgotten_and_who_lives_is_not() -> None:
 
 def test_names_without_end_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fleet_module, "MAX_SERVICES", 3)
-    fleet = Fleet()
+    fleet = FleetTracker()
     for number in range(5):
         tell(fleet, health(service=f"s{number}"), 0.0)
     fleet.set_alive([keys.alive("uuv-1", f"t{number}") for number in range(9)], 0.0)

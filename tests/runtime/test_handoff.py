@@ -15,12 +15,12 @@ from conftest import eventually
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery import protocol as handoff
-from sonarpost.delivery.protocol import CHUNK_BYTES, Reply
+from sonarpost.delivery.protocol import CHUNK_BYTES, AckReply
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import OutboxItem
 from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.messages import Decision, Record
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Service, UnitOfWork
 
 KEY = keys.contact_decision("vessel-1")
 
@@ -44,11 +44,11 @@ class Producer(Service[ServiceConfig]):
 
     NAME = "producer"
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         raise AssertionError("takes nothing")
 
     def owe(self, number: int, remark: str = "", priority: int = 4) -> None:
-        effects = Effects()
+        effects = UnitOfWork()
         effects.send(KEY, "consumer", decision(number, remark), priority=priority)
         self.commit(effects)
 
@@ -66,7 +66,7 @@ class Consumer(Service[ServiceConfig]):
     def consumes(self) -> Mapping[str, type[Record]]:
         return {KEY: Decision}
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         assert isinstance(record, Decision)
         error = self.fail_on.get(record.decision_id)
         if error is not None:
@@ -151,11 +151,11 @@ def test_a_restarted_consumer_takes_a_repeated_record_only_once(
     payload = wire.encode(decision(1))
     item = OutboxItem("consumer", 1, KEY, "", 4, payload, hashlib.sha256(payload).digest())
 
-    def ask() -> Reply:
+    def ask() -> AckReply:
         replies = client.get(
             keys.handoff(KEY, "consumer"), payload=payload, attachment=handoff.attachment(b"o" * 16, item), timeout=5
         )
-        return Reply.unpack(replies.recv().ok.payload.to_bytes(), KEY)
+        return AckReply.unpack(replies.recv().ok.payload.to_bytes(), KEY)
 
     eventually(lambda: bool(consumer.session.info.routers_zid()))
     assert ask().status == "stored"
@@ -180,7 +180,7 @@ def test_a_record_in_many_pieces_resumes_after_a_restart(platform: PlatformMaker
     sha = hashlib.sha256(payload).digest()
     item = OutboxItem("consumer", 1, KEY, "", 4, payload, sha)
 
-    def ask(offset: int, end: int) -> Reply:
+    def ask(offset: int, end: int) -> AckReply:
         querier = client.declare_querier(keys.handoff(KEY, "consumer"))
         eventually(lambda: querier.matching_status.matching)
         replies = client.get(
@@ -189,18 +189,18 @@ def test_a_record_in_many_pieces_resumes_after_a_restart(platform: PlatformMaker
             attachment=handoff.attachment(b"o" * 16, item, offset),
             timeout=5,
         )
-        return Reply.unpack(replies.recv().ok.payload.to_bytes(), KEY)
+        return AckReply.unpack(replies.recv().ok.payload.to_bytes(), KEY)
 
     consumer = Consumer(platform("vessel-1"), ServiceConfig())
     consumer.start()
-    assert ask(0, 500) == Reply("more", 500)
-    assert ask(900, 1000) == Reply("more", 500)
+    assert ask(0, 500) == AckReply("more", 500)
+    assert ask(900, 1000) == AckReply("more", 500)
     consumer.stop()
     consumer = Consumer(platform("vessel-1"), ServiceConfig())
     consumer.start()
     try:
-        assert ask(0, 500) == Reply("more", 500)
-        assert ask(500, len(payload)) == Reply("stored")
+        assert ask(0, 500) == AckReply("more", 500)
+        assert ask(500, len(payload)) == AckReply("stored")
         eventually(lambda: consumer.got == ["d1"])
     finally:
         consumer.stop()
@@ -225,7 +225,7 @@ def test_large_records_are_sent_in_pieces(size: int, producer: Producer, platfor
     consumer.start()
     try:
         for number in range(3):
-            effects = Effects()
+            effects = UnitOfWork()
             fields = decision(number).model_dump()
             effects.send(KEY, "consumer", Bulky(**fields, data=bytes([number]) * size))
             producer.commit(effects)

@@ -17,12 +17,12 @@ from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery import protocol as handoff
 from sonarpost.delivery.batch_protocol import MAX_RECORDS, attachment, pack_replies, parse_query, unpack_replies
-from sonarpost.delivery.inbox import NotNowError
-from sonarpost.delivery.protocol import CHUNK_BYTES, Reply
-from sonarpost.delivery.transaction import Chunk, OutboxItem
+from sonarpost.delivery.inbox import RetryLaterError
+from sonarpost.delivery.protocol import CHUNK_BYTES, AckReply
+from sonarpost.delivery.transaction import OutboxItem, ReceivedChunk
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Decision, Record
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Service, UnitOfWork
 
 KEY = keys.contact_decision("vessel-1")
 WHERE = keys.handoff(KEY, "consumer")
@@ -57,7 +57,7 @@ def test_what_was_packed_is_parsed(records: dict[int, bytes]) -> None:
     items = [item(seq, payload) for seq, payload in records.items()]
     settled = min(records) - 1
     chunks = parse_query(attachment(ORIGIN, items, settled), b"".join(records.values()), WHERE)
-    assert chunks == tuple(Chunk(ORIGIN, i.seq, len(i.payload), i.sha256, 0, i.payload, settled) for i in items)
+    assert chunks == tuple(ReceivedChunk(ORIGIN, i.seq, len(i.payload), i.sha256, 0, i.payload, settled) for i in items)
 
 
 SHA = bytes(32)
@@ -121,9 +121,9 @@ def test_a_wrong_reply_names_the_field(replies: object, field: str) -> None:
 
 
 def test_an_announcement_that_is_no_number_is_refused() -> None:
-    fields = msgpack.unpackb(Reply("stored").pack()) | {"takes": "many"}
+    fields = msgpack.unpackb(AckReply("stored").pack()) | {"takes": "many"}
     with pytest.raises(PayloadError, match="takes"):
-        Reply.unpack(msgpack.packb(fields), WHERE)
+        AckReply.unpack(msgpack.packb(fields), WHERE)
 
 
 # Producer
@@ -133,11 +133,11 @@ class Producer(Service[ServiceConfig]):
     NAME = "producer"
     PUBLISH = False
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         raise AssertionError("takes nothing")
 
     def owe(self, *payloads: bytes) -> None:
-        effects = Effects()
+        effects = UnitOfWork()
         for payload in payloads:
             effects.send_payload(KEY, "consumer", payload, Decision)
         self.commit(effects)
@@ -146,8 +146,10 @@ class Producer(Service[ServiceConfig]):
 class Listener:
     """A consumer made by hand: remembers what it was asked, and answers as a test wants."""
 
-    def __init__(self, session: zenoh.Session, answer: Callable[[tuple[Chunk, ...] | Chunk], bytes]) -> None:
-        self.asked: list[tuple[Chunk, ...] | Chunk] = []
+    def __init__(
+        self, session: zenoh.Session, answer: Callable[[tuple[ReceivedChunk, ...] | ReceivedChunk], bytes]
+    ) -> None:
+        self.asked: list[tuple[ReceivedChunk, ...] | ReceivedChunk] = []
         self._answer = answer
         session.declare_queryable(WHERE, self._on_query)
 
@@ -162,7 +164,7 @@ class Listener:
     @property
     def records(self) -> list[int]:
         """The numbers of all that was asked for."""
-        return [c.seq for asked in self.asked for c in ([asked] if isinstance(asked, Chunk) else asked)]
+        return [c.seq for asked in self.asked for c in ([asked] if isinstance(asked, ReceivedChunk) else asked)]
 
 
 @contextmanager
@@ -181,10 +183,10 @@ def producer(platform: PlatformMaker) -> Producer:
     return Producer(platform("vessel-1"), ServiceConfig())
 
 
-def stored(asked: tuple[Chunk, ...] | Chunk, takes: int) -> bytes:
-    if isinstance(asked, Chunk):
-        return Reply("stored").pack(takes)
-    return pack_replies([Reply("stored")] * len(asked))
+def stored(asked: tuple[ReceivedChunk, ...] | ReceivedChunk, takes: int) -> bytes:
+    if isinstance(asked, ReceivedChunk):
+        return AckReply("stored").pack(takes)
+    return pack_replies([AckReply("stored")] * len(asked))
 
 
 @pytest.mark.parametrize(("takes", "most"), [(0, 1), (1, 1), (5, 5), (2**60, MAX_RECORDS)])
@@ -195,11 +197,11 @@ def test_a_producer_sends_together_what_the_consumer_says_that_it_takes(
     producer.owe(*(decision(n) for n in range(300)))
     with running(producer):
         eventually(lambda: producer.store.outbox_depth() == 0)
-    assert isinstance(listener.asked[0], Chunk), "it has not said anything yet"
+    assert isinstance(listener.asked[0], ReceivedChunk), "it has not said anything yet"
     assert listener.records == list(range(1, 301))
-    longest = max(len(asked) for asked in listener.asked if not isinstance(asked, Chunk)) if most > 1 else 1
+    longest = max(len(asked) for asked in listener.asked if not isinstance(asked, ReceivedChunk)) if most > 1 else 1
     assert longest == most
-    assert all(isinstance(asked, Chunk) for asked in listener.asked) == (most == 1)
+    assert all(isinstance(asked, ReceivedChunk) for asked in listener.asked) == (most == 1)
 
 
 def test_what_does_not_fit_together_goes_by_itself(producer: Producer, client: zenoh.Session) -> None:
@@ -210,43 +212,43 @@ def test_what_does_not_fit_together_goes_by_itself(producer: Producer, client: z
         eventually(lambda: producer.store.outbox_depth() == 0)
     assert listener.records == list(range(1, 7))
     for asked in listener.asked:
-        if not isinstance(asked, Chunk):
+        if not isinstance(asked, ReceivedChunk):
             assert sum(chunk.size for chunk in asked) <= CHUNK_BYTES
 
 
 def test_a_consumer_that_takes_none_after_all_gets_each_by_itself(producer: Producer, client: zenoh.Session) -> None:
     """As one does that knows version 1 only and came up in the place of another under the same name."""
 
-    def answer(asked: tuple[Chunk, ...] | Chunk) -> bytes:
-        if isinstance(asked, Chunk):
-            return Reply("stored").pack(MAX_RECORDS)
-        return Reply("refused", reason="v: got 2, expected 1").pack()
+    def answer(asked: tuple[ReceivedChunk, ...] | ReceivedChunk) -> bytes:
+        if isinstance(asked, ReceivedChunk):
+            return AckReply("stored").pack(MAX_RECORDS)
+        return AckReply("refused", reason="v: got 2, expected 1").pack()
 
     listener = Listener(client, answer)
     producer.owe(*(decision(n) for n in range(30)))
     with running(producer):
         eventually(lambda: producer.store.outbox_depth() == 0)
         assert producer.store.refused_count() == 0
-    alone = [asked.seq for asked in listener.asked if isinstance(asked, Chunk)]
+    alone = [asked.seq for asked in listener.asked if isinstance(asked, ReceivedChunk)]
     assert alone == list(range(1, 31))
-    assert sum(not isinstance(asked, Chunk) for asked in listener.asked) >= 1
+    assert sum(not isinstance(asked, ReceivedChunk) for asked in listener.asked) >= 1
 
 
 def test_each_record_of_a_query_has_an_answer_of_its_own(producer: Producer, client: zenoh.Session) -> None:
     waited: set[int] = set()
 
-    def answer(asked: tuple[Chunk, ...] | Chunk) -> bytes:
-        if isinstance(asked, Chunk):
-            return Reply("stored").pack(MAX_RECORDS)
+    def answer(asked: tuple[ReceivedChunk, ...] | ReceivedChunk) -> bytes:
+        if isinstance(asked, ReceivedChunk):
+            return AckReply("stored").pack(MAX_RECORDS)
         replies = []
         for chunk in asked:
             if chunk.seq == 4:
-                replies.append(Reply("refused", reason="never"))
+                replies.append(AckReply("refused", reason="never"))
             elif chunk.seq == 7 and chunk.seq not in waited:
                 waited.add(chunk.seq)
-                replies.append(Reply("later", reason="full"))
+                replies.append(AckReply("later", reason="full"))
             else:
-                replies.append(Reply("stored"))
+                replies.append(AckReply("stored"))
         return pack_replies(replies)
 
     listener = Listener(client, answer)
@@ -278,14 +280,14 @@ class Consumer(Service[ServiceConfig]):
 
     def admit(self, key: str) -> None:
         if self.full:
-            raise NotNowError("no room")
+            raise RetryLaterError("no room")
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         assert isinstance(record, Decision)
         self.got.append(record.decision_id)
 
 
-def ask(client: zenoh.Session, items: list[OutboxItem], data: bytes | None = None) -> tuple[Reply, ...] | Reply:
+def ask(client: zenoh.Session, items: list[OutboxItem], data: bytes | None = None) -> tuple[AckReply, ...] | AckReply:
     querier = client.declare_querier(WHERE)
     eventually(lambda: querier.matching_status.matching)
     payload = b"".join(i.payload for i in items) if data is None else data
@@ -324,11 +326,11 @@ def test_a_query_that_cannot_be_read_is_refused_as_one(platform: PlatformMaker, 
     consumer = Consumer(platform("vessel-1"), ServiceConfig())
     with running(consumer):
         reply = ask(client, [item(1, decision(1)), item(2, decision(2))], data=b"short")
-        assert isinstance(reply, Reply)
+        assert isinstance(reply, AckReply)
         assert reply.status == "refused"
         assert consumer.store.refused_count() == 0, "nothing is known of any record"
         taken = ask(client, [item(1, decision(1)), item(2, decision(2))])
-        assert taken == (Reply("stored"), Reply("stored"))
+        assert taken == (AckReply("stored"), AckReply("stored"))
 
 
 def test_records_for_which_there_is_no_room_stay_with_their_producer(
@@ -357,11 +359,11 @@ def test_a_store_that_cannot_be_written_answers_the_whole_query(platform: Platfo
         pages = consumer.store._query("PRAGMA page_count")[0][0]
         consumer.store._db.execute(f"PRAGMA max_page_count={pages}")
         reply = ask(client, items)
-        assert isinstance(reply, Reply)
+        assert isinstance(reply, AckReply)
         assert reply.status == "later"
         assert consumer.store.inbox_depth() == 0
         consumer.store._db.execute("PRAGMA max_page_count=1000000")
-        assert ask(client, items) == (Reply("stored"),) * 59
+        assert ask(client, items) == (AckReply("stored"),) * 59
         eventually(lambda: len(consumer.got) == 59)
 
 
@@ -377,6 +379,6 @@ def test_settled_in_a_query_of_several_closes_gaps(platform: PlatformMaker, clie
         single = handoff.attachment(ORIGIN, items[0])
         received = client.get(WHERE, payload=items[0].payload, attachment=single, timeout=5).recv()
         assert received.ok is not None
-        reply = Reply.unpack(received.ok.payload.to_bytes(), WHERE)
+        reply = AckReply.unpack(received.ok.payload.to_bytes(), WHERE)
         assert (reply.status, reply.takes) == ("stored", MAX_RECORDS)
         eventually(lambda: consumer.got == ["d8", "d9"])

@@ -16,9 +16,9 @@ from conftest import eventually
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Health, Record
 from sonarpost.monitoring import healthcheck, heartbeat
-from sonarpost.monitoring.healthcheck import ailment, check
+from sonarpost.monitoring.healthcheck import check, health_problem
 from sonarpost.monitoring.heartbeat import Heartbeat
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Service, UnitOfWork
 
 NOW_S = 1000.0
 
@@ -52,47 +52,47 @@ def test_both_modules_name_the_same_variable() -> None:
 
 def test_a_service_that_beats_is_well(heart: Heartbeat, path: Path) -> None:
     heart.beat(health(), NOW_S)
-    assert ailment(path, NOW_S + 1) == ""
+    assert health_problem(path, NOW_S + 1) == ""
     assert check({"SONARPOST_HEARTBEAT": str(path)}, NOW_S + 1) == (0, "well")
 
 
 def test_no_heartbeat_is_a_service_that_has_not_started(path: Path) -> None:
-    assert "has not started" in ailment(path, NOW_S)
+    assert "has not started" in health_problem(path, NOW_S)
 
 
 def test_an_old_heartbeat_is_a_process_that_hangs(heart: Heartbeat, path: Path) -> None:
     heart.beat(health(), NOW_S)
-    assert ailment(path, NOW_S + 15.0) == ""
-    assert ailment(path, NOW_S + 15.1).startswith("hangs: last heartbeat 15 s ago")
+    assert health_problem(path, NOW_S + 15.0) == ""
+    assert health_problem(path, NOW_S + 15.1).startswith("hangs: last heartbeat 15 s ago")
 
 
 def test_slow_beats_are_given_their_time(path: Path, tmp_path: Path) -> None:
     Heartbeat(path, tmp_path, 60.0).beat(health(), NOW_S)
-    assert ailment(path, NOW_S + 180.0) == ""
-    assert ailment(path, NOW_S + 181.0).startswith("hangs")
+    assert health_problem(path, NOW_S + 180.0) == ""
+    assert health_problem(path, NOW_S + 181.0).startswith("hangs")
 
 
 @pytest.mark.parametrize("state", ["degraded", "stopping"])
 def test_a_service_that_says_it_cannot_work_is_ill_with_its_own_words(heart: Heartbeat, path: Path, state: str) -> None:
     heart.beat(health(state, "records cannot be stored"), NOW_S)
-    assert ailment(path, NOW_S) == f"{state}: records cannot be stored"
+    assert health_problem(path, NOW_S) == f"{state}: records cannot be stored"
 
 
 def test_records_that_wait_while_none_is_finished_are_a_stall(heart: Heartbeat, path: Path) -> None:
     heart.beat(health(inbox=3, handled=1), NOW_S)
     heart.beat(health(inbox=3, handled=1), NOW_S + 1800.0)
-    assert ailment(path, NOW_S + 1800.0) == ""
+    assert health_problem(path, NOW_S + 1800.0) == ""
     heart.beat(health(inbox=4, handled=1), NOW_S + 1805.0)
-    assert ailment(path, NOW_S + 1805.0) == "stalled: 4 records wait and none was finished for 1805 s"
+    assert health_problem(path, NOW_S + 1805.0) == "stalled: 4 records wait and none was finished for 1805 s"
     heart.beat(health(inbox=4, handled=2), NOW_S + 1810.0)
-    assert ailment(path, NOW_S + 1810.0) == ""
+    assert health_problem(path, NOW_S + 1810.0) == ""
 
 
 def test_an_idle_service_has_not_stalled(heart: Heartbeat, path: Path) -> None:
     heart.beat(health(handled=1), NOW_S)
     heart.beat(health(handled=1), NOW_S + 9000.0)
     heart.beat(health(inbox=1, handled=1), NOW_S + 9005.0)
-    assert ailment(path, NOW_S + 9005.0) == ""
+    assert health_problem(path, NOW_S + 9005.0) == ""
 
 
 def test_how_long_a_stall_may_last_is_configurable(heart: Heartbeat, path: Path) -> None:
@@ -112,12 +112,12 @@ def test_a_full_disk_is_told_before_a_record_meets_it(
 ) -> None:
     heart.beat(health(), NOW_S)
     monkeypatch.setattr(healthcheck, "MIN_FREE_BYTES", 1 << 62)
-    assert "B free, expected at least" in ailment(path, NOW_S)
+    assert "B free, expected at least" in health_problem(path, NOW_S)
 
 
 def test_a_store_that_went_away_is_named(path: Path, tmp_path: Path) -> None:
     Heartbeat(path, tmp_path / "gone", 5.0).beat(health(), NOW_S)
-    assert ailment(path, NOW_S) == f"{tmp_path / 'gone'}: No such file or directory"
+    assert health_problem(path, NOW_S) == f"{tmp_path / 'gone'}: No such file or directory"
 
 
 @pytest.mark.parametrize(
@@ -125,8 +125,8 @@ def test_a_store_that_went_away_is_named(path: Path, tmp_path: Path) -> None:
 )
 def test_a_file_that_is_no_heartbeat_is_named(path: Path, content: bytes) -> None:
     path.write_bytes(content)
-    assert str(path) in ailment(path, NOW_S)
-    assert "expected a heartbeat file" in ailment(path, NOW_S)
+    assert str(path) in health_problem(path, NOW_S)
+    assert "expected a heartbeat file" in health_problem(path, NOW_S)
 
 
 def test_without_a_file_there_is_nothing_to_check() -> None:
@@ -149,7 +149,7 @@ class Idle(Service[ServiceConfig]):
 
     NAME = "relay"
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         raise AssertionError(key)
 
 
@@ -170,7 +170,9 @@ def test_a_running_service_beats_and_the_command_finds_it_well(
         )
         assert (done.returncode, done.stdout) == (0, "well\n")
         service.problem("the disk is full")
-        eventually(lambda: ailment(path, time.monotonic()) == "degraded: the disk is full", 10, "the problem told")
+        eventually(
+            lambda: health_problem(path, time.monotonic()) == "degraded: the disk is full", 10, "the problem told"
+        )
     finally:
         service.stop()
     assert json.loads(path.read_bytes())["state"] == "stopping"

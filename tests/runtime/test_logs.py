@@ -160,8 +160,8 @@ def test_logs_go_to_standard_error_in_the_chosen_form(
 
 
 def test_what_a_line_concerns_is_in_both_formats() -> None:
-    with logs.concerning(vehicle="uuv-1", image_id=None):
-        with logs.concerning(image_id="00A7"):
+    with logs.log_context(vehicle="uuv-1", image_id=None):
+        with logs.log_context(image_id="00A7"):
             assert text("Sent", bytes=3).endswith(": Sent vehicle=uuv-1 image_id=00A7 bytes=3")
             assert event("Sent", image_id="00A8")["image_id"] == "00A8"  # the call knows better
         assert text("Sent").endswith(": Sent vehicle=uuv-1")
@@ -169,7 +169,7 @@ def test_what_a_line_concerns_is_in_both_formats() -> None:
 
 
 def test_what_a_line_concerns_ends_with_an_error() -> None:
-    with pytest.raises(ValueError, match="x"), logs.concerning(vehicle="uuv-1"):
+    with pytest.raises(ValueError, match="x"), logs.log_context(vehicle="uuv-1"):
         raise ValueError("x")
     assert text("Sent").endswith(": Sent")
 
@@ -182,13 +182,13 @@ def test_what_a_line_concerns_is_looked_for_once_and_only_for_a_line() -> None:
         looked += 1
         return {"image_id": "00A7", "contact_id": None}
 
-    with logs.concerning(vehicle="uuv-1"), logs.concerning_later(find):
+    with logs.log_context(vehicle="uuv-1"), logs.lazy_log_context(find):
         assert looked == 0
         assert text("Sent").endswith(": Sent vehicle=uuv-1 image_id=00A7")
-        with logs.concerning(step=2):
+        with logs.log_context(step=2):
             assert event("Sent")["step"] == 2
         assert looked == 1
     assert text("Sent").endswith(": Sent")
-    with logs.concerning_later(find):
+    with logs.lazy_log_context(find):
         pass
     assert looked == 1

@@ -18,7 +18,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from sonarpost.config import PlatformConfig
 from sonarpost.messages import Health
-from sonarpost.monitoring.fleet import FleetState, Seen
+from sonarpost.monitoring.fleet import FleetState, ServiceStatus
 from sonarpost.monitoring.metrics import MAX_VALUES, FleetCollector, registry_of
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
@@ -46,7 +46,7 @@ def health(service: str = "op_modem", **changes: object) -> Health:
     return Health(**(record | fields | changes))  # type: ignore[arg-type]
 
 
-def scraped(*services: Seen, connected: bool = True, rejected: int = 0) -> Samples:
+def scraped(*services: ServiceStatus, connected: bool = True, rejected: int = 0) -> Samples:
     registry = registry_of(FleetCollector(lambda: FleetState(services, connected, rejected), stale_after_s=30.0))
     text = openmetrics(registry).decode()
     assert len(list(parse_openmetrics(text))) > 0  # strict about names, types and order
@@ -54,7 +54,7 @@ def scraped(*services: Seen, connected: bool = True, rejected: int = 0) -> Sampl
 
 
 def test_a_service_in_metrics() -> None:
-    found = scraped(Seen("vessel-1", "op_modem", health(), 1.5, True), rejected=3)
+    found = scraped(ServiceStatus("vessel-1", "op_modem", health(), 1.5, True), rejected=3)
     who = ("vessel-1", "op_modem")
     assert found["sonarpost_up", *who] == 1
     assert found["sonarpost_frames_received_total", *who] == 7
@@ -74,13 +74,13 @@ def test_a_service_in_metrics() -> None:
 
 
 def test_stale_values_end_and_what_alerts_ask_stays() -> None:
-    found = scraped(Seen("vessel-1", "op_modem", health(), 30.1, False))
+    found = scraped(ServiceStatus("vessel-1", "op_modem", health(), 30.1, False))
     assert {name for name, *who in found if who} == {"sonarpost_up", "sonarpost_health_age_seconds"}
     assert found["sonarpost_up", "vessel-1", "op_modem"] == 0
 
 
 def test_without_a_router_nothing_is_said_about_who_lives() -> None:
-    found = scraped(Seen("vessel-1", "op_modem", health(), 1.0, None), connected=False)
+    found = scraped(ServiceStatus("vessel-1", "op_modem", health(), 1.0, None), connected=False)
     assert found["sonarpost_exporter_router_connected",] == 0
     assert not [name for name, *_ in found if name == "sonarpost_up"]
 
@@ -88,7 +88,7 @@ def test_without_a_router_nothing_is_said_about_who_lives() -> None:
 def test_names_that_are_no_metrics_and_names_without_end_are_left_out() -> None:
     hostile = {"a b": 1, 'x{y="z"}': 1, "": 1, "A": 1, "up": 1, "x_total": 1, "n\n# TYPE": 1, "fine": 1}
     many = {f"gauge_{n:04}": 1.0 for n in range(1000)} | {"fine": 2.0}
-    found = scraped(Seen("vessel-1", "op_modem", health(counters=hostile, gauges=many), 1.0, True))
+    found = scraped(ServiceStatus("vessel-1", "op_modem", health(counters=hostile, gauges=many), 1.0, True))
     assert found["sonarpost_fine_total", "vessel-1", "op_modem"] == 1
     assert ("sonarpost_fine", "vessel-1", "op_modem") not in found  # one name is one metric
     assert len(found) < MAX_VALUES + 20

@@ -31,7 +31,7 @@ from sonarpost.modem.micromodem.events import (
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.emulator import AcousticChannel
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
 
 CONFIG = MicroModemConfig(address=3, settings=())
@@ -260,7 +260,7 @@ def test_timers_run_without_a_byte_from_the_port(tmp_path: Path) -> None:
 
 def test_two_runners_ping_poll_and_exchange_small_things(tmp_path: Path) -> None:
     sites = (ModemSite(1), ModemSite(2, Position(150.0)))
-    channel = AcousticChannel(ChannelConfig(sites, pty_dir=tmp_path / "modems", time_scale=50.0))
+    channel = ChannelEmulator(ChannelConfig(sites, pty_dir=tmp_path / "modems", time_scale=50.0))
     channel.start()
     events: dict[int, list[Event]] = {1: [], 2: []}
     runners = {

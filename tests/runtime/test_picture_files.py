@@ -14,15 +14,15 @@ from golden.zenoh.strategies import images
 from hypothesis import given, settings
 
 from sonarpost.archive import image_files as picture_files
-from sonarpost.archive.image_files import picture_name, side_car, write_picture
-from sonarpost.messages import Raster, ReconstructedImage
+from sonarpost.archive.image_files import image_file_name, side_car, write_image
+from sonarpost.messages import Pixels, ReconstructedImage
 from sonarpost.sonar.image_files import read_image
 
 NAME = "uuv-1_20161012T090001Z_00A7_v1"
 
 
 def with_picture(pixels: np.ndarray, **more: object) -> ReconstructedImage:  # type: ignore[type-arg]
-    picture = Raster.from_array(pixels)
+    picture = Pixels.from_array(pixels)
     fields = COMPLETE_IMAGE.model_dump() | {"picture": picture, "picture_sha256": picture.sha256} | more
     return ReconstructedImage(**fields)
 
@@ -32,18 +32,18 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_a_name_tells_vehicle_time_image_and_version_apart() -> None:
-    assert picture_name(COMPLETE_IMAGE) == NAME
-    assert picture_name(DAMAGED_IMAGE) == "uuv-1_20161012T090001Z_00A7_v2"
+    assert image_file_name(COMPLETE_IMAGE) == NAME
+    assert image_file_name(DAMAGED_IMAGE) == "uuv-1_20161012T090001Z_00A7_v2"
     assert (
-        picture_name(with_picture(np.zeros((1, 1), np.uint8), first_frame_utc_s=0.0)).split("_")[1]
+        image_file_name(with_picture(np.zeros((1, 1), np.uint8), first_frame_utc_s=0.0)).split("_")[1]
         == "19700101T000000Z"
     )
     last = with_picture(np.zeros((1, 1), np.uint8), first_frame_utc_s=253402300799.0)
-    assert picture_name(last).split("_")[1] == "99991231T235959Z"
+    assert image_file_name(last).split("_")[1] == "99991231T235959Z"
 
 
 def test_a_picture_is_three_files_that_agree(tmp_path: Path) -> None:
-    tiff, new = write_picture(tmp_path / "a" / "b", COMPLETE_IMAGE)
+    tiff, new = write_image(tmp_path / "a" / "b", COMPLETE_IMAGE)
     assert new
     assert tiff == tmp_path / "a" / "b" / f"{NAME}.tiff"
     assert sorted(contents(tiff.parent)) == [f"{NAME}.json", f"{NAME}.png", f"{NAME}.tiff"]
@@ -59,7 +59,7 @@ def test_a_picture_is_three_files_that_agree(tmp_path: Path) -> None:
 
 def test_sixteen_bits_are_kept_in_tiff_and_png(tmp_path: Path) -> None:
     pixels = np.array([[0, 255, 256], [40_000, 65_535, 1]], np.uint16)
-    tiff, _ = write_picture(tmp_path, with_picture(pixels))
+    tiff, _ = write_image(tmp_path, with_picture(pixels))
     for suffix in (".tiff", ".png"):
         back = read_image(tiff.with_suffix(suffix))
         assert back.dtype == np.uint16
@@ -88,27 +88,27 @@ def test_any_picture_is_written_once_and_alike_everywhere(
     tmp_path_factory: pytest.TempPathFactory, image: ReconstructedImage
 ) -> None:
     here, there = tmp_path_factory.mktemp("vessel"), tmp_path_factory.mktemp("shore")
-    tiff, new = write_picture(here, image)
+    tiff, new = write_image(here, image)
     assert new
     np.testing.assert_array_equal(read_image(tiff), image.picture.to_array())
-    write_picture(there, image)
+    write_image(there, image)
     assert contents(here) == contents(there)
     before = {path.name: path.stat().st_mtime_ns for path in here.iterdir()}
-    assert write_picture(here, image) == (tiff, False)
+    assert write_image(here, image) == (tiff, False)
     assert {path.name: path.stat().st_mtime_ns for path in here.iterdir()} == before
 
 
 def test_a_version_does_not_replace_another(tmp_path: Path) -> None:
-    write_picture(tmp_path, COMPLETE_IMAGE)
+    write_image(tmp_path, COMPLETE_IMAGE)
     kept = contents(tmp_path)
-    write_picture(tmp_path, DAMAGED_IMAGE)
+    write_image(tmp_path, DAMAGED_IMAGE)
     now = contents(tmp_path)
     assert len(now) == 6
     assert kept.items() <= now.items()
 
 
 def test_a_picture_that_was_cut_short_is_written_again(tmp_path: Path) -> None:
-    tiff, _ = write_picture(tmp_path, COMPLETE_IMAGE)
+    tiff, _ = write_image(tmp_path, COMPLETE_IMAGE)
     whole = contents(tmp_path)
     for damage in (
         lambda: tiff.with_suffix(".json").unlink(),
@@ -116,7 +116,7 @@ def test_a_picture_that_was_cut_short_is_written_again(tmp_path: Path) -> None:
         tiff.unlink,
     ):
         damage()
-        assert write_picture(tmp_path, COMPLETE_IMAGE) == (tiff, True)
+        assert write_image(tmp_path, COMPLETE_IMAGE) == (tiff, True)
         assert contents(tmp_path) == whole
 
 
@@ -137,11 +137,11 @@ def test_a_disk_that_fills_up_leaves_no_side_car_without_its_picture(
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        write_picture(tmp_path, COMPLETE_IMAGE)
+        write_image(tmp_path, COMPLETE_IMAGE)
     monkeypatch.undo()
     assert sorted(contents(tmp_path)) == ([f"{NAME}.png", f"{NAME}.tiff"] if after == 3 else [])
     assert not (tmp_path / f"{NAME}.json").exists()
-    assert write_picture(tmp_path, COMPLETE_IMAGE)[1]
+    assert write_image(tmp_path, COMPLETE_IMAGE)[1]
     assert len(contents(tmp_path)) == 3
 
 
@@ -154,6 +154,6 @@ def test_the_side_car_is_written_last(tmp_path: Path, monkeypatch: pytest.Monkey
         return replace(self, target)
 
     monkeypatch.setattr(Path, "replace", rename)
-    picture_files.write_picture(tmp_path, COMPLETE_IMAGE)
+    picture_files.write_image(tmp_path, COMPLETE_IMAGE)
     assert order[-1] == ".json"
     assert sorted(order) == [".json", ".png", ".tiff"]

@@ -26,7 +26,7 @@ from collections.abc import Mapping
 from sonarpost.messages import Decision, Record
 from sonarpost.config import ServiceConfig
 from sonarpost.runtime.process import main
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import UnitOfWork, Service
 
 class TinyConfig(ServiceConfig):
     loops_forever_on_stop: bool = False
@@ -39,7 +39,7 @@ class Tiny(Service[TinyConfig]):
     def consumes(self) -> Mapping[str, type[Record]]:
         return {"sonarpost/v1/vessel-1/contact/decision": Decision}
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         effects.count("decisions")
 
     def on_start(self) -> None:

@@ -6,8 +6,8 @@ from collections import namedtuple
 
 import pytest
 
-from sonarpost.delivery.disk_reserve import Room
-from sonarpost.delivery.inbox import NotNowError
+from sonarpost.delivery.disk_reserve import DiskReserve
+from sonarpost.delivery.inbox import RetryLaterError
 
 DiskUsage = namedtuple("DiskUsage", "total used free")
 RECORD = bytes(100_000)
@@ -21,10 +21,10 @@ def disk(monkeypatch):
 
 
 def test_below_the_reserve_records_are_not_admitted_and_it_is_said_until_there_is_room(store, disk):
-    room = Room(store, 1000, "records wait")
+    room = DiskReserve(store, 1000, "records wait")
     disk[0] = 999
     assert room.trouble() == "", "nobody was turned away yet"
-    with pytest.raises(NotNowError, match="999 bytes free, below the reserve of 1000: records wait"):
+    with pytest.raises(RetryLaterError, match="999 bytes free, below the reserve of 1000: records wait"):
         room.need()
     assert "records wait" in room.trouble()
     disk[0] = 1000
@@ -36,8 +36,8 @@ def test_a_store_that_was_full_and_is_empty_takes_records_again(store, disk):
     with store.transaction() as tx:
         for _ in range(20):
             tx.accept("k", RECORD)
-    room = Room(store, 1_000_000, "records wait")
-    with pytest.raises(NotNowError):
+    room = DiskReserve(store, 1_000_000, "records wait")
+    with pytest.raises(RetryLaterError):
         room.need()
     with store.transaction() as tx:
         for item in store.pending(20):

@@ -16,8 +16,8 @@ from sonarpost.delivery.scheduler import (
     PROBE_WINDOW,
     WINDOW,
     WINDOW_BYTES,
-    Piece,
-    Schedule,
+    Chunk,
+    DeliveryScheduler,
     piece_bytes_for,
 )
 from sonarpost.delivery.token_bucket import TokenBucket
@@ -28,14 +28,14 @@ def item(seq: int, size: int = 100, priority: int = 6) -> OutboxItem:
     return OutboxItem("c2", seq, "k", "", priority, bytes(size), bytes(32), place=seq)
 
 
-def schedule(*items: OutboxItem, bytes_per_s: float | None = None, answered: bool = True) -> Schedule:
-    made = Schedule(bytes_per_s, 0.0)
+def schedule(*items: OutboxItem, bytes_per_s: float | None = None, answered: bool = True) -> DeliveryScheduler:
+    made = DeliveryScheduler(bytes_per_s, 0.0)
     made.probing = not answered
     made.put(items)
     return made
 
 
-def ask(plan: Schedule, now_s: float = 0.0) -> Piece:
+def ask(plan: DeliveryScheduler, now_s: float = 0.0) -> Chunk:
     piece, _ = plan.next_piece(now_s)
     assert piece is not None
     plan.asked(piece, now_s)
@@ -45,7 +45,7 @@ def ask(plan: Schedule, now_s: float = 0.0) -> Piece:
 class ThinLink:
     """Sends what the schedule gives over a link of a certain rate; every answer comes when its piece is through."""
 
-    def __init__(self, plan: Schedule) -> None:
+    def __init__(self, plan: DeliveryScheduler) -> None:
         self.plan = plan
         self.now_s = 0.0
         self.sent: list[tuple[float, int, int]] = []
@@ -259,7 +259,7 @@ def test_records_go_together_in_order_alike_and_within_one_piece(
     plan = schedule(*items, bytes_per_s=bytes_per_s)
     plan.takes = takes
     now_s = charged = 0.0
-    sent: list[Piece] = []
+    sent: list[Chunk] = []
     while plan.active:
         piece, wait_s = plan.next_piece(now_s)
         if piece is None:

@@ -11,13 +11,13 @@ import pytest
 from runtime.store_steps import send
 
 from sonarpost.delivery.store import Store
-from sonarpost.errors import HandoffError
+from sonarpost.errors import DeliveryError
 
 
 def test_a_closed_store_says_so(tmp_path: Path) -> None:
     store = Store(tmp_path / "s.db")
     store.close()
-    with pytest.raises(HandoffError, match="closed"), store.transaction():
+    with pytest.raises(DeliveryError, match="closed"), store.transaction():
         pass
 
 
@@ -32,7 +32,7 @@ def test_a_store_belongs_to_one_process_at_a_time(tmp_path: Path) -> None:
     script = f"from pathlib import Path; from sonarpost.delivery.store import Store; Store(Path({str(path)!r}))"
     store = Store(path)
     other = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert "HandoffError" in other.stderr
+    assert "DeliveryError" in other.stderr
     assert "in use by another process" in other.stderr
     send(store, b"still mine")
     store.close()
@@ -43,7 +43,7 @@ def test_a_file_that_is_no_store_is_refused_and_left_alone(tmp_path: Path) -> No
     path = tmp_path / "s.db"
     path.write_bytes(b"not a database, but somebody's file" * 100)
     before = path.read_bytes()
-    with pytest.raises(HandoffError, match=r"s\.db: cannot be opened as a sonarpost store"):
+    with pytest.raises(DeliveryError, match=r"s\.db: cannot be opened as a sonarpost store"):
         Store(path)
     assert path.read_bytes() == before
 
@@ -54,7 +54,7 @@ def test_a_store_of_another_version_is_refused(tmp_path: Path) -> None:
     with sqlite3.connect(path) as db:
         db.execute("UPDATE meta SET value = ? WHERE name = 'version'", (b"99",))
     db.close()
-    with pytest.raises(HandoffError, match="store version b'99', expected 2"):
+    with pytest.raises(DeliveryError, match="store version b'99', expected 2"):
         Store(path)
 
 
@@ -62,14 +62,14 @@ def test_a_folder_in_the_way_is_named(tmp_path: Path) -> None:
     (tmp_path / "s.db").mkdir()
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "s.db", tmp_path / "file" / "s.db"):
-        with pytest.raises(HandoffError, match=str(path)):
+        with pytest.raises(DeliveryError, match=str(path)):
             Store(path)
 
 
 def test_reading_a_closed_store_says_so(tmp_path: Path) -> None:
     store = Store(tmp_path / "s.db")
     store.close()
-    with pytest.raises(HandoffError, match="closed"):
+    with pytest.raises(DeliveryError, match="closed"):
         store.owed("c", 1)
 
 

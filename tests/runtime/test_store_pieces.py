@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 from runtime.store_steps import ORIGIN
 
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import Chunk
+from sonarpost.delivery.transaction import ReceivedChunk
 
 
-def pieces(data: bytes, *cuts: int, seq: int = 1) -> list[Chunk]:
+def pieces(data: bytes, *cuts: int, seq: int = 1) -> list[ReceivedChunk]:
     sha = hashlib.sha256(data).digest()
     edges = [0, *cuts, len(data)]
-    return [Chunk(ORIGIN, seq, len(data), sha, a, data[a:b]) for a, b in itertools.pairwise(edges)]
+    return [ReceivedChunk(ORIGIN, seq, len(data), sha, a, data[a:b]) for a, b in itertools.pairwise(edges)]
 
 
-def add(store: Store, chunk: Chunk) -> bytes | int:
+def add(store: Store, chunk: ReceivedChunk) -> bytes | int:
     with store.transaction() as tx:
         return tx.add_chunk(chunk)
 
@@ -46,7 +46,9 @@ def test_pieces_in_any_order_and_number_end_in_the_whole(
             store.close()
             store = Store(folder / "s.db")
         start = offset if chance.random() < 0.6 else chance.randrange(len(data))
-        offset = add(store, Chunk(ORIGIN, 1, len(data), sha, start, data[start : start + chance.randint(1, 20)]))
+        offset = add(
+            store, ReceivedChunk(ORIGIN, 1, len(data), sha, start, data[start : start + chance.randint(1, 20)])
+        )
         if isinstance(offset, bytes):
             break
     assert offset == data
@@ -80,7 +82,7 @@ def test_another_record_under_the_same_number_starts_anew(store: Store) -> None:
 
 def test_a_damaged_record_starts_anew(store: Store) -> None:
     first, second = pieces(b"0123456789", 5)
-    bad = Chunk(ORIGIN, 1, first.size, first.sha256, 0, b"0x234")
+    bad = ReceivedChunk(ORIGIN, 1, first.size, first.sha256, 0, b"0x234")
     assert add(store, bad) == 5
     assert add(store, second) == 0
     assert partials(store) == 0

@@ -19,7 +19,7 @@ from runtime.store_steps import ORIGIN, fail_within, send
 from sonarpost.delivery import rows
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
-from sonarpost.errors import HandoffError
+from sonarpost.errors import DeliveryError
 
 
 def test_state_is_remembered_replaced_and_forgotten(tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_a_full_disk_keeps_nothing_of_the_transaction_and_the_rest_unharmed(stor
             tx.put_state("small", b"1")
             tx.accept("k", b"x" * 100_000)
 
-    with pytest.raises(HandoffError, match="full"):
+    with pytest.raises(DeliveryError, match="full"):
         write()
     assert store.get_state("small") is None
     assert store.inbox_depth() == 0

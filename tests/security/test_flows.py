@@ -9,11 +9,11 @@ import pytest
 from conftest import eventually, free_port
 
 from sonarpost import keys, wire
-from sonarpost.bus.connectivity import Reach, ask_shore, try_endpoint, why_no_answer
+from sonarpost.bus.connectivity import ConnectivityState, diagnose_no_reply, probe_endpoint, query_presence
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Advice, Command, Decision, Record
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.security.router_config import Wanted
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
@@ -26,11 +26,11 @@ class Producer(Service[ServiceConfig]):
 
     NAME = "producer"
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         raise AssertionError("it consumes nothing")
 
     def owe(self, key: str, consumer: str, record: Record) -> None:
-        effects = Effects()
+        effects = UnitOfWork()
         effects.send(key, consumer, record)
         self.commit(effects)
 
@@ -47,7 +47,7 @@ class Console(Service[ServiceConfig]):
     def consumes(self):
         return {keys.advice(self.platform.id): Advice, keys.command_all(self.platform.id): Command}
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         self.got.append(record)
 
 
@@ -162,15 +162,15 @@ def test_the_self_test_tells_what_is_in_the_way(world, crew, aboard, tmp_path):
     endpoints = (world.shore_tls,)
     tls = world.tls("vessel-1")
 
-    def reached(vessel: str) -> Reach:
-        return why_no_answer(ask_shore(aboard, vessel), endpoints, tls).reach
+    def reached(vessel: str) -> ConnectivityState:
+        return diagnose_no_reply(query_presence(aboard, vessel), endpoints, tls).reach
 
     # The shore's router answers; c2 does not run.
-    eventually(lambda: reached("vessel-1") is Reach.NOBODY_THERE, what="the router's answer")
+    eventually(lambda: reached("vessel-1") is ConnectivityState.NOBODY_THERE, what="the router's answer")
     crew(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
-    eventually(lambda: reached("vessel-1") is Reach.REACHED, what="c2's answer")
+    eventually(lambda: reached("vessel-1") is ConnectivityState.REACHED, what="c2's answer")
     # A vessel whose `id` is not the certificate's name: TLS lets it in, the list does not.
-    assert reached("vessel-2") is Reach.DENIED
+    assert reached("vessel-2") is ConnectivityState.DENIED
 
 
 @pytest.mark.parametrize(
@@ -186,17 +186,17 @@ def test_a_refused_certificate_is_named_as_such(world, who, words):
     if who == "stranger":
         tls = tls.model_copy(update={"ca": world.fleet.folder / "ca.pem"})
         words = "unknown ca"
-    outcome = try_endpoint(world.shore_tls, tls)
-    assert outcome.reach is Reach.TLS_REFUSED
+    outcome = probe_endpoint(world.shore_tls, tls)
+    assert outcome.reach is ConnectivityState.TLS_REFUSED
     assert words in outcome.detail
     assert outcome.detail.startswith(world.shore_tls)
 
 
 def test_an_endpoint_where_nobody_listens_is_no_connection():
     endpoint = f"tls/localhost:{free_port()}"
-    assert try_endpoint(endpoint, None).reach is Reach.NO_CONNECTION
-    assert try_endpoint("tls/no-such-host.invalid:1", None).reach is Reach.NO_CONNECTION
-    assert try_endpoint("somewhere", None).reach is Reach.UNKNOWN
+    assert probe_endpoint(endpoint, None).reach is ConnectivityState.NO_CONNECTION
+    assert probe_endpoint("tls/no-such-host.invalid:1", None).reach is ConnectivityState.NO_CONNECTION
+    assert probe_endpoint("somewhere", None).reach is ConnectivityState.UNKNOWN
 
 
 def test_a_revoked_vessel_is_told_that_it_is_denied(world, crew, caplog):

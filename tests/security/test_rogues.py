@@ -9,7 +9,7 @@ import zenoh
 from conftest import eventually, free_port
 
 from sonarpost import keys, wire
-from sonarpost.bus.connectivity import Reach, try_endpoint
+from sonarpost.bus.connectivity import ConnectivityState, probe_endpoint
 from sonarpost.bus.session import client_config
 from sonarpost.messages import Health
 from sonarpost.security.router_config import Wanted
@@ -80,8 +80,8 @@ def test_a_server_under_a_wrong_name_is_not_linked_to(world):
     endpoint = f"tls/localhost:{free_port()}"
     wanted = Wanted("shore-2", listen=[endpoint], local=[], files=world.folders["nameless"])
     router = world.start("shore-2", wanted)
-    outcome = try_endpoint(endpoint, world.tls("vessel-2"))
-    assert outcome.reach is Reach.TLS_REFUSED
+    outcome = probe_endpoint(endpoint, world.tls("vessel-2"))
+    assert outcome.reach is ConnectivityState.TLS_REFUSED
     assert "localhost" in outcome.detail
     with pytest.raises(zenoh.ZError):
         world.open("vessel-2", endpoint=endpoint)

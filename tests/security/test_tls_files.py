@@ -12,7 +12,7 @@ import pytest
 from cryptography.hazmat.primitives import serialization
 
 from sonarpost import config
-from sonarpost.bus.tls import OwnTls
+from sonarpost.bus.tls import TlsMonitor
 from sonarpost.config import ServiceConfig
 from sonarpost.errors import ConfigError
 from sonarpost.security import tls_files
@@ -129,16 +129,16 @@ def test_a_key_written_where_its_path_belongs_is_not_repeated(folder):
 def test_health_warns_before_the_end_and_says_when_it_has_come(fleet, tmp_path, caplog):
     caplog.set_level(logging.WARNING)
     folder = fleet.issue("vessel-90", "vessel", days=10, out=tmp_path / "tls").folder
-    own, now_utc_s = OwnTls(tls_of(folder)), time.time()
+    own, now_utc_s = TlsMonitor(tls_of(folder)), time.time()
     assert "The certificate ends soon" in caplog.text
     assert "ends in 10.0 days" in own.remark(now_utc_s)
     assert own.trouble(now_utc_s) == ""
     assert own.remark(now_utc_s + 11 * DAY_S) == ""
     assert "has expired" in own.trouble(now_utc_s + 11 * DAY_S)
     assert own.gauges(now_utc_s)["certificate_days_left"] == pytest.approx(10, abs=0.01)
-    late = OwnTls(tls_of(folder).model_copy(update={"warn_days": 5.0}))
+    late = TlsMonitor(tls_of(folder).model_copy(update={"warn_days": 5.0}))
     assert late.remark(now_utc_s) == ""
-    nothing = OwnTls(None)
+    nothing = TlsMonitor(None)
     assert (nothing.remark(now_utc_s), nothing.trouble(now_utc_s), nothing.gauges(now_utc_s)) == ("", "", {})
 
 

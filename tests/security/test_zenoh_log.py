@@ -7,9 +7,9 @@ import pytest
 import zenoh
 
 from sonarpost.bus import presence as hello
-from sonarpost.bus.presence import Hello
-from sonarpost.bus.router_monitor import MAX_TOLD, Refusals, platform_and_sites
-from sonarpost.bus.zenoh_log import Denied, Remark, Stranger, TlsRejected, ZenohLog
+from sonarpost.bus.presence import PresenceReply
+from sonarpost.bus.router_monitor import MAX_TOLD, RefusedPeers, platform_and_sites
+from sonarpost.bus.zenoh_log import Denied, TlsRejected, UnknownCertificateAuthority, ZenohLog, ZenohLogMessage
 from sonarpost.errors import BadInputError, PayloadError
 
 ACL = "zenoh::net::routing::interceptor::access_control"
@@ -77,14 +77,14 @@ def test_threads_write_in_between_each_other():
 
 def test_a_peer_on_no_list_is_told():
     text = f"{ZID} did not match any configured ACL subject. Default permission `Deny` will be applied on all messages"
-    assert events(line(" INFO", f"rt{{zid=fb8ed621}}: {ACL}", text)) == [Stranger(ZID)]
+    assert events(line(" INFO", f"rt{{zid=fb8ed621}}: {ACL}", text)) == [UnknownCertificateAuthority(ZID)]
 
 
 def test_warnings_of_other_parts_are_kept_and_the_rest_is_not():
     assert events(
         line("ERROR", "demux{zid=1 src=south:0}:undeclare{id=2 expr=}: zenoh::net::routing::hat", "Unknown token id=2"),
         line(" INFO", "zenoh::net::runtime", "Using ZID: 1"),
-    ) == [Remark("ERROR", "zenoh::net::routing::hat", "Unknown token id=2")]
+    ) == [ZenohLogMessage("ERROR", "zenoh::net::routing::hat", "Unknown token id=2")]
 
 
 @pytest.mark.parametrize("text", ["", "Traceback (most recent call last):\n", "2026 WARN something\n", "\x00\xff\n"])
@@ -94,7 +94,7 @@ def test_what_is_no_line_of_the_log_is_said_to_be_none(text):
 
 
 def test_each_kind_of_refusal_is_told_once_an_interval_and_then_counted():
-    refusals = Refusals()
+    refusals = RefusedPeers()
     told = [refusals.count("messages_denied", "vessel-1", "Put", "a") for _ in range(5)]
     assert told == [True, False, False, False, False]
     assert refusals.counters["messages_denied"] == 5
@@ -103,7 +103,7 @@ def test_each_kind_of_refusal_is_told_once_an_interval_and_then_counted():
 
 
 def test_a_flood_of_different_refusals_is_counted_and_not_told():
-    refusals = Refusals()
+    refusals = RefusedPeers()
     told = sum(refusals.count("messages_denied", "vessel-1", "Put", f"key/{n}") for n in range(10_000))
     assert told == MAX_TOLD
     assert refusals.counters["messages_denied"] == 10_000
@@ -131,7 +131,7 @@ def test_a_configuration_that_says_it_wrongly_is_refused(metadata):
 
 
 def test_a_hello_is_read_as_it_was_written():
-    assert hello.parse(Hello("shore-1", "c2").pack(), "key") == Hello("shore-1", "c2")
+    assert hello.parse(PresenceReply("shore-1", "c2").pack(), "key") == PresenceReply("shore-1", "c2")
 
 
 @pytest.mark.parametrize(

@@ -19,11 +19,11 @@ from conftest import eventually, publish_once
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.messages import Contact, Health, Raster, Record, Snippet
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.messages import Contact, Health, Pixels, Record, Snippet
+from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
-from sonarpost.simulation.channel.emulator import AcousticChannel
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
@@ -44,11 +44,11 @@ class Neighbour(Service[ServiceConfig]):
     def consumes(self) -> Mapping[str, type[Record]]:
         return self._takes
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         self.got.append(record)
 
     def owe(self, key: str, consumer: str, *records: Record, priority: int = 4) -> None:
-        effects = Effects()
+        effects = UnitOfWork()
         for record in records:
             effects.send(key, consumer, record, priority=priority)
         self.commit(effects)
@@ -191,7 +191,7 @@ def snippet(texture: Callable[..., np.ndarray]) -> Callable[..., Snippet]:
     """Snippets by name."""
 
     def make(contact_id: str, height_px: int = 40, width_px: int = 60, **options: Any) -> Snippet:
-        picture = Raster.from_array(texture(height_px, width_px, **options))
+        picture = Pixels.from_array(texture(height_px, width_px, **options))
         return Snippet(contact=Contact(contact_id=contact_id, vehicle_id="uuv-1"), picture=picture)
 
     return make
@@ -273,15 +273,15 @@ class Sea:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._channel: AcousticChannel | None = None
+        self._channel: ChannelEmulator | None = None
 
     def port(self, modem: int) -> str:
         return str(self.folder / f"modem-{modem}")
 
-    def start(self, **water: Any) -> AcousticChannel:
+    def start(self, **water: Any) -> ChannelEmulator:
         sites = (ModemSite(1), ModemSite(3, Position(150.0)))
-        config = ChannelConfig(sites, WaterConfig(**water), pty_dir=self.folder, time_scale=150.0)
-        self._channel = AcousticChannel(config)
+        config = ChannelConfig(sites, ChannelParameters(**water), pty_dir=self.folder, time_scale=150.0)
+        self._channel = ChannelEmulator(config)
         self._channel.start()
         return self._channel
 

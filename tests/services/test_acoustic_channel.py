@@ -29,7 +29,7 @@ from sonarpost.modem.micromodem import nmea
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.services.acoustic_channel.service import AcousticChannel, AcousticChannelService
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
 from sonarpost.simulation.modem.config import ModemConfig
 
@@ -130,7 +130,7 @@ def hosts_of(channel: AcousticChannel) -> list[Host]:
 
 @pytest.mark.parametrize("tcp", [False, True])
 def test_the_log_is_what_the_receiver_read(make: Make, tmp_path: Path, tcp: bool):
-    water = WaterConfig(seed=3, frame_loss=0.3, tail_damage=0.4)
+    water = ChannelParameters(seed=3, frame_loss=0.3, tail_damage=0.4)
     channel = make(water=water, **({"tcp_ports": (0, 0)} if tcp else {}))
     sender, receiver = hosts_of(channel)
     for n in range(12):
@@ -167,7 +167,7 @@ def test_two_runs_of_one_seed_have_one_outcome(make: Make, tmp_path: Path):
     seen = []
     for run in ("a", "b"):
         channel = make(
-            water=WaterConfig(seed=8, frame_loss=0.5, tail_damage=0.5),
+            water=ChannelParameters(seed=8, frame_loss=0.5, tail_damage=0.5),
             pty_dir=tmp_path / run,
             log_path=tmp_path / f"{run}.jsonl",
         )

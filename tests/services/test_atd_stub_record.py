@@ -14,9 +14,9 @@ from golden.zenoh.samples import BARE_CONTACT, FULL_CONTACT
 from sonarpost import keys
 from sonarpost.config import load
 from sonarpost.detection.contacts import FilterScores, detect
-from sonarpost.detection.ground_snippet import ground_picture
+from sonarpost.detection.ground_snippet import ground_projected_image
 from sonarpost.errors import ConfigError, SurveyFileError
-from sonarpost.messages import Contact, Raster, Snippet
+from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.folder import FileSeen, SettledFiles, look_at
 from sonarpost.services.atd_stub.record import of_detection
@@ -172,7 +172,7 @@ def contact_at(survey: Survey, row: int, ground_m: float, found):
 @pytest.mark.parametrize("altitude_m", [2.0, 8.0])
 def test_a_square_metre_is_a_square_in_the_middle_whatever_speed_and_altitude(along_m, altitude_m, detection):
     survey = flat_survey(along_m=along_m, altitude_m=altitude_m)
-    picture = ground_picture(survey, contact_at(survey, 150, 12.0, detection), 80, 60, 0.1)
+    picture = ground_projected_image(survey, contact_at(survey, 150, 12.0, detection), 80, 60, 0.1)
     bright = np.argwhere(picture > 128)
     low, high = bright.min(axis=0), bright.max(axis=0) + 1
     assert picture.shape == (80, 60)
@@ -212,21 +212,21 @@ def test_a_picture_of_snippets_mode_has_no_wide_one(tmp_path, texture):
 
 def test_what_was_not_recorded_is_black(detection):
     survey = flat_survey()
-    at_the_end = ground_picture(survey, contact_at(survey, 290, 12.0, detection), 80, 60, 0.1)
+    at_the_end = ground_projected_image(survey, contact_at(survey, 290, 12.0, detection), 80, 60, 0.1)
     assert (at_the_end[52:] == 0).all()
-    at_the_nadir = ground_picture(survey, contact_at(survey, 150, 1.0, detection), 80, 60, 0.1)
+    at_the_nadir = ground_projected_image(survey, contact_at(survey, 150, 1.0, detection), 80, 60, 0.1)
     assert (at_the_nadir[:, :19] == 0).all()
     assert at_the_nadir[:, 22:].any()
-    far = ground_picture(survey, contact_at(survey, 150, 19.5, detection), 80, 60, 0.1)
+    far = ground_projected_image(survey, contact_at(survey, 150, 19.5, detection), 80, 60, 0.1)
     assert (far[:, -20:] == 0).all()
 
 
 def test_without_altitude_or_travel_or_with_tiny_pixels_there_is_none(detection):
     survey = flat_survey()
     found = contact_at(survey, 150, 12.0, detection)
-    assert ground_picture(survey, replace(found, altitude_m=None), 80, 60, 0.1) is None
-    assert ground_picture(survey, replace(found, pixel_along_m=None), 80, 60, 0.1) is None
-    assert ground_picture(survey, found, 80, 60, 1e-5) is None
+    assert ground_projected_image(survey, replace(found, altitude_m=None), 80, 60, 0.1) is None
+    assert ground_projected_image(survey, replace(found, pixel_along_m=None), 80, 60, 0.1) is None
+    assert ground_projected_image(survey, found, 80, 60, 1e-5) is None
 
 
 def test_the_record_says_the_size_of_the_pixels_it_has(line):
@@ -289,7 +289,7 @@ def test_a_text_file_that_is_none_is_refused_by_name(text, said, tmp_path):
 def test_a_snippet_on_the_disk_is_named_by_its_contact_and_stays_in_its_folder(tmp_path):
     picture = np.arange(400, dtype=np.uint8).reshape(20, 20)
     contact = Contact(contact_id="../a b/ü", vehicle_id="uuv-1", lat_deg=1.0)
-    tiff = write_snippet(tmp_path / "new" / "out", Snippet(contact=contact, picture=Raster.from_array(picture)))
+    tiff = write_snippet(tmp_path / "new" / "out", Snippet(contact=contact, picture=Pixels.from_array(picture)))
     assert tiff.parent == tmp_path / "new" / "out"
     np.testing.assert_array_equal(read_image(tiff), picture)
     assert read_contact(tiff.with_suffix(".txt"), "x", "uuv-1") == contact

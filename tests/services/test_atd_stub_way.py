@@ -14,8 +14,8 @@ from conftest import REPOSITORY, eventually
 
 from sonarpost import keys, wire
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.unit_of_work import Effects
-from sonarpost.messages import Contact, Health, QueuedImage, QueueState, Raster, Snippet
+from sonarpost.delivery.unit_of_work import UnitOfWork
+from sonarpost.messages import Contact, Health, Pixels, QueuedImage, QueueState, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.pool import ContactPool
 from sonarpost.services.atd_stub.service import AtdStubService
@@ -131,7 +131,7 @@ def test_after_a_restart_nothing_sets_out_before_the_reports_are_there():
 
 
 def snippet(name, confidence):
-    picture = Raster.from_array(np.full((16, 16), 7, np.uint8))
+    picture = Pixels.from_array(np.full((16, 16), 7, np.uint8))
     return Snippet(contact=Contact(contact_id=name, vehicle_id="uuv-1", atd_confidence=confidence), picture=picture)
 
 
@@ -145,13 +145,13 @@ def test_the_pool_gives_the_most_confident_first_and_survives(tmp_path):
     pool = ContactPool(store)
     wanted = [("c", 1.9), ("a", 1.5), ("d", 1.5), ("e", 1.25), ("b", 0.0), ("f", None), ("g", None)]
     for name, confidence in sorted(wanted):
-        effects = Effects()
+        effects = UnitOfWork()
         committed = pool.add(effects, [wire.encode(snippet(name, confidence))])
         commit(store, effects)
         committed()
     got = []
     for most in (1, 3, 2, 9):
-        effects = Effects()
+        effects = UnitOfWork()
         count, committed = pool.release(effects, most, lambda _, payload: got.append(payload))
         commit(store, effects)
         committed()

@@ -13,7 +13,7 @@ from records import decision_record, picture_record
 
 from sonarpost import keys, wire
 from sonarpost.files import AtomicFiles
-from sonarpost.messages import Contact, Raster, ReconstructedImage, Relayed
+from sonarpost.messages import Contact, Pixels, ReconstructedImage, Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.sonar.image_files import read_image
@@ -37,7 +37,7 @@ def relay(crew):
 @pytest.fixture
 def image(texture):
     def make(image_id="AAAA", vessel="vessel-1", seed=1):
-        picture = Raster.from_array(texture(seed=seed))
+        picture = Pixels.from_array(texture(seed=seed))
         missing = np.zeros((40, 60), dtype=np.bool_)
         missing[30:, :] = True
         return picture_record(

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from records import picture_record
 
 from sonarpost.archive.shore_files import find_picture, to_remove
-from sonarpost.archive.shore_index import FILE_NAME, PictureRow, ShoreIndex
-from sonarpost.errors import KeptFileError
-from sonarpost.messages import Decision, Raster
+from sonarpost.archive.shore_index import FILE_NAME, ImageRow, ShoreIndex
+from sonarpost.errors import StoredFileError
+from sonarpost.messages import Decision, Pixels
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 
@@ -21,7 +21,7 @@ DAY_S = 86400.0
 
 
 def image(image_id="AAAA", version=1, vessel="vessel-1", first_frame_utc_s=1_700_000_000.0):
-    picture = Raster(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
+    picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
     return picture_record(
         picture,
         vessel_id=vessel,
@@ -68,7 +68,7 @@ def row(name, accepted_utc_s=0.0, size_bytes=100, exported_utc_s=None, **changes
         "size_bytes": size_bytes,
         "exported_utc_s": exported_utc_s,
     }
-    return PictureRow(**(fields | changes))
+    return ImageRow(**(fields | changes))
 
 
 @pytest.fixture
@@ -193,11 +193,11 @@ def test_the_index_is_completed_from_the_files(archive, tmp_path):
 
 
 def test_an_index_of_another_version_or_none_is_refused(tmp_path):
-    with pytest.raises(KeptFileError, match="no such file"):
+    with pytest.raises(StoredFileError, match="no such file"):
         ShoreIndex(tmp_path, writable=False)
     (tmp_path / FILE_NAME).write_bytes(b"no database" * 100)
     for writable in (True, False):
-        with pytest.raises(KeptFileError, match=r"index\.db"):
+        with pytest.raises(StoredFileError, match=r"index\.db"):
             ShoreIndex(tmp_path, writable=writable)
 
 
@@ -206,10 +206,10 @@ def test_a_picture_is_found_by_name_and_newest_version():
     assert find_picture(rows, "uuv-1/AAAA", None, None).name == "f2"
     assert find_picture(rows, "uuv-1/AAAA", None, 1).name == "f1"
     assert find_picture(rows, "g", None, None).name == "g"
-    with pytest.raises(KeptFileError, match="a picture that"):
+    with pytest.raises(StoredFileError, match="a picture that"):
         find_picture(rows, "uuv-1/ZZZZ", None, None)
     twice = [*rows, row("h", first_frame_utc_s=9.0)]
-    with pytest.raises(KeptFileError, match="one picture, with --vessel or by the name of its files"):
+    with pytest.raises(StoredFileError, match="one picture, with --vessel or by the name of its files"):
         find_picture(twice, "uuv-1/AAAA", None, None)
 
 

@@ -11,7 +11,7 @@ from conftest import eventually, free_port
 from sonarpost import keys
 from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.bus.session import router_config
-from sonarpost.errors import KeptFileError
+from sonarpost.errors import StoredFileError
 from sonarpost.messages import Advice, Command, Decision, TaskingState
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
@@ -80,7 +80,7 @@ def states(out):
     """How far everything has come, by vessel, kind and identifier; nothing while there is no index yet."""
     try:
         index = ShoreIndex(out, writable=False)
-    except KeptFileError:
+    except StoredFileError:
         return {}
     try:
         return {(row.vessel_id, row.kind, row.record_id): row.state for row in index.tasking()}

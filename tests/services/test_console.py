@@ -15,7 +15,7 @@ import zenoh
 from conftest import eventually, publish_once
 
 from sonarpost import keys, wire
-from sonarpost.archive.image_files import write_picture
+from sonarpost.archive.image_files import write_image
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import (
     AcousticFrame,
@@ -25,7 +25,7 @@ from sonarpost.messages import (
     Decision,
     DownlinkState,
     LinkQuality,
-    Raster,
+    Pixels,
     ReconstructedImage,
     Relayed,
     TaskingState,
@@ -43,7 +43,7 @@ ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 
 def picture(version: int = 1, *, complete: bool = True) -> ReconstructedImage:
     pixels = np.full((20, 20), 100 + version, np.uint8)
-    raster = Raster.from_array(pixels)
+    raster = Pixels.from_array(pixels)
     mask = np.zeros(pixels.shape, np.bool_)
     mask[10:] = not complete
     return ReconstructedImage(
@@ -305,7 +305,7 @@ def test_ashore_c2s_pictures_are_shown_and_advice_goes_to_c2(crew, start, client
 
 
 def test_ashore_what_came_meanwhile_is_taken_from_c2s_folder(start, tmp_path):
-    write_picture(tmp_path / "out" / VESSEL, picture(2, complete=False))
+    write_image(tmp_path / "out" / VESSEL, picture(2, complete=False))
     (tmp_path / "out" / VESSEL / "broken.json").write_text("{")
     console = start(side="shore", out_dir=tmp_path / "out")
     eventually(lambda: console.board.counts().total == 1, what="kept picture")

@@ -14,18 +14,18 @@ from conftest import eventually
 from PIL import Image
 
 from sonarpost import keys
-from sonarpost.archive.image_files import picture_name
+from sonarpost.archive.image_files import image_file_name
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq.codebook import Catalogue, open_catalogue, save
-from sonarpost.codec.vq.codec import catalogue_tag
+from sonarpost.codec.vq.codebook import Codebook, open_codebook, save
+from sonarpost.codec.vq.codec import codebook_tag
 from sonarpost.codec.vq.tiles import TileDatabase
-from sonarpost.errors import CatalogueError
+from sonarpost.errors import CodebookError
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame, parse_frame
 from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.messages import AcousticFrame, ReconstructedImage
-from sonarpost.runtime.service import Effects
+from sonarpost.runtime.service import UnitOfWork
 from sonarpost.services.decompressor import service as decompressor
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.service import DecompressorService
@@ -38,7 +38,7 @@ CONTACT = ContactSummary(height_px=40, width_px=60, lat_deg=56.4, lon_deg=-5.6, 
 
 @pytest.fixture(scope="session")
 def vq():
-    return default_registry().create("vq", CodecResources(open_catalogue("nominal-10").tiles))
+    return default_registry().create("vq", CodecResources(open_codebook("nominal-10").tiles))
 
 
 @pytest.fixture
@@ -129,7 +129,7 @@ def test_files_and_record_are_the_same_picture(begin, modem, relay, stream, out)
     eventually(lambda: len(relay.got) == 1)
     image = relay.got[0]
     name = f"uuv-1_{datetime.fromtimestamp(1_700_000_000, UTC):%Y%m%dT%H%M%SZ}_0A1B_v1"
-    assert picture_name(image) == name
+    assert image_file_name(image) == name
     assert {p.name for p in out.iterdir()} == {f"{name}.{kind}" for kind in ("tiff", "png", "json")}
     tiff, png = read_image(out / f"{name}.tiff"), np.asarray(Image.open(out / f"{name}.png"))
     np.testing.assert_array_equal(tiff, png)
@@ -227,20 +227,20 @@ def test_an_index_beyond_the_catalogue_is_a_black_tile(begin, modem, relay, stre
 
 def test_a_picture_of_another_catalogue_is_kept_apart_by_name(begin, modem, relay, texture, refused, vq, stream):
     service = begin()
-    other = default_registry().create("vq", CodecResources(open_catalogue("nominal-20").tiles))
+    other = default_registry().create("vq", CodecResources(open_codebook("nominal-20").tiles))
     hear(modem, *frames_of("AAAA", other.encode(texture())), *frames_of("BBBB", stream()))
     eventually(lambda: [i.image_id for i in relay.got] == ["BBBB"])
     [(key, reason)] = refused(service)
     assert key == "image uuv-1/AAAA"
     for codec in (other, vq):
-        assert f"{catalogue_tag(codec.tiles):#06x}" in reason
+        assert f"{codebook_tag(codec.tiles):#06x}" in reason
     assert service.health().counters["images_undecodable"] == 1
     assert service.health().state == "ok"
 
 
 def test_every_configured_catalogue_is_used(begin, modem, relay, texture, stream):
     begin(catalogues=("nominal-10", "nominal-20"))
-    other = default_registry().create("vq", CodecResources(open_catalogue("nominal-20").tiles))
+    other = default_registry().create("vq", CodecResources(open_codebook("nominal-20").tiles))
     hear(modem, *frames_of("AAAA", other.encode(texture())), *frames_of("BBBB", stream()))
     eventually(lambda: len(relay.got) == 2)
     assert [i.complete for i in relay.got] == [True, True]
@@ -345,8 +345,8 @@ def test_a_frame_whose_commit_failed_is_new_when_it_is_handled_again(platform, o
     service = DecompressorService(platform("vessel-1"), DecompressorConfig(out_dir=out))
     for data in frames_of("AAAA", stream())[:2]:
         for _ in range(3):
-            service.handle(IN, frame(data), Effects())  # and no commit: the disk was full
-        effects = Effects()
+            service.handle(IN, frame(data), UnitOfWork())  # and no commit: the disk was full
+        effects = UnitOfWork()
         service.handle(IN, frame(data), effects)
         service.commit(effects)
     assert (service._hearing.paper.counts.frames, service._hearing.paper.counts.duplicates) == (2, 0)
@@ -384,7 +384,7 @@ def test_a_defect_in_decoding_costs_one_image(path, begin, modem, relay, stream,
 
 def test_a_catalogue_that_cannot_be_read_is_said_at_the_start(platform, tmp_path):
     config = DecompressorConfig(catalogues=("nominal-10", str(tmp_path / "absent.tiles")))
-    with pytest.raises(CatalogueError, match=r"absent\.tiles"):
+    with pytest.raises(CodebookError, match=r"absent\.tiles"):
         DecompressorService(platform("vessel-1"), config)
 
 
@@ -395,9 +395,9 @@ def test_two_catalogues_that_look_alike_on_the_link_are_refused(platform, tmp_pa
         tiles = rng.integers(0, 256, (3, 100), dtype=np.uint8)
         database = TileDatabase(10, tiles, np.zeros(100, np.uint8), np.ones((1, 100), np.int16))
         names.append(str(tmp_path / f"{number}.tiles"))
-        save(tmp_path / f"{number}.tiles", Catalogue(database, {}))
-    monkeypatch.setattr("sonarpost.services.decompressor.decoder.catalogue_tag", lambda tiles: 0x1234)
-    with pytest.raises(CatalogueError, match="0x1234"):
+        save(tmp_path / f"{number}.tiles", Codebook(database, {}))
+    monkeypatch.setattr("sonarpost.services.decompressor.decoder.codebook_tag", lambda tiles: 0x1234)
+    with pytest.raises(CodebookError, match="0x1234"):
         DecompressorService(platform("vessel-1"), DecompressorConfig(catalogues=tuple(names)))
     DecompressorService(platform("vessel-1"), DecompressorConfig(catalogues=(names[0], names[0]))).store.close()
 

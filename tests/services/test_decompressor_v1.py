@@ -11,27 +11,27 @@ from conftest import eventually
 
 from sonarpost import keys
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq.codebook import open_catalogue
+from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.errors import ConfigError
-from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
-from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
 from sonarpost.link.frames.v1.preview import ENTRY_HEAD_BYTES, Preview
-from sonarpost.link.sender import Sender
+from sonarpost.link.sender import LinkSender
 from sonarpost.messages import AcousticFrame, ReconstructedImage
-from sonarpost.runtime.service import Effects
+from sonarpost.runtime.service import UnitOfWork
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.service import DecompressorService
 
 IN, OUT = keys.acoustic_rx("vessel-1"), keys.image_reconstructed("vessel-1")
 CONTACT = ContactSummary(height_px=40, width_px=60, lat_deg=56.4, lon_deg=-5.6, time_utc_s=1_475_568_000.0)
-LOSS_30 = SenderConfig(frame_bytes=64, channels=(Channel(0.3),), frames_per_picture=6)
+LOSS_30 = SenderConfig(frame_bytes=64, channels=(LossChannel(0.3),), frames_per_picture=6)
 
 
 @pytest.fixture(scope="session")
@@ -81,7 +81,7 @@ def frame(data, source=3, at_utc_s=None):
 
 def sent(streams, config=LOSS_30, first=1, seal=None):
     """All frames of these pictures, in the order they are sent."""
-    sender = Sender(config, seal=seal)
+    sender = LinkSender(config, seal=seal)
     for number, stream in enumerate(streams, start=first):
         sender.add_picture(number, replace(CONTACT, time_utc_s=1_475_568_000.0 + number), stream, 0.0)
     frames = []
@@ -147,7 +147,7 @@ def test_a_record_without_a_picture_is_all_missing(begin, modem, relay):
 
 def test_what_a_codec_that_is_not_embedded_lacks_is_missing(begin, modem, relay, texture):
     begin()
-    vq = default_registry().create("vq", CodecResources(open_catalogue("nominal-10").tiles))
+    vq = default_registry().create("vq", CodecResources(open_codebook("nominal-10").tiles))
     stream = vq.encode(texture())
     beginning = stream[:24]
     preview = entry(9, beginning).pack(ENTRY_HEAD_BYTES + len(beginning))
@@ -163,7 +163,7 @@ def test_what_a_codec_that_is_not_embedded_lacks_is_missing(begin, modem, relay,
 
 def test_both_formats_are_heard_side_by_side(begin, modem, relay, streams, texture):
     service = begin()
-    vq = default_registry().create("vq", CodecResources(open_catalogue("nominal-10").tiles))
+    vq = default_registry().create("vq", CodecResources(open_codebook("nominal-10").tiles))
     halves = [data for packet in plan_packets("0A1B", vq.encode(texture()), CONTACT, 3, 64) for data in packet]
     hear(modem, halves, source=4)
     hear(modem, sent(streams[:1]))
@@ -179,7 +179,7 @@ def test_both_formats_are_heard_side_by_side(begin, modem, relay, streams, textu
 @pytest.mark.parametrize(("links", "images"), [(("v1",), {"0001"}), (("paper",), {"0A1B"})])
 def test_a_format_that_is_not_configured_is_rejected(links, images, begin, modem, relay, streams, texture):
     service = begin(links=links)
-    vq = default_registry().create("vq", CodecResources(open_catalogue("nominal-10").tiles))
+    vq = default_registry().create("vq", CodecResources(open_codebook("nominal-10").tiles))
     halves = [data for packet in plan_packets("0A1B", vq.encode(texture()), CONTACT, 3, 64) for data in packet]
     hear(modem, [*halves, *sent(streams[:1])])
     eventually(lambda: any(image.complete for image in relay.got))
@@ -207,8 +207,8 @@ def test_a_frame_whose_commit_failed_is_new_when_it_is_handled_again(begin, stre
     with service._lock:
         for data in sent(streams[:1]):
             for _ in range(2):
-                service.handle(IN, frame(data), Effects())  # and no commit: the disk was full
-            effects = Effects()
+                service.handle(IN, frame(data), UnitOfWork())  # and no commit: the disk was full
+            effects = UnitOfWork()
             service.handle(IN, frame(data), effects)
             service.commit(effects)
         counts = service._hearing.v1.counts
@@ -233,7 +233,7 @@ def key_file(tmp_path):
 
 
 def vehicle_seal(key_file, first_counter=0):
-    seal = AcousticSeal(read_key(key_file), 3, Direction.FROM_VEHICLE, first_counter=first_counter)
+    seal = FrameAuthenticator(read_key(key_file), 3, Direction.FROM_VEHICLE, first_counter=first_counter)
     seal.grant(seal.settings.lifetime_frames)
     return seal
 
@@ -262,8 +262,8 @@ def test_a_sealed_frame_whose_commit_failed_is_no_replay(begin, streams, key_fil
     with service._lock:
         for data in sent(streams[:1], seal=vehicle_seal(key_file)):
             for _ in range(2):
-                service.handle(IN, frame(data), Effects())
-            effects = Effects()
+                service.handle(IN, frame(data), UnitOfWork())
+            effects = UnitOfWork()
             service.handle(IN, frame(data), effects)
             assert "frames_rejected" not in effects.counts
             service.commit(effects)

@@ -11,16 +11,16 @@ from pydantic import ValidationError
 
 from sonarpost import keys, wire
 from sonarpost.errors import PayloadError
-from sonarpost.link.auth.authentication import AcousticSeal
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
-from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink import messages as dl
-from sonarpost.link.events import MessageReceived, ReportReceived
+from sonarpost.link.events import FeedbackReceived, MessageReceived
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
-from sonarpost.link.receiver import Receiver
-from sonarpost.link.sender import Sender
+from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.sender import LinkSender
 from sonarpost.messages import AcousticFrame, Command, Decision, DownlinkState, ReceivedMessage
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
@@ -30,7 +30,7 @@ from sonarpost.runtime.serial_port import SerialLink
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService
-from sonarpost.services.op_modem.speaking import Turn
+from sonarpost.services.op_modem.speaking import TransmitGate
 
 VESSEL = "vessel-1"
 RX, DECISION, STATE = keys.acoustic_rx(VESSEL), keys.contact_decision(VESSEL), keys.acoustic_downlink(VESSEL)
@@ -101,10 +101,10 @@ class Vehicle:
         self.orders, self.reports, self.silent = [], [], silent
         seal = None
         if key is not None:
-            seal = AcousticSeal(key, 3, Direction.FROM_VEHICLE)
+            seal = FrameAuthenticator(key, 3, Direction.FROM_VEHICLE)
             seal.grant(10_000)
-        self.receiver = Receiver(seal=seal)
-        self.sender = Sender(SenderConfig(frame_bytes=64, channels=(Channel(0.1),), feedback=True), seal=seal)
+        self.receiver = LinkReceiver(seal=seal)
+        self.sender = LinkSender(SenderConfig(frame_bytes=64, channels=(LossChannel(0.1),), feedback=True), seal=seal)
         link = SerialLink(port, 19200)
         self.modem = ModemRunner(MicroModem(MicroModemConfig(3), port), link, self.on_event)
 
@@ -113,7 +113,7 @@ class Vehicle:
             return
         for frame in event.frames:
             for found in self.receiver.accept(frame.src, frame.data, time.time()):
-                if isinstance(found, ReportReceived):
+                if isinstance(found, FeedbackReceived):
                     self.reports.append(found.report)
                 elif isinstance(found, MessageReceived):
                     self.take(dl.unpack(found.data))
@@ -121,7 +121,7 @@ class Vehicle:
     def take(self, order):
         self.orders.append(order)
         if len(self.orders) > self.silent:
-            answer = dl.Confirmation(((order.token, dl.Outcome.TAKEN),))
+            answer = dl.ConfirmationMessage(((order.token, dl.CommandOutcome.TAKEN),))
             self.sender.add_message(dl.pack(answer), time.time(), times=1)
             self.send()
 
@@ -148,8 +148,8 @@ def packet(*frames, dest=1, src=3):
     return PacketReceived(heard, 0, len(frames), src, dest, 1, None, True)
 
 
-def confirmation_of(record_id, kind="command", outcome=dl.Outcome.TAKEN):
-    answer = dl.pack(dl.Confirmation(((dl.token_of(record_id, kind), outcome),)))
+def confirmation_of(record_id, kind="command", outcome=dl.CommandOutcome.TAKEN):
+    answer = dl.pack(dl.ConfirmationMessage(((dl.token_of(record_id, kind), outcome),)))
     return pack_segments([Segment(SegmentKind.MESSAGE, b"\x01" + answer)], 32)
 
 
@@ -178,9 +178,9 @@ def test_orders_go_through_the_water_and_are_confirmed(sealed, sea, begin, conso
         assert steps[0] == "asked"
         assert set(steps[1:-1]) == {"sent"}
     by_kind = {type(order): order for order in far.orders}
-    assert by_kind[dl.Refine].number == by_kind[dl.Resend].number == by_kind[dl.Wider].number == 7
-    assert (by_kind[dl.Revisit].lat_deg, by_kind[dl.Revisit].lon_deg) == (41.5, -70.5)
-    judged = by_kind[dl.Judgement]
+    assert by_kind[dl.RefineMessage].number == by_kind[dl.ResendMessage].number == by_kind[dl.ExpandMessage].number == 7
+    assert (by_kind[dl.RevisitMessage].lat_deg, by_kind[dl.RevisitMessage].lon_deg) == (41.5, -70.5)
+    judged = by_kind[dl.DecisionMessage]
     assert (judged.verdict, judged.confidence, judged.version) == ("mine_like", 0.5, 2)
     assert "Manta".startswith(judged.mlo_class)
     eventually(lambda: service.health().gauges["orders_open"] == 0.0)
@@ -220,11 +220,11 @@ def test_confirmations_and_messages_are_kept_with_the_frame_they_came_in(begin, 
     service = begin(message_consumers=("bridge",))
     console.owe(keys.command(VESSEL, "refine"), "op_modem", command())
     eventually(lambda: service.health().gauges["orders_open"] == 1.0)
-    data = pack_segments([Segment(SegmentKind.MESSAGE, b"\x02" + dl.pack(dl.Data(b"battery 80")))], 32)
+    data = pack_segments([Segment(SegmentKind.MESSAGE, b"\x02" + dl.pack(dl.DataMessage(b"battery 80")))], 32)
     elsewhere = confirmation_of("c-1")
     service.on_modem_event(packet(elsewhere, dest=9))  # overheard: not for this vessel
     assert service.health().gauges["orders_open"] == 1.0
-    service.on_modem_event(packet(data, confirmation_of("c-1", outcome=dl.Outcome.UNKNOWN_IMAGE), data))
+    service.on_modem_event(packet(data, confirmation_of("c-1", outcome=dl.CommandOutcome.UNKNOWN_IMAGE), data))
     eventually(lambda: states("c-1") and states("c-1")[-1].state == "refused")
     assert states("c-1")[-1].reason == "unknown image"
     crew.stop(service)
@@ -238,7 +238,7 @@ def test_without_consumers_messages_are_shown(begin, watch):
     seen = watch(keys.message_received(VESSEL))
     service = begin()
     service.on_modem_event(
-        packet(pack_segments([Segment(SegmentKind.MESSAGE, b"\x02" + dl.pack(dl.Data(b"x")))], 32), src=5)
+        packet(pack_segments([Segment(SegmentKind.MESSAGE, b"\x02" + dl.pack(dl.DataMessage(b"x")))], 32), src=5)
     )
     eventually(lambda: len(seen) == 1)
     record = wire.decode(ReceivedMessage, seen[0].payload.to_bytes(), "message")
@@ -327,7 +327,7 @@ def test_a_state_that_cannot_be_read_is_left_and_said(begin, crew, caplog):
 
 
 def turn(**options):
-    return Turn(OpModemConfig(port="x", **options))
+    return TransmitGate(OpModemConfig(port="x", **options))
 
 
 def test_it_speaks_when_it_has_been_quiet_or_it_has_waited_long():

@@ -8,7 +8,7 @@ from conftest import eventually
 from records import decision_record, picture_record
 
 from sonarpost import keys, wire
-from sonarpost.messages import Raster, Relayed
+from sonarpost.messages import Pixels, Relayed
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
@@ -34,7 +34,7 @@ def source(crew):
 @pytest.fixture
 def image(texture):
     def make(image_id="AAAA", vessel="vessel-1"):
-        return picture_record(Raster.from_array(texture()), vessel_id=vessel, image_id=image_id)
+        return picture_record(Pixels.from_array(texture()), vessel_id=vessel, image_id=image_id)
 
     return make
 

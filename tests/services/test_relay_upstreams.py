@@ -14,7 +14,7 @@ from records import decision_record, picture_record
 
 from sonarpost import keys
 from sonarpost.bus.session import client_config, router_config
-from sonarpost.messages import Raster, Relayed
+from sonarpost.messages import Pixels, Relayed
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
 from sonarpost.services.relay.service import RelayService, topic_of
 
@@ -42,7 +42,7 @@ def source(crew):
 
 
 def image(image_id="AAAA", version=1, height_px=40, **changes):
-    picture = Raster(height_px=height_px, width_px=100, bits=8, data=bytes([version]) * height_px * 100)
+    picture = Pixels(height_px=height_px, width_px=100, bits=8, data=bytes([version]) * height_px * 100)
     return picture_record(picture, image_id=image_id, version=version, **changes)
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from sonarpost import keys
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq.codebook import open_catalogue
+from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.errors import ConfigError
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.sender import plan_packets
@@ -26,7 +26,7 @@ from sonarpost.services.op_modem.service import OpModemService
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService, summary_of
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.emulator import AcousticChannel
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
 
 IN, TX, RX = keys.image_encoded("uuv-1"), keys.acoustic_tx("uuv-1"), keys.acoustic_rx("vessel-1")
@@ -57,7 +57,7 @@ def ears(crew, platform, sea):
 
 @pytest.fixture(scope="session")
 def vq():
-    return default_registry().create("vq", CodecResources(open_catalogue("nominal-10").tiles))
+    return default_registry().create("vq", CodecResources(open_codebook("nominal-10").tiles))
 
 
 @pytest.fixture
@@ -320,7 +320,7 @@ def test_the_water_is_kept_busy_at_rate_5(tmp_path, crew, platform, compressor, 
     log = tmp_path / "water.jsonl"
     sites = (ModemSite(1), ModemSite(3, Position(150.0)))
     ports = tmp_path / "ports"
-    channel = AcousticChannel(ChannelConfig(sites, pty_dir=ports, serial_baud=baud, log_path=log))
+    channel = ChannelEmulator(ChannelConfig(sites, pty_dir=ports, serial_baud=baud, log_path=log))
     channel.start()
     try:
         service = crew.start(

@@ -13,26 +13,26 @@ from conftest import eventually
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.store import Store
-from sonarpost.link.auth.authentication import AcousticSeal
-from sonarpost.link.auth.key import Direction, SealKey
+from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.auth.key import AcousticKey, Direction
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink.messages import (
-    Confirmation,
-    Data,
-    Judgement,
-    Outcome,
-    Refine,
-    Resend,
-    Revisit,
-    Wider,
+    CommandOutcome,
+    ConfirmationMessage,
+    DataMessage,
+    DecisionMessage,
+    ExpandMessage,
+    RefineMessage,
+    ResendMessage,
+    RevisitMessage,
     pack,
     unpack,
 )
 from sonarpost.link.events import ContactUpdate, FrameRefused, MessageReceived
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.link.frames.v1.frame import checksum
-from sonarpost.link.receiver import Receiver
-from sonarpost.link.sender import Sender
+from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.sender import LinkSender
 from sonarpost.messages import (
     AcousticFrame,
     Command,
@@ -100,14 +100,14 @@ class Vessel:
     def __init__(self, crew, platform, sea) -> None:
         self._hearer = crew.neighbour("vessel-1", "decompressor", {RX: AcousticFrame})
         self.service = crew.start(OpModemService(platform("vessel-1"), OpModemConfig(port=sea.port(sea.VESSEL))))
-        self.sender = Sender(SenderConfig(frame_bytes=RATES[0].frame_bytes))
+        self.sender = LinkSender(SenderConfig(frame_bytes=RATES[0].frame_bytes))
 
     @property
     def frames(self) -> list[AcousticFrame]:
         return self._hearer.got
 
     def events(self, seal=None):
-        receiver = Receiver(seal=seal)
+        receiver = LinkReceiver(seal=seal)
         return [e for n, f in enumerate(self.frames) for e in receiver.accept(f.source, f.data, float(n))]
 
     def messages(self, seal=None) -> list[object]:
@@ -205,7 +205,7 @@ def test_a_killed_process_goes_on_where_it_was(vessel, begin, programs, crew, tm
     assert at_kill >= 6
     eventually(lambda: idle(again) and all(len(s) > 150 for s in vessel.streams().values()), what="all of it")
     assert set(vessel.streams()) == set(range(1, 13))
-    assert {m.data for m in vessel.messages() if isinstance(m, Data)} == {b"m%d" % n for n in range(5)}
+    assert {m.data for m in vessel.messages() if isinstance(m, DataMessage)} == {b"m%d" % n for n in range(5)}
     repeated = len(vessel.frames) - len({f.data for f in vessel.frames})
     # The first process lived on for a moment after the copy was made; what it sent then goes again.
     assert repeated <= 3 * (1 + (time_of_stop - heard_before + 2) // 3) + 3
@@ -227,8 +227,8 @@ def test_other_traffic_goes_by_priority(vessel, begin, programs):
     begin(aging_s=86400.0)
     programs.owe(IN, "uuv_modem", *[image(n) for n in range(1, 9)])
     programs.owe(OUT, "uuv_modem", message("urgent", priority=1), message("log", priority=7))
-    eventually(lambda: Data(b"urgent") in vessel.messages())
-    eventually(lambda: Data(b"log") in vessel.messages(), what="the rest, when pictures leave room")
+    eventually(lambda: DataMessage(b"urgent") in vessel.messages())
+    eventually(lambda: DataMessage(b"log") in vessel.messages(), what="the rest, when pictures leave room")
 
 
 def test_what_waits_is_told_with_the_time_it_is_expected(begin, programs, watch):
@@ -252,9 +252,9 @@ def test_what_has_expired_is_counted_and_not_sent(vessel, begin, programs):
     service = begin()
     old = message("old").model_copy(update={"created_utc_s": time.time() - 3600.0})
     programs.owe(OUT, "uuv_modem", old, message("new"))
-    eventually(lambda: Data(b"new") in vessel.messages())
+    eventually(lambda: DataMessage(b"new") in vessel.messages())
     eventually(lambda: service.health().gauges["messages_expired"] == 1)
-    assert Data(b"old") not in vessel.messages()
+    assert DataMessage(b"old") not in vessel.messages()
 
 
 def test_messages_beyond_the_limit_stay_with_their_program(begin, programs, crew):
@@ -271,10 +271,10 @@ def test_messages_beyond_the_limit_stay_with_their_program(begin, programs, crew
 
 
 ORDERS = [
-    (Refine(1, 1000, 2, 400), "refine", "0002"),
-    (Resend(2, 1001, 3), "resend", "0003"),
-    (Revisit(3, 1002, 56.5, -5.25), "revisit", None),
-    (Wider(5, 1004, 4), "wider", "0004"),
+    (RefineMessage(1, 1000, 2, 400), "refine", "0002"),
+    (ResendMessage(2, 1001, 3), "resend", "0003"),
+    (RevisitMessage(3, 1002, 56.5, -5.25), "revisit", None),
+    (ExpandMessage(5, 1004, 4), "wider", "0004"),
 ]
 
 
@@ -284,17 +284,17 @@ def test_orders_by_sound_are_handed_on_once_and_confirmed_each_time(vessel, begi
     takes = {keys.command("uuv-1", "revisit"): Command, keys.command("uuv-1", "decision"): Decision}
     autonomy = crew.neighbour("uuv-1", "autonomy", takes)
     eventually(lambda: service.modem.ready)
-    judgement = Judgement(4, 1003, 2, 1, "mine_like", 0.5, "sphere")
+    judgement = DecisionMessage(4, 1003, 2, 1, "mine_like", 0.5, "sphere")
     orders = [*[order for order, _, _ in ORDERS], judgement]
 
-    def told() -> list[tuple[int, Outcome]]:
-        return [o for m in vessel.messages() if isinstance(m, Confirmation) for o in m.outcomes]
+    def told() -> list[tuple[int, CommandOutcome]]:
+        return [o for m in vessel.messages() if isinstance(m, ConfirmationMessage) for o in m.outcomes]
 
     vessel.say(*orders, until=lambda: {token for token, _ in told()} == {1, 2, 3, 4, 5})
-    before = told().count((1, Outcome.TAKEN))
-    vessel.say(orders[0], until=lambda: told().count((1, Outcome.TAKEN)) > before)
+    before = told().count((1, CommandOutcome.TAKEN))
+    vessel.say(orders[0], until=lambda: told().count((1, CommandOutcome.TAKEN)) > before)
     eventually(lambda: len(compressor.got) == 3 and len(autonomy.got) == 2)
-    assert {outcome for _, outcome in told()} == {Outcome.TAKEN}
+    assert {outcome for _, outcome in told()} == {CommandOutcome.TAKEN}
     assert {(c.kind, c.image_id) for c in compressor.got} == {("refine", "0002"), ("resend", "0003"), ("wider", "0004")}
     revisit, decision = sorted(autonomy.got, key=lambda r: r.TYPE)
     assert (revisit.lat_deg, revisit.lon_deg, revisit.command_id) == (56.5, -5.25, "a1-00000003")
@@ -305,8 +305,8 @@ def test_orders_by_sound_are_handed_on_once_and_confirmed_each_time(vessel, begi
 def test_an_order_that_nobody_takes_is_told(vessel, begin):
     service = begin()
     eventually(lambda: service.modem.ready)
-    unsupported = Confirmation(((9, Outcome.UNSUPPORTED),))
-    vessel.say(Revisit(9, 1000, 1.0, 2.0), until=lambda: unsupported in vessel.messages())
+    unsupported = ConfirmationMessage(((9, CommandOutcome.UNSUPPORTED),))
+    vessel.say(RevisitMessage(9, 1000, 1.0, 2.0), until=lambda: unsupported in vessel.messages())
 
 
 def test_what_a_report_lacks_is_sent(vessel, begin, programs):
@@ -315,7 +315,7 @@ def test_what_a_report_lacks_is_sent(vessel, begin, programs):
     eventually(lambda: len(vessel.frames) > 10)
 
     def report() -> bool:
-        receiver = Receiver()
+        receiver = LinkReceiver()
         for number, frame in enumerate(vessel.frames):
             receiver.accept(3, frame.data, float(number))
         vessel.sender.add_report(receiver.report(3, 1e3))
@@ -345,8 +345,8 @@ def test_frames_for_others_and_damaged_ones_do_no_harm(vessel, begin, programs):
 
 
 @pytest.fixture
-def key(tmp_path) -> SealKey:
-    key = SealKey(bytes(range(100, 132)))
+def key(tmp_path) -> AcousticKey:
+    key = AcousticKey(bytes(range(100, 132)))
     (tmp_path / "acoustic.key").write_text(key.secret.hex() + "\n", encoding="utf-8")
     (tmp_path / "acoustic.key").chmod(0o600)
     return key
@@ -358,10 +358,10 @@ def test_with_a_key_only_sealed_frames_count_and_a_restart_uses_no_counter_twice
     place = platform("uuv-1").model_copy(update={"acoustic_key_file": tmp_path / "acoustic.key"})
     service = begin(place)
     eventually(lambda: service.modem.ready)
-    seal = AcousticSeal(key, 1, Direction.TO_VEHICLE)
+    seal = FrameAuthenticator(key, 1, Direction.TO_VEHICLE)
     seal.grant(seal.wanted_limit)
-    sealed = Sender(SenderConfig(frame_bytes=32), seal=seal)
-    sealed.add_message(pack(Resend(1, 1000, 3)), 0.0, times=1)
+    sealed = LinkSender(SenderConfig(frame_bytes=32), seal=seal)
+    sealed.add_message(pack(ResendMessage(1, 1000, 3)), 0.0, times=1)
     frame = sealed.next_frame(0.0)
     counters = lambda: service.health().counters  # noqa: E731
     vessel.send_until(frame, lambda: counters().get("orders_taken") == 1)
@@ -369,7 +369,7 @@ def test_with_a_key_only_sealed_frames_count_and_a_restart_uses_no_counter_twice
     body = frame[2:-1] + bytes([frame[-1] ^ 1])
     vessel.send_until(checksum(body).to_bytes(2, "big") + body, lambda: counters().get("frames_forged", 0) > 0)
     forged = counters()["frames_forged"]
-    vessel.say(Resend(2, 1000, 4), until=lambda: counters()["frames_forged"] > forged)
+    vessel.say(ResendMessage(2, 1000, 4), until=lambda: counters()["frames_forged"] > forged)
     assert counters()["orders_taken"] == 1
     programs.owe(IN, "uuv_modem", *[image(n) for n in range(1, 9)])
     eventually(lambda: len(vessel.frames) > 6)
@@ -383,8 +383,8 @@ def test_with_a_key_only_sealed_frames_count_and_a_restart_uses_no_counter_twice
     assert {e.reason.field for e in refused} <= {"counter"}
 
 
-def ears_of(key: SealKey) -> AcousticSeal:
-    return AcousticSeal(key, 1, Direction.TO_VEHICLE)
+def ears_of(key: AcousticKey) -> FrameAuthenticator:
+    return FrameAuthenticator(key, 1, Direction.TO_VEHICLE)
 
 
 def test_polled_it_sends_what_it_is_asked_for_and_nothing_else(vessel, begin, programs):

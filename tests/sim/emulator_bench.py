@@ -6,9 +6,9 @@ from datetime import UTC, datetime
 
 from sonarpost.modem.micromodem import nmea
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_events import Transmission
-from sonarpost.simulation.channel.channel_simulator import AcousticWorld, ModemPlace
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
 from sonarpost.simulation.modem.config import ModemConfig, Report
 
 START_UTC_S = datetime(2016, 10, 12, 9, 0, 0, tzinfo=UTC).timestamp()
@@ -19,12 +19,12 @@ class Bench:
     """Modems 150 m apart in one water, with what each told its host."""
 
     def __init__(self, modems: int = 2, serial_baud: float | None = None, **config: object) -> None:
-        water = {name: config.pop(name) for name in list(config) if name in WaterConfig.__dataclass_fields__}
+        water = {name: config.pop(name) for name in list(config) if name in ChannelParameters.__dataclass_fields__}
         places = {
             n: ModemPlace(ModemConfig(n, utc_at_zero_s=START_UTC_S, **config), Position(RANGE_M * (n - 1)))  # type: ignore[arg-type]
             for n in range(1, modems + 1)
         }
-        self.world = AcousticWorld(WaterConfig(**water), places, serial_baud)  # type: ignore[arg-type]
+        self.world = ChannelSimulator(ChannelParameters(**water), places, serial_baud)  # type: ignore[arg-type]
         self.told = dict.fromkeys(places, b"")
         self.reports: list[Report] = []
         self.transmissions: list[Transmission] = []

@@ -15,7 +15,7 @@ from conftest import eventually
 
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.emulator import AcousticChannel
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
 
 with warnings.catch_warnings():
@@ -77,7 +77,7 @@ class Client:
 @pytest.fixture
 def clients(tmp_path: Path) -> Iterator[tuple[Client, Client]]:
     sites = (ModemSite(1), ModemSite(2, Position(RANGE_M)))
-    channel = AcousticChannel(ChannelConfig(sites, pty_dir=tmp_path / "modems", time_scale=SCALE))
+    channel = ChannelEmulator(ChannelConfig(sites, pty_dir=tmp_path / "modems", time_scale=SCALE))
     channel.start()
     pair = [Client(f"m{d.address}", d.device, tmp_path) for d in channel.devices()]
     yield pair[0], pair[1]

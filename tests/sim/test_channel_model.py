@@ -12,29 +12,29 @@ from hypothesis import strategies as st
 
 from sonarpost.errors import ConfigError
 from sonarpost.simulation.channel.acoustics import Position, absorption_db_per_km, noise_db_per_hz
-from sonarpost.simulation.channel.channel_config import WaterConfig
-from sonarpost.simulation.channel.channel_events import ArrivalEnded, Fate, Outcome, Packet, PacketKind
-from sonarpost.simulation.channel.channel_presets import make_water, read_water
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, Fate, FrameFate, PacketKind
+from sonarpost.simulation.channel.channel_presets import make_channel, read_channel
 from sonarpost.simulation.channel.delivery_table import RANGES_M, deliver, table
 from sonarpost.simulation.channel.fading import Fading
-from sonarpost.simulation.channel.propagation import Water
+from sonarpost.simulation.channel.propagation import ChannelModel
 from sonarpost.simulation.channel.random_draws import TailDamage
 
 
-def send(sea: Water, count: int, now: float, airtime_s: float) -> ArrivalEnded:
+def send(sea: ChannelModel, count: int, now: float, airtime_s: float) -> ArrivalEnded:
     frames = tuple(bytes([n]) * 8 for n in range(1, count + 1))
-    sea.transmit(1, Packet(PacketKind.DATA, 1, 2, 1, airtime_s, frames), now)
+    sea.transmit(1, AcousticPacket(PacketKind.DATA, 1, 2, 1, airtime_s, frames), now)
     (arrival,) = (event for event in sea.poll(now + airtime_s + 1.0) if isinstance(event, ArrivalEnded))
     return arrival
 
 
-def two_modems(range_m: float, config: WaterConfig) -> Water:
-    return Water(config, {1: Position(), 2: Position(range_m)})
+def two_modems(range_m: float, config: ChannelParameters) -> ChannelModel:
+    return ChannelModel(config, {1: Position(), 2: Position(range_m)})
 
 
 def test_the_sea_trial_comes_out():
     """The paper's: 2 to 300 m at rate 1, most packets arrive below 130 m, most are lost beyond."""
-    sea = make_water({"preset": "sea-trial", "seed": 5}, "test")
+    sea = make_channel({"preset": "sea-trial", "seed": 5}, "test")
     near = [deliver(sea, 1, range_m, 60).packets for range_m in range(2, 130, 9)]
     far = [deliver(sea, 1, range_m, 60).packets for range_m in range(135, 301, 11)]
     assert min(near) > 0.85
@@ -45,12 +45,12 @@ def test_the_sea_trial_comes_out():
 
 
 def test_snr_falls_with_range():
-    sea = two_modems(1.0, WaterConfig(snr_at_1m_db=60.0))
+    sea = two_modems(1.0, ChannelParameters(snr_at_1m_db=60.0))
     levels = [sea.snr_db(range_m) for range_m in (0.0, 1.0, 10.0, 100.0, 1000.0)]
     assert levels[0] == levels[1] == pytest.approx(60.0, abs=0.01)
     assert levels[3] == pytest.approx(60 - 40 - 0.51, abs=0.01)
     assert levels[1:] == sorted(levels[1:], reverse=True)
-    cylinder = two_modems(1.0, WaterConfig(snr_at_1m_db=60.0, spreading_db_per_decade=10.0))
+    cylinder = two_modems(1.0, ChannelParameters(snr_at_1m_db=60.0, spreading_db_per_decade=10.0))
     assert cylinder.snr_db(100.0) == pytest.approx(39.49, abs=0.01)
 
 
@@ -74,10 +74,10 @@ def test_noise_is_that_of_wenz():
 
 
 def test_the_sonar_equation_adds_up():
-    config = WaterConfig(source_level_db=185.0, excess_loss_db=10.0)
+    config = ChannelParameters(source_level_db=185.0, excess_loss_db=10.0)
     noise_db = noise_db_per_hz(25_000, 5.0) + 10 * math.log10(5000)
     assert config.reference_snr_db == pytest.approx(185 - 10 - noise_db)
-    assert WaterConfig(snr_at_1m_db=41.0).reference_snr_db == 41.0
+    assert ChannelParameters(snr_at_1m_db=41.0).reference_snr_db == 41.0
 
 
 def test_fades_are_as_long_and_as_frequent_as_asked_for():
@@ -99,7 +99,7 @@ def test_a_fade_does_not_depend_on_when_it_is_looked_at_or_from_which_end(times_
 
 def test_a_fade_takes_the_frames_in_it_and_only_those():
     fading = Fading(1, 20.0, 4.0)
-    sea = two_modems(0.0, WaterConfig(seed=1, mean_clear_s=20.0, mean_fade_s=4.0))
+    sea = two_modems(0.0, ChannelParameters(seed=1, mean_clear_s=20.0, mean_fade_s=4.0))
     lost, partly = 0, 0
     for n in range(200):
         arrival = send(sea, 8, 10.0 * n, 8.0)
@@ -112,15 +112,15 @@ def test_a_fade_takes_the_frames_in_it_and_only_those():
 
 
 def test_a_deep_fade_hides_a_packet():
-    config = WaterConfig(range_loss=True, mean_clear_s=0.5, mean_fade_s=1e6, fade_loss=0.0, fade_depth_db=60.0)
+    config = ChannelParameters(range_loss=True, mean_clear_s=0.5, mean_fade_s=1e6, fade_loss=0.0, fade_depth_db=60.0)
     arrival = send(two_modems(50.0, config), 1, 1000.0, 3.0)
-    assert (arrival.detected, arrival.outcome) == (False, Outcome.LOST)
+    assert (arrival.detected, arrival.outcome) == (False, FrameFate.LOST)
 
 
 def test_water_from_preset_file_and_options(tmp_path: Path):
     file = tmp_path / "water.toml"
     file.write_text('preset = "sea-trial"\nsnr_at_1m_db = 45\ntail_damage_kind = "zeros"\n', encoding="utf-8")
-    config = make_water(read_water(file) | {"seed": 9}, "test")
+    config = make_channel(read_channel(file) | {"seed": 9}, "test")
     assert (config.snr_at_1m_db, config.seed, config.range_loss) == (45, 9, True)
     assert config.tail_damage_kind is TailDamage.ZEROS
 
@@ -142,11 +142,11 @@ def test_a_water_file_that_is_wrong_names_file_key_and_value(tmp_path: Path, tex
     file = tmp_path / "water.toml"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=named) as caught:
-        make_water(read_water(file), str(file))
+        make_channel(read_channel(file), str(file))
     assert "water.toml" in str(caught.value)
 
 
 def test_the_table_shows_every_rate_and_range():
-    lines = table(WaterConfig(), packets=2).splitlines()
+    lines = table(ChannelParameters(), packets=2).splitlines()
     assert len(lines) == 2 + len(RANGES_M)
     assert lines[2].split("|")[1:4] == [" 2 ", " 54.0 ", " 100 / 100 "]

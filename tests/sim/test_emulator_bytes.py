@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from sonarpost.modem.micromodem import nmea
 from sonarpost.simulation.channel.channel_events import Transmission
 from sonarpost.simulation.modem.config import ModemConfig
-from sonarpost.simulation.modem.emulator import Micromodem
-from sonarpost.simulation.modem.serial_timing import SerialPace
+from sonarpost.simulation.modem.emulator import EmulatedMicromodem
+from sonarpost.simulation.modem.serial_timing import SerialLineTiming
 from tests.sim.emulator_bench import START_UTC_S, Bench
 
 
@@ -37,7 +37,7 @@ from tests.sim.emulator_bench import START_UTC_S, Bench
     ],
 )
 def test_what_does_not_parse_is_answered_with_an_error(line: bytes, answer: str):
-    modem = Micromodem(ModemConfig(1, utc_at_zero_s=START_UTC_S))
+    modem = EmulatedMicromodem(ModemConfig(1, utc_at_zero_s=START_UTC_S))
     modem.bytes_to_send()
     modem.receive(line, 2.0)
     assert modem.bytes_to_send() == nmea.format("CAERR", "090002", *answer.split(","))
@@ -100,7 +100,7 @@ def test_the_serial_line_takes_its_time():
 
 
 def test_what_is_on_a_serial_line_comes_out_in_order_or_is_dropped():
-    line: SerialPace[str] = SerialPace(100)
+    line: SerialLineTiming[str] = SerialLineTiming(100)
     line.put("a", 10, 0.0)
     line.put("b", 10, 0.0)
     line.put("c", 10, 5.0)
@@ -110,4 +110,4 @@ def test_what_is_on_a_serial_line_comes_out_in_order_or_is_dropped():
     assert line.abandon() == ["c"]
     assert line.next_s() is None
     with pytest.raises(ValueError, match="baud"):
-        SerialPace(0)
+        SerialLineTiming(0)

@@ -8,7 +8,7 @@ from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import (
     Event,
-    ModemComplained,
+    ModemError,
     ModemRebooted,
     ModemUnresponsive,
     PacketFailed,
@@ -53,7 +53,7 @@ def test_the_driver_gets_along_with_the_emulator(rate: int, ack: bool):
     got = [event for event in events[2] if isinstance(event, PacketReceived)]
     assert [[frame.data for frame in packet.frames] for packet in got] == [frames] * 2
     assert all(packet.complete and packet.rate == rate and packet.statistics is not None for packet in got)
-    unwanted = (PacketFailed, ModemComplained, SentenceRejected, ModemRebooted, ModemUnresponsive)
+    unwanted = (PacketFailed, ModemError, SentenceRejected, ModemRebooted, ModemUnresponsive)
     assert not [event for n in events for event in events[n] if isinstance(event, unwanted)]
 
 

@@ -6,8 +6,8 @@ import pytest
 
 from sonarpost.modem.micromodem import nmea
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
-from sonarpost.simulation.channel.channel_simulator import AcousticWorld, ModemPlace
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
 from sonarpost.simulation.modem.config import ModemConfig
 from tests.sim.emulator_bench import START_UTC_S, Bench
 
@@ -69,7 +69,7 @@ def test_lost_flexible_data_is_told_as_bad():
 def test_ranging_to_transponders(kind: str):
     places = {1: ModemPlace(ModemConfig(1, utc_at_zero_s=START_UTC_S)), 2: ModemPlace(ModemConfig(2), Position(50.0))}
     transponders = {"A": Position(300.0), "B": Position(0.0, 600.0), "C": Position(5000.0), "D": Position(30.0)}
-    world = AcousticWorld(WaterConfig(), places, transponders=transponders)
+    world = ChannelSimulator(ChannelParameters(), places, transponders=transponders)
     world.advance(1.0)
     for number in places:
         world.take_outputs(number)

@@ -6,7 +6,7 @@ import pytest
 
 from sonarpost.modem.micromodem import nmea
 from sonarpost.simulation.modem.config import ModemConfig
-from sonarpost.simulation.modem.emulator import Micromodem
+from sonarpost.simulation.modem.emulator import EmulatedMicromodem
 from tests.sim.emulator_bench import START_UTC_S, Bench
 
 
@@ -67,7 +67,7 @@ def test_settings_switch_sentences_off():
 
 
 def test_the_known_start_up_query_has_the_known_answer():
-    modem = Micromodem(ModemConfig(1, utc_at_zero_s=START_UTC_S))
+    modem = EmulatedMicromodem(ModemConfig(1, utc_at_zero_s=START_UTC_S))
     assert modem.bytes_to_send() == b"$CAREV,090000,INIT,2.0.27087*44\r\n"
     modem.receive(b"$CCCFQ,SRC*3A\r\n", 0.5)
     assert modem.bytes_to_send() == b"$CACFG,SRC,1*33\r\n"
@@ -142,7 +142,7 @@ def test_the_revision_comes_every_ten_seconds():
 
 
 def test_settings_cannot_grow_without_end():
-    modem = Micromodem(ModemConfig(1))
+    modem = EmulatedMicromodem(ModemConfig(1))
     for number in range(2000):
         modem.receive(nmea.format("CCCFG", f"name.{number}", 1), 0.0)
     assert len(modem.settings.items()) == 512

@@ -8,8 +8,8 @@ from datetime import UTC, datetime
 import pytest
 
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
-from sonarpost.simulation.channel.channel_simulator import AcousticWorld, ModemPlace
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
 from sonarpost.simulation.modem.config import ModemConfig
 from tests.sim.goby_host import FRAME_BYTES, Delivery, GobyHost
 
@@ -26,7 +26,7 @@ class Pair:
             n: ModemPlace(ModemConfig(n, mm, utc_at_zero_s=start_utc_s), Position(RANGE_M * (n - 1))) for n in (1, 2)
         }
         transponders = {"A": Position(300.0), "B": Position(450.0)}
-        self.world = AcousticWorld(WaterConfig(), places, transponders=transponders)
+        self.world = ChannelSimulator(ChannelParameters(), places, transponders=transponders)
         settings = SETTINGS + (("psk.packet.mod_hdr_version,0",) if mm == 2 else ())
         self.hosts = {n: GobyHost(n, mm, start_utc_s, settings) for n in (1, 2)}
         self.now = 0.0

@@ -11,23 +11,30 @@ from hypothesis import strategies as st
 
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.simulation.channel.acoustics import Position, frame_error_rate
-from sonarpost.simulation.channel.channel_config import WaterConfig
-from sonarpost.simulation.channel.channel_events import ArrivalEnded, ArrivalStarted, Fate, Outcome, Packet, PacketKind
-from sonarpost.simulation.channel.propagation import Water
-from sonarpost.simulation.channel.random_draws import Dice, TailDamage, damage_tail
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.channel_events import (
+    AcousticPacket,
+    ArrivalEnded,
+    ArrivalStarted,
+    Fate,
+    FrameFate,
+    PacketKind,
+)
+from sonarpost.simulation.channel.propagation import ChannelModel
+from sonarpost.simulation.channel.random_draws import RandomDraws, TailDamage, damage_tail
 from sonarpost.simulation.time_scale import TimeScale
 
 PINNED_UNIFORM = 0.13411210046500488
 PINNED_NOISE = "daef2330"
 
 
-def packet(*frames: bytes, rate: int = 1, airtime_s: float = 3.0) -> Packet:
-    return Packet(PacketKind.DATA, 1, 2, rate, airtime_s, frames)
+def packet(*frames: bytes, rate: int = 1, airtime_s: float = 3.0) -> AcousticPacket:
+    return AcousticPacket(PacketKind.DATA, 1, 2, rate, airtime_s, frames)
 
 
-def water(*positions_m: float, **config: object) -> Water:
+def water(*positions_m: float, **config: object) -> ChannelModel:
     places = {number: Position(east_m) for number, east_m in enumerate(positions_m, start=1)}
-    return Water(WaterConfig(**config), places)  # type: ignore[arg-type]
+    return ChannelModel(ChannelParameters(**config), places)  # type: ignore[arg-type]
 
 
 def ended(events: list[ArrivalStarted | ArrivalEnded]) -> list[ArrivalEnded]:
@@ -49,7 +56,7 @@ def test_a_packet_arrives_after_its_travel_time_and_lasts_its_air_time():
     assert sea.poll(13.49) == []
     (end,) = sea.poll(13.5)
     assert isinstance(end, ArrivalEnded)
-    assert (end.at_s, end.delay_s, end.range_m, end.outcome) == (13.5, 0.5, 750.0, Outcome.ARRIVED)
+    assert (end.at_s, end.delay_s, end.range_m, end.outcome) == (13.5, 0.5, 750.0, FrameFate.ARRIVED)
     assert end.frames[0].received == b"abc"
     assert sea.next_event_s() is None
     assert sea.in_flight == 0
@@ -73,7 +80,7 @@ def test_half_duplex_a_modem_hears_nothing_that_overlaps_its_own_transmission(st
         events += ended(sea.poll(now))
         sea.transmit(modem, packet(b"x"), now)
     events += ended(sea.poll(100.0))
-    assert {event.receiver: event.outcome for event in events} == {1: Outcome.TRANSMITTING, 2: Outcome.TRANSMITTING}
+    assert {event.receiver: event.outcome for event in events} == {1: FrameFate.TRANSMITTING, 2: FrameFate.TRANSMITTING}
     assert all(fates(event) == [Fate.LOST] for event in events)
 
 
@@ -83,7 +90,7 @@ def test_transmissions_that_only_touch_are_both_heard():
     events = ended(sea.poll(2.0))
     sea.transmit(2, packet(b"y", airtime_s=2.0), 2.0)
     events += ended(sea.poll(4.0))
-    assert [event.outcome for event in events] == [Outcome.ARRIVED, Outcome.ARRIVED]
+    assert [event.outcome for event in events] == [FrameFate.ARRIVED, FrameFate.ARRIVED]
 
 
 def test_overlapping_arrivals_destroy_each_other_at_that_receiver_only():
@@ -92,9 +99,9 @@ def test_overlapping_arrivals_destroy_each_other_at_that_receiver_only():
     sea.transmit(1, packet(b"one"), 0.0)
     sea.transmit(2, packet(b"two"), 1.0)
     outcomes = {(e.transmission.transmitter, e.receiver): e for e in ended(sea.poll(100.0))}
-    assert outcomes[1, 3].outcome is Outcome.ARRIVED
-    assert outcomes[1, 4].outcome is Outcome.COLLISION
-    assert outcomes[2, 4].outcome is Outcome.COLLISION
+    assert outcomes[1, 3].outcome is FrameFate.ARRIVED
+    assert outcomes[1, 4].outcome is FrameFate.COLLISION
+    assert outcomes[2, 4].outcome is FrameFate.COLLISION
     assert fates(outcomes[1, 4]) == [Fate.LOST]
     assert outcomes[1, 4].detected
     assert not outcomes[2, 4].detected
@@ -106,10 +113,10 @@ def test_a_collision_counts_even_with_a_packet_that_was_resolved_before():
     sea.transmit(1, packet(b"long", airtime_s=10.0), 0.0)
     sea.transmit(2, packet(b"s1", airtime_s=1.0), 1.0)
     outcomes = [(e.transmission.transmitter, e.receiver, e.outcome) for e in ended(sea.poll(9.0))]
-    assert outcomes == [(2, 1, Outcome.TRANSMITTING), (2, 3, Outcome.COLLISION)]
+    assert outcomes == [(2, 1, FrameFate.TRANSMITTING), (2, 3, FrameFate.COLLISION)]
     assert [(e.receiver, e.outcome) for e in ended(sea.poll(10.0))] == [
-        (2, Outcome.TRANSMITTING),
-        (3, Outcome.COLLISION),
+        (2, FrameFate.TRANSMITTING),
+        (3, FrameFate.COLLISION),
     ]
 
 
@@ -139,7 +146,7 @@ def test_frame_loss_is_what_was_asked_for(loss: float):
 
 def test_packet_loss_takes_whole_packets_and_nothing_is_detected():
     arrivals = run_packets(1000, packet_loss=0.25, seed=3)
-    lost = [a for a in arrivals if a.outcome is Outcome.LOST]
+    lost = [a for a in arrivals if a.outcome is FrameFate.LOST]
     assert abs(len(lost) / 1000 - 0.25) <= 3 * math.sqrt(0.25 * 0.75 / 1000)
     assert not any(a.detected for a in lost)
     assert all(fates(a) == [Fate.LOST] * 3 for a in lost)
@@ -202,7 +209,7 @@ def test_zeros_over_zeros_are_no_damage():
 
 @given(st.binary(min_size=1, max_size=300), st.integers(0, 2**63), st.floats(0.01, 1.0), st.sampled_from(TailDamage))
 def test_damage_stays_within_the_tail(frame: bytes, seed: int, fraction: float, kind: TailDamage):
-    damaged = damage_tail(frame, Dice(seed, 1, 1, 2), 1, kind, fraction)
+    damaged = damage_tail(frame, RandomDraws(seed, 1, 1, 2), 1, kind, fraction)
     kept = len(frame) - max(1, int(len(frame) * fraction))
     assert len(damaged) == len(frame)
     assert damaged[:kept] == frame[:kept]
@@ -210,7 +217,7 @@ def test_damage_stays_within_the_tail(frame: bytes, seed: int, fraction: float, 
 
 def test_draws_are_pinned():
     # The draws are part of what a seed means: a change here changes every recorded run.
-    dice = Dice(seed=1, transmitter=1, packet=1, receiver=2)
+    dice = RandomDraws(seed=1, transmitter=1, packet=1, receiver=2)
     assert dice.uniform("frame loss", 1) == pytest.approx(PINNED_UNIFORM, abs=1e-15)
     assert dice.noise(4, "tail noise", 1).hex() == PINNED_NOISE
 
@@ -240,7 +247,7 @@ def test_range_loss_follows_the_published_error_rates():
 )
 def test_values_out_of_bounds_are_refused(config: dict[str, float]):
     with pytest.raises(ValueError, match=next(iter(config))):
-        WaterConfig(**config)  # type: ignore[arg-type]
+        ChannelParameters(**config)  # type: ignore[arg-type]
 
 
 def test_old_arrivals_are_forgotten():

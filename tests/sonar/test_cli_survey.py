@@ -18,7 +18,7 @@ from sonarpost.cli.survey.waterfall_picture import SIDE_PX, evened, nice_step, r
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.source import HeldSource
+from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import ChannelPing, Side
 
 
@@ -125,7 +125,7 @@ def test_the_waterfall_has_each_echo_at_its_range_and_row(small_survey):
             channels.append(ChannelPing(side, samples, 25.0))
         pings.append(dataclasses.replace(ping, channels=tuple(channels)))
     reduced = reduce_survey(
-        HeldSource(dataclasses.replace(survey, pings=tuple(pings)), SurveyOptions()), over_ground=False, max_rows=20
+        InMemorySource(dataclasses.replace(survey, pings=tuple(pings)), SurveyOptions()), over_ground=False, max_rows=20
     )
     assert reduced.echo.shape == (20, 2 * SIDE_PX)
     bright = np.argwhere(reduced.echo > 100)
@@ -136,7 +136,7 @@ def test_the_waterfall_has_each_echo_at_its_range_and_row(small_survey):
 
 def test_over_ground_the_nadir_is_in_the_middle_and_even_is_even():
     survey = simulate_survey(SurveySpec(seed=1, pings=150, samples=400, targets=0, clutter=0)).survey
-    source = HeldSource(survey, SurveyOptions())
+    source = InMemorySource(survey, SurveyOptions())
     slant, ground = (reduce_survey(source, over_ground=over, max_rows=75) for over in (False, True))
     middle = slice(SIDE_PX + 5, SIDE_PX + 40)
     assert np.nanmean(slant.echo[:, middle]) < 0.5 * np.nanmean(ground.echo[:, middle])

@@ -13,14 +13,14 @@ from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.sonar.options import SurveyOptions, load_options
 from sonarpost.sonar.readers import registry as readers
 from sonarpost.sonar.readers.registry import open_survey, read_survey, supported_suffixes
-from sonarpost.sonar.source import HeldSource, blocks, gather
+from sonarpost.sonar.source import InMemorySource, blocks, gather
 
 
 @pytest.fixture
 def plug_in(monkeypatch, small_survey):
     """Installs a reader of `.jsf` and a broken one of `.sdf`, as packages would."""
     module = types.ModuleType("others_sonar")
-    module.open_jsf = lambda path, options: HeldSource(small_survey(), options)
+    module.open_jsf = lambda path, options: InMemorySource(small_survey(), options)
     module.not_callable = 7
     monkeypatch.setitem(sys.modules, "others_sonar", module)
     points = [
@@ -49,7 +49,7 @@ def test_a_plug_in_opens_its_suffix(tmp_path, small_survey):
 
 @pytest.mark.parametrize(("length", "overlap"), [(1, 0), (3, 0), (3, 2), (5, 5), (12, 0), (12, 3), (100, 9), (2, 7)])
 def test_blocks_hold_every_ping_once_and_their_neighbours(small_survey, length, overlap):
-    source = HeldSource(small_survey(pings=12), SurveyOptions())
+    source = InMemorySource(small_survey(pings=12), SurveyOptions())
     new = []
     for lead, survey in blocks(source, length, overlap):
         numbers = [ping.number for ping in survey]
@@ -62,14 +62,14 @@ def test_blocks_hold_every_ping_once_and_their_neighbours(small_survey, length, 
 
 
 def test_blocks_of_nothing_are_refused(small_survey):
-    source = HeldSource(small_survey(), SurveyOptions())
+    source = InMemorySource(small_survey(), SurveyOptions())
     for length, overlap in ((0, 0), (1, -1)):
         with pytest.raises(ValueError, match="block"):
             list(blocks(source, length, overlap))
 
 
 def test_too_much_to_hold_is_an_error(small_survey):
-    source = HeldSource(small_survey(), SurveyOptions())
+    source = InMemorySource(small_survey(), SurveyOptions())
     assert len(gather(source, 400).pings) == 5
     with pytest.raises(SurveyFileError, match="samples"):
         gather(source, 399)

@@ -10,9 +10,9 @@ from sonarpost.codec.emb.bitplanes import STEPS, code_planes, extra_planes
 from sonarpost.codec.emb.coder import PLAIN_SCALE, Coder, State
 from sonarpost.codec.emb.layout import layout
 from sonarpost.codec.emb.model import SECOND, Model, model_of
-from sonarpost.codec.emb.rate_distortion_opt import Wanted, wanted_of
+from sonarpost.codec.emb.rate_distortion_opt import TargetCoefficients, target_coefficients
 from sonarpost.codec.emb.region import weights
-from sonarpost.codec.emb.side_info import MEAN_STEP, Side
+from sonarpost.codec.emb.side_info import MEAN_STEP, SideInfo
 
 Rows = npt.NDArray[np.int16]
 
@@ -27,19 +27,21 @@ def blank_model() -> Model:
     return model_of(zeros)
 
 
-def chance_side(targets: npt.NDArray[np.int32], mean_index: int, rng: np.random.Generator) -> Side:
+def chance_side(targets: npt.NDArray[np.int32], mean_index: int, rng: np.random.Generator) -> SideInfo:
     """Side information with a chance start step."""
     step = int(rng.integers(8))
-    return Side(mean_index, step, None, None, extra_planes(targets, step))
+    return SideInfo(mean_index, step, None, None, extra_planes(targets, step))
 
 
-def chance_wanted(model: Model, picture: npt.NDArray[np.uint8], rng: np.random.Generator) -> tuple[Wanted, int, int]:
+def chance_wanted(
+    model: Model, picture: npt.NDArray[np.uint8], rng: np.random.Generator
+) -> tuple[TargetCoefficients, int, int]:
     """What the encoder would tell of a picture in a chance number of bytes, the mean level, and the bytes."""
     lay = layout(*picture.shape)
     size = int(np.exp(rng.uniform(np.log(LEAST_BYTES), np.log(MOST_BYTES))) * picture.size / 6400)
     mean_index = min((int(picture.astype(np.int64).sum()) // picture.size + MEAN_STEP // 2) // MEAN_STEP, 63)
     plane = (picture.astype(np.int64) - mean_index * MEAN_STEP) * transform.UNIT
-    return wanted_of(plane, lay, weights(lay, None), size, model.aim), mean_index, size
+    return target_coefficients(plane, lay, weights(lay, None), size, model.aim), mean_index, size
 
 
 def list_examples(

@@ -13,7 +13,7 @@ from sonarpost.messages import ReconstructedImage
 from sonarpost.sonar.image_files import png_bytes, tiff_bytes
 
 
-def picture_name(image: ReconstructedImage) -> str:
+def image_file_name(image: ReconstructedImage) -> str:
     """Return the file name without suffix: vehicle, time of the first frame, image identifier, version.
 
     The time keeps a later mission's picture apart when a vehicle starts its identifiers anew.
@@ -38,7 +38,7 @@ def side_car(image: ReconstructedImage) -> dict[str, object]:
     }
 
 
-def write_picture(folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
+def write_image(folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
     """Write the three files of a picture; return the TIFF's path and whether it was new.
 
     The JSON comes last: where it is, the other two are whole. A picture that is there with the same pixels is left.
@@ -47,18 +47,18 @@ def write_picture(folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
         OSError: The folder cannot be written (a full disk).
     """
     files = AtomicFiles()
-    found = add_picture(files, folder, image)
+    found = add_image(files, folder, image)
     files.commit()
     return found
 
 
-def add_picture(files: AtomicFiles, folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
-    """Add a picture's files to others that are committed together; what is returned is as of `write_picture`.
+def add_image(files: AtomicFiles, folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
+    """Add a picture's files to others that are committed together; what is returned is as of `write_image`.
 
     Raises:
         OSError: The folder cannot be written (a full disk); none of the three is added.
     """
-    name = picture_name(image)
+    name = image_file_name(image)
     tiff, sidecar = folder / f"{name}.tiff", folder / f"{name}.json"
     text = (json.dumps(side_car(image), indent=1) + "\n").encode()
     picture = folder / f"{name}.png"

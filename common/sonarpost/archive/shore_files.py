@@ -9,9 +9,9 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from sonarpost.archive.image_files import picture_name
-from sonarpost.archive.shore_index import DecisionRow, PictureRow, ShoreIndex
-from sonarpost.errors import KeptFileError
+from sonarpost.archive.image_files import image_file_name
+from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex
+from sonarpost.errors import StoredFileError
 from sonarpost.export.accepted import DECISIONS, SideCar
 from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 SUFFIXES = (".json", ".tiff", ".png")
 
 
-def files_of(out_dir: Path, row: PictureRow) -> tuple[Path, ...]:
+def files_of(out_dir: Path, row: ImageRow) -> tuple[Path, ...]:
     """Return the paths of a picture's files."""
     return tuple(out_dir / row.vessel_id / f"{row.name}{suffix}" for suffix in SUFFIXES)
 
@@ -38,7 +38,7 @@ def decision_file_name(decision_id: str) -> str:
 
 def picture_row(
     out_dir: Path, name: str, image: ReconstructedImage | SideCar, relayed_utc_s: float | None, accepted_utc_s: float
-) -> PictureRow:
+) -> ImageRow:
     """Return the index's row of a picture whose files are written.
 
     Raises:
@@ -51,7 +51,7 @@ def picture_row(
     )
     contact = image.contact
     folder = out_dir / image.vessel_id
-    return PictureRow(
+    return ImageRow(
         vessel_id=image.vessel_id,
         name=name,
         vehicle_id=image.vehicle_id,
@@ -74,9 +74,9 @@ def picture_row(
     )
 
 
-def row_of_image(out_dir: Path, image: ReconstructedImage, relayed_utc_s: float) -> PictureRow:
+def row_of_image(out_dir: Path, image: ReconstructedImage, relayed_utc_s: float) -> ImageRow:
     """Return the row of a picture that was just written."""
-    return picture_row(out_dir, picture_name(image), image, relayed_utc_s, time.time())
+    return picture_row(out_dir, image_file_name(image), image, relayed_utc_s, time.time())
 
 
 def add_missing(out_dir: Path, index: ShoreIndex) -> int:
@@ -87,7 +87,7 @@ def add_missing(out_dir: Path, index: ShoreIndex) -> int:
     Raises:
         OSError: The index or a folder cannot be used.
     """
-    rows: list[PictureRow | DecisionRow] = [*_missing_pictures(out_dir, index), *_missing_decisions(out_dir, index)]
+    rows: list[ImageRow | DecisionRow] = [*_missing_pictures(out_dir, index), *_missing_decisions(out_dir, index)]
     if rows:
         index.put(rows)
     return len(rows)
@@ -107,7 +107,7 @@ def remove_unfinished(out_dir: Path) -> int:
     return count
 
 
-def _missing_pictures(out_dir: Path, index: ShoreIndex) -> Iterator[PictureRow]:
+def _missing_pictures(out_dir: Path, index: ShoreIndex) -> Iterator[ImageRow]:
     for path in sorted(out_dir.glob("*/[!.]*.json")):
         if index.has_picture(path.parent.name, path.stem):
             continue
@@ -129,15 +129,15 @@ def _missing_decisions(out_dir: Path, index: ShoreIndex) -> Iterator[DecisionRow
 
 
 def to_remove(
-    pictures: Sequence[PictureRow], now_utc_s: float, retain_days: float | None, max_bytes: int | None
-) -> list[PictureRow]:
+    pictures: Sequence[ImageRow], now_utc_s: float, retain_days: float | None, max_bytes: int | None
+) -> list[ImageRow]:
     """Choose the pictures that retention removes: pure.
 
     Everything accepted longer than `retain_days` ago goes. Of what is left, pictures that have been exported go first
     and then the others, each oldest first, until no more than `max_bytes` are left. Decisions are not pictures.
     """
-    old: list[PictureRow] = []
-    kept: list[PictureRow] = []
+    old: list[ImageRow] = []
+    kept: list[ImageRow] = []
     for row in pictures:
         too_old = retain_days is not None and now_utc_s - row.accepted_utc_s > retain_days * 86400.0
         (old if too_old else kept).append(row)
@@ -152,7 +152,7 @@ def to_remove(
     return old
 
 
-def remove_files(out_dir: Path, row: PictureRow) -> None:
+def remove_files(out_dir: Path, row: ImageRow) -> None:
     """Remove a picture's files; those that are gone already do no harm.
 
     Raises:
@@ -162,7 +162,7 @@ def remove_files(out_dir: Path, row: PictureRow) -> None:
         path.unlink(missing_ok=True)
 
 
-def find_picture(pictures: Sequence[PictureRow], name: str, vessel: str | None, version: int | None) -> PictureRow:
+def find_picture(pictures: Sequence[ImageRow], name: str, vessel: str | None, version: int | None) -> ImageRow:
     """Return the picture that a person means.
 
     Args:
@@ -172,16 +172,16 @@ def find_picture(pictures: Sequence[PictureRow], name: str, vessel: str | None, 
         version: Its version, None for the newest.
 
     Raises:
-        KeptFileError: There is none, or there are several that are not versions of one.
+        StoredFileError: There is none, or there are several that are not versions of one.
     """
     vehicle, _, image_id = name.partition("/")
     named = [r for r in pictures if r.name == name or (r.vehicle_id, r.image_id) == (vehicle, image_id)]
     found = [r for r in named if vessel in (None, r.vessel_id) and version in (None, r.version)]
     if not found:
-        raise KeptFileError("index", "picture", name, "a picture that `sonarpost c2 ls` shows")
+        raise StoredFileError("index", "picture", name, "a picture that `sonarpost c2 ls` shows")
     if len({(r.vessel_id, r.vehicle_id, r.image_id, r.first_frame_utc_s) for r in found}) > 1:
         names = ", ".join(f"{r.vessel_id}/{r.name}" for r in found)
-        raise KeptFileError(
+        raise StoredFileError(
             "index", "picture", name, f"one picture, with --vessel or by the name of its files: {names}"
         )
     return max(found, key=lambda r: r.version)

@@ -14,7 +14,7 @@ from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from sonarpost.errors import KeptFileError
+from sonarpost.errors import StoredFileError
 from sonarpost.messages import Decision, DeliveryState, TaskingKind
 
 FILE_NAME = "index.db"
@@ -43,7 +43,7 @@ CREATE TABLE IF NOT EXISTS tasking (
 
 
 @dataclass(frozen=True, slots=True)
-class PictureRow:
+class ImageRow:
     """One version of one picture.
 
     Attributes:
@@ -119,8 +119,8 @@ class TaskingRow:
     changed_utc_s: float
 
 
-Row = TypeVar("Row", PictureRow, DecisionRow, TaskingRow)
-_TABLES: dict[type, str] = {PictureRow: "picture", DecisionRow: "decision", TaskingRow: "tasking"}
+Row = TypeVar("Row", ImageRow, DecisionRow, TaskingRow)
+_TABLES: dict[type, str] = {ImageRow: "picture", DecisionRow: "decision", TaskingRow: "tasking"}
 Mark = Literal["exported_utc_s", "removed_utc_s"]
 
 
@@ -132,7 +132,7 @@ class ShoreIndex:
         writable: False opens what is there for reading only.
 
     Raises:
-        KeptFileError: There is no index, or the file is none of this version.
+        StoredFileError: There is no index, or the file is none of this version.
         OSError: It cannot be written.
     """
 
@@ -142,7 +142,7 @@ class ShoreIndex:
         if writable:
             out_dir.mkdir(parents=True, exist_ok=True)
         elif not self.path.is_file():
-            raise KeptFileError(str(self.path), "", "no such file", "the index that c2 keeps in its out_dir")
+            raise StoredFileError(str(self.path), "", "no such file", "the index that c2 keeps in its out_dir")
         mode = "rwc" if writable else "ro"
         try:
             self._db = sqlite3.connect(
@@ -156,13 +156,13 @@ class ShoreIndex:
         except sqlite3.DatabaseError as error:
             if isinstance(error, sqlite3.OperationalError) and writable:
                 raise OSError(f"{self.path}: {error}") from error
-            raise KeptFileError(str(self.path), "", str(error), "the index that c2 keeps in its out_dir") from error
+            raise StoredFileError(str(self.path), "", str(error), "the index that c2 keeps in its out_dir") from error
 
     def _open(self, *, writable: bool) -> None:
         version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
         if version != INDEX_VERSION and not (writable and version == 0):
             self._db.close()
-            raise KeptFileError(str(self.path), "user_version", version, str(INDEX_VERSION))
+            raise StoredFileError(str(self.path), "user_version", version, str(INDEX_VERSION))
         if writable:
             self._db.execute("PRAGMA journal_mode=WAL")
             # What a power cut takes from the index is in the files, and is added again at the next start.
@@ -188,7 +188,7 @@ class ShoreIndex:
                     raise OSError(f"{self.path}: {error}") from error
                 raise
 
-    def put(self, rows: Iterable[PictureRow | DecisionRow | TaskingRow]) -> None:
+    def put(self, rows: Iterable[ImageRow | DecisionRow | TaskingRow]) -> None:
         """Add rows, or replace those of the same names.
 
         Raises:
@@ -200,7 +200,7 @@ class ShoreIndex:
                 marks = ", ".join("?" * len(values))
                 db.execute(f"INSERT OR REPLACE INTO {_TABLES[type(row)]} VALUES ({marks})", values)  # noqa: S608
 
-    def mark(self, what: Mark, pictures: Iterable[PictureRow], at_utc_s: float) -> None:
+    def mark(self, what: Mark, pictures: Iterable[ImageRow], at_utc_s: float) -> None:
         """Note that pictures were exported or removed.
 
         Raises:
@@ -211,14 +211,14 @@ class ShoreIndex:
                 sql = f"UPDATE picture SET {what} = ? WHERE vessel_id = ? AND name = ?"  # noqa: S608 literals
                 db.execute(sql, (at_utc_s, row.vessel_id, row.name))
 
-    def pictures(self, *, removed: bool = False) -> list[PictureRow]:
+    def pictures(self, *, removed: bool = False) -> list[ImageRow]:
         """Return all versions of all pictures, oldest first; those that were removed only where asked for.
 
         Raises:
             OSError: The file cannot be read.
         """
         where = "" if removed else "WHERE removed_utc_s IS NULL"
-        rows = self._rows(PictureRow, f"{where} ORDER BY first_frame_utc_s, vessel_id, name")
+        rows = self._rows(ImageRow, f"{where} ORDER BY first_frame_utc_s, vessel_id, name")
         return [_with_bool(row) for row in rows]
 
     def decisions(self) -> list[DecisionRow]:
@@ -232,7 +232,7 @@ class ShoreIndex:
     def has_picture(self, vessel_id: str, name: str) -> bool:
         """Tell whether a picture's files are known and have not been removed."""
         sql = "WHERE vessel_id = ? AND name = ? AND removed_utc_s IS NULL"
-        return bool(self._rows(PictureRow, sql, (vessel_id, name)))
+        return bool(self._rows(ImageRow, sql, (vessel_id, name)))
 
     def has_decision(self, vessel_id: str, decision_id: str) -> bool:
         """Tell whether a decision is known."""
@@ -259,7 +259,7 @@ class ShoreIndex:
             raise OSError(f"{self.path}: {error}") from error
 
 
-def _with_bool(row: PictureRow) -> PictureRow:
+def _with_bool(row: ImageRow) -> ImageRow:
     """SQLite knows no truth values."""
     values = {f.name: getattr(row, f.name) for f in fields(row)}
-    return PictureRow(**{**values, "complete": bool(row.complete)})
+    return ImageRow(**{**values, "complete": bool(row.complete)})

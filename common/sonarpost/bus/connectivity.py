@@ -1,7 +1,7 @@
 """Why the other side is not reached: Zenoh says "timeout" or nothing, so this tries one thing after the other.
 
 An endpoint is tried with TCP and TLS alone, as Zenoh would; a shore by asking its processes whether they are there.
-What the two say together is a `Reach`.
+What the two say together is a `ConnectivityState`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ TIMEOUT_S = 3.0
 REFUSAL_S = 0.7
 
 
-class Reach(Enum):
+class ConnectivityState(Enum):
     """How far something gets towards the other side."""
 
     REACHED = "reached"
@@ -38,7 +38,7 @@ class Reach(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ConnectivityResult:
     """What an attempt came to.
 
     Attributes:
@@ -46,7 +46,7 @@ class Outcome:
         detail: What was met, for people.
     """
 
-    reach: Reach
+    reach: ConnectivityState
     detail: str = ""
 
     @property
@@ -55,7 +55,7 @@ class Outcome:
         return f"{self.reach.value}: {self.detail}" if self.detail else self.reach.value
 
 
-def try_endpoint(endpoint: str, tls: TlsConfig | None, timeout_s: float = TIMEOUT_S) -> Outcome:
+def probe_endpoint(endpoint: str, tls: TlsConfig | None, timeout_s: float = TIMEOUT_S) -> ConnectivityResult:
     """Connect to an endpoint by TCP and, for `tls/…`, shake hands with the host's own certificate.
 
     Returns:
@@ -64,21 +64,23 @@ def try_endpoint(endpoint: str, tls: TlsConfig | None, timeout_s: float = TIMEOU
     """
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None:
-        return Outcome(Reach.UNKNOWN, f"{endpoint} is not tcp/HOST:PORT or tls/HOST:PORT")
+        return ConnectivityResult(ConnectivityState.UNKNOWN, f"{endpoint} is not tcp/HOST:PORT or tls/HOST:PORT")
     host, port = match["host"].strip("[]"), int(match["port"])
     try:
         with socket.create_connection((host, port), timeout_s) as connection:
             if match["protocol"] == "tcp":
-                return Outcome(Reach.REACHED, endpoint)
+                return ConnectivityResult(ConnectivityState.REACHED, endpoint)
             return _shake_hands(connection, host, endpoint, tls)
     except (OSError, OverflowError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        return Outcome(Reach.NO_CONNECTION, f"{endpoint}: {reason}")
+        return ConnectivityResult(ConnectivityState.NO_CONNECTION, f"{endpoint}: {reason}")
 
 
-def _shake_hands(connection: socket.socket, host: str, endpoint: str, tls: TlsConfig | None) -> Outcome:
+def _shake_hands(connection: socket.socket, host: str, endpoint: str, tls: TlsConfig | None) -> ConnectivityResult:
     if tls is None:
-        return Outcome(Reach.TLS_REFUSED, f"{endpoint}: [platform] has no tls, so there is no certificate to show")
+        return ConnectivityResult(
+            ConnectivityState.TLS_REFUSED, f"{endpoint}: [platform] has no tls, so there is no certificate to show"
+        )
     try:
         context = ssl.create_default_context(cafile=str(tls.ca))
         context.load_cert_chain(str(tls.certificate), str(tls.key))
@@ -88,13 +90,15 @@ def _shake_hands(connection: socket.socket, host: str, endpoint: str, tls: TlsCo
                 ended = wrapped.recv(1) == b""
             except TimeoutError:
                 # Zenoh waits for our first message: nobody has refused us.
-                return Outcome(Reach.REACHED, endpoint)
+                return ConnectivityResult(ConnectivityState.REACHED, endpoint)
             detail = "closed after the handshake" if ended else "speaks before it is spoken to, no Zenoh router"
-            return Outcome(Reach.TLS_REFUSED, f"{endpoint}: {detail}")
+            return ConnectivityResult(ConnectivityState.TLS_REFUSED, f"{endpoint}: {detail}")
     except ssl.SSLCertVerificationError as error:
-        return Outcome(Reach.TLS_REFUSED, f"{endpoint}: its certificate is not accepted here: {error.verify_message}")
+        return ConnectivityResult(
+            ConnectivityState.TLS_REFUSED, f"{endpoint}: its certificate is not accepted here: {error.verify_message}"
+        )
     except ssl.SSLError as error:
-        return Outcome(Reach.TLS_REFUSED, f"{endpoint}: {_ssl_reason(error)}")
+        return ConnectivityResult(ConnectivityState.TLS_REFUSED, f"{endpoint}: {_ssl_reason(error)}")
 
 
 def _ssl_reason(error: ssl.SSLError) -> str:
@@ -104,7 +108,9 @@ def _ssl_reason(error: ssl.SSLError) -> str:
     return reason
 
 
-def ask_shore(session: zenoh.Session, vessel: str, site: str = keys.SHORE, timeout_s: float = TIMEOUT_S) -> Outcome:
+def query_presence(
+    session: zenoh.Session, vessel: str, site: str = keys.SHORE, timeout_s: float = TIMEOUT_S
+) -> ConnectivityResult:
     """Ask a site's processes, through the routers between, whether they are there for this vessel.
 
     Returns:
@@ -118,25 +124,27 @@ def ask_shore(session: zenoh.Session, vessel: str, site: str = keys.SHORE, timeo
         try:
             answer = hello.parse(reply.ok.payload.to_bytes(), str(reply.ok.key_expr))
         except PayloadError as error:
-            return Outcome(Reach.UNKNOWN, str(error))
+            return ConnectivityResult(ConnectivityState.UNKNOWN, str(error))
         answers[answer.service] = answer.platform
     if "c2" in answers:
-        return Outcome(Reach.REACHED, f"{answers['c2']} in {time.monotonic() - began:.3f} s")
+        return ConnectivityResult(ConnectivityState.REACHED, f"{answers['c2']} in {time.monotonic() - began:.3f} s")
     if answers:
         service, platform = next(iter(answers.items()))
-        return Outcome(Reach.NOBODY_THERE, f"{service} of {platform} answers, c2 does not")
-    return Outcome(Reach.UNKNOWN, f"nobody answers for {site}")
+        return ConnectivityResult(ConnectivityState.NOBODY_THERE, f"{service} of {platform} answers, c2 does not")
+    return ConnectivityResult(ConnectivityState.UNKNOWN, f"nobody answers for {site}")
 
 
-def why_no_answer(asked: Outcome, endpoints: tuple[str, ...], tls: TlsConfig | None) -> Outcome:
+def diagnose_no_reply(
+    asked: ConnectivityResult, endpoints: tuple[str, ...], tls: TlsConfig | None
+) -> ConnectivityResult:
     """Return what an unanswered question is due to, after trying the endpoints of the routers in between."""
-    if asked.reach is not Reach.UNKNOWN or not endpoints:
+    if asked.reach is not ConnectivityState.UNKNOWN or not endpoints:
         return asked
-    tried = [try_endpoint(endpoint, tls) for endpoint in endpoints]
-    refused = [outcome for outcome in tried if outcome.reach is Reach.TLS_REFUSED]
-    reached = [outcome for outcome in tried if outcome.reach is Reach.REACHED]
+    tried = [probe_endpoint(endpoint, tls) for endpoint in endpoints]
+    refused = [outcome for outcome in tried if outcome.reach is ConnectivityState.TLS_REFUSED]
+    reached = [outcome for outcome in tried if outcome.reach is ConnectivityState.REACHED]
     if reached:
         # sonarpost's own router answers every vessel that it lets in; zenohd does not, and then c2 may be away as well.
         detail = f"{reached[0].detail} takes our certificate and nothing comes back (with zenohd: or c2 is not there)"
-        return Outcome(Reach.DENIED, detail)
+        return ConnectivityResult(ConnectivityState.DENIED, detail)
     return (refused or tried)[0]

@@ -22,7 +22,7 @@ VERSION = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Hello:
+class PresenceReply:
     """An answer: which process of which platform is there."""
 
     platform: str
@@ -34,7 +34,7 @@ class Hello:
         return packed
 
 
-def parse(payload: bytes, where: str) -> Hello:
+def parse(payload: bytes, where: str) -> PresenceReply:
     """Read an answer.
 
     Raises:
@@ -49,14 +49,14 @@ def parse(payload: bytes, where: str) -> Hello:
         if not isinstance(value, str) or not 1 <= len(value) <= 40:
             raise PayloadError(where, name, value, "1 to 40 characters")
         found.append(value)
-    return Hello(*found)
+    return PresenceReply(*found)
 
 
-def answer_vessels(
+def declare_presence(
     session: zenoh.Session, platform: str, service: str, site: str = keys.SHORE
 ) -> zenoh.Queryable[None]:
     """Answer every vessel that asks, until the session closes or the queryable is undeclared."""
-    payload = Hello(platform, service).pack()
+    payload = PresenceReply(platform, service).pack()
 
     def on_query(query: zenoh.Query) -> None:
         # Of `…/inbox/{vessel}/hello/*` the vessel's part is certain, ours stands at the end.

@@ -21,7 +21,7 @@ from types import FrameType
 import zenoh
 
 from sonarpost import logs
-from sonarpost.bus.router_monitor import watched_router
+from sonarpost.bus.router_monitor import monitored_router
 from sonarpost.bus.session import router_config
 from sonarpost.errors import ConfigError, SonarpostError
 from sonarpost.parent_process import exit_with_parent
@@ -43,7 +43,7 @@ def run(config: zenoh.Config) -> int:
         signal.signal(number, on_signal)
     listen, connect = _shown(config, "listen/endpoints"), _shown(config, "connect/endpoints")
     try:
-        with watched_router(config):
+        with monitored_router(config):
             log.info("Router started", extra=logs.kv(listen=listen, connect=connect))
             stop.wait()
     except (zenoh.ZError, SonarpostError) as error:

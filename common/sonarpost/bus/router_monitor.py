@@ -21,8 +21,8 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.bus import presence as hello
 from sonarpost.bus.log_capture import LogCapture
-from sonarpost.bus.zenoh_log import Denied, Event, Remark, Stranger, TlsRejected
-from sonarpost.errors import BadInputError, HandoffError
+from sonarpost.bus.zenoh_log import Denied, Event, TlsRejected, UnknownCertificateAuthority, ZenohLogMessage
+from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.logs import kv
 from sonarpost.messages import Health, ServiceState
 from sonarpost.security import tls_files
@@ -41,7 +41,7 @@ _DIGITS = re.compile(r"[0-9]+")
 RECENT_S = 60.0
 
 
-class Refusals:
+class RefusedPeers:
     """Counts refusals and says which are to be logged: each kind once in an interval, and how often afterwards."""
 
     def __init__(self) -> None:
@@ -66,7 +66,7 @@ class Refusals:
         return [(kind, times) for kind, times in told if times > 0]
 
 
-class RouterWatch:
+class RouterMonitor:
     """Watches one router session of this process.
 
     Args:
@@ -93,14 +93,14 @@ class RouterWatch:
         self._interval_s = interval_s
         self._started_utc_s = time.time()
         self._lock = threading.Lock()
-        self._refusals = Refusals()
+        self._refusals = RefusedPeers()
         self._peers: dict[str, tuple[str, str]] = {}
         self._strangers: set[str] = set()
         self._last = ("", 0.0)
         self._stop = threading.Event()
         self._token = session.liveliness().declare_token(keys.alive(platform, NAME)) if platform else None
         self._links = session.info.declare_link_events_listener(self._on_link, history=True)
-        self._hellos = [hello.answer_vessels(session, platform, NAME, site) for site in sites if platform]
+        self._hellos = [hello.declare_presence(session, platform, NAME, site) for site in sites if platform]
         if capture is not None:
             capture.listen(self.on_event)
         self._thread = threading.Thread(target=self._report, name="router-health", daemon=True)
@@ -117,7 +117,7 @@ class RouterWatch:
         with self._lock:
             if isinstance(event, TlsRejected):
                 self._tell("tls_rejected", "TLS connection refused", reason=event.reason)
-            elif isinstance(event, Stranger):
+            elif isinstance(event, UnknownCertificateAuthority):
                 self._strangers.add(event.zid)
                 self._tell_stranger(event.zid)
             elif isinstance(event, Denied):
@@ -143,7 +143,7 @@ class RouterWatch:
             key=event.key,
         )
 
-    def _remark(self, event: Remark) -> None:
+    def _remark(self, event: ZenohLogMessage) -> None:
         if self._refusals.count("zenoh_warnings", event.module, event.text[:80]):
             log.warning("Zenoh warns", extra=kv(module=event.module, text=event.text[:400]))
 
@@ -223,12 +223,12 @@ class RouterWatch:
             record = self.health(self._platform, state)
             key = keys.health(self._platform, NAME)
             self._session.put(key, wire.encode(record), encoding=wire.encoding_of(Health))
-        except (HandoffError, zenoh.ZError) as error:
+        except (DeliveryError, zenoh.ZError) as error:
             log.warning("Health not published", extra=kv(error=str(error)))
 
 
 @contextmanager
-def watched_router(config: zenoh.Config) -> Iterator[zenoh.Session]:
+def monitored_router(config: zenoh.Config) -> Iterator[zenoh.Session]:
     """Open a router of this process and watch it where its configuration says whose it is (`metadata.platform`).
 
     Raises:
@@ -244,7 +244,7 @@ def watched_router(config: zenoh.Config) -> Iterator[zenoh.Session]:
     session = zenoh.open(config)
     watch = None
     try:
-        watch = RouterWatch(session, capture, platform, sites, certificate)
+        watch = RouterMonitor(session, capture, platform, sites, certificate)
         yield session
     finally:
         if watch is not None:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import zenoh
 
-from sonarpost.bus.connectivity import try_endpoint
+from sonarpost.bus.connectivity import probe_endpoint
 from sonarpost.config import TlsConfig
 from sonarpost.logs import kv
 
@@ -95,7 +95,7 @@ def open_with_retry(
         except zenoh.ZError as error:
             if attempt == 0:
                 # Zenoh says "timeout" for a refused certificate, too.
-                reason = try_endpoint(endpoint, tls).text if endpoint.startswith("tls/") else str(error)[:200]
+                reason = probe_endpoint(endpoint, tls).text if endpoint.startswith("tls/") else str(error)[:200]
                 log.warning("Zenoh router not reached, trying again", extra=kv(router=endpoint, error=reason))
             attempt += 1
             stop.wait(RETRY_S[min(attempt // len(endpoints), len(RETRY_S) - 1)])

@@ -14,21 +14,21 @@ from dataclasses import dataclass
 import zenoh
 
 from sonarpost.bus import connectivity as reach
-from sonarpost.bus.connectivity import Outcome, Reach
+from sonarpost.bus.connectivity import ConnectivityResult, ConnectivityState
 from sonarpost.config import TlsConfig
 from sonarpost.logs import kv
 
 log = logging.getLogger(__name__)
 
 # Every question costs the radio link some hundred bytes.
-WHILE_REACHED_S = 120.0
-WHILE_NOT_S = (2.0, 5.0, 15.0, 30.0)
+PROBE_INTERVAL_REACHABLE_S = 120.0
+PROBE_INTERVAL_UNREACHABLE_S = (2.0, 5.0, 15.0, 30.0)
 # Waiting does not help against these: somebody has to put a certificate or a list right.
-FAULTS = (Reach.TLS_REFUSED, Reach.DENIED)
+FAULTS = (ConnectivityState.TLS_REFUSED, ConnectivityState.DENIED)
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class SiteConnectivity:
     """A site that is to be reached.
 
     Attributes:
@@ -42,7 +42,7 @@ class Site:
     endpoints: tuple[str, ...] = ()
 
 
-class ShoreWatch:
+class SiteMonitor:
     """Tests the way to every site.
 
     Args:
@@ -51,12 +51,12 @@ class ShoreWatch:
         tls: The host's own certificate.
     """
 
-    def __init__(self, vessel: str, sites: Sequence[Site], tls: TlsConfig | None) -> None:
+    def __init__(self, vessel: str, sites: Sequence[SiteConnectivity], tls: TlsConfig | None) -> None:
         self._vessel = vessel
         self._sites = sites
         self._tls = tls
         self._lock = threading.Lock()
-        self._outcomes: dict[str, Outcome] = {}
+        self._outcomes: dict[str, ConnectivityResult] = {}
 
     def run(self, stop: threading.Event) -> None:
         """Test again and again until `stop` is set."""
@@ -67,28 +67,32 @@ class ShoreWatch:
                     return
                 self.note(site.name, self.test(site))
             failures = 0 if self._all_reached() else failures + 1
-            stop.wait(WHILE_NOT_S[min(failures, len(WHILE_NOT_S)) - 1] if failures else WHILE_REACHED_S)
+            stop.wait(
+                PROBE_INTERVAL_UNREACHABLE_S[min(failures, len(PROBE_INTERVAL_UNREACHABLE_S)) - 1]
+                if failures
+                else PROBE_INTERVAL_REACHABLE_S
+            )
 
-    def test(self, site: Site) -> Outcome:
+    def test(self, site: SiteConnectivity) -> ConnectivityResult:
         """Ask one site and, when nobody answers, try the routers on the way."""
         session = site.session()
         if session is None:
-            asked = Outcome(Reach.UNKNOWN, "its router is not reached")
+            asked = ConnectivityResult(ConnectivityState.UNKNOWN, "its router is not reached")
         else:
             try:
-                asked = reach.ask_shore(session, self._vessel, site.name)
+                asked = reach.query_presence(session, self._vessel, site.name)
             except zenoh.ZError as error:
-                asked = Outcome(Reach.UNKNOWN, str(error)[:200])
-        return reach.why_no_answer(asked, site.endpoints, self._tls)
+                asked = ConnectivityResult(ConnectivityState.UNKNOWN, str(error)[:200])
+        return reach.diagnose_no_reply(asked, site.endpoints, self._tls)
 
-    def note(self, name: str, outcome: Outcome) -> None:
+    def note(self, name: str, outcome: ConnectivityResult) -> None:
         """Remember an outcome; log it when it is another than before."""
         with self._lock:
             before = self._outcomes.get(name)
             self._outcomes[name] = outcome
         if before is not None and before.reach is outcome.reach:
             return
-        if outcome.reach is Reach.REACHED:
+        if outcome.reach is ConnectivityState.REACHED:
             log.info("Shore reached", extra=kv(site=name, by=outcome.detail))
         else:
             log.warning("Shore not reached", extra=kv(site=name, why=outcome.reach.value, detail=outcome.detail))
@@ -99,17 +103,21 @@ class ShoreWatch:
 
     def remark(self) -> str:
         """Return what is away and may come back by itself, empty when nothing."""
-        return self._said(lambda outcome: outcome.reach not in FAULTS and outcome.reach is not Reach.REACHED)
+        return self._said(
+            lambda outcome: outcome.reach not in FAULTS and outcome.reach is not ConnectivityState.REACHED
+        )
 
     def gauges(self) -> Mapping[str, float]:
         """Return for each tested site whether it was reached, 1 or 0."""
         with self._lock:
-            return {f"reached_{name}": float(o.reach is Reach.REACHED) for name, o in self._outcomes.items()}
+            return {
+                f"reached_{name}": float(o.reach is ConnectivityState.REACHED) for name, o in self._outcomes.items()
+            }
 
     def _all_reached(self) -> bool:
         with self._lock:
-            return all(outcome.reach is Reach.REACHED for outcome in self._outcomes.values())
+            return all(outcome.reach is ConnectivityState.REACHED for outcome in self._outcomes.values())
 
-    def _said(self, wanted: Callable[[Outcome], bool]) -> str:
+    def _said(self, wanted: Callable[[ConnectivityResult], bool]) -> str:
         with self._lock:
             return "; ".join(f"{name}: {outcome.text}" for name, outcome in self._outcomes.items() if wanted(outcome))

@@ -13,7 +13,7 @@ from sonarpost.security import tls_files
 log = logging.getLogger(__name__)
 
 
-class OwnTls:
+class TlsMonitor:
     """The `[platform] tls` of a process, or none.
 
     Raises:

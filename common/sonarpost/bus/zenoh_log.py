@@ -74,14 +74,14 @@ class Denied:
 
 
 @dataclass(frozen=True, slots=True)
-class Stranger:
+class UnknownCertificateAuthority:
     """A peer was let in by TLS whose certificate is on no list: whatever it says is denied."""
 
     zid: str
 
 
 @dataclass(frozen=True, slots=True)
-class Remark:
+class ZenohLogMessage:
     """Anything else that Zenoh finds worth a warning or an error."""
 
     level: str
@@ -89,7 +89,7 @@ class Remark:
     text: str
 
 
-Event = TlsRejected | Denied | Stranger | Remark
+Event = TlsRejected | Denied | UnknownCertificateAuthority | ZenohLogMessage
 
 
 class ZenohLog:
@@ -119,17 +119,17 @@ class ZenohLog:
             return None
         if module.startswith("zenoh_link_tls"):
             return TlsRejected(_HINT.sub("", text))
-        return Remark(level, module, text)
+        return ZenohLogMessage(level, module, text)
 
     def _interceptor(self, thread: str, text: str, level: str, module: str) -> Event | None:
         if text == _INTERCEPTED:
             return self._denied(self._last.pop(thread, None))
         if (stranger := _STRANGER.match(text)) is not None:
-            return Stranger(stranger["zid"])
+            return UnknownCertificateAuthority(stranger["zid"])
         if (decision := _DECISION.fullmatch(text)) is not None:
             self._note(thread, decision)
             return None
-        return Remark(level, module, text) if level in ("WARN", "ERROR") else None
+        return ZenohLogMessage(level, module, text) if level in ("WARN", "ERROR") else None
 
     def _note(self, thread: str, decision: re.Match[str]) -> None:
         """A decision may be asked for ahead of time; only the one right before the message is stopped counts."""

@@ -16,7 +16,7 @@ from sonarpost.detection.ground_snippet import cut_ground_snippet
 from sonarpost.detection.plot import annotated_waterfall
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.snippet import cut_snippet
-from sonarpost.detection.stream import LineContact, LineDetector
+from sonarpost.detection.stream import StreamContact, StreamDetector
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
 from sonarpost.sonar.options import SurveyOptions, load_options
@@ -91,7 +91,7 @@ def run(parsed: argparse.Namespace) -> int:
 
 def _detected(files: Sequence[Path], settings: DetectorSettings, options: SurveyOptions) -> list[FoundIn]:
     """Detect in the files as one line after another; a contact belongs to the file that holds its ping."""
-    detector = LineDetector(settings, options)
+    detector = StreamDetector(settings, options)
     results: list[FoundIn] = []
     for path in files:
         survey = read_survey(path, options)
@@ -107,7 +107,7 @@ def _detected(files: Sequence[Path], settings: DetectorSettings, options: Survey
     return results
 
 
-def _hand_out(told: Sequence[LineContact], results: Sequence[FoundIn]) -> None:
+def _hand_out(told: Sequence[StreamContact], results: Sequence[FoundIn]) -> None:
     for contact in told:
         results[contact.file].contacts.append(contact)
 

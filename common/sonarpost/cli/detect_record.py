@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 
-from sonarpost.detection.stream import LineContact
+from sonarpost.detection.stream import StreamContact
 from sonarpost.sonar.survey import Survey
 
 
@@ -17,11 +17,11 @@ class FoundIn:
     """A file, what was found in it, and the time that detecting took."""
 
     survey: Survey
-    contacts: list[LineContact]
+    contacts: list[StreamContact]
     seconds: float = 0.0
 
 
-def contact_json(survey: Survey, contact: LineContact, vehicle_id: str) -> dict[str, object]:
+def contact_json(survey: Survey, contact: StreamContact, vehicle_id: str) -> dict[str, object]:
     """Return one contact as JSON types.
 
     Args:

@@ -11,7 +11,7 @@ import numpy as np
 
 from sonarpost.codec.interface import Codec, StreamHeader
 from sonarpost.codec.registry import CodecRegistry, CodecResources, default_registry
-from sonarpost.codec.vq.codebook import nominal_for_tag, open_catalogue
+from sonarpost.codec.vq.codebook import default_for_tag, open_codebook
 from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.errors import SonarpostError, StreamError
 from sonarpost.files import write_atomically
@@ -69,7 +69,7 @@ def run_encode(args: argparse.Namespace) -> int:
         for name in registry.names():
             print(f"{name:12} {registry.spec(name).summary}")
         return 0
-    tiles = open_catalogue(args.catalogue).tiles if registry.spec(args.codec).needs_tiles else None
+    tiles = open_codebook(args.catalogue).tiles if registry.spec(args.codec).needs_tiles else None
     codec = registry.create(args.codec, CodecResources(tiles, IndexPacking(args.packing)))
     suffix = TEXT_SUFFIX if args.text else f".{codec.name}"
 
@@ -88,7 +88,7 @@ def run_decode(args: argparse.Namespace) -> int:
     registry = default_registry()
     suffixes = (*(f".{name}" for name in registry.names()), TEXT_SUFFIX)
     if args.catalogue is not None:
-        open_catalogue(args.catalogue)  # a wrong catalogue is one error, not one for each file of the folder
+        open_codebook(args.catalogue)  # a wrong catalogue is one error, not one for each file of the folder
 
     def decode_one(path: Path) -> str:
         return _decode_file(registry, path, _target_folder(args.out, path.parent / "out"), args.catalogue)
@@ -135,7 +135,7 @@ def _decode_file(registry: CodecRegistry, path: Path, folder: Path, catalogue: s
     header = StreamHeader.unpack(stream, str(path))
     tiles = None
     if registry.spec_for_id(header.codec_id).needs_tiles:
-        tiles = (open_catalogue(catalogue) if catalogue is not None else nominal_for_tag(header.model_tag)).tiles
+        tiles = (open_codebook(catalogue) if catalogue is not None else default_for_tag(header.model_tag)).tiles
     decoded = registry.create_for_stream(stream, CodecResources(tiles)).decode(stream)
     target = folder / f"{path.stem}.tiff"
     write_tiff(target, decoded.image)

@@ -13,7 +13,7 @@ from prometheus_client import start_http_server
 from sonarpost import logs
 from sonarpost.cli.fleet_options import add_router_options, router_of
 from sonarpost.errors import PortError
-from sonarpost.monitoring.fleet import Fleet, FleetWatcher
+from sonarpost.monitoring.fleet import FleetTracker, FleetWatcher
 from sonarpost.monitoring.metrics import FleetCollector, registry_of
 
 log = logging.getLogger(__name__)
@@ -61,7 +61,7 @@ def run(parsed: argparse.Namespace) -> int:
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)
-    watcher = FleetWatcher(endpoints, tls, Fleet(parsed.forget_after))
+    watcher = FleetWatcher(endpoints, tls, FleetTracker(parsed.forget_after))
     registry = registry_of(FleetCollector(watcher.state, parsed.stale_after))
     try:
         server, thread = start_http_server(parsed.port, parsed.address, registry)

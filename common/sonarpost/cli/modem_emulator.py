@@ -14,9 +14,9 @@ from types import FrameType
 from sonarpost.errors import ConfigError
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
-from sonarpost.simulation.channel.channel_presets import PRESETS, make_water, read_water
-from sonarpost.simulation.channel.emulator import AcousticChannel
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.channel_presets import PRESETS, make_channel, read_channel
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
 from sonarpost.simulation.modem.config import ModemConfig
 
@@ -90,7 +90,7 @@ def run(parsed: argparse.Namespace) -> int:
 
 
 def _serve(parsed: argparse.Namespace, stopping: threading.Event) -> int:
-    channel = AcousticChannel(_config(parsed), echo=sys.stdout if parsed.json else None)
+    channel = ChannelEmulator(_config(parsed), echo=sys.stdout if parsed.json else None)
     channel.open()
     try:
         devices = channel.devices()
@@ -156,7 +156,7 @@ def _config(parsed: argparse.Namespace) -> ChannelConfig:
         raise ConfigError("command line", name, rest, "a value within its bounds") from error
 
 
-def _water(parsed: argparse.Namespace) -> WaterConfig:
+def _water(parsed: argparse.Namespace) -> ChannelParameters:
     """Return the water of preset, file and options, the later over the earlier."""
     options = {
         "preset": parsed.preset,
@@ -168,8 +168,8 @@ def _water(parsed: argparse.Namespace) -> WaterConfig:
         "range_loss": parsed.range_loss or None,
     }
     given = {name: value for name, value in options.items() if value is not None}
-    from_file = read_water(parsed.water) if parsed.water else {}
-    return make_water(from_file | given | dict(_parameter(text) for text in parsed.set), "command line")
+    from_file = read_channel(parsed.water) if parsed.water else {}
+    return make_channel(from_file | given | dict(_parameter(text) for text in parsed.set), "command line")
 
 
 def _parameter(text: str) -> tuple[str, float | bool | str]:

@@ -110,7 +110,7 @@ class StreamHeader:
 
 
 @dataclass(frozen=True, slots=True)
-class Decoded:
+class DecodedImage:
     """A decoded picture and what of it is not measured.
 
     Attributes:
@@ -152,7 +152,7 @@ class Codec(Protocol):
             StreamError: The picture's size or depth is not supported, or the budget cannot be met.
         """
 
-    def decode(self, stream: bytes, received: Mask | None = None) -> Decoded:
+    def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
         """Rebuild the picture.
 
         Args:
@@ -166,7 +166,7 @@ class Codec(Protocol):
 
 
 @runtime_checkable
-class Extensible(Protocol):
+class ExtensibleCodec(Protocol):
     """A codec that can go on with a stream it has made."""
 
     def extend(self, stream: bytes, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], budget_bytes: int) -> bytes:
@@ -185,7 +185,7 @@ class Extensible(Protocol):
         """
 
 
-def arrived_body(
+def received_body(
     stream: bytes, received: Mask | None, codec_id: int, name: str
 ) -> tuple[StreamHeader, bytes, list[str]]:
     """Return a stream's header, its body up to the first byte that did not arrive, and notes.

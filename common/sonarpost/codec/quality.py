@@ -11,8 +11,8 @@ from scipy import ndimage
 
 from sonarpost.errors import StreamError
 
-Picture = npt.NDArray[np.uint8]
-FigureOfMerit = Callable[[Picture, Picture], float]
+GreyImage = npt.NDArray[np.uint8]
+FigureOfMerit = Callable[[GreyImage, GreyImage], float]
 """Takes the original and the rebuilt picture (same shape, uint8); larger is better, 100 is perfect."""
 
 PEAK = 255.0
@@ -22,7 +22,7 @@ MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001)  # the first three of the five of Wan
 MS_SSIM_LEAST = 1e-6  # a scale without likeness, or with the opposite, counts as this
 
 
-def psnr_db(original: Picture, rebuilt: Picture) -> float:
+def psnr_db(original: GreyImage, rebuilt: GreyImage) -> float:
     """Return the peak signal-to-noise ratio in dB for a peak of 255; infinite for equal pictures.
 
     PSNR = 10 log10(255^2 / mean((original - rebuilt)^2)).
@@ -40,7 +40,7 @@ def psnr_db(original: Picture, rebuilt: Picture) -> float:
     return math.inf if mean_square == 0.0 else 10.0 * math.log10(PEAK * PEAK / mean_square)
 
 
-def ssim(original: Picture, rebuilt: Picture) -> float:
+def ssim(original: GreyImage, rebuilt: GreyImage) -> float:
     """Return the mean structural similarity, -1..1, 1 for equal pictures.
 
     Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural similarity",
@@ -67,7 +67,7 @@ def ssim(original: Picture, rebuilt: Picture) -> float:
     return float(np.mean(numerator / denominator))
 
 
-def ms_ssim(original: Picture, rebuilt: Picture) -> float:
+def ms_ssim(original: GreyImage, rebuilt: GreyImage) -> float:
     """Return the multi-scale structural similarity over three scales, 0..1, 1 for equal pictures.
 
     Wang, Simoncelli, Bovik, "Multiscale structural similarity for image quality assessment", Asilomar 2003, with three
@@ -100,7 +100,7 @@ def ms_ssim(original: Picture, rebuilt: Picture) -> float:
     return result
 
 
-def fom(original: Picture, rebuilt: Picture) -> float:
+def fom(original: GreyImage, rebuilt: GreyImage) -> float:
     """Return the figure of merit used by default: 100 times the mean SSIM, so 100 is perfect and 0 is unrelated.
 
     The paper leaves its figure of merit "user-defined" and gives the threshold 39. SSIM is chosen because operators
@@ -145,7 +145,7 @@ def _window_mean(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return values
 
 
-def _check_pair(original: Picture, rebuilt: Picture) -> None:
+def _check_pair(original: GreyImage, rebuilt: GreyImage) -> None:
     if original.ndim != 2 or original.size == 0:
         raise StreamError("picture quality", "original.shape", original.shape, "(height, width), not empty")
     if original.shape != rebuilt.shape:

@@ -18,14 +18,14 @@ from sonarpost.codec import emb
 from sonarpost.codec.baselines.huffman import HuffmanCodec
 from sonarpost.codec.baselines.jpeg2000 import Jpeg2000Codec
 from sonarpost.codec.baselines.spiht import SpihtCodec
-from sonarpost.codec.baselines.still_images import ModernCodec, ModernFormat
+from sonarpost.codec.baselines.still_images import StillImageCodec, StillImageFormat
 from sonarpost.codec.interface import Codec, StreamHeader, model_tag, tag_length
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import ConfigError, StreamError
 
 ENTRY_POINT_GROUP = "sonarpost.codecs"
-CATALOGUE_TAG_BYTES = 2
+CODEBOOK_TAG_BYTES = 2
 
 
 @dataclass(frozen=True)
@@ -76,15 +76,15 @@ def _create_vq(resources: CodecResources) -> Codec:
     return VqCodec(resources.tiles, packing)
 
 
-def _modern_spec(wanted: ModernFormat) -> CodecSpec:
+def _modern_spec(wanted: StillImageFormat) -> CodecSpec:
     summary = f"{wanted.name} at the best quality that fits, for comparison"
-    return CodecSpec(wanted.value, (wanted.codec_id,), lambda _: ModernCodec(wanted), summary)
+    return CodecSpec(wanted.value, (wanted.codec_id,), lambda _: StillImageCodec(wanted), summary)
 
 
 def _what_is_absent(name_or_id: str | int) -> str:
     """Return what to install for a codec that is absent because its library is, as the end of a message."""
     absent = (
-        wanted for wanted in ModernFormat if name_or_id in (wanted.value, wanted.codec_id) and not wanted.available
+        wanted for wanted in StillImageFormat if name_or_id in (wanted.value, wanted.codec_id) and not wanted.available
     )
     return "".join(f" ({wanted.value} needs {wanted.needs})" for wanted in absent)
 
@@ -132,7 +132,7 @@ BUILTINS = (
         "set partitioning of a 9/7 wavelet, embedded (in the paper)",
         is_embedded=True,
     ),
-    *(_modern_spec(wanted) for wanted in ModernFormat if wanted.available),
+    *(_modern_spec(wanted) for wanted in StillImageFormat if wanted.available),
 )
 
 
@@ -160,7 +160,7 @@ class CodecRegistry:
         for codec_id in spec.codec_ids:
             if not 0 <= codec_id <= 0xFF:
                 raise ConfigError(where, "codec_ids", codec_id, "0..255")
-            if spec.needs_tiles and tag_length(codec_id) != CATALOGUE_TAG_BYTES:
+            if spec.needs_tiles and tag_length(codec_id) != CODEBOOK_TAG_BYTES:
                 expected = "0x10..0x1f or 0x80..0xff, whose streams say in two bytes which catalogue they need"
                 raise ConfigError(where, "codec_ids", f"{codec_id:#04x}", expected)
             if codec_id in self._by_id:

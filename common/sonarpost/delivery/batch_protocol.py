@@ -13,8 +13,8 @@ import msgpack
 
 from sonarpost import wire
 from sonarpost.delivery import protocol as handoff
-from sonarpost.delivery.items import Chunk, OutboxItem, consumer_of
-from sonarpost.delivery.protocol import CHUNK_BYTES, Reply
+from sonarpost.delivery.items import OutboxItem, ReceivedChunk, consumer_of
+from sonarpost.delivery.protocol import CHUNK_BYTES, AckReply
 from sonarpost.errors import PayloadError
 
 BATCH_VERSION = 2
@@ -23,7 +23,7 @@ MAX_RECORDS = 128
 RECORD_OVERHEAD_BYTES = 48
 """What one more record in a query costs besides its payload: its entries in attachment and reply."""
 
-_STORED = Reply("stored")
+_STORED = AckReply("stored")
 
 
 def attachment(origin: bytes, items: Sequence[OutboxItem], settled: int = 0) -> bytes:
@@ -46,7 +46,7 @@ def attachment(origin: bytes, items: Sequence[OutboxItem], settled: int = 0) -> 
     return packed
 
 
-def parse_query(attached: bytes, data: bytes, where: str) -> tuple[Chunk, ...] | Chunk:
+def parse_query(attached: bytes, data: bytes, where: str) -> tuple[ReceivedChunk, ...] | ReceivedChunk:
     """Parse a hand-over query, of a piece or of several records.
 
     Raises:
@@ -58,7 +58,7 @@ def parse_query(attached: bytes, data: bytes, where: str) -> tuple[Chunk, ...] |
     return handoff.parse_fields(fields, data, where)
 
 
-def _parse_batch(fields: dict[str, object], data: bytes, where: str) -> tuple[Chunk, ...]:
+def _parse_batch(fields: dict[str, object], data: bytes, where: str) -> tuple[ReceivedChunk, ...]:
     origin = handoff.binary(fields, "origin", 16, where)
     settled = handoff.integer(fields, "settled", where) if "settled" in fields else 0
     records = fields.get("records")
@@ -70,7 +70,7 @@ def _parse_batch(fields: dict[str, object], data: bytes, where: str) -> tuple[Ch
     start = 0
     for number, record in enumerate(records):
         seq, size, sha256 = _entry(record, f"records.{number}", where)
-        chunks.append(Chunk(origin, seq, size, sha256, 0, data[start : start + size], settled))
+        chunks.append(ReceivedChunk(origin, seq, size, sha256, 0, data[start : start + size], settled))
         start += size
     if start != len(data):
         raise PayloadError(where, "payload", f"{len(data)} bytes", f"{start} bytes, the sum of the records' sizes")
@@ -92,13 +92,13 @@ def _entry(record: object, field: str, where: str) -> tuple[int, int, bytes]:
     raise PayloadError(where, field, record, f"[seq from 1, size to {CHUNK_BYTES}, sha256 of 32 bytes]")
 
 
-def pack_replies(replies: Sequence[Reply]) -> bytes:
+def pack_replies(replies: Sequence[AckReply]) -> bytes:
     """Return the reply to a query of several records: what became of each, in the order of the query."""
     packed: bytes = msgpack.packb({"v": BATCH_VERSION, "replies": [(reply.status, reply.reason) for reply in replies]})
     return packed
 
 
-def unpack_replies(payload: bytes, count: int, where: str) -> tuple[Reply, ...] | Reply:
+def unpack_replies(payload: bytes, count: int, where: str) -> tuple[AckReply, ...] | AckReply:
     """Parse the reply to a query of `count` records; a single one is of a consumer that took none of them.
 
     Raises:
@@ -106,19 +106,19 @@ def unpack_replies(payload: bytes, count: int, where: str) -> tuple[Reply, ...] 
     """
     fields = wire.unpack_map(payload, where)
     if type(fields.get("v")) is not int or fields["v"] != BATCH_VERSION:
-        return Reply.unpack(payload, where)
+        return AckReply.unpack(payload, where)
     replies = fields.get("replies")
     if not isinstance(replies, tuple) or len(replies) != count:
         raise PayloadError(where, "replies", replies, f"an array of {count}")
     return tuple(_reply(reply, f"replies.{number}", where) for number, reply in enumerate(replies))
 
 
-def _reply(reply: object, field: str, where: str) -> Reply:
+def _reply(reply: object, field: str, where: str) -> AckReply:
     if isinstance(reply, tuple) and len(reply) == 2:
         status, reason = reply
         if status == "stored" and reason == "":
             return _STORED
         for known in ("stored", "refused", "later"):
             if status == known and isinstance(reason, str):
-                return Reply(known, reason=reason)
+                return AckReply(known, reason=reason)
     raise PayloadError(where, field, reply, "[stored, refused or later, reason]")

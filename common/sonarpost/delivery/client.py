@@ -10,25 +10,25 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.delivery import protocol as handoff
-from sonarpost.delivery.protocol import CHUNK_BYTES, Reply
+from sonarpost.delivery.protocol import CHUNK_BYTES, AckReply
 from sonarpost.delivery.transaction import OutboxItem
-from sonarpost.errors import HandoffError, PayloadError
+from sonarpost.errors import DeliveryError, PayloadError
 from sonarpost.messages import Record
 
 TRY_S = 2.0
 PAUSE_S = 0.2
 
 
-class NotHandedOverError(HandoffError):
+class NotDeliveredError(DeliveryError):
     """Nobody has taken the record in time; it may be handed over again, it is known by its identifier."""
 
 
-def hand_over(session: zenoh.Session, key: str, consumer: str, record: Record, timeout_s: float) -> None:
+def deliver(session: zenoh.Session, key: str, consumer: str, record: Record, timeout_s: float) -> None:
     """Hand `record` over on `key` and return when the consumer has committed it.
 
     Raises:
         PayloadError: The consumer has refused it; `expected` is its reason.
-        NotHandedOverError: Nobody has taken it within `timeout_s`.
+        NotDeliveredError: Nobody has taken it within `timeout_s`.
     """
     payload = wire.encode(record)
     item = OutboxItem(consumer, 1, key, "", 4, payload, hashlib.sha256(payload).digest())
@@ -50,11 +50,11 @@ def hand_over(session: zenoh.Session, key: str, consumer: str, record: Record, t
         elif reply is not None:
             last = f"{consumer} cannot store it: {reply.reason}"
         if time.monotonic() + PAUSE_S > ends_s:
-            raise NotHandedOverError(f"{key}: not handed over to {consumer} within {timeout_s:g} s: {last}")
+            raise NotDeliveredError(f"{key}: not handed over to {consumer} within {timeout_s:g} s: {last}")
         time.sleep(PAUSE_S)
 
 
-def _ask(session: zenoh.Session, item: OutboxItem, origin: bytes, offset: int) -> Reply | None:
+def _ask(session: zenoh.Session, item: OutboxItem, origin: bytes, offset: int) -> AckReply | None:
     replies = session.get(
         keys.handoff(item.key, item.consumer),
         payload=item.payload[offset : offset + CHUNK_BYTES],
@@ -64,5 +64,5 @@ def _ask(session: zenoh.Session, item: OutboxItem, origin: bytes, offset: int) -
     )
     for received in replies:
         if received.ok is not None:
-            return Reply.unpack(received.ok.payload.to_bytes(), item.key)
+            return AckReply.unpack(received.ok.payload.to_bytes(), item.key)
     return None

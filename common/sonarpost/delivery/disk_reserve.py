@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import shutil
 
-from sonarpost.delivery.inbox import NotNowError
+from sonarpost.delivery.inbox import RetryLaterError
 from sonarpost.delivery.store import Store
 
 HANDLING_RESERVE_BYTES = 8_388_608
 """What handling needs on the disk to get rid of what is there: to delete is to write, into the write-ahead log."""
 
 
-class Room:
+class DiskReserve:
     """Keeps a reserve on the disk of a store.
 
     A store's file never becomes smaller, so what lies free inside of it counts as free: else a store that was full once
@@ -41,11 +41,11 @@ class Room:
         """Check for room.
 
         Raises:
-            NotNowError: The reserve is touched.
+            RetryLaterError: The reserve is touched.
         """
         text = self._lacking()
         if text:
-            raise NotNowError(text)
+            raise RetryLaterError(text)
 
     def trouble(self) -> str:
         """Say that records are left with their senders, while that is so; looks again only where it was."""

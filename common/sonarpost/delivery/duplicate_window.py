@@ -9,7 +9,7 @@ from __future__ import annotations
 import sqlite3
 
 
-class Seen:
+class DuplicateWindow:
     """The numbers of one origin that were accepted or refused.
 
     Args:

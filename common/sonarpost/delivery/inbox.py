@@ -13,12 +13,12 @@ import zenoh
 
 from sonarpost import keys
 from sonarpost.delivery.batch_protocol import MAX_RECORDS, pack_replies, parse_query
-from sonarpost.delivery.protocol import MAX_RECORD_BYTES, Reply
+from sonarpost.delivery.protocol import MAX_RECORD_BYTES, AckReply
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import Chunk, Transaction
-from sonarpost.errors import BadInputError, HandoffError, PayloadError
-from sonarpost.logs import concerning_later, kv
-from sonarpost.monitoring.log_context import concern_of_payload
+from sonarpost.delivery.transaction import ReceivedChunk, Transaction
+from sonarpost.errors import BadInputError, DeliveryError, PayloadError
+from sonarpost.logs import kv, lazy_log_context
+from sonarpost.monitoring.log_context import context_of_payload
 
 log = logging.getLogger(__name__)
 
@@ -30,16 +30,16 @@ RETRY_S = 0.5
 MAX_REASON = 200
 
 
-Replies = Reply | list[Reply]
+Replies = AckReply | list[AckReply]
 """What is answered: to a query of several records, for each of them."""
 
 
-class NotNowError(HandoffError):
+class RetryLaterError(DeliveryError):
     """There is no room for this record at the moment; its sender keeps it, and other records may be taken."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Arrival:
+class _PendingAck:
     """A hand-over query, or (query None) a plain publication by somebody without an outbox."""
 
     key: str
@@ -58,7 +58,7 @@ class Inbox:
     Args:
         check: Called with (key, payload) before a record is stored; raises BadInputError to refuse it.
         on_refused: Called with every error that made a record be refused.
-        admit: Called with the key before anything of a record is stored; raises NotNowError where there is no room.
+        admit: Called with the key before anything of a record is stored; raises RetryLaterError where there is no room.
         handed_only: Key expressions on which plain publications are not for this consumer.
     """
 
@@ -79,10 +79,10 @@ class Inbox:
         self._check = check
         self._on_refused = on_refused
         self._admit = admit
-        self._arrivals: queue.Queue[_Arrival] = queue.Queue(QUEUE_LIMIT)
+        self._arrivals: queue.Queue[_PendingAck] = queue.Queue(QUEUE_LIMIT)
         self._stop = threading.Event()
         self._trouble = False
-        self._kept: list[_Arrival] = []
+        self._kept: list[_PendingAck] = []
         self._no_room: dict[str, str | None] = {}
         self._thread = threading.Thread(target=self._run, name=f"inbox-{consumer}", daemon=True)
         self._thread.start()
@@ -108,7 +108,7 @@ class Inbox:
         key = str(query.key_expr).removesuffix(self._suffix)
         payload = query.payload.to_bytes() if query.payload is not None else b""
         attached = query.attachment.to_bytes() if query.attachment is not None else b""
-        self._arrive(_Arrival(key, payload, attached, query))
+        self._arrive(_PendingAck(key, payload, attached, query))
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         if sample.attachment is not None or sample.kind != zenoh.SampleKind.PUT:
@@ -117,9 +117,9 @@ class Inbox:
         if size > MAX_RECORD_BYTES:
             self._on_refused(PayloadError(key, "payload", f"{size} bytes", f"at most {MAX_RECORD_BYTES} bytes"))
             return
-        self._arrive(_Arrival(key, sample.payload.to_bytes(), b"", None))
+        self._arrive(_PendingAck(key, sample.payload.to_bytes(), b"", None))
 
-    def _arrive(self, arrival: _Arrival) -> None:
+    def _arrive(self, arrival: _PendingAck) -> None:
         while not self._stop.is_set():
             try:
                 self._arrivals.put(arrival, timeout=0.2)
@@ -133,7 +133,7 @@ class Inbox:
             if batch:
                 self._answer(batch, self._commit(batch))
 
-    def _next_batch(self) -> list[_Arrival]:
+    def _next_batch(self) -> list[_PendingAck]:
         if self._kept:
             # What nobody sends again comes first, a moment after the trouble that kept it.
             self._stop.wait(RETRY_S)
@@ -150,90 +150,90 @@ class Inbox:
                 break
         return batch
 
-    def _commit(self, batch: list[_Arrival]) -> list[Replies]:
+    def _commit(self, batch: list[_PendingAck]) -> list[Replies]:
         """Store a batch in one transaction, so that many records share one write to the disk."""
         self._no_room.clear()
         try:
             with self._store.transaction() as tx:
                 replies = [self._take(tx, arrival) for arrival in batch]
-        except HandoffError as error:
+        except DeliveryError as error:
             if not self._trouble:
                 log.exception("Records cannot be stored, their senders keep them", extra=kv(error=str(error)))
             self._trouble = True
             self._kept = [arrival for arrival in batch if arrival.query is None]
-            later: Replies = Reply("later", reason=str(error)[:MAX_REASON])
+            later: Replies = AckReply("later", reason=str(error)[:MAX_REASON])
             return [later] * len(batch)
         if self._trouble:
             log.info("Records can be stored again")
         self._trouble = False
         return replies
 
-    def _take(self, tx: Transaction, arrival: _Arrival) -> Replies:
+    def _take(self, tx: Transaction, arrival: _PendingAck) -> Replies:
         if arrival.query is None:
             return self._take_publication(tx, arrival)
         try:
             asked = parse_query(arrival.attached, arrival.payload, arrival.key + self._suffix)
         except PayloadError as error:
             self._on_refused(error)
-            return Reply("refused", reason=str(error))
-        if isinstance(asked, Chunk):
+            return AckReply("refused", reason=str(error))
+        if isinstance(asked, ReceivedChunk):
             return self._take_chunk(tx, arrival.key, asked)
         return [self._take_chunk(tx, arrival.key, chunk) for chunk in asked]
 
-    def _take_chunk(self, tx: Transaction, key: str, chunk: Chunk) -> Reply:
+    def _take_chunk(self, tx: Transaction, key: str, chunk: ReceivedChunk) -> AckReply:
         try:
             return self._taken(tx, key, chunk)
-        except NotNowError as error:
-            return Reply("later", reason=str(error)[:MAX_REASON])
+        except RetryLaterError as error:
+            return AckReply("later", reason=str(error)[:MAX_REASON])
         except PayloadError as error:
             self._on_refused(error)
-            return Reply("refused", reason=str(error))
+            return AckReply("refused", reason=str(error))
 
     def _need_room(self, key: str) -> None:
         """Ask once a batch whether there is room for what comes on a key."""
         if key not in self._no_room:
             try:
                 self._admit(key)
-            except NotNowError as error:
+            except RetryLaterError as error:
                 self._no_room[key] = str(error)
             else:
                 self._no_room[key] = None
         reason = self._no_room[key]
         if reason is not None:
-            raise NotNowError(reason)
+            raise RetryLaterError(reason)
 
-    def _take_publication(self, tx: Transaction, arrival: _Arrival) -> Reply:
+    def _take_publication(self, tx: Transaction, arrival: _PendingAck) -> AckReply:
         try:
             self._need_room(arrival.key)
-        except NotNowError as error:
+        except RetryLaterError as error:
             # Nobody sends it again, and to keep it would take the room that is not there.
             self._on_refused(PayloadError(arrival.key, "payload", "a publication that cannot be stored", str(error)))
-            return Reply("later", reason=str(error)[:MAX_REASON])
+            return AckReply("later", reason=str(error)[:MAX_REASON])
         return self._take_checked(tx, arrival.key, arrival.payload, None)
 
-    def _taken(self, tx: Transaction, key: str, chunk: Chunk) -> Reply:
+    def _taken(self, tx: Transaction, key: str, chunk: ReceivedChunk) -> AckReply:
         if chunk.settled:
             tx.settle_upto(chunk.origin, chunk.settled)
         if tx.was_refused(chunk.origin, chunk.seq):
-            return Reply("refused", reason="refused before; the reason is in the consumer's log and store")
+            return AckReply("refused", reason="refused before; the reason is in the consumer's log and store")
         if tx.was_seen(chunk.origin, chunk.seq):
-            return Reply("stored")
+            return AckReply("stored")
         self._need_room(key)
         whole = tx.add_chunk(chunk)
         if isinstance(whole, int):
-            return Reply("more", next_offset=whole)
+            return AckReply("more", next_offset=whole)
         if hashlib.sha256(whole).digest() != chunk.sha256:
             raise PayloadError(key + self._suffix, "sha256", chunk.sha256.hex(), "the digest of the record")
         return self._take_checked(tx, key, whole, chunk)
 
-    def _take_checked(self, tx: Transaction, key: str, payload: bytes, chunk: Chunk | None) -> Reply:
-        with concerning_later(lambda: concern_of_payload(payload, key)):
+    def _take_checked(self, tx: Transaction, key: str, payload: bytes, chunk: ReceivedChunk | None) -> AckReply:
+        with lazy_log_context(lambda: context_of_payload(payload, key)):
             return self._checked(tx, key, payload, chunk)
 
-    def _checked(self, tx: Transaction, key: str, payload: bytes, chunk: Chunk | None) -> Reply:
+    def _checked(self, tx: Transaction, key: str, payload: bytes, chunk: ReceivedChunk | None) -> AckReply:
         try:
             self._check(key, payload)
-        except HandoffError:
+        except DeliveryError:
             raise
         except BadInputError as error:
             self._on_refused(error)
@@ -246,19 +246,19 @@ class Inbox:
             tx.accept(key, payload)
         else:
             tx.accept(key, payload, chunk.origin, chunk.seq)
-        return Reply("stored")
+        return AckReply("stored")
 
-    def _refuse(self, tx: Transaction, key: str, payload: bytes, chunk: Chunk | None, reason: str) -> Reply:
+    def _refuse(self, tx: Transaction, key: str, payload: bytes, chunk: ReceivedChunk | None, reason: str) -> AckReply:
         tx.refuse("in", key, payload, reason)
         if chunk is not None:
             tx.mark_refused(chunk.origin, chunk.seq)
-        return Reply("refused", reason=reason)
+        return AckReply("refused", reason=reason)
 
-    def _answer(self, batch: list[_Arrival], replies: list[Replies]) -> None:
+    def _answer(self, batch: list[_PendingAck], replies: list[Replies]) -> None:
         for arrival, reply in zip(batch, replies, strict=True):
             if arrival.query is None:
                 continue
-            packed = reply.pack(takes=MAX_RECORDS) if isinstance(reply, Reply) else pack_replies(reply)
+            packed = reply.pack(takes=MAX_RECORDS) if isinstance(reply, AckReply) else pack_replies(reply)
             try:
                 with arrival.query as query:
                     query.reply(query.key_expr, packed)

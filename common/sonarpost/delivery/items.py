@@ -45,7 +45,7 @@ class OutboxItem:
 
 
 @dataclass(frozen=True, slots=True)
-class Chunk:
+class ReceivedChunk:
     """A piece of a record on its way, as the hand-over query carries it."""
 
     origin: bytes

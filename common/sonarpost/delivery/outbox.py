@@ -8,14 +8,14 @@ from collections.abc import Callable
 
 import zenoh
 
-from sonarpost.delivery.queue_policy import PRIORITIES, REPLY_TIMEOUT_S, Lane, Settled
+from sonarpost.delivery.queue_policy import PRIORITIES, REPLY_TIMEOUT_S, OnAcknowledged, QueuePolicy
 from sonarpost.delivery.scheduler import PROBE_WINDOW, WINDOW
-from sonarpost.delivery.sender import BACK_OFF_S, Sender
+from sonarpost.delivery.sender import BACK_OFF_S, QueueSender
 from sonarpost.delivery.store import Store
-from sonarpost.errors import HandoffError
+from sonarpost.errors import DeliveryError
 from sonarpost.logs import kv
 
-__all__ = ["BACK_OFF_S", "PRIORITIES", "PROBE_WINDOW", "REPLY_TIMEOUT_S", "WINDOW", "Lane", "Outbox"]
+__all__ = ["BACK_OFF_S", "PRIORITIES", "PROBE_WINDOW", "REPLY_TIMEOUT_S", "WINDOW", "Outbox", "QueuePolicy"]
 
 log = logging.getLogger(__name__)
 
@@ -35,16 +35,16 @@ class Outbox:
         session: zenoh.Session,
         store: Store,
         *,
-        lane: Callable[[str], Lane] | None = None,
-        settled: Settled | None = None,
+        lane: Callable[[str], QueuePolicy] | None = None,
+        settled: OnAcknowledged | None = None,
     ) -> None:
         self._session = session
         self._store = store
-        self._lane = lane or (lambda _: Lane())
+        self._lane = lane or (lambda _: QueuePolicy())
         self._settled = settled
         self._stop = threading.Event()
         self._wake = threading.Event()
-        self._senders: dict[str, Sender] = {}
+        self._senders: dict[str, QueueSender] = {}
         self._held: set[str] = set()
         store.listen_outbox(self._wake)
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
@@ -58,7 +58,7 @@ class Outbox:
             self._wake.clear()
             try:
                 queues = self._store.consumers()
-            except HandoffError:
+            except DeliveryError:
                 log.exception("The outbox cannot be read, trying again")
                 self._stop.wait(1.0)
                 self._wake.set()
@@ -73,7 +73,7 @@ class Outbox:
             self._held.add(queue)
             log.warning("Records wait for a consumer that is not configured", extra=kv(consumer=queue))
             return
-        self._senders[queue] = Sender(self._session, self._store, queue, lane, self._settled)
+        self._senders[queue] = QueueSender(self._session, self._store, queue, lane, self._settled)
 
     def answering(self, queue: str) -> bool:
         """Tell whether a queue's consumer answered what it was asked last; False where nothing was asked yet."""

@@ -13,18 +13,18 @@ from typing import Literal
 import msgpack
 
 from sonarpost import wire
-from sonarpost.delivery.items import Chunk, OutboxItem, consumer_of
+from sonarpost.delivery.items import OutboxItem, ReceivedChunk, consumer_of
 from sonarpost.errors import PayloadError
 
 CHUNK_BYTES = 32 * 1024
 MAX_RECORD_BYTES = 8 * 1024 * 1024
 HANDOFF_VERSION = 1
 
-Status = Literal["stored", "more", "refused", "later"]
+AckStatus = Literal["stored", "more", "refused", "later"]
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class AckReply:
     """The consumer's answer.
 
     Attributes:
@@ -34,7 +34,7 @@ class Reply:
         takes: How many records the consumer takes with one query (`handoff_batch`); 0 for one.
     """
 
-    status: Status
+    status: AckStatus
     next_offset: int = 0
     reason: str = ""
     takes: int = field(default=0, compare=False)
@@ -52,7 +52,7 @@ class Reply:
         return packed
 
     @classmethod
-    def unpack(cls, payload: bytes, where: str) -> Reply:
+    def unpack(cls, payload: bytes, where: str) -> AckReply:
         """Parse a reply.
 
         Raises:
@@ -95,7 +95,7 @@ def attachment(origin: bytes, item: OutboxItem, offset: int = 0, settled: int = 
     return packed
 
 
-def parse_chunk(attached: bytes, data: bytes, where: str) -> Chunk:
+def parse_chunk(attached: bytes, data: bytes, where: str) -> ReceivedChunk:
     """Parse a hand-over query.
 
     Raises:
@@ -104,14 +104,14 @@ def parse_chunk(attached: bytes, data: bytes, where: str) -> Chunk:
     return parse_fields(wire.unpack_map(attached, where), data, where)
 
 
-def parse_fields(fields: dict[str, object], data: bytes, where: str) -> Chunk:
+def parse_fields(fields: dict[str, object], data: bytes, where: str) -> ReceivedChunk:
     """Parse the unpacked attachment of a hand-over query of one piece.
 
     Raises:
         PayloadError: A field is missing, wrong or out of bounds.
     """
     _need_version(fields, where)
-    chunk = Chunk(
+    chunk = ReceivedChunk(
         origin=binary(fields, "origin", 16, where),
         seq=integer(fields, "seq", where),
         size=integer(fields, "size", where),

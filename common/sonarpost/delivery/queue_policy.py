@@ -10,7 +10,7 @@ import zenoh
 from sonarpost import keys
 from sonarpost.delivery import batch_protocol as handoff_batch
 from sonarpost.delivery import protocol as handoff
-from sonarpost.delivery.scheduler import Piece
+from sonarpost.delivery.scheduler import Chunk
 from sonarpost.delivery.transaction import OutboxItem, Transaction, consumer_of
 
 REPLY_TIMEOUT_S = 5.0
@@ -24,12 +24,12 @@ PRIORITIES = {
     7: zenoh.Priority.BACKGROUND,
 }
 
-Settled = Callable[[Transaction, OutboxItem, str | None], None]
+OnAcknowledged = Callable[[Transaction, OutboxItem, str | None], None]
 """Called in the transaction that forgets a record: the record, and the consumer's reason if it was refused."""
 
 
 @dataclass(frozen=True, slots=True)
-class Lane:
+class QueuePolicy:
     """How a queue is sent.
 
     Attributes:
@@ -46,7 +46,7 @@ class Lane:
 
 
 def ask(
-    session: zenoh.Session, origin: bytes, pieces: Sequence[Piece], settled: int
+    session: zenoh.Session, origin: bytes, pieces: Sequence[Chunk], settled: int
 ) -> zenoh.handlers.Handler[zenoh.Reply]:
     """Send a hand-over query; return where its replies come.
 

@@ -39,7 +39,7 @@ OVERHEAD_BYTES = 320
 
 
 @dataclass(slots=True, eq=False)
-class Transfer:
+class RecordTransfer:
     """One record on its way: how much was asked, how much the consumer has, how often it was begun anew."""
 
     item: OutboxItem
@@ -70,10 +70,10 @@ class Transfer:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Piece:
+class Chunk:
     """Bytes `start` to `end` of a record, to be asked with one query."""
 
-    transfer: Transfer
+    transfer: RecordTransfer
     start: int
     end: int
     attempt: int
@@ -91,7 +91,7 @@ def piece_bytes_for(bytes_per_s: float | None) -> int:
     return int(min(max(bytes_per_s * PIECE_S, MIN_PIECE_BYTES), CHUNK_BYTES))
 
 
-class Schedule:
+class DeliveryScheduler:
     """The transfers to one consumer.
 
     Args:
@@ -101,16 +101,16 @@ class Schedule:
 
     def __init__(self, bytes_per_s: float | None, now_s: float) -> None:
         self.piece_bytes = piece_bytes_for(bytes_per_s)
-        self.active: dict[int, Transfer] = {}
+        self.active: dict[int, RecordTransfer] = {}
         self.probing = True
         self.takes = 0
         """How many records the consumer takes with one query."""
-        self._order: deque[Transfer] = deque()
+        self._order: deque[RecordTransfer] = deque()
         self._order_stale = False
         self._in_flight = 0
         self._bytes_in_flight = 0
         self._bucket: TokenBucket | None = None
-        self._asked: dict[Piece, tuple[float, int]] = {}
+        self._asked: dict[Chunk, tuple[float, int]] = {}
         self._window_bytes = WINDOW_BYTES
         if bytes_per_s is not None:
             self._bucket = TokenBucket(bytes_per_s, self.piece_bytes + OVERHEAD_BYTES, now_s)
@@ -132,10 +132,10 @@ class Schedule:
             del self.active[seq]
         for seq, item in wanted.items():
             if seq not in self.active:
-                self.active[seq] = Transfer(item)
+                self.active[seq] = RecordTransfer(item)
         self._order_stale = True
 
-    def _first_waiting(self) -> Transfer | None:
+    def _first_waiting(self) -> RecordTransfer | None:
         if self._order_stale:
             waiting = (transfer for transfer in self.active.values() if transfer.wants_sending)
             self._order = deque(sorted(waiting, key=lambda transfer: transfer.order))
@@ -147,14 +147,14 @@ class Schedule:
             self._order.popleft()
         return None
 
-    def next_piece(self, now_s: float) -> tuple[Piece | None, float | None]:
+    def next_piece(self, now_s: float) -> tuple[Chunk | None, float | None]:
         """Return the piece to ask now, or None and for how many seconds to wait (None: until something happens)."""
         transfer = self._first_waiting()
         if transfer is None:
             return None, None
         start = transfer.asked
         end = min(start + self.piece_bytes, len(transfer.item.payload))
-        piece = Piece(transfer, start, end, transfer.attempt)
+        piece = Chunk(transfer, start, end, transfer.attempt)
         if not self._has_room(piece):
             return None, None
         if self._bucket is not None and not transfer.urgent:
@@ -163,7 +163,7 @@ class Schedule:
                 return None, wait_s
         return piece, 0.0
 
-    def _has_room(self, piece: Piece) -> bool:
+    def _has_room(self, piece: Chunk) -> bool:
         if self.probing:
             # One query at a time until the consumer has answered: of a whole window, one that comes up in the middle
             # of it would take the last and not the first.
@@ -173,7 +173,7 @@ class Schedule:
         fits = self._in_flight == 0 or self._bytes_in_flight + piece.size <= self._window_bytes
         return fits and self._in_flight < WINDOW - KEPT_FOR_URGENT
 
-    def together_with(self, piece: Piece) -> list[Piece]:
+    def together_with(self, piece: Chunk) -> list[Chunk]:
         """Return what goes with the same query as the piece that is next: whole small records behind it, in order.
 
         All are of its key and priority, have not begun, and fit with it into one piece.
@@ -191,12 +191,12 @@ class Schedule:
             alike = item.key == first.item.key and item.priority == first.item.priority and transfer.fresh
             if room < 0 or not alike:
                 break
-            pieces.append(Piece(transfer, 0, len(item.payload), transfer.attempt))
+            pieces.append(Chunk(transfer, 0, len(item.payload), transfer.attempt))
             if len(pieces) == min(self.takes, MAX_RECORDS):
                 break
         return pieces
 
-    def asked(self, piece: Piece, now_s: float, *more: Piece) -> None:
+    def asked(self, piece: Chunk, now_s: float, *more: Chunk) -> None:
         """Note that a piece was sent, or that several records were, with one query."""
         size = piece.size
         for sent in (piece, *more):
@@ -209,7 +209,7 @@ class Schedule:
         if self._bucket is not None:
             self._bucket.take(size + OVERHEAD_BYTES + len(more) * RECORD_OVERHEAD_BYTES, now_s)
 
-    def answered(self, piece: Piece, now_s: float) -> None:
+    def answered(self, piece: Chunk, now_s: float) -> None:
         """Note that a query has ended, however it ended; `piece` is the first that was in it."""
         asked_s, size = self._asked.pop(piece)
         self._in_flight -= 1
@@ -222,7 +222,7 @@ class Schedule:
         elif took_s > SHRINK_ABOVE_S:
             self._window_bytes = max(self.piece_bytes, self._window_bytes // 2)
 
-    def go_on_from(self, piece: Piece, next_offset: int) -> None:
+    def go_on_from(self, piece: Chunk, next_offset: int) -> None:
         """Note what the consumer has of a record; where it did not take the piece, send on from there."""
         transfer = piece.transfer
         transfer.has = next_offset
@@ -232,7 +232,7 @@ class Schedule:
             transfer.asked = next_offset
             self._order_stale = True
 
-    def settled(self, transfer: Transfer) -> None:
+    def settled(self, transfer: RecordTransfer) -> None:
         """Forget a record that is done with."""
         self.active.pop(transfer.item.seq, None)
 

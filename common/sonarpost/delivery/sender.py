@@ -13,14 +13,14 @@ import zenoh
 
 from sonarpost.delivery import batch_protocol as handoff_batch
 from sonarpost.delivery import queue_policy as lane
-from sonarpost.delivery.protocol import Reply
-from sonarpost.delivery.queue_policy import Lane, Settled
-from sonarpost.delivery.scheduler import MAX_WINDOW_BYTES, WINDOW, Piece, Schedule, Transfer
+from sonarpost.delivery.protocol import AckReply
+from sonarpost.delivery.queue_policy import OnAcknowledged, QueuePolicy
+from sonarpost.delivery.scheduler import MAX_WINDOW_BYTES, WINDOW, Chunk, DeliveryScheduler, RecordTransfer
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import OutboxItem
-from sonarpost.errors import HandoffError, PayloadError
+from sonarpost.errors import DeliveryError, PayloadError
 from sonarpost.logs import kv
-from sonarpost.monitoring.log_context import concern_of_payload
+from sonarpost.monitoring.log_context import context_of_payload
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ FORGET_AFTER_S = 0.2
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    pieces: Sequence[Piece]
+    pieces: Sequence[Chunk]
     replies: zenoh.handlers.Handler[zenoh.Reply]
 
 
@@ -44,7 +44,7 @@ class _NoAnswerError(Exception):
     """The consumer is not there, or the link is down."""
 
 
-class Sender:
+class QueueSender:
     """Hands one queue over, with a few queries in flight, most urgent record first.
 
     Attributes:
@@ -53,7 +53,9 @@ class Sender:
         delivered: How many it has acknowledged in this run.
     """
 
-    def __init__(self, session: zenoh.Session, store: Store, queue: str, how: Lane, settled: Settled | None) -> None:
+    def __init__(
+        self, session: zenoh.Session, store: Store, queue: str, how: QueuePolicy, settled: OnAcknowledged | None
+    ) -> None:
         self.answering = False
         self.rejected = 0
         self.delivered = 0
@@ -63,7 +65,7 @@ class Sender:
         self._origin = store.origin_of(queue)
         self._lane = how
         self._on_settled = settled
-        self._schedule = Schedule(how.bytes_per_s, time.monotonic())
+        self._schedule = DeliveryScheduler(how.bytes_per_s, time.monotonic())
         self._shown: set[int] = set()
         self._in_flight: deque[_Asked] = deque()
         self._acknowledged: dict[int, OutboxItem] = {}
@@ -90,11 +92,11 @@ class Sender:
         while not self._stop.is_set():
             try:
                 self._step()
-            except (_NoAnswerError, HandoffError, zenoh.ZError) as error:
+            except (_NoAnswerError, DeliveryError, zenoh.ZError) as error:
                 self._back_off(str(error))
         try:
             self._forget()
-        except HandoffError as error:
+        except DeliveryError as error:
             log.debug("Acknowledged records are asked again after the next start: %s", error)
 
     def _step(self) -> None:
@@ -159,7 +161,7 @@ class Sender:
                 self._ask(pieces)
         return None
 
-    def _begun(self, pieces: Sequence[Piece]) -> list[Piece]:
+    def _begun(self, pieces: Sequence[Chunk]) -> list[Chunk]:
         """Let no newer edition take the place of these records any more; leave out those where one already has."""
         new = [piece.transfer.item.seq for piece in pieces if not piece.transfer.begun]
         there = self._store.begin_all(self._queue, new) if new else ()
@@ -172,7 +174,7 @@ class Sender:
                 self._schedule.settled(piece.transfer)
         return begun
 
-    def _ask(self, pieces: Sequence[Piece]) -> None:
+    def _ask(self, pieces: Sequence[Chunk]) -> None:
         session = self._session()
         if session is None:
             raise _NoAnswerError("its router has not been reached yet")
@@ -220,7 +222,7 @@ class Sender:
             self._wake.wait(min(poll_s, max(ends_s - time.monotonic(), 0.0)))
             poll_s = min(2 * poll_s, POLL_S[1])
 
-    def _act(self, pieces: Sequence[Piece], received: zenoh.Reply) -> None:
+    def _act(self, pieces: Sequence[Chunk], received: zenoh.Reply) -> None:
         if received.ok is None:
             raise _NoAnswerError("no reply in time")
         replies = self._replies(pieces, received.ok.payload.to_bytes())
@@ -231,24 +233,24 @@ class Sender:
             if reply.status == "later":
                 raise _NoAnswerError(f"the consumer cannot store: {reply.reason}")
 
-    def _replies(self, pieces: Sequence[Piece], payload: bytes) -> Sequence[Reply]:
+    def _replies(self, pieces: Sequence[Chunk], payload: bytes) -> Sequence[AckReply]:
         where = pieces[0].transfer.item.key
         try:
             if len(pieces) == 1:
-                reply = Reply.unpack(payload, where)
+                reply = AckReply.unpack(payload, where)
                 self._takes = reply.takes
                 return [reply]
             replies = handoff_batch.unpack_replies(payload, len(pieces), where)
         except PayloadError as error:
             raise _NoAnswerError(str(error)) from error
-        if isinstance(replies, Reply):
+        if isinstance(replies, AckReply):
             if replies.status != "later":
                 # Another consumer than the one that said it takes several: each is asked by itself.
                 self._one_by_one = True
             raise _NoAnswerError(f"several records were not taken: {replies.status} {replies.reason}")
         return replies
 
-    def _act_on(self, piece: Piece, reply: Reply) -> None:
+    def _act_on(self, piece: Chunk, reply: AckReply) -> None:
         transfer = piece.transfer
         self._failures = 0
         self.answering = True
@@ -265,20 +267,20 @@ class Sender:
         else:
             self._schedule.go_on_from(piece, reply.next_offset)
 
-    def _stored(self, transfer: Transfer) -> None:
+    def _stored(self, transfer: RecordTransfer) -> None:
         if not self._acknowledged:
             self._first_acknowledged_s = time.monotonic()
         self._acknowledged[transfer.item.seq] = transfer.item
         self._schedule.settled(transfer)
         self.delivered += 1
 
-    def _refused(self, transfer: Transfer, reason: str) -> None:
+    def _refused(self, transfer: RecordTransfer, reason: str) -> None:
         item = transfer.item
         with self._store.transaction() as tx:
             tx.rejected(item, reason)
             if self._on_settled is not None:
                 self._on_settled(tx, item, reason)
-        about = concern_of_payload(item.payload, item.key)
+        about = context_of_payload(item.payload, item.key)
         log.error(
             "A record was refused and is kept apart",
             extra=kv(**about, consumer=self._queue, key=item.key, reason=reason),

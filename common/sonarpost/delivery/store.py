@@ -22,7 +22,7 @@ from typing import IO
 from sonarpost.delivery import rows, store_schema
 from sonarpost.delivery.store_schema import SCHEMA_VERSION
 from sonarpost.delivery.transaction import QUEUE_MARK, InboxItem, OutboxItem, Transaction
-from sonarpost.errors import HandoffError
+from sonarpost.errors import DeliveryError
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ class Store:
     """A service's durable store; safe to use from several threads (one writer at a time).
 
     Raises:
-        HandoffError: The file cannot be opened or is not a store of this version.
+        DeliveryError: The file cannot be opened or is not a store of this version.
     """
 
     def __init__(self, path: Path) -> None:
@@ -62,7 +62,7 @@ class Store:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._lock_file = _only_user(path)
         except OSError as error:
-            raise HandoffError(f"{path}: cannot be opened as a sonarpost store: {error}") from error
+            raise DeliveryError(f"{path}: cannot be opened as a sonarpost store: {error}") from error
         try:
             self._open()
         except BaseException:
@@ -90,11 +90,11 @@ class Store:
             self._reader = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
             self._reader.execute("PRAGMA query_only=ON")
         except sqlite3.Error as error:
-            raise HandoffError(f"{self.path}: cannot be opened as a sonarpost store: {error}") from error
+            raise DeliveryError(f"{self.path}: cannot be opened as a sonarpost store: {error}") from error
         if version != str(SCHEMA_VERSION).encode():
             self._reader.close()
             self._db.close()
-            raise HandoffError(f"{self.path}: store version {version!r}, expected {SCHEMA_VERSION}")
+            raise DeliveryError(f"{self.path}: store version {version!r}, expected {SCHEMA_VERSION}")
 
     def _meta(self, name: str, initial: bytes) -> bytes:
         self._db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?)", (name, initial))
@@ -106,7 +106,7 @@ class Store:
         """Open a write transaction: committed (and on the disk) when the block ends, rolled back when it raises.
 
         Raises:
-            HandoffError: The database refused (a full disk, for example); nothing of the block was kept.
+            DeliveryError: The database refused (a full disk, for example); nothing of the block was kept.
         """
         with self._lock:
             tx = Transaction(self._db, self._begun)
@@ -118,7 +118,7 @@ class Store:
             except BaseException as error:
                 self._roll_back()
                 if isinstance(error, sqlite3.Error):
-                    raise HandoffError(f"{self.path}: {error}") from error
+                    raise DeliveryError(f"{self.path}: {error}") from error
                 raise
         if tx.wrote_outbox:
             for event in tuple(self._outbox_listeners):
@@ -147,7 +147,7 @@ class Store:
             try:
                 return self._db.execute(sql, args).fetchall()
             except sqlite3.Error as error:
-                raise HandoffError(f"{self.path}: {error}") from error
+                raise DeliveryError(f"{self.path}: {error}") from error
 
     def _read(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[object, ...]]:
         """Query what is committed, without waiting for a transaction that waits for the disk."""
@@ -155,7 +155,7 @@ class Store:
             try:
                 return self._reader.execute(sql, args).fetchall()
             except sqlite3.Error as error:
-                raise HandoffError(f"{self.path}: {error}") from error
+                raise DeliveryError(f"{self.path}: {error}") from error
 
     def consumers(self) -> tuple[str, ...]:
         """Return the consumers to whom something is owed."""
@@ -292,14 +292,14 @@ def _only_user(path: Path) -> IO[bytes]:
     """Lock the store for this process; the kernel lets go when it ends, however it ends.
 
     Raises:
-        HandoffError: Another process has it: two of them would handle every record twice.
+        DeliveryError: Another process has it: two of them would handle every record twice.
     """
     file = path.with_name(f"{path.name}.lock").open("ab")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         file.close()
-        raise HandoffError(f"{path}: in use by another process of this service") from error
+        raise DeliveryError(f"{path}: in use by another process of this service") from error
     return file
 
 

@@ -8,10 +8,10 @@ import time
 from collections.abc import Iterable, Set
 
 from sonarpost.delivery import rows
-from sonarpost.delivery.duplicate_window import Seen
-from sonarpost.delivery.items import QUEUE_MARK, Chunk, InboxItem, OutboxItem, Topic, consumer_of, queue_of
+from sonarpost.delivery.duplicate_window import DuplicateWindow
+from sonarpost.delivery.items import QUEUE_MARK, InboxItem, OutboxItem, ReceivedChunk, Topic, consumer_of, queue_of
 
-__all__ = ["QUEUE_MARK", "Chunk", "InboxItem", "OutboxItem", "Topic", "Transaction", "consumer_of", "queue_of"]
+__all__ = ["QUEUE_MARK", "InboxItem", "OutboxItem", "ReceivedChunk", "Topic", "Transaction", "consumer_of", "queue_of"]
 
 # Bounds on what strangers can make a store keep: whatever is beyond them, the oldest goes.
 REFUSED_KEPT = 1000
@@ -35,7 +35,7 @@ class Transaction:
         self.wrote_outbox = False
         self.wrote_inbox = False
         self.superseded = 0
-        self._seen: dict[bytes, Seen] = {}
+        self._seen: dict[bytes, DuplicateWindow] = {}
         self._numbers: dict[str, int] = {}
         self._new_outbox: list[tuple[object, ...]] = []
         self._new_topics: set[tuple[str, str]] = set()
@@ -205,10 +205,10 @@ class Transaction:
         """Remember that the producer is done with all up to `seq`: what it dropped leaves gaps in its numbers."""
         self._seen_of(origin).settle_upto(seq)
 
-    def _seen_of(self, origin: bytes) -> Seen:
+    def _seen_of(self, origin: bytes) -> DuplicateWindow:
         seen = self._seen.get(origin)
         if seen is None:
-            seen = self._seen[origin] = Seen(self._db, origin)
+            seen = self._seen[origin] = DuplicateWindow(self._db, origin)
         return seen
 
     def _first_time(self, origin: bytes, seq: int) -> bool:
@@ -219,7 +219,7 @@ class Transaction:
         self._forget_pieces(origin, seq)
         return True
 
-    def add_chunk(self, chunk: Chunk) -> bytes | int:
+    def add_chunk(self, chunk: ReceivedChunk) -> bytes | int:
         """Add one chunk of a large record; return the whole record's bytes, or the offset wanted next.
 
         A chunk that does not continue what is there is not stored: the returned offset says where to go on, which
@@ -244,7 +244,7 @@ class Transaction:
         whole = b"".join(bytes(row[0]) for row in pieces) + chunk.data
         return whole if hashlib.sha256(whole).digest() == chunk.sha256 else 0
 
-    def _partial(self, chunk: Chunk) -> tuple[int, int]:
+    def _partial(self, chunk: ReceivedChunk) -> tuple[int, int]:
         """Return number and length of what is there of a record, begun anew where it is of another content."""
         which = (chunk.origin, chunk.seq)
         row = self._db.execute(

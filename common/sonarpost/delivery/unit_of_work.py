@@ -9,7 +9,7 @@ from sonarpost.delivery.transaction import Topic, Transaction
 from sonarpost.messages import Record
 
 
-class Effects:
+class UnitOfWork:
     """What handling one record leads to; committed all together, or not at all.
 
     Attributes:

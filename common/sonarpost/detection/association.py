@@ -3,8 +3,8 @@
 A line is recorded file after file, and a long file is looked at piece after piece; what lies near a cut is looked at
 twice. Two ask here, and differ beyond it on purpose:
 
-- `sonarpost.detection.stream`, for commands, has whole files in memory. It withholds contacts near the end of a file; when
-  the next file is there they are forgotten, as that end is looked at once more. The settings say what is near.
+- `sonarpost.detection.stream`, for commands, has whole files in memory. It withholds contacts near the end of a file;
+  when the next file is there they are forgotten, as that end is looked at once more. The settings say what is near.
 - atd_stub has pieces of files of any length, and answers for each contact over restarts. What waits at a file's end is
   replaced by the same contact seen whole, and sent as it is where the second look does not see it.
 """
@@ -22,7 +22,7 @@ UNKNOWN_ALONG_M: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class DetectionPosition:
     """A contact as it was seen in one look at a stream of pings.
 
     Rows count in that stream, not in times: a clock that stands still must not make all contacts one.
@@ -62,7 +62,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Sameness:
+class AssociationRule:
     """When two looks were at one object: on one side, and near each other in both directions.
 
     Attributes:
@@ -76,7 +76,7 @@ class Sameness:
     across_m: float
     overlapping: bool
 
-    def holds(self, one: Look, other: Look, across_m: float) -> bool:
+    def holds(self, one: DetectionPosition, other: DetectionPosition, across_m: float) -> bool:
         """Tell whether both are looks at one object.
 
         Args:

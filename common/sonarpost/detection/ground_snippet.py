@@ -4,7 +4,7 @@ There are two, which differ pixel by pixel and are not to be exchanged for each 
 
 - `cut_ground_snippet` makes pictures for files: a square in metres with the contact in its very middle, over a flat
   bottom at the contact's altitude, of the file's own values, each row the mean of whole pings. It says what is unknown.
-- `ground_picture` makes the pictures that leave the vehicle: rows and columns of pixels that are counted from below the
+- `ground_projected_image` makes the pictures for records: rows and columns of pixels, counted from below the
   sonar, over each ping's altitude, of the echo with the recorder's weight applied, each row of its share of every ping.
 
 In common they have which contacts have a place on the bottom, how a ping's samples are averaged over steps of it
@@ -120,7 +120,7 @@ def _line(survey: Survey, detection: Detection, ping: int, slant_m: npt.NDArray[
     return means_between(channel.samples, slant_m / channel.sample_spacing_m, least_width=_LEAST_SAMPLES)
 
 
-def ground_picture(
+def ground_projected_image(
     survey: Survey, found: Detection, height_px: int, width_px: int, pixel_m: float
 ) -> npt.NDArray[np.uint8] | None:
     """Return the bottom around a contact, which lies in the middle.

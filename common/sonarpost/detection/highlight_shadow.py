@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.detection.integral_image import BoxMeans, in_noise_units
+from sonarpost.detection.integral_image import IntegralImage, in_noise_units
 from sonarpost.detection.preprocess import LevelGrid
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import FloatImage
@@ -52,7 +52,7 @@ def matched_response(grid: LevelGrid, settings: DetectorSettings) -> MatchedResp
     sizes = [highlight_size_cells(grid, size) for size in settings.highlight_sizes_m]
     lengths = [max(2, round(length / grid.cell_across_m)) for length in settings.shadow_lengths_m]
     reach = (max(h for h, _ in sizes), max(w for _, w in sizes) + max(lengths) + 1)
-    boxes = BoxMeans(grid.level, reach)
+    boxes = IntegralImage(grid.level, reach)
     half = (
         max(4, round(settings.noise_window_m[0] / grid.row_along_m / 2)),
         max(4, round(settings.noise_window_m[1] / grid.cell_across_m / 2)),

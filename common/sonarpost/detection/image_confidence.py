@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 from sonarpost.detection.candidates import FilterScores, candidates
 from sonarpost.detection.fusion import fused_confidences
-from sonarpost.detection.image_detector import Piece, piece_grid
+from sonarpost.detection.image_detector import LevelImage, level_image
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import Side
 
 
 @dataclass(frozen=True, slots=True)
-class PieceFinding:
+class ImageFinding:
     """The place of a piece of which the detector is surest.
 
     Attributes:
@@ -30,9 +30,9 @@ class PieceFinding:
     column: int
 
 
-def best_of_piece(
-    piece: Piece, settings: DetectorSettings | None = None, side: Side | None = None
-) -> PieceFinding | None:
+def image_confidence(
+    piece: LevelImage, settings: DetectorSettings | None = None, side: Side | None = None
+) -> ImageFinding | None:
     """Return the most confident place of a piece, or None where no filter answers.
 
     Args:
@@ -45,8 +45,8 @@ def best_of_piece(
     return max(found, key=lambda f: f.confidence, default=None)
 
 
-def _findings(piece: Piece, settings: DetectorSettings, side: Side) -> list[PieceFinding]:
-    grid = piece_grid(piece, side)
+def _findings(piece: LevelImage, settings: DetectorSettings, side: Side) -> list[ImageFinding]:
+    grid = level_image(piece, side)
     if grid is None:
         return []
     per_row = round(grid.row_along_m / piece.pixel_along_m)
@@ -57,5 +57,5 @@ def _findings(piece: Piece, settings: DetectorSettings, side: Side) -> list[Piec
         away = min(one.measured.cell * grid.samples_per_cell + grid.samples_per_cell // 2, last)
         column = away if side is Side.STARBOARD else last - away
         row = min(one.measured.row * per_row + per_row // 2, piece.picture.shape[0] - 1)
-        found.append(PieceFinding(confidence, one.scores, side, row, column))
+        found.append(ImageFinding(confidence, one.scores, side, row, column))
     return found

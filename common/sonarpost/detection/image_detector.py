@@ -12,7 +12,7 @@ from scipy import ndimage
 from sonarpost.detection.preprocess import LevelGrid
 from sonarpost.sonar.survey import FloatImage, Side
 
-Picture = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 _CELL_M: Final = 0.06
 _SEABED_WINDOW_M: Final = 4.0
@@ -22,7 +22,7 @@ _WATER_SHARE: Final = 0.12
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class LevelImage:
     """A piece of a side-scan picture.
 
     Attributes:
@@ -31,7 +31,7 @@ class Piece:
         pixel_across_m: Slant range of a column.
     """
 
-    picture: Picture
+    picture: GreyImage
     pixel_along_m: float
     pixel_across_m: float
 
@@ -47,7 +47,7 @@ class Piece:
             raise ValueError(f"pixel sizes: got {self.pixel_along_m}, {self.pixel_across_m} m, expected above 0")
 
 
-def piece_grid(piece: Piece, side: Side) -> LevelGrid | None:
+def level_image(piece: LevelImage, side: Side) -> LevelGrid | None:
     """Return a piece as a level grid, or None when it is too small or holds nothing.
 
     Range is not known, so the seabed's level is the median around each place instead of that of the same range;

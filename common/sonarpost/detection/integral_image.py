@@ -10,7 +10,7 @@ from sonarpost.sonar.survey import FloatImage
 Plane = npt.NDArray[np.float64]
 
 
-class BoxMeans:
+class IntegralImage:
     """Means over rectangles placed relative to every pixel of a picture; NaN pixels do not count.
 
     Args:
@@ -96,8 +96,8 @@ def in_noise_units(response: FloatImage, half: tuple[int, int]) -> FloatImage:
     picked = (slice(reach[0], None, step[0]), slice(reach[1], None, step[1]))
     if limited[picked].size == 0:
         picked = (slice(0, None, step[0]), slice(0, None, step[1]))
-    mean = BoxMeans(limited, reach).mean(rows, columns, 0.3)[picked]
-    square = BoxMeans(limited * limited, reach).mean(rows, columns, 0.3)[picked]
+    mean = IntegralImage(limited, reach).mean(rows, columns, 0.3)[picked]
+    square = IntegralImage(limited * limited, reach).mean(rows, columns, 0.3)[picked]
     deviation = np.sqrt(np.maximum(square - mean * mean, 0.0))
     level = _rank(mean, 50.0, 0.0)
     noise = np.clip(_rank(deviation, 40.0, spread), 0.5 * spread, 3.0 * spread)

@@ -20,7 +20,7 @@ HIGH_PERCENTILE = 99.5
 
 
 @dataclass(frozen=True, slots=True)
-class Snippet:
+class SnippetCut:
     """A picture cut from a survey at its own resolution.
 
     Attributes:
@@ -49,7 +49,7 @@ class Snippet:
 
 def cut_snippet(
     survey: Survey, detection: Detection, height_px: int = SNIPPET_HEIGHT_PX, width_px: int = SNIPPET_WIDTH_PX
-) -> Snippet:
+) -> SnippetCut:
     """Cut the picture of a contact.
 
     The window is centred on the highlight along-track, and on the highlight plus half the shadow across-track (but
@@ -66,7 +66,7 @@ def cut_snippet(
     left, columns = _window(centre_column, width_px, samples)
     raw, known = _cut(survey, detection.side, (top, rows), (left, columns))
     divisor = 1 << max(0, int(raw.max()).bit_length() - 16)
-    return Snippet(
+    return SnippetCut(
         image=to_grey(raw, known),
         image16=(raw // divisor).astype(np.uint16),
         divisor16=divisor,
@@ -79,7 +79,7 @@ def cut_snippet(
     )
 
 
-def cut_wide(survey: Survey, detection: Detection, height_px: int, width_px: int) -> npt.NDArray[np.uint8] | None:
+def cut_expanded(survey: Survey, detection: Detection, height_px: int, width_px: int) -> npt.NDArray[np.uint8] | None:
     """Cut twice the ground of `cut_snippet` in each direction, around the same centre, in pixels of twice the size.
 
     A pixel is the mean of the four file values that it covers, of those there are; 0 where there is none. The window is

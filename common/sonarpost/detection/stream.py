@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from sonarpost.detection.association import Look, Sameness
+from sonarpost.detection.association import AssociationRule, DetectionPosition
 from sonarpost.detection.contacts import Detection, detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.geometry import ping_spacing_m
@@ -22,14 +22,14 @@ from sonarpost.sonar.survey import Ping, Side, Survey
 
 OVERLAP_M: Final = 40.0
 """How much of a file is put before the next: more than the filters look around."""
-HELD_M: Final = 6.0
+WITHHELD_M: Final = 6.0
 """Contacts this near to a file's end wait for the next file: the longest mine, its shadow and what is around it."""
 _LONGEST_GAP_S: Final = 5.0
 _LONGEST_GAP_PINGS: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class LineContact:
+class StreamContact:
     """A contact of a line.
 
     Attributes:
@@ -65,7 +65,7 @@ class _Origin:
 class _Told:
     """A contact that was told, and its sample."""
 
-    look: Look
+    look: DetectionPosition
     sample: int
 
 
@@ -82,11 +82,11 @@ class _Tail:
 
     survey: Survey
     origins: tuple[_Origin, ...]
-    held: tuple[LineContact, ...]
+    held: tuple[StreamContact, ...]
     told: tuple[_Told, ...]
 
 
-class LineDetector:
+class StreamDetector:
     """Detects file by file, in the order of recording.
 
     Args:
@@ -97,14 +97,14 @@ class LineDetector:
     def __init__(self, settings: DetectorSettings | None = None, options: SurveyOptions | None = None) -> None:
         self._settings = settings if settings is not None else DetectorSettings()
         self._options = options if options is not None else SurveyOptions()
-        # A contact is told only where it lies `HELD_M` before the end, so that both looks see the same middle.
-        self._sameness = Sameness(
+        # A contact is told only where it lies `WITHHELD_M` before the end, so that both looks see the same middle.
+        self._sameness = AssociationRule(
             self._settings.separation_along_m, self._settings.separation_across_m, overlapping=False
         )
         self._tail: _Tail | None = None
         self._files = 0
 
-    def feed(self, survey: Survey) -> tuple[LineContact, ...]:
+    def feed(self, survey: Survey) -> tuple[StreamContact, ...]:
         """Look at the next file; return what is certain now, most confident first.
 
         That is the contacts of this file but those at its end, and those held back from the end of the file before.
@@ -112,34 +112,34 @@ class LineDetector:
         before, self._tail = self._tail, None
         origins = tuple(_Origin(self._files, survey.path, row) for row in range(len(survey.pings)))
         self._files += 1
-        released: tuple[LineContact, ...] = ()
+        released: tuple[StreamContact, ...] = ()
         known: tuple[_Told, ...] = ()
         first_row = 0
         if before is not None and follows(before.survey, survey):
-            first_row = max(0, len(before.survey.pings) - self._pings(before.survey, HELD_M))
+            first_row = max(0, len(before.survey.pings) - self._pings(before.survey, WITHHELD_M))
             known = before.told
             survey = replace(survey, pings=before.survey.pings + survey.pings)
             origins = before.origins + origins
         elif before is not None:
             released = before.held
         found = [
-            LineContact(origins[d.ping_index].file, origins[d.ping_index].path, origins[d.ping_index].ping, d, survey)
+            StreamContact(origins[d.ping_index].file, origins[d.ping_index].path, origins[d.ping_index].ping, d, survey)
             for d in detect(survey, self._settings, self._options)
             if d.ping_index >= first_row and not self._is_known(d, known)
         ]
-        end = len(survey.pings) - self._pings(survey, HELD_M)
+        end = len(survey.pings) - self._pings(survey, WITHHELD_M)
         held = tuple(c for c in found if c.detection.ping_index >= end)
         told = tuple(c for c in found if c.detection.ping_index < end)
         self._tail = self._last_of(survey, origins, held, (*known, *(self._told(c.detection) for c in told)))
         return _in_order((*released, *told))
 
-    def finish(self) -> tuple[LineContact, ...]:
+    def finish(self) -> tuple[StreamContact, ...]:
         """Return what was held back from the end of the last file: the line is over."""
         before, self._tail = self._tail, None
         return () if before is None else _in_order(before.held)
 
     def _last_of(
-        self, survey: Survey, origins: tuple[_Origin, ...], held: tuple[LineContact, ...], told: tuple[_Told, ...]
+        self, survey: Survey, origins: tuple[_Origin, ...], held: tuple[StreamContact, ...], told: tuple[_Told, ...]
     ) -> _Tail:
         cut = max(0, len(survey.pings) - self._pings(survey, OVERLAP_M))
         kept = tuple(replace(each, look=each.look.moved(-cut)) for each in told if each.look.row >= cut)
@@ -149,7 +149,7 @@ class LineDetector:
         return math.ceil(length_m / (ping_spacing_m(survey) or self._settings.assumed_row_along_m))
 
     def _told(self, found: Detection) -> _Told:
-        return _Told(Look.of(found, unknown_along_m=self._settings.assumed_row_along_m), found.sample)
+        return _Told(DetectionPosition.of(found, unknown_along_m=self._settings.assumed_row_along_m), found.sample)
 
     def _is_known(self, found: Detection, known: Sequence[_Told]) -> bool:
         new = self._told(found)
@@ -177,5 +177,5 @@ def _sampling(ping: Ping) -> dict[Side, list[tuple[int, float]]]:
     return {side: [(len(c.samples), c.slant_range_m) for c in ping.channels if c.side is side] for side in Side}
 
 
-def _in_order(contacts: Sequence[LineContact]) -> tuple[LineContact, ...]:
+def _in_order(contacts: Sequence[StreamContact]) -> tuple[StreamContact, ...]:
     return tuple(sorted(contacts, key=lambda c: -c.detection.confidence))

@@ -17,7 +17,7 @@ from typing import Annotated, Final, Literal, TypeVar
 
 from pydantic import Field, ValidationError
 
-from sonarpost.errors import BadInputError, KeptFileError
+from sonarpost.errors import BadInputError, StoredFileError
 from sonarpost.messages import (
     Contact,
     Count,
@@ -148,7 +148,7 @@ def load_accepted(out_dir: Path) -> Accepted:
         out_dir: c2's `out_dir`, with one folder a vessel.
 
     Raises:
-        KeptFileError: `out_dir` is not a readable folder.
+        StoredFileError: `out_dir` is not a readable folder.
     """
     problems: list[BadInputError] = []
     pictures: list[tuple[SideCar, Path]] = []
@@ -170,7 +170,7 @@ def _folders(out_dir: Path) -> list[Path]:
     try:
         return sorted(path for path in out_dir.iterdir() if path.is_dir())
     except OSError as error:
-        raise KeptFileError(str(out_dir), "", error.strerror or str(error), "the folder that c2 keeps") from error
+        raise StoredFileError(str(out_dir), "", error.strerror or str(error), "the folder that c2 keeps") from error
 
 
 def _json_files(folder: Path, problems: list[BadInputError]) -> list[Path]:
@@ -180,7 +180,7 @@ def _json_files(folder: Path, problems: list[BadInputError]) -> list[Path]:
     except FileNotFoundError:
         return []
     except OSError as error:
-        problems.append(KeptFileError(str(folder), "", error.strerror or str(error), "a readable folder"))
+        problems.append(StoredFileError(str(folder), "", error.strerror or str(error), "a readable folder"))
         return []
 
 
@@ -194,14 +194,14 @@ def _read(model: type[R], path: Path, problems: list[BadInputError]) -> R | None
         if len(text) <= MAX_FILE_BYTES:
             return model.model_validate_json(text)
         limit = f"{MAX_FILE_BYTES} bytes"
-        problems.append(KeptFileError(str(path), "size", f"more than {limit}", f"at most {limit}"))
+        problems.append(StoredFileError(str(path), "size", f"more than {limit}", f"at most {limit}"))
     except OSError as error:
-        problems.append(KeptFileError(str(path), "", error.strerror or str(error), f"a readable {model.TYPE}"))
+        problems.append(StoredFileError(str(path), "", error.strerror or str(error), f"a readable {model.TYPE}"))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         value = "nothing" if first["type"] == "missing" else first["input"]
         field = ".".join(str(part) for part in first["loc"])
-        problems.append(KeptFileError(str(path), field, value, expected_text(first["type"], first["msg"])))
+        problems.append(StoredFileError(str(path), field, value, expected_text(first["type"], first["msg"])))
     return None
 
 
@@ -209,7 +209,7 @@ def _belongs(record: SideCar | Decision, folder: Path, path: Path, problems: lis
     """Refuse a record that names another vessel than its folder: no vessel speaks for another."""
     if record.vessel_id == folder.name:
         return True
-    problems.append(KeptFileError(str(path), "vessel_id", record.vessel_id, folder.name))
+    problems.append(StoredFileError(str(path), "vessel_id", record.vessel_id, folder.name))
     return False
 
 

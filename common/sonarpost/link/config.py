@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.frames.v1.feedback import WINDOW
 from sonarpost.link.frames.v1.frame import MAX_FRAME_BYTES, MIN_FRAME_BYTES
 
@@ -43,7 +43,7 @@ class SenderConfig:
     """
 
     frame_bytes: int = 64
-    channels: tuple[Channel, ...] = (Channel(0.3),)
+    channels: tuple[LossChannel, ...] = (LossChannel(0.3),)
     uncertainty: float = 0.15
     feedback: bool = False
     frames_per_picture: float = 6.0
@@ -74,10 +74,10 @@ class SenderConfig:
         _check("kept_pictures", self.kept_pictures, 1, 65535)
 
     @property
-    def planned_channels(self) -> tuple[Channel, ...]:
+    def planned_channels(self) -> tuple[LossChannel, ...]:
         """The channels that detail is planned for."""
         factors = (1 - self.uncertainty, 1.0, 1 + self.uncertainty) if self.uncertainty else (1.0,)
-        return tuple(Channel(min(c.loss * f, 0.99), c.burst) for c in self.channels for f in factors)
+        return tuple(LossChannel(min(c.loss * f, 0.99), c.burst) for c in self.channels for f in factors)
 
     @property
     def group_size(self) -> int:
@@ -91,7 +91,7 @@ class SenderConfig:
         )
 
     @property
-    def worst(self) -> Channel:
+    def worst(self) -> LossChannel:
         """The worst receiver's."""
         return max(self.channels, key=lambda c: (c.loss, c.burst))
 

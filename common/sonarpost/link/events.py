@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sonarpost.errors import FrameError
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import Feedback, Request
+from sonarpost.link.frames.v1.feedback import Feedback, FeedbackRequest
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class MessageReceived:
 
 
 @dataclass(frozen=True, slots=True)
-class ReportReceived:
+class FeedbackReceived:
     """A receiver's report or request, for the sender on this side.
 
     Attributes:
@@ -63,7 +63,7 @@ class ReportReceived:
     """
 
     source: int
-    report: Feedback | Request
+    report: Feedback | FeedbackRequest
     at: float
 
 
@@ -82,4 +82,4 @@ class FrameRefused:
     at: float
 
 
-Event = ContactUpdate | MessageReceived | ReportReceived | FrameRefused
+Event = ContactUpdate | MessageReceived | FeedbackReceived | FrameRefused

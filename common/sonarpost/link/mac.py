@@ -15,7 +15,7 @@ from sonarpost.errors import ConfigError
 _WHERE: Final = "medium access"
 
 
-class Medium(Protocol):
+class MediumAccess(Protocol):
     """A policy of medium access."""
 
     def wait_s(self, packet_s: float, now: float) -> float | None:
@@ -83,7 +83,7 @@ class Continuous:
         self._heard = now
 
 
-class Slots:
+class Tdma:
     """Sends in its own slot of a frame of time (TDMA): no two stations at once, however many there are.
 
     Slots repeat every `frame_s` from 1970-01-01 UTC on. The last `guard_s` of a slot are silent: they take up what the
@@ -124,7 +124,7 @@ class Slots:
         """See `Medium.heard`: the clock alone decides."""
 
 
-class OnPoll:
+class Polled:
     """Sends only when the other end asks for a packet."""
 
     def wait_s(self, packet_s: float, now: float) -> float | None:
@@ -138,7 +138,7 @@ class OnPoll:
         """See `Medium.heard`."""
 
 
-class RandomAccess:
+class Csma:
     """Waits a random time before each packet and while others are heard (ALOHA with carrier sense).
 
     Waits are drawn evenly from 0 to twice their mean. For n stations with packets of length T a mean of about n T makes

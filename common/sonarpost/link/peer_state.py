@@ -6,12 +6,12 @@ import zlib
 from dataclasses import dataclass, field
 from typing import Final
 
-from sonarpost.link.coding.block_decoder import Assembly, Found
+from sonarpost.link.coding.block_decoder import BlockDecoder, DecodedObject
 from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.events import ContactUpdate, Event, MessageReceived
-from sonarpost.link.frames.v1.feedback import UNHEARD, WINDOW, Feedback
+from sonarpost.link.frames.v1.feedback import NEVER_RECEIVED, WINDOW, Feedback
 from sonarpost.link.frames.v1.frame import BLOCKS, Symbol
-from sonarpost.link.frames.v1.payload_objects import Message, Piece
+from sonarpost.link.frames.v1.payload_objects import MessageObject, StreamPiece
 from sonarpost.link.frames.v1.preview import Preview
 from sonarpost.link.received_contact import KnownContact
 
@@ -20,7 +20,7 @@ _PIECES_WAITING: Final = 128
 
 
 @dataclass(eq=False)
-class Source:
+class PeerState:
     """One sender.
 
     Attributes:
@@ -43,8 +43,8 @@ class Source:
     frames: int = 0
     newest: int = -1
     span: int = 0
-    blocks: dict[int, Assembly] = field(default_factory=dict)
-    rivals: dict[int, Assembly] = field(default_factory=dict)
+    blocks: dict[int, BlockDecoder] = field(default_factory=dict)
+    rivals: dict[int, BlockDecoder] = field(default_factory=dict)
     contacts: dict[int, KnownContact] = field(default_factory=dict)
     messages: list[tuple[int, int, float]] = field(default_factory=list)
     reported_at: float = 0.0
@@ -91,7 +91,7 @@ class Source:
         else:
             self.span = min(WINDOW, max(self.span, (self.newest - number) % BLOCKS + 1))
 
-    def _block_for(self, symbol: Symbol, now: float) -> Assembly:
+    def _block_for(self, symbol: Symbol, now: float) -> BlockDecoder:
         """Return the block a symbol is of.
 
         One that does not fit the remembered block of its number may be of a later one, or damaged: it takes two of them
@@ -99,20 +99,20 @@ class Source:
         """
         block = self.blocks.get(symbol.block)
         if block is None:
-            block = self.blocks[symbol.block] = Assembly.of(symbol, now)
+            block = self.blocks[symbol.block] = BlockDecoder.of(symbol, now)
         if block.takes(symbol):
             return block
         rival = self.rivals.get(symbol.block)
         if rival is None or not rival.takes(symbol):
-            rival = self.rivals[symbol.block] = Assembly.of(symbol, now)
+            rival = self.rivals[symbol.block] = BlockDecoder.of(symbol, now)
             return rival
         if symbol.index not in rival.symbols:
             self.blocks[symbol.block] = self.rivals.pop(symbol.block)
         return rival
 
-    def add_found(self, found: Found, now: float, config: ReceiverConfig) -> list[Event]:
+    def add_found(self, found: DecodedObject, now: float, config: ReceiverConfig) -> list[Event]:
         """Take what a block or segment gave."""
-        if isinstance(found, Message):
+        if isinstance(found, MessageObject):
             return self.add_message(found, now)
         if isinstance(found, Preview):
             update = self._add_preview(found, now, config)
@@ -120,7 +120,7 @@ class Source:
         updates = [self._add_piece(piece, now, config, final=found.final) for piece in found.pieces]
         return [update for update in updates if update]
 
-    def add_message(self, message: Message, now: float) -> list[Event]:
+    def add_message(self, message: MessageObject, now: float) -> list[Event]:
         """Take a message; repetitions give nothing."""
         digest = zlib.crc32(message.data)
         repeated = any((number, check) == (message.number, digest) for number, check, _ in self.messages)
@@ -137,7 +137,9 @@ class Source:
         known.add_preview(preview, now)
         return known.update()
 
-    def _add_piece(self, piece: Piece, now: float, config: ReceiverConfig, *, final: bool) -> ContactUpdate | None:
+    def _add_piece(
+        self, piece: StreamPiece, now: float, config: ReceiverConfig, *, final: bool
+    ) -> ContactUpdate | None:
         known = self.contacts.pop(piece.number, None)
         if known is None or known.link != piece.link:
             self._make_room(config)
@@ -166,7 +168,9 @@ class Source:
     def needs(self) -> tuple[int, ...]:
         """What is lacking of each block, the newest first; see `Feedback.needs`."""
         numbers = [(self.newest - back) % BLOCKS for back in range(self.span)]
-        return tuple(min(self.blocks[n].need, UNHEARD - 1) if n in self.blocks else UNHEARD for n in numbers)
+        return tuple(
+            min(self.blocks[n].need, NEVER_RECEIVED - 1) if n in self.blocks else NEVER_RECEIVED for n in numbers
+        )
 
     def report(self, now: float) -> Feedback | None:
         """Return the report of now, None while no block was heard."""

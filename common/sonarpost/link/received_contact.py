@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from sonarpost.link.coding.byte_ranges import Ranges, add_range, covered_within
 from sonarpost.link.events import ContactUpdate
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.payload_objects import Piece
+from sonarpost.link.frames.v1.payload_objects import StreamPiece
 from sonarpost.link.frames.v1.preview import Preview, contact_link
 
 
@@ -54,7 +54,7 @@ class KnownContact:
             self.end = max(self.end, len(preview.prefix))
         self.last_at = now
 
-    def add_piece(self, piece: Piece, now: float, *, final: bool) -> None:
+    def add_piece(self, piece: StreamPiece, now: float, *, final: bool) -> None:
         """Take a piece whose link is this contact's."""
         self._write(piece.start, piece.data)
         if final:

@@ -11,12 +11,12 @@ from dataclasses import asdict, dataclass, replace
 
 from sonarpost.errors import BadInputError, FrameError
 from sonarpost.link.config import ReceiverConfig
-from sonarpost.link.events import ContactUpdate, Event, FrameRefused, MessageReceived, ReportReceived
-from sonarpost.link.frames.v1.feedback import Feedback, Request, pack_mini
-from sonarpost.link.frames.v1.frame import FrameSeal, Segment, SegmentKind, Symbol, parse_frame, parse_symbol
-from sonarpost.link.frames.v1.payload_objects import Message
+from sonarpost.link.events import ContactUpdate, Event, FeedbackReceived, FrameRefused, MessageReceived
+from sonarpost.link.frames.v1.feedback import Feedback, FeedbackRequest, pack_mini
+from sonarpost.link.frames.v1.frame import FrameProtection, Segment, SegmentKind, Symbol, parse_frame, parse_symbol
+from sonarpost.link.frames.v1.payload_objects import MessageObject
 from sonarpost.link.frames.v1.preview import Preview
-from sonarpost.link.peer_state import Source
+from sonarpost.link.peer_state import PeerState
 from sonarpost.link.receiver_state import export_source, import_source, read_list, read_map
 
 _STATE_FORMAT = 1
@@ -32,7 +32,7 @@ class ReceiverCounts:
         updates: `ContactUpdate` events.
         complete: Of these, complete.
         messages: `MessageReceived` events.
-        reports: `ReportReceived` events.
+        reports: `FeedbackReceived` events.
         forgotten_sources: Senders forgotten because `max_sources` was reached.
     """
 
@@ -45,7 +45,7 @@ class ReceiverCounts:
     forgotten_sources: int = 0
 
 
-class Receiver:
+class LinkReceiver:
     """Receives from any number of senders.
 
     Memory: at most `max_sources` senders; of each at most 32 blocks of 255 symbols, `max_contacts` contacts of 64 KiB.
@@ -55,10 +55,10 @@ class Receiver:
         seal: Authenticates frames.
     """
 
-    def __init__(self, config: ReceiverConfig | None = None, *, seal: FrameSeal | None = None) -> None:
+    def __init__(self, config: ReceiverConfig | None = None, *, seal: FrameProtection | None = None) -> None:
         self.config = config or ReceiverConfig()
         self._seal = seal
-        self._sources: dict[int, Source] = {}  # least recently heard first
+        self._sources: dict[int, PeerState] = {}  # least recently heard first
         self._counts = ReceiverCounts()
 
     @property
@@ -96,30 +96,30 @@ class Receiver:
         self._count_events(events)
         return events
 
-    def _take(self, sender: Source, item: Symbol | Segment, now: float, where: str) -> list[Event]:
+    def _take(self, sender: PeerState, item: Symbol | Segment, now: float, where: str) -> list[Event]:
         if isinstance(item, Symbol):
             return sender.add_symbol(item, now, self.config)
         match item.kind:
             case SegmentKind.SYMBOL:
                 return sender.add_symbol(parse_symbol(item.data, where), now, self.config)
             case SegmentKind.MESSAGE if len(item.data) > 1:
-                return sender.add_message(Message(item.data[0], item.data[1:]), now)
+                return sender.add_message(MessageObject(item.data[0], item.data[1:]), now)
             case SegmentKind.CONTACT | SegmentKind.PREVIEW:
                 return sender.add_found(Preview.unpack(item.data, where), now, self.config)
             case SegmentKind.FEEDBACK:
-                return [ReportReceived(sender.address, Feedback.unpack(item.data, where), now)]
+                return [FeedbackReceived(sender.address, Feedback.unpack(item.data, where), now)]
             case SegmentKind.REQUEST:
-                return [ReportReceived(sender.address, Request.unpack(item.data, where), now)]
+                return [FeedbackReceived(sender.address, FeedbackRequest.unpack(item.data, where), now)]
             case _:
                 raise FrameError(where, "segment kind", item.kind, "1..6, a message not empty")
 
-    def _sender(self, source: int, now: float) -> Source:
+    def _sender(self, source: int, now: float) -> PeerState:
         found = self._sources.pop(source, None)
         if found is None:
             while len(self._sources) >= self.config.max_sources:
                 del self._sources[next(iter(self._sources))]
                 self._count(forgotten_sources=1)
-            found = Source(source, now, reported_at=now)
+            found = PeerState(source, now, reported_at=now)
         self._sources[source] = found
         found.heard_at = now
         found.frames += 1
@@ -175,7 +175,7 @@ class Receiver:
             updates=len(updates),
             complete=sum(e.complete for e in updates),
             messages=sum(isinstance(e, MessageReceived) for e in events),
-            reports=sum(isinstance(e, ReportReceived) for e in events),
+            reports=sum(isinstance(e, FeedbackReceived) for e in events),
         )
 
     def _count(self, **more: int) -> None:

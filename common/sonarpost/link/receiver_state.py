@@ -7,16 +7,16 @@ from collections.abc import Mapping
 from typing import TypeVar
 
 from sonarpost.errors import BadInputError, FrameError
-from sonarpost.link.coding.block_decoder import Assembly
+from sonarpost.link.coding.block_decoder import BlockDecoder
 from sonarpost.link.coding.byte_ranges import Ranges, add_range
 from sonarpost.link.coding.erasure_code import MAX_SYMBOLS
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.feedback import WINDOW
 from sonarpost.link.frames.v1.frame import BLOCKS, SymbolKind
 from sonarpost.link.frames.v1.layers import Layering
-from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, Piece, Pieces
+from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, PieceList, StreamPiece
 from sonarpost.link.frames.v1.preview import MAX_NUMBER
-from sonarpost.link.peer_state import Source
+from sonarpost.link.peer_state import PeerState
 from sonarpost.link.received_contact import KnownContact
 
 _WHERE = "receiver state"
@@ -59,7 +59,7 @@ def read_time(entry: object, name: str) -> float:
     return value
 
 
-def export_source(source: Source) -> dict[str, object]:
+def export_source(source: PeerState) -> dict[str, object]:
     """Return a sender as a map."""
     return {
         "address": source.address,
@@ -77,7 +77,7 @@ def export_source(source: Source) -> dict[str, object]:
     }
 
 
-def import_source(entry: object) -> Source:
+def import_source(entry: object) -> PeerState:
     """Return the sender that `export_source` wrote.
 
     Raises:
@@ -90,7 +90,7 @@ def import_source(entry: object) -> Source:
         contacts = [_import_contact(address, e) for e in read_list(entry, "contacts")]
     except BadInputError as error:
         raise FrameError(_WHERE, f"sender {address}, {error.field}", error.value, error.expected) from error
-    return Source(
+    return PeerState(
         address=address,
         heard_at=read_time(entry, "heard_at"),
         frames=read_number(entry, "frames", 0, 2**62),
@@ -114,7 +114,7 @@ def _message(entry: object) -> tuple[int, int, float]:
             raise FrameError(_WHERE, "messages", entry, "[number, digest, time]")
 
 
-def _export_block(block: Assembly) -> dict[str, object]:
+def _export_block(block: BlockDecoder) -> dict[str, object]:
     return {
         "kind": int(block.kind),
         "number": block.number,
@@ -129,14 +129,14 @@ def _export_block(block: Assembly) -> dict[str, object]:
     }
 
 
-def _import_block(entry: object) -> Assembly:
+def _import_block(entry: object) -> BlockDecoder:
     kind = read_number(entry, "kind", 0, 3)
     if kind not in tuple(SymbolKind):
         raise FrameError(_WHERE, "kind", kind, "0, 1 or 3")
     packed = read_field(entry, "layering", bytes)
     if len(packed) not in (0, 4):
         raise FrameError(_WHERE, "layering", packed, "0 or 4 bytes")
-    block = Assembly(
+    block = BlockDecoder(
         kind=SymbolKind(kind),
         number=read_number(entry, "number", 0, BLOCKS - 1),
         symbol_bytes=read_number(entry, "symbol_bytes", 1, 65535),
@@ -161,21 +161,21 @@ def _import_block(entry: object) -> Assembly:
     return block
 
 
-def _export_pieces(pieces: Pieces) -> dict[str, object]:
+def _export_pieces(pieces: PieceList) -> dict[str, object]:
     return {"final": pieces.final, "pieces": [[p.number, p.link, p.start, p.data] for p in pieces.pieces]}
 
 
-def _import_pieces(entry: object) -> Pieces:
+def _import_pieces(entry: object) -> PieceList:
     found = []
     for piece in read_list(entry, "pieces"):
         match piece:
             case [int() as number, int() as link, int() as start, bytes() as data] if (
                 1 <= number <= MAX_NUMBER and 0 <= link <= 255 and 0 <= start <= MAX_STREAM_BYTES - len(data)
             ):
-                found.append(Piece(number, link, start, data))
+                found.append(StreamPiece(number, link, start, data))
             case _:
                 raise FrameError(_WHERE, "pieces", piece, "[number, link, start, bytes]")
-    return Pieces(tuple(found), read_field(entry, "final", bool))
+    return PieceList(tuple(found), read_field(entry, "final", bool))
 
 
 def _export_contact(known: KnownContact) -> dict[str, object]:

@@ -13,18 +13,18 @@ from typing import Final
 
 from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.coding.block_builder import group_limit, make_group, numbers_needed, whole_blocks
-from sonarpost.link.coding.blocks import Picture, SendBlock
-from sonarpost.link.coding.channel_capacity import Channel
-from sonarpost.link.coding.delivery_ledger import forgettable, owed, revived, settle, within_window
+from sonarpost.link.coding.blocks import OutgoingImage, SendBlock
+from sonarpost.link.coding.channel_capacity import LossChannel
+from sonarpost.link.coding.delivery_ledger import forgettable, missing, record_delivered, revived, within_window
 from sonarpost.link.coding.rate_distortion import Values, quality_curve
 from sonarpost.link.coding.redundancy_plan import copies, symbols_to_send
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import WINDOW, Feedback, Request
+from sonarpost.link.frames.v1.feedback import WINDOW, Feedback, FeedbackRequest
 from sonarpost.link.frames.v1.frame import (
     BLOCKS,
     HEADER_BYTES,
-    FrameSeal,
+    FrameProtection,
     Segment,
     SegmentKind,
     Symbol,
@@ -33,9 +33,9 @@ from sonarpost.link.frames.v1.frame import (
     pack_symbol,
     segments_room,
 )
-from sonarpost.link.frames.v1.payload_objects import MESSAGE_OVERHEAD_BYTES, Message
+from sonarpost.link.frames.v1.payload_objects import MESSAGE_OVERHEAD_BYTES, MessageObject
 from sonarpost.link.frames.v1.preview import ENTRY_HEAD_BYTES, MAX_NUMBER
-from sonarpost.link.sender_feedback import ReportBook
+from sonarpost.link.sender_feedback import FeedbackTracker
 from sonarpost.link.sender_messages import MessageQueue
 
 _LEAST_PREFIX_BYTES: Final = 16
@@ -46,7 +46,7 @@ _SAFE: Final = -2.5
 """Caution (see `symbols_to_send`) of blocks that go without feedback: so many deviations more than the average."""
 
 
-class Sender:
+class LinkSender:
     """Sends contacts, their pictures and messages.
 
     With feedback a picture is settled when reports have told that all of it arrived. Whatever was given up before, sent
@@ -66,19 +66,19 @@ class Sender:
         seal: Authenticates frames.
     """
 
-    def __init__(self, config: SenderConfig, *, first_block: int = 0, seal: FrameSeal | None = None) -> None:
+    def __init__(self, config: SenderConfig, *, first_block: int = 0, seal: FrameProtection | None = None) -> None:
         self.config = config
         self._seal = seal
-        self.waiting: list[Picture] = []
+        self.waiting: list[OutgoingImage] = []
         self.blocks: list[SendBlock] = []
         self.past: list[SendBlock] = []
         self.owing = True
         self.messages = MessageQueue()
-        self.kept: dict[int, Picture] = {}
+        self.kept: dict[int, OutgoingImage] = {}
         self.next_block = first_block % BLOCKS
         self.frames_sent = 0
         self.announced: set[int] = set()
-        self.book = ReportBook()
+        self.book = FeedbackTracker()
         self.reports: list[Segment] = []
 
     @property
@@ -121,7 +121,7 @@ class Sender:
             raise FrameError("acoustic link v1", "contact number", number, f"1..{MAX_NUMBER}, not one that waits")
         if not stream:
             raise StreamError("picture", "stream", stream, "at least one byte")
-        picture = Picture(number, contact.rounded(), stream, quality_curve(len(stream), mean_square_error), now)
+        picture = OutgoingImage(number, contact.rounded(), stream, quality_curve(len(stream), mean_square_error), now)
         self.waiting.append(picture)
         self.kept.pop(number, None)
         self.kept[number] = picture
@@ -162,12 +162,12 @@ class Sender:
         often = copies(self.config.worst) if times is None else max(1, times)
         return self.messages.add(data, priority, now + lifetime_s, often, rises_at)
 
-    def add_report(self, report: Feedback | Request) -> None:
+    def add_report(self, report: Feedback | FeedbackRequest) -> None:
         """Send a report or request in the next frame (a receiver's reports go through its own sender)."""
         kind = SegmentKind.FEEDBACK if isinstance(report, Feedback) else SegmentKind.REQUEST
         self.reports.append(Segment(kind, report.pack()))
 
-    def plan_for(self, channels: tuple[Channel, ...]) -> None:
+    def plan_for(self, channels: tuple[LossChannel, ...]) -> None:
         """Plan with another measured loss from now on; what is under way stays as it was planned."""
         self.config = replace(self.config, channels=channels)
 
@@ -250,7 +250,7 @@ class Sender:
             self.announced -= {p.number for p in group}
             self.blocks += make_group(group, self.config, symbol_bytes, self._take_number, now)
 
-    def _may_begin(self, group: Sequence[Picture]) -> bool:
+    def _may_begin(self, group: Sequence[OutgoingImage]) -> bool:
         fresh = sum(1 for b in self.blocks if b.kind == SymbolKind.PREVIEW and b.lacks > 0)
         busy = sum(1 for b in self.blocks if b.kind != SymbolKind.PREVIEW and b.lacks > 0)
         if max(fresh, busy) >= self.config.depth:
@@ -264,7 +264,7 @@ class Sender:
             return
         waiting = {p.number for p in self.waiting}
         kept = {n: p for n, p in self.kept.items() if n not in waiting}
-        found = owed(kept, self.config, self.blocks, group_limit(self.config, self.symbol_bytes))
+        found = missing(kept, self.config, self.blocks, group_limit(self.config, self.symbol_bytes))
         if not found:
             self.owing = False
             return
@@ -297,7 +297,7 @@ class Sender:
         while self._free_numbers() >= 1 and (message := self.messages.take_long(room)) is not None:
             size = self.symbol_bytes
             source = -(-(len(message.data) + MESSAGE_OVERHEAD_BYTES) // size)
-            data = Message(message.number, message.data).pack(source * size)
+            data = MessageObject(message.number, message.data).pack(source * size)
             planned = min(255, symbols_to_send(source, self.config.worst, _SAFE))
             number = self._take_number()
             self.blocks.append(
@@ -402,7 +402,7 @@ class Sender:
         if self._free_numbers() < WINDOW and unsure:
             min(unsure, key=lambda b: b.sent / b.source_symbols).planned += 1
 
-    def on_report(self, report: Feedback | Request, now: float, receiver: int = 0) -> None:
+    def on_report(self, report: Feedback | FeedbackRequest, now: float, receiver: int = 0) -> None:
         """Take what a receiver reports or asks for.
 
         Args:
@@ -413,7 +413,7 @@ class Sender:
         Raises:
             FrameError: It asks for a picture that is not remembered.
         """
-        if isinstance(report, Request):
+        if isinstance(report, FeedbackRequest):
             self.refine(report, now)
         else:
             self.on_feedback(report, now, receiver)
@@ -425,7 +425,7 @@ class Sender:
         """
         self._revive(report)
         self.blocks, done = self.book.take(report, self.blocks, self.config, now, receiver, self.frames_sent)
-        settle(self.kept, done)
+        record_delivered(self.kept, done)
 
     def _revive(self, report: Feedback) -> None:
         """Go on with blocks that were sent before anybody reported, where a receiver has some of them."""
@@ -437,9 +437,9 @@ class Sender:
         report = Feedback(block_number, 0, (needed,))
         self._revive(report)
         self.blocks, done = self.book.apply(report, self.blocks, self.config, now, receiver)
-        settle(self.kept, done)
+        record_delivered(self.kept, done)
 
-    def refine(self, request: Request, now: float) -> bool:
+    def refine(self, request: FeedbackRequest, now: float) -> bool:
         """Send more detail of a picture than was planned; return whether there is any.
 
         Raises:

@@ -9,7 +9,7 @@ from typing import Final
 from sonarpost.link.coding.blocks import SendBlock
 from sonarpost.link.coding.redundancy_plan import symbols_to_send
 from sonarpost.link.config import SenderConfig
-from sonarpost.link.frames.v1.feedback import UNHEARD, WINDOW, Feedback
+from sonarpost.link.frames.v1.feedback import NEVER_RECEIVED, WINDOW, Feedback
 from sonarpost.link.frames.v1.frame import BLOCKS
 
 _LEAST_TO_MEASURE: Final = 16
@@ -39,7 +39,7 @@ class LossMeter:
 
 
 @dataclass(eq=False)
-class ReportBook:
+class FeedbackTracker:
     """The receivers that report.
 
     Attributes:
@@ -85,10 +85,10 @@ class ReportBook:
             behind = (report.newest - block.number) % BLOCKS
             if behind >= WINDOW or block.reported or len(report.needs) < 2:
                 return False  # newer than anything heard, told before, or a report of one block only
-            need = UNHEARD
-        block.reported = block.reported or need != UNHEARD
+            need = NEVER_RECEIVED
+        block.reported = block.reported or need != NEVER_RECEIVED
         block.asked_at = now
-        block.needs[receiver] = block.source_symbols if need == UNHEARD else need
+        block.needs[receiver] = block.source_symbols if need == NEVER_RECEIVED else need
         if max(block.needs.get(known, block.source_symbols) for known in self.receivers) == 0:
             return True
         if need > 0:

@@ -9,7 +9,7 @@ from typing import TypeGuard
 import numpy as np
 
 from sonarpost.errors import BadInputError, FrameError
-from sonarpost.link.coding.blocks import Picture, SendBlock, Span
+from sonarpost.link.coding.blocks import OutgoingImage, SendBlock, StreamSpan
 from sonarpost.link.coding.byte_ranges import Ranges, add_range
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import BLOCKS, Segment, SymbolKind
@@ -17,8 +17,8 @@ from sonarpost.link.frames.v1.layers import Layering
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
 from sonarpost.link.frames.v1.preview import MAX_NUMBER
 from sonarpost.link.receiver_state import read_field, read_list, read_number, read_time
-from sonarpost.link.sender import Sender
-from sonarpost.link.sender_feedback import LossMeter, ReportBook
+from sonarpost.link.sender import LinkSender
+from sonarpost.link.sender_feedback import FeedbackTracker, LossMeter
 from sonarpost.link.sender_messages import MessageQueue, WaitingMessage
 
 _FORMAT = 1
@@ -26,7 +26,7 @@ _WHERE = "sender state"
 _MANY = 2**62
 
 
-def export_sender(sender: Sender) -> dict[str, object]:
+def export_sender(sender: LinkSender) -> dict[str, object]:
     """Return the whole state as maps, lists, numbers, strings and bytes (msgpack can hold it)."""
     pictures = {p.number: p for p in (*sender.kept.values(), *sender.waiting)}
     return {
@@ -51,7 +51,7 @@ def export_sender(sender: Sender) -> dict[str, object]:
     }
 
 
-def restore_sender(sender: Sender, state: Mapping[str, object]) -> None:
+def restore_sender(sender: LinkSender, state: Mapping[str, object]) -> None:
     """Replace the whole state of a sender by one that `export_sender` returned; the configuration stays.
 
     Raises:
@@ -80,11 +80,11 @@ def restore_sender(sender: Sender, state: Mapping[str, object]) -> None:
     sender.kept = by_number
     sender.waiting = [p for p in waiting if p is not None]
     sender.blocks, sender.past, sender.messages, sender.reports = blocks, past, queue, reports
-    sender.book = ReportBook(receivers, meters)
+    sender.book = FeedbackTracker(receivers, meters)
     sender.next_block, sender.frames_sent, sender.announced = next_block, frames_sent, announced
 
 
-def _export_picture(picture: Picture) -> dict[str, object]:
+def _export_picture(picture: OutgoingImage) -> dict[str, object]:
     return {
         "number": picture.number,
         "contact": picture.contact.pack(),
@@ -102,7 +102,7 @@ def _later(entry: object, name: str) -> list[object]:
     return read_list(entry, name) if isinstance(entry, Mapping) and name in entry else []
 
 
-def import_picture(entry: object) -> Picture:
+def import_picture(entry: object) -> OutgoingImage:
     """Return a picture as `export_sender` wrote it.
 
     Raises:
@@ -116,7 +116,7 @@ def import_picture(entry: object) -> Picture:
     curve = np.frombuffer(raw, "<f8").astype(np.float64)
     if not np.isfinite(curve).all():
         raise FrameError(_WHERE, "curve", "not finite", "finite values in dB")
-    return Picture(
+    return OutgoingImage(
         number=read_number(entry, "number", 1, MAX_NUMBER),
         contact=ContactSummary.unpack(read_field(entry, "contact", bytes)),
         stream=stream,
@@ -186,7 +186,7 @@ def _import_block(entry: object) -> SendBlock:
     )
 
 
-def _import_span(entry: object) -> Span:
+def _import_span(entry: object) -> StreamSpan:
     match entry:
         case [int(number), int(link), int(start), int(stop)] if (
             1 <= number <= MAX_NUMBER and 0 <= link <= 255 and 0 <= start <= stop <= MAX_STREAM_BYTES

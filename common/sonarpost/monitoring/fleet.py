@@ -1,7 +1,7 @@
 """What is known of every service of every platform: its last health record, when it came, and whether it lives.
 
-`Fleet` holds it, with the clock as an argument; `FleetWatcher` fills it from a router. Ages are measured by the clock
-of this host from the arrival of a record, never by the record's own: clocks of platforms differ.
+`FleetTracker` holds it, with the clock as an argument; `FleetWatcher` fills it from a router. Ages are measured by the
+clock of this host from the arrival of a record, never by the record's own: clocks of platforms differ.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Name = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ServiceStatus:
     """What is known of one service.
 
     Attributes:
@@ -59,12 +59,12 @@ class FleetState:
         rejected: Records that could not be used since the start.
     """
 
-    services: tuple[Seen, ...]
+    services: tuple[ServiceStatus, ...]
     connected: bool
     rejected: int
 
 
-class Fleet:
+class FleetTracker:
     """Collects health records and tokens, from any thread.
 
     Args:
@@ -128,10 +128,10 @@ class Fleet:
             services = tuple(self._seen(name, now_s) for name in sorted(self._last_s))
             return FleetState(services, self._connected, self._rejected)
 
-    def _seen(self, name: Name, now_s: float) -> Seen:
+    def _seen(self, name: Name, now_s: float) -> ServiceStatus:
         health = self._health.get(name)
         age_s = None if health is None else max(0.0, now_s - self._last_s[name])
-        return Seen(*name, health, age_s, name in self._alive if self._connected else None)
+        return ServiceStatus(*name, health, age_s, name in self._alive if self._connected else None)
 
 
 class FleetWatcher:
@@ -145,9 +145,13 @@ class FleetWatcher:
     """
 
     def __init__(
-        self, endpoints: Sequence[str], tls: TlsConfig | None = None, fleet: Fleet | None = None, poll_s: float = 1.0
+        self,
+        endpoints: Sequence[str],
+        tls: TlsConfig | None = None,
+        fleet: FleetTracker | None = None,
+        poll_s: float = 1.0,
     ) -> None:
-        self.fleet = fleet or Fleet()
+        self.fleet = fleet or FleetTracker()
         self._endpoints = tuple(endpoints)
         self._tls = tls
         self._poll_s = poll_s

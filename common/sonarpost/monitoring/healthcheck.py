@@ -31,7 +31,7 @@ HANGS_AFTER_S = 15.0
 MIN_FREE_BYTES = 1 << 20
 
 
-def ailment(path: Path, now_s: float, stalled_after_s: float = STALLED_AFTER_S) -> str:
+def health_problem(path: Path, now_s: float, stalled_after_s: float = STALLED_AFTER_S) -> str:
     """Return what is wrong with the service, an empty text when nothing is.
 
     Args:
@@ -77,7 +77,7 @@ def check(environment: Mapping[str, str], now_s: float) -> tuple[int, str]:
         stalled_after_s = float(text)
     except ValueError:
         return 1, f"{STALLED_VARIABLE}: got {text!r}, expected seconds"
-    reason = ailment(Path(name), now_s, stalled_after_s)
+    reason = health_problem(Path(name), now_s, stalled_after_s)
     return (1, reason) if reason else (0, "well")
 
 

@@ -14,7 +14,7 @@ from sonarpost.link.frames.v1.preview import Preview, entry_shape
 from sonarpost.messages import AcousticFrame, Record, Relayed
 
 
-def concern_of_payload(payload: bytes, where: str) -> dict[str, str]:
+def context_of_payload(payload: bytes, where: str) -> dict[str, str]:
     """Return `vehicle`, `image_id` and `contact_id` of a record, as far as it says them.
 
     An envelope is looked into, and an acoustic frame tells its image where its wire format does. What cannot be read
@@ -31,10 +31,10 @@ def concern_of_payload(payload: bytes, where: str) -> dict[str, str]:
     inside = fields.get("payload")
     if fields.get("type") == Relayed.TYPE and isinstance(inside, bytes):
         # One envelope deep: an envelope in an envelope is refused anyway.
-        return {} if _is_envelope(inside, where) else concern_of_payload(inside, where)
+        return {} if _is_envelope(inside, where) else context_of_payload(inside, where)
     data = fields.get("data")
     if fields.get("type") == AcousticFrame.TYPE and isinstance(data, bytes):
-        image_id = image_of_frame(data)
+        image_id = image_ids_of_frame(data)
         return {} if image_id is None else {"image_id": image_id}
     contact = fields.get("contact")
     about: Mapping[str, object] = contact if isinstance(contact, dict) else {}
@@ -46,7 +46,7 @@ def concern_of_payload(payload: bytes, where: str) -> dict[str, str]:
     return {name: value for name, value in found.items() if isinstance(value, str)}
 
 
-class Concern:
+class LogContext:
     """Which contact a payload is about, looked for when somebody wants to know.
 
     Attributes:
@@ -59,9 +59,9 @@ class Concern:
         self._where = where
 
     def fields(self) -> dict[str, str]:
-        """Return what `concern_of_payload` does."""
+        """Return what `context_of_payload` does."""
         if self.record is None or isinstance(self.record, (Relayed, AcousticFrame)):
-            return concern_of_payload(self._payload, self._where)
+            return context_of_payload(self._payload, self._where)
         about = getattr(self.record, "contact", None)
         found = {
             "vehicle": getattr(self.record, "vehicle_id", None) or getattr(about, "vehicle_id", None),
@@ -78,7 +78,7 @@ def _is_envelope(payload: bytes, where: str) -> bool:
         return False
 
 
-def image_of_frame(data: bytes) -> str | None:
+def image_ids_of_frame(data: bytes) -> str | None:
     """Return the image a frame belongs to, several with commas between; None where the frame does not say it.
 
     Frames of the paper's format all say it. Those of v1 do where they hold records of contacts; a symbol of a block of

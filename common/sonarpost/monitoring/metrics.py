@@ -14,7 +14,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from sonarpost.monitoring.fleet import FleetState, Seen
+from sonarpost.monitoring.fleet import FleetState, ServiceStatus
 
 LABELS: Final = ("platform", "service")
 STATES: Final = ("starting", "ok", "degraded", "stopping")
@@ -63,7 +63,7 @@ class FleetCollector(Collector):
         fresh = [s for s in state.services if s.health is not None and (s.age_s or 0.0) <= self._stale_after_s]
         yield from self._of_the_records(fresh)
 
-    def _up(self, services: Iterable[Seen]) -> Metric:
+    def _up(self, services: Iterable[ServiceStatus]) -> Metric:
         up = GaugeMetricFamily("sonarpost_up", "1 while the service's liveliness token is there", labels=LABELS)
         for seen in services:
             # Without a router nothing is known: no series rather than a wrong one.
@@ -71,7 +71,7 @@ class FleetCollector(Collector):
                 up.add_metric((seen.platform, seen.service), float(seen.alive))
         return up
 
-    def _of_the_records(self, services: Sequence[Seen]) -> Iterable[Metric]:
+    def _of_the_records(self, services: Sequence[ServiceStatus]) -> Iterable[Metric]:
         state = GaugeMetricFamily("sonarpost_state", "1 for the state the service is in", labels=(*LABELS, "state"))
         started = GaugeMetricFamily("sonarpost_started_time_seconds", "Start of the process, Unix time", labels=LABELS)
         said = GaugeMetricFamily(
@@ -88,7 +88,7 @@ class FleetCollector(Collector):
         yield from _values(services)
 
 
-def _values(services: Iterable[Seen]) -> Iterable[Metric]:
+def _values(services: Iterable[ServiceStatus]) -> Iterable[Metric]:
     """Return one metric a counter and a gauge; where a name is both, the counter."""
     counters: dict[str, CounterMetricFamily] = {}
     gauges: dict[str, GaugeMetricFamily] = {}

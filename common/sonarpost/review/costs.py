@@ -9,7 +9,7 @@ from sonarpost.modem.micromodem.rates import RATES
 
 
 @dataclass(frozen=True, slots=True)
-class Cost:
+class RequestCost:
     """What a request costs.
 
     Attributes:
@@ -52,7 +52,7 @@ def request_cost(
     bytes_total: int,
     loss: float | None,
     overhead_bytes: int,
-) -> Cost:
+) -> RequestCost:
     """Return what a `refine`, `resend`, `revisit` or `wider` costs.
 
     To refine gives a stream of twice the length, to resend what is lacking of the stream there is; more seabed around a
@@ -71,11 +71,13 @@ def request_cost(
     """
     downlink_s = RATES[downlink_rate].airtime_s
     if kind == "revisit":
-        return Cost(downlink_s, 0.0, 0, 0, f"one packet down at rate {downlink_rate}; a new look is a new contact")
+        return RequestCost(
+            downlink_s, 0.0, 0, 0, f"one packet down at rate {downlink_rate}; a new look is a new contact"
+        )
     if uplink_rate is None:
-        return Cost(downlink_s, None, None, None, "the vehicle's rate is not known: nothing was heard from it")
+        return RequestCost(downlink_s, None, None, None, "the vehicle's rate is not known: nothing was heard from it")
     if bytes_total == 0:
-        return Cost(downlink_s, None, None, None, "the length of the picture's stream is not known")
+        return RequestCost(downlink_s, None, None, None, "the length of the picture's stream is not known")
     whole = 2 * bytes_total if kind == "refine" else bytes_total
     wanted = max(0, whole - bytes_received)
     share = min(0.9, loss or 0.0)
@@ -85,4 +87,4 @@ def request_cost(
     basis = f"rate {uplink_rate} as heard last, {lacking}"
     if share:
         basis += f", {share:.0%} of frames lost"
-    return Cost(downlink_s, packets * RATES[uplink_rate].airtime_s, wanted, packets, basis)
+    return RequestCost(downlink_s, packets * RATES[uplink_rate].airtime_s, wanted, packets, basis)

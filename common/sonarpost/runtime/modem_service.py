@@ -91,7 +91,7 @@ class ModemService(Service[M]):
                 log.warning("Modem restarted", extra=kv(firmware=event.firmware))
             case ev.SettingRefused():
                 log.warning("Modem did not confirm a setting", extra=kv(command=event.command))
-            case ev.ModemComplained():
+            case ev.ModemError():
                 self.count("modem_errors")
                 log.warning("Modem reports an error", extra=kv(complaint=event.complaint))
             case ev.SentenceRejected():

@@ -1,7 +1,7 @@
 """The base of every service: a process that takes records, handles each once, and owes what follows from them.
 
 A service names the records it consumes in `consumes()` and handles each in `handle()`, which returns nothing but
-writes what follows into an `Effects`: records to send on and state to keep. The base commits these together with the
+writes what follows into an `UnitOfWork`: records to send on and state to keep. The base commits these together with the
 record's removal from the inbox. A service with other sources (a folder, a modem) starts them in `on_start()` and
 commits with `self.store.transaction()`.
 """
@@ -23,21 +23,21 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
-from sonarpost.bus.tls import OwnTls
+from sonarpost.bus.tls import TlsMonitor
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.delivery.disk_reserve import HANDLING_RESERVE_BYTES, Room
+from sonarpost.delivery.disk_reserve import HANDLING_RESERVE_BYTES, DiskReserve
 from sonarpost.delivery.inbox import Inbox
-from sonarpost.delivery.outbox import Lane, Outbox
+from sonarpost.delivery.outbox import Outbox, QueuePolicy
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction
-from sonarpost.delivery.unit_of_work import Effects
-from sonarpost.errors import BadInputError, HandoffError
-from sonarpost.logs import concerning_later, kv
+from sonarpost.delivery.unit_of_work import UnitOfWork
+from sonarpost.errors import BadInputError, DeliveryError
+from sonarpost.logs import kv, lazy_log_context
 from sonarpost.messages import Health, Record, ServiceState
 from sonarpost.monitoring.heartbeat import Heartbeat
-from sonarpost.monitoring.log_context import Concern
+from sonarpost.monitoring.log_context import LogContext
 
-__all__ = ["Effects", "InterruptedByStopError", "Service"]
+__all__ = ["Service", "ServiceStoppingError", "UnitOfWork"]
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ TYPES_KEPT = 1000
 """Of how many keys a service remembers what they carry."""
 
 
-class InterruptedByStopError(Exception):
+class ServiceStoppingError(Exception):
     """Raised by `Service.handle` when the service stops before the record is handled; it stays in the inbox."""
 
 
@@ -86,9 +86,9 @@ class Service(ABC, Generic[C]):
         self.failed = False
         self._stopped = False
         self.started_utc_s = time.time()
-        self._tls = OwnTls(platform.tls)
+        self._tls = TlsMonitor(platform.tls)
         self.store = Store(platform.state_dir / f"{self.NAME}.db")
-        self._room = Room(self.store, HANDLING_RESERVE_BYTES, "records wait with their senders")
+        self._room = DiskReserve(self.store, HANDLING_RESERVE_BYTES, "records wait with their senders")
         self._counters: Counter[str] = Counter()
         self._counter_lock = threading.Lock()
         self._types: dict[str, type[Record]] = {}
@@ -107,13 +107,13 @@ class Service(ABC, Generic[C]):
         return {}
 
     @abstractmethod
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Handle one record; called once a record, one at a time, in the order of arrival.
 
         Raises:
             BadInputError: The record cannot be handled, now or ever: it is kept apart, logged and counted.
-            OSError, HandoffError: It cannot be handled now (a full disk): it is tried again.
-            InterruptedByStopError: The service is stopping; the record is handled after the next start.
+            OSError, DeliveryError: It cannot be handled now (a full disk): it is tried again.
+            ServiceStoppingError: The service is stopping; the record is handled after the next start.
         """
 
     def check(self, key: str, record: Record) -> None:
@@ -133,9 +133,9 @@ class Service(ABC, Generic[C]):
         """Return those of the consumed key expressions on which plain publications are for somebody else."""
         return ()
 
-    def lane(self, queue: str) -> Lane:
+    def lane(self, queue: str) -> QueuePolicy:
         """Return how a queue of the outbox is sent."""
-        return Lane(publish=self.PUBLISH)
+        return QueuePolicy(publish=self.PUBLISH)
 
     def settled(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Act, within the transaction, on a record's consumer having taken it (None) or refused it for a reason."""
@@ -258,11 +258,11 @@ class Service(ABC, Generic[C]):
                     if self.stopping.is_set():
                         return
                     self._handle_batch(items[first : first + self.BATCH])
-            except (OSError, HandoffError) as error:
+            except (OSError, DeliveryError) as error:
                 self.problem(f"{type(error).__name__}: {error}")
                 self.stopping.wait(RETRY_AFTER_S)
                 continue
-            except InterruptedByStopError:
+            except ServiceStoppingError:
                 return
             self.problem("")
             if not items:
@@ -273,7 +273,7 @@ class Service(ABC, Generic[C]):
             for item in items:
                 self._handle_item(item)
             return
-        handled: list[tuple[Effects, InboxItem]] = []
+        handled: list[tuple[UnitOfWork, InboxItem]] = []
         try:
             for item in items:
                 effects = self._effects_of(item)
@@ -289,21 +289,21 @@ class Service(ABC, Generic[C]):
         if effects is not None:
             self.commit(effects, item)
 
-    def _effects_of(self, item: InboxItem) -> Effects | None:
+    def _effects_of(self, item: InboxItem) -> UnitOfWork | None:
         """Handle a record; return what follows, None where it cannot be handled and is kept apart.
 
         Every line that is logged meanwhile says which contact it concerns.
         """
-        about = Concern(item.payload, item.key)
-        with concerning_later(about.fields):
+        about = LogContext(item.payload, item.key)
+        with lazy_log_context(about.fields):
             return self._handled(item, about)
 
-    def _handled(self, item: InboxItem, about: Concern) -> Effects | None:
-        effects = Effects(item.payload)
+    def _handled(self, item: InboxItem, about: LogContext) -> UnitOfWork | None:
+        effects = UnitOfWork(item.payload)
         try:
             about.record = record = wire.decode(self._record_type(item.key), item.payload, item.key)
             self.handle(item.key, record, effects)
-        except (OSError, HandoffError, InterruptedByStopError):
+        except (OSError, DeliveryError, ServiceStoppingError):
             raise
         except BadInputError as error:
             self._refused(error)
@@ -323,11 +323,11 @@ class Service(ABC, Generic[C]):
             tx.refuse("in", item.key, item.payload, reason)
             tx.done(item)
 
-    def commit(self, effects: Effects, item: InboxItem | None = None) -> None:
+    def commit(self, effects: UnitOfWork, item: InboxItem | None = None) -> None:
         """Write effects, and the end of the record they come from, in one transaction."""
         self.commit_all([(effects, item)])
 
-    def commit_all(self, handled: Sequence[tuple[Effects, InboxItem | None]]) -> int:
+    def commit_all(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """Write the effects of several records, and the ends of these, in one transaction.
 
         Returns:
@@ -409,5 +409,5 @@ class Service(ABC, Generic[C]):
             self._heartbeat.beat(record, time.monotonic())
             key = keys.health(self.platform.id, self.NAME)
             self.session.put(key, wire.encode(record), encoding=wire.encoding_of(Health))
-        except (HandoffError, zenoh.ZError) as error:
+        except (DeliveryError, zenoh.ZError) as error:
             log.warning("Health not published", extra=kv(error=str(error)))

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Final
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.auth.key import SealKey, parse_key
+from sonarpost.link.auth.key import AcousticKey, parse_key
 
 _MAX_BYTES: Final = 256
 
 
-def read_key(path: Path) -> SealKey:
+def read_key(path: Path) -> AcousticKey:
     """Read a key file: 64 hexadecimal digits, readable by its owner only.
 
     Raises:

@@ -18,7 +18,7 @@ _NEW_PLACE_PINGS: Final = 5
 """So many fixes in a row that agree with each other are believed, however far from the last ones."""
 
 
-class FixGate:
+class PositionJumpFilter:
     """Takes away fixes that no carrier can have reached, one ping after the other.
 
     A fix is doubted when it lies farther from the last good one than 30 m/s and 100 m allow. Five doubted fixes in a
@@ -76,7 +76,7 @@ def mounted(ping: Ping, mounting: Mounting) -> Ping:
 
 
 @dataclass
-class Rows:
+class NavigationRows:
     """How often something was met, and where first."""
 
     count: int = 0
@@ -94,14 +94,14 @@ class Rows:
 
 
 @dataclass
-class NavigationScan:
+class NavigationStatistics:
     """Collects, in constant memory, what a user of the survey should know of its navigation."""
 
     mounting: Mounting
-    _gate: FixGate = field(default_factory=FixGate)
-    _back: Rows = field(default_factory=Rows)
-    _jumps: Rows = field(default_factory=Rows)
-    _unmounted: Rows = field(default_factory=Rows)
+    _gate: PositionJumpFilter = field(default_factory=PositionJumpFilter)
+    _back: NavigationRows = field(default_factory=NavigationRows)
+    _jumps: NavigationRows = field(default_factory=NavigationRows)
+    _unmounted: NavigationRows = field(default_factory=NavigationRows)
     _last_s: float = -math.inf
 
     def observe(self, row: int, ping: Ping) -> None:

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.navigation_check import FixGate, NavigationScan, mounted
+from sonarpost.sonar.navigation_check import NavigationStatistics, PositionJumpFilter, mounted
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.survey import Ping, Side, Survey
 
@@ -94,7 +94,7 @@ class StreamedSource(SurveySource):
         Raises:
             SurveyFileError: The file is damaged, or has no ping with a port or starboard channel.
         """
-        scan = NavigationScan(self.options.mounting)
+        scan = NavigationStatistics(self.options.mounting)
         sides: set[Side] = set()
         count = 0
         for ping in self._walk(first=True):
@@ -109,20 +109,20 @@ class StreamedSource(SurveySource):
 
     def pings(self) -> Iterator[Ping]:
         """Yield the pings with implausible fixes left out and the sonar's mounting applied."""
-        gate = FixGate()
+        gate = PositionJumpFilter()
         for ping in self._walk(first=False):
             yield mounted(gate.checked(ping), self.options.mounting)
 
 
-class HeldSource(SurveySource):
+class InMemorySource(SurveySource):
     """A survey in memory as a source, for formats whose reader holds the whole file anyway."""
 
     def __init__(self, survey: Survey, options: SurveyOptions) -> None:
         self.options = options
-        scan = NavigationScan(options.mounting)
+        scan = NavigationStatistics(options.mounting)
         for row, ping in enumerate(survey.pings):
             scan.observe(row, ping)
-        gate = FixGate()
+        gate = PositionJumpFilter()
         pings = tuple(mounted(gate.checked(ping), options.mounting) for ping in survey.pings)
         self._survey = replace(survey, pings=pings)
         warnings = (*survey.warnings, *scan.warnings(len(pings)))

@@ -15,8 +15,8 @@ from conftest import eventually
 from sonarpost import keys, wire
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.messages import Command, Contact, Decision, EncodedImage, Raster, Record
-from sonarpost.runtime.service import Effects, Service
+from sonarpost.messages import Command, Contact, Decision, EncodedImage, Pixels, Record
+from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.services.console.config import ConsoleConfig
@@ -31,8 +31,8 @@ from sonarpost.services.relay.service import RelayService
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
-from sonarpost.simulation.channel.emulator import AcousticChannel
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 
@@ -62,11 +62,11 @@ class Program(Service[ServiceConfig]):
     def consumes(self) -> Mapping[str, type[Record]]:
         return self._takes
 
-    def handle(self, key: str, record: Record, effects: Effects) -> None:
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         self.got.append(record)
 
     def owe(self, key: str, consumer: str, record: Record) -> None:
-        effects = Effects()
+        effects = UnitOfWork()
         effects.send(key, consumer, record, priority=4)
         self.commit(effects)
 
@@ -99,7 +99,9 @@ def start() -> Iterator[Callable[[Service[Any]], Any]]:
 def ports(tmp_path: Path) -> Iterator[tuple[str, str]]:
     """Modem ports of vessel and vehicle, 150 m apart, where time runs fast."""
     sites = (ModemSite(1), ModemSite(3, Position(150.0)))
-    channel = AcousticChannel(ChannelConfig(sites, WaterConfig(), pty_dir=tmp_path / "sea", time_scale=TIME_SCALE))
+    channel = ChannelEmulator(
+        ChannelConfig(sites, ChannelParameters(), pty_dir=tmp_path / "sea", time_scale=TIME_SCALE)
+    )
     channel.start()
     yield str(tmp_path / "sea" / "modem-1"), str(tmp_path / "sea" / "modem-2")
     channel.stop()
@@ -121,7 +123,7 @@ def encoded() -> EncodedImage:
     )  # fmt: skip
     return EncodedImage(
         vehicle_id="uuv-1", image_id="0007", contact=contact, codec="emb", model="", height_px=80, width_px=80,
-        stream=EmbCodec().encode(picture, 512), original_sha256=Raster.from_array(picture).sha256,
+        stream=EmbCodec().encode(picture, 512), original_sha256=Pixels.from_array(picture).sha256,
     )  # fmt: skip
 
 

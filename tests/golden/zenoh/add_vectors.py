@@ -21,7 +21,7 @@ from golden.zenoh.samples import SAMPLES  # noqa: E402  # the line above makes i
 
 from sonarpost import wire  # noqa: E402
 from sonarpost.delivery import batch_protocol as handoff_batch  # noqa: E402
-from sonarpost.delivery.protocol import Reply, attachment  # noqa: E402
+from sonarpost.delivery.protocol import AckReply, attachment  # noqa: E402
 from sonarpost.delivery.store import OutboxItem  # noqa: E402
 
 
@@ -47,11 +47,11 @@ def handoff_samples() -> dict[str, dict[str, bytes]]:
             "after-dropped-ones": attachment(bytes(range(16)), item, 0, 5),
         },
         "handoff-reply": {
-            "stored": Reply("stored").pack(),
-            "more": Reply("more", next_offset=65536).pack(),
-            "refused": Reply("refused", reason="k: v: got 2, expected 1").pack(),
-            "later": Reply("later", reason="disk is full").pack(),
-            "stored-takes-several": Reply("stored").pack(takes=128),
+            "stored": AckReply("stored").pack(),
+            "more": AckReply("more", next_offset=65536).pack(),
+            "refused": AckReply("refused", reason="k: v: got 2, expected 1").pack(),
+            "later": AckReply("later", reason="disk is full").pack(),
+            "stored-takes-several": AckReply("stored").pack(takes=128),
         },
     }
 
@@ -59,7 +59,11 @@ def handoff_samples() -> dict[str, dict[str, bytes]]:
 def batch_samples() -> dict[str, dict[str, bytes]]:
     """Return attachments and replies of queries with several records, by file and name."""
     items = [OutboxItem("c2", seq, "k", "", 4, b"\x80" * size, bytes.fromhex("11" * 32)) for seq, size in BATCH]
-    replies = [Reply("stored"), Reply("refused", reason="k: v: got 2, expected 1"), Reply("later", reason="full")]
+    replies = [
+        AckReply("stored"),
+        AckReply("refused", reason="k: v: got 2, expected 1"),
+        AckReply("later", reason="full"),
+    ]
     return {
         "handoff-batch-attachment": {
             "three-records": handoff_batch.attachment(bytes(range(16)), items),

@@ -13,9 +13,9 @@ from sonarpost.messages import (
     Health,
     LinkQuality,
     OutgoingMessage,
+    Pixels,
     QueuedImage,
     QueueState,
-    Raster,
     ReceivedMessage,
     ReconstructedImage,
     Record,
@@ -53,8 +53,8 @@ FULL_CONTACT = Contact(
     pixel_across_m=0.03125,
 )
 
-RASTER_8 = Raster(height_px=2, width_px=3, bits=8, data=bytes([0, 1, 2, 127, 128, 255]))
-RASTER_16 = Raster(height_px=1, width_px=2, bits=16, data=b"\x01\x00\xff\xfe")
+RASTER_8 = Pixels(height_px=2, width_px=3, bits=8, data=bytes([0, 1, 2, 127, 128, 255]))
+RASTER_16 = Pixels(height_px=1, width_px=2, bits=16, data=b"\x01\x00\xff\xfe")
 
 QUALITY = LinkQuality(
     snr_in_db=11.5, snr_out_db=9.25, spl_db=132.0, mse_db=-9.75, doppler=-0.125, frames=3, bad_frames=1

@@ -19,9 +19,9 @@ from sonarpost.messages import (
     Health,
     LinkQuality,
     OutgoingMessage,
+    Pixels,
     QueuedImage,
     QueueState,
-    Raster,
     ReceivedMessage,
     ReconstructedImage,
     Record,
@@ -88,10 +88,10 @@ contacts = st.builds(
 
 
 @st.composite
-def rasters(draw: st.DrawFn) -> Raster:
+def rasters(draw: st.DrawFn) -> Pixels:
     height_px, width_px, bits = draw(st.integers(1, 12)), draw(st.integers(1, 12)), draw(st.sampled_from([8, 16]))
     size = height_px * width_px * bits // 8
-    return Raster(height_px=height_px, width_px=width_px, bits=bits, data=draw(st.binary(min_size=size, max_size=size)))
+    return Pixels(height_px=height_px, width_px=width_px, bits=bits, data=draw(st.binary(min_size=size, max_size=size)))
 
 
 qualities = st.builds(
@@ -151,7 +151,7 @@ def commands(draw: st.DrawFn) -> Command:
 
 STRATEGIES: dict[type[Record], st.SearchStrategy[Any]] = {
     Contact: contacts,
-    Raster: rasters(),
+    Pixels: rasters(),
     Snippet: st.builds(Snippet, contact=contacts, picture=rasters(), source=_text(0, 2000), wide=_maybe(rasters())),
     EncodedImage: st.builds(
         EncodedImage,

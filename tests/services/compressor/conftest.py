@@ -6,7 +6,7 @@ import pytest
 
 from sonarpost import keys
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq.codebook import open_catalogue
+from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.messages import EncodedImage
 from sonarpost.services.compressor.config import CompressorConfig
@@ -35,7 +35,7 @@ def atd(crew):
 
 @pytest.fixture(scope="session")
 def vq():
-    tiles = open_catalogue("nominal-10").tiles
+    tiles = open_codebook("nominal-10").tiles
     return default_registry().create("vq", CodecResources(tiles, IndexPacking.BITS14))
 
 

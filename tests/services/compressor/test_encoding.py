@@ -10,9 +10,9 @@ from conftest import eventually
 from sonarpost import keys, wire
 from sonarpost.codec.interface import StreamHeader, to_uint8
 from sonarpost.codec.vq.codec import IndexPacking
-from sonarpost.errors import CatalogueError, ConfigError
+from sonarpost.errors import CodebookError, ConfigError
 from sonarpost.link.frames.paper.frame import format_image_id, is_image_id
-from sonarpost.messages import Contact, EncodedImage, Raster, Snippet
+from sonarpost.messages import Contact, EncodedImage, Pixels, Snippet
 from sonarpost.services.compressor.config import CompressorConfig
 from sonarpost.services.compressor.service import IMAGE_IDS, CompressorService
 
@@ -167,8 +167,8 @@ def test_every_packing_is_what_the_configuration_says(packing, begin, atd, modem
 @pytest.mark.parametrize(
     ("options", "error", "said"),
     [
-        ({"catalogue": "/nowhere/own.tiles"}, CatalogueError, "/nowhere/own.tiles"),
-        ({"catalogue": "nominal-11"}, CatalogueError, "nominal-11"),
+        ({"catalogue": "/nowhere/own.tiles"}, CodebookError, "/nowhere/own.tiles"),
+        ({"catalogue": "nominal-11"}, CodebookError, "nominal-11"),
         ({"codec": "jpeg-of-the-future"}, ConfigError, "one of"),
     ],
 )
@@ -181,7 +181,7 @@ def test_a_wrong_configuration_is_said_before_anything_is_opened(options, error,
 def test_a_damaged_catalogue_is_named(platform, tmp_path):
     path = tmp_path / "own.tiles"
     path.write_bytes(b"SPTILES\n" + bytes(100))
-    with pytest.raises(CatalogueError, match=r"own\.tiles"):
+    with pytest.raises(CodebookError, match=r"own\.tiles"):
         CompressorService(platform("uuv-1"), CompressorConfig(catalogue=str(path)))
 
 
@@ -201,6 +201,6 @@ def test_the_contact_arrives_as_it_was(begin, atd, modem, texture):
     contact = Contact(
         contact_id="full", vehicle_id="uuv-1", lat_deg=56.1, lon_deg=-5.2, atd_confidence=1.5, ping_number=7
     )
-    atd.owe(IN, "compressor", Snippet(contact=contact, picture=Raster.from_array(texture())))
+    atd.owe(IN, "compressor", Snippet(contact=contact, picture=Pixels.from_array(texture())))
     eventually(lambda: len(modem.got) == 1)
     assert modem.got[0].contact == contact

@@ -18,7 +18,7 @@ from sonarpost.services.atd_stub.seam import Origin
 from sonarpost.services.compressor.wide import wider
 from sonarpost.services.op_modem.station import order_of
 from sonarpost.services.uuv_modem.config import UuvModemConfig
-from sonarpost.services.uuv_modem.orders import OrderBook
+from sonarpost.services.uuv_modem.orders import ReceivedCommands
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 
 IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
@@ -80,8 +80,10 @@ def test_wider_of_a_real_detection_shows_twice_the_ground_from_the_vessels_order
     first = modem.got[0]
     # On the vessel a command, in the water bytes, on the vehicle a command again.
     in_the_water = dl.pack(order_of(command_record("wider", first.image_id), 7))
-    outcome, handed = OrderBook("uuv-1", UuvModemConfig(port="unused")).take(1, dl.unpack(in_the_water), first.image_id)
-    assert (outcome, handed.consumers) == (dl.Outcome.TAKEN, ("compressor",))
+    outcome, handed = ReceivedCommands("uuv-1", UuvModemConfig(port="unused")).take(
+        1, dl.unpack(in_the_water), first.image_id
+    )
+    assert (outcome, handed.consumers) == (dl.CommandOutcome.TAKEN, ("compressor",))
     crew.neighbour("uuv-1", "orders").owe(handed.key, "compressor", handed.record)
     eventually(lambda: len(modem.got) == 2)
     wide = modem.got[1]

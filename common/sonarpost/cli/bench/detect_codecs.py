@@ -20,7 +20,7 @@ from sonarpost.cli.bench.measure import Subject, code
 from sonarpost.codec.interface import Image
 from sonarpost.detection.contacts import Detection, detect
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.snippet import HIGH_PERCENTILE, LOW_PERCENTILE, Snippet, cut_snippet
+from sonarpost.detection.snippet import HIGH_PERCENTILE, LOW_PERCENTILE, SnippetCut, cut_snippet
 from sonarpost.sonar.survey import ChannelPing, Survey
 
 HEIGHT_PX: Final = 80
@@ -44,7 +44,7 @@ class Shot:
 
     survey: Survey
     found: Detection
-    cut: Snippet
+    cut: SnippetCut
     confidence: float
 
 
@@ -121,7 +121,7 @@ def effects(pictures: Sequence[Shot], subject: Subject, budgets: Sequence[int]) 
     return found
 
 
-def confidence_with(survey: Survey, found: Detection, cut: Snippet, picture: Image) -> float:
+def confidence_with(survey: Survey, found: Detection, cut: SnippetCut, picture: Image) -> float:
     """Return the greatest confidence at a contact's place with `picture` in its snippet's place; 0 without contact.
 
     Args:
@@ -150,7 +150,7 @@ def confidence_with(survey: Survey, found: Detection, cut: Snippet, picture: Ima
     )
 
 
-def _unmapped(picture: Image, cut: Snippet) -> npt.NDArray[np.float64]:
+def _unmapped(picture: Image, cut: SnippetCut) -> npt.NDArray[np.float64]:
     """Return the sample values that a picture's greys stand for, by the snippet's own mapping, backwards."""
     root = np.sqrt(cut.image16.astype(np.float64) * cut.divisor16)
     low, high = np.percentile(root, (LOW_PERCENTILE, HIGH_PERCENTILE))

@@ -14,8 +14,8 @@ from sonarpost.cli.bench.pictures import JPEG_SUFFIXES, read_jpeg
 from sonarpost.cli.bench.sdvd import survey_line
 from sonarpost.cli.bench.statistics import Interval, auc, bootstrap_weights, interval
 from sonarpost.codec.interface import to_uint8
-from sonarpost.detection.image_confidence import best_of_piece
-from sonarpost.detection.image_detector import Piece
+from sonarpost.detection.image_confidence import image_confidence
+from sonarpost.detection.image_detector import LevelImage
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.image_files import read_image
 
@@ -60,7 +60,7 @@ def _scored(folder: Path, row: dict[str, str], where: str) -> TileScore:
         raise SurveyFileError(where, "target_px", row["target_px"], "a whole number") from error
     path = folder / split / "images" / image
     pixels = read_jpeg(path) if path.suffix.lower() in JPEG_SUFFIXES else to_uint8(read_image(path))
-    best = best_of_piece(Piece(pixels, PIXEL_M, PIXEL_M))
+    best = image_confidence(LevelImage(pixels, PIXEL_M, PIXEL_M))
     return TileScore(split, image, is_target, 0.0 if best is None else best.confidence)
 
 

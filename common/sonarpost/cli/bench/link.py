@@ -26,7 +26,7 @@ from sonarpost.cli.bench.link_schemes import (
 )
 from sonarpost.cli.bench.pictures import PictureSet, read_folder, simulated_pictures
 from sonarpost.errors import ConfigError
-from sonarpost.link.coding.channel_capacity import Channel, erasure_bound_frames
+from sonarpost.link.coding.channel_capacity import LossChannel, erasure_bound_frames
 from sonarpost.link.frames.v1.frame import MAX_FRAME_BYTES, MIN_FRAME_BYTES
 
 _Row = dict[str, object]
@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
     for burst in bursts:
         for loss in losses:
             say(f"loss {loss}, burst {burst}")
-            setting = Setting(args.frames, args.frame_bytes, Channel(loss, burst), 0, args.depth, args.seed)
+            setting = Setting(args.frames, args.frame_bytes, LossChannel(loss, burst), 0, args.depth, args.seed)
             rows += measure_setting(pictures, codecs, setting, groups)
     if args.json:
         print(json.dumps({"images": len(pictures), "results": rows}, allow_nan=False))

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import Image, Mask
 from sonarpost.codec.quality import psnr_db, ssim
-from sonarpost.codec.vq.codebook import NOMINAL_TILE_PX, load_nominal
+from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.link.frames.contact_record import ContactSummary
 
@@ -77,7 +77,7 @@ class Codecs:
     @classmethod
     def shipped(cls) -> Codecs:
         """Make both with what comes with the package."""
-        return cls(EmbCodec(), VqCodec(load_nominal(NOMINAL_TILE_PX[0]).tiles, IndexPacking.BITS14))
+        return cls(EmbCodec(), VqCodec(load_default(DEFAULT_TILE_PX[0]).tiles, IndexPacking.BITS14))
 
     def code(self, pixels: Image, number: int, stream_bytes: int) -> LinkPicture:
         """Encode a picture with both."""

@@ -9,16 +9,16 @@ from typing import Final
 import numpy as np
 
 from sonarpost.cli.bench.link_pictures import GREY, Codecs, LinkPicture, Quality, judge
-from sonarpost.link.coding.channel_capacity import Channel, received_distribution
+from sonarpost.link.coding.channel_capacity import LossChannel, received_distribution
 from sonarpost.link.config import ReceiverConfig, SenderConfig
-from sonarpost.link.events import ContactUpdate, ReportReceived
+from sonarpost.link.events import ContactUpdate, FeedbackReceived
 from sonarpost.link.frames.contact_record import RECORD_SIZE
 from sonarpost.link.frames.paper.events import ContactOnly, ImageReady
 from sonarpost.link.frames.paper.frame import format_image_id
-from sonarpost.link.frames.paper.receiver import PairingReceiver
+from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import plan_packets
-from sonarpost.link.receiver import Receiver
-from sonarpost.link.sender import Sender
+from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.sender import LinkSender
 
 SEQUENTIAL_HEADER_BYTES: Final = 4
 """Checksum, picture and place: what a plain stream needs a frame."""
@@ -33,7 +33,7 @@ _MOST_STEPS: Final = 1_000_000
 class Water:
     """Loses frames as a channel does, in the order in which they are sent."""
 
-    def __init__(self, channel: Channel, seed: int) -> None:
+    def __init__(self, channel: LossChannel, seed: int) -> None:
         self._channel = channel
         self._rng = np.random.default_rng(seed)
         self._lost = bool(self._rng.random() < channel.loss)
@@ -93,7 +93,7 @@ class Setting:
 
     frames: int
     frame_bytes: int
-    channel: Channel
+    channel: LossChannel
     group: int
     depth: int
     seed: int
@@ -106,7 +106,7 @@ def run_paper(pictures: Sequence[LinkPicture], codecs: Codecs, setting: Setting)
         stream = picture.paper_stream
         packets = plan_packets(format_image_id(number), stream, picture.contact, 3, setting.frame_bytes)
         planned = [frame for packet in packets for frame in packet]
-        receiver = PairingReceiver(60.0)
+        receiver = PaperReceiver(60.0)
         events = []
         for place in range(setting.frames):
             if water.passes():
@@ -188,7 +188,7 @@ def run_v1(pictures: Sequence[LinkPicture], codecs: Codecs, setting: Setting, *,
         depth=setting.depth,
         kept_pictures=max(len(pictures), 1),
     )
-    sender, receiver = Sender(config), Receiver(ReceiverConfig(max_contacts=65535))
+    sender, receiver = LinkSender(config), LinkReceiver(ReceiverConfig(max_contacts=65535))
     for number, picture in enumerate(pictures, start=1):
         sender.add_picture(number, picture.contact, picture.stream, 0.0, picture.mean_square_error)
     latest: dict[int, ContactUpdate] = {}
@@ -204,10 +204,10 @@ def run_v1(pictures: Sequence[LinkPicture], codecs: Codecs, setting: Setting, *,
 
 
 def _exchange(
-    sender: Sender, receiver: Receiver, water: Water, *, feedback: bool
+    sender: LinkSender, receiver: LinkReceiver, water: Water, *, feedback: bool
 ) -> Iterator[tuple[float, bytes, bool]]:
     """Yield time, what arrives (empty where it is lost) and whether it is a report, of each frame sent either way."""
-    vessel, back = Sender(replace(sender.config, feedback=False)), Receiver()
+    vessel, back = LinkSender(replace(sender.config, feedback=False)), LinkReceiver()
     for step in range(1, _MOST_STEPS):
         now = step * _FRAME_S
         if sender.is_idle:
@@ -222,7 +222,7 @@ def _exchange(
         told, passed = vessel.next_frame(now), water.passes()
         yield now, b"", True
         for event in back.accept(_VESSEL, told, now) if told and passed else []:
-            if isinstance(event, ReportReceived):
+            if isinstance(event, FeedbackReceived):
                 sender.on_report(event.report, now)
 
 

@@ -15,7 +15,7 @@ from sonarpost.cli.bench.pictures import BenchPicture
 from sonarpost.codec.interface import Codec, Image
 from sonarpost.codec.quality import ms_ssim, psnr_db, ssim
 from sonarpost.codec.registry import CodecRegistry, CodecResources
-from sonarpost.codec.vq.codebook import NOMINAL_TILE_PX, open_catalogue
+from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, open_codebook
 from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.errors import ConfigError, StreamError
 
@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 PSNR_LIMIT_DB: Final = 60.0
 """A picture rebuilt without error has an infinite PSNR, which no mean survives; it counts as this."""
-SHIPPED_CATALOGUES: Final = tuple(f"nominal-{tile_px}" for tile_px in NOMINAL_TILE_PX)
+SHIPPED_CATALOGUES: Final = tuple(f"nominal-{tile_px}" for tile_px in DEFAULT_TILE_PX)
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def _with_tiles(
 ) -> list[Subject]:
     made = []
     for catalogue in catalogues:
-        tiles = open_catalogue(catalogue).tiles
+        tiles = open_codebook(catalogue).tiles
         for packing in packings:
             codec = registry.create(name, CodecResources(tiles, packing))
             made.append(Subject(codec, f"{catalogue} {packing.value}", is_natural=True))

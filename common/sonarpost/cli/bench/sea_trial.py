@@ -14,11 +14,11 @@ import numpy as np
 from sonarpost.cli.bench.codecs import say
 from sonarpost.cli.bench.pictures import BenchPicture, simulated_pictures
 from sonarpost.cli.bench.sea_trial_rig import Delivered, Sample, cross
-from sonarpost.codec.vq.codebook import load_nominal
+from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.errors import ConfigError
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.simulation.channel.channel_presets import make_water
+from sonarpost.simulation.channel.channel_presets import make_channel
 
 BOUNDARY_M: Final = 130
 """Where the paper's trial turns."""
@@ -115,9 +115,9 @@ def measure(pictures: int, seed: int, ranges_m: Sequence[int], sizes_px: Sequenc
         ranges_m: Distances.
         sizes_px: (width, height), 140 px at most.
     """
-    water = make_water({"preset": _PRESET}, "bench sea-trial")
+    water = make_channel({"preset": _PRESET}, "bench sea-trial")
     drawn = simulated_pictures(pictures, seed, max(max(size) for size in SIZES_PX)).pictures
-    codec = VqCodec(load_nominal(_TILE_PX).tiles, IndexPacking.ASCII5)
+    codec = VqCodec(load_default(_TILE_PX).tiles, IndexPacking.ASCII5)
     cells = []
     for width_px, height_px in sizes_px:
         samples = _samples(drawn, codec, width_px, height_px)

@@ -12,15 +12,15 @@ from typing import Final
 
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import format_image_id
-from sonarpost.link.frames.paper.receiver import ContactOnly, Event, ImageReady, PairingReceiver
+from sonarpost.link.frames.paper.receiver import ContactOnly, Event, ImageReady, PaperReceiver
 from sonarpost.link.frames.paper.sender import Packet, plan_packets
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import FrameReceived, ModemReady, PacketFailed, PacketSent
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
-from sonarpost.simulation.channel.channel_simulator import AcousticWorld, ModemPlace
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
 from sonarpost.simulation.modem.config import ModemConfig
 
 VESSEL: Final = 1
@@ -86,12 +86,12 @@ class Rig:
         RuntimeError: The modems do not get ready; the emulator and the driver disagree.
     """
 
-    def __init__(self, water: WaterConfig, range_m: float) -> None:
+    def __init__(self, water: ChannelParameters, range_m: float) -> None:
         places = {
             number: ModemPlace(ModemConfig(number), Position(east_m, depth_m=_DEPTH_M))
             for number, east_m in ((VESSEL, 0.0), (VEHICLE, range_m))
         }
-        self._world = AcousticWorld(water, places, serial_baud=_SERIAL_BAUD)
+        self._world = ChannelSimulator(water, places, serial_baud=_SERIAL_BAUD)
         self._drivers = {number: MicroModem(MicroModemConfig(number)) for number in places}
         self._now = 0.0
         self._ready: set[int] = set()
@@ -155,7 +155,7 @@ class Rig:
                     self._heard.append(event)
 
 
-def cross(water: WaterConfig, range_m: float, rate: int, samples: Sequence[Sample]) -> Delivered:
+def cross(water: ChannelParameters, range_m: float, rate: int, samples: Sequence[Sample]) -> Delivered:
     """Send pictures over a range, a packet at a time, and count what arrives.
 
     Args:
@@ -164,7 +164,7 @@ def cross(water: WaterConfig, range_m: float, rate: int, samples: Sequence[Sampl
         rate: Of the modem, 0..6.
         samples: The pictures, in the order of sending.
     """
-    rig, receiver = Rig(water, range_m), PairingReceiver(_WAIT_FOR_HALF_S)
+    rig, receiver = Rig(water, range_m), PaperReceiver(_WAIT_FOR_HALF_S)
     shown: dict[str, bytes | None] = {}  # stream of a whole picture, nothing of a partial one, None of a bare record
     packets = whole = second_lost = frames = good = 0
     for number, sample in enumerate(samples):

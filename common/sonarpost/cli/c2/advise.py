@@ -16,7 +16,7 @@ from sonarpost import keys
 from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.c2.options import add_site
 from sonarpost.cli.fleet_options import add_router_options, router_of
-from sonarpost.delivery.client import hand_over
+from sonarpost.delivery.client import deliver
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import Advice, Command, CommandKind, Record, Verdict
 from sonarpost.wire import expected_text
@@ -143,7 +143,7 @@ def _hand_in(parsed: argparse.Namespace, key: str, record: Record) -> None:
         session = open_with_retry(endpoints, give_up, tls)
         if session is None:
             raise PortError(f"{', '.join(endpoints)}: no router answered within {parsed.timeout:g} s")
-        hand_over(session, key, CONSUMER, record, parsed.timeout)
+        deliver(session, key, CONSUMER, record, parsed.timeout)
     finally:
         timer.cancel()
         if session is not None:

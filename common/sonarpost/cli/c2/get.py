@@ -8,7 +8,7 @@ from pathlib import Path
 from sonarpost.archive.shore_files import files_of, find_picture
 from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.cli.c2.options import add_out_dir
-from sonarpost.errors import KeptFileError
+from sonarpost.errors import StoredFileError
 from sonarpost.files import write_atomically
 
 
@@ -27,7 +27,7 @@ def run(parsed: argparse.Namespace) -> int:
     """Copy, and print a path a line; return 0.
 
     Raises:
-        KeptFileError: There is no such picture, or several, or a file of it cannot be read.
+        StoredFileError: There is no such picture, or several, or a file of it cannot be read.
         OSError: A copy cannot be written.
     """
     index = ShoreIndex(parsed.out_dir, writable=False)
@@ -40,7 +40,7 @@ def run(parsed: argparse.Namespace) -> int:
         try:
             copies.append((parsed.to / path.name, path.read_bytes()))
         except OSError as error:
-            raise KeptFileError(str(path), "", error.strerror or str(error), "a file that c2 keeps") from error
+            raise StoredFileError(str(path), "", error.strerror or str(error), "a file that c2 keeps") from error
     parsed.to.mkdir(parents=True, exist_ok=True)
     for path, data in copies:
         write_atomically(path, data)

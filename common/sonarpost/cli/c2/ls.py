@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sonarpost.archive.shore_index import DecisionRow, PictureRow, ShoreIndex, TaskingRow
+from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, TaskingRow
 from sonarpost.cli.c2.options import add_out_dir, printable, since_of, time_text
 
 PIPED_WIDTH = 160
@@ -22,7 +22,7 @@ PIPED_WIDTH = 160
 class Listed:
     """A picture and the latest decision about it."""
 
-    picture: PictureRow
+    picture: ImageRow
     decision: DecisionRow | None
 
 
@@ -73,7 +73,7 @@ def run(parsed: argparse.Namespace) -> int:
     return 0
 
 
-def join(pictures: Sequence[PictureRow], decisions: Iterable[DecisionRow]) -> list[Listed]:
+def join(pictures: Sequence[ImageRow], decisions: Iterable[DecisionRow]) -> list[Listed]:
     """Give every picture the latest decision about it.
 
     Where a vehicle began its identifiers anew, a decision is about the last picture of that name that had begun to

@@ -11,8 +11,8 @@ from rich.console import Console
 from sonarpost.cli.catalogue.images import training_images
 from sonarpost.cli.catalogue.info import print_facts
 from sonarpost.cli.catalogue.progress import ProgressDisplay
-from sonarpost.codec.vq.adaptation import Quality, adapt, measure, split
-from sonarpost.codec.vq.codebook import Catalogue, open_catalogue, save
+from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split
+from sonarpost.codec.vq.codebook import Codebook, open_codebook, save
 from sonarpost.codec.vq.training_config import MAX_TILES
 
 EXIT_SOME_FAILED = 1
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
         SonarpostError: Fewer than two images can be read, an argument is wrong, or the catalogue cannot be written.
     """
     console = Console(stderr=True)
-    base = open_catalogue(args.base).tiles
+    base = open_codebook(args.base).tiles
     images, failed = training_images(args.images, console)
     training, held_out = split(images)
     with ProgressDisplay(console) as display:
@@ -59,14 +59,14 @@ def run(args: argparse.Namespace) -> int:
         "new tiles": str(adapted.new),
         **gain,
     }
-    save(args.out, Catalogue(adapted.tiles, notes))
+    save(args.out, Codebook(adapted.tiles, notes))
     print_facts({"tiles": str(len(adapted.tiles)), "identity": adapted.tiles.identity, **notes})
     if np.mean([quality.psnr_db for quality in after]) <= np.mean([quality.psnr_db for quality in before]):
         console.print("no gain on the images held out: the base serves this seabed as well", markup=False)
     return EXIT_SOME_FAILED if failed else 0
 
 
-def _gain(before: list[Quality], after: list[Quality]) -> dict[str, str]:
+def _gain(before: list[CodebookQuality], after: list[CodebookQuality]) -> dict[str, str]:
     """Tell mean PSNR and figure of merit over the pictures held out, and how many of them became better."""
     gains = {}
     for name, values in (

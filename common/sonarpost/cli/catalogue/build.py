@@ -12,10 +12,10 @@ from sonarpost.cli.catalogue.images import training_images
 from sonarpost.cli.catalogue.info import show
 from sonarpost.cli.catalogue.progress import ProgressDisplay
 from sonarpost.codec.vq.builder import build
-from sonarpost.codec.vq.codebook import Catalogue, open_catalogue, save
+from sonarpost.codec.vq.codebook import Codebook, open_codebook, save
 from sonarpost.codec.vq.tiles import MAX_DIMS
 from sonarpost.codec.vq.training_config import MAX_TILES, Round, rms_distance
-from sonarpost.errors import CatalogueError, ConfigError
+from sonarpost.errors import CodebookError, ConfigError
 
 DEFAULT_ROUNDS = "39:16"
 EXIT_SOME_FAILED = 1
@@ -60,10 +60,10 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError("--refine", "", args.refine, "zero or more passes")
     journal = args.out.with_name(args.out.name + ".journal")
     if journal.exists() and not args.resume:
-        raise CatalogueError(str(journal), "", "a build that was stopped", "--resume to go on, or remove the journal")
+        raise CodebookError(str(journal), "", "a build that was stopped", "--resume to go on, or remove the journal")
     console = Console(stderr=True)
     images, failed = training_images(args.images, console)
-    core = open_catalogue(args.core).tiles if args.core is not None else None
+    core = open_codebook(args.core).tiles if args.core is not None else None
     with ProgressDisplay(console) as display:
         database = build(
             images,
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     notes = {"images": str(len(images)), "rounds": args.rounds, "refine passes": str(args.refine)}
     if core is not None:
         notes["core"] = f"{args.core} {core.identity}"
-    catalogue = Catalogue(database, notes)
+    catalogue = Codebook(database, notes)
     save(args.out, catalogue)
     journal.unlink()
     show(catalogue)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sonarpost.cli.catalogue.humminbird_lines import humminbird_lines
-from sonarpost.codec.vq.builder import Told, build
-from sonarpost.codec.vq.codebook import Catalogue
-from sonarpost.codec.vq.patches import WindowPlan, cut_line, shuffled
+from sonarpost.codec.vq.builder import ProgressCallback, build
+from sonarpost.codec.vq.codebook import Codebook
+from sonarpost.codec.vq.patches import PatchPlan, cut_line, shuffled
 from sonarpost.codec.vq.training_config import Round, TrainingImage, rms_distance
 
 SOURCES = (
@@ -53,15 +53,15 @@ RECIPES = (Recipe(10, 15_992, _rounds(10), 2), Recipe(20, 15_992, _rounds(20), 2
 
 def humminbird_images(folder: Path) -> list[TrainingImage]:
     """Cut the recording into training images (see `humminbird_lines` for the folder and the errors)."""
-    plan = WindowPlan(copies=2)
+    plan = PatchPlan(copies=2)
     return [image for name, line in humminbird_lines(folder).items() for image in cut_line(name, line, plan)]
 
 
 def build_nominal(
     recipe: Recipe,
     images: Sequence[TrainingImage],
-    progress: Told | None = None,
-) -> Catalogue:
+    progress: ProgressCallback | None = None,
+) -> Codebook:
     """Build one of the shipped catalogues; the same images, in any order, give the same bytes."""
     images = shuffled(images)
     tiles = build(
@@ -77,4 +77,4 @@ def build_nominal(
         "rounds": rounds,
         "refine passes": str(recipe.passes),
     }
-    return Catalogue(tiles, notes)
+    return Codebook(tiles, notes)

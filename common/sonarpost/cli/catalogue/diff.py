@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 from sonarpost.cli.catalogue.info import print_facts
-from sonarpost.codec.vq.codebook import open_catalogue
-from sonarpost.codec.vq.comparison import OneSide, compare
+from sonarpost.codec.vq.codebook import open_codebook
+from sonarpost.codec.vq.comparison import UnmatchedTiles, compare
 
 EXIT_DIFFERENT = 1
 
@@ -27,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         CatalogueError: One cannot be read, or their tiles are of different size.
     """
-    first, second = open_catalogue(args.first).tiles, open_catalogue(args.second).tiles
+    first, second = open_codebook(args.first).tiles, open_codebook(args.second).tiles
     difference = compare(first, second)
     print_facts(
         {
@@ -45,13 +45,13 @@ def run(args: argparse.Namespace) -> int:
     return 0 if difference.same_identity else EXIT_DIFFERENT
 
 
-def _only(side: OneSide, other: str) -> str:
+def _only(side: UnmatchedTiles, other: str) -> str:
     return (
         f"{side.only_here} tiles; from all to the nearest in {other}: median {side.rms_median:.2f}, "
         f"95 % within {side.rms_95:.2f}, at most {side.rms_largest:.2f} grey levels RMS"
     )
 
 
-def _variance(side: OneSide, own: str, other: str) -> str:
+def _variance(side: UnmatchedTiles, own: str, other: str) -> str:
     own_part, other_part = 100 * side.variance_own, 100 * side.variance_other
     return f"{own_part:.2f} % seen by the basis of {own}, {other_part:.2f} % by that of {other}"

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.vq.patches import Line
-from sonarpost.errors import CatalogueError
+from sonarpost.codec.vq.patches import SonarLine
+from sonarpost.errors import CodebookError
 from sonarpost.sonar.image_files import read_image
 
 CHANNELS = ("B002", "B003")
@@ -26,7 +26,7 @@ _COUNT = struct.Struct(">BIB")  # the last six bytes of the header
 _MAX_SAMPLES = 1 << 16
 
 
-def humminbird_lines(folder: Path) -> dict[str, Line]:
+def humminbird_lines(folder: Path) -> dict[str, SonarLine]:
     """Read both channels, from the recording itself or from images made of it.
 
     Args:
@@ -38,7 +38,7 @@ def humminbird_lines(folder: Path) -> dict[str, Line]:
         give the same lines.
 
     Raises:
-        CatalogueError: A channel is not there, or the recording is damaged.
+        CodebookError: A channel is not there, or the recording is damaged.
         SurveyFileError: An image cannot be read.
     """
     return {f"humminbird {channel}": _without_padding(_channel(folder, channel)) for channel in CHANNELS}
@@ -54,11 +54,11 @@ def read_channel(son: Path) -> npt.NDArray[np.uint8]:
         Shape (pings, samples of the longest), uint8, zeros after the end of a shorter ping.
 
     Raises:
-        CatalogueError: A file cannot be read or is damaged; the message names the ping.
+        CodebookError: A file cannot be read or is damaged; the message names the ping.
     """
     data, index = _read(son), _read(son.with_suffix(".IDX"))
     if len(index) % 8 or not index:
-        raise CatalogueError(str(son.with_suffix(".IDX")), "length", f"{len(index)} B", "8 B for each ping")
+        raise CodebookError(str(son.with_suffix(".IDX")), "length", f"{len(index)} B", "8 B for each ping")
     offsets = np.frombuffer(index, dtype=">u4")[1::2].tolist()
     pings = [_ping(data, offset, f"{son} ping {number}") for number, offset in enumerate(offsets)]
     image = np.zeros((len(pings), max(ping.size for ping in pings)), dtype=np.uint8)
@@ -70,13 +70,13 @@ def read_channel(son: Path) -> npt.NDArray[np.uint8]:
 def _ping(data: bytes, offset: int, where: str) -> npt.NDArray[np.uint8]:
     header = data[offset : offset + _HEADER_BYTES]
     if len(header) < _HEADER_BYTES or not header.startswith(_START):
-        raise CatalogueError(where, "header", header[:8], f"{_HEADER_BYTES} B that begin with C0 DE AB 21")
+        raise CodebookError(where, "header", header[:8], f"{_HEADER_BYTES} B that begin with C0 DE AB 21")
     tag, count, end = _COUNT.unpack(header[-_COUNT.size :])
     if (tag, end) != (0xA0, 0x21):
-        raise CatalogueError(where, "header", header[-_COUNT.size :], "A0, the number of samples, 21 at its end")
+        raise CodebookError(where, "header", header[-_COUNT.size :], "A0, the number of samples, 21 at its end")
     first = offset + _HEADER_BYTES
     if not 1 <= count <= min(_MAX_SAMPLES, len(data) - first):
-        raise CatalogueError(where, "samples", count, f"1..{_MAX_SAMPLES}, no more than the file holds")
+        raise CodebookError(where, "samples", count, f"1..{_MAX_SAMPLES}, no more than the file holds")
     return np.frombuffer(data, np.uint8, count, first)
 
 
@@ -87,11 +87,11 @@ def _channel(folder: Path, channel: str) -> npt.NDArray[np.generic]:
     images = sorted(folder.glob(f"*{channel}*.png"))
     if recordings or len(images) != 1:
         met = [path.name for path in (*recordings, *images)]
-        raise CatalogueError(str(folder), channel, met, f"one {channel}.SON, or one PNG with {channel} in its name")
+        raise CodebookError(str(folder), channel, met, f"one {channel}.SON, or one PNG with {channel} in its name")
     return read_image(images[0])
 
 
-def _without_padding(image: npt.NDArray[np.generic]) -> Line:
+def _without_padding(image: npt.NDArray[np.generic]) -> SonarLine:
     """Return the line with the zeros after the end of each ping as NaN."""
     line = image.astype(np.float32)
     line[np.cumsum(line[:, ::-1] != 0, axis=1)[:, ::-1] == 0] = np.nan
@@ -102,4 +102,4 @@ def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise CatalogueError(str(path), "", error.strerror or str(error), "a file of the recording") from error
+        raise CodebookError(str(path), "", error.strerror or str(error), "a file of the recording") from error

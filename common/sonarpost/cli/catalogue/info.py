@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from sonarpost.codec.vq.codebook import Catalogue, open_catalogue
-from sonarpost.codec.vq.codec import catalogue_tag
+from sonarpost.codec.vq.codebook import Codebook, open_codebook
+from sonarpost.codec.vq.codec import codebook_tag
 
 
 def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -21,11 +21,11 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         CatalogueError: It cannot be read.
     """
-    show(open_catalogue(args.catalogue))
+    show(open_codebook(args.catalogue))
     return 0
 
 
-def show(catalogue: Catalogue) -> None:
+def show(catalogue: Codebook) -> None:
     """Print size, identity and notes."""
     tiles = catalogue.tiles
     print_facts(
@@ -33,7 +33,7 @@ def show(catalogue: Catalogue) -> None:
             "tiles": f"{len(tiles)} of {tiles.tile_px} x {tiles.tile_px} px",
             "dimensions": f"{tiles.dims} of {tiles.tile_px**2}",
             "identity": tiles.identity,
-            "tag in streams": f"{catalogue_tag(tiles):#06x}",
+            "tag in streams": f"{codebook_tag(tiles):#06x}",
             **catalogue.notes,
         }
     )

@@ -12,7 +12,7 @@ from rich.console import Console
 from sonarpost.cli.catalogue.default_codebooks import RECIPES, Recipe, build_nominal, humminbird_images
 from sonarpost.cli.catalogue.progress import ProgressDisplay
 from sonarpost.codec.vq.codebook import load, save
-from sonarpost.codec.vq.patches import Line, WindowPlan, cut_around, cut_line
+from sonarpost.codec.vq.patches import PatchPlan, SonarLine, cut_around, cut_line
 from sonarpost.codec.vq.training_config import TrainingImage
 from sonarpost.errors import ConfigError
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
@@ -65,14 +65,14 @@ def run(args: argparse.Namespace) -> int:
 
 def simulated_images(console: Console) -> Iterator[TrainingImage]:
     """Yield windows of simulated lines over every kind of bottom, and of the objects that lie there."""
-    bottom = WindowPlan(reductions=SIMULATED_REDUCTIONS, per_reduction=16, least_std=4.0)
-    objects = WindowPlan(reductions=SIMULATED_REDUCTIONS[:5], copies=2)
+    bottom = PatchPlan(reductions=SIMULATED_REDUCTIONS, per_reduction=16, least_std=4.0)
+    objects = PatchPlan(reductions=SIMULATED_REDUCTIONS[:5], copies=2)
     for spec in SIMULATED_SURVEYS:
         simulated = simulate_survey(spec)
         name = simulated.survey.line_name
         console.print(f"{name}: simulated")
         for side in simulated.survey.sides():
-            line: Line = simulated.survey.waterfall(side)
+            line: SonarLine = simulated.survey.waterfall(side)
             yield from cut_line(f"{name} {side.value}", line, bottom)
             places = [(thing.ping, thing.sample_index) for thing in simulated.truth if thing.side is side]
             yield from cut_around(f"{name} {side.value}", line, places, objects)

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from sonarpost.codec.vq.training_config import PassProgress, Progress
+from sonarpost.codec.vq.training_config import BuildProgress, RefinementProgress
 
 LINE_EVERY_S = 10.0
 
@@ -42,9 +42,9 @@ class ProgressDisplay:
     ) -> None:
         self._bar.stop()
 
-    def build(self, progress: Progress | PassProgress) -> None:
+    def build(self, progress: BuildProgress | RefinementProgress) -> None:
         """Show where a build stands."""
-        if isinstance(progress, Progress):
+        if isinstance(progress, BuildProgress):
             step = f"round {progress.round_number + 1} of {progress.rounds}"
             self.show(step, progress.done_in_round, progress.images_in_round, f"{progress.tiles} tiles")
             return

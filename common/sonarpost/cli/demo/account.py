@@ -13,7 +13,7 @@ from sonarpost.errors import FrameError
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.events import ContactUpdate
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, parse_frame
-from sonarpost.link.receiver import Receiver
+from sonarpost.link.receiver import LinkReceiver
 
 
 @dataclass
@@ -36,7 +36,7 @@ class ChannelAccount:
     acoustic_s: float = 0.0
     images_through: set[str] = field(default_factory=set)
     frames_through: Counter[tuple[str, str]] = field(default_factory=Counter)
-    _v1: Receiver = field(default_factory=Receiver)
+    _v1: LinkReceiver = field(default_factory=LinkReceiver)
 
     def add_frame(self, content: bytes, *, heard: bool) -> None:
         """Count one frame; `content` is what the receiver got."""

@@ -13,9 +13,9 @@ from sonarpost.cli.demo.account import Result
 from sonarpost.cli.demo.settings import ChainSettings
 from sonarpost.cli.demo.sheet import SheetRow, write_sheet
 from sonarpost.cli.demo.watch import Watcher
-from sonarpost.codec.interface import Decoded
+from sonarpost.codec.interface import DecodedImage
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq.codebook import open_catalogue
+from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.messages import EncodedImage, ReconstructedImage
 
 _COLUMNS: tuple[tuple[str, Literal["left", "right"]], ...] = (
@@ -37,9 +37,9 @@ def show(watcher: Watcher, settings: ChainSettings, result: Result, console: Con
     _print_summary(result, sheet, console)
 
 
-def _as_sent(image: EncodedImage, settings: ChainSettings) -> Decoded:
+def _as_sent(image: EncodedImage, settings: ChainSettings) -> DecodedImage:
     """Decode the stream as it left the vehicle, nothing lost."""
-    resources = CodecResources(open_catalogue(settings.catalogue).tiles)
+    resources = CodecResources(open_codebook(settings.catalogue).tiles)
     return default_registry().create_for_stream(image.stream, resources).decode(image.stream)
 
 

@@ -19,7 +19,7 @@ from sonarpost.link.events import ContactUpdate
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import parse_frame
 from sonarpost.link.frames.paper.sender import plan_packets
-from sonarpost.link.receiver import Receiver
+from sonarpost.link.receiver import LinkReceiver
 from sonarpost.messages import AcousticFrame, EncodedImage, Health, QueueState, ReconstructedImage, Record, Snippet
 from sonarpost.modem.micromodem.rates import RATES
 
@@ -61,7 +61,7 @@ class Watcher:
         self.accepted: set[str] = set()
         self.health: dict[str, Health] = {}
         self.queue: QueueState | None = None
-        self._v1 = Receiver()
+        self._v1 = LinkReceiver()
         self.packets_sent = 0
         self.changes = 0
         self._packets: set[tuple[float, int]] = set()

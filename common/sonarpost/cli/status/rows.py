@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from sonarpost.monitoring.fleet import FleetState, Seen
+from sonarpost.monitoring.fleet import FleetState, ServiceStatus
 
 Mood = Literal["good", "bad", "doubtful", "gone"]
 
@@ -61,7 +61,7 @@ def is_well(rows: tuple[Row, ...], state: FleetState) -> bool:
     return state.connected and bool(rows) and all(row.mood == "good" for row in rows)
 
 
-def _row(seen: Seen, stale_after_s: float) -> Row:
+def _row(seen: ServiceStatus, stale_after_s: float) -> Row:
     health = seen.health
     words, mood = _state(seen, stale_after_s)
     gauges: Mapping[str, float] = health.gauges if health else {}
@@ -79,7 +79,7 @@ def _row(seen: Seen, stale_after_s: float) -> Row:
     )
 
 
-def _state(seen: Seen, stale_after_s: float) -> tuple[str, Mood]:
+def _state(seen: ServiceStatus, stale_after_s: float) -> tuple[str, Mood]:
     health = seen.health
     if seen.alive is False:
         return ("stopped" if health is not None and health.state == "stopping" else "gone"), "gone"

@@ -33,7 +33,7 @@ from sonarpost.codec.baselines.huffman_levels import (
     read_levels,
     reduced_side,
 )
-from sonarpost.codec.interface import Decoded, Mask, StreamHeader, arrived_body, check_image, to_uint8
+from sonarpost.codec.interface import DecodedImage, Mask, StreamHeader, check_image, received_body, to_uint8
 from sonarpost.errors import ConfigError, StreamError
 
 CODEC_ID = 0x01
@@ -94,7 +94,7 @@ class HuffmanCodec:
             raise StreamError("codec huffman", "budget_bytes", budget_bytes, f"at least {len(header) + 3} B")
         return header + coded.body()
 
-    def decode(self, stream: bytes, received: Mask | None = None) -> Decoded:
+    def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
         """Rebuild the picture; pixels behind the first byte that did not arrive are black and missing.
 
         Args:
@@ -105,7 +105,7 @@ class HuffmanCodec:
             StreamError: The header is wrong, the stream is another codec's, or levels or code lengths cannot be
                 right.
         """
-        header, body, notes = arrived_body(stream, received, CODEC_ID, self.name)
+        header, body, notes = received_body(stream, received, CODEC_ID, self.name)
         shape = (header.height_px, header.width_px)
         bits = Bits(body)
         try:
@@ -115,7 +115,7 @@ class HuffmanCodec:
             )
         except EndOfBitsError:
             notes.append(f"body ends after {len(body)} B, before the first pixel")
-            return Decoded(np.zeros(shape, np.uint8), np.ones(shape, np.bool_), tuple(notes))
+            return DecodedImage(np.zeros(shape, np.uint8), np.ones(shape, np.bool_), tuple(notes))
         if count < len(symbols):
             notes.append(f"{len(symbols) - count} of {len(symbols)} pixels did not arrive")
         elif bits.bytes_left:
@@ -125,4 +125,4 @@ class HuffmanCodec:
         rebuilt = enlarge(levels[symbols].reshape(small).astype(np.uint8), shape)
         missing = enlarge_mask(lost, shape)
         rebuilt[missing] = 0
-        return Decoded(rebuilt, missing, tuple(notes))
+        return DecodedImage(rebuilt, missing, tuple(notes))

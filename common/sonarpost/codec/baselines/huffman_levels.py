@@ -25,7 +25,7 @@ _Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Coded:
+class QuantisedImage:
     """A quantised picture, ready to be written.
 
     Attributes:
@@ -80,7 +80,7 @@ def enlarge_mask(lost: Mask, shape: tuple[int, int]) -> Mask:
     return np.asarray(np.array(resized) > 0, dtype=np.bool_)
 
 
-def nearest(image: Image, limit_bits: int) -> Coded | None:
+def nearest(image: Image, limit_bits: int) -> QuantisedImage | None:
     """Return the quantised picture, reduced or not, that fits and is nearest to `image`, or None."""
     best, least = None, 0
     for coded in _finest_each(image, limit_bits):
@@ -93,7 +93,7 @@ def nearest(image: Image, limit_bits: int) -> Coded | None:
     return best
 
 
-def _finest_each(image: Image, limit_bits: int) -> Iterator[Coded]:
+def _finest_each(image: Image, limit_bits: int) -> Iterator[QuantisedImage]:
     """Return the finest equally spaced levels that fit, then the finest chosen ones in each resolution."""
     spaced = (_spaced(image, step) for step in range(1, MAX_CHOSEN_LEVELS))
     yield from islice((coded for coded in spaced if coded is not None and coded.bits <= limit_bits), 1)
@@ -105,7 +105,7 @@ def _finest_each(image: Image, limit_bits: int) -> Iterator[Coded]:
         yield from islice((coded for coded in chosen if coded.bits <= limit_bits), 1)
 
 
-def _spaced(image: Image, step: int) -> Coded | None:
+def _spaced(image: Image, step: int) -> QuantisedImage | None:
     """Quantise to levels `step` apart, or return None if those are few enough to be chosen."""
     low, high = int(image.min()), int(image.max())
     count = (high - low) // step + 1
@@ -120,7 +120,7 @@ def _spaced_levels(low: int, step: int, count: int) -> Integers:
     return np.minimum(low + step * np.arange(count, dtype=np.int64) + (step - 1) // 2, 255)
 
 
-def chosen_levels(image: Image, scale: int, counts: Iterable[int]) -> Iterator[Coded]:
+def chosen_levels(image: Image, scale: int, counts: Iterable[int]) -> Iterator[QuantisedImage]:
     """Quantise to so many levels with the least squared error, for each number in `counts`."""
     greys, counted = np.unique(image, return_counts=True)
     starts = _least_error_starts(greys.astype(np.float64), counted.astype(np.float64))
@@ -160,13 +160,13 @@ def _least_error_starts(greys: _Floats, counted: _Floats) -> Integers:
     return starts
 
 
-def _coded(scale: int, prefix: bytes, levels: Integers, symbols: Integers) -> Coded:
+def _coded(scale: int, prefix: bytes, levels: Integers, symbols: Integers) -> QuantisedImage:
     counts = np.bincount(symbols.ravel(), minlength=len(levels)).tolist()
     lengths = code_lengths(counts)
     bits = 8 * len(prefix) + sum(c * length for c, length in zip(counts, lengths, strict=True))
     if len(levels) > 2:
         bits += sum(len(gamma(value)) for value in differences(lengths))
-    return Coded(scale, prefix, levels, lengths, symbols, bits)
+    return QuantisedImage(scale, prefix, levels, lengths, symbols, bits)
 
 
 def read_levels(bits: Bits) -> tuple[int, Integers]:

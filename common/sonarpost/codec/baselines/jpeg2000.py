@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image as Pillow
 
-from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, arrived_body, check_image, to_uint8
+from sonarpost.codec.interface import DecodedImage, Image, Mask, StreamHeader, check_image, received_body, to_uint8
 from sonarpost.errors import ConfigError, StreamError
 
 RAW_CODEC_ID = 0x02
@@ -152,7 +152,7 @@ class Jpeg2000Codec:
             raise StreamError(f"codec {self.name}", "budget_bytes", budget_bytes, needed)
         return header + self._body(best, grey.shape)
 
-    def decode(self, stream: bytes, received: Mask | None = None) -> Decoded:
+    def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
         """Rebuild the picture.
 
         Args:
@@ -164,7 +164,7 @@ class Jpeg2000Codec:
             StreamError: The header is wrong, the stream is another codec's, or the codestream is cut or damaged so that
                 OpenJPEG refuses it.
         """
-        header, body, notes = arrived_body(stream, received, self.codec_id, self.name)
+        header, body, notes = received_body(stream, received, self.codec_id, self.name)
         shape = (header.height_px, header.width_px)
         try:
             image = self._decode_body(body, shape)
@@ -172,8 +172,8 @@ class Jpeg2000Codec:
             if received is None or received.all():
                 raise
             notes.append(f"nothing can be decoded: {error}")
-            return Decoded(np.zeros(shape, np.uint8), np.ones(shape, np.bool_), tuple(notes))
-        return Decoded(image, np.zeros(shape, np.bool_), tuple(notes))
+            return DecodedImage(np.zeros(shape, np.uint8), np.ones(shape, np.bool_), tuple(notes))
+        return DecodedImage(image, np.zeros(shape, np.bool_), tuple(notes))
 
     def _decode_body(self, body: bytes, shape: tuple[int, int]) -> Image:
         if not self.packets_only:

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.baselines.spiht_passes import MAX_PLANES, EndOfBits, PictureAnswers, StreamAnswers, run_passes
+from sonarpost.codec.baselines.spiht_passes import MAX_PLANES, DecoderTests, EncoderTests, EndOfBits, run_passes
 from sonarpost.codec.baselines.spiht_wavelet import Forest, Integers, forest_of, inverse, transform
-from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, arrived_body, check_image, to_uint8
+from sonarpost.codec.interface import DecodedImage, Image, Mask, StreamHeader, check_image, received_body, to_uint8
 from sonarpost.errors import ConfigError, StreamError
 
 CODEC_ID = 0x04
@@ -92,7 +92,7 @@ class SpihtCodec:
         errors = [int(((_read_body(body, forest).astype(np.int64) - grey) ** 2).sum()) for body in bodies]
         return header + bodies[errors.index(min(errors))]
 
-    def decode(self, stream: bytes, received: Mask | None = None) -> Decoded:
+    def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
         """Rebuild the picture from the bytes up to the first that did not arrive.
 
         Every coefficient bears on a wide neighbourhood and the coarse ones come first, so a cut stream gives the whole
@@ -105,18 +105,18 @@ class SpihtCodec:
         Raises:
             StreamError: The header is wrong, the stream is another codec's, or its highest plane cannot be right.
         """
-        header, body, notes = arrived_body(stream, received, CODEC_ID, self.name)
+        header, body, notes = received_body(stream, received, CODEC_ID, self.name)
         if 8 * len(body) < _PREFIX_BITS:
             shape = (header.height_px, header.width_px)
             notes.append(f"{len(body)} B of the body arrived, at least 2 are needed")
-            return Decoded(np.zeros(shape, np.uint8), np.ones(shape, np.bool_), tuple(notes))
+            return DecodedImage(np.zeros(shape, np.uint8), np.ones(shape, np.bool_), tuple(notes))
         image = _read_body(body, forest_of(header.height_px, header.width_px))
-        return Decoded(image, np.zeros(image.shape, np.bool_), tuple(notes))
+        return DecodedImage(image, np.zeros(image.shape, np.bool_), tuple(notes))
 
 
 def _write_body(flat: Integers, mean: int, phase: int, forest: Forest, loops: int, length: int | None) -> bytes:
     """Return a body of at most `length` bytes, of at most `loops` planes."""
-    picture = PictureAnswers(flat, phase, forest, None if length is None else 8 * length - _PREFIX_BITS)
+    picture = EncoderTests(flat, phase, forest, None if length is None else 8 * length - _PREFIX_BITS)
     top = picture.planes - 1
     with suppress(EndOfBits):
         run_passes(forest, range(top, max(top - loops, -1), -1), picture.tests())
@@ -131,7 +131,7 @@ def _read_body(body: bytes, forest: Forest) -> Image:
     mean, phase, top = (body[0] >> 3), (body[0] >> 1) & 3, (body[0] & 1) << 4 | body[1] >> 4
     if top >= MAX_PLANES:
         raise StreamError("spiht body", "highest plane", top, f"0..{MAX_PLANES - 1}")
-    stream = StreamAnswers(bits[_PREFIX_BITS:], forest)
+    stream = DecoderTests(bits[_PREFIX_BITS:], forest)
     with suppress(EndOfBits):
         run_passes(forest, range(top, -1, -1), stream.tests())
     return inverse(stream.coefficients(phase), _MEAN_STEP * mean + _MEAN_STEP // 2, forest)

@@ -21,7 +21,7 @@ class EndOfBits(Exception):  # noqa: N818  (no error: the budget is full, or the
 
 
 @dataclass(frozen=True)
-class Tests:
+class SignificanceTests:
     """The questions SPIHT asks about a coefficient in a plane; answered from the picture, or from the stream."""
 
     significant: Callable[[int, int], bool]
@@ -31,7 +31,7 @@ class Tests:
     refined: Callable[[int, int], None]
 
 
-def run_passes(forest: Forest, planes: range, ask: Tests) -> None:
+def run_passes(forest: Forest, planes: range, ask: SignificanceTests) -> None:
     """Ask every question in SPIHT's order, plane by plane; ends early when a test raises EndOfBits.
 
     Encoder and decoder are this one routine, so they cannot disagree about the order.
@@ -67,7 +67,7 @@ def run_passes(forest: Forest, planes: range, ask: Tests) -> None:
         known += found
 
 
-class PictureAnswers:
+class EncoderTests:
     """Answers from the quantised coefficients, and writes each answer."""
 
     def __init__(self, flat: Integers, phase: int, forest: Forest, limit: int | None) -> None:
@@ -85,9 +85,9 @@ class PictureAnswers:
         self._levels, self._below, self._beyond = quantised.tolist(), below.tolist(), beyond.tolist()
         self._signs = (flat < 0).tolist()
 
-    def tests(self) -> Tests:
+    def tests(self) -> SignificanceTests:
         """Return the questions, each of which writes its answer; at the limit they raise EndOfBits."""
-        return Tests(
+        return SignificanceTests(
             lambda node, plane: self._write(bool(self._levels[node] >> plane)),
             lambda node: self._write(self._signs[node]),
             lambda node, plane: self._write(bool(self._below[node] >> plane)),
@@ -105,7 +105,7 @@ class PictureAnswers:
         return answer
 
 
-class StreamAnswers:
+class DecoderTests:
     """Answers from the stream, and keeps what is known of each coefficient: a lower bound and an interval."""
 
     def __init__(self, bits: bytes, forest: Forest) -> None:
@@ -115,10 +115,10 @@ class StreamAnswers:
         self.sign = [1] * forest.size
         self._last = 0
 
-    def tests(self) -> Tests:
+    def tests(self) -> SignificanceTests:
         """Return the questions, each of which reads its answer; at the end they raise EndOfBits."""
         read = self._read
-        return Tests(
+        return SignificanceTests(
             self._significant, self._negative, lambda _node, _plane: read(), lambda _node, _plane: read(), self._refined
         )
 

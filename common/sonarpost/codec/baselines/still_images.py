@@ -27,7 +27,7 @@ from PIL import Image as Pillow
 from PIL import features
 
 from sonarpost.codec.baselines.avif_file import avif_file, check_frame, frame_of
-from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, arrived_body, check_image, to_uint8
+from sonarpost.codec.interface import DecodedImage, Image, Mask, StreamHeader, check_image, received_body, to_uint8
 from sonarpost.errors import ConfigError, StreamError
 
 NATURAL_QUALITY = 30
@@ -37,7 +37,7 @@ _KEY_FRAME_TAG = 3  # bytes
 _START_CODE = b"\x9d\x01\x2a"
 
 
-class ModernFormat(Enum):
+class StillImageFormat(Enum):
     """A format, by its name in the registry."""
 
     JPEGXL = "jpegxl"
@@ -52,18 +52,18 @@ class ModernFormat(Enum):
     @property
     def needs(self) -> str:
         """What has to be installed, for people."""
-        return "pillow-jxl-plugin" if self is ModernFormat.JPEGXL else f"a Pillow built with {self.value}"
+        return "pillow-jxl-plugin" if self is StillImageFormat.JPEGXL else f"a Pillow built with {self.value}"
 
     @property
     def available(self) -> bool:
         """Whether the library is there."""
-        if self is ModernFormat.JPEGXL:
+        if self is StillImageFormat.JPEGXL:
             return importlib.util.find_spec("pillow_jxl") is not None
         return bool(features.check(self.value))
 
 
 @dataclass(frozen=True)
-class ModernCodec:
+class StillImageCodec:
     """A format of a library. Satisfies `sonarpost.codec.interface.Codec`.
 
     Attributes:
@@ -74,7 +74,7 @@ class ModernCodec:
         ConfigError: The library is not installed, or `quality` is out of bounds.
     """
 
-    format: ModernFormat
+    format: StillImageFormat
     quality: int = NATURAL_QUALITY
 
     def __post_init__(self) -> None:
@@ -118,7 +118,7 @@ class ModernCodec:
             raise StreamError(f"codec {self.name}", "budget_bytes", budget_bytes, "more: not the lowest quality fits")
         return header + body
 
-    def decode(self, stream: bytes, received: Mask | None = None) -> Decoded:
+    def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
         """Rebuild the picture.
 
         Args:
@@ -130,7 +130,7 @@ class ModernCodec:
             StreamError: The header is wrong, the stream is another codec's, or the body is cut, damaged, or a picture
                 of another size.
         """
-        header, body, notes = arrived_body(stream, received, self.codec_id, self.name)
+        header, body, notes = received_body(stream, received, self.codec_id, self.name)
         shape = (header.height_px, header.width_px)
         try:
             image = _decode(self.format, body, shape)
@@ -138,11 +138,11 @@ class ModernCodec:
             if received is None or received.all():
                 raise
             notes.append(f"nothing can be decoded: {error}")
-            return Decoded(np.zeros(shape, np.uint8), np.ones(shape, np.bool_), tuple(notes))
-        return Decoded(image, np.zeros(shape, np.bool_), tuple(notes))
+            return DecodedImage(np.zeros(shape, np.uint8), np.ones(shape, np.bool_), tuple(notes))
+        return DecodedImage(image, np.zeros(shape, np.bool_), tuple(notes))
 
 
-def _search(wanted: ModernFormat, grey: Image, limit_bytes: int) -> bytes | None:
+def _search(wanted: StillImageFormat, grey: Image, limit_bytes: int) -> bytes | None:
     """Return the body with the least error among those tried that fit, or None.
 
     Halves the range of qualities. Neither length nor error follow the quality strictly, so the last that fits need not
@@ -163,38 +163,38 @@ def _search(wanted: ModernFormat, grey: Image, limit_bytes: int) -> bytes | None
     return best
 
 
-def _encode(wanted: ModernFormat, grey: Image, quality: int) -> bytes:
+def _encode(wanted: StillImageFormat, grey: Image, quality: int) -> bytes:
     file, picture = io.BytesIO(), Pillow.fromarray(grey)
     match wanted:
-        case ModernFormat.WEBP:
+        case StillImageFormat.WEBP:
             picture.save(file, "WEBP", quality=quality, method=6)
             return _key_frame(file.getvalue(), grey.shape)
-        case ModernFormat.AVIF:
+        case StillImageFormat.AVIF:
             picture.save(file, "AVIF", quality=quality, subsampling="4:0:0", speed=4, max_threads=1)
             return frame_of(file.getvalue(), grey.shape)
-        case ModernFormat.JPEGXL:
+        case StillImageFormat.JPEGXL:
             importlib.import_module("pillow_jxl")
             picture.save(file, "JXL", quality=quality, effort=7, num_threads=0)
     return file.getvalue()
 
 
-def _decode(wanted: ModernFormat, body: bytes, shape: tuple[int, ...]) -> Image:
+def _decode(wanted: StillImageFormat, body: bytes, shape: tuple[int, ...]) -> Image:
     """Return the picture.
 
     Raises:
         StreamError: The library refuses it, or it has another size.
     """
     file = body
-    if wanted is ModernFormat.WEBP:
+    if wanted is StillImageFormat.WEBP:
         file = _webp_file(body, shape)
-    elif wanted is ModernFormat.AVIF:
+    elif wanted is StillImageFormat.AVIF:
         file = _avif_file(body, shape)
-    elif wanted is ModernFormat.JPEGXL:
+    elif wanted is StillImageFormat.JPEGXL:
         importlib.import_module("pillow_jxl")
         _check_size(wanted, jpegxl_size(body), shape)
     try:
         with Pillow.open(
-            io.BytesIO(file), formats=["JXL" if wanted is ModernFormat.JPEGXL else wanted.name]
+            io.BytesIO(file), formats=["JXL" if wanted is StillImageFormat.JPEGXL else wanted.name]
         ) as picture:
             _check_size(wanted, (picture.height, picture.width), shape)
             return np.array(picture.convert("L"), dtype=np.uint8)
@@ -204,7 +204,7 @@ def _decode(wanted: ModernFormat, body: bytes, shape: tuple[int, ...]) -> Image:
         raise StreamError(f"{wanted.value} body", "data", repr(error), "data that the library decodes") from error
 
 
-def _check_size(wanted: ModernFormat, met: tuple[int, int], shape: tuple[int, ...]) -> None:
+def _check_size(wanted: StillImageFormat, met: tuple[int, int], shape: tuple[int, ...]) -> None:
     if met != shape:
         raise StreamError(f"{wanted.value} body", "size", met, f"{shape}, the stream header's")
 

@@ -15,7 +15,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def compiled(function: Callable[P, R]) -> Callable[P, R]:
+def jit(function: Callable[P, R]) -> Callable[P, R]:
     """Return `function` compiled on first call; the machine code is kept on disk beside the module where possible.
 
     A cached function is not compiled anew when another module that it calls changes, so compiled functions call only

@@ -13,7 +13,7 @@ from sonarpost.codec.emb.coder import PLAIN_SCALE, Coder, State
 from sonarpost.codec.emb.layout import HEIGHT, HL, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH
 from sonarpost.codec.emb.model import Model
 from sonarpost.codec.emb.region import OUTSIDE, weights
-from sonarpost.codec.emb.side_info import MAX_EXTRA, Box, Side
+from sonarpost.codec.emb.side_info import MAX_EXTRA, Box, SideInfo
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
@@ -39,7 +39,7 @@ def code_planes(
     state: State,
     model: Model,
     targets: I32,
-    side: Side,
+    side: SideInfo,
     price: int = 0,
     planes: int = PLANES,
     plain: I32 | None = None,
@@ -100,7 +100,7 @@ def code_planes(
                     return
 
 
-def held(targets: I32, state: State, side: Side) -> I32:
+def held(targets: I32, state: State, side: SideInfo) -> I32:
     """Return targets changed by as little as makes the coder decide as a stream already has.
 
     Args:
@@ -158,7 +158,7 @@ def _band_features(features: I32, band: list[int], threshold: int, mean: int, de
     features[kernel.BAND_FEATURES :] = here
 
 
-def low_pictures(state: State, model: Model, side: Side, down_to: int) -> I32:
+def low_pictures(state: State, model: Model, side: SideInfo, down_to: int) -> I32:
     """The low-pass pictures of what is known so far, in 1/64 grey times 2^level."""
     plane = known_plane(state, model, side.box)
     _, lows = transform.inverse(plane, state.lay, down_to)

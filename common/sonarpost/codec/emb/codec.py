@@ -15,15 +15,15 @@ import numpy.typing as npt
 from sonarpost.codec.emb import CODEC_ID, NAME, STRUCTURE_ID, STRUCTURE_NAME, transform
 from sonarpost.codec.emb.bitplanes import held
 from sonarpost.codec.emb.coder import State, error_by_length
-from sonarpost.codec.emb.decode import Plain, picture_of, plain_of, read_body, usable
+from sonarpost.codec.emb.decode import DecodedCoefficients, picture_of, plain_of, read_body, usable
 from sonarpost.codec.emb.layout import layout
 from sonarpost.codec.emb.model import Model, all_shipped, all_structure, shipped
-from sonarpost.codec.emb.rate_distortion_opt import wanted_of
+from sonarpost.codec.emb.rate_distortion_opt import target_coefficients
 from sonarpost.codec.emb.region import fill_unknown, weights
-from sonarpost.codec.emb.search import MAX_BODY_BYTES, Writer
-from sonarpost.codec.emb.side_info import MEAN_STEP, Box, Side
-from sonarpost.codec.emb.speckle_synthesis import make_grain, measure_grain
-from sonarpost.codec.interface import Decoded, Image, Mask, StreamHeader, check_image, model_tag, to_uint8
+from sonarpost.codec.emb.search import MAX_BODY_BYTES, TrialEncoder
+from sonarpost.codec.emb.side_info import MEAN_STEP, Box, SideInfo
+from sonarpost.codec.emb.speckle_synthesis import measure_speckle, synthesise_speckle
+from sonarpost.codec.interface import DecodedImage, Image, Mask, StreamHeader, check_image, model_tag, to_uint8
 from sonarpost.errors import StreamError
 
 MIN_BODY_BYTES: Final = 3
@@ -123,9 +123,9 @@ class EmbCodec:
         lay = layout(height_px, width_px)
         mean_index = min((int(picture.astype(np.int64).sum()) // picture.size + MEAN_STEP // 2) // MEAN_STEP, 63)
         plane = (picture.astype(np.int64) - mean_index * MEAN_STEP) * transform.UNIT
-        wanted = wanted_of(plane, lay, weights(lay, box), limit, self.model.aim)
-        grain = measure_grain(picture, lay) if self.grain else None
-        written = Writer(self.model, limit, self.price).best(wanted, mean_index, box, grain, self.steps)
+        wanted = target_coefficients(plane, lay, weights(lay, box), limit, self.model.aim)
+        grain = measure_speckle(picture, lay) if self.grain else None
+        written = TrialEncoder(self.model, limit, self.price).best(wanted, mean_index, box, grain, self.steps)
         estimate = error_by_length(written.curve, len(written.body), header.size, picture.size)
         return Encoded(header.pack() + written.body, estimate)
 
@@ -161,12 +161,12 @@ class EmbCodec:
         if side.step < 0 or limit < len(stream) - header.size:
             return stream
         plane = (picture.astype(np.int64) - side.mean) * transform.UNIT
-        wanted = wanted_of(plane, state.lay, weights(state.lay, side.box), limit, model.aim)
+        wanted = target_coefficients(plane, state.lay, weights(state.lay, side.box), limit, model.aim)
         wanted = replace(wanted, targets=held(wanted.targets, state, side))
-        longer = header.pack() + Writer(model, limit, 0, stream[header.size : -1]).write(wanted, side).body
+        longer = header.pack() + TrialEncoder(model, limit, 0, stream[header.size : -1]).write(wanted, side).body
         return longer if len(longer) > len(stream) and longer.startswith(stream[:-1]) else stream
 
-    def decode(self, stream: bytes, received: Mask | None = None) -> Decoded:
+    def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
         """Rebuild the picture from as much of the stream as is there.
 
         Args:
@@ -182,9 +182,9 @@ class EmbCodec:
         state, side = read_body(body, layout(header.height_px, header.width_px), model)
         if side.mean_index < 0:
             blank = np.zeros((header.height_px, header.width_px), np.uint8)
-            return Decoded(blank, np.ones(blank.shape, np.bool_), (*notes, "too little arrived for any picture"))
+            return DecodedImage(blank, np.ones(blank.shape, np.bool_), (*notes, "too little arrived for any picture"))
         picture = picture_of(state, side, model)
-        return Decoded(picture, np.zeros(picture.shape, np.bool_), notes)
+        return DecodedImage(picture, np.zeros(picture.shape, np.bool_), notes)
 
     def decode_grain(self, stream: bytes) -> npt.NDArray[np.int16]:
         """Return the layer of invented speckle that the picture lacks, in grey to be added; see `grain.make_grain`.
@@ -195,7 +195,7 @@ class EmbCodec:
         model, state, side = self._known(stream)
         if side.grain is None:
             raise StreamError("stream", "grain", None, "a stream made by a codec with grain on")
-        return make_grain(picture_of(state, side, model), state.lay, side.grain)
+        return synthesise_speckle(picture_of(state, side, model), state.lay, side.grain)
 
     def decode_with_grain(self, stream: bytes) -> Image:
         """Return the picture with grain at half strength: a view for the eye, not to be measured on.
@@ -206,7 +206,7 @@ class EmbCodec:
         layer = self.decode_grain(stream).astype(np.int32)
         return np.clip(self.decode(stream).image + (layer >> 1), 0, 255).astype(np.uint8)
 
-    def decode_plain(self, stream: bytes) -> Plain:
+    def decode_plain(self, stream: bytes) -> DecodedCoefficients:
         """Return the picture as the coefficients say, before the enhancer: what that is trained on.
 
         Raises:
@@ -217,7 +217,7 @@ class EmbCodec:
             raise StreamError("stream", "length", len(stream), "enough bytes for a mean level")
         return plain_of(state, side, model)
 
-    def read_state(self, stream: bytes) -> tuple[State, Side]:
+    def read_state(self, stream: bytes) -> tuple[State, SideInfo]:
         """Return what a stream says of the coefficients, and its side information.
 
         Raises:
@@ -226,7 +226,7 @@ class EmbCodec:
         _, state, side = self._known(stream)
         return state, side
 
-    def _known(self, stream: bytes) -> tuple[Model, State, Side]:
+    def _known(self, stream: bytes) -> tuple[Model, State, SideInfo]:
         model, header = self._model_of(stream)
         return model, *read_body(stream[header.size :], layout(header.height_px, header.width_px), model)
 

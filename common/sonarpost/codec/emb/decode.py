@@ -13,13 +13,13 @@ from sonarpost.codec.emb.coder import Coder, State
 from sonarpost.codec.emb.enhance import enhanced
 from sonarpost.codec.emb.layout import Layout
 from sonarpost.codec.emb.model import Model
-from sonarpost.codec.emb.side_info import Side, read_side
+from sonarpost.codec.emb.side_info import SideInfo, read_side
 from sonarpost.codec.interface import Image, Mask
 from sonarpost.errors import StreamError
 
 
 @dataclass(frozen=True, eq=False)
-class Plain:
+class DecodedCoefficients:
     """A picture before the enhancer.
 
     Attributes:
@@ -33,7 +33,7 @@ class Plain:
     situation: tuple[int, int, int]
 
 
-def read_body(body: bytes, lay: Layout, model: Model) -> tuple[State, Side]:
+def read_body(body: bytes, lay: Layout, model: Model) -> tuple[State, SideInfo]:
     """Return what a body says of the coefficients, and its side information.
 
     Args:
@@ -48,10 +48,10 @@ def read_body(body: bytes, lay: Layout, model: Model) -> tuple[State, Side]:
     return state, side
 
 
-def plain_of(state: State, side: Side, model: Model) -> Plain:
+def plain_of(state: State, side: SideInfo, model: Model) -> DecodedCoefficients:
     """Return the picture that the coefficients say."""
     plane, _ = transform.inverse(known_plane(state, model, side.box), state.lay)
-    return Plain(plane, side.mean, situation(state, side.mean))
+    return DecodedCoefficients(plane, side.mean, situation(state, side.mean))
 
 
 def grey_of(plane: npt.NDArray[np.int64], mean: int) -> Image:
@@ -59,7 +59,7 @@ def grey_of(plane: npt.NDArray[np.int64], mean: int) -> Image:
     return np.clip((plane + transform.UNIT // 2) // transform.UNIT + mean, 0, 255).astype(np.uint8)
 
 
-def picture_of(state: State, side: Side, model: Model) -> Image:
+def picture_of(state: State, side: SideInfo, model: Model) -> Image:
     """Return the picture with what the model knows of what the coefficients do not say."""
     plain = plain_of(state, side, model)
     plane = enhanced(plain.plane, plain.mean, plain.situation, model)

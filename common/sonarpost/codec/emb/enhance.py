@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb._jit import compiled
+from sonarpost.codec.emb._jit import jit
 from sonarpost.codec.emb.model import Model
 from sonarpost.codec.emb.transform import UNIT
 
@@ -23,7 +23,7 @@ LIMIT_GREY: Final = 48
 _ACTIVE_MAX: Final = 4095  # activations are 1/256
 
 
-@compiled
+@jit
 def _layer(source: I32, weights: I32, bias: I32, dilation: int, out: I32, rectify: int) -> None:
     """A layer of 3 x 3 taps; outside the picture its edge repeats.
 

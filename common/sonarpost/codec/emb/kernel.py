@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb._jit import compiled
+from sonarpost.codec.emb._jit import jit
 from sonarpost.codec.emb.layout import (
     CHILD,
     COUSIN_1,
@@ -71,7 +71,7 @@ _TOP: Final = 1 << 32
 _BOTTOM: Final = 1 << 24
 
 
-@compiled
+@jit
 def start_reading(coder: I64, data: U8) -> None:
     """Load the first four bytes; bytes that are not there are unknown."""
     coder[CODER_RANGE] = _TOP - 1
@@ -81,7 +81,7 @@ def start_reading(coder: I64, data: U8) -> None:
     coder[CODER_CODE] = min(coder[CODER_CODE], coder[CODER_RANGE] - 1)
 
 
-@compiled
+@jit
 def _next_byte(coder: I64, data: U8) -> None:
     at = coder[CODER_AT]
     if at < data.shape[0]:
@@ -93,7 +93,7 @@ def _next_byte(coder: I64, data: U8) -> None:
     coder[CODER_AT] = at + 1
 
 
-@compiled
+@jit
 def _get(coder: I64, data: U8, chance: int) -> int:
     """Read a decision whose chance of being 1 is `chance` / 65536; -1 where the bytes that are there do not tell."""
     bound = (coder[CODER_RANGE] >> 16) * chance
@@ -114,7 +114,7 @@ def _get(coder: I64, data: U8, chance: int) -> int:
     return bit
 
 
-@compiled
+@jit
 def _held_bit(coder: I64, data: U8, good: U8, bit: int, bound: int) -> int:
     """Return `bit`, or its opposite where only that leads to bytes that begin with the CODER_HELD first ones of `good`.
 
@@ -139,7 +139,7 @@ def _held_bit(coder: I64, data: U8, good: U8, bit: int, bound: int) -> int:
     return bit
 
 
-@compiled
+@jit
 def _put(coder: I64, data: U8, good: U8, bit: int, chance: int) -> int:
     """Write a decision, and return it as it was written (see `_held_bit`).
 
@@ -169,7 +169,7 @@ def _put(coder: I64, data: U8, good: U8, bit: int, chance: int) -> int:
     return bit
 
 
-@compiled
+@jit
 def _carry(data: U8, length: int) -> None:
     at = length - 1
     while data[at] == 255:
@@ -178,7 +178,7 @@ def _carry(data: U8, length: int) -> None:
     data[at] += 1
 
 
-@compiled
+@jit
 def _keep_if_whole(coder: I64, data: U8, good: U8) -> None:
     """Keep the bytes of CODER_LIMIT length that tell everything so far, if there are such."""
     length = coder[CODER_LENGTH]
@@ -198,7 +198,7 @@ def _keep_if_whole(coder: I64, data: U8, good: U8) -> None:
     coder[CODER_GOOD_LENGTH] = length + left
 
 
-@compiled
+@jit
 def finish_writing(coder: I64, data: U8, good: U8) -> None:
     """Keep the shortest bytes that tell everything, where the budget was not used up."""
     if coder[CODER_STOP]:
@@ -211,7 +211,7 @@ def finish_writing(coder: I64, data: U8, good: U8) -> None:
             _keep_if_whole(coder, data, good)
 
 
-@compiled
+@jit
 def code_plain(coder: I64, data: U8, good: U8, bit: int, chance: int, mode: int) -> int:
     """Write or read one decision of known chance; returns it, or -1 at the end."""
     if mode == READ:
@@ -220,12 +220,12 @@ def code_plain(coder: I64, data: U8, good: U8, bit: int, chance: int, mode: int)
     return -1 if coder[CODER_STOP] else bit
 
 
-@compiled
+@jit
 def _clip(value: int, limit: int) -> int:
     return min(max(value, -limit), limit)
 
 
-@compiled
+@jit
 def _log2_eighths(value: int) -> int:
     """8 log2(value) for value >= 1, linear between powers of two."""
     power, rest = 0, value
@@ -236,7 +236,7 @@ def _log2_eighths(value: int) -> int:
     return int(8 * power + ((value << 3) >> power) - 8)
 
 
-@compiled
+@jit
 def _box(seen: I32, at: int, stride: int) -> int:
     """Sum of the eight neighbours."""
     up, down = at - stride, at + stride
@@ -252,7 +252,7 @@ def _box(seen: I32, at: int, stride: int) -> int:
     )
 
 
-@compiled
+@jit
 def _relative(bands: I32, row: int, y: int, x: int) -> int:
     """Flat index of a cell, held inside the band; -1 where the band is empty."""
     height, width = bands[row, HEIGHT], bands[row, WIDTH]
@@ -261,7 +261,7 @@ def _relative(bands: I32, row: int, y: int, x: int) -> int:
     return int(bands[row, OFFSET] + min(y, height - 1) * bands[row, STRIDE] + min(x, width - 1))
 
 
-@compiled
+@jit
 def _is_near(seen: I32, bands: I32, row: int, y: int, x: int, at: int) -> bool:
     """Whether anything around, above or beside a coefficient is significant, or the band is a coarse one."""
     if bands[row, PARENT] < 0:
@@ -278,7 +278,7 @@ def _is_near(seen: I32, bands: I32, row: int, y: int, x: int, at: int) -> bool:
     return False
 
 
-@compiled
+@jit
 def _thresholds(size: int, threshold: int, inverse: int) -> int:
     """min(size // threshold, CAP) without a division: `inverse` is 2^54 // threshold + 1.
 
@@ -288,7 +288,7 @@ def _thresholds(size: int, threshold: int, inverse: int) -> int:
     return int((size * inverse) >> _INVERSE_BITS) if size < CAP * threshold else CAP
 
 
-@compiled
+@jit
 def _context(  # noqa: C901, PLR0912, PLR0915  a list of 44 features, one after the other
     f: I32,
     seen: I32,
@@ -377,7 +377,7 @@ def _context(  # noqa: C901, PLR0912, PLR0915  a list of 44 features, one after 
     f[31] = min(_log2_eighths(max(around >> (level + 2), 256)), 120) - 80
 
 
-@compiled
+@jit
 def _logit(f: I32, base: I32, w1: I32, w2: I32, b2: I32, live: I64, h1: I32, h2: I32) -> int:
     """Run the network: features, two hidden layers, one output in 1/256. Leaves the last hidden layer in `h2`."""
     for j in range(HIDDEN_1):
@@ -406,7 +406,7 @@ def _logit(f: I32, base: I32, w1: I32, w2: I32, b2: I32, live: I64, h1: I32, h2:
     return _clip(int(total >> 28), LOGIT_LIMIT)
 
 
-@compiled
+@jit
 def _learn(live: I64, h2: I32, bit: int, chance: int) -> None:
     """Move the last layer's weights down the gradient of the decision's code length, at a rate of 1/256.
 
@@ -418,7 +418,7 @@ def _learn(live: I64, h2: I32, bit: int, chance: int) -> None:
     live[HIDDEN_2] = min(max(live[HIDDEN_2] + (error << 4), -_LIVE_LIMIT), _LIVE_LIMIT)
 
 
-@compiled
+@jit
 def band_base(f: I32, w1: I32, b1: I32, base: I32) -> None:
     """The part of the first layer that is the same for a whole band."""
     for j in range(base.shape[0]):
@@ -428,7 +428,7 @@ def band_base(f: I32, w1: I32, b1: I32, base: I32) -> None:
             base[j] += f[i] * w1[i, j]
 
 
-@compiled
+@jit
 def _cross(f: I32, first: int, signed: I32, at: int, stride: int) -> None:
     """A signed coefficient and its neighbours left, right, above, below."""
     f[first] = signed[at]
@@ -436,14 +436,14 @@ def _cross(f: I32, first: int, signed: I32, at: int, stride: int) -> None:
     f[first + 3], f[first + 4] = signed[at - stride], signed[at + stride]
 
 
-@compiled
+@jit
 def _corners(f: I32, first: int, signed: I32, at: int, stride: int) -> None:
     """The four diagonal neighbours of a signed coefficient."""
     f[first], f[first + 1] = signed[at - stride - 1], signed[at - stride + 1]
     f[first + 2], f[first + 3] = signed[at + stride - 1], signed[at + stride + 1]
 
 
-@compiled
+@jit
 def _sign_context(  # noqa: C901, PLR0912  a list of 61 features, one after the other
     f: I32, signed: I32, lows: I32, bands: I32, low_width: int, threshold: int, row: int, y: int, x: int, at: int
 ) -> None:
@@ -503,13 +503,13 @@ def _sign_context(  # noqa: C901, PLR0912  a list of 61 features, one after the 
     f[SIGN_ODD + 9] = known
 
 
-@compiled
+@jit
 def _active(total: int) -> int:
     """The sign network's hidden unit: 1/256, never negative."""
     return min(max(total >> 6, 0), 4095)
 
 
-@compiled
+@jit
 def _sign_logit(f: I32, base: I32, w1: I32, w2: I32, orient: int) -> int:
     """An odd function of the odd features: with all signs turned the logit turns. A network a band orientation."""
     turn, even = np.zeros(SIGN_HIDDEN, np.int32), base.copy()
@@ -524,7 +524,7 @@ def _sign_logit(f: I32, base: I32, w1: I32, w2: I32, orient: int) -> int:
     return _clip(int(total >> 12), LOGIT_LIMIT)
 
 
-@compiled
+@jit
 def _guess(value: int, width: int, odds: int, centres: I32) -> int:
     """Mean magnitude of significant coefficients that were as likely: the unlikely lie low in their interval."""
     size = min(value // width, 4) - 1
@@ -532,14 +532,14 @@ def _guess(value: int, width: int, odds: int, centres: I32) -> int:
     return int(value + (width * centres[size, column] >> 8))
 
 
-@compiled
+@jit
 def most_likely(values: I32, widths: I32, signs: I32, odds: I32, centres: I32, out: I32) -> None:
     """Write the mean value of every coefficient, as far as it is known."""
     for at in range(values.shape[0]):
         out[at] = signs[at] * _guess(values[at], widths[at], odds[at], centres) if values[at] > 0 else 0
 
 
-@compiled
+@jit
 def refresh(values: I32, widths: I32, signs: I32, seen: I32, signed: I32, threshold: int) -> None:
     """Express what is known of every coefficient in thresholds."""
     for at in range(values.shape[0]):
@@ -548,7 +548,7 @@ def refresh(values: I32, widths: I32, signs: I32, seen: I32, signed: I32, thresh
             signed[at] = seen[at] * signs[at]
 
 
-@compiled
+@jit
 def _list_decision(rows: I16, coder: I64, f: I32, bit: int, net: int, share: int) -> None:
     """Note an example, one out of `share` by a chance that repeats."""
     coder[CODER_CODE] = (coder[CODER_CODE] * 1103515245 + 12345) & 0x7FFFFFFF
@@ -561,7 +561,7 @@ def _list_decision(rows: I16, coder: I64, f: I32, bit: int, net: int, share: int
     coder[CODER_ROWS] = n + 1
 
 
-@compiled
+@jit
 def _list_sign(rows: I16, coder: I64, f: I32, orient: int, sign: int) -> None:
     n = coder[CODER_SIGN_ROWS]
     if n >= rows.shape[0]:
@@ -572,7 +572,7 @@ def _list_sign(rows: I16, coder: I64, f: I32, orient: int, sign: int) -> None:
     coder[CODER_SIGN_ROWS] = n + 1
 
 
-@compiled
+@jit
 def _transfer(mode: int, bit: int, logit: int, chances: I32, costs: I32, coder: I64, data: U8, good: U8) -> int:
     """Write `bit`, or read one; returns it, or -1 at the end."""
     chance = chances[logit + LOGIT_LIMIT]
@@ -583,14 +583,14 @@ def _transfer(mode: int, bit: int, logit: int, chances: I32, costs: I32, coder: 
     return -1 if coder[CODER_STOP] else bit
 
 
-@compiled
+@jit
 def _is_worth(magnitude: int, threshold: int, guess: int, cost: int, price: int) -> bool:
     """Whether making a coefficient significant takes away enough error for its bits (its sign costs one more)."""
     size, shown = magnitude * 16 // threshold, guess * 16 // threshold
     return bool(shown * (2 * size - shown) >= (price * (cost + 256)) >> 8)
 
 
-@compiled
+@jit
 def code_band(  # noqa: C901, PLR0912, PLR0915  three modes and three passes share one loop, so that they cannot part
     mode: int,
     kind: int,

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import kernel as k
-from sonarpost.codec.emb.perceptual_weights import CONTRASTS, LEVELS, Aim
+from sonarpost.codec.emb.perceptual_weights import CONTRASTS, LEVELS, PerceptualWeights
 from sonarpost.errors import StreamError
 
 I32 = npt.NDArray[np.int32]
@@ -60,7 +60,7 @@ def _arrays(features: int, sign_features: int, sign_hidden: int, channels: int, 
 
 
 @dataclass(frozen=True)
-class Form:
+class ModelFormat:
     """What a model file holds.
 
     Attributes:
@@ -75,13 +75,13 @@ class Form:
 
 
 _AIM_ARRAYS: Final[Arrays] = (("aim_levels", (LEVELS,), "<i2"), ("aim_contrast", (CONTRASTS,), "<i2"))
-FIRST: Final = Form(b"SPEMB1\n", _arrays(50, 11, 8, channels=24, layers=4), (1, 2, 3, 1))
-SECOND: Final = Form(
+FIRST: Final = ModelFormat(b"SPEMB1\n", _arrays(50, 11, 8, channels=24, layers=4), (1, 2, 3, 1))
+SECOND: Final = ModelFormat(
     b"SPEMB2\n",
     _arrays(k.FEATURES, k.SIGN_FEATURES, k.SIGN_HIDDEN, channels=CHANNELS, layers=len(DILATIONS)),
     DILATIONS,
 )
-AIMED: Final = Form(b"SPEMB3\n", SECOND.arrays + _AIM_ARRAYS, DILATIONS)
+AIMED: Final = ModelFormat(b"SPEMB3\n", SECOND.arrays + _AIM_ARRAYS, DILATIONS)
 FORMS: Final = (FIRST, SECOND, AIMED)
 _FIRST_LOCAL: Final = 40
 """Features of one coefficient in the first form; those of its band came after them."""
@@ -119,10 +119,10 @@ class Model:
     situation: I32
     layers: tuple[tuple[I32, I32], ...]
     dilations: tuple[int, ...]
-    aim: Aim | None = None
+    aim: PerceptualWeights | None = None
 
 
-def form_of(raw: bytes, where: str = "emb model") -> Form:
+def form_of(raw: bytes, where: str = "emb model") -> ModelFormat:
     """Return what a model file holds.
 
     Raises:
@@ -161,7 +161,7 @@ def model_of(arrays: dict[str, I32], identity: str = "", dilations: tuple[int, .
         missing = k.SIGN_HIDDEN - plain[name].shape[-1]
         plain[name] = np.pad(plain[name], [(0, 0)] * (plain[name].ndim - 1) + [(0, missing)])
     layers = tuple((arrays[f"taps{i}"], arrays[f"bias{i}"]) for i in range(len(dilations)))
-    aim = Aim(arrays["aim_levels"], arrays["aim_contrast"]) if "aim_levels" in arrays else None
+    aim = PerceptualWeights(arrays["aim_levels"], arrays["aim_contrast"]) if "aim_levels" in arrays else None
     return Model(identity=identity, layers=layers, dilations=dilations, aim=aim, **plain)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
-from sonarpost.codec.emb._jit import compiled
+from sonarpost.codec.emb._jit import jit
 from sonarpost.codec.emb.coder import PLAIN_SCALE, State
 from sonarpost.codec.emb.layout import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, Layout, cells_of
 
@@ -36,7 +36,7 @@ _WINDOWS: Final = ((1, 1), (1, 2), (2, 2))
 
 
 @dataclass(frozen=True, eq=False)
-class Aim:
+class PerceptualWeights:
     """How a model scales coefficients before it codes them, in 1/256.
 
     Attributes:
@@ -56,18 +56,18 @@ def _first_scales(levels: tuple[int, ...], lay: Layout) -> I32:
     return out
 
 
-def start_scales(aim: Aim, lay: Layout) -> I32:
+def start_scales(aim: PerceptualWeights, lay: Layout) -> I32:
     """Return the scales of all coefficients by their level alone; flat, int32, not to be written to."""
     return _first_scales(tuple(aim.levels.tolist()), lay)
 
 
-def begin(aim: Aim, state: State, targets: I32) -> I32:
+def begin(aim: PerceptualWeights, state: State, targets: I32) -> I32:
     """Scale every coefficient by its level, before anything is known; returns the targets so scaled."""
     state.scale[:] = start_scales(aim, state.lay)
     return (np.abs(targets.astype(np.int64)) * state.scale // PLAIN_SCALE * np.sign(targets)).astype(np.int32)
 
 
-def follow(aim: Aim, state: State, row: int, lows: I32, finest: int, targets: I32, scaled: I32) -> None:
+def follow(aim: PerceptualWeights, state: State, row: int, lows: I32, finest: int, targets: I32, scaled: I32) -> None:
     """Scale the bands of a level anew by the contrast that is known around each coefficient.
 
     Args:
@@ -88,7 +88,7 @@ def follow(aim: Aim, state: State, row: int, lows: I32, finest: int, targets: I3
     )  # fmt: skip
 
 
-def expected(aim: Aim, shown: I32, lay: Layout) -> I32:
+def expected(aim: PerceptualWeights, shown: I32, lay: Layout) -> I32:
     """Return the scales that a picture will have once its coefficients `shown` (flat, int32) are coded; flat, int32."""
     state = State(lay)
     begin(aim, state, shown)
@@ -106,7 +106,7 @@ def _variance(lows: I32, lay: Layout, finest: int, level: int) -> I64:
     return np.asarray(_spread(lows, int(lay.low_offsets[finest]), height, width, finest + 3, radius, rounds))
 
 
-@compiled
+@jit
 def _sum_around(plane: I64, radius: int) -> I64:
     """Sum over a square around each place; outside the picture its edge repeats."""
     height, width = plane.shape
@@ -123,7 +123,7 @@ def _sum_around(plane: I64, radius: int) -> I64:
     return out
 
 
-@compiled
+@jit
 def _spread(lows: I32, at: int, height: int, width: int, shift: int, radius: int, rounds: int) -> I64:
     """Local variance in grey squared; `shift` makes eighths of grey of the values."""
     sums, squares = np.zeros((height, width), np.int64), np.zeros((height, width), np.int64)
@@ -138,7 +138,7 @@ def _spread(lows: I32, at: int, height: int, width: int, shift: int, radius: int
     return (squares * count - sums * sums) // (count * count * 64)
 
 
-@compiled
+@jit
 def _apply(
     bands: I32,
     row: int,

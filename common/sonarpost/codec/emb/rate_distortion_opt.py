@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
-from sonarpost.codec.emb._jit import compiled
+from sonarpost.codec.emb._jit import jit
 from sonarpost.codec.emb.coder import PLAIN_SCALE
 from sonarpost.codec.emb.layout import HEIGHT, HH, HL, LEVEL, LH, LL, ORIENT, WIDTH, Layout, cells_of
-from sonarpost.codec.emb.perceptual_weights import Aim, expected, start_scales
+from sonarpost.codec.emb.perceptual_weights import PerceptualWeights, expected, start_scales
 from sonarpost.codec.emb.region import OUTSIDE
 
 Plane = npt.NDArray[np.int64]
@@ -33,7 +33,7 @@ _HALF: Final = 1 << (transform.FRACTION_BITS - 1)
 
 
 @dataclass(frozen=True, eq=False)
-class Wanted:
+class TargetCoefficients:
     """What to encode.
 
     Attributes:
@@ -49,11 +49,13 @@ class Wanted:
     targets: I32
 
 
-def wanted_of(plane: Plane, lay: Layout, worth: Plane, body_bytes: int, aim: Aim | None = None) -> Wanted:
+def target_coefficients(
+    plane: Plane, lay: Layout, worth: Plane, body_bytes: int, aim: PerceptualWeights | None = None
+) -> TargetCoefficients:
     """Return what to encode of a picture into so many bytes.
 
     Args:
-        plane: See `Wanted`.
+        plane: See `TargetCoefficients`.
         lay: The picture's layout.
         worth: Weight of each coefficient in 1/256, flat; see `region.weights`.
         body_bytes: The budget.
@@ -61,19 +63,19 @@ def wanted_of(plane: Plane, lay: Layout, worth: Plane, body_bytes: int, aim: Aim
     """
     plain = transform.to_flat(transform.forward(plane, lay), lay)
     worth_coded = worth if aim is None else _worth_with_aim(aim, plain, worth, lay, body_bytes)
-    targets = fitted(plane, plain, worth_coded, lay, body_bytes)
+    targets = optimised_targets(plane, plain, worth_coded, lay, body_bytes)
     plain, targets = ((c.astype(np.int64) * worth // OUTSIDE).astype(np.int32) for c in (plain, targets))
-    return Wanted(lay, plane, plain, targets)
+    return TargetCoefficients(lay, plane, plain, targets)
 
 
-def _worth_with_aim(aim: Aim, plain: I32, worth: Plane, lay: Layout, body_bytes: int) -> Plane:
+def _worth_with_aim(aim: PerceptualWeights, plain: I32, worth: Plane, lay: Layout, body_bytes: int) -> Plane:
     """Weight of each coefficient with the scale that it will about have once the budget is spent."""
     scaled = plain.astype(np.int64) * start_scales(aim, lay) // PLAIN_SCALE
     shown = np.where(np.abs(scaled) >= _threshold(scaled, body_bytes), plain, 0).astype(np.int32)
     return np.asarray(np.maximum(worth * expected(aim, shown, lay) // PLAIN_SCALE, 1), np.int64)
 
 
-def fitted(picture: Plane, plain: I32, worth: Plane, lay: Layout, body_bytes: int) -> I32:
+def optimised_targets(picture: Plane, plain: I32, worth: Plane, lay: Layout, body_bytes: int) -> I32:
     """Return what to code instead of the plain coefficients.
 
     A few rounds of iterated thresholding (Blumensath and Davies, 2008): those that the budget will reach move half way
@@ -82,7 +84,7 @@ def fitted(picture: Plane, plain: I32, worth: Plane, lay: Layout, body_bytes: in
     Args:
         picture: Shape (height_px, width_px), int64, 1/64 grey, without its mean level.
         plain: Its coefficients, flat, int32.
-        worth: As `wanted_of`.
+        worth: As `target_coefficients`.
         lay: The picture's layout.
         body_bytes: What they are coded into.
 
@@ -121,7 +123,7 @@ def _pull(picture: Plane, coefficients: Plane, lay: Layout) -> Plane:
     return (slope * _reach(lay) + (1 << (_STEP_BITS - 1))) >> _STEP_BITS
 
 
-@compiled
+@jit
 def _lift_back(line: Plane, n: int, first: int, constant: int) -> None:
     """Undo the sides of a lifting step: every second value gives to its two neighbours what it would take of them."""
     for i in range(first, n, 2):
@@ -130,7 +132,7 @@ def _lift_back(line: Plane, n: int, first: int, constant: int) -> None:
         line[i + 1 if i + 1 < n else i - 1] += part
 
 
-@compiled
+@jit
 def _gather_line(line: Plane, n: int, scratch: Plane) -> None:
     """The transpose of `transform.synthesise_line`."""
     if n == 1:
@@ -148,7 +150,7 @@ def _gather_line(line: Plane, n: int, scratch: Plane) -> None:
     line[:n] = scratch[:n]
 
 
-@compiled
+@jit
 def _gather(plane: Plane, sides: I32) -> None:
     """In place: what each wavelet, as the decoder draws it, has in common with the picture (its scalar product)."""
     line = np.zeros(max(plane.shape), np.int64)

@@ -13,9 +13,9 @@ from sonarpost.codec.emb.bitplanes import STEPS, code_planes, extra_planes, know
 from sonarpost.codec.emb.coder import Coder, State
 from sonarpost.codec.emb.decode import grey_of
 from sonarpost.codec.emb.model import Model
-from sonarpost.codec.emb.rate_distortion_opt import Wanted
-from sonarpost.codec.emb.side_info import Box, Side, write_side
-from sonarpost.codec.emb.similarity import likeness
+from sonarpost.codec.emb.rate_distortion_opt import TargetCoefficients
+from sonarpost.codec.emb.side_info import Box, SideInfo, write_side
+from sonarpost.codec.emb.similarity import structural_similarity
 from sonarpost.codec.interface import MAX_SIDE_PX
 
 I64 = npt.NDArray[np.int64]
@@ -39,7 +39,7 @@ AIMED_SEARCHES: Final = (*SEARCHES[:-2], SEARCHES[-1])
 
 
 @dataclass(frozen=True, eq=False)
-class Written:
+class EncodedTrial:
     """A body.
 
     Attributes:
@@ -56,7 +56,7 @@ class Written:
 
 
 @dataclass(frozen=True)
-class Writer:
+class TrialEncoder:
     """Writes bodies of at most so many bytes.
 
     Attributes:
@@ -71,7 +71,7 @@ class Writer:
     price: int
     begin: bytes = b""
 
-    def write(self, wanted: Wanted, side: Side) -> Written:
+    def write(self, wanted: TargetCoefficients, side: SideInfo) -> EncodedTrial:
         """Write a body with the start step of `side`."""
         coder, state = Coder.writer(self.limit, self.begin), State(wanted.lay)
         coder.curve[0] = int((wanted.plain.astype(np.int64) ** 2).sum())
@@ -79,29 +79,31 @@ class Writer:
         coder.record()
         code_planes(coder, state, self.model, wanted.targets, side, self.price, plain=wanted.plain)
         if side.box is not None:
-            return Written(int(coder.curve[0]), coder.finish(), coder.curve)
+            return EncodedTrial(int(coder.curve[0]), coder.finish(), coder.curve)
         shown, _ = transform.inverse(known_plane(state, self.model), wanted.lay)
         if self.model.aim is not None:
-            error = -likeness(*(grey_of(plane, side.mean).astype(np.int64) for plane in (wanted.plane, shown)))
+            error = -structural_similarity(
+                *(grey_of(plane, side.mean).astype(np.int64) for plane in (wanted.plane, shown))
+            )
         else:
             error = int(((wanted.plane - shown) ** 2).sum())
-        return Written(error, coder.finish(), coder.curve)
+        return EncodedTrial(error, coder.finish(), coder.curve)
 
     def best(
         self,
-        wanted: Wanted,
+        wanted: TargetCoefficients,
         mean_index: int,
         box: Box | None,
         grain: tuple[int, ...] | None,
         steps: tuple[int, ...] = (),
-    ) -> Written:
+    ) -> EncodedTrial:
         """Write bodies with several start steps and return the one with the least error.
 
         Args:
             wanted: What to encode.
-            mean_index: See `Side`.
+            mean_index: See `SideInfo`.
             box: Region of interest.
-            grain: See `Side`.
+            grain: See `SideInfo`.
             steps: Start steps to try; none: as many as the time allows, see `SEARCHES`.
         """
         pixels = wanted.plane.size
@@ -111,10 +113,10 @@ class Writer:
         )
         if steps:
             first, more = steps, 0
-        found: dict[int, Written] = {}
+        found: dict[int, EncodedTrial] = {}
         for i in range(len(first) + more):
             step = first[i] if i < len(first) else beside({at: written.error for at, written in found.items()})
-            side = Side(mean_index, step, box, grain, extra_planes(wanted.targets, step))
+            side = SideInfo(mean_index, step, box, grain, extra_planes(wanted.targets, step))
             found[step] = self.write(wanted, side)
         return min(found.values(), key=lambda written: written.error)
 

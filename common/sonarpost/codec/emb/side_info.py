@@ -58,7 +58,7 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
+class SideInfo:
     """Side information.
 
     Attributes:
@@ -85,17 +85,17 @@ class _EndOfStreamError(Exception):
     """The bytes do not tell the next decision."""
 
 
-def write_side(coder: Coder, model: Model, side: Side) -> None:
+def write_side(coder: Coder, model: Model, side: SideInfo) -> None:
     """Write side information. A coder whose budget ends within it stops, which the caller sees from its length."""
     _code(coder, model, side)
 
 
-def read_side(coder: Coder, model: Model) -> Side:
+def read_side(coder: Coder, model: Model) -> SideInfo:
     """Read as much as the stream tells."""
     return _code(coder, model, None)
 
 
-def _code(coder: Coder, model: Model, side: Side | None) -> Side:
+def _code(coder: Coder, model: Model, side: SideInfo | None) -> SideInfo:
     mean_index = -1
     try:
         mean_index = _mean(coder, model, side.mean_index if side else 0)
@@ -113,9 +113,9 @@ def _code(coder: Coder, model: Model, side: Side | None) -> Side:
         if _bit(coder, int(side is not None and side.grain is not None), _RARE):
             given = side.grain if side and side.grain else (0,) * GRAIN_BANDS
             grain = tuple(_number(coder, 4, n) for n in given)
-        return Side(mean_index, found, box, grain, extra)
+        return SideInfo(mean_index, found, box, grain, extra)
     except _EndOfStreamError:
-        return Side(mean_index, -1)
+        return SideInfo(mean_index, -1)
 
 
 def _bit(coder: Coder, bit: int, chance: int = 32768) -> int:

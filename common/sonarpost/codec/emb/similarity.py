@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb._jit import compiled
+from sonarpost.codec.emb._jit import jit
 
 I64 = npt.NDArray[np.int64]
 
@@ -20,7 +20,7 @@ _FIRST: Final = 426148  # (0.01 * 255)^2 and (0.03 * 255)^2, times 2^16
 _SECOND: Final = 3835331
 
 
-@compiled
+@jit
 def _blurred(plane: I64) -> I64:
     """Binomial window of 9 taps each way, standard deviation 1.4, 65536 times as large; edges repeat."""
     taps = (1, 8, 28, 56, 70, 56, 28, 8, 1)
@@ -38,7 +38,7 @@ def _blurred(plane: I64) -> I64:
     return out
 
 
-@compiled
+@jit
 def _halved_sums(plane: I64) -> I64:
     height, width = plane.shape[0] // 2, plane.shape[1] // 2
     out = np.zeros((height, width), np.int64)
@@ -50,7 +50,7 @@ def _halved_sums(plane: I64) -> I64:
     return out
 
 
-@compiled
+@jit
 def _similar(a: I64, b: I64, unit: int, whole: int) -> int:
     """Mean structural similarity, times 2^14, of pictures in 1/`unit` grey; its luminance term too if `whole` is 1."""
     mean_a, mean_b = _blurred(a), _blurred(b)
@@ -72,7 +72,7 @@ def _similar(a: I64, b: I64, unit: int, whole: int) -> int:
     return int(total // (a.shape[0] * a.shape[1]))
 
 
-def likeness(picture: I64, shown: I64) -> int:
+def structural_similarity(picture: I64, shown: I64) -> int:
     """Return how like two pictures are at half and a quarter of their size, about as MS-SSIM weighs it.
 
     Args:

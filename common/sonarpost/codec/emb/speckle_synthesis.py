@@ -61,7 +61,7 @@ def _square_of(level: int) -> int:
     return 0 if level == 0 else 1024 << level
 
 
-def measure_grain(picture: Image, lay: Layout) -> tuple[int, ...]:
+def measure_speckle(picture: Image, lay: Layout) -> tuple[int, ...]:
     """Return the strength of a picture's texture in each band, 0 (none) to 15, 3 dB a step."""
     levels = []
     for square in _strengths_square(picture, lay):
@@ -70,13 +70,13 @@ def measure_grain(picture: Image, lay: Layout) -> tuple[int, ...]:
     return tuple(levels)
 
 
-def make_grain(picture: Image, lay: Layout, levels: tuple[int, ...], seed: int = 0) -> npt.NDArray[np.int16]:
+def synthesise_speckle(picture: Image, lay: Layout, levels: tuple[int, ...], seed: int = 0) -> npt.NDArray[np.int16]:
     """Return the layer of speckle that a decoded picture lacks, in grey to be added.
 
     Args:
         picture: Shape (height_px, width_px), uint8, as decoded.
         lay: Its layout.
-        levels: The original's, as `measure_grain` gives them.
+        levels: The original's, as `measure_speckle` gives them.
         seed: Which of the equally good speckles.
 
     Returns:

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb._jit import compiled
+from sonarpost.codec.emb._jit import jit
 from sonarpost.codec.emb.layout import Layout
 
 Plane = npt.NDArray[np.int64]
@@ -41,7 +41,7 @@ STRENGTHS: Final = (
 )
 
 
-@compiled
+@jit
 def _lift(line: Plane, n: int, first: int, constant: int) -> None:
     """Add to every second value, from `first` on, its two neighbours times a constant; mirrored at the ends."""
     for i in range(first, n, 2):
@@ -50,7 +50,7 @@ def _lift(line: Plane, n: int, first: int, constant: int) -> None:
         line[i] += ((left + right) * constant + _ROUND) >> FRACTION_BITS
 
 
-@compiled
+@jit
 def _analyse(line: Plane, n: int, scratch: Plane) -> None:
     if n == 1:
         return
@@ -67,7 +67,7 @@ def _analyse(line: Plane, n: int, scratch: Plane) -> None:
     line[:n] = scratch[:n]
 
 
-@compiled
+@jit
 def synthesise_line(line: Plane, n: int, scratch: Plane) -> None:
     """Undo one level of the wavelet on the first `n` values of a line, in place; `scratch` is at least as long."""
     if n == 1:
@@ -85,7 +85,7 @@ def synthesise_line(line: Plane, n: int, scratch: Plane) -> None:
     line[:n] = scratch[:n]
 
 
-@compiled
+@jit
 def _forward(plane: Plane, sides: npt.NDArray[np.int32]) -> None:
     line = np.zeros(max(plane.shape), np.int64)
     scratch = np.zeros(max(plane.shape), np.int64)
@@ -101,7 +101,7 @@ def _forward(plane: Plane, sides: npt.NDArray[np.int32]) -> None:
             plane[:height, x] = line[:height]
 
 
-@compiled
+@jit
 def _inverse(
     plane: Plane, sides: npt.NDArray[np.int32], down_to: int, lows: npt.NDArray[np.int32], offsets: Plane
 ) -> None:
@@ -237,7 +237,7 @@ def from_flat(flat: npt.NDArray[np.int32], lay: Layout) -> Plane:
     return out
 
 
-@compiled
+@jit
 def _place(flat: npt.NDArray[np.int32], strengths: Plane, position: Plane, out: Plane) -> None:
     for y in range(out.shape[0]):
         for x in range(out.shape[1]):

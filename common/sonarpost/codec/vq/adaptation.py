@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.quality import fom, psnr_db
-from sonarpost.codec.vq.incremental import GrowingTiles
+from sonarpost.codec.vq.incremental import IncrementalTileSet
 from sonarpost.codec.vq.refinement import refine_once
 from sonarpost.codec.vq.tiles import TileDatabase, Tiles, cut_tiles, join_tiles
 from sonarpost.codec.vq.training_config import MAX_TILES, TrainingImage
@@ -43,7 +43,7 @@ Squared = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Adapted:
+class AdaptedCodebook:
     """An adapted catalogue.
 
     Attributes:
@@ -60,7 +60,7 @@ class Adapted:
 
 
 @dataclass(frozen=True)
-class Quality:
+class CodebookQuality:
     """How well a catalogue rebuilds one picture, as the codec does: PSNR in dB, and the figure of merit."""
 
     psnr_db: float
@@ -75,7 +75,7 @@ def adapt(
     keep: int | None = None,
     passes: int = 4,
     told: Callable[[str, int, int], None] | None = None,
-) -> Adapted:
+) -> AdaptedCodebook:
     """Adapt a catalogue (module docstring). The same base and images in the same order give the same catalogue.
 
     Args:
@@ -99,7 +99,7 @@ def adapt(
     room = free + len(base) - keep
     given_up = by_use[: max(0, min(room, int(_tiles_of(images, base.tile_px))) - free)]
     stays = np.setdiff1d(np.arange(len(base)), given_up)
-    growing = GrowingTiles(base.tile_px, max_tiles)
+    growing = IncrementalTileSet(base.tile_px, max_tiles)
     growing.append(base.tiles[stays])
     _draw(growing, images, free + given_up.size, told)
     new = _refined(growing.tiles(), stays.size, base.tile_px, images, passes, told)
@@ -108,7 +108,7 @@ def adapt(
     tiles[places[: new.shape[0]]] = new[: places.size]
     adapted = TileDatabase.from_tiles(base.tile_px, tiles, base.dims)
     replaced = int((tiles[: len(base)] != base.tiles).any(axis=1).sum())
-    return Adapted(adapted, int((uses > 0).sum()), replaced, new.shape[0])
+    return AdaptedCodebook(adapted, int((uses > 0).sum()), replaced, new.shape[0])
 
 
 def split(images: Sequence[TrainingImage]) -> tuple[list[TrainingImage], list[TrainingImage]]:
@@ -125,14 +125,14 @@ def split(images: Sequence[TrainingImage]) -> tuple[list[TrainingImage], list[Tr
     return list(images[:-held_out]), list(images[-held_out:])
 
 
-def measure(database: TileDatabase, images: Sequence[TrainingImage]) -> list[Quality]:
+def measure(database: TileDatabase, images: Sequence[TrainingImage]) -> list[CodebookQuality]:
     """Rebuild each picture from the tiles that the codec would choose, and measure it."""
     measured = []
     for image in images:
         pixels = image.load()
         index, _ = database.nearest(cut_tiles(pixels, database.tile_px))
         rebuilt = join_tiles(database.tiles[index], pixels.shape[0], pixels.shape[1], database.tile_px)
-        measured.append(Quality(min(psnr_db(pixels, rebuilt), EQUAL_PSNR_DB), fom(pixels, rebuilt)))
+        measured.append(CodebookQuality(min(psnr_db(pixels, rebuilt), EQUAL_PSNR_DB), fom(pixels, rebuilt)))
     return measured
 
 
@@ -176,7 +176,7 @@ def _uses(
 
 
 def _draw(
-    growing: GrowingTiles, images: Sequence[TrainingImage], wanted: int, told: Callable[[str, int, int], None]
+    growing: IncrementalTileSet, images: Sequence[TrainingImage], wanted: int, told: Callable[[str, int, int], None]
 ) -> None:
     """Add `wanted` training tiles to `growing`, or fewer if there are not so many different ones."""
     before = len(growing)
@@ -189,13 +189,13 @@ def _draw(
         start = len(growing)
         # Pieces drawn in one step may be the same: only the first of them is added.
         growing.add_far(_at(images, growing.tile_px, picked), squared[picked].astype(np.float64), 0.0)
-        fresh = GrowingTiles(growing.tile_px, len(growing) - start)
+        fresh = IncrementalTileSet(growing.tile_px, len(growing) - start)
         fresh.append(growing.tiles_at(np.arange(start, len(growing))))
         squared = _squared(fresh, images, squared)
         told("drawing tiles", step + 1, _STEPS)
 
 
-def _squared(growing: GrowingTiles, images: Sequence[TrainingImage], least: Squared | None) -> Squared:
+def _squared(growing: IncrementalTileSet, images: Sequence[TrainingImage], least: Squared | None) -> Squared:
     """Return squared distances of all training tiles to the nearest tile, or to that of `least` where it is nearer."""
     parts = []
     start = 0

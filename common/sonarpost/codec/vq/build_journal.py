@@ -26,7 +26,7 @@ from typing import BinaryIO
 import numpy as np
 
 from sonarpost.codec.vq.tiles import Tiles
-from sonarpost.errors import CatalogueError
+from sonarpost.errors import CodebookError
 
 MAGIC = b"SPJOURNAL2\n"
 _RECORD = struct.Struct(">BHII32s")
@@ -69,7 +69,7 @@ class Journal:
         pixels: Pixels of a tile.
 
     Raises:
-        CatalogueError: The file is no journal, belongs to another plan, or cannot be read or written.
+        CodebookError: The file is no journal, belongs to another plan, or cannot be read or written.
     """
 
     def __init__(self, path: Path | None, plan: str, pixels: int) -> None:
@@ -81,7 +81,7 @@ class Journal:
             try:
                 self._file = self._open(path, MAGIC + hashlib.sha256(plan.encode()).digest())
             except OSError as error:
-                raise CatalogueError(str(path), "", str(error), "a journal that can be read and written") from error
+                raise CodebookError(str(path), "", str(error), "a journal that can be read and written") from error
 
     def __enter__(self) -> Journal:
         return self
@@ -101,7 +101,7 @@ class Journal:
         """Yield the whole records, in the order they were written. Nothing may be appended meanwhile.
 
         Raises:
-            CatalogueError: The file cannot be read.
+            CodebookError: The file cannot be read.
         """
         if self._file is None:
             return
@@ -110,13 +110,13 @@ class Journal:
             yield from _records(self._file, self._pixels)
             self._file.seek(0, os.SEEK_END)
         except OSError as error:
-            raise CatalogueError(self.name, "", str(error), "a journal that can be read") from error
+            raise CodebookError(self.name, "", str(error), "a journal that can be read") from error
 
     def append(self, entry: JournalEntry) -> None:
         """Write one record and force it to disk.
 
         Raises:
-            CatalogueError: It cannot be written (full disk).
+            CodebookError: It cannot be written (full disk).
         """
         if self._file is None:
             return
@@ -127,7 +127,7 @@ class Journal:
             self._file.flush()
             os.fsync(self._file.fileno())
         except OSError as error:
-            raise CatalogueError(self.name, "", str(error), "a journal that can be written") from error
+            raise CodebookError(self.name, "", str(error), "a journal that can be written") from error
 
     def _open(self, path: Path, start: bytes) -> BinaryIO:
         file = path.open("r+b" if path.exists() else "w+b")
@@ -152,9 +152,9 @@ class Journal:
 def _check_start(where: str, met: bytes, start: bytes) -> None:
     if met != start[: len(met)]:
         if met[: len(MAGIC)] != MAGIC[: len(met)]:
-            raise CatalogueError(where, "magic", met[: len(MAGIC)], repr(MAGIC))
+            raise CodebookError(where, "magic", met[: len(MAGIC)], repr(MAGIC))
         expected = "this build's images, rounds and tile size (remove the journal to start anew)"
-        raise CatalogueError(where, "plan", met[len(MAGIC) :].hex(), expected)
+        raise CodebookError(where, "plan", met[len(MAGIC) :].hex(), expected)
 
 
 def _records(file: BinaryIO, pixels: int) -> Iterator[JournalEntry]:

@@ -25,13 +25,13 @@ import numpy.typing as npt
 
 from sonarpost.codec.quality import FigureOfMerit, fom
 from sonarpost.codec.vq.build_journal import EntryKind, Journal, JournalEntry
-from sonarpost.codec.vq.incremental import GrowingTiles
-from sonarpost.codec.vq.refinement import refine_once, without_doubles
+from sonarpost.codec.vq.incremental import IncrementalTileSet
+from sonarpost.codec.vq.refinement import refine_once, without_duplicates
 from sonarpost.codec.vq.tiles import TileDatabase, Tiles, cut_tiles, join_tiles
 from sonarpost.codec.vq.training_config import (
     MAX_TILES,
-    PassProgress,
-    Progress,
+    BuildProgress,
+    RefinementProgress,
     Round,
     TrainingImage,
     check_plan,
@@ -40,9 +40,9 @@ from sonarpost.codec.vq.training_config import (
     pixels_hash,
     spread,
 )
-from sonarpost.errors import CatalogueError
+from sonarpost.errors import CodebookError
 
-Told = Callable[[Progress | PassProgress], None]
+ProgressCallback = Callable[[BuildProgress | RefinementProgress], None]
 
 
 def build(
@@ -56,7 +56,7 @@ def build(
     passes: int = 0,
     journal_path: Path | None = None,
     figure_of_merit: FigureOfMerit = fom,
-    progress: Told | None = None,
+    progress: ProgressCallback | None = None,
 ) -> TileDatabase:
     """Build a database (module docstring). The same images in the same order give the same database.
 
@@ -76,21 +76,21 @@ def build(
 
     Raises:
         ConfigError: No images, no rounds, or a number out of range.
-        CatalogueError: The journal belongs to another build or to other pixels, or cannot be read or written.
+        CodebookError: The journal belongs to another build or to other pixels, or cannot be read or written.
     """
     check_plan(images, tile_px, rounds, max_tiles, core)
     plan = fingerprint(images, tile_px, rounds, max_tiles, core)
     with Journal(journal_path, plan, tile_px * tile_px) as journal:
         work = _Build(images, tile_px, journal, progress or _untold)
-        work.start(GrowingTiles(tile_px, max_tiles), core)
+        work.start(IncrementalTileSet(tile_px, max_tiles), core)
         work.run_rounds(rounds, figure_of_merit)
         tiles = work.growing.tiles()
         for number in range(1, passes + 1):
             tiles = work.run_pass(tiles, number, passes)
-    return TileDatabase.from_tiles(tile_px, without_doubles(tiles) if passes else tiles, dims)
+    return TileDatabase.from_tiles(tile_px, without_duplicates(tiles) if passes else tiles, dims)
 
 
-def _untold(_: Progress | PassProgress) -> None:
+def _untold(_: BuildProgress | RefinementProgress) -> None:
     """Stand in for a listener."""
 
 
@@ -101,13 +101,13 @@ class _Build:
     images: Sequence[TrainingImage]
     tile_px: int
     journal: Journal
-    told: Told
+    told: ProgressCallback
     done: set[tuple[int, int]] = field(default_factory=set)
     hashes: dict[int, bytes] = field(default_factory=dict)
-    growing: GrowingTiles = field(init=False)
+    growing: IncrementalTileSet = field(init=False)
     _all_hash: bytes = b""
 
-    def start(self, growing: GrowingTiles, core: TileDatabase | None) -> None:
+    def start(self, growing: IncrementalTileSet, core: TileDatabase | None) -> None:
         """Fill `growing` with the core and with what the journal holds, after a look at the images it came from."""
         self.growing = growing
         if core is not None:
@@ -116,7 +116,7 @@ class _Build:
             if entry.kind is EntryKind.IMAGE:
                 if entry.image_number >= len(self.images):
                     expected = f"below {len(self.images)}, the number of images"
-                    raise CatalogueError(self.journal.name, "image", entry.image_number, expected)
+                    raise CodebookError(self.journal.name, "image", entry.image_number, expected)
                 self._load(entry.image_number, entry.pixels_hash)
                 growing.append(entry.tiles)
                 self.done.add((entry.number, entry.image_number))
@@ -133,7 +133,7 @@ class _Build:
                 record = JournalEntry(EntryKind.IMAGE, number, image_number, self.hashes[image_number], added)
                 self.journal.append(record)
                 where = (number, len(rounds), image_number, position, len(chosen), self.images[image_number].name)
-                self.told(Progress(*where, merit, added.shape[0], len(self.growing)))
+                self.told(BuildProgress(*where, merit, added.shape[0], len(self.growing)))
 
     def run_pass(self, tiles: Tiles, number: int, passes: int) -> Tiles:
         """Do one pass of refinement, or take its result from the journal."""
@@ -144,25 +144,25 @@ class _Build:
         count = len(self.images)
 
         def told(done: int) -> None:
-            self.told(PassProgress(number, passes, done, count, float("nan")))
+            self.told(RefinementProgress(number, passes, done, count, float("nan")))
 
         refined = refine_once(tiles, self.tile_px, self.images, told)
         self.journal.append(JournalEntry(EntryKind.PASS, number, 0, refined.images_hash, refined.tiles))
-        self.told(PassProgress(number, passes, count, count, refined.rms))
+        self.told(RefinementProgress(number, passes, count, count, refined.rms))
         return refined.tiles
 
     def _load(self, number: int, expected: bytes | None = None) -> npt.NDArray[np.uint8]:
         """Return an image's pixels, if they are those that were met before.
 
         Raises:
-            CatalogueError: They are others: what was learned from the image is not in it any more.
+            CodebookError: They are others: what was learned from the image is not in it any more.
         """
         pixels = self.images[number].load()
         met = pixels_hash(pixels)
         known = self.hashes.setdefault(number, expected or met)
         if met != known:
             wanted = f"sha256 {known.hex()}, as when it was learned from (remove the journal to start anew)"
-            raise CatalogueError(self.images[number].name, "pixels", met.hex(), wanted)
+            raise CodebookError(self.images[number].name, "pixels", met.hex(), wanted)
         return pixels
 
     def _check_all(self, expected: bytes) -> None:
@@ -170,11 +170,11 @@ class _Build:
             self._all_hash = images_hash(self.images)
         if self._all_hash != expected:
             what = "images as they were when the pass was done (remove the journal to start anew)"
-            raise CatalogueError(self.journal.name, "pass", self._all_hash.hex(), what)
+            raise CodebookError(self.journal.name, "pass", self._all_hash.hex(), what)
 
 
 def _learn(
-    growing: GrowingTiles, image: npt.NDArray[np.uint8], settings: Round, figure_of_merit: FigureOfMerit
+    growing: IncrementalTileSet, image: npt.NDArray[np.uint8], settings: Round, figure_of_merit: FigureOfMerit
 ) -> tuple[float, Tiles]:
     """Table IV for one image: return its figure of merit before, and the tiles it added."""
     tiles = cut_tiles(image, growing.tile_px)

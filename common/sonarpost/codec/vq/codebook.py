@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.codec.vq.codec import catalogue_tag
+from sonarpost.codec.vq.codec import codebook_tag
 from sonarpost.codec.vq.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase
-from sonarpost.errors import CatalogueError
+from sonarpost.errors import CodebookError
 from sonarpost.files import write_atomically
 
 MAGIC = b"SPTILES\n"
 VERSION = 1
-NOMINAL_TILE_PX = (10, 20)
+DEFAULT_TILE_PX = (10, 20)
 
 _HEADER = struct.Struct(">8sHHIHI")  # magic, version, tile_px, tiles, dims, bytes of notes
 _HASH_BYTES = 32
@@ -32,7 +32,7 @@ MAX_NOTES_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
-class Catalogue:
+class Codebook:
     """A tile database with notes about where it comes from.
 
     Attributes:
@@ -44,16 +44,16 @@ class Catalogue:
     notes: Mapping[str, str]
 
 
-def to_bytes(catalogue: Catalogue) -> bytes:
+def to_bytes(catalogue: Codebook) -> bytes:
     """Return the file's bytes.
 
     Raises:
-        CatalogueError: The notes take more than 1 MiB.
+        CodebookError: The notes take more than 1 MiB.
     """
     tiles = catalogue.tiles
     notes = json.dumps(dict(catalogue.notes), sort_keys=True, ensure_ascii=False).encode()
     if len(notes) > MAX_NOTES_BYTES:
-        raise CatalogueError("tile catalogue", "notes", f"{len(notes)} B", f"at most {MAX_NOTES_BYTES} B")
+        raise CodebookError("tile catalogue", "notes", f"{len(notes)} B", f"at most {MAX_NOTES_BYTES} B")
     header = _HEADER.pack(MAGIC, VERSION, tiles.tile_px, len(tiles), tiles.dims, len(notes))
     content = b"".join(
         (header, notes, tiles.mean.tobytes(), tiles.basis.astype(">i2").tobytes(), tiles.tiles.tobytes())
@@ -61,7 +61,7 @@ def to_bytes(catalogue: Catalogue) -> bytes:
     return content + hashlib.sha256(content).digest()
 
 
-def from_bytes(data: bytes, where: str) -> Catalogue:
+def from_bytes(data: bytes, where: str) -> Codebook:
     """Parse a catalogue.
 
     Args:
@@ -69,35 +69,33 @@ def from_bytes(data: bytes, where: str) -> Catalogue:
         where: Its name, for messages.
 
     Raises:
-        CatalogueError: Not a catalogue, of another version, cut off, or damaged (the sha256 at its end differs).
+        CodebookError: Not a catalogue, of another version, cut off, or damaged (the sha256 at its end differs).
     """
     if len(data) < _HEADER.size + _HASH_BYTES:
-        raise CatalogueError(where, "", f"{len(data)} B", f"a tile catalogue of at least {_HEADER.size + 32} B")
+        raise CodebookError(where, "", f"{len(data)} B", f"a tile catalogue of at least {_HEADER.size + 32} B")
     magic, version, tile_px, count, dims, notes_bytes = _HEADER.unpack_from(data)
     if magic != MAGIC:
-        raise CatalogueError(where, "magic", magic, repr(MAGIC))
+        raise CodebookError(where, "magic", magic, repr(MAGIC))
     if version != VERSION:
-        raise CatalogueError(where, "version", version, f"{VERSION}, the only one this release reads")
+        raise CodebookError(where, "version", version, f"{VERSION}, the only one this release reads")
     if not MIN_TILE_PX <= tile_px <= MAX_TILE_PX:
-        raise CatalogueError(where, "tile_px", tile_px, f"{MIN_TILE_PX}..{MAX_TILE_PX}")
+        raise CodebookError(where, "tile_px", tile_px, f"{MIN_TILE_PX}..{MAX_TILE_PX}")
     if not 1 <= dims <= min(MAX_DIMS, tile_px * tile_px):
-        raise CatalogueError(where, "dims", dims, f"1..{min(MAX_DIMS, tile_px * tile_px)}")
+        raise CodebookError(where, "dims", dims, f"1..{min(MAX_DIMS, tile_px * tile_px)}")
     if count < 1:
-        raise CatalogueError(where, "tiles", count, "at least 1")
+        raise CodebookError(where, "tiles", count, "at least 1")
     pixels = tile_px * tile_px
     sizes = (_HEADER.size, notes_bytes, pixels, dims * pixels * 2, count * pixels, _HASH_BYTES)
     if len(data) != sum(sizes):
-        raise CatalogueError(where, "length", f"{len(data)} B", f"{sum(sizes)} B, as its header says")
+        raise CodebookError(where, "length", f"{len(data)} B", f"{sum(sizes)} B, as its header says")
     if hashlib.sha256(data[:-_HASH_BYTES]).digest() != data[-_HASH_BYTES:]:
-        raise CatalogueError(
-            where, "sha256", data[-_HASH_BYTES:].hex(), "the hash of the content (the file is damaged)"
-        )
+        raise CodebookError(where, "sha256", data[-_HASH_BYTES:].hex(), "the hash of the content (the file is damaged)")
     ends = np.cumsum(sizes)
     mean = np.frombuffer(data, np.uint8, pixels, int(ends[1]))
     basis = np.frombuffer(data, ">i2", dims * pixels, int(ends[2])).reshape(dims, pixels)
     tiles = np.frombuffer(data, np.uint8, count * pixels, int(ends[3])).reshape(count, pixels)
     notes = _parse_notes(data[_HEADER.size : int(ends[1])], where)
-    return Catalogue(TileDatabase(tile_px, tiles, mean, basis.astype(np.int16)), notes)
+    return Codebook(TileDatabase(tile_px, tiles, mean, basis.astype(np.int16)), notes)
 
 
 def _parse_notes(data: bytes, where: str) -> dict[str, str]:
@@ -105,79 +103,79 @@ def _parse_notes(data: bytes, where: str) -> dict[str, str]:
     try:
         notes = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise CatalogueError(where, "notes", data, expected) from error
+        raise CodebookError(where, "notes", data, expected) from error
     if not isinstance(notes, dict) or not all(isinstance(value, str) for value in notes.values()):
-        raise CatalogueError(where, "notes", notes, expected)
+        raise CodebookError(where, "notes", notes, expected)
     return notes
 
 
-def save(path: Path, catalogue: Catalogue) -> None:
+def save(path: Path, catalogue: Codebook) -> None:
     """Write a catalogue atomically.
 
     Raises:
-        CatalogueError: It cannot be written.
+        CodebookError: It cannot be written.
     """
     try:
         write_atomically(path, to_bytes(catalogue))
     except OSError as error:
-        raise CatalogueError(str(path), "", str(error), "a place that can be written to") from error
+        raise CodebookError(str(path), "", str(error), "a place that can be written to") from error
 
 
-def load(path: Path) -> Catalogue:
+def load(path: Path) -> Codebook:
     """Read a catalogue and verify its hash.
 
     Raises:
-        CatalogueError: The file cannot be read or is damaged.
+        CodebookError: The file cannot be read or is damaged.
     """
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise CatalogueError(str(path), "", str(error), "a tile catalogue file") from error
+        raise CodebookError(str(path), "", str(error), "a tile catalogue file") from error
     return from_bytes(data, str(path))
 
 
 @cache
-def load_nominal(tile_px: int) -> Catalogue:
+def load_default(tile_px: int) -> Codebook:
     """Return the catalogue shipped with the package for tiles of 10 or 20 px; kept in memory after the first call.
 
     Raises:
-        CatalogueError: There is none for that size, or the installed file is damaged.
+        CodebookError: There is none for that size, or the installed file is damaged.
     """
-    if tile_px not in NOMINAL_TILE_PX:
-        sizes = " or ".join(str(size) for size in NOMINAL_TILE_PX)
-        raise CatalogueError("nominal catalogues", "tile_px", tile_px, sizes)
+    if tile_px not in DEFAULT_TILE_PX:
+        sizes = " or ".join(str(size) for size in DEFAULT_TILE_PX)
+        raise CodebookError("nominal catalogues", "tile_px", tile_px, sizes)
     name = f"nominal-{tile_px}.tiles"
     try:
         data = (resources.files("sonarpost.codec.vq") / "data" / name).read_bytes()
     except OSError as error:
-        raise CatalogueError(name, "", str(error), "the file installed with the package") from error
+        raise CodebookError(name, "", str(error), "the file installed with the package") from error
     return from_bytes(data, name)
 
 
-def open_catalogue(name_or_path: str) -> Catalogue:
+def open_codebook(name_or_path: str) -> Codebook:
     """Return a shipped catalogue by its name (`nominal-10`, `nominal-20`) or any other by its path.
 
     Raises:
-        CatalogueError: It cannot be read.
+        CodebookError: It cannot be read.
     """
-    for tile_px in NOMINAL_TILE_PX:
+    for tile_px in DEFAULT_TILE_PX:
         if name_or_path == f"nominal-{tile_px}":
-            return load_nominal(tile_px)
+            return load_default(tile_px)
     return load(Path(name_or_path))
 
 
-def nominal_for_tag(tag: int) -> Catalogue:
+def default_for_tag(tag: int) -> Codebook:
     """Return the shipped catalogue whose identity has the 16-bit tag that a stream header carries.
 
     Raises:
-        CatalogueError: The stream was made with a catalogue that is not one of the shipped ones.
+        CodebookError: The stream was made with a catalogue that is not one of the shipped ones.
     """
     tags = {}
-    for tile_px in NOMINAL_TILE_PX:
-        catalogue = load_nominal(tile_px)
-        own = catalogue_tag(catalogue.tiles)
+    for tile_px in DEFAULT_TILE_PX:
+        catalogue = load_default(tile_px)
+        own = codebook_tag(catalogue.tiles)
         if own == tag:
             return catalogue
         tags[f"nominal-{tile_px}"] = own
     known = ", ".join(f"{own:#06x} ({name})" for name, own in tags.items())
-    raise CatalogueError("stream", "model_tag", f"{tag:#06x}", f"one of {known}, or the catalogue it was made with")
+    raise CodebookError("stream", "model_tag", f"{tag:#06x}", f"one of {known}, or the catalogue it was made with")

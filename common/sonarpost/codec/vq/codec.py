@@ -23,7 +23,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.interface import Decoded, Mask, StreamHeader, check_image, model_tag, to_uint8
+from sonarpost.codec.interface import DecodedImage, Mask, StreamHeader, check_image, model_tag, to_uint8
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles, join_tiles, tile_grid
 from sonarpost.errors import ConfigError, StreamError
 
@@ -77,7 +77,7 @@ _CODEC_IDS = {
 }
 
 
-def catalogue_tag(tiles: TileDatabase) -> int:
+def codebook_tag(tiles: TileDatabase) -> int:
     """Return the tag that streams made with a tile database carry, the same for every packing."""
     return model_tag(IndexPacking.BITS14.codec_id, tiles.identity)
 
@@ -143,7 +143,7 @@ class VqCodec:
         indices, _ = self.tiles.nearest(cut_tiles(to_uint8(image), self.tiles.tile_px))
         return header.pack() + pack_indices(indices + 1, self.packing)
 
-    def decode(self, stream: bytes, received: Mask | None = None) -> Decoded:
+    def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
         """Rebuild the picture from its tiles; what did not arrive is black and missing.
 
         Args:
@@ -176,11 +176,11 @@ class VqCodec:
         chosen[missing] = 0
         blank = np.repeat(missing[:, None].astype(np.uint8), self.tiles.tile_px**2, axis=1)
         size = (header.height_px, header.width_px, self.tiles.tile_px)
-        return Decoded(join_tiles(chosen, *size), join_tiles(blank, *size).astype(np.bool_), tuple(notes))
+        return DecodedImage(join_tiles(chosen, *size), join_tiles(blank, *size).astype(np.bool_), tuple(notes))
 
     @property
     def _tag(self) -> int:
-        return catalogue_tag(self.tiles)
+        return codebook_tag(self.tiles)
 
     def _body_length(self, height_px: int, width_px: int) -> int:
         rows, columns = tile_grid(height_px, width_px, self.tiles.tile_px)

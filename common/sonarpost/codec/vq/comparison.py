@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.vq.incremental import GrowingTiles
+from sonarpost.codec.vq.incremental import IncrementalTileSet
 from sonarpost.codec.vq.tiles import TileDatabase
-from sonarpost.errors import CatalogueError
+from sonarpost.errors import CodebookError
 
 
 @dataclass(frozen=True)
-class OneSide:
+class UnmatchedTiles:
     """One catalogue as seen from the other.
 
     Attributes:
@@ -36,7 +36,7 @@ class OneSide:
 
 
 @dataclass(frozen=True)
-class Difference:
+class CodebookDifference:
     """How two catalogues of the same tile size differ.
 
     Attributes:
@@ -52,25 +52,25 @@ class Difference:
     same_identity: bool
     same_places: int
     common: int
-    first: OneSide
-    second: OneSide
+    first: UnmatchedTiles
+    second: UnmatchedTiles
     angle_largest_deg: float
     angle_rms_deg: float
 
 
-def compare(first: TileDatabase, second: TileDatabase) -> Difference:
+def compare(first: TileDatabase, second: TileDatabase) -> CodebookDifference:
     """Compare two catalogues.
 
     Raises:
-        CatalogueError: Their tiles are of different size, so no distance is defined between them.
+        CodebookError: Their tiles are of different size, so no distance is defined between them.
     """
     if first.tile_px != second.tile_px:
         expected = f"{first.tile_px} px as in the first: tiles of different size cannot be compared"
-        raise CatalogueError("second catalogue", "tile_px", second.tile_px, expected)
+        raise CodebookError("second catalogue", "tile_px", second.tile_px, expected)
     tiles = [{row.tobytes() for row in database.tiles} for database in (first, second)]
     both = min(len(first), len(second))
     angles = principal_angles_deg(first.basis, second.basis)
-    return Difference(
+    return CodebookDifference(
         same_identity=first.identity == second.identity,
         same_places=int((first.tiles[:both] == second.tiles[:both]).all(axis=1).sum()),
         common=len(tiles[0] & tiles[1]),
@@ -97,12 +97,12 @@ def principal_angles_deg(one: npt.NDArray[np.int16], other: npt.NDArray[np.int16
     return np.asarray(np.degrees(angles), dtype=np.float64)
 
 
-def _one_side(own: TileDatabase, other: TileDatabase, own_tiles: set[bytes], other_tiles: set[bytes]) -> OneSide:
-    search = GrowingTiles(other.tile_px, len(other))
+def _one_side(own: TileDatabase, other: TileDatabase, own_tiles: set[bytes], other_tiles: set[bytes]) -> UnmatchedTiles:
+    search = IncrementalTileSet(other.tile_px, len(other))
     search.append(other.tiles)
     rms = np.sqrt(search.nearest(own.tiles)[1]) / own.tile_px
     median, high = np.percentile(rms, (50, 95))
-    return OneSide(
+    return UnmatchedTiles(
         tiles=len(own_tiles),
         only_here=len(own_tiles - other_tiles),
         rms_median=float(median),

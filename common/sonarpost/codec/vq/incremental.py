@@ -13,11 +13,11 @@ _QUERY_ROWS = 256
 _CHUNK_TILES = 256
 _POOL_TILES = 4096
 
-Single = npt.NDArray[np.float32]
+FloatArray = npt.NDArray[np.float32]
 Distances = npt.NDArray[np.float64]
 
 
-class GrowingTiles:
+class IncrementalTileSet:
     """Tiles that grow, with an exact nearest search over all pixels.
 
     Pixels are held centred on 128. Products of two tiles of at most 32 x 32 px then never exceed 2^24, so that sums of

@@ -16,25 +16,25 @@ import numpy.typing as npt
 
 from sonarpost.codec.vq.training_config import TrainingImage
 
-Picture = npt.NDArray[np.uint8]
-Line = npt.NDArray[np.float32]
+TrainingSnippet = npt.NDArray[np.uint8]
+SonarLine = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Tone:
+class ToneMapping:
     """A tone curve: `255 * gain * (value / 255) ** gamma`, limited to 255."""
 
     gamma: float
     gain: float
 
-    def table(self) -> Picture:
+    def table(self) -> TrainingSnippet:
         """Return the curve as a table, shape (256,), uint8."""
         values = 255.0 * self.gain * (np.arange(256) / 255.0) ** self.gamma
         return np.minimum(np.floor(values + 0.5), 255.0).astype(np.uint8)
 
 
 @dataclass(frozen=True)
-class WindowPlan:
+class PatchPlan:
     """How a line is cut.
 
     Attributes:
@@ -50,21 +50,21 @@ class WindowPlan:
     reductions: tuple[tuple[int, int], ...] = ((1, 1), (2, 2), (3, 3), (4, 4), (2, 1), (4, 2), (6, 6))
     per_reduction: int = 250
     least_std: float = 12.0
-    tones: tuple[Tone, ...] = field(
+    tones: tuple[ToneMapping, ...] = field(
         default=(
-            Tone(1.0, 1.0),
-            Tone(1.3, 0.9),
-            Tone(1.7, 0.8),
-            Tone(0.85, 0.8),
-            Tone(1.5, 0.6),
-            Tone(1.2, 1.15),
-            Tone(2.0, 0.95),
+            ToneMapping(1.0, 1.0),
+            ToneMapping(1.3, 0.9),
+            ToneMapping(1.7, 0.8),
+            ToneMapping(0.85, 0.8),
+            ToneMapping(1.5, 0.6),
+            ToneMapping(1.2, 1.15),
+            ToneMapping(2.0, 0.95),
         )
     )
     copies: int = 1
 
 
-def stretch(window: npt.NDArray[np.float64], low_percent: float = 1.0, high_percent: float = 99.5) -> Picture:
+def stretch(window: npt.NDArray[np.float64], low_percent: float = 1.0, high_percent: float = 99.5) -> TrainingSnippet:
     """Map a window to 8 bits: the two percentiles become 0 and 255, what lies beyond is limited.
 
     Percentiles are order statistics (no interpolation), so the result is the same everywhere.
@@ -77,14 +77,14 @@ def stretch(window: npt.NDArray[np.float64], low_percent: float = 1.0, high_perc
     return np.clip(scaled, 0.0, 255.0).astype(np.uint8)
 
 
-def reduce_line(line: Line, pings: int, samples: int) -> npt.NDArray[np.float64]:
+def reduce_line(line: SonarLine, pings: int, samples: int) -> npt.NDArray[np.float64]:
     """Average blocks of (pings, samples); the remainder at the far edges is left out."""
     rows, columns = line.shape[0] // pings, line.shape[1] // samples
     blocks = line[: rows * pings, : columns * samples].astype(np.float64).reshape(rows, pings, columns, samples)
     return np.asarray(blocks.mean(axis=(1, 3)), dtype=np.float64)
 
 
-def cut_line(name: str, line: Line, plan: WindowPlan) -> Iterator[TrainingImage]:
+def cut_line(name: str, line: SonarLine, plan: PatchPlan) -> Iterator[TrainingImage]:
     """Cut one side of a survey line into training images.
 
     Args:
@@ -107,7 +107,9 @@ def cut_line(name: str, line: Line, plan: WindowPlan) -> Iterator[TrainingImage]
                 serial += 1
 
 
-def cut_around(name: str, line: Line, places: Sequence[tuple[int, int]], plan: WindowPlan) -> Iterator[TrainingImage]:
+def cut_around(
+    name: str, line: SonarLine, places: Sequence[tuple[int, int]], plan: PatchPlan
+) -> Iterator[TrainingImage]:
     """Cut windows that each show one place, for what is rare on the bottom (objects with their shadows).
 
     Args:
@@ -142,7 +144,7 @@ def shuffled(images: Sequence[TrainingImage]) -> list[TrainingImage]:
     return sorted(images, key=lambda image: hashlib.sha256(image.name.encode()).digest())
 
 
-def _usable_corners(line: npt.NDArray[np.float64], plan: WindowPlan) -> list[tuple[int, int]]:
+def _usable_corners(line: npt.NDArray[np.float64], plan: PatchPlan) -> list[tuple[int, int]]:
     corners = []
     for top in range(0, line.shape[0] - plan.side_px + 1, plan.side_px):
         for left in range(0, line.shape[1] - plan.side_px + 1, plan.side_px):
@@ -157,5 +159,5 @@ def _scattered(corners: list[tuple[int, int]], wanted: int) -> list[tuple[int, i
     return sorted(corners, key=lambda corner: hashlib.sha256(repr(corner).encode()).digest())[:wanted]
 
 
-def _training_image(name: str, pixels: Picture) -> TrainingImage:
+def _training_image(name: str, pixels: TrainingSnippet) -> TrainingImage:
     return TrainingImage(name, lambda: pixels)

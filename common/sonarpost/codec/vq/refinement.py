@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sonarpost.codec.vq.incremental import GrowingTiles
+from sonarpost.codec.vq.incremental import IncrementalTileSet
 from sonarpost.codec.vq.tiles import TileDatabase, Tiles, cut_tiles
 from sonarpost.codec.vq.training_config import TrainingImage, pixels_hash
 
@@ -56,7 +56,7 @@ def refine(
         tiles = refined.tiles
         if progress is not None:
             progress(number, refined.rms)
-    return TileDatabase.from_tiles(database.tile_px, without_doubles(tiles), database.dims) if passes else database
+    return TileDatabase.from_tiles(database.tile_px, without_duplicates(tiles), database.dims) if passes else database
 
 
 def refine_once(
@@ -70,7 +70,7 @@ def refine_once(
         images: The training images; one batch of their tiles is held at a time.
         told: Called after each batch with the number of images done.
     """
-    search = GrowingTiles(tile_px, tiles.shape[0])
+    search = IncrementalTileSet(tile_px, tiles.shape[0])
     search.append(tiles)
     sums = np.zeros(tiles.shape, dtype=np.int64)
     counts = np.zeros(tiles.shape[0], dtype=np.int64)
@@ -92,7 +92,7 @@ def refine_once(
     return RefinedTiles(means, float(np.sqrt(squared_error / pixels)), digest.digest())
 
 
-def without_doubles(tiles: Tiles) -> Tiles:
+def without_duplicates(tiles: Tiles) -> Tiles:
     """Return each tile once, in order: means may coincide, and a doubled tile would only waste an index."""
     _, first = np.unique(tiles, axis=0, return_index=True)
     return tiles[np.sort(first)]

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.vq.tile_search import LEADING, Distances, Indices, NearestSearch
-from sonarpost.errors import CatalogueError
+from sonarpost.errors import CodebookError
 
 MIN_TILE_PX = 4
 MAX_TILE_PX = 32  # a squared distance of 32 x 32 tiles in units of (1/4096)^2 still fits float64's 53 bits
@@ -50,7 +50,7 @@ class TileDatabase:
         projections: Shape (n, dims), float64 holding integers: `(tiles - mean) @ basis.T`.
 
     Raises:
-        CatalogueError: A shape, dtype or count is not as above.
+        CodebookError: A shape, dtype or count is not as above.
     """
 
     tile_px: int
@@ -85,7 +85,7 @@ class TileDatabase:
             dims: Dimensions to keep, 1..70; fewer are kept where the tiles span fewer.
 
         Raises:
-            CatalogueError: Shapes or counts outside the documented ranges.
+            CodebookError: Shapes or counts outside the documented ranges.
         """
         _check("dims", dims, f"1..{MAX_DIMS}", 1 <= dims <= MAX_DIMS)
         _check("tile_px", tile_px, f"{MIN_TILE_PX}..{MAX_TILE_PX}", MIN_TILE_PX <= tile_px <= MAX_TILE_PX)
@@ -233,7 +233,7 @@ def tile_grid(height_px: int, width_px: int, tile_px: int) -> tuple[int, int]:
 
 def _check(name: str, value: object, expected: str, good: bool) -> None:  # noqa: FBT001 - a condition, not a switch
     if not good:
-        raise CatalogueError("tile database", name, value, expected)
+        raise CodebookError("tile database", name, value, expected)
 
 
 def _check_array(

@@ -50,7 +50,7 @@ class TrainingImage:
 
 
 @dataclass(frozen=True)
-class Progress:
+class BuildProgress:
     """Told after every image: where the build stands.
 
     Attributes:
@@ -77,7 +77,7 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class PassProgress:
+class RefinementProgress:
     """Told after every image of a refinement pass, and once more, with the error, when the pass is done.
 
     Attributes:

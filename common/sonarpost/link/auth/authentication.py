@@ -15,7 +15,7 @@ from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 
 from sonarpost.errors import ConfigError, FrameError
-from sonarpost.link.auth.key import MAX_ADDRESS, Direction, SealKey, SealSettings
+from sonarpost.link.auth.key import MAX_ADDRESS, AcousticKey, AuthenticationSettings, Direction
 from sonarpost.link.auth.replay_window import WINDOW, ReplayWindow
 from sonarpost.link.receiver_state import read_field, read_list, read_number
 
@@ -28,7 +28,7 @@ _LOOK_BACK: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
-class SealCounts:
+class AuthenticationCounts:
     """Counters since the beginning, restarts included.
 
     Attributes:
@@ -46,7 +46,7 @@ class SealCounts:
     unconfirmed: int = 0
 
 
-class AcousticSeal:
+class FrameAuthenticator:
     """Seals what this station sends and opens what others send: a `FrameSeal`.
 
     Before frames are sealed, counters must be reserved, so that none is used twice, whatever crashes when:
@@ -71,14 +71,14 @@ class AcousticSeal:
 
     def __init__(
         self,
-        key: SealKey,
+        key: AcousticKey,
         address: int,
         sends: Direction,
-        settings: SealSettings | None = None,
+        settings: AuthenticationSettings | None = None,
         *,
         first_counter: int = 0,
     ) -> None:
-        self.settings = settings or SealSettings()
+        self.settings = settings or AuthenticationSettings()
         for name, value, high in (
             ("address", address, MAX_ADDRESS),
             ("first_counter", first_counter, self.settings.lifetime_frames),
@@ -92,7 +92,7 @@ class AcousticSeal:
         self._windows: dict[int, ReplayWindow] = {}
         self._ahead: dict[int, int] = {}
         self._next = self._limit = first_counter
-        self._counts = SealCounts()
+        self._counts = AuthenticationCounts()
 
     @property
     def size(self) -> int:
@@ -100,7 +100,7 @@ class AcousticSeal:
         return self.settings.size
 
     @property
-    def counts(self) -> SealCounts:
+    def counts(self) -> AuthenticationCounts:
         """The counters."""
         return self._counts
 
@@ -255,7 +255,9 @@ class AcousticSeal:
             limit = read_number(state, "limit", 0, self.settings.lifetime_frames)
             windows = dict(self._import_window(entry) for entry in read_list(state, "windows"))
             counts = read_field(state, "counts", dict)
-            restored = SealCounts(**{name: read_number(counts, name, 0, 2**62) for name in asdict(self._counts)})
+            restored = AuthenticationCounts(
+                **{name: read_number(counts, name, 0, 2**62) for name in asdict(self._counts)}
+            )
         except FrameError as error:
             raise FrameError("seal state", error.field, error.value, error.expected) from error
         self._next = self._limit = max(self._limit, limit)

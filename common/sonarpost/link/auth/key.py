@@ -41,7 +41,7 @@ class Direction(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class SealSettings:
+class AuthenticationSettings:
     """What both ends must agree on besides the key.
 
     Attributes:
@@ -83,7 +83,7 @@ class SealSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class SealKey:
+class AcousticKey:
     """A pre-shared key. It is not shown when printed.
 
     Attributes:
@@ -104,7 +104,7 @@ class SealKey:
         """Eight hexadecimal digits by which people compare keys; the key does not follow from them."""
         return self._derive(b"fingerprint", 4).hex()
 
-    def cipher(self, source: int, direction: Direction, settings: SealSettings) -> AESCCM:
+    def cipher(self, source: int, direction: Direction, settings: AuthenticationSettings) -> AESCCM:
         """Return AES-256-CCM with the key of one transmitter.
 
         Args:
@@ -119,7 +119,7 @@ class SealKey:
         return HKDF(algorithm=SHA256(), length=length, salt=None, info=_LABEL + purpose).derive(self.secret)
 
 
-def parse_key(text: str, where: str) -> SealKey:
+def parse_key(text: str, where: str) -> AcousticKey:
     """Read a key: 64 hexadecimal digits, with or without a line end.
 
     Args:
@@ -137,4 +137,4 @@ def parse_key(text: str, where: str) -> SealKey:
     if different < _LEAST_DIFFERENT_BYTES:
         # 32 bytes drawn by chance have fewer than this once in 10^16 keys.
         raise ConfigError(where, "key", f"{different} different bytes", "32 random bytes (openssl rand -hex 32)")
-    return SealKey(secret)
+    return AcousticKey(secret)

@@ -7,13 +7,13 @@ from functools import lru_cache
 from typing import Final
 
 from sonarpost.link.coding import erasure_code as fec
-from sonarpost.link.coding.blocks import Picture, SendBlock, fitted_stops, layer_objects, preview_object
-from sonarpost.link.coding.rate_distortion import GroupGain
+from sonarpost.link.coding.blocks import OutgoingImage, SendBlock, fitted_stops, layer_objects, preview_object
+from sonarpost.link.coding.rate_distortion import GroupDistortion
 from sonarpost.link.coding.redundancy_plan import arrivals, plan_layers, plan_whole, preview_frames, symbols_to_send
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.v1.frame import SymbolKind
 from sonarpost.link.frames.v1.layers import Layering
-from sonarpost.link.frames.v1.payload_objects import CHECK_BYTES, Pieces
+from sonarpost.link.frames.v1.payload_objects import CHECK_BYTES, PieceList
 from sonarpost.link.frames.v1.preview import entry_shape
 
 TakeNumber = Callable[[], int]
@@ -39,7 +39,7 @@ def group_limit(config: SenderConfig, symbol_bytes: int) -> int:
     return most
 
 
-def numbers_needed(pictures: Sequence[Picture], config: SenderConfig, symbol_bytes: int) -> int:
+def numbers_needed(pictures: Sequence[OutgoingImage], config: SenderConfig, symbol_bytes: int) -> int:
     """Return how many blocks a group makes at most."""
     if not config.feedback:
         return 2
@@ -55,7 +55,7 @@ def _planned_previews(config: SenderConfig, source: int, pictures: int) -> int:
 
 
 def make_group(
-    pictures: Sequence[Picture], config: SenderConfig, symbol_bytes: int, take_number: TakeNumber, now: float
+    pictures: Sequence[OutgoingImage], config: SenderConfig, symbol_bytes: int, take_number: TakeNumber, now: float
 ) -> list[SendBlock]:
     """Return the blocks of a group: previews first."""
     shape = entry_shape(symbol_bytes)
@@ -85,7 +85,7 @@ def make_group(
 
 
 def _layered(
-    pictures: Sequence[Picture],
+    pictures: Sequence[OutgoingImage],
     config: SenderConfig,
     symbol_bytes: int,
     frames: int,
@@ -93,11 +93,11 @@ def _layered(
     now: float,
 ) -> Iterator[SendBlock]:
     starts = [p.sent for p in pictures]
-    gain = GroupGain.of([p.curve for p in pictures], starts)
+    gain = GroupDistortion.of([p.curve for p in pictures], starts)
     if frames < 1 or gain.total_bytes == 0:
         return
     # Lengths of 128 bytes and more take two bytes; most pieces are shorter or longer together.
-    guess = Pieces(
+    guess = PieceList(
         tuple(p.piece(s, min(s + 128, len(p.stream))) for p, s in zip(pictures, starts, strict=True)), final=True
     )
     first, later = guess.overhead_bytes(), 1 + len(pictures) + CHECK_BYTES
@@ -131,28 +131,28 @@ def _layered(
 
 
 def _layer_stops(
-    pictures: Sequence[Picture],
+    pictures: Sequence[OutgoingImage],
     starts: Sequence[int],
-    gain: GroupGain,
+    gain: GroupDistortion,
     layering: Layering,
     symbol_bytes: int,
     first: int,
     later: int,
 ) -> list[list[int]]:
     stops: list[list[int]] = []
-    below: Pieces | None = None
+    below: PieceList | None = None
     begins, total = list(starts), 0
     for length in layering.lengths(symbol_bytes):
         total += length - (later if stops else first)
         ends = fitted_stops(pictures, begins, gain.stops(total), length, below)
-        below = Pieces(tuple(p.piece(a, b) for p, a, b in zip(pictures, begins, ends, strict=True)), final=False)
+        below = PieceList(tuple(p.piece(a, b) for p, a, b in zip(pictures, begins, ends, strict=True)), final=False)
         stops.append(ends)
         begins = ends
     return stops
 
 
 def whole_blocks(
-    pictures: Sequence[Picture],
+    pictures: Sequence[OutgoingImage],
     config: SenderConfig,
     symbol_bytes: int,
     take_number: TakeNumber,
@@ -178,7 +178,7 @@ def whole_blocks(
 
 
 def _whole_block(
-    run: Sequence[Picture],
+    run: Sequence[OutgoingImage],
     stops: Sequence[int],
     source: int,
     symbol_bytes: int,
@@ -189,7 +189,7 @@ def _whole_block(
     final: bool,
 ) -> SendBlock:
     """Return a block without layers of the pictures from what was sent to their stops, and note that it is."""
-    pieces = Pieces(tuple(p.piece(p.sent, stop) for p, stop in zip(run, stops, strict=True)), final)
+    pieces = PieceList(tuple(p.piece(p.sent, stop) for p, stop in zip(run, stops, strict=True)), final)
     spans = tuple(p.span(p.sent, stop) for p, stop in zip(run, stops, strict=True))
     for picture, stop in zip(run, stops, strict=True):
         picture.sent = stop
@@ -207,12 +207,14 @@ def _whole_block(
     )
 
 
-def _object_bytes(run: Sequence[Picture], starts: Sequence[int], stops: Sequence[int]) -> int:
-    pieces = Pieces(tuple(p.piece(a, b) for p, a, b in zip(run, starts, stops, strict=True)), final=True)
+def _object_bytes(run: Sequence[OutgoingImage], starts: Sequence[int], stops: Sequence[int]) -> int:
+    pieces = PieceList(tuple(p.piece(a, b) for p, a, b in zip(run, starts, stops, strict=True)), final=True)
     return pieces.overhead_bytes() + sum(stops) - sum(starts)
 
 
-def _run_that_fits(rest: Sequence[Picture], goals: Mapping[int, int], room: int) -> tuple[list[Picture], int]:
+def _run_that_fits(
+    rest: Sequence[OutgoingImage], goals: Mapping[int, int], room: int
+) -> tuple[list[OutgoingImage], int]:
     """Return pictures from the front whose rest fits one block (at least one), shared out evenly over the blocks."""
     sizes = [goals[p.number] - p.sent + 5 for p in rest]
     blocks = -(-(sum(sizes) + 16) // room)

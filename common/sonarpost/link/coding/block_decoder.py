@@ -12,14 +12,14 @@ from sonarpost.errors import FrameError
 from sonarpost.link.coding import erasure_code as fec
 from sonarpost.link.frames.v1.frame import Symbol, SymbolKind
 from sonarpost.link.frames.v1.layers import DESCRIPTOR_SYMBOLS, Layering, recover_layer, recover_layering
-from sonarpost.link.frames.v1.payload_objects import Message, Pieces, unpack_object
+from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, unpack_object
 from sonarpost.link.frames.v1.preview import Preview, entry_shape
 
-Found = Preview | Pieces | Message
+DecodedObject = Preview | PieceList | MessageObject
 
 
 @dataclass(eq=False)
-class Assembly:
+class BlockDecoder:
     """A block under way.
 
     Attributes:
@@ -45,12 +45,12 @@ class Assembly:
     symbols: dict[int, bytes] = field(default_factory=dict)
     told: dict[int, int] = field(default_factory=dict)
     layering: Layering | None = None
-    layers: list[Pieces] = field(default_factory=list)
+    layers: list[PieceList] = field(default_factory=list)
     complete: bool = False
     mixed: int = 0
 
     @classmethod
-    def of(cls, symbol: Symbol, now: float) -> Assembly:
+    def of(cls, symbol: Symbol, now: float) -> BlockDecoder:
         """Begin a block with its first symbol (which is still to be added)."""
         count = 0 if symbol.kind == SymbolKind.LAYERED else symbol.parameter
         return cls(symbol.kind, symbol.block, len(symbol.data), count, now)
@@ -77,7 +77,7 @@ class Assembly:
             wanted = self.count
         return max(1, wanted - len(self.symbols))
 
-    def add(self, symbol: Symbol, now: float) -> list[Found]:
+    def add(self, symbol: Symbol, now: float) -> list[DecodedObject]:
         """Take a symbol; return what became known by it.
 
         Raises:
@@ -98,7 +98,7 @@ class Assembly:
             self._forget_older_half()
             raise
 
-    def _object(self) -> list[Found]:
+    def _object(self) -> list[DecodedObject]:
         if len(self.symbols) < self.count:
             return []
         found = unpack_object(self._source().tobytes(), where=f"block {self.number}")
@@ -124,10 +124,10 @@ class Assembly:
                 data = b"".join(p for p in parts if p is not None)
                 yield from _entries(data, shape.entries, len(data), shape.entry_bytes)
 
-    def _more_layers(self) -> Iterator[Pieces]:
+    def _more_layers(self) -> Iterator[PieceList]:
         if self.layering is None and len(self.told) >= DESCRIPTOR_SYMBOLS:
             self.layering = recover_layering(self.told)
-        found: list[Pieces] = []
+        found: list[PieceList] = []
         while self.layering is not None and len(self.layers) < len(self.layering.needs):
             layer = len(self.layers)
             if len(self.symbols) < self.layering.needs[layer]:
@@ -135,7 +135,7 @@ class Assembly:
             below = self.layers[-1] if self.layers else None
             data = recover_layer(self.layering, layer, self.symbols)
             pieces = unpack_object(data, below, f"block {self.number}, layer {layer}")
-            if not isinstance(pieces, Pieces):
+            if not isinstance(pieces, PieceList):
                 raise FrameError(f"block {self.number}", "layer", "a message", "pieces of pictures")
             self.layers.append(pieces)
             found.append(pieces)

@@ -14,17 +14,17 @@ from sonarpost.link.coding.rate_distortion import Values
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import Symbol, SymbolKind
 from sonarpost.link.frames.v1.layers import Layering, layered_symbols
-from sonarpost.link.frames.v1.payload_objects import Piece, Pieces
+from sonarpost.link.frames.v1.payload_objects import PieceList, StreamPiece
 from sonarpost.link.frames.v1.preview import Preview, contact_link, entry_shape
 
-Span = tuple[int, int, int, int]
+StreamSpan = tuple[int, int, int, int]
 """Number and link of a picture, and a part of its stream `[start, stop)`."""
 _AHEAD = 32
 """Symbols are made so many at a time: a matrix product of several costs little more than one."""
 
 
 @dataclass(eq=False)
-class Picture:
+class OutgoingImage:
     """A picture to send.
 
     Attributes:
@@ -60,13 +60,13 @@ class Picture:
         """Return the preview with so much of the stream."""
         return Preview(self.number, self.contact, self.stream[:prefix_bytes], ended=len(self.stream) < prefix_bytes)
 
-    def span(self, start: int, stop: int) -> Span:
+    def span(self, start: int, stop: int) -> StreamSpan:
         """Return what a block notes of a part of the stream that it holds."""
         return self.number, self.link, start, stop
 
-    def piece(self, start: int, stop: int) -> Piece:
+    def piece(self, start: int, stop: int) -> StreamPiece:
         """Return a piece of the stream."""
-        return Piece(self.number, self.link, start, self.stream[start:stop])
+        return StreamPiece(self.number, self.link, start, self.stream[start:stop])
 
 
 @dataclass(eq=False)
@@ -101,7 +101,7 @@ class SendBlock:
     reported: bool = False
     asked_at: float = 0.0
     needs: dict[int, int] = field(default_factory=dict)
-    spans: tuple[Span, ...] = ()
+    spans: tuple[StreamSpan, ...] = ()
     _made: dict[int, Symbol] = field(default_factory=dict)
 
     @property
@@ -142,7 +142,7 @@ class SendBlock:
             self._made[index] = Symbol(self.kind, self.number, index, source.shape[0], row.tobytes())
 
 
-def preview_object(pictures: Sequence[Picture], symbol_bytes: int) -> bytes:
+def preview_object(pictures: Sequence[OutgoingImage], symbol_bytes: int) -> bytes:
     """Return the source symbols of a preview block as one object."""
     shape = entry_shape(symbol_bytes)
     entries = [picture.preview(shape.prefix_bytes).pack(shape.entry_bytes) for picture in pictures]
@@ -151,7 +151,7 @@ def preview_object(pictures: Sequence[Picture], symbol_bytes: int) -> bytes:
 
 
 def layer_objects(
-    pictures: Sequence[Picture],
+    pictures: Sequence[OutgoingImage],
     layering: Layering,
     symbol_bytes: int,
     starts: Sequence[int],
@@ -159,18 +159,18 @@ def layer_objects(
 ) -> tuple[bytes, ...]:
     """Return the objects of a layered block, given up to where each layer goes in each stream."""
     objects: list[bytes] = []
-    below: Pieces | None = None
+    below: PieceList | None = None
     begins = list(starts)
     for layer, (length, stops) in enumerate(zip(layering.lengths(symbol_bytes), layer_stops, strict=True)):
         pieces = tuple(p.piece(a, b) for p, a, b in zip(pictures, begins, stops, strict=True))
-        group = Pieces(pieces, final=layer == len(layer_stops) - 1)
+        group = PieceList(pieces, final=layer == len(layer_stops) - 1)
         objects.append(group.pack(length, below))
         below, begins = group, stops
     return tuple(objects)
 
 
 def fitted_stops(
-    pictures: Sequence[Picture], starts: Sequence[int], stops: list[int], room: int, below: Pieces | None
+    pictures: Sequence[OutgoingImage], starts: Sequence[int], stops: list[int], room: int, below: PieceList | None
 ) -> list[int]:
     """Return `stops`, drawn back or pushed on until the object fills `room` bytes as well as it can.
 
@@ -182,7 +182,7 @@ def fitted_stops(
 
     def overhead(ends: Sequence[int]) -> int:
         found = tuple(p.piece(a, b) for p, a, b in zip(pictures, starts, ends, strict=True))
-        return Pieces(found, final=True).overhead_bytes(below)
+        return PieceList(found, final=True).overhead_bytes(below)
 
     ends = [max(a, b) for a, b in zip(starts, stops, strict=True)]
     spare = room - overhead(ends) - sum(ends) + sum(starts)

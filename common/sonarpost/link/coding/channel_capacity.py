@@ -18,7 +18,7 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Channel:
+class LossChannel:
     """What a frame meets.
 
     Attributes:
@@ -43,18 +43,20 @@ class Channel:
         """Correlation of the fates of two successive frames, 0..1."""
         return max(0.0, 1.0 - 1.0 / (self.burst * (1.0 - self.loss)))
 
-    def spread(self, depth: int) -> Channel:
+    def spread(self, depth: int) -> LossChannel:
         """Return what frames see that are sent `depth` frames apart."""
         memory = self.memory**depth
-        return Channel(self.loss, max(1.0, 1.0 / ((1.0 - self.loss) * (1.0 - memory)))) if memory > 0 else self.plain
+        return (
+            LossChannel(self.loss, max(1.0, 1.0 / ((1.0 - self.loss) * (1.0 - memory)))) if memory > 0 else self.plain
+        )
 
     @property
-    def plain(self) -> Channel:
+    def plain(self) -> LossChannel:
         """The same share of losses, independent of each other."""
-        return Channel(self.loss)
+        return LossChannel(self.loss)
 
 
-def received_distribution(frames: int, channel: Channel) -> Values:
+def received_distribution(frames: int, channel: LossChannel) -> Values:
     """Return shape (frames + 1,): the probability that 0, 1, ... of successive frames arrive."""
     loss, memory = channel.loss, channel.memory
     stay_lost, become_lost = loss + (1 - loss) * memory, loss - loss * memory
@@ -78,7 +80,7 @@ def erasure_bound_frames(payload_bytes: float, frame_bytes: int, loss: float) ->
     return payload_bytes / (frame_bytes * (1.0 - loss))
 
 
-def unseen_share(source_frames: int, sent_frames: int, channel: Channel) -> float:
+def unseen_share(source_frames: int, sent_frames: int, channel: LossChannel) -> float:
     """Return the share of source symbols that stay unknown when `sent_frames` of a systematic block are sent.
 
     With fewer than k received symbols those of the source that came are known all the same: given r received of n, each
@@ -90,7 +92,7 @@ def unseen_share(source_frames: int, sent_frames: int, channel: Channel) -> floa
     return float((arrived * short * (1 - counts / max(sent_frames, 1))).sum())
 
 
-def frames_for(source_frames: int, channel: Channel, unseen: float, limit: int) -> int:
+def frames_for(source_frames: int, channel: LossChannel, unseen: float, limit: int) -> int:
     """Return the fewest frames of a systematic block with which at most `unseen` of the source stay unknown.
 
     At most `limit`, whatever that gives.

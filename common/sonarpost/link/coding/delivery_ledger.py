@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from sonarpost.link.coding.blocks import Picture, SendBlock
+from sonarpost.link.coding.blocks import OutgoingImage, SendBlock
 from sonarpost.link.coding.byte_ranges import Ranges, add_range, gaps_within
 from sonarpost.link.config import SenderConfig
-from sonarpost.link.frames.v1.feedback import UNHEARD, WINDOW, Feedback
+from sonarpost.link.frames.v1.feedback import NEVER_RECEIVED, WINDOW, Feedback
 from sonarpost.link.frames.v1.frame import BLOCKS
 
 
-def settle(pictures: Mapping[int, Picture], done: Iterable[SendBlock]) -> None:
+def record_delivered(pictures: Mapping[int, OutgoingImage], done: Iterable[SendBlock]) -> None:
     """Note that receivers have all of these blocks."""
     for block in done:
         for number, link, start, stop in block.spans:
@@ -25,7 +25,7 @@ def settle(pictures: Mapping[int, Picture], done: Iterable[SendBlock]) -> None:
                 picture.settled = add_range(picture.settled, start, min(stop, len(picture.stream)))
 
 
-def owed_start(picture: Picture, config: SenderConfig, blocks: Sequence[SendBlock]) -> int | None:
+def missing_start(picture: OutgoingImage, config: SenderConfig, blocks: Sequence[SendBlock]) -> int | None:
     """Return the first byte of a picture that nobody is known to have and no block holds, None where there is none."""
     covered: Ranges = picture.settled
     for block in blocks:
@@ -36,31 +36,31 @@ def owed_start(picture: Picture, config: SenderConfig, blocks: Sequence[SendBloc
     return gaps[0][0] if gaps else None
 
 
-def owed(
-    pictures: Mapping[int, Picture], config: SenderConfig, blocks: Sequence[SendBlock], most: int
-) -> list[tuple[Picture, int]]:
+def missing(
+    pictures: Mapping[int, OutgoingImage], config: SenderConfig, blocks: Sequence[SendBlock], most: int
+) -> list[tuple[OutgoingImage, int]]:
     """Return pictures, at most `most`, the oldest first, of which something is owed, and from which byte on.
 
     Pictures whose record is owed do not mix with those of which only detail is: they are those of the first kind, or
     where there are none of the second.
     """
-    found = [(p, at) for p in pictures.values() if (at := owed_start(p, config, blocks)) is not None]
+    found = [(p, at) for p in pictures.values() if (at := missing_start(p, config, blocks)) is not None]
     anew = [(p, at) for p, at in found if at == 0]
     return (anew or found)[:most]
 
 
-def forgettable(pictures: Mapping[int, Picture], config: SenderConfig, needed: Iterable[int]) -> list[int]:
+def forgettable(pictures: Mapping[int, OutgoingImage], config: SenderConfig, needed: Iterable[int]) -> list[int]:
     """Return the numbers of pictures that are not needed in the order in which to forget them: what is owed last."""
     keep = set(needed)
     free = [p for n, p in pictures.items() if n not in keep]
-    return [p.number for p in sorted(free, key=lambda p: owed_start(p, config, ()) is not None)]
+    return [p.number for p in sorted(free, key=lambda p: missing_start(p, config, ()) is not None)]
 
 
 def revived(past: list[SendBlock], report: Feedback) -> list[SendBlock]:
     """Take from `past` the blocks that a report tells of, and return those of which the receiver has something."""
     told = [block for block in past if report.need_of(block.number) is not None]
     past[:] = [block for block in past if block not in told]
-    return [block for block in told if report.need_of(block.number) != UNHEARD]
+    return [block for block in told if report.need_of(block.number) != NEVER_RECEIVED]
 
 
 def within_window(past: list[SendBlock], next_block: int) -> list[SendBlock]:

@@ -65,7 +65,7 @@ def _hull(curve: Values, start: int) -> tuple[list[int], list[float]]:
 
 
 @dataclass(frozen=True, eq=False)
-class GroupGain:
+class GroupDistortion:
     """The gains of a group, steepest first.
 
     Attributes:
@@ -83,7 +83,7 @@ class GroupGain:
     gain_by_step: Values
 
     @classmethod
-    def of(cls, curves: Sequence[Values], starts: Sequence[int]) -> GroupGain:
+    def of(cls, curves: Sequence[Values], starts: Sequence[int]) -> GroupDistortion:
         """Merge the hulls of pictures, each from its start on."""
         owners, sizes, gains = [], [], []
         for owner, (curve, start) in enumerate(zip(curves, starts, strict=True)):

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.coding.channel_capacity import Channel, Values, frames_for, goodput_bps, received_distribution
-from sonarpost.link.coding.rate_distortion import GroupGain
+from sonarpost.link.coding.channel_capacity import LossChannel, Values, frames_for, goodput_bps, received_distribution
+from sonarpost.link.coding.rate_distortion import GroupDistortion
 from sonarpost.link.frames.v1.frame import HEADER_BYTES
 from sonarpost.link.frames.v1.layers import DESCRIPTOR_SYMBOLS, MAX_LAYERS, MAX_STEP, SHARES, Layering
 from sonarpost.modem.micromodem.rates import Rate
@@ -52,7 +52,7 @@ def _compositions(layers: int) -> npt.NDArray[np.int64]:
 
 
 def plan_layers(
-    gain: GroupGain, symbol_bytes: int, arrive: Values, first_overhead: int, next_overhead: int
+    gain: GroupDistortion, symbol_bytes: int, arrive: Values, first_overhead: int, next_overhead: int
 ) -> LayerPlan | None:
     """Return the layers with the greatest expected gain, None where the frames are too few for any.
 
@@ -89,7 +89,7 @@ def plan_layers(
     return None if best is None else LayerPlan(best[1], best[0])
 
 
-def plan_whole(gain: GroupGain, symbol_bytes: int, arrive: Values, overhead: int) -> tuple[int, float] | None:
+def plan_whole(gain: GroupDistortion, symbol_bytes: int, arrive: Values, overhead: int) -> tuple[int, float] | None:
     """Return k and the expected gain of a block without layers (for groups too small for any), or None.
 
     Args:
@@ -109,7 +109,7 @@ def plan_whole(gain: GroupGain, symbol_bytes: int, arrive: Values, overhead: int
 
 
 def _best_shares(
-    gain: GroupGain,
+    gain: GroupDistortion,
     symbol_bytes: int,
     needs: npt.NDArray[np.int64],
     reached: Values,
@@ -128,7 +128,7 @@ def _best_shares(
     return float(expected[place]), place
 
 
-def arrivals(frames: int, channels: Sequence[Channel], depth: int) -> Values:
+def arrivals(frames: int, channels: Sequence[LossChannel], depth: int) -> Values:
     """Return the probability that 0, 1, ... of a block's frames arrive, over receivers that are equally important.
 
     Args:
@@ -141,7 +141,7 @@ def arrivals(frames: int, channels: Sequence[Channel], depth: int) -> Values:
     return mean
 
 
-def preview_frames(source_symbols: int, channel: Channel, unseen: float = PREVIEWS_UNSEEN, limit: int = 255) -> int:
+def preview_frames(source_symbols: int, channel: LossChannel, unseen: float = PREVIEWS_UNSEEN, limit: int = 255) -> int:
     """Return how many frames of a preview block to send for at most `unseen` of its contacts to stay unseen.
 
     At most `limit`, but every source symbol once.
@@ -149,14 +149,14 @@ def preview_frames(source_symbols: int, channel: Channel, unseen: float = PREVIE
     return frames_for(source_symbols, channel, unseen, limit=min(255, limit))
 
 
-def copies(channel: Channel, missed: float = 0.01, most: int = 8) -> int:
+def copies(channel: LossChannel, missed: float = 0.01, most: int = 8) -> int:
     """Return how often to send what must arrive and fits one frame: missed at most with the given probability."""
     if channel.loss <= missed:
         return 1
     return min(most, math.ceil(math.log(missed) / math.log(channel.loss)))
 
 
-def symbols_to_send(needed: int, channel: Channel, caution: float) -> int:
+def symbols_to_send(needed: int, channel: LossChannel, caution: float) -> int:
     """Return how many symbols to send before the next report when `needed` are lacking.
 
     Fewer than would arrive on average: what still lacks is asked for again, what arrives beyond the need is wasted.

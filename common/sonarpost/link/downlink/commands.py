@@ -11,10 +11,10 @@ from enum import StrEnum
 from typing import Final
 
 from sonarpost.errors import FrameError
-from sonarpost.link.downlink.messages import Outcome, token_of
+from sonarpost.link.downlink.messages import CommandOutcome, token_of
 from sonarpost.link.receiver_state import read_field, read_list, read_number, read_time
 
-MOST_OPEN: Final = 500
+MAX_PENDING: Final = 500
 """Orders that may be open at a time."""
 _REMEMBERED: Final = 1000
 _SLOWEST: Final = 8
@@ -22,7 +22,7 @@ _WHERE: Final = "orders"
 _STATE_FORMAT: Final = 1
 
 
-class OrderState(StrEnum):
+class CommandState(StrEnum):
     """How far an order has come. `CONFIRMED`, `REFUSED` and `EXPIRED` are final."""
 
     ASKED = "asked"
@@ -34,11 +34,11 @@ class OrderState(StrEnum):
     @property
     def is_open(self) -> bool:
         """Whether it is still to be sent or confirmed."""
-        return self in (OrderState.ASKED, OrderState.SENT)
+        return self in (CommandState.ASKED, CommandState.SENT)
 
 
 @dataclass(frozen=True, slots=True)
-class OpenOrder:
+class PendingCommand:
     """An order and what became of it.
 
     Attributes:
@@ -64,14 +64,14 @@ class OpenOrder:
     message: bytes
     asked_at: float
     expires_at: float
-    state: OrderState = OrderState.ASKED
+    state: CommandState = CommandState.ASKED
     times_sent: int = 0
     due_at: float = 0.0
     reason: str = ""
 
 
 @dataclass
-class OrderBook:
+class CommandTracker:
     """All orders that are open, and the last 1000 that are not.
 
     Attributes:
@@ -79,15 +79,15 @@ class OrderBook:
     """
 
     retry_s: float
-    _orders: dict[int, OpenOrder] = field(default_factory=dict)
+    _orders: dict[int, PendingCommand] = field(default_factory=dict)
 
     @property
-    def open_orders(self) -> tuple[OpenOrder, ...]:
+    def open_orders(self) -> tuple[PendingCommand, ...]:
         """What is not confirmed, refused or expired, the oldest first."""
         # A copy first, made in one go: others may ask how many there are while one is added.
         return tuple(order for order in list(self._orders.values()) if order.state.is_open)
 
-    def known(self, kind: str, record_id: str) -> OpenOrder | None:
+    def known(self, kind: str, record_id: str) -> PendingCommand | None:
         """Return the order that a record has led to, None for a new one."""
         same = (o for o in self._orders.values() if (o.kind, o.record_id) == (kind, record_id))
         return next(same, None)
@@ -99,62 +99,68 @@ class OrderBook:
             attempt += 1
         return token
 
-    def ask(self, order: OpenOrder, now: float) -> OpenOrder:
+    def ask(self, order: PendingCommand, now: float) -> PendingCommand:
         """Take an order with a `free_token`; return it as it is now: late ones are expired at once.
 
         Raises:
             FrameError: As many as are allowed are open, or the token is taken.
         """
-        if len(self.open_orders) >= MOST_OPEN:
-            raise FrameError(_WHERE, "open", MOST_OPEN, f"at most {MOST_OPEN}")
+        if len(self.open_orders) >= MAX_PENDING:
+            raise FrameError(_WHERE, "open", MAX_PENDING, f"at most {MAX_PENDING}")
         if order.token in self._orders:
             raise FrameError(_WHERE, "token", order.token, "one that is free")
-        state = OrderState.EXPIRED if order.expires_at <= now else OrderState.ASKED
+        state = CommandState.EXPIRED if order.expires_at <= now else CommandState.ASKED
         self._orders[order.token] = taken = replace(order, state=state, due_at=now)
         closed = [token for token, each in self._orders.items() if not each.state.is_open]
         for token in closed[: max(0, len(closed) - _REMEMBERED)]:
             del self._orders[token]
         return taken
 
-    def due(self, now: float) -> tuple[OpenOrder, ...]:
+    def due(self, now: float) -> tuple[PendingCommand, ...]:
         """Return what is to be sent now, what waits longest first."""
         waiting = [order for order in self.open_orders if order.due_at <= now < order.expires_at]
         return tuple(sorted(waiting, key=lambda order: order.due_at))
 
-    def sent(self, tokens: Iterable[int], now: float) -> tuple[OpenOrder, ...]:
+    def sent(self, tokens: Iterable[int], now: float) -> tuple[PendingCommand, ...]:
         """Note that these have gone into the water; return them as they are now."""
 
-        def after(order: OpenOrder) -> OpenOrder:
+        def after(order: PendingCommand) -> PendingCommand:
             wait_s = self.retry_s * min(2**order.times_sent, _SLOWEST)
-            return replace(order, state=OrderState.SENT, times_sent=order.times_sent + 1, due_at=now + wait_s)
+            return replace(order, state=CommandState.SENT, times_sent=order.times_sent + 1, due_at=now + wait_s)
 
         return self._change(tokens, lambda order: after(order) if order.state.is_open else order)
 
-    def confirm(self, address: int, outcomes: Iterable[tuple[int, Outcome]]) -> tuple[OpenOrder, ...]:
+    def confirm(self, address: int, outcomes: Iterable[tuple[int, CommandOutcome]]) -> tuple[PendingCommand, ...]:
         """Take what a vehicle says of its orders; return those that are closed by it.
 
         An order that expired here and was taken there all the same is confirmed: that is what happened.
         """
-        changed: list[OpenOrder] = []
+        changed: list[PendingCommand] = []
         for token, outcome in outcomes:
             order = self._orders.get(token)
-            if order is None or order.address != address or order.state in (OrderState.CONFIRMED, OrderState.REFUSED):
+            if (
+                order is None
+                or order.address != address
+                or order.state in (CommandState.CONFIRMED, CommandState.REFUSED)
+            ):
                 continue
-            if outcome is Outcome.TAKEN:
-                closed = replace(order, state=OrderState.CONFIRMED)
+            if outcome is CommandOutcome.TAKEN:
+                closed = replace(order, state=CommandState.CONFIRMED)
             else:
-                closed = replace(order, state=OrderState.REFUSED, reason=outcome.name.lower().replace("_", " "))
+                closed = replace(order, state=CommandState.REFUSED, reason=outcome.name.lower().replace("_", " "))
             self._orders[token] = closed
             changed.append(closed)
         return tuple(changed)
 
-    def expire(self, now: float) -> tuple[OpenOrder, ...]:
+    def expire(self, now: float) -> tuple[PendingCommand, ...]:
         """Close what is too old; return it."""
         late = [order.token for order in self.open_orders if order.expires_at <= now]
-        return self._change(late, lambda order: replace(order, state=OrderState.EXPIRED))
+        return self._change(late, lambda order: replace(order, state=CommandState.EXPIRED))
 
-    def _change(self, tokens: Iterable[int], change: Callable[[OpenOrder], OpenOrder]) -> tuple[OpenOrder, ...]:
-        changed: list[OpenOrder] = []
+    def _change(
+        self, tokens: Iterable[int], change: Callable[[PendingCommand], PendingCommand]
+    ) -> tuple[PendingCommand, ...]:
+        changed: list[PendingCommand] = []
         for token in tokens:
             before = self._orders.get(token)
             if before is not None and (after := change(before)) != before:
@@ -178,16 +184,16 @@ class OrderBook:
         self._orders = {order.token: order for order in orders}
 
 
-def _export(order: OpenOrder) -> dict[str, object]:
-    fields: dict[str, object] = {name: getattr(order, name) for name in OpenOrder.__dataclass_fields__}
+def _export(order: PendingCommand) -> dict[str, object]:
+    fields: dict[str, object] = {name: getattr(order, name) for name in PendingCommand.__dataclass_fields__}
     return fields | {"state": str(order.state)}
 
 
-def _import(entry: object) -> OpenOrder:
+def _import(entry: object) -> PendingCommand:
     state = read_field(entry, "state", str)
-    if state not in tuple(OrderState):
-        raise FrameError(_WHERE, "state", state, ", ".join(OrderState))
-    return OpenOrder(
+    if state not in tuple(CommandState):
+        raise FrameError(_WHERE, "state", state, ", ".join(CommandState))
+    return PendingCommand(
         kind=read_field(entry, "kind", str),
         record_id=read_field(entry, "record_id", str),
         vehicle=read_field(entry, "vehicle", str),
@@ -196,7 +202,7 @@ def _import(entry: object) -> OpenOrder:
         message=read_field(entry, "message", bytes),
         asked_at=read_time(entry, "asked_at"),
         expires_at=read_time(entry, "expires_at"),
-        state=OrderState(state),
+        state=CommandState(state),
         times_sent=read_number(entry, "times_sent", 0, 2**62),
         due_at=read_time(entry, "due_at"),
         reason=read_field(entry, "reason", str),

@@ -24,7 +24,7 @@ from sonarpost.messages import Verdict
 
 SMALLEST_ROOM_BYTES: Final = 27
 """Bytes of a message in a frame of 32 bytes without a tag."""
-ALL_THERE_IS: Final = 0
+EVERYTHING: Final = 0
 """As `Refine.stream_bytes`: as much of the picture as the vehicle has."""
 
 _WHERE: Final = "acoustic message"
@@ -63,7 +63,7 @@ _ORDERS: Final = (
 )
 
 
-class Outcome(IntEnum):
+class CommandOutcome(IntEnum):
     """What became of an order on the vehicle.
 
     TAKEN: it is on the vehicle's disk, and its consumers get it.
@@ -81,7 +81,7 @@ _VERDICTS: Final[tuple[Verdict, ...]] = ("mine_like", "not_mine_like", "unsure")
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class CommandMessage:
     """Base of what the vessel asks or tells.
 
     Attributes:
@@ -101,47 +101,47 @@ class Order:
 
 
 @dataclass(frozen=True, slots=True)
-class Refine(Order):
+class RefineMessage(CommandMessage):
     """More detail of a picture.
 
     Attributes:
         number: Of the contact, 1..65535.
-        stream_bytes: So many bytes of its stream, 1..65535; `ALL_THERE_IS` for all.
+        stream_bytes: So many bytes of its stream, 1..65535; `EVERYTHING` for all.
     """
 
     number: int
-    stream_bytes: int = ALL_THERE_IS
+    stream_bytes: int = EVERYTHING
 
     def __post_init__(self) -> None:
-        Order.__post_init__(self)
+        CommandMessage.__post_init__(self)
         _check("number", self.number, 1, MAX_NUMBER)
         _check("stream_bytes", self.stream_bytes, 0, 65535)
 
 
 @dataclass(frozen=True, slots=True)
-class Resend(Order):
+class ResendMessage(CommandMessage):
     """A picture again, from its beginning. `number`: of the contact, 1..65535."""
 
     number: int
 
     def __post_init__(self) -> None:
-        Order.__post_init__(self)
+        CommandMessage.__post_init__(self)
         _check("number", self.number, 1, MAX_NUMBER)
 
 
 @dataclass(frozen=True, slots=True)
-class Wider(Order):
+class ExpandMessage(CommandMessage):
     """More of the seabed around a contact, as a picture of its own. `number`: of the contact, 1..65535."""
 
     number: int
 
     def __post_init__(self) -> None:
-        Order.__post_init__(self)
+        CommandMessage.__post_init__(self)
         _check("number", self.number, 1, MAX_NUMBER)
 
 
 @dataclass(frozen=True, slots=True)
-class Revisit(Order):
+class RevisitMessage(CommandMessage):
     """Go there again.
 
     Attributes:
@@ -153,13 +153,13 @@ class Revisit(Order):
     lon_deg: float
 
     def __post_init__(self) -> None:
-        Order.__post_init__(self)
+        CommandMessage.__post_init__(self)
         _check("lat_deg", self.lat_deg, -90, 90)
         _check("lon_deg", self.lon_deg, -180, 180)
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement(Order):
+class DecisionMessage(CommandMessage):
     """What an operator decided about a picture. The remark and the operator's name do not travel.
 
     Attributes:
@@ -177,7 +177,7 @@ class Judgement(Order):
     mlo_class: str = ""
 
     def __post_init__(self) -> None:
-        Order.__post_init__(self)
+        CommandMessage.__post_init__(self)
         _check("number", self.number, 1, MAX_NUMBER)
         _check("version", self.version, 1, 2**63)
         if self.confidence is not None:
@@ -187,10 +187,10 @@ class Judgement(Order):
 
 
 @dataclass(frozen=True, slots=True)
-class Confirmation:
+class ConfirmationMessage:
     """What became of orders. `outcomes`: token and outcome of each, at least one."""
 
-    outcomes: tuple[tuple[int, Outcome], ...]
+    outcomes: tuple[tuple[int, CommandOutcome], ...]
 
     def __post_init__(self) -> None:
         _check("outcomes", len(self.outcomes), 1, 800)
@@ -199,7 +199,7 @@ class Confirmation:
 
 
 @dataclass(frozen=True, slots=True)
-class Data:
+class DataMessage:
     """Any other traffic. `data`: at least one byte."""
 
     data: bytes
@@ -208,8 +208,8 @@ class Data:
         _check("data", len(self.data), 1, 4095)
 
 
-DownlinkOrder = Refine | Resend | Revisit | Judgement | Wider
-Content = DownlinkOrder | Confirmation | Data
+DownlinkCommand = RefineMessage | ResendMessage | RevisitMessage | DecisionMessage | ExpandMessage
+Content = DownlinkCommand | ConfirmationMessage | DataMessage
 
 
 def pack(content: Content, room_bytes: int = SMALLEST_ROOM_BYTES) -> bytes:
@@ -223,26 +223,26 @@ def pack(content: Content, room_bytes: int = SMALLEST_ROOM_BYTES) -> bytes:
         FrameError: It does not fit.
     """
     packed = _packed(content, room_bytes)
-    if len(packed) > room_bytes and not isinstance(content, Data):
+    if len(packed) > room_bytes and not isinstance(content, DataMessage):
         raise FrameError(_WHERE, "length", len(packed), f"at most {room_bytes} bytes")
     return packed
 
 
 def _packed(content: Content, room_bytes: int) -> bytes:
     match content:
-        case Data():
+        case DataMessage():
             return bytes([MessageKind.DATA]) + content.data
-        case Confirmation():
+        case ConfirmationMessage():
             return bytes([MessageKind.CONFIRMATION]) + b"".join(_OUTCOME.pack(*each) for each in content.outcomes)
-        case Refine():
+        case RefineMessage():
             return _head(MessageKind.REFINE, content) + _REFINE.pack(content.number, content.stream_bytes)
-        case Resend() | Wider():
-            kind = MessageKind.RESEND if isinstance(content, Resend) else MessageKind.WIDER
+        case ResendMessage() | ExpandMessage():
+            kind = MessageKind.RESEND if isinstance(content, ResendMessage) else MessageKind.WIDER
             return _head(kind, content) + _NUMBER.pack(content.number)
-        case Revisit():
+        case RevisitMessage():
             degrees = (round(value * _DEGREE_STEPS) for value in (content.lat_deg, content.lon_deg))
             return _head(MessageKind.REVISIT, content) + _REVISIT.pack(*degrees)
-        case Judgement():
+        case DecisionMessage():
             confidence = _NO_CONFIDENCE if content.confidence is None else round(content.confidence * _CONFIDENCE_STEPS)
             fixed = _head(MessageKind.DECISION, content) + _DECISION.pack(
                 content.number, min(content.version, _MOST_VERSION), _VERDICTS.index(content.verdict), confidence
@@ -250,7 +250,7 @@ def _packed(content: Content, room_bytes: int) -> bytes:
             return fixed + _shortened(content.mlo_class, room_bytes - len(fixed))
 
 
-def _head(kind: MessageKind, order: Order) -> bytes:
+def _head(kind: MessageKind, order: CommandMessage) -> bytes:
     return _HEAD.pack(kind, order.token, order.issued_utc_s)
 
 
@@ -266,7 +266,7 @@ def unpack(data: bytes, where: str = _WHERE) -> Content:
     """
     kind = data[0] if data else -1
     if kind == MessageKind.DATA:
-        return _made(where, lambda: Data(data[1:]))
+        return _made(where, lambda: DataMessage(data[1:]))
     if kind == MessageKind.CONFIRMATION:
         return _confirmation(data[1:], where)
     if kind not in _ORDERS:
@@ -278,16 +278,16 @@ def unpack(data: bytes, where: str = _WHERE) -> Content:
     return _made(where, lambda: _order(MessageKind(kind), token, issued, body))
 
 
-def _order(kind: MessageKind, token: int, issued: int, body: bytes) -> DownlinkOrder:
+def _order(kind: MessageKind, token: int, issued: int, body: bytes) -> DownlinkCommand:
     if kind == MessageKind.REFINE:
         number, stream_bytes = _fields(_REFINE, body)
-        return Refine(token, issued, number, stream_bytes)
+        return RefineMessage(token, issued, number, stream_bytes)
     if kind in (MessageKind.RESEND, MessageKind.WIDER):
         (number,) = _fields(_NUMBER, body)
-        return (Resend if kind == MessageKind.RESEND else Wider)(token, issued, number)
+        return (ResendMessage if kind == MessageKind.RESEND else ExpandMessage)(token, issued, number)
     if kind == MessageKind.REVISIT:
         lat, lon = _fields(_REVISIT, body)
-        return Revisit(token, issued, lat / _DEGREE_STEPS, lon / _DEGREE_STEPS)
+        return RevisitMessage(token, issued, lat / _DEGREE_STEPS, lon / _DEGREE_STEPS)
     number, version, verdict, confidence = _fields(_DECISION, body[: _DECISION.size])
     if verdict >= len(_VERDICTS):
         raise FrameError(_WHERE, "verdict", verdict, f"0..{len(_VERDICTS) - 1}")
@@ -296,7 +296,7 @@ def _order(kind: MessageKind, token: int, issued: int, body: bytes) -> DownlinkO
         text = body[_DECISION.size :].decode()
     except UnicodeDecodeError as error:
         raise FrameError(_WHERE, "mlo_class", body[_DECISION.size :], "UTF-8") from error
-    return Judgement(token, issued, number, version, _VERDICTS[verdict], sure, text)
+    return DecisionMessage(token, issued, number, version, _VERDICTS[verdict], sure, text)
 
 
 def _fields(layout: struct.Struct, body: bytes) -> tuple[int, ...]:
@@ -305,15 +305,15 @@ def _fields(layout: struct.Struct, body: bytes) -> tuple[int, ...]:
     return layout.unpack(body)
 
 
-def _confirmation(body: bytes, where: str) -> Confirmation:
+def _confirmation(body: bytes, where: str) -> ConfirmationMessage:
     if not body or len(body) % _OUTCOME.size:
         raise FrameError(where, "length", len(body), f"a multiple of {_OUTCOME.size} bytes after the kind")
-    found: list[tuple[int, Outcome]] = []
+    found: list[tuple[int, CommandOutcome]] = []
     for token, outcome in _OUTCOME.iter_unpack(body):
-        if outcome not in tuple(Outcome):
+        if outcome not in tuple(CommandOutcome):
             raise FrameError(where, "outcome", outcome, "0..2")
-        found.append((token, Outcome(outcome)))
-    return _made(where, lambda: Confirmation(tuple(found)))
+        found.append((token, CommandOutcome(outcome)))
+    return _made(where, lambda: ConfirmationMessage(tuple(found)))
 
 
 def _made(where: str, make: Callable[[], _T]) -> _T:
@@ -325,11 +325,11 @@ def _made(where: str, make: Callable[[], _T]) -> _T:
 
 
 def confirmations(
-    outcomes: Sequence[tuple[int, Outcome]], room_bytes: int = SMALLEST_ROOM_BYTES
-) -> tuple[Confirmation, ...]:
+    outcomes: Sequence[tuple[int, CommandOutcome]], room_bytes: int = SMALLEST_ROOM_BYTES
+) -> tuple[ConfirmationMessage, ...]:
     """Return outcomes as few messages of at most `room_bytes` each."""
     each = max(1, (room_bytes - 1) // _OUTCOME.size)
-    return tuple(Confirmation(tuple(outcomes[at : at + each])) for at in range(0, len(outcomes), each))
+    return tuple(ConfirmationMessage(tuple(outcomes[at : at + each])) for at in range(0, len(outcomes), each))
 
 
 def token_of(record_id: str, kind: Literal["command", "decision"], attempt: int = 0) -> int:

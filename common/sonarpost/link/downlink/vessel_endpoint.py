@@ -12,12 +12,12 @@ from typing import Final
 
 from sonarpost.errors import FrameError
 from sonarpost.link.config import ReceiverConfig
-from sonarpost.link.downlink.commands import OpenOrder, OrderBook
-from sonarpost.link.downlink.messages import Confirmation, Data, unpack
+from sonarpost.link.downlink.commands import CommandTracker, PendingCommand
+from sonarpost.link.downlink.messages import ConfirmationMessage, DataMessage, unpack
 from sonarpost.link.events import FrameRefused, MessageReceived
 from sonarpost.link.frames.v1.feedback import Feedback
-from sonarpost.link.frames.v1.frame import FrameSeal, Segment, SegmentKind, pack_segments, segments_room
-from sonarpost.link.receiver import Receiver
+from sonarpost.link.frames.v1.frame import FrameProtection, Segment, SegmentKind, pack_segments, segments_room
+from sonarpost.link.receiver import LinkReceiver
 from sonarpost.link.receiver_state import read_map, read_number
 
 _STATE_FORMAT: Final = 1
@@ -26,7 +26,7 @@ _MOST_SILENT: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class ReceivedContent:
     """What a frame has led to.
 
     Attributes:
@@ -36,12 +36,12 @@ class Heard:
     """
 
     data: tuple[bytes, ...] = ()
-    orders: tuple[OpenOrder, ...] = ()
+    orders: tuple[PendingCommand, ...] = ()
     refused: tuple[FrameError, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Packet:
+class DownlinkPacket:
     """What is to be sent now.
 
     Attributes:
@@ -57,7 +57,7 @@ class Packet:
     reports: bool
 
 
-class VesselLink:
+class VesselEndpoint:
     """Hears all vehicles and speaks to them.
 
     Args:
@@ -69,14 +69,14 @@ class VesselLink:
 
     def __init__(
         self,
-        book: OrderBook,
+        book: CommandTracker,
         config: ReceiverConfig | None = None,
         *,
-        seal: FrameSeal | None = None,
+        seal: FrameProtection | None = None,
         feedback: bool = True,
     ) -> None:
         self.book = book
-        self.receiver = Receiver(config, seal=seal)
+        self.receiver = LinkReceiver(config, seal=seal)
         self._seal = seal
         self._feedback = feedback
         self._message_number = 0
@@ -84,11 +84,11 @@ class VesselLink:
         self._reported_at: dict[int, float] = {}
         self._again: set[int] = set()
 
-    def hear(self, source: int, frame: bytes, now: float) -> Heard:
+    def hear(self, source: int, frame: bytes, now: float) -> ReceivedContent:
         """Take a frame that was addressed to this vessel or to everybody. Never raises because of `frame`."""
         self._silent.pop(source, None)
         data: list[bytes] = []
-        orders: list[OpenOrder] = []
+        orders: list[PendingCommand] = []
         refused: list[FrameError] = []
         for event in self.receiver.accept(source, frame, now):
             if isinstance(event, FrameRefused):
@@ -99,12 +99,12 @@ class VesselLink:
                 except FrameError as error:
                     refused.append(error)
                     continue
-                if isinstance(content, Data):
+                if isinstance(content, DataMessage):
                     data.append(content.data)
-                elif isinstance(content, Confirmation):
+                elif isinstance(content, ConfirmationMessage):
                     orders += self.book.confirm(source, content.outcomes)
                 # Orders are for vehicles: this one was another vessel's.
-        return Heard(tuple(data), tuple(orders), tuple(refused))
+        return ReceivedContent(tuple(data), tuple(orders), tuple(refused))
 
     def wants_to_send(self, now: float) -> int | None:
         """Return the modem address that something is due for, None for none."""
@@ -114,7 +114,7 @@ class VesselLink:
         reports = [source for source in self.receiver.sources if self._report_is_due(source, now)]
         return min(reports, key=lambda source: self._reported_at.get(source, 0.0), default=None)
 
-    def packet(self, frames: int, frame_bytes: int, now: float) -> Packet | None:
+    def packet(self, frames: int, frame_bytes: int, now: float) -> DownlinkPacket | None:
         """Return the packet to send now, None when nothing is due.
 
         Follow it with `sent` or `failed`.
@@ -130,7 +130,7 @@ class VesselLink:
         address = self.wants_to_send(now)
         if address is None:
             return None
-        filling = _Filling(frames, segments_room(frame_bytes, self._seal))
+        filling = _FramePacker(frames, segments_room(frame_bytes, self._seal))
         number = self._message_number
         tokens: list[int] = []
         for order in self.book.due(now):
@@ -155,9 +155,9 @@ class VesselLink:
             self._silent[address] = self._silent.get(address, -1) + 1
             self._reported_at[address] = now
             self._again.discard(address)
-        return Packet(address, packed, tuple(tokens), report)
+        return DownlinkPacket(address, packed, tuple(tokens), report)
 
-    def _report(self, address: int, now: float, filling: _Filling) -> bool:
+    def _report(self, address: int, now: float, filling: _FramePacker) -> bool:
         """Add the report for a vehicle, where there is one and room for it."""
         if not self._feedback or not (self._report_is_due(address, now) or self.receiver.mini_report(address)):
             return False
@@ -180,11 +180,11 @@ class VesselLink:
                 return False
         return self.receiver.report_is_due(source, now)
 
-    def sent(self, packet: Packet, now: float) -> tuple[OpenOrder, ...]:
+    def sent(self, packet: DownlinkPacket, now: float) -> tuple[PendingCommand, ...]:
         """Note that a packet has gone into the water; return the orders that were in it."""
         return self.book.sent(packet.tokens, now)
 
-    def failed(self, packet: Packet) -> None:
+    def failed(self, packet: DownlinkPacket) -> None:
         """Note that a packet has not gone: what was in it is still due."""
         if packet.reports:
             self._again.add(packet.address)
@@ -215,7 +215,7 @@ class VesselLink:
         self._message_number = number
 
 
-class _Filling:
+class _FramePacker:
     """Segments put into as few frames as they fit, in their order."""
 
     def __init__(self, most_frames: int, room_bytes: int) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
-LEAST_URGENT: Final = 7
+LOWEST_PRIORITY: Final = 7
 FILLS_FROM: Final = 6
 """From this priority on a message goes only where frames have room, until it has aged."""
 _IDS_REMEMBERED: Final = 1024
@@ -42,7 +42,7 @@ class QueuedMessage:
 
 
 @dataclass(eq=False)
-class MessageStore:
+class WaitingMessages:
     """The messages that wait.
 
     Attributes:

@@ -11,7 +11,7 @@ from sonarpost.modem.micromodem.rates import RATES, Rate
 
 
 @dataclass(eq=False)
-class RateChoice:
+class RateSelector:
     """Chooses the rate with the most payload through per second, and tries the others now and then.
 
     The loss at a rate that was not used of late is not known. It is taken to be that of the next slower rate that is

@@ -13,12 +13,12 @@ from dataclasses import replace
 from typing import Final
 
 from sonarpost.errors import BadInputError, FrameError
-from sonarpost.link.coding.blocks import Picture
-from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.coding.blocks import OutgoingImage
+from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.frames.v1.preview import MAX_NUMBER
-from sonarpost.link.queue.messages import LEAST_URGENT, MessageStore, QueuedMessage
-from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName
+from sonarpost.link.queue.messages import LOWEST_PRIORITY, QueuedMessage, WaitingMessages
+from sonarpost.link.queue.transmit_queue import ImageName, TransmitQueue
 from sonarpost.link.receiver_state import read_field, read_list, read_map, read_number, read_time
 from sonarpost.link.sender_state import export_sender, import_picture, restore_sender
 from sonarpost.modem.micromodem.rates import RATES
@@ -35,7 +35,7 @@ _FIXED_OF_A_BLOCK: Final = ("kind", "number", "symbol_bytes", "objects", "layeri
 Part = Mapping[str, object]
 
 
-def export_queue(queue: AcousticQueue) -> dict[str, Part]:
+def export_queue(queue: TransmitQueue) -> dict[str, Part]:
     """Return the whole state as parts by name: maps, lists, numbers, strings and bytes (msgpack can hold them)."""
     parts: dict[str, Part] = {}
     sender = export_sender(queue.sender)
@@ -81,7 +81,7 @@ def _maps(value: object) -> list[dict[str, object]]:
     return [dict(entry) for entry in value]
 
 
-def restore_queue(queue: AcousticQueue, parts: Mapping[str, Part]) -> None:
+def restore_queue(queue: TransmitQueue, parts: Mapping[str, Part]) -> None:
     """Replace the state of a new queue by the parts that `export_queue` returned; the configuration stays.
 
     Where the rate in use is not among the configured ones any more, the queue goes on with the configured first one.
@@ -103,7 +103,7 @@ def restore_queue(queue: AcousticQueue, parts: Mapping[str, Part]) -> None:
     planned_loss = read_time(core, "planned_loss") if "planned_loss" in core else queue.config.expected_loss
     if not 0.0 <= planned_loss <= 0.95:
         raise FrameError(_WHERE, "planned_loss", planned_loss, "0..0.95")
-    channel = Channel(planned_loss, queue.config.burst_frames)
+    channel = LossChannel(planned_loss, queue.config.burst_frames)
     queue.sender.config = replace(queue.sender.config, frame_bytes=frame_bytes, feedback=feedback, channels=(channel,))
     restore_sender(queue.sender, {**read_map(core, "sender"), "pictures": pictures, **blocks})
     queue.names = dict(_import_name(entry) for entry in read_list(core, "names"))
@@ -119,7 +119,7 @@ def restore_queue(queue: AcousticQueue, parts: Mapping[str, Part]) -> None:
         queue.sender.resize(RATES[queue.rate].frame_bytes)
 
 
-def salvage_queue(queue: AcousticQueue, parts: Mapping[str, Part], now: float) -> tuple[int, list[FrameError]]:
+def salvage_queue(queue: TransmitQueue, parts: Mapping[str, Part], now: float) -> tuple[int, list[FrameError]]:
     """Fill a new queue with what can be read of the pictures and messages in parts that `restore_queue` refused.
 
     What of the pictures has been sent is not known any more: all of them are sent again, and receivers know what they
@@ -133,7 +133,7 @@ def salvage_queue(queue: AcousticQueue, parts: Mapping[str, Part], now: float) -
     Returns:
         How many pictures and messages, and why the others are none.
     """
-    pictures: list[tuple[Picture, PictureName]] = []
+    pictures: list[tuple[OutgoingImage, ImageName]] = []
     messages: list[QueuedMessage] = []
     refused: list[FrameError] = []
     for name, part in parts.items():
@@ -155,12 +155,12 @@ def salvage_queue(queue: AcousticQueue, parts: Mapping[str, Part], now: float) -
     return len(pictures) + len(messages), refused
 
 
-def _name_in(part: Part, number: int) -> PictureName:
+def _name_in(part: Part, number: int) -> ImageName:
     match part.get("name"):
         case [str(image_id), str(contact_id)]:
-            return PictureName(image_id, contact_id)
+            return ImageName(image_id, contact_id)
         case _:
-            return PictureName(image_of_number(number), "?")
+            return ImageName(image_of_number(number), "?")
 
 
 def _export_message(message: QueuedMessage) -> Part:
@@ -175,12 +175,12 @@ def _export_message(message: QueuedMessage) -> Part:
     }
 
 
-def _import_messages(core: Part, parts: Mapping[str, Part]) -> MessageStore:
+def _import_messages(core: Part, parts: Mapping[str, Part]) -> WaitingMessages:
     found = [_import_message(part) for name, part in parts.items() if name.startswith(_MESSAGE)]
     served = read_map(core, "served")
     if not all(isinstance(n, int) for n in served.values()):
         raise FrameError(_WHERE, "served", served, "bytes by program")
-    return MessageStore(
+    return WaitingMessages(
         {message.key: message for message in sorted(found, key=lambda m: m.key)},
         read_number(core, "next_key", 0, _MANY),
         Counter({name: n for name, n in served.items() if isinstance(n, int)}),
@@ -194,7 +194,7 @@ def _import_message(part: Part) -> QueuedMessage:
         read_number(part, "key", 0, _MANY),
         read_field(part, "id", str),
         read_field(part, "source", str),
-        read_number(part, "priority", 1, LEAST_URGENT),
+        read_number(part, "priority", 1, LOWEST_PRIORITY),
         read_time(part, "added_at"),
         read_time(part, "expires_at"),
         read_field(part, "data", bytes),
@@ -229,10 +229,10 @@ def _import_progress(entry: object) -> tuple[int, Part]:
             raise FrameError(_WHERE, "sent", entry, "[number, bytes, bytes, ranges]")
 
 
-def _import_name(entry: object) -> tuple[int, PictureName]:
+def _import_name(entry: object) -> tuple[int, ImageName]:
     match entry:
         case [int(number), str(image_id), str(contact_id)]:
-            return number, PictureName(image_id, contact_id)
+            return number, ImageName(image_id, contact_id)
         case _:
             raise FrameError(_WHERE, "names", entry, "[number, image_id, contact_id]")
 

@@ -1,6 +1,6 @@
 """The vehicle's acoustic queue: pictures and other traffic in, packets out, in the order of their value.
 
-Pure: `now` in (UTC in seconds), packets out. It stands before the v1 `Sender`, which plans pictures, and adds what
+Pure: `now` in (UTC in seconds), packets out. It stands before the v1 `LinkSender`, which plans pictures, and adds what
 makes it a queue of a vehicle: messages of several programs by priority, lifetime and fairness, a share of the water
 that no flood of messages can take from pictures, redundancy and rate by the measured loss, and when everything is
 expected to have gone. Packets are chosen one at a time, so that whatever is more urgent waits for one packet at most.
@@ -13,18 +13,18 @@ from dataclasses import dataclass
 from typing import Final
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.coding.blocks import Picture
-from sonarpost.link.coding.channel_capacity import Channel
+from sonarpost.link.coding.blocks import OutgoingImage
+from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.coding.rate_distortion import quality_curve
 from sonarpost.link.coding.redundancy_plan import copies
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import Feedback, Request
-from sonarpost.link.frames.v1.frame import FrameSeal
+from sonarpost.link.frames.v1.feedback import Feedback, FeedbackRequest
+from sonarpost.link.frames.v1.frame import FrameProtection
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
-from sonarpost.link.queue.messages import FILLS_FROM, MessageStore
-from sonarpost.link.queue.rate_choice import RateChoice
-from sonarpost.link.sender import Sender
+from sonarpost.link.queue.messages import FILLS_FROM, WaitingMessages
+from sonarpost.link.queue.rate_choice import RateSelector
+from sonarpost.link.sender import LinkSender
 from sonarpost.modem.micromodem.rates import RATES
 
 _SEGMENTS: Final = 2
@@ -97,7 +97,7 @@ class QueueConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class PictureName:
+class ImageName:
     """Which picture of the vehicle has a number on the link."""
 
     image_id: str
@@ -105,7 +105,7 @@ class PictureName:
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
+class ExpectedDelivery:
     """When a picture is expected to have gone.
 
     Attributes:
@@ -115,31 +115,31 @@ class Expected:
         done_at: When all that is planned has.
     """
 
-    name: PictureName
+    name: ImageName
     bytes_left: int
     preview_at: float | None
     done_at: float
 
 
-class AcousticQueue:
+class TransmitQueue:
     """The queue of one vehicle.
 
     Args:
         config: How it behaves.
-        first_block: See `Sender`.
-        seal: See `Sender`.
+        first_block: See `LinkSender`.
+        seal: See `LinkSender`.
 
     Raises:
         ConfigError: A rate that there is not.
     """
 
-    def __init__(self, config: QueueConfig, *, first_block: int = 0, seal: FrameSeal | None = None) -> None:
+    def __init__(self, config: QueueConfig, *, first_block: int = 0, seal: FrameProtection | None = None) -> None:
         self.config = config
-        self.rate_choice = RateChoice(config.rates, config.first_rate)
-        self.sender = Sender(
+        self.rate_choice = RateSelector(config.rates, config.first_rate)
+        self.sender = LinkSender(
             SenderConfig(
                 frame_bytes=RATES[config.first_rate].frame_bytes,
-                channels=(Channel(config.expected_loss, config.burst_frames),),
+                channels=(LossChannel(config.expected_loss, config.burst_frames),),
                 frames_per_picture=config.frames_per_picture,
                 stream_bytes=config.stream_bytes,
                 gather_s=config.gather_s,
@@ -150,8 +150,8 @@ class AcousticQueue:
             first_block=first_block,
             seal=seal,
         )
-        self.messages = MessageStore()
-        self.names: dict[int, PictureName] = {}
+        self.messages = WaitingMessages()
+        self.names: dict[int, ImageName] = {}
         self.packet_interval_s = RATES[config.first_rate].airtime_s
         self.last_report_at: float | None = None
         self.picture_credit = 0.0
@@ -180,7 +180,7 @@ class AcousticQueue:
     def add_picture(
         self,
         number: int,
-        name: PictureName,
+        name: ImageName,
         contact: ContactSummary,
         stream: bytes,
         now: float,
@@ -217,10 +217,12 @@ class AcousticQueue:
             del self.names[forgotten]
         return True
 
-    def _extend(self, picture: Picture, stream: bytes, now: float, mean_square_error: Sequence[float] | None) -> bool:
+    def _extend(
+        self, picture: OutgoingImage, stream: bytes, now: float, mean_square_error: Sequence[float] | None
+    ) -> bool:
         picture.curve = quality_curve(len(stream), mean_square_error)
         picture.stream = stream
-        return self.sender.refine(Request(picture.number, min(len(stream), MAX_STREAM_BYTES)), now)
+        return self.sender.refine(FeedbackRequest(picture.number, min(len(stream), MAX_STREAM_BYTES)), now)
 
     def refine(self, number: int, stream_bytes: int, now: float) -> bool:
         """Send more of a picture, up to a length of its stream (0: all of it); False where no more of it is here.
@@ -234,7 +236,7 @@ class AcousticQueue:
         wanted = stream_bytes or min(len(known.stream), MAX_STREAM_BYTES)
         if not known.sent < wanted <= len(known.stream):
             return False
-        return self.sender.refine(Request(number, wanted), now)
+        return self.sender.refine(FeedbackRequest(number, wanted), now)
 
     def _is_open(self, number: int) -> bool:
         return number in self.open_numbers()
@@ -257,13 +259,13 @@ class AcousticQueue:
             return False
         return self.messages.add(message_id, source, priority, data, added_at=now, expires_at=now + lifetime_s)
 
-    def on_report(self, report: Feedback | Request, now: float, receiver: int) -> None:
+    def on_report(self, report: Feedback | FeedbackRequest, now: float, receiver: int) -> None:
         """Take a receiver's report or request.
 
         Raises:
             FrameError: A request for a picture that is not remembered.
         """
-        if isinstance(report, Request):
+        if isinstance(report, FeedbackRequest):
             self.sender.refine(report, now)
             return
         self._reported(now)
@@ -287,7 +289,7 @@ class AcousticQueue:
     def _plan_for(self, loss: float) -> None:
         planned = self.sender.config.worst.loss
         if abs(planned - loss) >= _LEAST_CHANGE:
-            self.sender.plan_for((Channel(min(loss, 0.95), self.config.burst_frames),))
+            self.sender.plan_for((LossChannel(min(loss, 0.95), self.config.burst_frames),))
 
     def next_packet(self, now: float, most_frames: int | None = None) -> tuple[bytes, ...]:
         """Return the frames of the next packet at `rate`, none when there is nothing to send.
@@ -366,7 +368,7 @@ class AcousticQueue:
         waiting = {picture.number for picture in self.sender.waiting}
         return waiting | {n for block in self.sender.blocks if block.lacks > 0 for n in block.contacts}
 
-    def expected(self, now: float) -> list[Expected]:
+    def expected(self, now: float) -> list[ExpectedDelivery]:
         """Return when each picture is expected to have gone, the first to be finished first.
 
         Detail of the blocks under way is sent in turns, so all of it is finished at about the same time; groups follow
@@ -395,8 +397,8 @@ class AcousticQueue:
             total += frames_of[picture.number]
             done[picture.number] = now + total * frame_s
         found = [
-            Expected(
-                self.names.get(n, PictureName("0000", "?")),
+            ExpectedDelivery(
+                self.names.get(n, ImageName("0000", "?")),
                 round(frames_of[n] * self.sender.config.frame_bytes),
                 None if n in self.sender.announced else previews.get(n),
                 done[n],

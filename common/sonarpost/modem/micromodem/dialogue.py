@@ -9,14 +9,14 @@ from enum import Enum, auto
 
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.settings import ClockSetting, Setting, SettingQuery
+from sonarpost.modem.micromodem.settings import ClockSetting, ConfigurationSetting, SettingQuery
 from sonarpost.modem.micromodem.short_sentences import TimeSetting
 
 _OPTIONAL_TRIES = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class ModemCommand:
     """A sentence and the answer it must have.
 
     Attributes:
@@ -37,19 +37,19 @@ class Command:
         return ",".join((self.sentence.kind, *self.sentence.fields))
 
 
-def set_command(name: str, value: int, *, required: bool = True) -> Command:
+def set_command(name: str, value: int, *, required: bool = True) -> ModemCommand:
     """Return the command that sets a value; the modem echoes name and value."""
-    setting = Setting(name, str(value))
+    setting = ConfigurationSetting(name, str(value))
     tries = None if required else _OPTIONAL_TRIES
-    return Command(setting.sentence(), setting.sentence("CACFG"), required, tries)
+    return ModemCommand(setting.sentence(), setting.sentence("CACFG"), required, tries)
 
 
-def query_command(name: str, value: int) -> Command:
+def query_command(name: str, value: int) -> ModemCommand:
     """Return the command that asks for a value, and expects this one."""
-    return Command(SettingQuery(name).sentence(), Setting(name, str(value)).sentence("CACFG"))
+    return ModemCommand(SettingQuery(name).sentence(), ConfigurationSetting(name, str(value)).sentence("CACFG"))
 
 
-def clock_command(utc: datetime, generation: int | None) -> Command:
+def clock_command(utc: datetime, generation: int | None) -> ModemCommand:
     """Return the command that sets the modem's clock, in the words of its generation; the modem echoes the time.
 
     It is sent once only: a second time, the time in it would be past. A modem of unknown generation understands the
@@ -57,12 +57,12 @@ def clock_command(utc: datetime, generation: int | None) -> Command:
     """
     if generation == 2:
         time = TimeSetting(utc)
-        return Command(time.sentence(), time.sentence("CATMS"), required=False, tries=1)
+        return ModemCommand(time.sentence(), time.sentence("CATMS"), required=False, tries=1)
     clock = ClockSetting(utc)
-    return Command(clock.sentence(), clock.sentence("CACLK"), required=False, tries=1)
+    return ModemCommand(clock.sentence(), clock.sentence("CACLK"), required=False, tries=1)
 
 
-class Progress(Enum):
+class CommandProgress(Enum):
     """Where a dialogue stands."""
 
     IDLE = auto()
@@ -71,7 +71,7 @@ class Progress(Enum):
     FAILED = auto()
 
 
-class Dialogue:
+class CommandQueue:
     """Runs a list of commands. An answer to something else (a configuration dump, a revision) changes nothing.
 
     Args:
@@ -82,21 +82,21 @@ class Dialogue:
     def __init__(self, config: MicroModemConfig, send: Callable[[Sentence], None]) -> None:
         self._config = config
         self._send = send
-        self._commands: tuple[Command, ...] = ()
+        self._commands: tuple[ModemCommand, ...] = ()
         self._index = 0
         self._attempt = 0
         self._earlier_attempts = 0
         self._sent_s = 0.0
-        self._refused: list[Command] = []
-        self.progress = Progress.IDLE
+        self._refused: list[ModemCommand] = []
+        self.progress = CommandProgress.IDLE
         self.deadline_s: float | None = None
 
     @property
-    def current(self) -> Command:
+    def current(self) -> ModemCommand:
         """The command that waits for its answer, or failed."""
         return self._commands[self._index]
 
-    def begin(self, commands: Sequence[Command], start_s: float, earlier_attempts: int = 0) -> None:
+    def begin(self, commands: Sequence[ModemCommand], start_s: float, earlier_attempts: int = 0) -> None:
         """Start a new list at the given time, at the next `poll`.
 
         Args:
@@ -109,22 +109,22 @@ class Dialogue:
         self._attempt = 0
         self._earlier_attempts = earlier_attempts
         self._refused.clear()
-        self.progress = Progress.RUNNING
+        self.progress = CommandProgress.RUNNING
         self.deadline_s = start_s
 
     def stop(self) -> None:
         """Forget the commands."""
-        self.progress = Progress.IDLE
+        self.progress = CommandProgress.IDLE
         self.deadline_s = None
 
-    def take_refused(self) -> list[Command]:
+    def take_refused(self) -> list[ModemCommand]:
         """Return, once, the commands that were not required and had no answer."""
         refused, self._refused = self._refused, []
         return refused
 
     def receive(self, sentence: Sentence, now: float) -> bool:
         """Take a sentence of the kinds that answer commands; tell whether it was the answer waited for."""
-        if self.progress is not Progress.RUNNING or self._attempt == 0:
+        if self.progress is not CommandProgress.RUNNING or self._attempt == 0:
             return False
         if _same(self.current.answer, sentence):
             self._next(now)
@@ -137,7 +137,7 @@ class Dialogue:
 
     def poll(self, now: float) -> None:
         """Send what is due; count a command without an answer."""
-        if self.progress is not Progress.RUNNING or self.deadline_s is None or now < self.deadline_s:
+        if self.progress is not CommandProgress.RUNNING or self.deadline_s is None or now < self.deadline_s:
             return
         required = self.current.required
         if self._attempt < (self.current.tries or self._config.tries):
@@ -148,7 +148,7 @@ class Dialogue:
             self.deadline_s = now + wait_s
             self._send(self.current.sentence)
         elif required:
-            self.progress = Progress.FAILED
+            self.progress = CommandProgress.FAILED
             self.deadline_s = None
         else:
             self._refused.append(self.current)
@@ -162,7 +162,7 @@ class Dialogue:
             self.deadline_s = now
             self.poll(now)
         else:
-            self.progress = Progress.DONE
+            self.progress = CommandProgress.DONE
             self.deadline_s = None
 
 

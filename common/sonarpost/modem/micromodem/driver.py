@@ -14,13 +14,13 @@ from datetime import datetime
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem.events import Event, FailureReason, Polled, SentenceRejected
-from sonarpost.modem.micromodem.machine import Machine
+from sonarpost.modem.micromodem.machine import DriverStateMachine
 from sonarpost.modem.micromodem.requests import RequestKind, flexible_command, mini_command, ping_command, poll_command
 from sonarpost.modem.micromodem.supervisor import Phase
-from sonarpost.modem.micromodem.transmit import Packet, check_packet
+from sonarpost.modem.micromodem.transmit import OutgoingPacket, check_packet
 
 
-class MicroModem(Machine):
+class MicroModem(DriverStateMachine):
     """Drives one modem: configures it, sends packets one at a time, hands over what arrives.
 
     Args:
@@ -83,7 +83,7 @@ class MicroModem(Machine):
             FrameError: An address, a rate or frames that the modem cannot send.
         """
         check_packet(destination, rate, frames)
-        packet = Packet(self._next_id, destination, rate, tuple(bytes(f) for f in frames), ack, now)
+        packet = OutgoingPacket(self._next_id, destination, rate, tuple(bytes(f) for f in frames), ack, now)
         self._enqueue(packet, now)
         return packet.packet_id
 

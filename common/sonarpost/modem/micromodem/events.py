@@ -9,7 +9,7 @@ from enum import StrEnum
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem.nmea import Sentence
 from sonarpost.modem.micromodem.sentences import ModemMessage
-from sonarpost.modem.micromodem.settings import ModemComplaint
+from sonarpost.modem.micromodem.settings import ErrorReport
 from sonarpost.modem.micromodem.short_sentences import ReceivedFlexibleData
 from sonarpost.modem.micromodem.statistics import LinkStatistics, TransmitStatistics
 
@@ -82,14 +82,14 @@ class ClockConfirmed:
 
 
 @dataclass(frozen=True, slots=True)
-class ModemComplained:
+class ModemError:
     """The modem has reported an error of its own."""
 
-    complaint: ModemComplaint
+    complaint: ErrorReport
 
 
 @dataclass(frozen=True, slots=True)
-class ModemSaid:
+class ModemText:
     """A `CAMSG` that is no news of a frame."""
 
     message: ModemMessage
@@ -181,7 +181,7 @@ class FrameReceived:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameHeard:
+class FrameOverheard:
     """A good frame has arrived, of a packet that may not be over: what must not be lost is kept now.
 
     The same frame comes again as `FrameReceived`, with its packet.
@@ -257,7 +257,7 @@ class RequestFailed:
 
 
 @dataclass(frozen=True, slots=True)
-class PingHeard:
+class PingOverheard:
     """Somebody pings `dest`; its modem answers by itself."""
 
     src: int
@@ -328,20 +328,20 @@ Event = (
     | ModemRebooted
     | SettingRefused
     | ClockConfirmed
-    | ModemComplained
-    | ModemSaid
+    | ModemError
+    | ModemText
     | SentenceRejected
     | OtherSentence
     | PacketSent
     | PacketFailed
     | FrameReceived
-    | FrameHeard
+    | FrameOverheard
     | PacketReceived
     | FrameAcknowledged
     | StatisticsReceived
     | RequestDone
     | RequestFailed
-    | PingHeard
+    | PingOverheard
     | PingAnswered
     | MiniPacketReceived
     | MiniPacketAnswered

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import Event, FrameHeard, ModemSaid, SentenceRejected, StatisticsReceived
+from sonarpost.modem.micromodem.events import Event, FrameOverheard, ModemText, SentenceRejected, StatisticsReceived
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.receive import Reception
+from sonarpost.modem.micromodem.receive import PacketReception
 from sonarpost.modem.micromodem.sentences import Cycle, ModemMessage, ReceivedData
 from sonarpost.modem.micromodem.statistics import LinkStatistics
 
@@ -14,12 +14,12 @@ _NO_CYCLE = frozenset({2, 4, 5})
 """Packet types that carry no frames of a cycle: mini-packets and flexible data."""
 
 
-class Listener:
+class ReceptionTracker:
     """Follows packets on their way in. The water is busy while `reception` is not None."""
 
     def __init__(self, config: MicroModemConfig) -> None:
         self._config = config
-        self.reception: Reception | None = None
+        self.reception: PacketReception | None = None
 
     @property
     def deadline_s(self) -> float | None:
@@ -32,7 +32,7 @@ class Listener:
             self.reception.on_start(now)
             return []
         events = self.flush()
-        self.reception = Reception(self._config, now)
+        self.reception = PacketReception(self._config, now)
         return events
 
     def on_cycle(self, cycle: Cycle, now: float) -> list[Event]:
@@ -49,7 +49,7 @@ class Listener:
         if self.reception is not None and not self.reception.belongs(data):
             events = self.flush()
         frame = self._open(now).on_frame(data, now)
-        return [*events, FrameHeard(frame)]
+        return [*events, FrameOverheard(frame)]
 
     def on_message(self, message: ModemMessage, now: float) -> list[Event]:
         """A damaged frame, the end of waiting, or something else the modem says."""
@@ -58,7 +58,7 @@ class Listener:
             return []
         if message.text == "PACKET_TIMEOUT" and self.reception is not None:
             self.reception.on_timeout(now)
-        return [ModemSaid(message)]
+        return [ModemText(message)]
 
     def on_acknowledgement(self, now: float) -> None:
         """The packet that arrives carries acknowledgements."""
@@ -91,9 +91,9 @@ class Listener:
         """Hand over what has arrived of an unfinished packet."""
         return self._close(None, over=False)
 
-    def _open(self, now: float) -> Reception:
+    def _open(self, now: float) -> PacketReception:
         if self.reception is None:
-            self.reception = Reception(self._config, now)
+            self.reception = PacketReception(self._config, now)
         return self.reception
 
     def _close(self, statistics: LinkStatistics | None, *, over: bool) -> list[Event]:

@@ -15,17 +15,17 @@ from sonarpost.modem.micromodem.events import (
     Event,
     FailureReason,
     FrameAcknowledged,
-    ModemComplained,
+    ModemError,
     OtherSentence,
     PacketFailed,
     Polled,
     SentenceRejected,
 )
-from sonarpost.modem.micromodem.listener import Listener
+from sonarpost.modem.micromodem.listener import ReceptionTracker
 from sonarpost.modem.micromodem.nmea import LineAssembler, Sentence
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.modem.micromodem.requester import Requester, is_modems_fault
-from sonarpost.modem.micromodem.requests import Request, RequestKind
+from sonarpost.modem.micromodem.requester import RequestTracker, is_modems_fault
+from sonarpost.modem.micromodem.requests import ModemRequest, RequestKind
 from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
     Cycle,
@@ -37,23 +37,23 @@ from sonarpost.modem.micromodem.sentences import (
     TransmitData,
     TransmitMark,
 )
-from sonarpost.modem.micromodem.settings import ModemComplaint, Revision
+from sonarpost.modem.micromodem.settings import ErrorReport, Revision
 from sonarpost.modem.micromodem.statistics import TransmitStatistics
-from sonarpost.modem.micromodem.supervisor import Phase, Supervisor
-from sonarpost.modem.micromodem.transmit import Packet, TransmitCycle, check_packet
+from sonarpost.modem.micromodem.supervisor import ModemSupervisor, Phase
+from sonarpost.modem.micromodem.transmit import OutgoingPacket, TransmitCycle, check_packet
 
 
-class Machine:
+class DriverStateMachine:
     """One cycle or request at a time, one reception, and a supervisor that keeps the modem configured."""
 
     def __init__(self, config: MicroModemConfig, where: str = "modem port") -> None:
         self.config = config
         self._lines = LineAssembler(where, learn_checksums=True)
-        self._supervisor = Supervisor(config, self._send)
-        self._listener = Listener(config)
-        self._requester = Requester(config, self._send)
+        self._supervisor = ModemSupervisor(config, self._send)
+        self._listener = ReceptionTracker(config)
+        self._requester = RequestTracker(config, self._send)
         self._cycle: TransmitCycle | None = None
-        self._queue: deque[Packet | Request] = deque()
+        self._queue: deque[OutgoingPacket | ModemRequest] = deque()
         self._uplink: Callable[[Polled], Sequence[bytes]] | None = None
         self._next_id = 1
         self._out = bytearray()
@@ -109,7 +109,7 @@ class Machine:
         if not (self._queue and water_free and self._idle and self.phase is Phase.READY):
             return
         following = self._queue.popleft()
-        if isinstance(following, Packet):
+        if isinstance(following, OutgoingPacket):
             self._cycle = TransmitCycle(following, self.config, self._send, now)
         else:
             self._requester.start(following, now)
@@ -119,11 +119,11 @@ class Machine:
         return self._cycle is None and self._requester.exchange is None
 
     def _request(self, kind: RequestKind, far: int, command: Sentence, now: float, rate: int = 0) -> int:
-        request = Request(self._next_id, kind, far, command, rate, now)
+        request = ModemRequest(self._next_id, kind, far, command, rate, now)
         self._enqueue(request, now)
         return request.request_id
 
-    def _enqueue(self, item: Packet | Request, now: float) -> None:
+    def _enqueue(self, item: OutgoingPacket | ModemRequest, now: float) -> None:
         self._next_id += 1
         if len(self._queue) >= self.config.queued_packets:
             self._events.append(item.failed(FailureReason.QUEUE_FULL))
@@ -156,7 +156,7 @@ class Machine:
     def _take(self, sentence: Sentence, now: float) -> None:
         self._supervisor.heard(now)
         try:
-            self._HANDLERS.get(sentence.kind, Machine._on_other)(self, sentence, now)
+            self._HANDLERS.get(sentence.kind, DriverStateMachine._on_other)(self, sentence, now)
         except SentenceError as error:
             self._events.append(SentenceRejected(error))
 
@@ -200,7 +200,7 @@ class Machine:
         if not frames:
             return True
         check_packet(polled.dest, polled.rate, frames)
-        packet = Packet(self._next_id, polled.dest, polled.rate, frames, polled.ack, now)
+        packet = OutgoingPacket(self._next_id, polled.dest, polled.rate, frames, polled.ack, now)
         self._next_id += 1
         self._cycle = TransmitCycle(packet, self.config, self._send, now, polled=cycle)
         return True
@@ -270,14 +270,14 @@ class Machine:
             self._events.append(FrameAcknowledged(a.src, a.dest, a.frame_number))
 
     def _on_complaint(self, sentence: Sentence, now: float) -> None:
-        complaint = ModemComplaint.parse(sentence)
-        self._events.append(ModemComplained(complaint))
+        complaint = ErrorReport.parse(sentence)
+        self._events.append(ModemError(complaint))
         if self._cycle is not None:
             self._cycle.on_complaint(complaint)
         elif self._requester.exchange is not None:
             self._requester.exchange.on_complaint(complaint, now)
 
-    _HANDLERS: ClassVar[Mapping[str, Callable[[Machine, Sentence, float], None]]] = {
+    _HANDLERS: ClassVar[Mapping[str, Callable[[DriverStateMachine, Sentence, float], None]]] = {
         "CAREV": _on_revision,
         "CACFG": _on_setting,
         "CACLK": _on_clock,
@@ -295,5 +295,5 @@ class Machine:
         "CACST": _on_link_statistics,
         "CAACK": _on_acknowledgement,
         "CAERR": _on_complaint,
-        **dict.fromkeys(Requester.KINDS, _on_short),
+        **dict.fromkeys(RequestTracker.KINDS, _on_short),
     }

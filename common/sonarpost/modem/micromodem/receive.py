@@ -12,7 +12,7 @@ from sonarpost.modem.micromodem.statistics import LinkStatistics
 _FSK_MINI_PACKET = 2
 
 
-class Reception:
+class PacketReception:
     """Collects what the modem says of one packet until `close`.
 
     Frames wait for the statistics, which come last; `deadline_s` is when the wait is over, so that a frame is

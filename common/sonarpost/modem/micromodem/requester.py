@@ -14,15 +14,21 @@ from sonarpost.modem.micromodem.events import (
     MiniPacketReceived,
     PacketReceived,
     PingAnswered,
-    PingHeard,
+    PingOverheard,
     RequestFailed,
 )
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.requests import Request, RequestExchange, RequestKind
-from sonarpost.modem.micromodem.short_sentences import MiniPacket, MiniReply, Ping, PingReply, ReceivedFlexibleData
+from sonarpost.modem.micromodem.requests import ModemRequest, RequestExchange, RequestKind
+from sonarpost.modem.micromodem.short_sentences import (
+    MiniPacket,
+    MiniReply,
+    PingCommand,
+    PingReply,
+    ReceivedFlexibleData,
+)
 
 
-class Requester:
+class RequestTracker:
     """The side of the driver that is no data cycle.
 
     Args:
@@ -40,7 +46,7 @@ class Requester:
         """When `poll` has something to do, or None."""
         return None if self.exchange is None else self.exchange.deadline_s
 
-    def start(self, request: Request, now: float) -> None:
+    def start(self, request: ModemRequest, now: float) -> None:
         """Begin a request; there is none under way."""
         self.exchange = RequestExchange(request, self._config, self._send, now)
 
@@ -79,8 +85,8 @@ class Requester:
         return [] if exchange is None else [exchange.abort(reason)]
 
     def _on_ping(self, sentence: Sentence, _now: float) -> list[Event]:
-        ping = Ping.parse(sentence)
-        return [PingHeard(ping.src, ping.dest)]
+        ping = PingCommand.parse(sentence)
+        return [PingOverheard(ping.src, ping.dest)]
 
     def _on_ping_reply(self, sentence: Sentence, _now: float) -> list[Event]:
         reply = PingReply.parse(sentence)
@@ -101,7 +107,7 @@ class Requester:
     def _on_flexible(self, sentence: Sentence, now: float) -> list[Event]:
         return [FlexibleDataReceived(ReceivedFlexibleData.parse(sentence), now)]
 
-    KINDS: ClassVar[Mapping[str, Callable[[Requester, Sentence, float], list[Event]] | None]] = {
+    KINDS: ClassVar[Mapping[str, Callable[[RequestTracker, Sentence, float], list[Event]] | None]] = {
         "CAMPC": None,
         "CAMPA": _on_ping,
         "CAMPR": _on_ping_reply,

@@ -17,8 +17,8 @@ from sonarpost.modem.micromodem.fields import MAX_ADDRESS
 from sonarpost.modem.micromodem.nmea import Sentence
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.modem.micromodem.sentences import Cycle
-from sonarpost.modem.micromodem.settings import ModemComplaint
-from sonarpost.modem.micromodem.short_sentences import MAX_MINI_BITS, FlexibleData, MiniPacket, Ping
+from sonarpost.modem.micromodem.settings import ErrorReport
+from sonarpost.modem.micromodem.short_sentences import MAX_MINI_BITS, FlexibleData, MiniPacket, PingCommand
 
 FLEXIBLE_RATES = (1, 3, 5)
 FLEXIBLE_BYTES = 2048
@@ -35,7 +35,7 @@ class RequestKind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class ModemRequest:
     """A command to the modem that is no data cycle of its own.
 
     Attributes:
@@ -66,7 +66,7 @@ def ping_command(src: int, dest: int) -> Sentence:
         FrameError: An address outside 0..127.
     """
     _check_address("ping", dest)
-    return Ping(src, dest).sentence()
+    return PingCommand(src, dest).sentence()
 
 
 def mini_command(src: int, dest: int, bits: int) -> Sentence:
@@ -136,7 +136,7 @@ class RequestExchange:
     """Takes one request through the modem. When `result` is set it is over."""
 
     def __init__(
-        self, request: Request, config: MicroModemConfig, send: Callable[[Sentence], None], now: float
+        self, request: ModemRequest, config: MicroModemConfig, send: Callable[[Sentence], None], now: float
     ) -> None:
         self.request = request
         self.result: RequestDone | RequestFailed | None = None
@@ -179,7 +179,7 @@ class RequestExchange:
         if self.request.kind is RequestKind.POLL and self._stage is _Stage.ANSWER:
             self._fail(FailureReason.NO_ANSWER)
 
-    def on_complaint(self, complaint: ModemComplaint, now: float) -> None:
+    def on_complaint(self, complaint: ErrorReport, now: float) -> None:
         """The modem did not understand a sentence: the command, as long as its echo is not there."""
         if complaint.module in _COMMAND_PARTS and self._stage is _Stage.ECHO:
             self.deadline_s = now

@@ -15,14 +15,14 @@ _INTEGER = re.compile(r"[+-]?[0-9]{1,10}")
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class ConfigurationSetting:
     """`CCCFG,name,value` and its echo `CACFG`; Micro-Modem 2 has dotted names, some values are no integers."""
 
     name: str
     value: str
 
     @classmethod
-    def parse(cls, sentence: Sentence) -> Setting:
+    def parse(cls, sentence: Sentence) -> ConfigurationSetting:
         """Read `CCCFG` or `CACFG`; the value is kept as text because a dump also holds other than integers."""
         read = FieldReader(sentence, ("CACFG", "CCCFG"), 2)
         return cls(read.name(0, "name"), ",".join(sentence.fields[1:]).strip())
@@ -84,7 +84,7 @@ class Revision:
 
 
 @dataclass(frozen=True, slots=True)
-class ModemComplaint:
+class ErrorReport:
     """`CAERR,hhmmss,module,errno,message`, or `CAERR,hhmmss,DATA_TIMEOUT,frame`.
 
     Attributes:
@@ -100,7 +100,7 @@ class ModemComplaint:
     modem_time: str = ""
 
     @classmethod
-    def parse(cls, sentence: Sentence) -> ModemComplaint:
+    def parse(cls, sentence: Sentence) -> ErrorReport:
         """Read `CAERR`; a number that is none is kept as part of the message."""
         read = FieldReader(sentence, ("CAERR",), 2)
         rest = sentence.fields[2:]

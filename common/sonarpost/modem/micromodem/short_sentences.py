@@ -24,14 +24,14 @@ _ISO = "%Y-%m-%dT%H:%M:%SZ"
 
 
 @dataclass(frozen=True, slots=True)
-class Ping:
+class PingCommand:
     """`CCMPC,src,dest`, its echo `CAMPC`, and `CAMPA` at the far side."""
 
     src: int
     dest: int
 
     @classmethod
-    def parse(cls, sentence: Sentence) -> Ping:
+    def parse(cls, sentence: Sentence) -> PingCommand:
         """Read `CCMPC`, `CAMPC` or `CAMPA`."""
         read = FieldReader(sentence, ("CAMPA", "CAMPC", "CCMPC"), 2)
         return cls(read.address(0, "src"), read.address(1, "dest"))

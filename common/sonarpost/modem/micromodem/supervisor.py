@@ -7,7 +7,14 @@ from datetime import datetime
 from enum import Enum, auto
 
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.dialogue import Command, Dialogue, Progress, clock_command, query_command, set_command
+from sonarpost.modem.micromodem.dialogue import (
+    CommandProgress,
+    CommandQueue,
+    ModemCommand,
+    clock_command,
+    query_command,
+    set_command,
+)
 from sonarpost.modem.micromodem.events import (
     ClockConfirmed,
     Event,
@@ -18,7 +25,7 @@ from sonarpost.modem.micromodem.events import (
     SettingRefused,
 )
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.settings import ClockSetting, Revision, Setting
+from sonarpost.modem.micromodem.settings import ClockSetting, ConfigurationSetting, Revision
 from sonarpost.modem.micromodem.short_sentences import TimeSetting
 
 
@@ -31,7 +38,7 @@ class Phase(Enum):
     READY = auto()
 
 
-class Supervisor:
+class ModemSupervisor:
     """Brings the modem to READY and back there, whatever it does.
 
     Args:
@@ -43,7 +50,7 @@ class Supervisor:
         self.phase = Phase.CLOSED
         self.firmware: str | None = None
         self._config = config
-        self._dialogue = Dialogue(config, send)
+        self._dialogue = CommandQueue(config, send)
         self._alive_s = 0.0
         self._heard_s: float | None = None
         self._attempts = 0
@@ -77,7 +84,7 @@ class Supervisor:
         """A valid sentence has come."""
         self._heard_s = self._alive_s = now
 
-    def check(self, now: float, command: Command | None = None) -> None:
+    def check(self, now: float, command: ModemCommand | None = None) -> None:
         """Ask the modem something before anything else is done: a command, or its address."""
         self.phase = Phase.CHECKING
         self._dialogue.begin([command or query_command("SRC", self._config.address)], now)
@@ -101,7 +108,7 @@ class Supervisor:
         Raises:
             SentenceError: It is no setting.
         """
-        setting = Setting.parse(sentence)
+        setting = ConfigurationSetting.parse(sentence)
         if self._dialogue.receive(sentence, now) or self.phase is Phase.CONFIGURING:
             return []
         if setting.name == "SRC" and setting.number != self._config.address:
@@ -137,9 +144,9 @@ class Supervisor:
             return []
         self._dialogue.poll(now)
         events: list[Event] = [SettingRefused(command.text) for command in self._dialogue.take_refused()]
-        if self._dialogue.progress is Progress.DONE:
+        if self._dialogue.progress is CommandProgress.DONE:
             return events + self._done(now)
-        if self._dialogue.progress is Progress.FAILED:
+        if self._dialogue.progress is CommandProgress.FAILED:
             return events + self._failed(now)
         return events
 

@@ -21,14 +21,14 @@ from sonarpost.modem.micromodem.sentences import (
     TransmitData,
     TransmitMark,
 )
-from sonarpost.modem.micromodem.settings import ModemComplaint
+from sonarpost.modem.micromodem.settings import ErrorReport
 from sonarpost.modem.micromodem.statistics import TransmitStatistics
 
 _FSK_MINI_PACKET = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Packet:
+class OutgoingPacket:
     """A packet to send.
 
     Attributes:
@@ -72,7 +72,7 @@ def check_packet(destination: int, rate: int, frames: Sequence[bytes]) -> None:
             raise FrameError(where, f"length of frame {number}", len(frame), expected)
 
 
-class Stage(Enum):
+class TransmitStage(Enum):
     """What the cycle waits for."""
 
     ECHO = auto()
@@ -95,7 +95,7 @@ class TransmitCycle:
 
     def __init__(
         self,
-        packet: Packet,
+        packet: OutgoingPacket,
         config: MicroModemConfig,
         send: Callable[[Sentence], None],
         now: float,
@@ -103,7 +103,7 @@ class TransmitCycle:
     ) -> None:
         self.packet = packet
         self.result: PacketSent | PacketFailed | None = None
-        self.stage = Stage.ECHO
+        self.stage = TransmitStage.ECHO
         self.deadline_s = now
         self._config = config
         self._send = send
@@ -118,7 +118,7 @@ class TransmitCycle:
         if polled is None:
             self.poll(now)
         else:
-            self._wait(Stage.REQUEST, now, config.request_timeout_s)
+            self._wait(TransmitStage.REQUEST, now, config.request_timeout_s)
 
     def owns(self, cycle: Cycle) -> bool:
         """Tell whether a `CACYC` is the echo of this cycle's command."""
@@ -126,16 +126,16 @@ class TransmitCycle:
 
     def on_echo(self, now: float) -> None:
         """The modem has echoed the cycle command."""
-        if self.stage is Stage.ECHO:
+        if self.stage is TransmitStage.ECHO:
             # At rate 0 a mini-packet that announces the cycle goes on the air before the first request.
             announcement_s = self._config.on_air_limit_s(0) if self.packet.rate == 0 else 0.0
-            self._wait(Stage.REQUEST, now, self._config.request_timeout_s + announcement_s)
+            self._wait(TransmitStage.REQUEST, now, self._config.request_timeout_s + announcement_s)
 
     def on_request(self, request: DataRequest, now: float) -> None:
         """The modem asks for a frame: answer, again if it asks again."""
         # A modem that was polled for more frames than there are asks on when all have been given.
-        asking = self.stage is Stage.ON_AIR and not self._on_air
-        if not asking and self.stage not in {Stage.ECHO, Stage.REQUEST, Stage.DATA_ECHO}:
+        asking = self.stage is TransmitStage.ON_AIR and not self._on_air
+        if not asking and self.stage not in {TransmitStage.ECHO, TransmitStage.REQUEST, TransmitStage.DATA_ECHO}:
             return
         number = request.frame_number
         frame = self._frame(number)
@@ -146,16 +146,16 @@ class TransmitCycle:
         self._frame_number = number
         self._given.add(number)
         self._send(self._data(frame))
-        self._wait(Stage.DATA_ECHO, now, self._config.reply_timeout_s)
+        self._wait(TransmitStage.DATA_ECHO, now, self._config.reply_timeout_s)
 
     def on_data_accepted(self, accepted: DataAccepted, now: float) -> None:
         """The modem has taken a frame, or not all of it."""
-        if self.stage is not Stage.DATA_ECHO:
+        if self.stage is not TransmitStage.DATA_ECHO:
             return
         if accepted.nbytes != len(self._frame(self._frame_number)):
             self._fail(FailureReason.FRAME_REFUSED)
         elif self._missing():
-            self._wait(Stage.REQUEST, now, self._config.request_timeout_s)
+            self._wait(TransmitStage.REQUEST, now, self._config.request_timeout_s)
         else:
             self._wait_for_transmission(now)
 
@@ -166,19 +166,19 @@ class TransmitCycle:
         if not self._given:
             on_air_s = self._config.on_air_limit_s(self.packet.rate)
             self.deadline_s = max(self.deadline_s, now + self._config.request_timeout_s + on_air_s)
-        elif self.stage in {Stage.REQUEST, Stage.DATA_ECHO, Stage.ON_AIR}:
+        elif self.stage in {TransmitStage.REQUEST, TransmitStage.DATA_ECHO, TransmitStage.ON_AIR}:
             self._on_air = True
             if mark.ends:
-                self._wait(Stage.STATISTICS, now, self._config.statistics_timeout_s)
+                self._wait(TransmitStage.STATISTICS, now, self._config.statistics_timeout_s)
             else:
-                self._wait(Stage.ON_AIR, now, self._config.on_air_limit_s(self.packet.rate))
+                self._wait(TransmitStage.ON_AIR, now, self._config.on_air_limit_s(self.packet.rate))
 
     def on_statistics(self, statistics: TransmitStatistics | None, now: float) -> None:
         """The modem tells what it has sent (None: it did, in a form nobody can read)."""
         announcement = statistics is not None and statistics.packet_type == _FSK_MINI_PACKET
         if announcement or not self._given:
             return
-        if self.stage in {Stage.DATA_ECHO, Stage.ON_AIR, Stage.STATISTICS}:
+        if self.stage in {TransmitStage.DATA_ECHO, TransmitStage.ON_AIR, TransmitStage.STATISTICS}:
             self._on_air = True
             self._statistics = statistics
             self._transmitted(now)
@@ -190,12 +190,12 @@ class TransmitCycle:
             return
         if 1 <= number <= len(self.packet.frames):
             self._acknowledged.add(number)
-        if self.stage is Stage.ACKNOWLEDGEMENT and len(self._acknowledged) == len(self.packet.frames):
+        if self.stage is TransmitStage.ACKNOWLEDGEMENT and len(self._acknowledged) == len(self.packet.frames):
             self._finish(now)
 
-    def on_complaint(self, complaint: ModemComplaint) -> None:
+    def on_complaint(self, complaint: ErrorReport) -> None:
         """The modem has given up waiting for data."""
-        if complaint.data_timeout and self.stage in {Stage.REQUEST, Stage.DATA_ECHO}:
+        if complaint.data_timeout and self.stage in {TransmitStage.REQUEST, TransmitStage.DATA_ECHO}:
             self._fail(FailureReason.DATA_TIMEOUT)
 
     def abort(self, reason: FailureReason) -> PacketFailed:
@@ -215,7 +215,7 @@ class TransmitCycle:
             return
         self._attempt += 1
         self._send(self._cycle.sentence())
-        self._wait(Stage.ECHO, now, self._config.reply_timeout_s)
+        self._wait(TransmitStage.ECHO, now, self._config.reply_timeout_s)
 
     def _request_late(self, now: float) -> None:
         self._fail(FailureReason.NO_DATA_REQUEST)
@@ -233,7 +233,7 @@ class TransmitCycle:
         if self._missing():
             self._fail(FailureReason.DATA_TIMEOUT)
         elif self.packet.ack and len(self._acknowledged) < len(self.packet.frames):
-            self._wait(Stage.ACKNOWLEDGEMENT, now, self._config.ack_wait_s)
+            self._wait(TransmitStage.ACKNOWLEDGEMENT, now, self._config.ack_wait_s)
         else:
             self._finish(now)
 
@@ -243,19 +243,19 @@ class TransmitCycle:
         self.result = PacketSent(
             p.packet_id, p.dest, p.rate, p.frames, acknowledged, self._started_s, now, self._statistics
         )
-        self.stage = Stage.OVER
+        self.stage = TransmitStage.OVER
 
     def _fail(self, reason: FailureReason) -> None:
         # With a frame in the modem nobody knows what it does after an exchange that broke off.
         self.result = self.packet.failed(reason, maybe_sent=bool(self._given))
-        self.stage = Stage.OVER
+        self.stage = TransmitStage.OVER
 
     def _wait_for_transmission(self, now: float) -> None:
         # Long enough for the end of the transmission, should the sentence that tells its start be lost.
         wait_s = self._config.start_timeout_s + self._config.on_air_limit_s(self.packet.rate)
-        self._wait(Stage.ON_AIR, now, wait_s)
+        self._wait(TransmitStage.ON_AIR, now, wait_s)
 
-    def _wait(self, stage: Stage, now: float, wait_s: float) -> None:
+    def _wait(self, stage: TransmitStage, now: float, wait_s: float) -> None:
         self.stage = stage
         self.deadline_s = now + wait_s
 
@@ -268,11 +268,11 @@ class TransmitCycle:
     def _data(self, data: bytes) -> Sentence:
         return TransmitData(self._cycle.src, self._cycle.dest, self._cycle.ack, data).sentence()
 
-    _WHEN_LATE: ClassVar[Mapping[Stage, Callable[[TransmitCycle, float], None]]] = {
-        Stage.ECHO: _echo_late,
-        Stage.REQUEST: _request_late,
-        Stage.DATA_ECHO: _data_echo_late,
-        Stage.ON_AIR: _on_air_late,
-        Stage.STATISTICS: _transmitted,
-        Stage.ACKNOWLEDGEMENT: _finish,
+    _WHEN_LATE: ClassVar[Mapping[TransmitStage, Callable[[TransmitCycle, float], None]]] = {
+        TransmitStage.ECHO: _echo_late,
+        TransmitStage.REQUEST: _request_late,
+        TransmitStage.DATA_ECHO: _data_echo_late,
+        TransmitStage.ON_AIR: _on_air_late,
+        TransmitStage.STATISTICS: _transmitted,
+        TransmitStage.ACKNOWLEDGEMENT: _finish,
     }

@@ -37,7 +37,7 @@ _BOUNDS: Mapping[str, tuple[float, float]] = MappingProxyType(
 
 
 @dataclass(frozen=True, slots=True)
-class WaterConfig:
+class ChannelParameters:
     """What the water does to packets.
 
     Attributes:

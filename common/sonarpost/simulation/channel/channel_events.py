@@ -29,7 +29,7 @@ class Fate(Enum):
     EMPTY = "empty"
 
 
-class Outcome(Enum):
+class FrameFate(Enum):
     """What became of a packet as a whole at one receiver."""
 
     ARRIVED = "arrived"
@@ -39,7 +39,7 @@ class Outcome(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Packet:
+class AcousticPacket:
     """What a modem puts into the water.
 
     Attributes:
@@ -77,7 +77,7 @@ class Transmission:
 
     transmitter: int
     number: int
-    packet: Packet
+    packet: AcousticPacket
     started_s: float
     ended_s: float
 
@@ -120,7 +120,7 @@ class ArrivalEnded:
     receiver: int
     at_s: float
     transmission: Transmission
-    outcome: Outcome
+    outcome: FrameFate
     detected: bool
     frames: tuple[FrameArrival, ...]
     range_m: float

@@ -51,7 +51,7 @@ class Totals:
     frames: Mapping[str, int]
 
 
-class WaterLog:
+class ChannelLog:
     """Writes the log and keeps the totals.
 
     Args:

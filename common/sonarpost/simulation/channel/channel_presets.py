@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.random_draws import TailDamage
 
 Value = float | int | bool | str
@@ -32,10 +32,10 @@ PRESETS: Mapping[str, Mapping[str, Value]] = MappingProxyType(
 )
 """Sets of parameters by name."""
 
-_KINDS = MappingProxyType({field.name: str(field.type) for field in fields(WaterConfig)})
+_KINDS = MappingProxyType({field.name: str(field.type) for field in fields(ChannelParameters)})
 
 
-def read_water(path: Path) -> dict[str, Value]:
+def read_channel(path: Path) -> dict[str, Value]:
     """Read a TOML file of the water's parameters, `preset` among them if it likes.
 
     Raises:
@@ -48,7 +48,7 @@ def read_water(path: Path) -> dict[str, Value]:
     return {name: _checked(str(path), name, value) for name, value in table.items()}
 
 
-def make_water(values: Mapping[str, Value], where: str) -> WaterConfig:
+def make_channel(values: Mapping[str, Value], where: str) -> ChannelParameters:
     """Return the water of a preset, where `values` names one, and the other values over it.
 
     Raises:
@@ -60,7 +60,7 @@ def make_water(values: Mapping[str, Value], where: str) -> WaterConfig:
     if "tail_damage_kind" in merged:
         merged["tail_damage_kind"] = TailDamage(merged["tail_damage_kind"])
     try:
-        return WaterConfig(**merged)  # type: ignore[arg-type]
+        return ChannelParameters(**merged)  # type: ignore[arg-type]
     except ValueError as error:
         name, _, rest = str(error).partition(": ")
         raise ConfigError(where, name, merged.get(name), rest.partition("expected ")[2]) from error

@@ -13,12 +13,12 @@ from functools import partial
 from types import MappingProxyType
 
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_events import ArrivalStarted, Transmission
-from sonarpost.simulation.channel.propagation import Water
+from sonarpost.simulation.channel.propagation import ChannelModel
 from sonarpost.simulation.modem.config import ModemConfig, Output, Report
-from sonarpost.simulation.modem.emulator import Micromodem
-from sonarpost.simulation.modem.serial_timing import SerialPace
+from sonarpost.simulation.modem.emulator import EmulatedMicromodem
+from sonarpost.simulation.modem.serial_timing import SerialLineTiming
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,13 +33,13 @@ class ModemPlace:
 class _Port:
     """A modem with the two directions of its serial line."""
 
-    modem: Micromodem
-    to_modem: SerialPace[bytes]
-    to_host: SerialPace[Output]
+    modem: EmulatedMicromodem
+    to_modem: SerialLineTiming[bytes]
+    to_host: SerialLineTiming[Output]
     passed: list[Output] = field(default_factory=list)
 
 
-class AcousticWorld:
+class ChannelSimulator:
     """Modems, their serial lines, and the water.
 
     Args:
@@ -51,25 +51,25 @@ class AcousticWorld:
 
     def __init__(
         self,
-        water: WaterConfig,
+        water: ChannelParameters,
         modems: Mapping[int, ModemPlace],
         serial_baud: float | None = None,
         transponders: Mapping[str, Position] = MappingProxyType({}),
     ) -> None:
         self.now = 0.0
-        self.water = Water(water, {number: place.position for number, place in modems.items()})
+        self.water = ChannelModel(water, {number: place.position for number, place in modems.items()})
         self._ports = {
             number: _Port(
-                Micromodem(place.config, travel_times=partial(self.water.travel_times_s, number, transponders)),
-                SerialPace(serial_baud),
-                SerialPace(serial_baud),
+                EmulatedMicromodem(place.config, travel_times=partial(self.water.travel_times_s, number, transponders)),
+                SerialLineTiming(serial_baud),
+                SerialLineTiming(serial_baud),
             )
             for number, place in modems.items()
         }
         # What the modems say when they are switched on belongs to this moment, not to the first event.
         self._step(self.now)
 
-    def modem(self, number: int) -> Micromodem:
+    def modem(self, number: int) -> EmulatedMicromodem:
         """Return one modem.
 
         Raises:

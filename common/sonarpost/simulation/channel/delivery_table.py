@@ -12,10 +12,10 @@ from pathlib import Path
 
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
-from sonarpost.simulation.channel.channel_events import ArrivalEnded, Fate, Packet, PacketKind
-from sonarpost.simulation.channel.channel_presets import PRESETS, make_water, read_water
-from sonarpost.simulation.channel.propagation import Water
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, Fate, PacketKind
+from sonarpost.simulation.channel.channel_presets import PRESETS, make_channel, read_channel
+from sonarpost.simulation.channel.propagation import ChannelModel
 
 RANGES_M = (2, 30, 60, 90, 110, 120, 130, 140, 160, 200, 250, 300)
 GAP_S = 10.0
@@ -31,14 +31,14 @@ class Delivery:
     frames: float
 
 
-def deliver(config: WaterConfig, rate: int, range_m: float, packets: int) -> Delivery:
+def deliver(config: ChannelParameters, rate: int, range_m: float, packets: int) -> Delivery:
     """Send full packets of a rate over a range, a few seconds apart, and count what arrives."""
-    water = Water(config, {1: Position(), 2: Position(east_m=range_m)})
+    water = ChannelModel(config, {1: Position(), 2: Position(east_m=range_m)})
     shape = RATES[rate]
     frames = tuple(bytes([number]) * shape.frame_bytes for number in range(1, shape.frames + 1))
     whole = good = 0
     for number in range(packets):
-        water.transmit(1, Packet(PacketKind.DATA, 1, 2, rate, shape.airtime_s, frames), number * GAP_S)
+        water.transmit(1, AcousticPacket(PacketKind.DATA, 1, 2, rate, shape.airtime_s, frames), number * GAP_S)
         for event in water.poll((number + 1) * GAP_S):
             if isinstance(event, ArrivalEnded):
                 arrived = sum(frame.fate in {Fate.DELIVERED, Fate.DAMAGED} for frame in event.frames)
@@ -47,7 +47,7 @@ def deliver(config: WaterConfig, rate: int, range_m: float, packets: int) -> Del
     return Delivery(range_m, water.snr_db(range_m), whole / packets, good / packets / shape.frames)
 
 
-def table(config: WaterConfig, packets: int) -> str:
+def table(config: ChannelParameters, packets: int) -> str:
     """Return the table: whole packets and frames that arrive, in percent, for each range and rate."""
     lines = [
         "| range m | SNR dB | " + " | ".join(f"rate {rate}" for rate in RATES) + " |",
@@ -67,8 +67,8 @@ def main() -> None:
     parser.add_argument("--water", type=Path, metavar="FILE", help="TOML file of parameters, over the preset")
     parser.add_argument("--packets", type=int, default=500, help="packets for each cell (500)")
     parsed = parser.parse_args()
-    values = {"preset": parsed.preset} | (read_water(parsed.water) if parsed.water else {})
-    print(table(make_water(values, str(parsed.water or "command line")), parsed.packets))
+    values = {"preset": parsed.preset} | (read_channel(parsed.water) if parsed.water else {})
+    print(table(make_channel(values, str(parsed.water or "command line")), parsed.packets))
 
 
 if __name__ == "__main__":

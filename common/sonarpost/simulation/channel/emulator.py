@@ -1,6 +1,6 @@
 """The emulated modems and their water as a running thing: ports, one thread, a clock and a log.
 
-The thread does what `AcousticWorld` cannot: it reads the clock, moves bytes between ports and world, and writes down
+The thread does what `ChannelSimulator` cannot: it reads the clock, moves bytes between ports and world, and writes down
 what became of each packet. Everything else is decided in the pure parts.
 """
 
@@ -19,8 +19,8 @@ from typing import IO
 
 from sonarpost.errors import PortError
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_log import Totals, WaterLog
-from sonarpost.simulation.channel.channel_simulator import AcousticWorld, ModemPlace
+from sonarpost.simulation.channel.channel_log import ChannelLog, Totals
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
 from sonarpost.simulation.channel.emulator_config import ChannelConfig, Device
 from sonarpost.simulation.modem.config import Output, Report
 from sonarpost.simulation.modem.host_ports import HostPort, PtyPort, TcpPort
@@ -53,7 +53,7 @@ class _State(Enum):
     CLOSED = "closed"
 
 
-class AcousticChannel:
+class ChannelEmulator:
     """Emulated modems on real ports.
 
     Args:
@@ -68,9 +68,9 @@ class AcousticChannel:
         self._state = _State.NEW
         self._stopping = threading.Event()
         self._lines: dict[int, _Line] = {}
-        self._log = WaterLog(None)
+        self._log = ChannelLog(None)
         self._thread: threading.Thread
-        self._world: AcousticWorld
+        self._world: ChannelSimulator
         self._clock: TimeScale
         self._wake_out = self._wake_in = -1
         self.failure: Exception | None = None
@@ -84,10 +84,10 @@ class AcousticChannel:
             RuntimeError: It was opened before.
         """
         if self._state is not _State.NEW:
-            raise RuntimeError("an AcousticChannel is opened once")
+            raise RuntimeError("an ChannelEmulator is opened once")
         self._state = _State.OPEN
         try:
-            self._log = WaterLog(self.config.log_path, self._echo)
+            self._log = ChannelLog(self.config.log_path, self._echo)
             for number in range(1, len(self.config.sites) + 1):
                 self._lines[number] = _Line(self._open_port(number))
         except PortError:
@@ -155,14 +155,14 @@ class AcousticChannel:
             return PtyPort(self.config.pty_dir / f"modem-{number}")
         return TcpPort(self.config.tcp_host, self.config.tcp_ports[number - 1])
 
-    def _make_world(self) -> AcousticWorld:
+    def _make_world(self) -> ChannelSimulator:
         timeout_s = math.ceil(max(2.0, 2.0 * self.config.time_scale))
         template = replace(self.config.modem, utc_at_zero_s=time.time(), data_timeout_s=timeout_s)
         places = {
             number: ModemPlace(replace(template, address=site.address), site.position)
             for number, site in enumerate(self.config.sites, start=1)
         }
-        return AcousticWorld(self.config.water, places, self.config.serial_baud, self.config.transponders)
+        return ChannelSimulator(self.config.water, places, self.config.serial_baud, self.config.transponders)
 
     def _settings(self) -> dict[str, object]:
         water = asdict(self.config.water) | {"tail_damage_kind": self.config.water.tail_damage_kind.value}

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.modem.config import ModemConfig
 
 
@@ -43,7 +43,7 @@ class ChannelConfig:
     """
 
     sites: tuple[ModemSite, ...]
-    water: WaterConfig = field(default_factory=WaterConfig)
+    water: ChannelParameters = field(default_factory=ChannelParameters)
     modem: ModemConfig = field(default_factory=lambda: ModemConfig(address=0))
     pty_dir: Path | None = None
     tcp_ports: tuple[int, ...] = ()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 
-from sonarpost.simulation.channel.random_draws import Dice
+from sonarpost.simulation.channel.random_draws import RandomDraws
 
 
 class Fading:
@@ -34,7 +34,7 @@ class Fading:
         path = (min(one, other), max(one, other))
         changes = self._changes.setdefault(path, [])
         while not changes or changes[-1] <= at_s:
-            dice = Dice(self._seed, path[0], len(changes), path[1])
+            dice = RandomDraws(self._seed, path[0], len(changes), path[1])
             mean_s = self._means_s[len(changes) % 2]
             # 1 - u is above 0, so the logarithm is finite; an instant's stay must still move time on.
             stay_s = max(1e-3, -mean_s * math.log(1.0 - dice.uniform("fading")))

@@ -24,25 +24,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from sonarpost.simulation.channel.acoustics import Position, frame_error_rate, transmission_loss_db
-from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_events import (
+    AcousticPacket,
     ArrivalEnded,
     ArrivalStarted,
     Fate,
     FrameArrival,
-    Outcome,
-    Packet,
+    FrameFate,
     Transmission,
 )
 from sonarpost.simulation.channel.fading import Fading
-from sonarpost.simulation.channel.random_draws import Dice, damage_tail
+from sonarpost.simulation.channel.random_draws import RandomDraws, damage_tail
 
 DETECTION_SNR_DB = -12.0
 """With `range_loss`, packets weaker than this are not noticed at all."""
 
 
 @dataclass(slots=True)
-class _Arrival:
+class _PendingArrival:
     """A transmission at one receiver, `start_s` to `end_s`."""
 
     receiver: int
@@ -63,10 +63,10 @@ class _Place:
     position: Position
     sent: int = 0
     transmissions: list[Transmission] = field(default_factory=list)
-    arrivals: list[_Arrival] = field(default_factory=list)
+    arrivals: list[_PendingArrival] = field(default_factory=list)
 
 
-class Water:
+class ChannelModel:
     """The shared medium of any number of modems.
 
     Args:
@@ -74,11 +74,11 @@ class Water:
         positions: Where each modem is, by its number.
     """
 
-    def __init__(self, config: WaterConfig, positions: Mapping[int, Position]) -> None:
+    def __init__(self, config: ChannelParameters, positions: Mapping[int, Position]) -> None:
         self.config = config
         self._places = {modem: _Place(position) for modem, position in positions.items()}
         # (time, 0 for an end and 1 for a start, order, arrival): ends come first, since touching is not overlapping
-        self._events: list[tuple[float, int, int, _Arrival]] = []
+        self._events: list[tuple[float, int, int, _PendingArrival]] = []
         self._order = 0
         self._fading = Fading(config.seed, config.mean_clear_s, config.mean_fade_s)
         self._reference_snr_db = config.reference_snr_db
@@ -102,7 +102,7 @@ class Water:
         """Return the simulated time of the next event, or None while the water is quiet."""
         return self._events[0][0] if self._events else None
 
-    def transmit(self, modem: int, packet: Packet, now: float) -> Transmission:
+    def transmit(self, modem: int, packet: AcousticPacket, now: float) -> Transmission:
         """Put a packet into the water at `now`.
 
         Raises:
@@ -137,7 +137,7 @@ class Water:
     def _send_towards(self, receiver: int, place: _Place, sent: Transmission, origin: Position) -> None:
         range_m = origin.range_m(place.position)
         start_s = sent.started_s + range_m / self.config.sound_speed_m_per_s
-        dice = Dice(self.config.seed, sent.transmitter, sent.number, receiver)
+        dice = RandomDraws(self.config.seed, sent.transmitter, sent.number, receiver)
         level_db = self.snr_db(range_m) + self.config.snr_spread_db * (2 * dice.uniform("snr") - 1)
         detectable_db = level_db - self._fade_db(sent.transmitter, receiver, start_s)
         lost = dice.happens(self.config.packet_loss, "packet loss") or (
@@ -146,7 +146,7 @@ class Water:
         if not sent.packet.frames:  # an acknowledgement or mini-packet is lost like a frame, and then not noticed
             lost = lost or dice.happens(self._frame_loss(sent, receiver, level_db, start_s), "lost frame")
         end_s = start_s + sent.packet.airtime_s
-        arrival = _Arrival(receiver, sent, start_s, end_s, range_m, level_db, lost)
+        arrival = _PendingArrival(receiver, sent, start_s, end_s, range_m, level_db, lost)
         place.arrivals.append(arrival)
         for at_s, is_start in ((start_s, 1), (end_s, 0)):
             self._order += 1
@@ -168,14 +168,14 @@ class Water:
         by_fade = self.config.fade_loss if faded else 0.0
         return 1.0 - (1.0 - self.config.frame_loss) * (1.0 - by_range) * (1.0 - by_fade)
 
-    def _detect(self, arrival: _Arrival, at_s: float) -> bool:
+    def _detect(self, arrival: _PendingArrival, at_s: float) -> bool:
         place = self._places[arrival.receiver]
         transmitting = any(sent.started_s <= at_s < sent.ended_s for sent in place.transmissions)
         busy = any(other.detected and not other.resolved for other in place.arrivals)
         arrival.detected = not (arrival.lost or transmitting or busy)
         return arrival.detected
 
-    def _resolve(self, arrival: _Arrival, at_s: float) -> ArrivalEnded:
+    def _resolve(self, arrival: _PendingArrival, at_s: float) -> ArrivalEnded:
         arrival.resolved = True
         outcome = self._outcome(arrival)
         self._forget(self._places[arrival.receiver], at_s)
@@ -191,20 +191,20 @@ class Water:
             arrival.start_s - arrival.transmission.started_s,
         )
 
-    def _outcome(self, arrival: _Arrival) -> Outcome:
+    def _outcome(self, arrival: _PendingArrival) -> FrameFate:
         place = self._places[arrival.receiver]
         if any(sent.started_s < arrival.end_s and arrival.start_s < sent.ended_s for sent in place.transmissions):
-            return Outcome.TRANSMITTING
+            return FrameFate.TRANSMITTING
         if any(
             other is not arrival and other.start_s < arrival.end_s and arrival.start_s < other.end_s
             for other in place.arrivals
         ):
-            return Outcome.COLLISION
-        return Outcome.LOST if arrival.lost else Outcome.ARRIVED
+            return FrameFate.COLLISION
+        return FrameFate.LOST if arrival.lost else FrameFate.ARRIVED
 
-    def _frames(self, arrival: _Arrival, outcome: Outcome) -> tuple[FrameArrival, ...]:
+    def _frames(self, arrival: _PendingArrival, outcome: FrameFate) -> tuple[FrameArrival, ...]:
         sent = arrival.transmission
-        dice = Dice(self.config.seed, sent.transmitter, sent.number, arrival.receiver)
+        dice = RandomDraws(self.config.seed, sent.transmitter, sent.number, arrival.receiver)
         frame_s = sent.packet.airtime_s / max(1, len(sent.packet.frames))
         last = max((n for n, data in enumerate(sent.packet.frames, start=1) if data), default=0)
         arrivals = []
@@ -214,7 +214,7 @@ class Water:
             loss = self._frame_loss(sent, arrival.receiver, arrival.snr_db, middle_s)
             if not data:
                 fate = Fate.EMPTY
-            elif outcome is not Outcome.ARRIVED or dice.happens(loss, "lost frame", number):
+            elif outcome is not FrameFate.ARRIVED or dice.happens(loss, "lost frame", number):
                 received, fate = b"", Fate.LOST
             elif number == last and dice.happens(self.config.tail_damage, "tail damage"):
                 kind, fraction = self.config.tail_damage_kind, self.config.tail_fraction

@@ -21,7 +21,7 @@ class TailDamage(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Dice:
+class RandomDraws:
     """Draws for one packet on its way to one receiver.
 
     Attributes:
@@ -53,7 +53,7 @@ class Dice:
         return hashlib.shake_128(key.encode("ascii")).digest(count)
 
 
-def damage_tail(frame: bytes, dice: Dice, number: int, kind: TailDamage, longest_fraction: float) -> bytes:
+def damage_tail(frame: bytes, dice: RandomDraws, number: int, kind: TailDamage, longest_fraction: float) -> bytes:
     """Return `frame` with its end replaced, its length kept.
 
     The tail is between one byte and `longest_fraction` of the frame. A tail of zeros over bytes that were zero

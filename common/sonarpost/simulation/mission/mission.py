@@ -1,6 +1,6 @@
 """A day of several vehicles and one vessel in one water, on simulated time: queues, slots, losses, reports, restarts.
 
-Everything but the modems and the processes is the real thing: each vehicle's `AcousticQueue`, medium access by slots,
+Everything but the modems and the processes is the real thing: each vehicle's `TransmitQueue`, medium access by slots,
 the vessel's v1 receiver. Frames are lost in bursts by a chain of two states.
 """
 
@@ -18,10 +18,10 @@ from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.events import ContactUpdate, Event, MessageReceived
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.feedback import Feedback
-from sonarpost.link.mac import Slots
+from sonarpost.link.mac import Tdma
 from sonarpost.link.queue.state import export_queue, restore_queue
-from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName, QueueConfig
-from sonarpost.link.receiver import Receiver
+from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, TransmitQueue
+from sonarpost.link.receiver import LinkReceiver
 from sonarpost.modem.micromodem.rates import RATES
 
 _SLOT_S: Final = 7.5
@@ -41,7 +41,7 @@ class Traffic:
         source: The program.
         every_s: Mean time between messages, exponentially distributed.
         size_bytes: Of each.
-        priority: See `AcousticQueue.add_message`.
+        priority: See `TransmitQueue.add_message`.
         lifetime_s: See there.
     """
 
@@ -170,7 +170,7 @@ class _Vehicle:
         self.config = QueueConfig(
             rates=(_RATE,), first_rate=_RATE, expected_loss=spec.loss, gather_s=60.0, kept_pictures=_KEPT
         )
-        self.queue = AcousticQueue(self.config)
+        self.queue = TransmitQueue(self.config)
         self.number = 0
         self.due = [rng.exponential(t.every_s) for t in spec.traffic]
         self.contact_due = float(rng.exponential(spec.contact_every_s))
@@ -179,7 +179,7 @@ class _Vehicle:
     def restart(self) -> None:
         """Save the queue and take it up as another process does."""
         parts = {name: msgpack.packb(part) for name, part in export_queue(self.queue).items()}
-        self.queue = AcousticQueue(self.config)
+        self.queue = TransmitQueue(self.config)
         restore_queue(self.queue, {n: msgpack.unpackb(p, strict_map_key=False) for n, p in parts.items()})
 
     def work(self, now: float, mission: _Mission) -> None:
@@ -195,7 +195,7 @@ class _Vehicle:
             self.number += 1
             contact = ContactSummary(height_px=80, width_px=80, time_utc_s=round(self.contact_due))
             stream = self._rng.bytes(self._spec.stream_bytes)
-            name_of_it = PictureName("0001", f"{self.address}-{self.number}")
+            name_of_it = ImageName("0001", f"{self.address}-{self.number}")
             self.queue.add_picture(self.number, name_of_it, contact, stream, now)
             mission.offer_picture((self.address, self.number), self.contact_due, stream)
             self.contact_due += float(self._rng.exponential(self._spec.contact_every_s))
@@ -254,8 +254,8 @@ def run_mission(spec: MissionSpec) -> MissionResult:
     mission = _Mission(spec)
     vehicles = [_Vehicle(n + 1, spec, rng) for n in range(spec.vehicles)]
     frame_s = (spec.vehicles + 1) * _SLOT_S
-    slots = [Slots(frame_s, n * _SLOT_S, _SLOT_S, _GUARD_S) for n in range(spec.vehicles)]
-    receiver = Receiver(ReceiverConfig(max_sources=16))
+    slots = [Tdma(frame_s, n * _SLOT_S, _SLOT_S, _GUARD_S) for n in range(spec.vehicles)]
+    receiver = LinkReceiver(ReceiverConfig(max_sources=16))
     now, hour, restarts = 0.0, 0, 0
     state_bytes: list[int] = []
     while now < spec.hours * _HOUR_S:
@@ -289,7 +289,7 @@ def run_mission(spec: MissionSpec) -> MissionResult:
     )
 
 
-def _report(vehicles: Sequence[_Vehicle], receiver: Receiver, water: _Water, now: float, *, deaf: bool) -> None:
+def _report(vehicles: Sequence[_Vehicle], receiver: LinkReceiver, water: _Water, now: float, *, deaf: bool) -> None:
     """Let the vessel report to the vehicles that need it most, as many as its slot holds."""
     sent = 0
     for vehicle in sorted(vehicles, key=lambda v: v.queue.last_report_at or -1.0):
@@ -303,6 +303,6 @@ def _report(vehicles: Sequence[_Vehicle], receiver: Receiver, water: _Water, now
             vehicle.queue.on_report(report, now, 100)
 
 
-def _state_bytes(vehicles: Sequence[_Vehicle], receiver: Receiver) -> int:
+def _state_bytes(vehicles: Sequence[_Vehicle], receiver: LinkReceiver) -> int:
     queues = sum(len(msgpack.packb(part)) for v in vehicles for part in export_queue(v.queue).values())
     return queues + len(msgpack.packb(receiver.snapshot()))

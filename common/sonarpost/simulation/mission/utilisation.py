@@ -1,6 +1,6 @@
 """How much of the time a vehicle that has data keeps the water busy: queue, medium access, driver, modem, serial line.
 
-Everything runs as on a vehicle and a vessel, on a simulated clock: the vehicle's `AcousticQueue` and `Continuous`
+Everything runs as on a vehicle and a vessel, on a simulated clock: the vehicle's `TransmitQueue` and `Continuous`
 medium, drivers on emulated modems with serial lines of a given speed, and a vessel that reports in the pauses.
 """
 
@@ -13,21 +13,21 @@ from typing import Final
 import numpy as np
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.downlink.commands import OrderBook
-from sonarpost.link.downlink.vessel_endpoint import Packet, VesselLink
-from sonarpost.link.events import ReportReceived
+from sonarpost.link.downlink.commands import CommandTracker
+from sonarpost.link.downlink.vessel_endpoint import DownlinkPacket, VesselEndpoint
+from sonarpost.link.events import FeedbackReceived
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.mac import Continuous
-from sonarpost.link.queue.transmit_queue import AcousticQueue, PictureName, QueueConfig
-from sonarpost.link.receiver import Receiver
+from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, TransmitQueue
+from sonarpost.link.receiver import LinkReceiver
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import Event, FrameHeard, FrameReceived, PacketFailed, PacketSent
+from sonarpost.modem.micromodem.events import Event, FrameOverheard, FrameReceived, PacketFailed, PacketSent
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_config import WaterConfig
+from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_events import Transmission
-from sonarpost.simulation.channel.channel_simulator import AcousticWorld, ModemPlace
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
 from sonarpost.simulation.modem.config import ModemConfig
 
 _VESSEL: Final = 1
@@ -96,8 +96,8 @@ class BusyResult:
 class _Rig:
     def __init__(self, spec: BusySpec) -> None:
         places = {n: ModemPlace(ModemConfig(n), Position(e)) for n, e in ((_VESSEL, 0.0), (_VEHICLE, spec.range_m))}
-        water = WaterConfig(frame_loss=spec.frame_loss)
-        self.world = AcousticWorld(water, places, spec.serial_baud or None)
+        water = ChannelParameters(frame_loss=spec.frame_loss)
+        self.world = ChannelSimulator(water, places, spec.serial_baud or None)
         self.drivers = {n: MicroModem(MicroModemConfig(n)) for n in places}
         self.now = 0.0
         for driver in self.drivers.values():
@@ -133,9 +133,9 @@ class _Vehicle:
 
     def __init__(self, spec: BusySpec) -> None:
         self._rate = spec.rate
-        self.queue = AcousticQueue(QueueConfig(rates=(spec.rate,), first_rate=spec.rate, expected_loss=spec.frame_loss))
+        self.queue = TransmitQueue(QueueConfig(rates=(spec.rate,), first_rate=spec.rate, expected_loss=spec.frame_loss))
         self._medium = Continuous(spec.listen_every_s, spec.listen_s, quiet_s=2.0)
-        self._receiver = Receiver()
+        self._receiver = LinkReceiver()
         self._asked = False
         self._rng = np.random.default_rng(1)
         self._number = 0
@@ -148,11 +148,11 @@ class _Vehicle:
                 self._asked = False
             case PacketFailed():
                 self._asked = False
-            case FrameHeard():
+            case FrameOverheard():
                 self._medium.heard(now)
             case FrameReceived():
                 for found in self._receiver.accept(event.src, event.data, now):
-                    if isinstance(found, ReportReceived):
+                    if isinstance(found, FeedbackReceived):
                         self.queue.on_report(found.report, now, event.src)
                         self.reports += 1
 
@@ -161,7 +161,7 @@ class _Vehicle:
         while len(self.queue.sender.waiting) < _ALWAYS_WAITING:
             self._number = self._number % 65535 + 1
             contact = ContactSummary(80, 80, time_utc_s=self._number)
-            name, stream = PictureName("0001", str(self._number)), self._rng.bytes(_STREAM_BYTES)
+            name, stream = ImageName("0001", str(self._number)), self._rng.bytes(_STREAM_BYTES)
             self.queue.add_picture(self._number, name, contact, stream, now)
         if self._asked:
             return 0.0
@@ -177,9 +177,9 @@ class _Vessel:
     """Does what `op_modem` does: it reports when it has heard nothing for a while."""
 
     def __init__(self) -> None:
-        self._link = VesselLink(OrderBook(60.0))
+        self._link = VesselEndpoint(CommandTracker(60.0))
         self._heard_s = 0.0
-        self._under_way: Packet | None = None
+        self._under_way: DownlinkPacket | None = None
         self.reports = 0
 
     def take(self, event: Event, now: float) -> None:

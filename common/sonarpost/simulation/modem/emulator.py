@@ -29,11 +29,11 @@ from datetime import datetime
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem import nmea
-from sonarpost.simulation.channel.channel_events import ArrivalEnded, ArrivalStarted, Packet
+from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, ArrivalStarted
 from sonarpost.simulation.modem import commands
 from sonarpost.simulation.modem.config import VERSIONS, ModemConfig, Output, Report
 from sonarpost.simulation.modem.navigation import Navigator, TravelTimes
-from sonarpost.simulation.modem.reception import Listener
+from sonarpost.simulation.modem.reception import ReceptionReporter
 from sonarpost.simulation.modem.settings import ModemClock, Settings
 from sonarpost.simulation.modem.transmitter import BusyError, Transmitter
 
@@ -41,7 +41,7 @@ _ERROR_FRAMING, _ERROR_UNKNOWN, _ERROR_FIELD, _ERROR_BUSY = 1, 2, 3, 4
 _UNPRINTABLE = re.compile(r"[^ -~]|[$*,]")
 
 
-class Micromodem:
+class EmulatedMicromodem:
     """One emulated modem.
 
     Args:
@@ -54,7 +54,7 @@ class Micromodem:
         self.config = config
         self.settings = Settings(config.address, config.data_timeout_s)
         self.clock = ModemClock(config.utc_at_zero_s)
-        self._listener = Listener(config, self.settings, self.clock)
+        self._listener = ReceptionReporter(config, self.settings, self.clock)
         self._transmitter = Transmitter(config, self.settings, self.clock, self._write, self._listener.expect)
         self._navigator = Navigator(self.settings, self.clock, self._transmitter, travel_times, self._write)
         self._lines = nmea.LineAssembler("host")
@@ -161,7 +161,7 @@ class Micromodem:
             self._transmitter.answer(arrival, hearing.good_frames)
         return report
 
-    def packets_to_transmit(self) -> list[Packet]:
+    def packets_to_transmit(self) -> list[AcousticPacket]:
         """Return, once, the packets that go into the water now."""
         return self._transmitter.packets_to_transmit()
 

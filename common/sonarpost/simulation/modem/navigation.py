@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from sonarpost.modem.micromodem import nmea
-from sonarpost.simulation.channel.channel_events import Packet, PacketKind
+from sonarpost.simulation.channel.channel_events import AcousticPacket, PacketKind
 from sonarpost.simulation.modem import commands
 from sonarpost.simulation.modem.settings import ModemClock, Settings
 from sonarpost.simulation.modem.transmitter import BusyError, Transmitter
@@ -90,7 +90,9 @@ class Navigator:
             if letter in asked.beacons and 2 * travel_s + turnaround_s <= asked.timeout_s
         }
         self._ranging = _Ranging(now, now + max(asked.timeout_s, PING_S), answers)
-        self._transmitter.send_when_free(Packet(PacketKind.NAVIGATION, self._settings["SRC"], 0, 0, PING_S), now)
+        self._transmitter.send_when_free(
+            AcousticPacket(PacketKind.NAVIGATION, self._settings["SRC"], 0, 0, PING_S), now
+        )
 
     def poll(self, now: float) -> None:
         """Tell the travel times when the time-out is over; a transponder that did not answer has an empty field."""

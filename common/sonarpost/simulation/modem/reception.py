@@ -12,9 +12,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from sonarpost.modem.micromodem import nmea
-from sonarpost.simulation.channel.channel_events import ArrivalEnded, Fate, FrameArrival, Outcome, Packet, PacketKind
+from sonarpost.simulation.channel.channel_events import (
+    AcousticPacket,
+    ArrivalEnded,
+    Fate,
+    FrameArrival,
+    FrameFate,
+    PacketKind,
+)
 from sonarpost.simulation.modem.config import ModemConfig
-from sonarpost.simulation.modem.sentences import Heard, PacketType, ReceiveMode, receive_statistics
+from sonarpost.simulation.modem.sentences import PacketType, ReceivedPacket, ReceiveMode, receive_statistics
 from sonarpost.simulation.modem.settings import ModemClock, Settings
 
 _GOOD = frozenset({Fate.DELIVERED, Fate.DAMAGED})
@@ -22,7 +29,7 @@ _NOT_MINE = "addressed to another modem"
 
 
 @dataclass(slots=True)
-class Hearing:
+class ReceptionReport:
     """What comes of a packet at one modem.
 
     Attributes:
@@ -42,11 +49,11 @@ class Hearing:
 class _Expected:
     """Data that a cycle header, heard or sent, has announced."""
 
-    header: Packet
+    header: AcousticPacket
     deadline_s: float
 
 
-def packet_type(packet: Packet) -> PacketType:
+def packet_type(packet: AcousticPacket) -> PacketType:
     """Return the type that the statistics give for a packet."""
     if packet.kind is PacketKind.FLEXIBLE:
         return PacketType.FLEXIBLE
@@ -55,7 +62,7 @@ def packet_type(packet: Packet) -> PacketType:
     return PacketType.FSK if packet.rate == 0 else PacketType.PSK
 
 
-class Listener:
+class ReceptionReporter:
     """The listening half of one modem.
 
     Args:
@@ -81,7 +88,7 @@ class Listener:
         """When an announced packet that has not begun is given up."""
         return None if self._expected is None or self._arriving else self._expected.deadline_s
 
-    def expect(self, header: Packet, now: float) -> None:
+    def expect(self, header: AcousticPacket, now: float) -> None:
         """Wait for the data that `header` announces."""
         patience_s = self._settings["CTO"] + header.announced_frames * self._settings["DTO"]
         self._expected = _Expected(header, now + patience_s)
@@ -99,7 +106,7 @@ class Listener:
         self._expected = None
         return [nmea.format("CAMSG", "PACKET_TIMEOUT", rate)]
 
-    def begin(self, packet: Packet) -> list[bytes]:
+    def begin(self, packet: AcousticPacket) -> list[bytes]:
         """A packet begins to arrive; return what the host is told."""
         if packet.kind is PacketKind.NAVIGATION:
             return []
@@ -109,18 +116,18 @@ class Listener:
         psk = packet_type(packet) in {PacketType.PSK, PacketType.FLEXIBLE}
         return [nmea.format("CARXP", int(psk))]
 
-    def hear(self, arrival: ArrivalEnded) -> Hearing:
+    def hear(self, arrival: ArrivalEnded) -> ReceptionReport:
         """Return what the modem tells about a packet that has passed."""
         packet = arrival.transmission.packet
         if packet.kind is PacketKind.NAVIGATION:
-            return Hearing(untold="no communication", missed=True)
+            return ReceptionReport(untold="no communication", missed=True)
         if not arrival.detected:
-            return Hearing(untold=arrival.outcome.value, missed=True)
+            return ReceptionReport(untold=arrival.outcome.value, missed=True)
         if not self._arriving:
-            return Hearing(untold="rebooting", missed=True)
+            return ReceptionReport(untold="rebooting", missed=True)
         self._arriving = False
         expected, self._expected = self._expected, None
-        if arrival.outcome is not Outcome.ARRIVED:
+        if arrival.outcome is not FrameFate.ARRIVED:
             return self._broken(arrival, arrival.outcome.value)
         if packet.kind is PacketKind.DATA:
             missed = packet.rate == 0 and not _announces(expected, packet)
@@ -134,22 +141,22 @@ class Listener:
         addressed = destination == self._settings["SRC"] or destination in self._config.broadcast_addresses
         return self._config.promiscuous or addressed
 
-    def _broken(self, arrival: ArrivalEnded, untold: str) -> Hearing:
+    def _broken(self, arrival: ArrivalEnded, untold: str) -> ReceptionReport:
         lines = [nmea.format("CAMSG", "PACKET_TIMEOUT", arrival.transmission.packet.rate)]
         heard = self._heard(arrival)
         heard = replace(heard, mode=ReceiveMode.TIMEOUT, source=0, destination=0, frames=0, bad_frames=0)
-        return Hearing(lines + self._statistics(heard), untold=untold)
+        return ReceptionReport(lines + self._statistics(heard), untold=untold)
 
-    def _cycle(self, arrival: ArrivalEnded) -> Hearing:
+    def _cycle(self, arrival: ArrivalEnded) -> ReceptionReport:
         packet = arrival.transmission.packet
         if packet.source != self._settings["SRC"]:
             self.expect(packet, arrival.at_s)
         lines = [_cycle_line(packet, packet.announced_frames)]
-        return Hearing(lines + self._statistics(replace(self._heard(arrival), frames=0, bad_frames=0)))
+        return ReceptionReport(lines + self._statistics(replace(self._heard(arrival), frames=0, bad_frames=0)))
 
-    def _data(self, arrival: ArrivalEnded) -> Hearing:
+    def _data(self, arrival: ArrivalEnded) -> ReceptionReport:
         packet = arrival.transmission.packet
-        hearing = Hearing()
+        hearing = ReceptionReport()
         if packet.rate != 0:
             hearing.lines.append(_cycle_line(packet, len(packet.frames)))
         if not self._accepts(packet.destination):
@@ -169,16 +176,16 @@ class Listener:
         return hearing
 
     @staticmethod
-    def _frame_line(packet: Packet, frame: FrameArrival) -> tuple[bytes, str]:
+    def _frame_line(packet: AcousticPacket, frame: FrameArrival) -> tuple[bytes, str]:
         head = (packet.source, packet.destination, int(frame.number in packet.ack_frames), frame.number)
         # What noise made of a text need not be text any more.
         if frame.number in packet.ascii_frames and nmea.is_text(frame.received):
             return nmea.format("CARXA", *head, *frame.received.decode("ascii").split(",")), "RXA"
         return nmea.format("CARXD", *head, frame.received.hex().upper()), "RXD"
 
-    def _flexible(self, arrival: ArrivalEnded) -> Hearing:
+    def _flexible(self, arrival: ArrivalEnded) -> ReceptionReport:
         packet = arrival.transmission.packet
-        hearing = Hearing()
+        hearing = ReceptionReport()
         if self._accepts(packet.destination):
             mini, *rest = [_group(frame) for frame in arrival.frames]
             ends = (packet.source, packet.destination, packet.rate, int(packet.ack_requested), 0)
@@ -188,10 +195,10 @@ class Listener:
         hearing.lines += self._statistics(self._heard(arrival))
         return hearing
 
-    def _short(self, arrival: ArrivalEnded) -> Hearing:
+    def _short(self, arrival: ArrivalEnded) -> ReceptionReport:
         packet = arrival.transmission.packet
         ends = (packet.source, packet.destination)
-        hearing = Hearing()
+        hearing = ReceptionReport()
         if packet.kind is PacketKind.ACK:
             if self._accepts(packet.destination):
                 hearing.lines += [nmea.format("CAACK", *ends, number, 1) for number in packet.acked_frames]
@@ -204,12 +211,12 @@ class Listener:
         hearing.lines += self._statistics(self._heard(arrival))
         return hearing
 
-    def _heard(self, arrival: ArrivalEnded) -> Heard:
+    def _heard(self, arrival: ArrivalEnded) -> ReceivedPacket:
         packet = arrival.transmission.packet
         held = [frame for frame in arrival.frames if frame.fate is not Fate.EMPTY]
         bad = sum(frame.fate is Fate.LOST for frame in held)
         arrived_s = arrival.transmission.started_s + arrival.delay_s
-        return Heard(
+        return ReceivedPacket(
             mode=ReceiveMode.BAD_CRC if bad else ReceiveMode.GOOD,
             arrived=self._clock.at(arrived_s),
             clock=self._clock.status(self._config.generation),
@@ -233,7 +240,7 @@ class Listener:
             lines.append(nmea.format("CADQF", max(0, min(254, round(180 + arrival.snr_db))), PacketType.FSK.value))
         return lines
 
-    def _statistics(self, heard: Heard) -> list[bytes]:
+    def _statistics(self, heard: ReceivedPacket) -> list[bytes]:
         return [receive_statistics(heard, self._config.statistics_version)] if self._settings.on("CST") else []
 
 
@@ -249,11 +256,11 @@ def _ends(arrival: ArrivalEnded) -> tuple[int, int]:
     return arrival.transmission.packet.source, arrival.transmission.packet.destination
 
 
-def _cycle_line(packet: Packet, frames: int) -> bytes:
+def _cycle_line(packet: AcousticPacket, frames: int) -> bytes:
     return nmea.format("CACYC", 0, packet.source, packet.destination, packet.rate, int(packet.ack_requested), frames)
 
 
-def _announces(expected: _Expected | None, packet: Packet) -> bool:
+def _announces(expected: _Expected | None, packet: AcousticPacket) -> bool:
     if expected is None:
         return False
     header = expected.header

@@ -42,7 +42,7 @@ class PacketType(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class ReceivedPacket:
     """What `CACST` tells about one packet.
 
     Attributes:
@@ -73,7 +73,7 @@ class Heard:
 
 
 @dataclass(frozen=True, slots=True)
-class Sent:
+class TransmittedPacket:
     """What `CAXST` tells about one packet.
 
     Attributes:
@@ -101,7 +101,7 @@ class Sent:
     data_bytes: int
 
 
-def receive_statistics(heard: Heard, version: int) -> bytes:
+def receive_statistics(heard: ReceivedPacket, version: int) -> bytes:
     """Return the `CACST` sentence for one packet, in the layout of `version` (6 or 8)."""
     level_db = _SOURCE_LEVEL_DB - 20 * math.log10(max(1.0, heard.range_m))
     out_db = min(heard.snr_db - 3.0, _BEST_OUTPUT_SNR_DB)
@@ -142,7 +142,7 @@ def receive_statistics(heard: Heard, version: int) -> bytes:
     return nmea.format("CACST", *fields, *((0, -1, -1, "00") if version == 8 else ()))
 
 
-def transmit_statistics(sent: Sent, version: int) -> bytes:
+def transmit_statistics(sent: TransmittedPacket, version: int) -> bytes:
     """Return the `CAXST` sentence for one packet, in the layout that goes with `version` (6 or 8) of `CACST`."""
     return nmea.format(
         "CAXST",

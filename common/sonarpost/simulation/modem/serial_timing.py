@@ -11,7 +11,7 @@ BITS_PER_BYTE = 10
 """Start bit, eight data bits, stop bit (8N1)."""
 
 
-class SerialPace(Generic[Item]):
+class SerialLineTiming(Generic[Item]):
     """One direction of a serial line: what is put in comes out when its last byte would have passed.
 
     Args:

@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem import nmea
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.simulation.channel.channel_events import ArrivalEnded, Outcome, Packet, PacketKind
+from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, FrameFate, PacketKind
 from sonarpost.simulation.modem import commands
 from sonarpost.simulation.modem.config import ModemConfig
 from sonarpost.simulation.modem.reception import packet_type
-from sonarpost.simulation.modem.sentences import Sent, transmit_statistics
+from sonarpost.simulation.modem.sentences import TransmittedPacket, transmit_statistics
 from sonarpost.simulation.modem.settings import ModemClock, Settings
 
 _ANSWERS = frozenset({PacketKind.ACK, PacketKind.PING_REPLY, PacketKind.MINI_REPLY})
@@ -42,7 +42,7 @@ class _Cycle:
 class _Sending:
     """A packet in the water."""
 
-    packet: Packet
+    packet: AcousticPacket
     started_s: float
     ended_s: float
 
@@ -64,17 +64,17 @@ class Transmitter:
         settings: Settings,
         clock: ModemClock,
         write: Callable[[bytes], None],
-        expect: Callable[[Packet, float], None],
+        expect: Callable[[AcousticPacket, float], None],
     ) -> None:
         self._config = config
         self._settings = settings
         self._clock = clock
         self._write = write
         self._expect = expect
-        self._packets: deque[Packet] = deque()
+        self._packets: deque[AcousticPacket] = deque()
         self._cycle: _Cycle | None = None
         self._sending: _Sending | None = None
-        self._waiting: deque[tuple[float, Packet]] = deque()
+        self._waiting: deque[tuple[float, AcousticPacket]] = deque()
         self._flexible_packets = 0
 
     @property
@@ -82,7 +82,7 @@ class Transmitter:
         """Whether a cycle is being filled, or a packet is in the water or waits to be."""
         return self._cycle is not None or self._sending is not None or bool(self._waiting)
 
-    def packets_to_transmit(self) -> list[Packet]:
+    def packets_to_transmit(self) -> list[AcousticPacket]:
         """Return, once, the packets that go into the water now."""
         packets = list(self._packets)
         self._packets.clear()
@@ -152,7 +152,7 @@ class Transmitter:
             if request.rate != 0:
                 self._ask_frame(self._cycle, now)
                 return
-        header = Packet(
+        header = AcousticPacket(
             PacketKind.CYCLE,
             request.source,
             request.destination,
@@ -163,7 +163,7 @@ class Transmitter:
         )
         self.send_when_free(header, now)
 
-    def polled(self, header: Packet, now: float) -> None:
+    def polled(self, header: AcousticPacket, now: float) -> None:
         """Another modem asks for data of this one: ask the host for it, unless that is sending already."""
         if self._cycle is not None:
             return
@@ -210,7 +210,7 @@ class Transmitter:
         self._say("CA" + sentence.kind[2:], asked.source, asked.destination, *bits)
         kind = PacketKind.PING if is_ping else PacketKind.MINI
         airtime_s = self._config.mini_airtime_s
-        self.send_when_free(Packet(kind, asked.source, asked.destination, 0, airtime_s, mini=asked.bits), now)
+        self.send_when_free(AcousticPacket(kind, asked.source, asked.destination, 0, airtime_s, mini=asked.bits), now)
 
     def send_flexible(self, sentence: nmea.Sentence, now: float) -> None:
         """Act on `CCTDP`.
@@ -230,10 +230,10 @@ class Transmitter:
         frames += [rest[at : at + rate.frame_bytes] for at in range(0, len(rest), rate.frame_bytes)]
         airtime_s = self._config.mini_airtime_s + self._config.airtime_s(asked.rate) * (len(frames) - 1) / rate.frames
         own, ack = self._settings["SRC"], asked.ack_requested
-        packet = Packet(PacketKind.FLEXIBLE, own, asked.destination, asked.rate, airtime_s, tuple(frames), ack)
+        packet = AcousticPacket(PacketKind.FLEXIBLE, own, asked.destination, asked.rate, airtime_s, tuple(frames), ack)
         self.send_when_free(packet, now)
 
-    def send_when_free(self, packet: Packet, now: float) -> None:
+    def send_when_free(self, packet: AcousticPacket, now: float) -> None:
         """Put a packet into the water, after what is in it now."""
         if self._sending:
             self._waiting.appendleft((now, packet))
@@ -246,7 +246,7 @@ class Transmitter:
     def answer(self, arrival: ArrivalEnded, good_frames: tuple[int, ...]) -> None:
         """Plan the automatic answer to a packet that was heard whole and was meant for this modem, if it wants one."""
         packet = arrival.transmission.packet
-        if arrival.outcome is not Outcome.ARRIVED:
+        if arrival.outcome is not FrameFate.ARRIVED:
             return
         own = self._settings["SRC"]
         if packet.kind is PacketKind.CYCLE and packet.source == own:
@@ -256,11 +256,11 @@ class Transmitter:
         ends = (own, packet.source, 0, self._config.mini_airtime_s)
         acked = tuple(number for number in good_frames if number in packet.ack_frames)
         if packet.kind is PacketKind.PING:
-            answer = Packet(PacketKind.PING_REPLY, *ends)
+            answer = AcousticPacket(PacketKind.PING_REPLY, *ends)
         elif packet.kind is PacketKind.MINI:
-            answer = Packet(PacketKind.MINI_REPLY, *ends)
+            answer = AcousticPacket(PacketKind.MINI_REPLY, *ends)
         elif packet.kind is PacketKind.DATA and acked:
-            answer = Packet(PacketKind.ACK, *ends, acked_frames=acked)
+            answer = AcousticPacket(PacketKind.ACK, *ends, acked_frames=acked)
         else:
             return
         self._waiting.append((arrival.at_s + self._config.turnaround_s, answer))
@@ -268,7 +268,7 @@ class Transmitter:
     def _say(self, kind: str, *fields: str | int) -> None:
         self._write(nmea.format(kind, *fields))
 
-    def _header_gone(self, header: Packet, now: float) -> None:
+    def _header_gone(self, header: AcousticPacket, now: float) -> None:
         if header.source != self._settings["SRC"]:
             self._expect(header, now)
         elif self._cycle is not None and self._cycle.deadline_s is None:
@@ -287,10 +287,10 @@ class Transmitter:
             len(cycle.frames) + 1,
         )
 
-    def _data_packet(self, cycle: _Cycle) -> Packet:
+    def _data_packet(self, cycle: _Cycle) -> AcousticPacket:
         request, filled = cycle.request, list(enumerate(cycle.frames, start=1))
         empty = (b"",) * (request.frames - len(cycle.frames))
-        return Packet(
+        return AcousticPacket(
             PacketKind.DATA,
             request.source,
             request.destination,
@@ -311,7 +311,7 @@ class Transmitter:
             self._say("CATXF", total)
         if packet.kind not in _WITH_STATISTICS or not self._settings.on("XST"):
             return
-        statistics = Sent(
+        statistics = TransmittedPacket(
             started=self._clock.at(sending.started_s),
             clock=str(int(self._clock.was_set)),
             rate=packet.rate,

@@ -30,9 +30,9 @@ import numpy as np
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position
-from sonarpost.sonar.navigation_check import Rows
+from sonarpost.sonar.navigation_check import NavigationRows
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.readers.open_file import OpenFile, Walk
+from sonarpost.sonar.readers.open_file import CheckedFile, SequentialReader
 from sonarpost.sonar.source import StreamedSource
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 
@@ -72,10 +72,14 @@ class HumminbirdSource(StreamedSource):
 
     def __init__(self, path: Path, options: SurveyOptions) -> None:
         super().__init__(path, options)
-        self._files: dict[Side, OpenFile] = {}
+        self._files: dict[Side, CheckedFile] = {}
         self._started_s = _start_time(path)
         self._spacing_m = options.humminbird_sample_spacing_m or SAMPLE_SPACING_M
-        self._without_fix, self._without_heading, self._without_depth = Rows(), Rows(), Rows()
+        self._without_fix, self._without_heading, self._without_depth = (
+            NavigationRows(),
+            NavigationRows(),
+            NavigationRows(),
+        )
         self._pings = 0
         self._unpaired = 0
         found = {side: channel for side, name in _SIDES.items() if (channel := _beside(path, name)) is not None}
@@ -84,7 +88,7 @@ class HumminbirdSource(StreamedSource):
             raise SurveyFileError(str(path), "side-scan channels", "none", expected)
         try:
             for side, channel in found.items():
-                self._files[side] = OpenFile(channel)
+                self._files[side] = CheckedFile(channel)
             self._scan("Humminbird", path.stem)
         except BaseException:
             self.close()
@@ -106,7 +110,7 @@ class HumminbirdSource(StreamedSource):
             notes.append(f"the file of the other side than {next(iter(self._files)).value} is missing")
         elif self._unpaired:
             notes.append(f"only one side in {self._unpaired} of {self._pings} pings")
-        texts: tuple[tuple[Rows, str], ...] = (
+        texts: tuple[tuple[NavigationRows, str], ...] = (
             (self._without_fix, "no position fix in"),
             (self._without_heading, "no heading in"),
             (self._without_depth, "no depth under the transducer in"),
@@ -176,13 +180,13 @@ class HumminbirdSource(StreamedSource):
         )
 
 
-def _records(file: OpenFile) -> Iterator[_Record]:
+def _records(file: CheckedFile) -> Iterator[_Record]:
     """Yield the pings of one channel.
 
     Raises:
         SurveyFileError: The file is damaged or ends inside a ping.
     """
-    walk = Walk(file)
+    walk = SequentialReader(file)
     number = 0
     while walk.left:
         place = f"ping {number} at byte {walk.offset}"
@@ -197,7 +201,7 @@ def _records(file: OpenFile) -> Iterator[_Record]:
         number += 1
 
 
-def _fields(walk: Walk, file: OpenFile, place: str) -> dict[int, int]:
+def _fields(walk: SequentialReader, file: CheckedFile, place: str) -> dict[int, int]:
     """Read a header's fields up to its end."""
     fields: dict[int, int] = {}
     first = walk.offset
@@ -234,7 +238,7 @@ def _signed(value: int) -> int:
 
 def _start_time(path: Path) -> float:
     """Return when a recording began, UTC seconds, from its DAT file."""
-    with OpenFile(path) as file:
+    with CheckedFile(path) as file:
         if not _DAT_BYTES <= file.size_bytes <= _MAX_DAT_BYTES:
             raise file.error("file size", file.size_bytes, f"{_DAT_BYTES} to {_MAX_DAT_BYTES} bytes")
         raw = file.read_at(0, _DAT_BYTES, "header")

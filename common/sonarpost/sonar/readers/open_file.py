@@ -15,7 +15,7 @@ _BUFFER_BYTES: Final = 1 << 18
 _LINE_BYTES: Final = 1 << 16
 
 
-class OpenFile:
+class CheckedFile:
     """A regular file opened once. A file put in its place later is not seen; one rewritten in place is an error.
 
     Raises:
@@ -64,7 +64,7 @@ class OpenFile:
         Raises:
             SurveyFileError: Not UTF-8, a line over 64 KiB, or the file cannot be read; the message names the line.
         """
-        walk = Walk(self)
+        walk = SequentialReader(self)
         rest = b""
         number = 0
         while walk.left or rest:
@@ -103,7 +103,7 @@ class OpenFile:
             os.close(self._descriptor)
             self._descriptor = -1
 
-    def __enter__(self) -> OpenFile:
+    def __enter__(self) -> CheckedFile:
         return self
 
     def __exit__(
@@ -116,10 +116,10 @@ class OpenFile:
             self.close()
 
 
-class Walk:
+class SequentialReader:
     """A position that moves through an open file; several may walk one file at a time."""
 
-    def __init__(self, file: OpenFile, offset: int = 0) -> None:
+    def __init__(self, file: CheckedFile, offset: int = 0) -> None:
         self._file = file
         self.offset = offset
         self._buffer = b""

@@ -30,10 +30,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position
 from sonarpost.sonar.image_files import GreyImage, read_image
-from sonarpost.sonar.navigation_check import Rows
+from sonarpost.sonar.navigation_check import NavigationRows
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection
-from sonarpost.sonar.readers.open_file import OpenFile
+from sonarpost.sonar.readers.open_file import CheckedFile
 from sonarpost.sonar.source import StreamedSource
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Ping, Side
 
@@ -50,7 +50,7 @@ _COORDINATES: Final = {"degrees": ("lat_deg", "lon_deg"), "metres": ("northing_m
 _Name = Annotated[str, Field(min_length=1, max_length=255)]
 
 
-class WaterfallFile(BaseModel):
+class WaterfallDescription(BaseModel):
     """The fields of a `.waterfall.toml`; see the module's text."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -85,9 +85,9 @@ class WaterfallSource(StreamedSource):
             raise SurveyFileError(str(path), "projected_crs", None, "the coordinate system of positions in metres")
         self._projection = Projection(crs, path) if crs is not None and self._file.positions == "metres" else None
         self._pictures = self._read_pictures()
-        self._table = OpenFile(path.parent / self._file.navigation)
-        self._without_fix = Rows()
-        self._odd: dict[str, Rows] = {}
+        self._table = CheckedFile(path.parent / self._file.navigation)
+        self._without_fix = NavigationRows()
+        self._odd: dict[str, NavigationRows] = {}
         self._pings = 0
         try:
             self._scan(self._file.sonar_id, path.name.removesuffix(".toml").removesuffix(".waterfall"))
@@ -201,7 +201,7 @@ class WaterfallSource(StreamedSource):
         if low <= value <= high:
             return value
         if first:
-            self._odd.setdefault(name, Rows()).add(row)
+            self._odd.setdefault(name, NavigationRows()).add(row)
         return None
 
     def _position(self, row: int, values: dict[str, str]) -> Position | None:
@@ -229,12 +229,14 @@ class WaterfallSource(StreamedSource):
             raise self._table.error(f"ping {row}, time_utc", text, "ISO 8601, or seconds since 1970") from error
 
 
-def _description(path: Path) -> WaterfallFile:
-    with OpenFile(path) as file:
+def _description(path: Path) -> WaterfallDescription:
+    with CheckedFile(path) as file:
         if file.size_bytes > _MAX_TOML_BYTES:
             raise file.error("file size", file.size_bytes, f"at most {_MAX_TOML_BYTES} bytes")
         try:
-            return WaterfallFile.model_validate(tomllib.loads(file.read_at(0, file.size_bytes, "file").decode("utf-8")))
+            return WaterfallDescription.model_validate(
+                tomllib.loads(file.read_at(0, file.size_bytes, "file").decode("utf-8"))
+            )
         except ValidationError as error:
             first = error.errors()[0]
             field = ".".join(str(part) for part in first["loc"])

@@ -13,7 +13,7 @@ from pyxtf import XTFPacketStart
 
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection
-from sonarpost.sonar.readers.open_file import OpenFile, Walk
+from sonarpost.sonar.readers.open_file import CheckedFile, SequentialReader
 from sonarpost.sonar.readers.xtf_navigation import NAV_UNITS_METRES, NavigationCleaner, NavigationRecord
 from sonarpost.sonar.readers.xtf_records import HEADER_BYTES, Attitude, PingParser, attitude_of, read_header, text_of
 from sonarpost.sonar.source import StreamedSource, gather
@@ -51,7 +51,7 @@ def read_xtf(path: Path, options: SurveyOptions | None = None) -> Survey:
     Raises:
         SurveyFileError: Not an XTF file, truncated, inconsistent, too long, without sonar pings, or unreadable.
     """
-    with OpenFile(path) as file:
+    with CheckedFile(path) as file:
         if file.size_bytes > MAX_FILE_BYTES:
             raise file.error("file size", file.size_bytes, f"at most {MAX_FILE_BYTES} bytes, or reading in blocks")
     with XtfSource(path, options or SurveyOptions()) as source:
@@ -69,7 +69,7 @@ class XtfSource(StreamedSource):
 
     def __init__(self, path: Path, options: SurveyOptions) -> None:
         super().__init__(path, options)
-        self._file = OpenFile(path)
+        self._file = CheckedFile(path)
         try:
             self._open()
         except BaseException:
@@ -79,7 +79,7 @@ class XtfSource(StreamedSource):
     def _open(self) -> None:
         if self._file.size_bytes < HEADER_BYTES:
             raise self._file.error("file size", self._file.size_bytes, f"at least {HEADER_BYTES} bytes")
-        walk = Walk(self._file)
+        walk = SequentialReader(self._file)
         header, channels = read_header(walk, self._file)
         self._first_packet = walk.offset
         crs = self.options.projected_crs
@@ -128,7 +128,7 @@ class XtfSource(StreamedSource):
 
     def _packets(self) -> Iterator[tuple[int, str, bytes]]:
         """Yield (type, place, bytes of the whole record) of each packet."""
-        walk = Walk(self._file, self._first_packet)
+        walk = SequentialReader(self._file, self._first_packet)
         while walk.left:
             place = f"packet at byte {walk.offset}"
             raw = walk.take(_START_BYTES, place)

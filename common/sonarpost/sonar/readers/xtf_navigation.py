@@ -8,7 +8,7 @@ from typing import Final
 
 from pyxtf import XTFPingHeader
 
-from sonarpost.sonar.navigation_check import Rows
+from sonarpost.sonar.navigation_check import NavigationRows
 from sonarpost.sonar.projection import Projection
 
 KNOT_MPS: Final = 1852 / 3600
@@ -80,8 +80,8 @@ class NavigationCleaner:
         self._nav_units = nav_units
         self._projection = projection
         self._recorded: set[str] = set()
-        self._without_fix = Rows()
-        self._odd: dict[str, Rows] = {}
+        self._without_fix = NavigationRows()
+        self._odd: dict[str, NavigationRows] = {}
 
     def observe(self, row: int, record: NavigationRecord) -> None:
         """Take note of a record on the first walk through the file."""
@@ -92,7 +92,7 @@ class NavigationCleaner:
             if value:
                 self._recorded.add(name)
                 if not _plausible(name, value):
-                    self._odd.setdefault(name, Rows()).add(row)
+                    self._odd.setdefault(name, NavigationRows()).add(row)
 
     def records(self, name: str) -> bool:
         """Return whether any ping seen so far has something in this field."""

@@ -25,7 +25,7 @@ from typing import Final
 import numpy as np
 from pyxtf import XTFAttitudeData, XTFChanInfo, XTFFileHeader, XTFPingChanHeader, XTFPingHeader
 
-from sonarpost.sonar.readers.open_file import OpenFile, Walk
+from sonarpost.sonar.readers.open_file import CheckedFile, SequentialReader
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Samples, Side
 
 FILE_MAGIC: Final = 0x7B
@@ -48,7 +48,7 @@ _DELAY_AGREEMENT: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class Channel:
+class ChannelInfo:
     """What the file header says of one channel."""
 
     kind: int
@@ -69,7 +69,7 @@ class Attitude:
     heading_deg: float
 
 
-def read_header(walk: Walk, file: OpenFile) -> tuple[XTFFileHeader, list[Channel]]:
+def read_header(walk: SequentialReader, file: CheckedFile) -> tuple[XTFFileHeader, list[ChannelInfo]]:
     """Read the file header with its channels.
 
     Raises:
@@ -89,9 +89,9 @@ def read_header(walk: Walk, file: OpenFile) -> tuple[XTFFileHeader, list[Channel
     return header, [_channel(raw, index) for index in range(6 + 8 * extra)]
 
 
-def _channel(raw: bytes, index: int) -> Channel:
+def _channel(raw: bytes, index: int) -> ChannelInfo:
     info = XTFChanInfo.from_buffer_copy(raw, _CHAN_INFO_OFFSET + index * _CHAN_INFO_BYTES)
-    return Channel(
+    return ChannelInfo(
         kind=info.TypeOfChannel,
         bytes_per_sample=info.BytesPerSample,
         sample_format=info.SampleFormat,
@@ -119,7 +119,7 @@ def attitude_of(raw: bytes) -> Attitude | None:
 class PingParser:
     """Parses sonar packets of one file; `notes` counts what was left out or put right."""
 
-    def __init__(self, file: OpenFile, channels: list[Channel], *, port_farthest_first: bool) -> None:
+    def __init__(self, file: CheckedFile, channels: list[ChannelInfo], *, port_farthest_first: bool) -> None:
         self._file = file
         self._channels = channels
         self._reverse = {Side.PORT: port_farthest_first, Side.STARBOARD: False}
@@ -176,7 +176,7 @@ class PingParser:
             if channel is not None:
                 yield channel
 
-    def _sample_bytes(self, info: Channel, number: int) -> int:
+    def _sample_bytes(self, info: ChannelInfo, number: int) -> int:
         size = info.bytes_per_sample
         if size not in _SAMPLE_BYTES:
             raise self._file.error(f"channel {number}, BytesPerSample", size, "1, 2 or 4")
@@ -189,7 +189,7 @@ class PingParser:
         return size
 
     def _channel_ping(
-        self, head: XTFPingChanHeader, info: Channel, raw: bytes, sound_velocity_mps: float
+        self, head: XTFPingChanHeader, info: ChannelInfo, raw: bytes, sound_velocity_mps: float
     ) -> ChannelPing | None:
         side = _SIDES.get(info.kind)
         if side is None:

@@ -85,7 +85,7 @@ class ContactOnly:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameRejected:
+class PaperFrameRejected:
     """A frame that is not of this wire format, or that cannot belong to its image.
 
     Attributes:
@@ -99,4 +99,4 @@ class FrameRejected:
     at: float
 
 
-Event = ImageReady | ContactOnly | FrameRejected
+Event = ImageReady | ContactOnly | PaperFrameRejected

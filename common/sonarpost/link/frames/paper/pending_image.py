@@ -13,10 +13,10 @@ from sonarpost.link.frames.paper.frame import HalfFrame, HalfName, half_bounds
 
 MAX_CANDIDATES = 3
 
-Given = tuple[int, int, bool]
+DeliveredState = tuple[int, int, bool]
 
 
-class Outcome(Enum):
+class FrameOutcome(Enum):
     """What a frame did to its image."""
 
     NEWS = "news"
@@ -25,7 +25,7 @@ class Outcome(Enum):
 
 
 @dataclass(slots=True)
-class Candidate:
+class ImageCandidate:
     """The body as told by all frames that agree on one stream header and body length.
 
     Attributes:
@@ -91,14 +91,14 @@ class PendingImage:
     last_at: float
     news_at: float
     heard_at: float
-    candidates: list[Candidate] = field(default_factory=list)
+    candidates: list[ImageCandidate] = field(default_factory=list)
     contact: ContactSummary | None = None
     conflicts: int = 0
     version: int = 0
-    given: Given | None = None
+    given: DeliveredState | None = None
 
     @property
-    def leader(self) -> Candidate | None:
+    def leader(self) -> ImageCandidate | None:
         """The candidate that speaks for the image, or None before the first half frame.
 
         It is the one whose picture size is the contact record's (which has a checksum), then the one with the most
@@ -106,7 +106,7 @@ class PendingImage:
         """
         return max(self.candidates, key=self._rank, default=None)
 
-    def _rank(self, candidate: Candidate) -> tuple[bool, int, int]:
+    def _rank(self, candidate: ImageCandidate) -> tuple[bool, int, int]:
         header, contact = candidate.header, self.contact
         agrees = contact is not None and (contact.height_px, contact.width_px) == (header.height_px, header.width_px)
         return agrees, candidate.frames, candidate.received_bytes
@@ -122,14 +122,14 @@ class PendingImage:
         """Whether more is known than was last given out."""
         return self._state() != self.given
 
-    def _state(self) -> Given:
+    def _state(self) -> DeliveredState:
         leader = self.leader
         if leader is None:
             return -1, 0, self.contact is not None
         index = next(i for i, candidate in enumerate(self.candidates) if candidate is leader)
         return index, leader.received_bytes, self.contact is not None
 
-    def add_half(self, frame: HalfFrame, now: float) -> Outcome:
+    def add_half(self, frame: HalfFrame, now: float) -> FrameOutcome:
         """Put in one half frame."""
         self.heard_at = now
         agreeing = (c for c in self.candidates if c.header == frame.header and len(c.body) == frame.body_length)
@@ -138,29 +138,29 @@ class PendingImage:
             self.conflicts += 1
         if candidate is None:
             if len(self.candidates) >= MAX_CANDIDATES:
-                return Outcome.REFUSED
-            candidate = Candidate(frame.header, bytearray(frame.body_length))
+                return FrameOutcome.REFUSED
+            candidate = ImageCandidate(frame.header, bytearray(frame.body_length))
             candidate.fill(frame)
             self.candidates.append(candidate)
             self._note_news(now)
-            return Outcome.NEWS
+            return FrameOutcome.NEWS
         added, conflict = candidate.fill(frame)
         self.conflicts += conflict
         if not added:
-            return Outcome.DUPLICATE
+            return FrameOutcome.DUPLICATE
         candidate.frames += 1
         self._note_news(now)
-        return Outcome.NEWS
+        return FrameOutcome.NEWS
 
-    def add_contact(self, contact: ContactSummary, now: float) -> Outcome:
+    def add_contact(self, contact: ContactSummary, now: float) -> FrameOutcome:
         """Put in one contact record; the first stays."""
         self.heard_at = now
         if self.contact is not None:
             self.conflicts += contact != self.contact
-            return Outcome.DUPLICATE
+            return FrameOutcome.DUPLICATE
         self.contact = contact
         self._note_news(now)
-        return Outcome.NEWS
+        return FrameOutcome.NEWS
 
     def _note_news(self, now: float) -> None:
         self.last_at = self.news_at = now

@@ -10,19 +10,19 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 
 from sonarpost.errors import FrameError
-from sonarpost.link.frames.paper.events import ContactOnly, Event, FrameRejected, ImageReady
+from sonarpost.link.frames.paper.events import ContactOnly, Event, ImageReady, PaperFrameRejected
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, parse_frame
-from sonarpost.link.frames.paper.pending_image import MAX_CANDIDATES, Outcome, PendingImage
+from sonarpost.link.frames.paper.pending_image import MAX_CANDIDATES, FrameOutcome, PendingImage
 from sonarpost.link.frames.paper.state import export_image, import_image, read_field, read_list
 
-__all__ = ["ContactOnly", "Event", "FrameRejected", "ImageReady", "PairingReceiver", "ReceiverCounts"]
+__all__ = ["ContactOnly", "Event", "ImageReady", "PaperFrameRejected", "PaperReceiver", "PaperReceiverCounts"]
 
 _STATE_FORMAT = 1
 _Key = tuple[int, str]
 
 
 @dataclass(frozen=True, slots=True)
-class ReceiverCounts:
+class PaperReceiverCounts:
     """Counters since the beginning, restarts included.
 
     Attributes:
@@ -46,7 +46,7 @@ class ReceiverCounts:
     evicted: int = 0
 
 
-class PairingReceiver:
+class PaperReceiver:
     """Puts images together from frames of any number of sources.
 
     An image that holds something not yet given out is *open*. It is given out
@@ -85,17 +85,17 @@ class PairingReceiver:
         self._max_images = max_images
         self._memory_s = memory_s
         self._images: dict[_Key, PendingImage] = {}  # least recently heard first
-        self._counts = ReceiverCounts()
+        self._counts = PaperReceiverCounts()
 
     @property
-    def counts(self) -> ReceiverCounts:
+    def counts(self) -> PaperReceiverCounts:
         """The counters."""
         return self._counts
 
     def accept(self, source: int, frame: bytes, now: float) -> list[Event]:
         """Take one frame; return what follows from it, after what `poll(now)` would have returned.
 
-        Never raises because of `frame`: one that does not parse becomes a `FrameRejected`.
+        Never raises because of `frame`: one that does not parse becomes a `PaperFrameRejected`.
         """
         now = float(now)
         events = self.poll(now)
@@ -104,7 +104,7 @@ class PairingReceiver:
             parsed = parse_frame(frame, f"acoustic frame from modem {source}")
         except FrameError as reason:
             self._count(rejected=1)
-            return [*events, FrameRejected(source, reason, now)]
+            return [*events, PaperFrameRejected(source, reason, now)]
         return events + self._take(source, parsed, now)
 
     def poll(self, now: float) -> list[Event]:
@@ -145,7 +145,7 @@ class PairingReceiver:
             raise FrameError("receiver state", "format", state.get("format"), str(_STATE_FORMAT))
         images = [import_image(entry) for entry in read_list(state, "images")]
         counts = read_field(state, "counts", dict)
-        restored = ReceiverCounts(**{name: read_field(counts, name, int) for name in asdict(self._counts)})
+        restored = PaperReceiverCounts(**{name: read_field(counts, name, int) for name in asdict(self._counts)})
         self._images = {(image.source, image.image_id): image for image in images}
         self._counts = restored
 
@@ -161,8 +161,8 @@ class PairingReceiver:
         self._images[key] = image  # last, as the most recently heard
         known_conflicts = image.conflicts
         outcome = image.add_half(frame, now) if isinstance(frame, HalfFrame) else image.add_contact(frame.contact, now)
-        self._count(conflicts=image.conflicts - known_conflicts, duplicates=int(outcome is Outcome.DUPLICATE))
-        if outcome is Outcome.REFUSED:
+        self._count(conflicts=image.conflicts - known_conflicts, duplicates=int(outcome is FrameOutcome.DUPLICATE))
+        if outcome is FrameOutcome.REFUSED:
             self._count(rejected=1)
             reason = FrameError(
                 f"acoustic frame from modem {source}",
@@ -170,7 +170,7 @@ class PairingReceiver:
                 f"another one for image {frame.image_id}",
                 f"one of the {MAX_CANDIDATES} different ones it came with so far",
             )
-            events.append(FrameRejected(source, reason, now))
+            events.append(PaperFrameRejected(source, reason, now))
         if image.open and image.complete:
             events += self._give_out([image])
         return events

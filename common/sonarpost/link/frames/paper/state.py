@@ -11,7 +11,7 @@ from sonarpost.errors import BadInputError, FrameError
 from sonarpost.link.coding.byte_ranges import Ranges, add_range
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import is_image_id
-from sonarpost.link.frames.paper.pending_image import MAX_CANDIDATES, Candidate, Given, PendingImage
+from sonarpost.link.frames.paper.pending_image import MAX_CANDIDATES, DeliveredState, ImageCandidate, PendingImage
 
 _WHERE = "receiver state"
 _T = TypeVar("_T")
@@ -95,7 +95,7 @@ def _read_time(entry: object, name: str) -> float:
     return value
 
 
-def _export_candidate(candidate: Candidate) -> dict[str, object]:
+def _export_candidate(candidate: ImageCandidate) -> dict[str, object]:
     pieces = [[start, bytes(candidate.body[start:stop])] for start, stop in candidate.received]
     return {
         "header": candidate.header.pack(),
@@ -105,7 +105,7 @@ def _export_candidate(candidate: Candidate) -> dict[str, object]:
     }
 
 
-def _import_candidate(image_id: str, entry: object) -> Candidate:
+def _import_candidate(image_id: str, entry: object) -> ImageCandidate:
     packed = read_field(entry, "header", bytes)
     header = StreamHeader.unpack(packed)
     if len(packed) != header.size:
@@ -122,10 +122,10 @@ def _import_candidate(image_id: str, entry: object) -> Candidate:
                 received = add_range(received, start, start + len(data))
             case _:
                 raise FrameError(_WHERE, "pieces", piece, f"[position, bytes] within {len(body)} bytes")
-    return Candidate(header, body, received, read_field(entry, "frames", int))
+    return ImageCandidate(header, body, received, read_field(entry, "frames", int))
 
 
-def _import_given(entry: object) -> Given | None:
+def _import_given(entry: object) -> DeliveredState | None:
     given = _read_optional(entry, "given", list)
     match given:
         case None:

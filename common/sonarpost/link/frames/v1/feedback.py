@@ -10,8 +10,8 @@ from sonarpost.link.frames.v1.frame import BLOCKS
 
 WINDOW: Final = BLOCKS // 2
 """How many successive blocks may be under way."""
-UNHEARD: Final = 255
-MOST_NEEDED: Final = 254
+NEVER_RECEIVED: Final = 255
+MAX_NEEDED: Final = 254
 _HEAD_BYTES: Final = 3
 
 
@@ -52,7 +52,7 @@ class Feedback:
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class FeedbackRequest:
     """A wish for more detail of a contact than was planned.
 
     Attributes:
@@ -68,7 +68,7 @@ class Request:
         return self.number.to_bytes(2, "big") + self.stream_bytes.to_bytes(2, "big")
 
     @classmethod
-    def unpack(cls, data: bytes, where: str = "request") -> Request:
+    def unpack(cls, data: bytes, where: str = "request") -> FeedbackRequest:
         """Parse the data of a REQUEST segment.
 
         Raises:
@@ -86,8 +86,8 @@ def pack_mini(block: int, needed: int) -> int:
     Raises:
         FrameError: A number out of range.
     """
-    if not 0 <= block < BLOCKS or not 0 <= needed <= UNHEARD:
-        raise FrameError("mini-packet", "block, needed", (block, needed), f"below {BLOCKS}, 0..{UNHEARD}")
+    if not 0 <= block < BLOCKS or not 0 <= needed <= NEVER_RECEIVED:
+        raise FrameError("mini-packet", "block, needed", (block, needed), f"below {BLOCKS}, 0..{NEVER_RECEIVED}")
     return block << 8 | needed
 
 

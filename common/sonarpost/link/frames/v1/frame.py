@@ -53,7 +53,7 @@ CONTACT_SEGMENT_BYTES: Final = 29
 MAX_SEGMENT_BYTES: Final = 255
 
 
-class FrameSeal(Protocol):
+class FrameProtection(Protocol):
     """Authenticates frames and may encrypt them; implemented by `sonarpost.link.auth.authentication`."""
 
     @property
@@ -118,17 +118,17 @@ class Segment:
 Content = Symbol | tuple[Segment, ...]
 
 
-def pack_symbol(symbol: Symbol, seal: FrameSeal | None = None) -> bytes:
+def pack_symbol(symbol: Symbol, seal: FrameProtection | None = None) -> bytes:
     """Return the frame of one symbol, 5 bytes longer than the symbol (and its tag)."""
     return _sealed(symbol.head() + symbol.data, seal)
 
 
-def segments_room(frame_bytes: int, seal: FrameSeal | None = None) -> int:
+def segments_room(frame_bytes: int, seal: FrameProtection | None = None) -> int:
     """Return how many bytes of segments (by `Segment.size`) fit a frame."""
     return frame_bytes - _CRC_BYTES - (0 if seal is None else seal.size)
 
 
-def pack_segments(segments: Iterable[Segment], frame_bytes: int, seal: FrameSeal | None = None) -> bytes:
+def pack_segments(segments: Iterable[Segment], frame_bytes: int, seal: FrameProtection | None = None) -> bytes:
     """Return a frame of segments, padded with zeros to `frame_bytes`.
 
     Raises:
@@ -162,7 +162,7 @@ def _check_segment(segment: Segment) -> None:
         raise FrameError("acoustic frame", "segment", f"{len(segment.data)} bytes", expected)
 
 
-def _sealed(covered: bytes, seal: FrameSeal | None) -> bytes:
+def _sealed(covered: bytes, seal: FrameProtection | None) -> bytes:
     if seal is not None:
         covered = seal.seal(bytes([covered[0] | _TAG_BIT]) + covered[1:])
     return checksum(covered).to_bytes(_CRC_BYTES, "big") + covered
@@ -173,7 +173,9 @@ def checksum(covered: bytes) -> int:
     return binascii.crc_hqx(covered, 0xFFFF)
 
 
-def parse_frame(frame: bytes, source: int = 0, seal: FrameSeal | None = None, where: str = "acoustic frame") -> Content:
+def parse_frame(
+    frame: bytes, source: int = 0, seal: FrameProtection | None = None, where: str = "acoustic frame"
+) -> Content:
     """Parse a frame as it came from a modem.
 
     Args:

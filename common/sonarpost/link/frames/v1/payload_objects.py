@@ -21,7 +21,7 @@ _FINAL, _FOLLOWS, _COMMON_START, _CONSECUTIVE = 1, 2, 4, 8
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class StreamPiece:
     """Bytes of one picture's stream.
 
     Attributes:
@@ -43,7 +43,7 @@ class Piece:
 
 
 @dataclass(frozen=True, slots=True)
-class Pieces:
+class PieceList:
     """Pieces of one or more pictures.
 
     Attributes:
@@ -51,10 +51,10 @@ class Pieces:
         final: Whether each ends where its stream, as it was planned then, ends.
     """
 
-    pieces: tuple[Piece, ...]
+    pieces: tuple[StreamPiece, ...]
     final: bool
 
-    def pack(self, length: int, below: Pieces | None = None) -> bytes:
+    def pack(self, length: int, below: PieceList | None = None) -> bytes:
         """Return an object of a length.
 
         Args:
@@ -70,7 +70,7 @@ class Pieces:
         body += b"".join(piece.data for piece in self.pieces)
         return _checked(bytes(body), length)
 
-    def _head(self, below: Pieces | None) -> bytearray:
+    def _head(self, below: PieceList | None) -> bytearray:
         flags = _FINAL if self.final else 0
         if below is not None:
             same = [(p.number, p.link, p.start) for p in self.pieces]
@@ -94,13 +94,13 @@ class Pieces:
                 head += _varint(piece.start)
         return head
 
-    def overhead_bytes(self, below: Pieces | None = None) -> int:
+    def overhead_bytes(self, below: PieceList | None = None) -> int:
         """Return how many bytes of an object are not picture, for pieces of these lengths."""
         return len(self._head(below)) + sum(len(_varint(len(p.data))) for p in self.pieces) + CHECK_BYTES
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class MessageObject:
     """Bytes for the other end, whatever they mean there.
 
     Attributes:
@@ -123,7 +123,7 @@ class Message:
 MESSAGE_OVERHEAD_BYTES: Final = 4 + CHECK_BYTES
 
 
-def unpack_object(data: bytes, below: Pieces | None = None, where: str = "object") -> Pieces | Message:
+def unpack_object(data: bytes, below: PieceList | None = None, where: str = "object") -> PieceList | MessageObject:
     """Parse an object.
 
     Args:
@@ -142,11 +142,11 @@ def unpack_object(data: bytes, below: Pieces | None = None, where: str = "object
     if kind & 0xF0 == _PIECES:
         return _read_pieces(reader, kind & 0x0F, below)
     if kind == _MESSAGE:
-        return Message(reader.byte(), reader.take(reader.number()))
+        return MessageObject(reader.byte(), reader.take(reader.number()))
     raise FrameError(where, "kind", kind, "0x10..0x1F or 0x20")
 
 
-def _read_pieces(reader: _Reader, flags: int, below: Pieces | None) -> Pieces:
+def _read_pieces(reader: _Reader, flags: int, below: PieceList | None) -> PieceList:
     if flags & _FOLLOWS:
         if below is None or flags & (_COMMON_START | _CONSECUTIVE):
             raise FrameError(reader.where, "flags", flags, "a layer below, and no other way to say what goes on")
@@ -158,8 +158,8 @@ def _read_pieces(reader: _Reader, flags: int, below: Pieces | None) -> Pieces:
     for (number, link, start), length in zip(begun, lengths, strict=True):
         if start + length > MAX_STREAM_BYTES:
             raise FrameError(reader.where, "piece", (start, length), f"an end at {MAX_STREAM_BYTES} or before")
-        pieces.append(Piece(number, link, start, reader.take(length)))
-    return Pieces(tuple(pieces), bool(flags & _FINAL))
+        pieces.append(StreamPiece(number, link, start, reader.take(length)))
+    return PieceList(tuple(pieces), bool(flags & _FINAL))
 
 
 def _read_begun(reader: _Reader, flags: int) -> list[tuple[int, int, int]]:
