@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import os
-import socket
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import zenoh
+from builders.common import REPOSITORY, free_port
 from hypothesis import settings
 from xdist.remote import Producer
 from xdist.scheduler import LoadFileScheduling
 
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.config import PlatformConfig
-
-REPOSITORY = Path(__file__).resolve().parents[1]
 
 # An example that waits for the disk of a loaded machine is slow, not wrong; pytest-timeout ends what hangs.
 settings.register_profile("sonarpost", deadline=None)
@@ -27,7 +24,7 @@ settings.load_profile("sonarpost")
 class OneChainAtATime(LoadFileScheduling):
     """Gives a file's tests to one worker, and those of many real processes to one, one after the other."""
 
-    PROCESSES = ("tests/chain/", "tests/faults/", "tests/compose/")
+    PROCESSES = ("tests/system/chain/", "tests/system/faults/", "tests/system/compose/")
 
     def _split_scope(self, nodeid: str) -> str:
         return "processes" if nodeid.startswith(self.PROCESSES) else super()._split_scope(nodeid)
@@ -36,30 +33,6 @@ class OneChainAtATime(LoadFileScheduling):
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> OneChainAtATime:
     """Schedule `make test`, which runs two tests at a time."""
     return OneChainAtATime(config, log)
-
-
-def free_port() -> int:
-    """Return a TCP port that was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def eventually(condition: Callable[[], bool], timeout_s: float = 40.0, what: str = "condition") -> None:
-    """Wait until `condition()` holds; fail the test when it does not in time."""
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline:
-            pytest.fail(f"{what} did not come true within {timeout_s} s")
-        time.sleep(0.01)
-
-
-def publish_once(session: zenoh.Session, key: str, payload: bytes, encoding: str | None = None) -> None:
-    """Publish as a program without an outbox does, once somebody listens."""
-    publisher = session.declare_publisher(key, encoding=encoding)
-    eventually(lambda: publisher.matching_status.matching, what=f"subscriber of {key}")
-    publisher.put(payload)
-    publisher.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
 
 
 @pytest.fixture

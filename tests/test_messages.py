@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from golden.zenoh.samples import COMPLETE_IMAGE, DAMAGED_IMAGE, RASTER_8, RASTER_16, RECORD_TYPES, SAMPLES
+from builders.record_samples import COMPLETE_IMAGE, DAMAGED_IMAGE, RASTER_8, RASTER_16, RECORD_TYPES, SAMPLES
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp

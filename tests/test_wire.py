@@ -9,9 +9,9 @@ from typing import Any
 
 import msgpack
 import pytest
-from golden.zenoh.add_vectors import BATCH, batch_samples, handoff_samples, plain
-from golden.zenoh.samples import RECORD_TYPES, SAMPLES
-from golden.zenoh.strategies import STRATEGIES, any_record
+from builders.record_samples import RECORD_TYPES, SAMPLES
+from builders.record_strategies import STRATEGIES, any_record
+from builders.record_vectors import BATCH, batch_samples, handoff_samples, plain
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

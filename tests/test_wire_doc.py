@@ -16,8 +16,8 @@ from typing import Any
 import msgpack
 import pytest
 import zenoh
-from conftest import REPOSITORY, eventually
-from golden.zenoh.samples import RECORD_TYPES, SAMPLES
+from builders.common import REPOSITORY, eventually
+from builders.record_samples import RECORD_TYPES, SAMPLES
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig

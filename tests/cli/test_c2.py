@@ -13,8 +13,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 import zenoh
-from conftest import eventually, free_port, publish_once
-from records import picture_record
+from builders.common import eventually, free_port, publish_once
+from builders.records import picture_record
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import router_config

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import io
 import json
 import os
 import pty
@@ -21,66 +20,17 @@ from typing import Any
 
 import pytest
 import zenoh
-from conftest import eventually, free_port
-from rich.console import Console
+from builders.common import eventually, free_port
+from builders.fleet import BROKEN, FLEET, Platforms, health, on_terminal, seen
 
-from sonarpost import keys, wire
 from sonarpost.bus.session import router_config
 from sonarpost.cli.main import main
 from sonarpost.cli.status import show
 from sonarpost.cli.status.rows import age_text, bytes_text, is_well, rows_of
 from sonarpost.config import PlatformConfig
-from sonarpost.messages import Health
 from sonarpost.monitoring.fleet import FleetState, ServiceStatus
 
 NAMES = ("uuv_modem", "acoustic_channel", "op_modem", "decompressor")
-
-
-def health(platform: str = "vessel-1", service: str = "op_modem", **changes: Any) -> Health:
-    fields: dict[str, Any] = {
-        "platform_id": platform,
-        "service": service,
-        "time_utc_s": 1476262800.0,
-        "started_utc_s": 1476262000.0,
-        "state": "ok",
-        "counters": {},
-        "gauges": {"inbox": 0.0, "outbox": 3.0, "refused": 0.0, "disk_free_bytes": 12.3e9},
-    }
-    return Health(**(fields | changes))
-
-
-def seen(record: Health | None, age_s: float | None = 1.2, *, alive: bool | None = True) -> ServiceStatus:
-    platform, service = (record.platform_id, record.service) if record else ("vessel-1", "relay")
-    return ServiceStatus(platform, service, record, age_s if record else None, alive)
-
-
-MODEM = health(
-    counters={"frames_received": 49, "frames_bad": 1},
-    gauges={"inbox": 0.0, "outbox": 3.0, "snr_in_db": 11.5, "modem_ready": 1.0, "disk_free_bytes": 0.5e9},
-)
-BROKEN = health(
-    "uuv-1", "uuv_modem", state="degraded", detail="/dev/ttyUSB0: not open yet", gauges={"modem_ready": 0.0}
-)
-FLEET = FleetState(
-    (
-        seen(health("uuv-1", "compressor")),
-        seen(BROKEN, 3.0),
-        seen(health(service="decompressor"), 200.0),
-        seen(MODEM),
-        seen(None),
-        seen(health("vessel-2", "relay", state="stopping"), 90_000.0, alive=False),
-        seen(health("vessel-2", "router"), 4.0, alive=False),
-    ),
-    connected=True,
-    rejected=2,
-)
-
-
-def on_terminal(state: FleetState, width: int = 80) -> list[str]:
-    console = Console(file=io.StringIO(), force_terminal=True, width=width, height=40, color_system=None)
-    console.print(show.table(state, rows_of(state, 15.0), "tcp/127.0.0.1:7447"))
-    assert isinstance(console.file, io.StringIO)
-    return [line.rstrip() for line in console.file.getvalue().splitlines()]
 
 
 def test_eighty_columns_show_every_row_whole() -> None:
@@ -155,36 +105,6 @@ def test_ages(age_s: float | None, text: str) -> None:
 )
 def test_sizes(size: float | None, text: str) -> None:
     assert bytes_text(size) == text
-
-
-class Platforms:
-    """Tells health and holds tokens as services do."""
-
-    def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
-        self._tokens: dict[str, zenoh.LivelinessToken] = {}
-        self._records: list[Health] = []
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._tell, daemon=True)
-        self._thread.start()
-
-    def run(self, record: Health) -> None:
-        key = keys.alive(record.platform_id, record.service)
-        self._tokens[key] = self._session.liveliness().declare_token(key)
-        self._records.append(record)
-
-    def end(self, record: Health) -> None:
-        self._records.remove(record)
-        self._tokens.pop(keys.alive(record.platform_id, record.service)).undeclare()
-
-    def _tell(self) -> None:
-        while not self._stop.wait(0.05):
-            for record in tuple(self._records):
-                self._session.put(keys.health(record.platform_id, record.service), wire.encode(record))
-
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join()
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import re
 
-from cli.test_status import FLEET, on_terminal
-from conftest import REPOSITORY
+from builders.common import REPOSITORY
+from builders.fleet import FLEET, on_terminal
 
 from sonarpost.monitoring.metrics import FleetCollector
 

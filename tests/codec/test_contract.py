@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from builders.common import GOLDEN_FOLDER
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,7 +14,7 @@ from sonarpost.codec.vq.codebook import load
 from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.errors import StreamError
 
-RESOURCES = CodecResources(load(Path(__file__).parents[1] / "golden" / "vq" / "small.tiles").tiles)
+RESOURCES = CodecResources(load(GOLDEN_FOLDER / "vq" / "small.tiles").tiles)
 NAMES = default_registry().names()
 SIZES = [(16, 16), (16, 512), (512, 16), (17, 33), (49, 113), (80, 80), (140, 80), (127, 201)]
 

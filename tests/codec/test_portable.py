@@ -1,7 +1,7 @@
 """Machine code for another processor gives the same bytes and pixels.
 
 emb is compiled for the processor it runs on. Here its golden streams are written and read by machine code for a plain
-x86-64 (or aarch64) without vector extensions, compiled anew into a cache of its own. `tests/arm64/run.sh` does the
+x86-64 (or aarch64) without vector extensions, compiled anew into a cache of its own. `arm64/run.sh` does the
 same on an emulated aarch64, for all codecs.
 """
 
@@ -14,8 +14,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from builders.common import REPOSITORY
 
-ROOT = Path(__file__).parents[2]
+ROOT = REPOSITORY
 
 
 @pytest.mark.timeout(900)  # it compiles everything anew: 15 s of an idle machine

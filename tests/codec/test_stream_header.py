@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
+from builders.common import GOLDEN_FOLDER
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,7 +21,7 @@ from sonarpost.codec.interface import (
 )
 from sonarpost.errors import StreamError
 
-GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "codec" / "stream_headers.json").read_text())
+GOLDEN = json.loads((GOLDEN_FOLDER / "codec" / "stream_headers.json").read_text())
 UNCOMMON_SIDES_PX = sorted(set(range(MIN_SIDE_PX, MAX_SIDE_PX + 1)) - set(COMMON_SIDES_PX))
 ONE_ID_OF_EACH_KIND = (0x01, 0x10, 0x20, 0x80)
 SHA256 = "f893" + "a5" * 30

@@ -10,8 +10,8 @@ import zipfile
 from xml.etree import ElementTree as ET
 
 import pytest
-from conftest import REPOSITORY
-from console.conftest import picture_record
+from builders.common import REPOSITORY
+from builders.console import picture_record
 
 from sonarpost.messages import AcousticFrame, LinkQuality, QueuedImage, QueueState
 from sonarpost.review.choice import clopper_pearson, wilson

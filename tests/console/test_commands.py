@@ -11,8 +11,8 @@ from itertools import islice
 from pathlib import Path
 
 import pytest
-from conftest import eventually
-from console.conftest import PASSWORD
+from builders.common import eventually
+from builders.console import PASSWORD
 
 from sonarpost.cli.main import main
 from sonarpost.config import TlsConfig

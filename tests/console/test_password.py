@@ -6,7 +6,7 @@ import logging
 import re
 
 import pytest
-from console.conftest import PASSWORD, PEOPLE
+from builders.console import PASSWORD, PEOPLE
 
 from sonarpost.services.console.users import MAX_PASSWORD, MIN_PASSWORD
 

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from console.conftest import picture_record
+from builders.console import picture_record
 from PIL import Image
 
 from sonarpost.messages import Contact

@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import count
 
 import pytest
-from console.conftest import FIRST_UTC_S, picture_record
+from builders.console import FIRST_UTC_S, picture_record
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 

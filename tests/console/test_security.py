@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from console.conftest import PASSWORD, PEOPLE, Browser, picture_record
+from builders.console import PASSWORD, PEOPLE, Browser, picture_record
 from starlette.testclient import TestClient
 
 from sonarpost.errors import BadInputError

@@ -10,8 +10,8 @@ from http.client import HTTPResponse
 from typing import Any
 
 import pytest
-from conftest import eventually
-from console.conftest import PASSWORD, picture_record
+from builders.common import eventually
+from builders.console import PASSWORD, picture_record
 
 from sonarpost.services.console.server import WebServer
 

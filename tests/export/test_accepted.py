@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import eventually
-from export.make import FIRST_UTC_S, decision, image, keep, mission
+from builders.common import eventually
+from builders.exports import FIRST_UTC_S, decision, image, keep, mission
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig

@@ -8,8 +8,8 @@ import threading
 from pathlib import Path
 
 import pytest
-from conftest import REPOSITORY
-from export.make import mission
+from builders.common import REPOSITORY
+from builders.exports import mission
 
 from sonarpost.export.cot import BOTTOM_RETURN, MINE_POSITIONS, SPOT
 from sonarpost.export.properties import COLUMNS

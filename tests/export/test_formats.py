@@ -13,7 +13,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 import xmlschema
-from export.make import FIRST_UTC_S, decision, golden_files, image, keep, mission
+from builders.common import GOLDEN_FOLDER
+from builders.exports import FIRST_UTC_S, decision, golden_files, image, keep, mission
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -28,7 +29,7 @@ from sonarpost.export.properties import COLUMNS
 from sonarpost.export.text import csv_text, html_text, xml_text
 from sonarpost.messages import Decision, Pixels
 
-GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "export"
+GOLDEN = GOLDEN_FOLDER / "export"
 KML = "{http://www.opengis.net/kml/2.2}"
 NOW_UTC_S = FIRST_UTC_S + 3600
 

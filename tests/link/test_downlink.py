@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 
 import pytest
+from builders.common import GOLDEN_FOLDER
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,7 +14,7 @@ from sonarpost.errors import FrameError
 from sonarpost.link.downlink import messages as dl
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments, parse_frame
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "acoustic-v1" / "messages.json"
+GOLDEN = GOLDEN_FOLDER / "acoustic-v1" / "messages.json"
 SAMPLES: dict[str, dl.Content] = {
     "refine-192": dl.RefineMessage(0x01020304, 1_790_000_000, 7, 192),
     "refine-all": dl.RefineMessage(0xFFFFFFFF, 1_790_000_001, 65535),

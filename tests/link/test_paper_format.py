@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
+from builders.common import GOLDEN_FOLDER
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
@@ -27,7 +27,7 @@ from sonarpost.link.frames.paper.frame import (
     parse_frame,
 )
 
-GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "link" / "paper_frames.json").read_text())
+GOLDEN = json.loads((GOLDEN_FOLDER / "link" / "paper_frames.json").read_text())
 HEADER = StreamHeader(0x10, 0xBEEF, 113, 49)
 
 

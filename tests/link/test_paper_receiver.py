@@ -6,11 +6,11 @@ import copy
 import dataclasses
 import json
 import math
-from pathlib import Path
 from typing import Any
 
 import msgpack
 import pytest
+from builders.common import GOLDEN_FOLDER
 
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import FrameError
@@ -19,13 +19,13 @@ from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, format_im
 from sonarpost.link.frames.paper.receiver import (
     ContactOnly,
     Event,
-    FrameRejected,
     ImageReady,
+    PaperFrameRejected,
     PaperReceiver,
     PaperReceiverCounts,
 )
 
-GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "link" / "paper_receiver.json").read_text())["scenarios"]
+GOLDEN = json.loads((GOLDEN_FOLDER / "link" / "paper_receiver.json").read_text())["scenarios"]
 HEADER = StreamHeader(0x10, 0xBEEF, 113, 49)
 BODY = bytes(range(0xA1, 0xAA))
 CONTACT = ContactSummary(height_px=113, width_px=49, lat_deg=44.7, lon_deg=-63.6).rounded()
@@ -75,7 +75,7 @@ def describe(event: Event) -> dict[str, Any]:
                 "version": event.version,
                 "conflicts": event.conflicts,
             }
-        case FrameRejected():
+        case PaperFrameRejected():
             return {"event": "rejected", "source": event.source, "field": event.reason.field}
 
 
@@ -222,7 +222,7 @@ def test_a_fourth_stream_header_is_refused() -> None:
     for width in (49, 50, 51):
         assert receiver.accept(2, half("top", header=dataclasses.replace(HEADER, width_px=width)), 0) == []
     (event,) = receiver.accept(2, half("top", header=dataclasses.replace(HEADER, width_px=52)), 1)
-    assert isinstance(event, FrameRejected)
+    assert isinstance(event, PaperFrameRejected)
     assert event.source == 2
     assert event.reason.field == "stream header"
     assert receiver.counts == PaperReceiverCounts(frames=4, rejected=1, conflicts=3)
@@ -244,7 +244,7 @@ def test_a_fourth_body_length_is_refused() -> None:
     for length in (9, 10, 11):
         assert receiver.accept(2, HalfFrame("top", "00A7", 0, length, HEADER, b"x").pack(), 0) == []
     (event,) = receiver.accept(2, HalfFrame("top", "00A7", 0, 12, HEADER, b"x").pack(), 1)
-    assert isinstance(event, FrameRejected)
+    assert isinstance(event, PaperFrameRejected)
     assert receiver.counts == PaperReceiverCounts(frames=4, rejected=1, conflicts=3)
 
 

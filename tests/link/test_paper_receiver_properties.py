@@ -16,7 +16,7 @@ from sonarpost.errors import FrameError
 from sonarpost.link.coding.byte_ranges import Ranges
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, parse_frame
-from sonarpost.link.frames.paper.receiver import ContactOnly, Event, FrameRejected, ImageReady, PaperReceiver
+from sonarpost.link.frames.paper.receiver import ContactOnly, Event, ImageReady, PaperFrameRejected, PaperReceiver
 from sonarpost.link.frames.paper.sender import plan_packets
 
 RATES = [(1, 32), (3, 64), (2, 256), (6, 32)]
@@ -161,13 +161,13 @@ def test_any_frames_in_any_order_give_right_bytes_and_every_version_once(
     for step in steps:
         parses = step.frame is None or ledger.deliver(step)
         events = take(receiver, step)
-        rejected = [e for e in events if isinstance(e, FrameRejected)]
+        rejected = [e for e in events if isinstance(e, PaperFrameRejected)]
         assert len(rejected) == (0 if parses else 1)
         for event in events:
-            if not isinstance(event, FrameRejected):
+            if not isinstance(event, PaperFrameRejected):
                 ledger.check(event)
     for event in receiver.poll(1e9):
-        assert not isinstance(event, FrameRejected)
+        assert not isinstance(event, PaperFrameRejected)
         ledger.check(event)
     assert receiver.next_deadline() is None
     # Nothing that arrived is held back: the last version of each image tells all of it.
@@ -197,7 +197,7 @@ def test_a_restart_at_every_point_changes_nothing(delivery: tuple[list[Sent], li
 
 def comparable(events: list[Event]) -> list[Any]:
     """Errors have no equality of their own."""
-    return [(e.source, e.at, str(e.reason)) if isinstance(e, FrameRejected) else e for e in events]
+    return [(e.source, e.at, str(e.reason)) if isinstance(e, PaperFrameRejected) else e for e in events]
 
 
 @st.composite
@@ -225,7 +225,7 @@ def test_hostile_frames_at_wild_times_never_raise_and_memory_stays_bounded(
             if isinstance(parsed := parse_frame(frame), HalfFrame):
                 told[source, parsed.image_id].add((parsed.header, parsed.body_length))
         for event in receiver.accept(source, frame, now):
-            if isinstance(event, FrameRejected):
+            if isinstance(event, PaperFrameRejected):
                 continue
             key = (event.source, event.image_id)
             # Forgotten images start again at 1; otherwise versions count up one by one.

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
+from builders.common import GOLDEN_FOLDER
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -17,7 +17,7 @@ from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, half_boun
 from sonarpost.link.frames.paper.receiver import ImageReady, PaperReceiver
 from sonarpost.link.frames.paper.sender import Packet, body_capacity_bytes, plan_packets
 
-GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "link" / "paper_packets.json").read_text())["plans"]
+GOLDEN = json.loads((GOLDEN_FOLDER / "link" / "paper_packets.json").read_text())["plans"]
 RATES = {0: (1, 32), 1: (3, 64), 2: (3, 64), 3: (2, 256), 4: (2, 256), 5: (8, 256), 6: (6, 32)}
 CONTACT = ContactSummary(height_px=80, width_px=140, lat_deg=44.7, lon_deg=-63.6, confidence=1.5)
 

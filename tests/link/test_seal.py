@@ -8,8 +8,8 @@ import random
 import re
 
 import pytest
-from link.seal_world import VEHICLE, VESSEL, key, skip, vehicle_seal, vessel_seal
-from link.v1_world import contact, stream
+from builders.authentication_world import VEHICLE, VESSEL, key, skip, vehicle_seal, vessel_seal
+from builders.v1_world import contact, stream
 
 from sonarpost.errors import ConfigError, FrameError
 from sonarpost.link.auth.authentication import RESERVED, AuthenticationCounts, FrameAuthenticator

@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import hmac
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
+from builders import authentication_golden as seal_golden
+from builders.common import REPOSITORY
+from builders.v1_golden import FOLDER
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
-from link import seal_golden
-from link.v1_golden import FOLDER
 
 from sonarpost.link.auth.authentication import RESERVED, FrameAuthenticator
 from sonarpost.link.auth.key import AuthenticationSettings, Direction, parse_key
@@ -83,7 +83,7 @@ def test_another_implementation_seals_the_same(case: dict[str, Any]) -> None:
 
 
 def test_the_page_has_the_numbers_of_the_code() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "wire-acoustic-v1.md").read_text(encoding="utf-8")
+    page = (REPOSITORY / "docs" / "wire-acoustic-v1.md").read_text(encoding="utf-8")
     section = " ".join(page[page.index("## Authentication") : page.index("## What a receiver may show")].split())
     one, two = AuthenticationSettings(), AuthenticationSettings(2)
     assert f"{one.size} by default" in section

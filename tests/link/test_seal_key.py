@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from link.seal_world import key
+from builders.authentication_world import key
 
 from sonarpost.errors import ConfigError
 from sonarpost.link.auth.key import AcousticKey, AuthenticationSettings, Direction, parse_key

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from builders.authentication_world import VEHICLE, key, vehicle_seal, vessel_seal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from link.seal_world import VEHICLE, key, vehicle_seal, vessel_seal
 
 from sonarpost.errors import FrameError
 from sonarpost.link.auth.authentication import RESERVED, FrameAuthenticator

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import zlib
-from pathlib import Path
+
+from builders.common import REPOSITORY
 
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.coding.redundancy_plan import PREVIEWS_UNSEEN
@@ -23,7 +24,7 @@ from sonarpost.link.frames.v1.frame import (
 from sonarpost.link.frames.v1.preview import Preview, entry_shape
 from sonarpost.link.sender_messages import MAX_MESSAGE_BYTES
 
-PAGE = (Path(__file__).parents[2] / "docs" / "wire-acoustic-v1.md").read_text(encoding="utf-8")
+PAGE = (REPOSITORY / "docs" / "wire-acoustic-v1.md").read_text(encoding="utf-8")
 
 
 def test_the_examples_parse_to_what_the_page_says() -> None:

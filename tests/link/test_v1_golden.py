@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from link import v1_golden
+from builders import v1_golden
 
 from sonarpost.errors import FrameError
 from sonarpost.link.coding import erasure_code as fec

@@ -7,7 +7,7 @@ from itertools import pairwise
 import msgpack
 import numpy as np
 import pytest
-from link.v1_world import VEHICLE, World, contact, stream
+from builders.v1_world import VEHICLE, World, contact, stream
 
 from sonarpost.errors import ConfigError, FrameError, StreamError
 from sonarpost.link.coding.channel_capacity import LossChannel, erasure_bound_frames

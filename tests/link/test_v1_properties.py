@@ -6,10 +6,10 @@ from typing import Any
 
 import msgpack
 import pytest
+from builders import v1_fuzz
+from builders.v1_world import VEHICLE, contact, stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from link import v1_fuzz
-from link.v1_world import VEHICLE, contact, stream
 
 from sonarpost.errors import FrameError
 from sonarpost.link.coding.channel_capacity import LossChannel

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import msgpack
 import numpy as np
 import pytest
-from link.v1_world import VEHICLE, contact, stream
+from builders.v1_world import VEHICLE, contact, stream
 
 from sonarpost.link.coding.byte_ranges import count_positions
 from sonarpost.link.events import ContactUpdate, MessageReceived

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from builders.modem_fuzz import Fuzz, parse_alone
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.modem.micromodem import nmea
-from tests.modem.fuzz import Fuzz, parse_alone
 
 
 @pytest.mark.parametrize("seed", [1, 2])

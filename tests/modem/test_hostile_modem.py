@@ -1,5 +1,6 @@
 """Whatever a modem or a line does, the driver raises nothing, keeps its memory and works again afterwards."""
 
+from builders.fake_modem import FakeModem
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -7,7 +8,6 @@ from sonarpost.modem.micromodem import nmea
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import PacketFailed, PacketSent
-from tests.modem.fake_modem import FakeModem
 
 KINDS = ["CAREV", "CACFG", "CACLK", "CACYC", "CADRQ", "CATXD", "CATXP", "CATXF", "CAXST", "CARXP", "CARXD", "CAMSG",
          "CACST", "CAACK", "CAERR", "CAMPR"]  # fmt: skip

@@ -1,6 +1,7 @@
 from collections.abc import Callable
 
 import pytest
+from builders.fake_modem import FakeModem
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,7 +18,6 @@ from sonarpost.modem.micromodem.events import (
     SentenceRejected,
     StatisticsReceived,
 )
-from tests.modem.fake_modem import FakeModem
 
 CONFIG = MicroModemConfig(address=1)
 FRAMES = (b"first frame", b"second")

@@ -2,6 +2,7 @@ import itertools
 from datetime import UTC, datetime
 
 import pytest
+from builders.fake_modem import FakeModem, nth_of
 
 from sonarpost.errors import ConfigError
 from sonarpost.modem.micromodem.config import MicroModemConfig
@@ -19,7 +20,6 @@ from sonarpost.modem.micromodem.events import (
     SettingRefused,
 )
 from sonarpost.modem.micromodem.supervisor import Phase
-from tests.modem.fake_modem import FakeModem, nth_of
 
 CONFIG = MicroModemConfig(address=3)
 

@@ -1,4 +1,5 @@
 import pytest
+from builders.fake_modem import FakeModem, Loses, never, nth_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,7 +20,6 @@ from sonarpost.modem.micromodem.events import (
     SentenceRejected,
 )
 from sonarpost.modem.micromodem.rates import RATES
-from tests.modem.fake_modem import FakeModem, Loses, never, nth_of
 
 CONFIG = MicroModemConfig(address=3)
 FIRST = [b"a" * 256, b"b"]

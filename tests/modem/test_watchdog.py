@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
+from builders.two_drivers import Spoil, TwoDrivers, cut, double, drop, garble, kinds_of
 
 from sonarpost.modem.micromodem import nmea
 from sonarpost.modem.micromodem.events import (
@@ -25,7 +26,6 @@ from sonarpost.modem.micromodem.events import (
 )
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.simulation.channel.channel_config import ChannelParameters
-from tests.modem.two_drivers import Spoil, TwoDrivers, cut, double, drop, garble, kinds_of
 
 READY_S = 30.0
 RECOVERY_S = 150.0

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from conftest import REPOSITORY, eventually
+from builders.common import REPOSITORY, eventually
 
 from sonarpost import keys, wire
 from sonarpost.delivery.store import Store

@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from conftest import eventually, free_port
+from builders.common import eventually, free_port
 
 from sonarpost import keys, wire
 from sonarpost.bus.connectivity import ConnectivityState, diagnose_no_reply, probe_endpoint, query_presence

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zenoh
-from conftest import eventually
+from builders.common import eventually
 
 from sonarpost import keys
 from sonarpost.bus.session import client_config

@@ -6,14 +6,14 @@ import os
 
 import pytest
 import zenoh
-from conftest import eventually, free_port
+from builders.common import eventually, free_port
+from builders.fleet_certificates import tls_of
 
 from sonarpost import keys, wire
 from sonarpost.bus.connectivity import ConnectivityState, probe_endpoint
 from sonarpost.bus.session import client_config
 from sonarpost.messages import Health
 from sonarpost.security.router_config import Wanted
-from tests.security.conftest import tls_of
 
 INBOX_1 = keys.shore_inbox("vessel-1")
 INBOX_2 = keys.shore_inbox("vessel-2")

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from builders.fleet_certificates import tls_of
 from cryptography.hazmat.primitives import serialization
 
 from sonarpost import config
@@ -17,7 +18,6 @@ from sonarpost.config import ServiceConfig
 from sonarpost.errors import ConfigError
 from sonarpost.security import tls_files
 from sonarpost.security.fleet import Fleet
-from tests.security.conftest import tls_of
 
 DAY_S = 86400.0
 

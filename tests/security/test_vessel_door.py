@@ -6,12 +6,12 @@ import time
 
 import pytest
 import zenoh
-from conftest import eventually
+from builders.common import eventually
+from builders.fleet_certificates import tls_of
 
 from sonarpost import keys
 from sonarpost.security import tls_files
 from sonarpost.security.fleet import Fleet
-from tests.security.conftest import tls_of
 
 VESSEL = "vessel-1"
 DECISION = keys.handoff(keys.contact_decision(VESSEL), "relay")

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 import zenoh
-from cli.test_status import Platforms, health
-from conftest import eventually
+from builders.common import eventually
+from builders.fleet import Platforms, health
 
 from sonarpost.cli.main import main
 

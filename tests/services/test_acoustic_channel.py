@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 import serial
 import zenoh
-from conftest import eventually, free_port
+from builders.common import eventually, free_port
 from pydantic import ValidationError
 
 from sonarpost import keys, wire
@@ -27,7 +27,7 @@ from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import Health
 from sonarpost.modem.micromodem import nmea
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
-from sonarpost.services.acoustic_channel.service import AcousticChannel, AcousticChannelService
+from sonarpost.services.acoustic_channel.service import AcousticChannelService, ChannelEmulator
 from sonarpost.simulation.channel.acoustics import Position
 from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
@@ -96,19 +96,19 @@ class Host:
         self._port.close()
 
 
-Make = Callable[..., AcousticChannel]
+Make = Callable[..., ChannelEmulator]
 
 
 @pytest.fixture
 def make(tmp_path: Path) -> Iterator[Make]:
     """Starts channels, with ptys and a log in a temporary folder unless told otherwise, and stops them."""
-    running: list[AcousticChannel] = []
+    running: list[ChannelEmulator] = []
 
-    def start(**config: object) -> AcousticChannel:
+    def start(**config: object) -> ChannelEmulator:
         defaults: dict[str, object] = {"sites": SITES, "time_scale": SCALE, "log_path": tmp_path / "water.jsonl"}
         if "tcp_ports" not in config:
             defaults["pty_dir"] = tmp_path / "ports"
-        channel = AcousticChannel(ChannelConfig(**(defaults | config)))  # type: ignore[arg-type]
+        channel = ChannelEmulator(ChannelConfig(**(defaults | config)))  # type: ignore[arg-type]
         running.append(channel)
         channel.start()
         return channel
@@ -124,7 +124,7 @@ def log_of(path: Path, event: str | None = None) -> list[dict[str, object]]:
     return [line for line in lines if event is None or line["event"] == event]
 
 
-def hosts_of(channel: AcousticChannel) -> list[Host]:
+def hosts_of(channel: ChannelEmulator) -> list[Host]:
     return [Host(device.device) for device in channel.devices()]
 
 
@@ -328,7 +328,7 @@ def test_ports_that_cannot_be_had_are_named(make: Make, tmp_path: Path):
 
 def test_a_log_that_cannot_be_written_ends_the_channel(tmp_path: Path):
     config = ChannelConfig(sites=SITES, pty_dir=tmp_path / "ports", log_path=Path("/dev/full"))
-    channel = AcousticChannel(config)
+    channel = ChannelEmulator(config)
     channel.start()
     eventually(lambda: channel.failure is not None, what="failure")
     assert isinstance(channel.failure, PortError)

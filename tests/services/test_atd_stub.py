@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import eventually
+from builders.common import eventually
 
 from sonarpost import keys
 from sonarpost.detection.contacts import detect

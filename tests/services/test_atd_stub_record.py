@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import eventually
-from golden.zenoh.samples import BARE_CONTACT, FULL_CONTACT
+from builders.common import eventually
+from builders.record_samples import BARE_CONTACT, FULL_CONTACT
 
 from sonarpost import keys
 from sonarpost.config import load

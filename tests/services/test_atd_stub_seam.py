@@ -7,9 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from conftest import eventually
-from seams import RANGE_M, SAMPLES, START_S, Box, cut_into, held_of, near, run, survey_of
-from two_frequencies import with_second_frequency
+from builders.common import eventually
+from builders.joined_surveys import RANGE_M, SAMPLES, START_S, Box, cut_into, held_of, near, run, survey_of
+from builders.two_frequencies import with_second_frequency
 
 from sonarpost import keys
 from sonarpost.messages import Snippet

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
+from builders.common import GOLDEN_FOLDER
 
 from sonarpost.services.atd_stub.seam import Origin, SeamLook, pack, unpack
 from sonarpost.sonar.survey import Side
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "atd_stub" / "seam-format-1.hex"
+GOLDEN = GOLDEN_FOLDER / "atd_stub" / "seam-format-1.hex"
 
 
 def test_a_seam_of_format_1_is_read_and_stays_as_it_is():

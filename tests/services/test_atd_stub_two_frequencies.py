@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from seams import RANGE_M, SAMPLES, Box, cut_into, near, run, survey_of
-from two_frequencies import files_of, with_second_frequency
+from builders.joined_surveys import RANGE_M, SAMPLES, Box, cut_into, near, run, survey_of
+from builders.two_frequencies import files_of, with_second_frequency
 
 from sonarpost.detection.stream import follows
 from sonarpost.services.atd_stub.config import AtdStubConfig

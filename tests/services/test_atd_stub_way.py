@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY, eventually
+from builders.common import REPOSITORY, eventually
 
 from sonarpost import keys, wire
 from sonarpost.delivery.store import Store

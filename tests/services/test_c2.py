@@ -8,8 +8,8 @@ import json
 import msgpack
 import numpy as np
 import pytest
-from conftest import eventually
-from records import decision_record, picture_record
+from builders.common import eventually
+from builders.records import decision_record, picture_record
 
 from sonarpost import keys, wire
 from sonarpost.files import AtomicFiles

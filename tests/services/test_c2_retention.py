@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from conftest import eventually
+from builders.common import eventually
+from builders.records import picture_record
 from hypothesis import given
 from hypothesis import strategies as st
-from records import picture_record
 
 from sonarpost.archive.shore_files import find_picture, to_remove
 from sonarpost.archive.shore_index import FILE_NAME, ImageRow, ShoreIndex

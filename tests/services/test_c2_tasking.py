@@ -5,8 +5,8 @@ from __future__ import annotations
 import msgpack
 import pytest
 import zenoh
-from chain.tcp_proxy import TcpProxy
-from conftest import eventually, free_port
+from builders.common import eventually, free_port
+from builders.tcp_proxy import TcpProxy
 
 from sonarpost import keys
 from sonarpost.archive.shore_index import ShoreIndex

@@ -8,7 +8,7 @@ import re
 import tomllib
 
 import pytest
-from conftest import REPOSITORY
+from builders.common import REPOSITORY
 
 from sonarpost.config import SERVICES, ServiceConfig, load
 from sonarpost.errors import ConfigError

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from conftest import eventually, publish_once
+from builders.common import eventually, publish_once
 
 from sonarpost import keys, wire
 from sonarpost.archive.image_files import write_image

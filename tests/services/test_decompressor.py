@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 import msgpack
 import numpy as np
 import pytest
-from conftest import eventually
+from builders.common import eventually
 from PIL import Image
 
 from sonarpost import keys

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import eventually
+from builders.common import eventually
 
 from sonarpost import keys
 from sonarpost.codec.registry import CodecResources, default_registry

@@ -19,7 +19,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from conftest import eventually
+from builders.common import eventually
 
 from sonarpost.config import PlatformConfig
 from sonarpost.services.atd_stub.config import AtdStubConfig

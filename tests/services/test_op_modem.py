@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from conftest import eventually
+from builders.common import eventually
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

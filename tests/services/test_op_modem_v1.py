@@ -6,7 +6,7 @@ import threading
 import time
 
 import pytest
-from conftest import eventually
+from builders.common import eventually
 from pydantic import ValidationError
 
 from sonarpost import keys, wire

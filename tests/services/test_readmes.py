@@ -9,7 +9,7 @@ import re
 import tomllib
 
 import pytest
-from conftest import REPOSITORY
+from builders.common import REPOSITORY
 from pydantic import TypeAdapter
 from pydantic_core import PydanticUndefined
 

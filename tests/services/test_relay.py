@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import msgpack
 import pytest
-from conftest import eventually
-from records import decision_record, picture_record
+from builders.common import eventually
+from builders.records import decision_record, picture_record
 
 from sonarpost import keys, wire
 from sonarpost.messages import Pixels, Relayed

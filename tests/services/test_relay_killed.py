@@ -10,7 +10,7 @@ import time
 
 import msgpack
 import pytest
-from conftest import REPOSITORY, eventually
+from builders.common import REPOSITORY, eventually
 
 from sonarpost import keys
 from sonarpost.messages import Decision, Relayed

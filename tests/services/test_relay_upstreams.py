@@ -8,9 +8,9 @@ from collections import namedtuple
 import msgpack
 import pytest
 import zenoh
-from conftest import eventually, free_port
+from builders.common import eventually, free_port
+from builders.records import decision_record, picture_record
 from pydantic import ValidationError
-from records import decision_record, picture_record
 
 from sonarpost import keys
 from sonarpost.bus.session import client_config, router_config

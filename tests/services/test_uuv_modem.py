@@ -8,7 +8,7 @@ import os
 
 import msgpack
 import pytest
-from conftest import eventually
+from builders.common import eventually
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -8,7 +8,7 @@ import time
 import msgpack
 import numpy as np
 import pytest
-from conftest import eventually
+from builders.common import eventually
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig

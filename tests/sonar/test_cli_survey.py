@@ -9,8 +9,8 @@ import json
 
 import numpy as np
 import pytest
+from builders.surveys import MAKERS, make_xtf
 from PIL import Image
-from sonar.makers import MAKERS, make_xtf
 
 from sonarpost.cli.main import main
 from sonarpost.cli.survey.track_picture import thinned_track

@@ -6,7 +6,7 @@ import time
 from collections import Counter
 
 import numpy as np
-from fuzz.survey_oracle import Readers
+from builders.survey_oracle import Readers
 
 MOST_S = 2.0
 """Of processor time that reading any of these small files may take."""

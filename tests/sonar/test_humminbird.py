@@ -6,8 +6,8 @@ import struct
 
 import numpy as np
 import pytest
+from builders.surveys import make_humminbird, mercator, son_ping
 from PIL import Image
-from sonar.makers import make_humminbird, mercator, son_ping
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.bottom_track import altitudes_m

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.surveys import MAKERS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from sonar.makers import MAKERS
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position, offset_between_m, offset_position

@@ -7,7 +7,7 @@ import sys
 import types
 
 import pytest
-from sonar.makers import make_xtf
+from builders.surveys import make_xtf
 
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.sonar.options import SurveyOptions, load_options

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from two_frequencies import files_of, read_both
+from builders.two_frequencies import files_of, read_both
 
 from sonarpost.cli.main import main
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from sonar.makers import make_waterfall
+from builders.surveys import make_waterfall
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.readers.registry import open_survey, read_survey

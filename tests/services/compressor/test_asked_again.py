@@ -5,8 +5,8 @@ from __future__ import annotations
 from itertools import pairwise
 
 import pytest
-from conftest import eventually
-from records import command_record
+from builders.common import eventually
+from builders.records import command_record
 
 from sonarpost import keys
 

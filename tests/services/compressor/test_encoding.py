@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgpack
 import numpy as np
 import pytest
-from conftest import eventually
+from builders.common import eventually
 
 from sonarpost import keys, wire
 from sonarpost.codec.interface import StreamHeader, to_uint8

@@ -1,0 +1,159 @@
+"""Pictures on the disk: three files that agree, the same bytes wherever they are written."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders.record_samples import COMPLETE_IMAGE, DAMAGED_IMAGE
+from builders.record_strategies import images
+from hypothesis import given, settings
+
+from sonarpost.archive import image_files as picture_files
+from sonarpost.archive.image_files import image_file_name, side_car, write_image
+from sonarpost.messages import Pixels, ReconstructedImage
+from sonarpost.sonar.image_files import read_image
+
+NAME = "uuv-1_20161012T090001Z_00A7_v1"
+
+
+def with_picture(pixels: np.ndarray, **more: object) -> ReconstructedImage:  # type: ignore[type-arg]
+    picture = Pixels.from_array(pixels)
+    fields = COMPLETE_IMAGE.model_dump() | {"picture": picture, "picture_sha256": picture.sha256} | more
+    return ReconstructedImage(**fields)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_name_tells_vehicle_time_image_and_version_apart() -> None:
+    assert image_file_name(COMPLETE_IMAGE) == NAME
+    assert image_file_name(DAMAGED_IMAGE) == "uuv-1_20161012T090001Z_00A7_v2"
+    assert (
+        image_file_name(with_picture(np.zeros((1, 1), np.uint8), first_frame_utc_s=0.0)).split("_")[1]
+        == "19700101T000000Z"
+    )
+    last = with_picture(np.zeros((1, 1), np.uint8), first_frame_utc_s=253402300799.0)
+    assert image_file_name(last).split("_")[1] == "99991231T235959Z"
+
+
+def test_a_picture_is_three_files_that_agree(tmp_path: Path) -> None:
+    tiff, new = write_image(tmp_path / "a" / "b", COMPLETE_IMAGE)
+    assert new
+    assert tiff == tmp_path / "a" / "b" / f"{NAME}.tiff"
+    assert sorted(contents(tiff.parent)) == [f"{NAME}.json", f"{NAME}.png", f"{NAME}.tiff"]
+    for suffix in (".tiff", ".png"):
+        np.testing.assert_array_equal(read_image(tiff.with_suffix(suffix)), COMPLETE_IMAGE.picture.to_array())
+    said = json.loads(tiff.with_suffix(".json").read_text())
+    assert said == json.loads(json.dumps(side_car(COMPLETE_IMAGE)))
+    assert said["contact"]["lat_deg"] == 41.5251
+    assert (said["height_px"], said["width_px"], said["bits"]) == (2, 3, 8)
+    assert (said["type"], said["v"], said["image_id"], said["complete"]) == ("reconstructed_image", 1, "00A7", True)
+    assert "picture" not in said
+
+
+def test_sixteen_bits_are_kept_in_tiff_and_png(tmp_path: Path) -> None:
+    pixels = np.array([[0, 255, 256], [40_000, 65_535, 1]], np.uint16)
+    tiff, _ = write_image(tmp_path, with_picture(pixels))
+    for suffix in (".tiff", ".png"):
+        back = read_image(tiff.with_suffix(suffix))
+        assert back.dtype == np.uint16
+        np.testing.assert_array_equal(back, pixels)
+
+
+@pytest.mark.parametrize(
+    ("mask", "pixels", "rows"),
+    [
+        ([[0, 0], [0, 0], [0, 0]], 0, []),
+        ([[1, 0], [0, 0], [0, 0]], 1, [0, 1]),
+        ([[0, 0], [0, 1], [1, 1]], 3, [1, 3]),
+        ([[1, 0], [0, 0], [0, 1]], 2, [0, 3]),
+    ],
+)
+def test_the_side_car_says_how_much_is_missing_and_where(mask: list[list[int]], pixels: int, rows: list[int]) -> None:
+    missing = np.array(mask, np.bool_)
+    said = side_car(with_picture(np.zeros((3, 2), np.uint8), missing_mask=np.packbits(missing).tobytes()))
+    assert (said["missing_pixels"], said["missing_rows"]) == (pixels, rows)
+    assert "missing_mask" not in said
+
+
+@given(images())
+@settings(max_examples=20)
+def test_any_picture_is_written_once_and_alike_everywhere(
+    tmp_path_factory: pytest.TempPathFactory, image: ReconstructedImage
+) -> None:
+    here, there = tmp_path_factory.mktemp("vessel"), tmp_path_factory.mktemp("shore")
+    tiff, new = write_image(here, image)
+    assert new
+    np.testing.assert_array_equal(read_image(tiff), image.picture.to_array())
+    write_image(there, image)
+    assert contents(here) == contents(there)
+    before = {path.name: path.stat().st_mtime_ns for path in here.iterdir()}
+    assert write_image(here, image) == (tiff, False)
+    assert {path.name: path.stat().st_mtime_ns for path in here.iterdir()} == before
+
+
+def test_a_version_does_not_replace_another(tmp_path: Path) -> None:
+    write_image(tmp_path, COMPLETE_IMAGE)
+    kept = contents(tmp_path)
+    write_image(tmp_path, DAMAGED_IMAGE)
+    now = contents(tmp_path)
+    assert len(now) == 6
+    assert kept.items() <= now.items()
+
+
+def test_a_picture_that_was_cut_short_is_written_again(tmp_path: Path) -> None:
+    tiff, _ = write_image(tmp_path, COMPLETE_IMAGE)
+    whole = contents(tmp_path)
+    for damage in (
+        lambda: tiff.with_suffix(".json").unlink(),
+        lambda: tiff.with_suffix(".json").write_bytes(b"\xff{"),
+        tiff.unlink,
+    ):
+        damage()
+        assert write_image(tmp_path, COMPLETE_IMAGE) == (tiff, True)
+        assert contents(tmp_path) == whole
+
+
+@pytest.mark.parametrize("after", [0, 1, 2, 3])
+def test_a_disk_that_fills_up_leaves_no_side_car_without_its_picture(
+    after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk takes `after` of the three files, and with 3 their folder does not."""
+    synced = 0
+    fsync = os.fsync
+
+    def full(descriptor: int) -> None:
+        nonlocal synced
+        synced += 1
+        if synced > after:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_image(tmp_path, COMPLETE_IMAGE)
+    monkeypatch.undo()
+    assert sorted(contents(tmp_path)) == ([f"{NAME}.png", f"{NAME}.tiff"] if after == 3 else [])
+    assert not (tmp_path / f"{NAME}.json").exists()
+    assert write_image(tmp_path, COMPLETE_IMAGE)[1]
+    assert len(contents(tmp_path)) == 3
+
+
+def test_the_side_car_is_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+    replace = Path.replace
+
+    def rename(self: Path, target: Path) -> Path:
+        order.append(Path(target).suffix)
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", rename)
+    picture_files.write_image(tmp_path, COMPLETE_IMAGE)
+    assert order[-1] == ".json"
+    assert sorted(order) == [".json", ".png", ".tiff"]

@@ -1,0 +1,38 @@
+"""Paths, ports and waiting, used by many tests."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import zenoh
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+GOLDEN_FOLDER = REPOSITORY / "tests" / "golden"
+
+
+def free_port() -> int:
+    """Return a TCP port that was free a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def eventually(condition: Callable[[], bool], timeout_s: float = 40.0, what: str = "condition") -> None:
+    """Wait until `condition()` holds; fail the test when it does not in time."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline:
+            pytest.fail(f"{what} did not come true within {timeout_s} s")
+        time.sleep(0.01)
+
+
+def publish_once(session: zenoh.Session, key: str, payload: bytes, encoding: str | None = None) -> None:
+    """Publish as a program without an outbox does, once somebody listens."""
+    publisher = session.declare_publisher(key, encoding=encoding)
+    eventually(lambda: publisher.matching_status.matching, what=f"subscriber of {key}")
+    publisher.put(payload)
+    publisher.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type

@@ -1,0 +1,180 @@
+"""A console without a network: its board, users, and a browser's way of asking."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from sonarpost.messages import Contact, Pixels, ReconstructedImage
+from sonarpost.services.console.app import ConsoleApp
+from sonarpost.services.console.board import Board
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.database import Database
+from sonarpost.services.console.users import Users
+
+PASSWORD = "correct horse battery"
+PEOPLE = {"watch": "observer", "anna": "operator", "bo": "operator", "eva": "expert"}
+FIRST_UTC_S = 1_700_000_000.0
+
+
+def picture_record(
+    image_id: str = "00A7",
+    version: int = 1,
+    *,
+    vehicle: str = "uuv-1",
+    vessel: str = "vessel-1",
+    missing_rows: int = 0,
+    total: int = 200,
+    seed: int = 0,
+    place: tuple[float, float] | None = (56.0, -5.0),
+    first_utc_s: float = FIRST_UTC_S,
+    **known: Any,
+) -> ReconstructedImage:
+    """A version of a picture of 40 x 60 px, the last rows missing."""
+    pixels = np.random.default_rng(seed + version).integers(0, 256, (40, 60), dtype=np.uint8)
+    mask = np.zeros(pixels.shape, np.bool_)
+    if missing_rows:
+        mask[-missing_rows:] = True
+        pixels[mask] = 0
+    picture = Pixels.from_array(pixels)
+    fields: dict[str, Any] = {
+        "altitude_m": 5.0,
+        "ground_range_m": 12.0,
+        "channel": "starboard",
+        "heading_deg": 0.0,
+        "pixel_along_m": 0.1,
+        "pixel_across_m": 0.05,
+        "atd_confidence": 1.2,
+        "time_utc_s": first_utc_s - 100,
+    }
+    lat, lon = place or (None, None)
+    contact = Contact(
+        contact_id=f"{vehicle}/{image_id}", vehicle_id=vehicle, lat_deg=lat, lon_deg=lon, **{**fields, **known}
+    )
+    received = total if not missing_rows else total * (40 - missing_rows) // 40
+    return ReconstructedImage(
+        vessel_id=vessel,
+        vehicle_id=vehicle,
+        image_id=image_id,
+        version=version,
+        contact=contact,
+        codec="emb",
+        model="",
+        picture=picture,
+        picture_sha256=picture.sha256,
+        complete=not missing_rows,
+        missing_fraction=float(mask.mean()),
+        missing_mask=np.packbits(mask).tobytes() if missing_rows else b"",
+        missing_halves=(),
+        bytes_received=received,
+        bytes_total=total,
+        frames_received=version,
+        first_frame_utc_s=first_utc_s,
+        last_frame_utc_s=first_utc_s + version,
+    )
+
+
+@dataclass
+class Browser:
+    """Somebody's browser, logged in or not."""
+
+    client: TestClient
+    csrf: str = ""
+
+    def login(self, user: str, password: str = PASSWORD) -> Any:
+        answer = self.client.post("/api/login", json={"user": user, "password": password})
+        if answer.status_code == 200:
+            self.csrf = answer.json()["csrf"]
+        return answer
+
+    def get(self, path: str, **parameters: Any) -> Any:
+        return self.client.get(path, params=parameters or None, follow_redirects=False)
+
+    def post(self, path: str, body: Any, **headers: str) -> Any:
+        given = {"X-CSRF-Token": self.csrf, **headers}
+        return self.client.post(path, json=body, headers=given)
+
+
+@dataclass
+class Console:
+    """A console and those who use it."""
+
+    board: Board
+    users: Users
+    app: ConsoleApp
+
+    def browser(self, user: str = "") -> Browser:
+        found = Browser(TestClient(self.app.asgi, base_url="http://127.0.0.1:8470"))
+        if user:
+            assert found.login(user).status_code == 200
+        return found
+
+    def decide(self, browser: Browser, contact_id: str, **changes: Any) -> Any:
+        """Decide on what the browser sees at this moment."""
+        whole = browser.get(f"/api/contacts/{contact_id}").json()
+        version = whole["versions"][-1]
+        body = {
+            "revision": whole["contact"]["revision"],
+            "version": version["version"],
+            "sha256": version["sha256"],
+            "layer": "raw",
+            "verdict": "mine_like",
+            "confidence": 0.8,
+            "mlo_class": "manta",
+            "remark": "clean edge",
+        }
+        return browser.post(f"/api/contacts/{contact_id}/decisions", {**body, **changes})
+
+
+ConsoleMaker = Callable[..., Console]
+
+
+@pytest.fixture(autouse=True)
+def cheap_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hashing costs time on purpose; how much of it is no matter here."""
+    monkeypatch.setattr("sonarpost.services.console.users.COST", 2**4)
+
+
+@pytest.fixture(scope="session")
+def users_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of those who may log in, made once."""
+    path = tmp_path_factory.mktemp("users") / "console-users.db"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sonarpost.services.console.users.COST", 2**4)
+        users = Users(path)
+        for name, role in PEOPLE.items():
+            users.add(name, role, PASSWORD)
+        users.close()
+    return path
+
+
+@pytest.fixture
+def make_console(tmp_path: Path, users_file: Path) -> Iterator[ConsoleMaker]:
+    made: list[Console] = []
+
+    def make(**options: Any) -> Console:
+        folder = tmp_path / str(len(made))
+        folder.mkdir()
+        shutil.copy(users_file, folder)
+        config = ConsoleConfig(**options)
+        users = Users(folder / users_file.name, config.session_s, config.session_most_s)
+        board = Board(config, Database(folder / "console-review.db"))
+        made.append(Console(board, users, ConsoleApp(board, users, "vessel-1")))
+        return made[-1]
+
+    yield make
+    for console in made:
+        console.board.database.close()
+        console.users.close()
+
+
+@pytest.fixture
+def console(make_console: ConsoleMaker) -> Console:
+    return make_console()

@@ -1,0 +1,47 @@
+"""The test's own outbox, and pictures for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from builders.records import picture_record
+from sonarpost import keys
+from sonarpost.config import ServiceConfig
+from sonarpost.messages import Pixels, ReconstructedImage
+from sonarpost.runtime.service import Service, UnitOfWork
+
+VESSEL = "vessel-1"
+
+
+def make_image(
+    number: int, shape: tuple[int, int] = (24, 32), mission: int = 0, version: int = 1
+) -> ReconstructedImage:
+    """Return a picture of noise that no other number, mission or version has."""
+    rng = np.random.default_rng([mission, number, version])
+    raster = Pixels.from_array(rng.integers(0, 256, shape, dtype=np.uint8))
+    return picture_record(
+        raster,
+        vehicle_id=f"uuv-{number % 3 + 1}",
+        image_id=f"{number:04d}",
+        version=version,
+        first_frame_utc_s=1.0e9 + 86400.0 * mission + number,
+        last_frame_utc_s=1.0e9 + 86400.0 * mission + number,
+    )
+
+
+class Feeder(Service[ServiceConfig]):
+    """The test's own outbox, in the decompressor's place."""
+
+    NAME = "feeder"
+
+    def handle(self, key: str, record: object, effects: UnitOfWork) -> None:
+        raise AssertionError("the feeder takes nothing")
+
+    def owe(self, images: Iterable[ReconstructedImage]) -> None:
+        """Commit pictures for the relay."""
+        effects = UnitOfWork()
+        for image in images:
+            effects.send(keys.image_reconstructed(VESSEL), "relay", image, priority=5)
+        self.commit(effects)

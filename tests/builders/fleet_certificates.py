@@ -1,0 +1,190 @@
+"""A fleet with certificates and real routers in processes, whose logs tests read."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from builders.common import eventually, free_port
+from sonarpost.bus.session import client_config
+from sonarpost.config import TlsConfig
+from sonarpost.security.fleet import Fleet
+from sonarpost.security.router_config import Wanted, router_json5
+
+DAY_S = 86400.0
+
+
+def tls_of(folder: Path) -> TlsConfig:
+    return TlsConfig(ca=folder / "ca.pem", certificate=folder / "certificate.pem", key=folder / "key.pem")
+
+
+class Router:
+    """A router process, and what it has logged."""
+
+    def __init__(self, config: Path) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "sonarpost.bus.router", "--config", str(config)],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={name: value for name, value in os.environ.items() if name != "RUST_LOG"},
+        )
+        self.lines: list[str] = []
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.lines.append(line)
+
+    def said(self, *words: str) -> bool:
+        return any(all(word in line for word in words) for line in list(self.lines))
+
+    def wait_for(self, *words: str) -> None:
+        deadline = time.monotonic() + 20
+        while not self.said(*words):
+            if time.monotonic() > deadline or (self.process.poll() is not None and not self._thread.is_alive()):
+                pytest.fail(f"the router did not say {words}:\n{''.join(self.lines)}")
+            time.sleep(0.01)
+
+    def stop(self) -> None:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+            try:
+                self.process.wait(10)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+        self._thread.join(5)
+        assert self.process.stderr is not None
+        self.process.stderr.close()
+
+
+@dataclass
+class World:
+    """A shore's router and a vessel's, linked by TLS, and certificates of all kinds."""
+
+    folder: Path
+    fleet: Fleet
+    shore_tls: str
+    shore_local: str
+    vessel_local: str
+    vessel_tls: str
+    folders: dict[str, Path]
+    routers: dict[str, Router] = field(default_factory=dict)
+
+    def start(self, platform: str, wanted: Wanted) -> Router:
+        path = self.folder / f"{platform}-{len(self.routers)}.json5"
+        path.write_text(router_json5(self.fleet.index(), wanted, time.time()), encoding="utf-8")
+        router = Router(path)
+        self.routers[path.stem] = router
+        router.wait_for("Router started")
+        return router
+
+    def shore_wanted(self, shore_tls: str, shore_local: str) -> Wanted:
+        return Wanted("shore-1", listen=[shore_tls], local=[shore_local], files=self.folders["shore-1"])
+
+    @property
+    def shore(self) -> Router:
+        return self.routers["shore-1-0"]
+
+    @property
+    def vessel(self) -> Router:
+        return self.routers["vessel-1-1"]
+
+    def tls(self, name: str) -> TlsConfig:
+        return tls_of(self.folders[name])
+
+    def open(self, name: str, mode: str = "client", endpoint: str = "") -> zenoh.Session:
+        """A session at the shore's outer door with somebody's certificate."""
+        config = client_config([endpoint or self.shore_tls], self.tls(name))
+        config.insert_json5("mode", json.dumps(mode))
+        return zenoh.open(config)
+
+
+def shifted(now_days: float) -> Callable[[], float]:
+    return lambda: time.time() + now_days * DAY_S
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    folder = tmp_path_factory.mktemp("fleet")
+    fleet = Fleet.init(folder / "pki", "test")
+    folders = {
+        "shore-1": fleet.issue("shore-1", "shore", ["localhost", "127.0.0.1"]).folder,
+        "vessel-1": fleet.issue("vessel-1", "vessel", ["localhost"]).folder,
+        "vessel-2": fleet.issue("vessel-2", "vessel").folder,
+        "vessel-3": fleet.issue("vessel-3", "vessel").folder,
+        "uuv-1": fleet.issue("uuv-1", "uuv").folder,
+        "console-1": fleet.issue("console-1", "console").folder,
+        "observer-1": fleet.issue("observer-1", "observer").folder,
+        # Made forty days ago for ten days; the authority of then is the one of now.
+        "expired": Fleet(fleet.folder, lambda: b"", shifted(-40)).issue("vessel-4", "vessel", days=10).folder,
+        "nameless": fleet.issue("shore-2", "shore", ["elsewhere.example"]).folder,
+    }
+    fleet.revoke("vessel-3", "lost at sea")
+    folders["vessel-3.g2"] = fleet.issue("vessel-3", "vessel").folder
+    other = Fleet.init(folder / "other", "another fleet")
+    folders["stranger"] = other.issue("vessel-1", "vessel").folder
+    port = [free_port() for _ in range(4)]
+    made = World(
+        folder,
+        fleet,
+        f"tls/localhost:{port[0]}",
+        f"tcp/127.0.0.1:{port[1]}",
+        f"tcp/127.0.0.1:{port[2]}",
+        f"tls/localhost:{port[3]}",
+        folders,
+    )
+    try:
+        made.start("shore-1", made.shore_wanted(made.shore_tls, made.shore_local))
+        made.start(
+            "vessel-1",
+            Wanted(
+                "vessel-1",
+                listen=[made.vessel_tls],
+                local=[made.vessel_local],
+                connect=[made.shore_tls],
+                files=folders["vessel-1"],
+            ),
+        )
+        yield made
+    finally:
+        for router in made.routers.values():
+            router.stop()
+
+
+@pytest.fixture
+def ashore(world: World) -> Iterator[zenoh.Session]:
+    """A service's session at the shore's router."""
+    session = zenoh.open(client_config([world.shore_local]))
+    yield session
+    session.close()
+
+
+@pytest.fixture
+def aboard(world: World) -> Iterator[zenoh.Session]:
+    """A service's session at the vessel's router, linked to the shore's."""
+    world.shore.wait_for("Peer connected", "peer=vessel-1")
+    session = zenoh.open(client_config([world.vessel_local]))
+    yield session
+    session.close()
+
+
+def matching(session: zenoh.Session, key: str) -> zenoh.Publisher:
+    """A publisher that somebody listens to."""
+    publisher = session.declare_publisher(key)
+    eventually(lambda: bool(publisher.matching_status.matching), what=f"a subscriber of {key}")
+    return publisher

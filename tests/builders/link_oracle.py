@@ -1,0 +1,166 @@
+"""What must hold of the acoustic link whatever bytes come: the v1 receiver, and the driver of the modem.
+
+An input is a list of steps. Every step begins with a byte that says what it is and one that says how long it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from itertools import islice
+from typing import Final
+
+from builders import v1_fuzz
+from builders.modem_fuzz import ENDS, LIKELY, Fuzz, real_lines
+from sonarpost.link.events import ContactUpdate, MessageReceived
+from sonarpost.link.receiver import LinkReceiver
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+
+VEHICLE: Final = 3
+STRANGER: Final = 4
+_GENUINE_FRAMES: Final = 250
+_MOST_STEPS: Final = 200
+
+
+def _steps(data: bytes) -> Iterator[tuple[int, bytes]]:
+    at = 0
+    for _ in range(_MOST_STEPS):
+        if at + 2 > len(data):
+            return
+        kind, length = data[at], data[at + 1]
+        yield kind, data[at + 2 : at + 2 + length]
+        at += 2 + length
+
+
+@cache
+def _genuine() -> tuple[bytes, ...]:
+    return tuple(islice(v1_fuzz.genuine(1), _GENUINE_FRAMES))
+
+
+def check_receiver(data: bytes) -> int:
+    """Give frames to a receiver; return how many pictures and messages it showed.
+
+    A stranger says whatever the input says, with checksums put right or not. Between that, genuine frames of a vehicle
+    come in any order and as often as the input wants: what is shown of it must have been sent. Reports, the state and
+    its bounds are checked at the end.
+
+    Raises:
+        AssertionError: Something that must hold does not.
+    """
+    receiver, now, shown = LinkReceiver(v1_fuzz.SMALL), 0.0, 0
+    for kind, body in _steps(data):
+        now += (0.0, 1.0, 70.0, 4000.0)[kind >> 2 & 3]
+        if kind & 3 == 0:
+            frames = [(VEHICLE, _genuine()[number % _GENUINE_FRAMES]) for number in body]
+        elif kind & 3 == 1:
+            frames = [(STRANGER, body)]
+        else:
+            frames = [(STRANGER, bytes(v1_fuzz.with_checksum(body)))]
+        for source, frame in frames:
+            for event in receiver.accept(source, frame, now):
+                assert source == STRANGER or v1_fuzz.is_right(event), f"shown though never sent: {event}"
+                shown += isinstance(event, ContactUpdate | MessageReceived)
+        for source in receiver.sources:
+            if receiver.report_is_due(source, now):
+                report = receiver.report(source, now)
+                assert report is None or len(report.pack()) <= 19
+            receiver.mini_report(source)
+    v1_fuzz.check_bounds(receiver)
+    restored = LinkReceiver(v1_fuzz.SMALL)
+    restored.restore(receiver.snapshot())
+    assert restored.snapshot() == receiver.snapshot()
+    return shown
+
+
+@cache
+def _real_lines() -> tuple[bytes, ...]:
+    return tuple(real_lines())
+
+
+def check_driver(data: bytes) -> int:
+    """Give lines to a driver and to the parser alone; return how many were sentences.
+
+    Lines are raw, or made of the input's fields with a right checksum, or from real exchanges; packets are asked for in
+    between. Whatever was asked for ends once, and a modem that answers again is used again.
+
+    Raises:
+        AssertionError: Something that must hold does not.
+    """
+    fuzz = Fuzz.__new__(Fuzz)  # for its checks; its lines are drawn, ours are given
+    driver, parser = MicroModem(MicroModemConfig(1)), nmea.LineAssembler()
+    now, taken, asked, ended = 0.0, 0, [], []
+    driver.start(now)
+    fuzz._make_ready(driver)
+    for kind, body in _steps(data):
+        now += (0.0, 0.01, 0.5, 7.0)[kind >> 3 & 3]
+        line = _line(kind & 7, body)
+        if line is None:
+            asked.append(_ask(driver, body, now))
+        else:
+            taken += sum(isinstance(item, nmea.Sentence) for item in parser.feed(line))
+            ended += [e for e in driver.receive(line, now) if isinstance(e, ENDS)]
+        ended += [e for e in driver.poll(now) if isinstance(e, ENDS)]
+        fuzz._check(driver, parser, now)
+    fuzz._recover(driver, now, asked, ended)
+    return taken
+
+
+def _line(kind: int, body: bytes) -> bytes | None:
+    match kind:
+        case 0:
+            return None
+        case 1:
+            return body
+        case 2:
+            return b"".join(_real_lines()[number % len(_real_lines())] for number in body[:8])
+        case 3 | 4:
+            name, rest = body[:5], body[5:]
+            return _checked(b"$" + name + b"".join(b"," + LIKELY[n % len(LIKELY)].encode() for n in rest))
+        case _:
+            return _checked(b"$" + body)
+
+
+def _checked(start: bytes) -> bytes:
+    """Return a line with its checksum, where its text can have one."""
+    total = 0
+    for byte in start[1:]:
+        total ^= byte
+    return start + b"*%02X\r\n" % total
+
+
+def _ask(driver: MicroModem, body: bytes, now: float) -> int:
+    match body[0] % 5 if body else 0:
+        case 0:
+            return driver.send_packet(2, 1, [body[:64] or b"."], ack=len(body) % 2 == 0, now=now)
+        case 1:
+            return driver.ping(2, now)
+        case 2:
+            return driver.send_mini(2, 5, now)
+        case 3:
+            return driver.send_flexible(2, 1, b"flexible", now)
+        case _:
+            return driver.request_packet(2, 1, now=now)
+
+
+CHECKS: Final = {"receiver": check_receiver, "driver": check_driver}
+
+
+def seeds(name: str) -> Iterator[bytes]:
+    """Yield inputs to begin with, which reach what genuine traffic reaches."""
+    if name == "receiver":
+        frames = _genuine()
+        for first in range(0, _GENUINE_FRAMES, 25):
+            yield bytes([0, 25, *range(first, first + 25)])
+            yield b"".join(bytes([2 | first % 3 << 2, len(f) - 2]) + f[2:] for f in frames[first : first + 8])
+        return
+    lines = _real_lines()
+    for first in range(0, len(lines), 8):
+        asked = bytes([0, 3, first % 256, 1, 2])
+        yield asked + bytes([2, 8, *(n % 256 for n in range(first, first + 8))])
+        yield asked + b"".join(
+            bytes([5 | 1 << 3, len(body)]) + body
+            for line in lines[first : first + 8]
+            if len(body := line[1:].split(b"*")[0]) < 256
+        )

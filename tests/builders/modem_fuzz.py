@@ -1,0 +1,219 @@
+"""Throws damaged, misplaced and invented lines at the NMEA parser and the driver, and checks what must always hold.
+
+`PYTHONPATH=tests python -m builders.modem_fuzz --lines 1000000 --seed 1` runs a million; the suite runs a few thousand.
+Lines are what a modem says in real exchanges, or made of every kind of sentence with likely and unlikely fields; then
+some are damaged: bytes flipped, lost, doubled, lines cut, joined and repeated. The same seed gives the same lines.
+"""
+
+# ruff: noqa: SIM905 - lists of this length are harder to read
+
+from __future__ import annotations
+
+import argparse
+import random
+import time
+from dataclasses import dataclass, field
+
+from builders.two_drivers import TwoDrivers
+from sonarpost.errors import SentenceError
+from sonarpost.modem.micromodem import nmea
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import PacketFailed, PacketSent, RequestDone, RequestFailed
+
+KINDS = (
+    "CAREV CACFG CACLK CATMS CATMQ CATMG CACYC CADRQ CATXD CATXA CATXP CATXF CAXST CARXP CARXD CARXA CAMSG CACST CAACK "
+    "CAERR CAMPC CAMPA CAMPR CAMUC CAMUA CAMUR CATDP CARDP CATOA CADQF SNTTA CCCYC GPRMC"
+).split()
+LIKELY = (
+    "0 1 2 3 4 5 6 7 8 15 32 64 127 128 255 256 -1 AB 00FF 1ABC INIT AUV SRC CST RXP BAD_CRC PACKET_TIMEOUT "
+    "DATA_TIMEOUT NMEA 120000 20250606230123.348554 2.0.27087 0.93.0.09 1;2;AABB 0;1;00 1;3;AABB 0.1000 1e308 nan inf"
+).split()
+ENDS = (PacketSent, PacketFailed, RequestDone, RequestFailed)
+ROUND_LINES = 500
+MOST_BYTES_TO_SEND = 1 << 20
+
+
+@dataclass
+class Fuzz:
+    """One run.
+
+    Attributes:
+        seed: Of every draw.
+        lines: Thrown so far.
+        kinds_taken: How many sentences the parser took as valid.
+    """
+
+    seed: int
+    lines: int = 0
+    kinds_taken: int = 0
+    real: list[bytes] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.dice = random.Random(self.seed)
+        self.real = real_lines()
+
+    def run(self, lines: int) -> None:
+        """Throw so many lines, in rounds with a driver each.
+
+        Raises:
+            AssertionError: Something that must always hold did not.
+        """
+        while self.lines < lines:
+            self._round(min(ROUND_LINES, lines - self.lines))
+
+    def _round(self, count: int) -> None:
+        driver = MicroModem(MicroModemConfig(1))
+        driver.answer_polls(lambda polled: [b"x" * min(3, polled.frame_bytes)] * (polled.frames // 2))
+        parser = nmea.LineAssembler()
+        now, asked, ended = 0.0, [], []
+        driver.start(now)
+        if self.dice.random() < 0.8:
+            self._make_ready(driver)
+        for _ in range(count):
+            self.lines += 1
+            line = self.line()
+            self.kinds_taken += sum(isinstance(item, nmea.Sentence) for item in parser.feed(line))
+            if self.dice.random() < 0.02:
+                asked.append(self._ask(driver, now))
+            events = driver.receive(line, now)
+            now += self.dice.choice((0.0, 0.0, 0.01, 0.5, 7.0))
+            events += driver.poll(now)
+            ended += [e for e in events if isinstance(e, ENDS)]
+            self._check(driver, parser, now)
+        self._recover(driver, now, asked, ended)
+
+    @staticmethod
+    def _check(driver: MicroModem, parser: nmea.LineAssembler, now: float) -> None:
+        assert parser.pending_bytes <= nmea.MAX_SENTENCE_BYTES
+        assert driver.queued <= driver.config.queued_packets + 1
+        out = driver.bytes_to_send()
+        assert len(out) < MOST_BYTES_TO_SEND
+        for item in nmea.LineAssembler().feed(out):
+            assert isinstance(item, nmea.Sentence), "the driver writes whole sentences"
+        wakeup_s = driver.next_wakeup()
+        assert wakeup_s is None or wakeup_s > now, "a poll leaves nothing that is due"
+
+    @staticmethod
+    def _recover(driver: MicroModem, now: float, asked: list[int], ended: list[object]) -> None:
+        """With silence, whatever was asked for comes to one end, and a modem that answers is used again."""
+        driver.receive(b"\r\n", now)
+        for _ in range(400):
+            now += 5.0
+            ended += [e for e in driver.poll(now) if isinstance(e, ENDS)]
+            for item in nmea.LineAssembler().feed(driver.bytes_to_send()):
+                assert isinstance(item, nmea.Sentence)
+                if item.kind == "CCCFG":
+                    driver.receive(nmea.format("CACFG", *item.fields), now)
+                elif item.kind == "CCCFQ":
+                    driver.receive(nmea.format("CACFG", item.fields[0], 1), now)
+        numbers = [getattr(e, "packet_id", None) or getattr(e, "request_id", None) for e in ended]
+        assert len(numbers) == len(set(numbers)), "nothing ends twice"
+        assert set(asked) <= set(numbers), "everything ends"
+        assert driver.ready
+        assert not driver.receiving
+        assert driver.queued == 0
+
+    @staticmethod
+    def _make_ready(driver: MicroModem) -> None:
+        for _ in range(20):
+            for item in nmea.LineAssembler().feed(driver.bytes_to_send()):
+                assert isinstance(item, nmea.Sentence)
+                value = item.fields[1] if item.kind == "CCCFG" else "1"
+                driver.receive(nmea.format("CACFG", item.fields[0], value), 0.0)
+        assert driver.ready
+
+    def _ask(self, driver: MicroModem, now: float) -> int:
+        choice = self.dice.randrange(5)
+        if choice == 0:
+            return driver.ping(2, now)
+        if choice == 1:
+            return driver.send_mini(2, 5, now)
+        if choice == 2:
+            return driver.send_flexible(2, 1, b"flexible", now)
+        if choice == 3:
+            return driver.request_packet(2, self.dice.choice((0, 1, 4)), now=now)
+        return driver.send_packet(2, self.dice.choice((0, 4)), [b"ab"], ack=self.dice.random() < 0.5, now=now)
+
+    def line(self) -> bytes:
+        """Return the next line, or what is left of it."""
+        draw = self.dice.random()
+        if draw < 0.45:
+            line = self.dice.choice(self.real)
+        elif draw < 0.95:
+            fields = [self.dice.choice(LIKELY) for _ in range(self.dice.randrange(10))]
+            line = nmea.format(self.dice.choice(KINDS), *fields)
+        else:
+            return self.dice.randbytes(self.dice.randrange(80))
+        return self._damaged(line) if self.dice.random() < 0.4 else line
+
+    def _damaged(self, line: bytes) -> bytes:
+        at = self.dice.randrange(len(line))
+        other = self.dice.choice(self.real)
+        return self.dice.choice(
+            (
+                line[:at] + bytes([line[at] ^ 1 << self.dice.randrange(8)]) + line[at + 1 :],
+                line[:at] + line[at + 1 :],
+                line[:at] + line[at : at + 4] + line[at:],
+                line[:at],
+                line[:at] + other,
+                line + line,
+                line.split(b"*")[0] + b"\r\n",
+                nmea.format(*self._swapped(line)),
+            )
+        )
+
+    def _swapped(self, line: bytes) -> list[str]:
+        """One field replaced, with a checksum that is right."""
+        fields = line[1:].split(b"*")[0].decode("ascii").split(",")
+        if len(fields) > 1:
+            fields[self.dice.randrange(1, len(fields))] = self.dice.choice(LIKELY)
+        return fields
+
+
+def real_lines() -> list[bytes]:
+    """Return what the modem says to a driver in an exchange of each kind."""
+    rig = TwoDrivers()
+    rig.drivers[2].answer_polls(lambda polled: [b"polled"])
+    rig.arm()
+    rig.run(10.0)
+    for rate in (0, 1, 4):
+        rig.drivers[1].send_packet(2, rate, [b"real"], ack=True, now=rig.now)
+        rig.drivers[2].send_packet(1, rate, [b"back"], now=rig.now)
+    rig.drivers[1].ping(2, rig.now)
+    rig.drivers[2].send_mini(1, 77, rig.now)
+    rig.drivers[2].send_flexible(1, 1, b"flexible", rig.now)
+    rig.drivers[2].request_packet(1, 1, now=rig.now)
+    rig.run(150.0)
+    return [passed.line for passed in rig.passed if passed.host == 1 and not passed.to_modem]
+
+
+def parse_alone(lines: list[bytes]) -> int:
+    """Parse lines one by one; return how many are valid. Nothing but `SentenceError` is raised."""
+    valid = 0
+    for line in lines:
+        try:
+            sentence = nmea.parse(line)
+        except SentenceError:
+            continue
+        valid += 1
+        assert nmea.parse(sentence.encode()) == sentence, "what was parsed is written as it was"
+    return valid
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--lines", type=int, default=1_000_000)
+    parser.add_argument("--seed", type=int, default=1)
+    parsed = parser.parse_args()
+    fuzz, started_s = Fuzz(parsed.seed), time.monotonic()
+    fuzz.run(parsed.lines)
+    valid = parse_alone([fuzz.line() for _ in range(parsed.lines // 10)])
+    seconds = time.monotonic() - started_s
+    alone = f"{valid} of {parsed.lines // 10} alone"
+    print(f"{fuzz.lines} lines, {fuzz.kinds_taken} taken as sentences, {alone}; {seconds:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

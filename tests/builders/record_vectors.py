@@ -1,0 +1,99 @@
+"""Adds golden vectors of the Zenoh wire: `PYTHONPATH=tests python -m builders.record_vectors` from the repository root.
+
+A vector says what bytes a record had when the vector was made. Programs of that time are still out there, so a vector
+is never changed or removed: this script adds those of `samples.py` and `handoff_samples()` that are not there yet, and
+stops when one that is there would come out otherwise. When a record gains a field, give the sample a new name.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import msgpack
+
+from builders.common import GOLDEN_FOLDER
+from builders.record_samples import SAMPLES
+from sonarpost import wire
+from sonarpost.delivery import batch_protocol as handoff_batch
+from sonarpost.delivery.protocol import AckReply, attachment
+from sonarpost.delivery.store import OutboxItem
+
+BATCH = ((7, 1), (9, 0), (2**40, 300))
+FOLDER = GOLDEN_FOLDER / "zenoh"
+
+
+def plain(value: object) -> object:
+    """Return a msgpack value as JSON can hold it: bytes become {"$hex": "…"}."""
+    if isinstance(value, bytes):
+        return {"$hex": value.hex()}
+    if isinstance(value, dict):
+        return {name: plain(inner) for name, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(inner) for inner in value]
+    return value
+
+
+def handoff_samples() -> dict[str, dict[str, bytes]]:
+    """Return attachments and replies by file and name."""
+    item = OutboxItem("c2", 7, "k", "", 4, b"\x80", bytes.fromhex("11" * 32))
+    large = OutboxItem("relay", 2**40, "k", "", 4, b"\x00" * 100_000, bytes.fromhex("22" * 32))
+    return {
+        "handoff-attachment": {
+            "first-piece": attachment(bytes(range(16)), item),
+            "second-piece": attachment(bytes(range(16)), large, 32768),
+            "after-dropped-ones": attachment(bytes(range(16)), item, 0, 5),
+        },
+        "handoff-reply": {
+            "stored": AckReply("stored").pack(),
+            "more": AckReply("more", next_offset=65536).pack(),
+            "refused": AckReply("refused", reason="k: v: got 2, expected 1").pack(),
+            "later": AckReply("later", reason="disk is full").pack(),
+            "stored-takes-several": AckReply("stored").pack(takes=128),
+        },
+    }
+
+
+def batch_samples() -> dict[str, dict[str, bytes]]:
+    """Return attachments and replies of queries with several records, by file and name."""
+    items = [OutboxItem("c2", seq, "k", "", 4, b"\x80" * size, bytes.fromhex("11" * 32)) for seq, size in BATCH]
+    replies = [
+        AckReply("stored"),
+        AckReply("refused", reason="k: v: got 2, expected 1"),
+        AckReply("later", reason="full"),
+    ]
+    return {
+        "handoff-batch-attachment": {
+            "three-records": handoff_batch.attachment(bytes(range(16)), items),
+            "after-dropped-ones": handoff_batch.attachment(bytes(range(16)), items, 6),
+        },
+        "handoff-batch-reply": {"one-of-each": handoff_batch.pack_replies(replies)},
+    }
+
+
+def add(path: Path, name: str, payload: bytes) -> bool:
+    """Add one vector to its file; tell whether it was new."""
+    vectors = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    vector = {"hex": payload.hex(), "fields": plain(msgpack.unpackb(payload))}
+    if name in vectors:
+        if vectors[name] != vector:
+            raise SystemExit(f"{path.name}: {name} would change; give the new one another name")
+        return False
+    vectors[name] = vector
+    path.write_text(json.dumps(vectors, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return True
+
+
+def main() -> None:
+    """Add what is missing."""
+    added = 0
+    for name, record in SAMPLES.items():
+        added += add(FOLDER / f"{record.TYPE}.json", name, wire.encode(record))
+    for file, payloads in (handoff_samples() | batch_samples()).items():
+        for name, payload in payloads.items():
+            added += add(FOLDER / f"{file}.json", name, payload)
+    print(f"{added} vectors added")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""What a survey reader may do with any bytes: refuse them with a SurveyFileError, or give pings that can be.
+
+Used by the coverage-guided fuzzer (`run_atheris_survey.py`) and by the bounded tests of the default suite.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from builders.surveys import MAKERS
+from sonarpost.errors import SurveyFileError
+from sonarpost.sonar.georeference import georeference
+from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.readers.registry import open_survey
+from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
+
+FILES = (
+    ("xtf", "line.xtf"),
+    ("humminbird", "line.DAT"),
+    ("humminbird", "line/B002.SON"),
+    ("waterfall", "line.waterfall.toml"),
+    ("waterfall", "line.csv"),
+    ("waterfall", "line.port.png"),
+)
+"""Which format and which of its files an input's first byte stands for."""
+MOST_PINGS = 2000
+OPTIONS = SurveyOptions(projected_crs="EPSG:32619", humminbird_depth_as_altitude=True)
+
+
+def tiny_survey() -> Survey:
+    """Return three pings of a few samples."""
+    rng = np.random.default_rng(0)
+    pings = tuple(
+        Ping(
+            number=row,
+            time_utc_s=1_378_847_588.0 + row,
+            channels=tuple(ChannelPing(side, rng.integers(1, 255, 12, dtype=np.uint8), 25.0) for side in Side),
+            lat_deg=48.4 + row * 1e-5,
+            lon_deg=-68.8,
+            heading_deg=90.0,
+            altitude_m=6.0,
+            depth_m=14.0,
+            speed_mps=1.0,
+            pitch_deg=1.0,
+            roll_deg=-1.0,
+        )
+        for row in range(3)
+    )
+    return Survey(Path("line"), "HDS", "line", pings)
+
+
+class Readers:
+    """Whole recordings of every format in a folder, of which one file at a time is replaced."""
+
+    def __init__(self, root: Path) -> None:
+        self._opened: dict[str, Path] = {}
+        for kind, make in MAKERS.items():
+            (root / kind).mkdir()
+            self._opened[kind] = make(tiny_survey(), root / kind)
+        self._files = [root / kind / name for kind, name in FILES]
+        self._whole = [path.read_bytes() for path in self._files]
+
+    def seeds(self) -> list[bytes]:
+        """Return an input of each file as it should be."""
+        return [bytes([number]) + whole for number, whole in enumerate(self._whole)]
+
+    def check(self, data: bytes) -> str:
+        """Read an input; return "refused" or "read".
+
+        Raises:
+            AssertionError: A ping holds what cannot be.
+            Exception: Anything but a SurveyFileError that reading raised.
+        """
+        number = (data[0] if data else 0) % len(FILES)
+        self._files[number].write_bytes(data[1:])
+        try:
+            return self._read(self._opened[FILES[number][0]])
+        finally:
+            self._files[number].write_bytes(self._whole[number])
+
+    def _read(self, path: Path) -> str:
+        try:
+            with open_survey(path, OPTIONS) as source:
+                count = 0
+                for ping in source.pings():
+                    check_ping(ping)
+                    count += 1
+                assert count == source.info.ping_count <= MOST_PINGS
+        except SurveyFileError:
+            return "refused"
+        return "read"
+
+
+def check_ping(ping: Ping) -> None:
+    """Raise AssertionError where a ping holds what no vehicle can have."""
+    assert math.isfinite(ping.time_utc_s)
+    assert (ping.lat_deg is None) == (ping.lon_deg is None)
+    assert ping.lat_deg is None or ping.lon_deg is None or (abs(ping.lat_deg) <= 90 and abs(ping.lon_deg) <= 180)
+    assert ping.heading_deg is None or 0 <= ping.heading_deg < 360
+    assert ping.altitude_m is None or 0 < ping.altitude_m <= 11_000
+    assert ping.speed_mps is None or 0 <= ping.speed_mps <= 50
+    assert ping.pitch_deg is None or abs(ping.pitch_deg) <= 90
+    for channel in ping.channels:
+        assert channel.samples.ndim == 1
+        assert channel.samples.size
+        assert math.isfinite(channel.slant_range_m)
+        assert channel.slant_range_m > 0
+        assert np.isfinite(channel.echo()).all()
+        found = georeference(ping, channel.side, len(channel.samples) - 1, OPTIONS)
+        assert found is None or (abs(found.position.lat_deg) <= 90.5 and math.isfinite(found.drms_m))

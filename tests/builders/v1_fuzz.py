@@ -1,0 +1,168 @@
+"""Hostile frames for the v1 receiver, a bounded run and a long one; `run_atheris_link.py` does it by coverage.
+
+PYTHONPATH=tests python -m builders.v1_fuzz FRAMES [SEED]
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from sonarpost.link.config import ReceiverConfig, SenderConfig
+from sonarpost.link.events import ContactUpdate, MessageReceived
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.v1.frame import checksum
+from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.sender import LinkSender
+
+SMALL = ReceiverConfig(max_sources=3, max_contacts=20, block_memory_s=300.0, contact_memory_s=900.0)
+MESSAGE = b"status: "
+
+
+def picture_stream(number: int) -> bytes:
+    return np.random.default_rng(number).integers(0, 256, 40 + number % 400, dtype=np.uint8).tobytes()
+
+
+def record(number: int) -> ContactSummary:
+    return ContactSummary(lat_deg=number / 1000, lon_deg=1.0, confidence=1.0).rounded()
+
+
+def genuine(seed: int) -> Iterator[bytes]:
+    """Yield frames of a vehicle that goes on for ever, with every kind of content, sizes and settings changing."""
+    rng, number = np.random.default_rng(seed), 0
+    while True:
+        sender = LinkSender(
+            SenderConfig(
+                frame_bytes=int(rng.choice([32, 64, 256])),
+                group_pictures=int(rng.integers(1, 9)),
+                feedback=bool(rng.random() < 0.5),
+            ),
+            first_block=int(rng.integers(0, 32)),
+        )
+        for _ in range(int(rng.integers(1, 12))):
+            number = number % 5000 + 1
+            sender.add_picture(number, record(number), picture_stream(number), 0.0)
+            if rng.random() < 0.3:
+                sender.add_message(MESSAGE + bytes([number % 256]) * int(rng.integers(1, 150)), 0.0)
+        while (frame := sender.next_frame(0.0)) is not None:
+            yield frame
+
+
+def mangled(frame: bytes, rng: np.random.Generator, kind: int) -> bytes:
+    """Return a frame as bad modems, water and strangers make it: one of nine kinds, 6 and 7 are forgeries."""
+    data, cut = bytearray(frame), int(rng.integers(0, len(frame)))
+    match kind:
+        case 0:
+            data = bytearray(rng.bytes(int(rng.integers(0, 300))))
+        case 1:
+            del data[cut:]
+        case 2:
+            data[cut:] = bytes(len(data) - cut)
+        case 3:
+            data[cut:] = rng.bytes(len(data) - cut)
+        case 4:
+            for _ in range(int(rng.integers(1, 20))):
+                data[int(rng.integers(0, len(data)))] ^= 1 << int(rng.integers(0, 8))
+        case 5:
+            data += bytes(int(rng.integers(1, 200)))
+        case 6:  # a right checksum over nonsense: only the checks inside stand between it and the operator
+            head = bytes([int(rng.integers(0, 128)), int(rng.integers(0, 8)), int(rng.integers(0, 6))])
+            data = with_checksum(head + rng.bytes(int(rng.choice([27, 59, 251]))))
+        case 7:  # a right checksum over a damaged frame
+            for _ in range(int(rng.integers(1, 4))):
+                data[2 + int(rng.integers(0, len(data) - 2))] = int(rng.integers(0, 256))
+            data = with_checksum(bytes(data[2:]))
+        case _:
+            data = bytearray(rng.permutation(np.frombuffer(frame, np.uint8)).tobytes())
+    return bytes(data)
+
+
+def with_checksum(covered: bytes) -> bytearray:
+    return bytearray(checksum(covered).to_bytes(2, "big") + covered)
+
+
+def is_right(event: object) -> bool:
+    """Whether what the receiver shows was sent."""
+    if isinstance(event, ContactUpdate):
+        return event.contact == record(event.number) and picture_stream(event.number).startswith(event.stream)
+    if isinstance(event, MessageReceived):
+        return event.data.startswith(MESSAGE)
+    return True
+
+
+def run(frames: int, seed: int = 0) -> dict[str, int]:
+    """Feed that many frames, a third of them genuine, replayed or out of order; return counts.
+
+    `forged` counts what was shown though never sent. A forger who computes checksums can make messages, contacts and
+    reports (there is no authentication without a seal), so frames with right checksums over nonsense are kept to a
+    source of their own, whose events are counted apart; of all others none may be wrong.
+    """
+    rng = np.random.default_rng(seed)
+    source, receiver, now = genuine(seed), LinkReceiver(SMALL), 0.0
+    past: list[bytes] = []
+    counts = {"frames": 0, "shown": 0, "wrong": 0, "forged": 0}
+    for step in range(frames):
+        now += float(rng.choice([0.0, 0.3, 2.0, 40.0], p=[0.2, 0.5, 0.29, 0.01]))
+        frame, address = next(source), 3
+        past = [*past[-63:], frame]
+        kind = rng.random()
+        if kind < 0.35:
+            how = int(rng.integers(0, 9))
+            frame = mangled(past[int(rng.integers(0, len(past)))], rng, how)
+            address = 4 if how in (6, 7) and frame not in past else 3
+        elif kind < 0.6:
+            frame = past[int(rng.integers(0, len(past)))]
+        elif kind < 0.7:
+            continue
+        events = receiver.accept(address, frame, now)
+        counts["frames"] += 1
+        for event in events:
+            wrong = not is_right(event)
+            counts["shown"] += isinstance(event, ContactUpdate | MessageReceived)
+            counts["wrong" if address == 3 else "forged"] += wrong
+        if step % 5000 == 0:
+            check_bounds(receiver)
+            restored = LinkReceiver(SMALL)
+            restored.restore(receiver.snapshot())
+            receiver = restored
+    check_bounds(receiver)
+    return counts
+
+
+def check_bounds(receiver: LinkReceiver) -> None:
+    """Assert that memory is bounded."""
+    sources = receiver.snapshot()["sources"]
+    assert isinstance(sources, list)
+    assert len(sources) <= SMALL.max_sources
+    for source in sources:
+        assert len(source["contacts"]) <= SMALL.max_contacts
+        assert len(source["blocks"]) <= 32
+        assert all(len(block["symbols"]) <= 255 for block in source["blocks"])
+
+
+def one_input(data: bytes) -> None:
+    """Take frames from one string: a length byte, then a frame, with its checksum put right."""
+    receiver, at, now = LinkReceiver(SMALL), 0, 0.0
+    while at < len(data):
+        covered = data[at + 1 : at + 1 + data[at]]
+        at += 1 + data[at]
+        now += 1.0
+        receiver.accept(3, bytes(with_checksum(covered)), now)
+        receiver.accept(3, covered, now)
+    receiver.report(3, now)
+    receiver.mini_report(3)
+    check_bounds(receiver)
+    LinkReceiver(SMALL).restore(receiver.snapshot())
+
+
+def main(arguments: list[str]) -> None:
+    started = time.process_time()
+    seed = int(arguments[1]) if len(arguments) > 1 else 0
+    print(run(int(arguments[0]), seed), f"{time.process_time() - started:.0f} s CPU")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,178 @@
+"""The embedded router takes zenohd's configuration files and options, and says what is wrong with them in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+from builders.common import REPOSITORY, eventually, free_port
+
+from sonarpost.bus import router
+from sonarpost.bus.session import client_config
+from sonarpost.errors import ConfigError
+
+Start = Callable[..., subprocess.Popen[str]]
+
+CONFIG = """{
+  // Comments, unquoted names and trailing commas: JSON5.
+  mode: "router",
+  listen: { endpoints: ["%s"] },
+  connect: { endpoints: [] },
+  scouting: { delay: 0, multicast: { enabled: false }, gossip: { enabled: false } },
+  transport: { link: { tx: { lease: 3000 } } },
+}
+"""
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Starts a router process; all are ended with the test."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start_one(*arguments: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "sonarpost.bus.router", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env={**os.environ, "RUST_LOG": "error"},
+        )
+        started.append(process)
+        return process
+
+    yield start_one
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def reach(endpoint: str) -> zenoh.Session:
+    """Open a client session as soon as the router listens."""
+    opened: list[zenoh.Session] = []
+
+    def try_once() -> bool:
+        try:
+            opened.append(zenoh.open(client_config([endpoint])))
+        except zenoh.ZError:
+            return False
+        return True
+
+    eventually(try_once, 20, f"a router at {endpoint}")
+    return opened[0]
+
+
+def write_config(tmp_path: Path, text: str, name: str = "router.json5") -> Path:
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_two_routers_with_files_carry_a_record_from_one_to_the_other(start: Start, tmp_path: Path) -> None:
+    shore, vessel = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
+    processes = [
+        start("--config", str(write_config(tmp_path, CONFIG % shore, "shore.json5"))),
+        start("-c", str(write_config(tmp_path, CONFIG % vessel, "vessel.json5")), "-e", shore),
+    ]
+    with reach(shore) as ashore, reach(vessel) as aboard:
+        came = threading.Event()
+        subscriber = ashore.declare_subscriber("sonarpost/test", lambda _sample: came.set())
+        publisher = aboard.declare_publisher("sonarpost/test")
+        eventually(lambda: bool(publisher.matching_status.matching), 20, "the subscriber known on the vessel")
+        publisher.put(b"here")
+        assert came.wait(10)
+        subscriber.undeclare()
+    for process in processes:
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=10) == 0
+        output = process.communicate()[0]
+        assert "Router started listen=tcp/127.0.0.1:" in output
+        assert "Router stopped" in output
+
+
+def test_endpoints_on_the_command_line_stand_instead_of_the_files(tmp_path: Path) -> None:
+    path = write_config(tmp_path, CONFIG % "tcp/127.0.0.1:1")
+    config = router.load(path, ["tcp/127.0.0.1:7001", "tcp/127.0.0.1:7002"], ["tcp/shore:7448"], [])
+    assert json.loads(config.get_json("listen/endpoints")) == ["tcp/127.0.0.1:7001", "tcp/127.0.0.1:7002"]
+    assert json.loads(config.get_json("connect/endpoints")) == ["tcp/shore:7448"]
+    kept = router.load(path, [], [], [])
+    assert json.loads(kept.get_json("listen/endpoints")) == ["tcp/127.0.0.1:1"]
+
+
+def test_a_file_without_a_mode_is_a_routers(tmp_path: Path) -> None:
+    config = router.load(write_config(tmp_path, "{}"), [], [], [])
+    assert json.loads(config.get_json("mode")) == "router"
+
+
+def test_single_keys_are_set_last(tmp_path: Path) -> None:
+    path = write_config(tmp_path, CONFIG % "tcp/127.0.0.1:1")
+    config = router.load(path, [], [], ["transport/link/tx/lease:1234", "metadata:{name:'a'}"])
+    assert json.loads(config.get_json("transport/link/tx/lease")) == 1234
+    assert json.loads(config.get_json("metadata")) == {"name": "a"}
+
+
+def test_without_a_file_the_router_listens_on_loopback_only() -> None:
+    config = router.load(None, [], [], [])
+    assert json.loads(config.get_json("listen/endpoints")) == ["tcp/127.0.0.1:7447"]
+    assert json.loads(config.get_json("scouting/multicast/enabled")) is False
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "words"),
+    [
+        (None, {}, ("router.json5", "No such file")),
+        ("{mode: 'router', lisen: {}}", {}, ("router.json5", "lisen")),
+        ("{mode: ", {}, ("router.json5", "JSON5")),
+        ("{mode: 'client'}", {}, ("router.json5", "mode", "client")),
+        ("{}", {"listen": ["nowhere"]}, ("--listen", "nowhere")),
+        ("{}", {"connect": ["nowhere"]}, ("--connect", "nowhere")),
+        ("{}", {"settings": ["lease"]}, ("--cfg", "lease", "KEY:VALUE")),
+        ("{}", {"settings": ["no/such/key:1"]}, ("--cfg", "no/such/key")),
+    ],
+)
+def test_what_is_wrong_is_named(
+    tmp_path: Path, text: str | None, arguments: dict[str, list[str]], words: tuple[str, ...]
+) -> None:
+    path = tmp_path / "router.json5"
+    if text is not None:
+        path.write_text(text)
+    given = {"listen": [], "connect": [], "settings": [], **arguments}
+    with pytest.raises(ConfigError) as caught:
+        router.load(path, given["listen"], given["connect"], given["settings"])
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_wrong_endpoints_without_a_file_are_named() -> None:
+    with pytest.raises(ConfigError, match="Zenoh endpoints"):
+        router.load(None, ["nowhere"], [], [])
+
+
+def test_a_wrong_file_ends_the_process_with_one_line(start: Start, tmp_path: Path) -> None:
+    process = start("--config", str(write_config(tmp_path, "{mode: 'router', lisen: {}}")))
+    output = process.communicate(timeout=20)[0]
+    assert process.returncode == router.EXIT_CANNOT_START
+    [line] = output.splitlines()
+    assert line.startswith("router: ")
+    assert "lisen" in line
+
+
+@pytest.mark.parametrize("path", sorted(REPOSITORY.glob("config/router-*.json5")), ids=lambda path: path.name)
+def test_the_projects_router_files_are_a_routers_and_discover_nobody(path: Path) -> None:
+    config = router.load(path, [], [], [])
+    assert json.loads(config.get_json("scouting/multicast/enabled")) is False
+    assert json.loads(config.get_json("scouting/gossip/enabled")) is False
+    assert json.loads(config.get_json("transport/shared_memory/enabled")) is False
+    assert json.loads(config.get_json("transport/link/tx/lease")) == 3000
+    wait = "transport/link/tx/queue/congestion_control/block/wait_before_close"
+    assert json.loads(config.get_json(wait)) == 60_000_000

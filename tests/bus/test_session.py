@@ -1,0 +1,123 @@
+"""Sessions: configurations that join nobody uninvited, and opening until it works or is stopped."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+
+import pytest
+import zenoh
+from builders.common import eventually, free_port
+
+from sonarpost.bus import session
+from sonarpost.bus.session import client_config, open_with_retry, router_config
+
+
+def setting(config: zenoh.Config, path: str) -> object:
+    return json.loads(config.get_json(path))
+
+
+@pytest.mark.parametrize(
+    "config", [client_config(["tcp/127.0.0.1:1"]), router_config(["tcp/127.0.0.1:1"], ["tcp/h:2"])]
+)
+def test_nothing_is_discovered_and_no_memory_is_shared(config: zenoh.Config) -> None:
+    assert setting(config, "scouting/multicast/enabled") is False
+    assert setting(config, "scouting/gossip/enabled") is False
+    assert setting(config, "transport/shared_memory/enabled") is False
+    assert setting(config, "transport/link/tx/lease") == 3000
+
+
+def test_services_are_clients_and_hubs_are_routers() -> None:
+    client, router = client_config(["tcp/a:1", "tcp/b:2"]), router_config(["tcp/c:3"], ["tcp/d:4"])
+    assert (setting(client, "mode"), setting(router, "mode")) == ("client", "router")
+    assert setting(client, "connect/endpoints") == ["tcp/a:1", "tcp/b:2"]
+    assert setting(client, "listen/endpoints") == []
+    assert setting(router, "listen/endpoints") == ["tcp/c:3"]
+    assert setting(router, "connect/endpoints") == ["tcp/d:4"]
+
+
+def test_a_router_that_is_there_is_joined_at_once(router: str) -> None:
+    opened = open_with_retry([router], threading.Event())
+    assert opened is not None
+    assert len(opened.info.routers_zid()) == 1
+    opened.close()
+
+
+def test_the_second_endpoint_serves_when_the_first_is_dead(router: str) -> None:
+    stop = threading.Event()
+    end = threading.Timer(3.0, stop.set)
+    end.start()
+    opened = open_with_retry(["tcp/127.0.0.1:1", router], stop)
+    end.cancel()
+    assert opened is not None
+    opened.close()
+
+
+def test_a_router_that_comes_later_is_joined_then(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "RETRY_S", (0.02,))
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    opened: list[zenoh.Session | None] = []
+    stop = threading.Event()
+    caplog.set_level(logging.WARNING)
+    waiting = threading.Thread(target=lambda: opened.append(open_with_retry([endpoint], stop)))
+    waiting.start()
+    try:
+        eventually(lambda: "Zenoh router not reached, trying again" in caplog.text)
+        assert opened == []
+        late = zenoh.open(router_config([endpoint]))
+        eventually(lambda: len(opened) == 1)
+    finally:
+        stop.set()
+        waiting.join()
+    assert opened[0] is not None
+    opened[0].close()
+    late.close()
+    # However often it tried, it said so once, and where.
+    warnings = [r for r in caplog.records if r.message.startswith("Zenoh router not reached")]
+    assert len(warnings) == 1
+    assert vars(warnings[0])["fields"]["router"] == endpoint
+
+
+def test_waiting_ends_soon_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "RETRY_S", (60.0,))
+    stop = threading.Event()
+    opened: list[zenoh.Session | None] = []
+    dead = ["tcp/127.0.0.1:1"]
+    waiting = threading.Thread(target=lambda: opened.append(open_with_retry(dead, stop)))
+    waiting.start()
+    eventually(waiting.is_alive)
+    began = time.monotonic()
+    stop.set()
+    waiting.join(timeout=10)
+    assert opened == [None]
+    assert time.monotonic() - began < 3
+
+
+def test_nothing_is_tried_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_open(_: zenoh.Config) -> zenoh.Session:
+        raise AssertionError("tried")
+
+    monkeypatch.setattr(zenoh, "open", no_open)
+    stop = threading.Event()
+    stop.set()
+    assert open_with_retry(["tcp/127.0.0.1:1"], stop) is None
+
+
+def test_two_routers_carry_what_one_is_told(router: str) -> None:
+    far_endpoint = f"tcp/127.0.0.1:{free_port()}"
+    far = zenoh.open(router_config([far_endpoint], [router]))
+    here, there = zenoh.open(client_config([router])), zenoh.open(client_config([far_endpoint]))
+    got: list[bytes] = []
+    there.declare_subscriber("a/b", lambda sample: got.append(sample.payload.to_bytes()))
+    publisher = here.declare_publisher("a/b")
+    try:
+        eventually(lambda: publisher.matching_status.matching)
+        publisher.put(b"x")
+        eventually(lambda: got == [b"x"])
+    finally:
+        for opened in (here, there, far):
+            opened.close()

@@ -1,0 +1,274 @@
+"""The vector-quantisation codec: packings, reserved index, damage, golden streams."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from builders.common import GOLDEN_FOLDER
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonarpost.codec.interface import Codec, StreamHeader
+from sonarpost.codec.vq.codebook import load
+from sonarpost.codec.vq.codec import IndexPacking, VqCodec, codebook_tag, pack_indices, unpack_indices
+from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
+from sonarpost.errors import ConfigError, StreamError
+
+GOLDEN = GOLDEN_FOLDER / "vq"
+PACKINGS = list(IndexPacking)
+
+
+@pytest.fixture(scope="module")
+def tiles() -> TileDatabase:
+    return load(GOLDEN / "small.tiles").tiles
+
+
+def picture(height_px: int, width_px: int) -> np.ndarray:
+    """A slope with a bright box and its shadow, in integers."""
+    rows, columns = np.mgrid[:height_px, :width_px]
+    image = 40 + (rows * 3 + columns * 5) % 97
+    image[height_px // 3 : height_px // 2, width_px // 4 : width_px // 2] = 240
+    image[height_px // 3 : height_px // 2, width_px // 2 : width_px * 3 // 4] = 3
+    return image.astype(np.uint8)
+
+
+def split(stream: bytes) -> tuple[bytes, bytes]:
+    """Header and body."""
+    size = StreamHeader.unpack(stream).size
+    return stream[:size], stream[size:]
+
+
+@pytest.mark.parametrize("packing", PACKINGS)
+@pytest.mark.parametrize("size", [(80, 80), (49, 113), (17, 31)])
+def test_golden_streams_are_written_and_read_for_ever(
+    tiles: TileDatabase, packing: IndexPacking, size: tuple[int, int]
+) -> None:
+    golden = bytes.fromhex((GOLDEN / f"{size[0]}x{size[1]}-{packing.value}.hex").read_text())
+    codec = VqCodec(tiles, packing)
+    assert codec.encode(picture(*size)).hex() == golden.hex()
+    expected = bytes.fromhex((GOLDEN / f"{size[0]}x{size[1]}-picture.hex").read_text())
+    decoded = codec.decode(golden)
+    assert decoded.image.tobytes() == expected
+    assert decoded.image.shape == size
+    assert not decoded.missing.any()
+    assert decoded.notes == ()
+
+
+def test_it_is_a_codec(tiles: TileDatabase) -> None:
+    codec = VqCodec(tiles)
+    assert isinstance(codec, Codec)
+    assert (codec.name, codec.codec_id, codec.model_hash) == ("vq", 0x10, tiles.identity)
+
+
+def test_the_papers_sizes_come_out() -> None:
+    tiles = TileDatabase.from_tiles(10, np.arange(0, 200, 2, dtype=np.uint8)[:, None].repeat(100, axis=1))
+    lengths = {packing: len(VqCodec(tiles, packing).encode(picture(140, 80))) - 4 for packing in PACKINGS}
+    assert lengths == {
+        IndexPacking.BITS14: 196,
+        IndexPacking.BYTES2: 224,
+        IndexPacking.BYTES3: 336,
+        IndexPacking.ASCII5: 560,
+    }
+
+
+@pytest.mark.parametrize("packing", PACKINGS)
+@given(data=st.data())
+@settings(max_examples=40, deadline=None)
+def test_packing_round_trips(packing: IndexPacking, data: st.DataObject) -> None:
+    values = data.draw(st.lists(st.integers(0, packing.max_index), min_size=1, max_size=40))
+    body = pack_indices(np.array(values, dtype=np.int64), packing)
+    assert len(body) == packing.body_length(len(values))
+    assert unpack_indices(body, len(values), packing).tolist() == values
+
+
+def test_packings_are_these_bytes() -> None:
+    values = np.array([1, 0x2ABC, 0], dtype=np.int64)
+    assert pack_indices(values, IndexPacking.BITS14).hex() == "0006abc00000"  # 14 + 14 + 14 bits, then 6 zero bits
+    assert pack_indices(values, IndexPacking.BYTES2).hex() == "00012abc0000"
+    assert pack_indices(values, IndexPacking.BYTES3).hex() == "000001002abc000000"
+    assert pack_indices(values, IndexPacking.ASCII5) == b"000011094000000"
+
+
+@pytest.mark.parametrize("packing", PACKINGS)
+def test_a_stored_tile_travels_as_its_number_plus_one(tiles: TileDatabase, packing: IndexPacking) -> None:
+    image = tiles.tiles[0].reshape(tiles.tile_px, tiles.tile_px).repeat(4, axis=0).repeat(4, axis=1)
+    codec = VqCodec(tiles, packing)
+    flat = np.tile(tiles.tiles[0].reshape(tiles.tile_px, -1), (4, 4))
+    stream = codec.encode(flat)
+    assert set(unpack_indices(split(stream)[1], 16, packing).tolist()) == {1}
+    assert np.array_equal(codec.decode(stream).image, flat)
+    assert codec.encode(image) != stream
+
+
+@pytest.mark.parametrize("packing", PACKINGS)
+def test_zero_padding_is_black_and_missing_never_tile_0(tiles: TileDatabase, packing: IndexPacking) -> None:
+    codec = VqCodec(tiles, packing)
+    stream = codec.encode(picture(80, 40))
+    header, body = split(stream)
+    half = len(body) // 2
+    decoded = codec.decode(header + body[:half] + bytes(len(body) - half))
+    whole = codec.decode(stream)
+    # Indices are in raster order: the first half of the body is the top half of the picture.
+    assert np.array_equal(decoded.image[:40], whole.image[:40])
+    assert not decoded.missing[:40].any()
+    assert decoded.missing[40:].all()
+    assert not decoded.image[40:].any()
+    assert "reserved index 0" in decoded.notes[0]
+
+
+@pytest.mark.parametrize("packing", PACKINGS)
+def test_an_index_above_the_last_tile_is_black_and_missing(tiles: TileDatabase, packing: IndexPacking) -> None:
+    codec = VqCodec(tiles, packing)
+    stream = codec.encode(picture(20, 30))
+    header, body = split(stream)
+    indices = unpack_indices(body, 6, packing)
+    indices[4] = len(tiles) + 1
+    decoded = codec.decode(header + pack_indices(indices, packing))
+    assert decoded.missing[10:, 10:20].all()
+    assert decoded.missing.sum() == 100
+    assert not decoded.image[decoded.missing].any()
+    assert "outside the catalogue" in decoded.notes[0]
+    indices[4] = len(tiles)
+    assert not codec.decode(header + pack_indices(indices, packing)).missing.any()
+
+
+@pytest.mark.parametrize("text", [b"12x45", b"    1", b"-0001", b"+0001", b"\xff" * 5, b"\x000001", b"1_000"])
+def test_ascii_that_is_not_five_digits_is_black_and_missing(tiles: TileDatabase, text: bytes) -> None:
+    codec = VqCodec(tiles, IndexPacking.ASCII5)
+    stream = codec.encode(picture(16, 16))
+    header, body = split(stream)
+    decoded = codec.decode(header + text + body[5:])
+    assert decoded.missing[:10, :10].all()
+    assert decoded.missing.sum() == 100
+    assert "damaged" in decoded.notes[0]
+
+
+@pytest.mark.parametrize("packing", PACKINGS)
+def test_a_tile_is_missing_if_any_byte_of_its_index_is(tiles: TileDatabase, packing: IndexPacking) -> None:
+    codec = VqCodec(tiles, packing)
+    stream = codec.encode(picture(16, 160))
+    header, sent = split(stream)
+    count, length = 32, len(sent)
+    whole = codec.decode(stream)
+    for lost_byte in range(length):
+        received = np.ones(length, dtype=np.bool_)
+        received[lost_byte] = False
+        body = bytearray(sent)
+        body[lost_byte] = 0
+        decoded = codec.decode(header + bytes(body), received)
+        touched = [i for i in range(count) if i * packing.bits // 8 <= lost_byte <= ((i + 1) * packing.bits - 1) // 8]
+        shown = [int(cut_tiles(decoded.missing.astype(np.uint8), 10)[i].max()) for i in range(count)]
+        assert [i for i in range(count) if shown[i]] == touched
+        assert not decoded.image[decoded.missing].any()
+        assert np.array_equal(decoded.image[~decoded.missing], whole.image[~decoded.missing])
+
+
+def test_a_short_body_and_trailing_bytes_are_told(tiles: TileDatabase) -> None:
+    codec = VqCodec(tiles, IndexPacking.BYTES2)
+    stream = codec.encode(picture(20, 20))
+    short = codec.decode(stream[:-3])
+    assert short.missing.sum() == 200
+    assert "body ends after 5 of 8 B" in short.notes
+    assert "2 of 4 tiles did not arrive" in short.notes
+    longer = codec.decode(stream + b"\0\0\0")
+    assert not longer.missing.any()
+    assert longer.notes == ("3 B after the body ignored",)
+
+
+def test_a_catalogue_of_another_identity_is_named_with_both_tags(tiles: TileDatabase) -> None:
+    other = TileDatabase.from_tiles(tiles.tile_px, tiles.tiles[::-1])
+    stream = VqCodec(other).encode(picture(20, 20))
+    with pytest.raises(StreamError, match="another identity") as caught:
+        VqCodec(tiles).decode(stream)
+    assert f"{codebook_tag(other):#06x}" in str(caught.value)
+    assert f"{codebook_tag(tiles):#06x}" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"codec_id": 0x11}, "codec_id"),
+        ({"codec_id": 0x99}, "codec_id"),
+        ({"model_tag": 0}, "model_tag"),
+        ({"codec_id": 0x01, "model_tag": 0}, "codec_id"),
+        ({"codec_id": 0x20, "model_tag": 0}, "codec_id"),
+        ({"height_px": 15}, "height_px"),
+        ({"width_px": 513}, "width_px"),
+    ],
+)
+def test_a_header_that_does_not_fit_is_refused(tiles: TileDatabase, change: dict[str, int], field: str) -> None:
+    codec = VqCodec(tiles)
+    header = StreamHeader.unpack(codec.encode(picture(20, 20)))
+    with pytest.raises(StreamError) as caught:
+        codec.decode(dataclasses.replace(header, **change).pack() + bytes(16))
+    assert caught.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("height_px", "note"), [(41, "body ends after 14 of 18 B"), (10 + 6, "7 B after the body ignored")]
+)
+def test_a_header_with_another_height_shows_the_disagreement(tiles: TileDatabase, height_px: int, note: str) -> None:
+    codec = VqCodec(tiles)
+    header, body = split(codec.encode(picture(40, 20)))
+    wrong = dataclasses.replace(StreamHeader.unpack(header), height_px=height_px)
+    decoded = codec.decode(wrong.pack() + body)
+    assert decoded.image.shape == (height_px, 20)
+    assert note in decoded.notes
+    whole = codec.decode(header + body).image
+    assert np.array_equal(decoded.image[:16], whole[:16])
+
+
+@pytest.mark.parametrize("packing", PACKINGS)
+@pytest.mark.parametrize("size", [(80, 80), (140, 80), (81, 80), (17, 31), (512, 512)])
+def test_a_stream_starts_with_four_bytes_or_seven(
+    tiles: TileDatabase, packing: IndexPacking, size: tuple[int, int]
+) -> None:
+    header, _ = split(VqCodec(tiles, packing).encode(picture(*size)))
+    common = all(side in (80, 140, 512) for side in size)
+    assert len(header) == (4 if common else 7)
+    assert header[:3] == bytes([packing.codec_id]) + bytes.fromhex(tiles.identity[:4])
+
+
+def test_the_tag_is_the_same_for_every_packing_and_begins_the_identity(tiles: TileDatabase) -> None:
+    assert f"{codebook_tag(tiles):04x}" == tiles.identity[:4]
+    tags = {StreamHeader.unpack(VqCodec(tiles, packing).encode(picture(20, 20))).model_tag for packing in PACKINGS}
+    assert tags == {codebook_tag(tiles)}
+
+
+@pytest.mark.parametrize("received", [np.ones(6, np.bool_), np.ones((7, 1), np.bool_), np.ones(7, np.uint8)])
+def test_a_mask_of_another_shape_or_type_is_refused(tiles: TileDatabase, received: np.ndarray) -> None:
+    codec = VqCodec(tiles)
+    with pytest.raises(StreamError, match="received"):
+        codec.decode(codec.encode(picture(20, 20)), received)
+
+
+def test_a_budget_is_met_or_refused(tiles: TileDatabase) -> None:
+    codec = VqCodec(tiles)
+    needed = len(codec.encode(picture(40, 40)))
+    assert len(codec.encode(picture(40, 40), needed)) == needed
+    with pytest.raises(StreamError, match=f"at least {needed} B"):
+        codec.encode(picture(40, 40), needed - 1)
+
+
+def test_a_body_a_half_frame_cannot_count_is_refused() -> None:
+    codec = VqCodec(TileDatabase.from_tiles(4, np.eye(16, dtype=np.uint8)), IndexPacking.ASCII5)
+    with pytest.raises(StreamError, match="81924"):
+        codec.encode(picture(512, 512))
+
+
+def test_more_tiles_than_the_packing_can_number_are_refused() -> None:
+    many = np.zeros((0x4000, 16), dtype=np.uint8)
+    database = TileDatabase.from_tiles(4, many)
+    with pytest.raises(ConfigError, match="wider packing"):
+        VqCodec(database, IndexPacking.BITS14)
+    assert VqCodec(database, IndexPacking.BYTES2).codec_id == 0x11
+    assert VqCodec(TileDatabase.from_tiles(4, many[1:])).codec_id == 0x10
+
+
+def test_every_packing_has_its_own_id_and_is_found_by_it() -> None:
+    ids = [packing.codec_id for packing in PACKINGS]
+    assert ids == [0x10, 0x11, 0x12, 0x13]
+    assert [IndexPacking.from_codec_id(number) for number in ids] == PACKINGS
+    assert IndexPacking.from_codec_id(0x14) is None

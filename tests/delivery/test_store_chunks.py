@@ -1,0 +1,110 @@
+"""Pieces of large records in the durable store: any order, twice, lost, damaged, too many."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import random
+
+import pytest
+from builders.store_steps import ORIGIN
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import ReceivedChunk
+
+
+def pieces(data: bytes, *cuts: int, seq: int = 1) -> list[ReceivedChunk]:
+    sha = hashlib.sha256(data).digest()
+    edges = [0, *cuts, len(data)]
+    return [ReceivedChunk(ORIGIN, seq, len(data), sha, a, data[a:b]) for a, b in itertools.pairwise(edges)]
+
+
+def add(store: Store, chunk: ReceivedChunk) -> bytes | int:
+    with store.transaction() as tx:
+        return tx.add_chunk(chunk)
+
+
+def partials(store: Store) -> int:
+    return len(store._query("SELECT 1 FROM partial"))
+
+
+@given(data=st.binary(min_size=1, max_size=60), seed=st.integers(0, 2**32))
+@settings(max_examples=30)
+def test_pieces_in_any_order_and_number_end_in_the_whole(
+    tmp_path_factory: pytest.TempPathFactory, data: bytes, seed: int
+) -> None:
+    """As a producer would: it sends pieces, some twice, some lost, and goes on where it is told to."""
+    folder, chance = tmp_path_factory.mktemp("pieces"), random.Random(seed)
+    store = Store(folder / "s.db")
+    sha = hashlib.sha256(data).digest()
+    offset: bytes | int = 0
+    for _ in range(1000):
+        assert isinstance(offset, int)
+        if chance.random() < 0.2:
+            store.close()
+            store = Store(folder / "s.db")
+        start = offset if chance.random() < 0.6 else chance.randrange(len(data))
+        offset = add(
+            store, ReceivedChunk(ORIGIN, 1, len(data), sha, start, data[start : start + chance.randint(1, 20)])
+        )
+        if isinstance(offset, bytes):
+            break
+    assert offset == data
+    assert partials(store) == 0
+    store.close()
+
+
+def test_a_piece_that_does_not_continue_is_told_where_to_go_on(store: Store) -> None:
+    first, second, third = pieces(b"0123456789", 4, 8)
+    assert add(store, second) == 0
+    assert add(store, first) == 4
+    assert add(store, first) == 4
+    assert add(store, third) == 4
+    assert add(store, second) == 8
+    assert add(store, third) == b"0123456789"
+
+
+def test_pieces_of_two_records_do_not_mix(store: Store) -> None:
+    a, b = pieces(b"aaaa", 2), pieces(b"bbbb", 2, seq=2)
+    assert add(store, a[0]) == add(store, b[0]) == 2
+    assert (add(store, a[1]), add(store, b[1])) == (b"aaaa", b"bbbb")
+
+
+def test_another_record_under_the_same_number_starts_anew(store: Store) -> None:
+    add(store, pieces(b"old record", 5)[0])
+    new = pieces(b"new record", 5)
+    assert add(store, new[1]) == 0
+    assert add(store, new[0]) == 5
+    assert add(store, new[1]) == b"new record"
+
+
+def test_a_damaged_record_starts_anew(store: Store) -> None:
+    first, second = pieces(b"0123456789", 5)
+    bad = ReceivedChunk(ORIGIN, 1, first.size, first.sha256, 0, b"0x234")
+    assert add(store, bad) == 5
+    assert add(store, second) == 0
+    assert partials(store) == 0
+    assert add(store, first) == 5
+    assert add(store, second) == b"0123456789"
+
+
+def test_accepting_a_record_forgets_its_pieces(store: Store) -> None:
+    add(store, pieces(b"0123456789", 5)[0])
+    with store.transaction() as tx:
+        tx.accept("k", b"0123456789", ORIGIN, 1)
+    assert partials(store) == 0
+
+
+def test_only_the_pieces_touched_last_are_kept(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sonarpost.delivery.transaction.PARTIALS_KEPT", 3)
+    firsts = {seq: pieces(b"0123456789", 4, seq=seq) for seq in range(1, 5)}
+    for seq in (1, 2, 3):
+        assert add(store, firsts[seq][0]) == 4
+    assert add(store, firsts[1][0]) == 4  # touched again
+    assert add(store, firsts[4][0]) == 4
+    assert partials(store) == 3
+    # The second went; its producer is told to begin again, and loses nothing by it.
+    assert add(store, firsts[2][1]) == 0
+    assert add(store, firsts[1][1]) == b"0123456789"

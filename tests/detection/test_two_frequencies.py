@@ -1,0 +1,151 @@
+"""Files of sonars of two frequencies give what the first frequency alone gives: places, sizes, pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builders.two_frequencies import read_both, with_second_frequency
+
+from sonarpost.cli.bench.detect_codecs import confidence_with
+from sonarpost.detection.contacts import detect
+from sonarpost.detection.ground_snippet import cut_ground_snippet, ground_projected_image
+from sonarpost.detection.plot import annotated_waterfall
+from sonarpost.detection.preprocess import preprocess
+from sonarpost.detection.settings import DetectorSettings
+from sonarpost.detection.snippet import cut_expanded, cut_snippet
+from sonarpost.detection.stream import StreamDetector, follows
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.sonar.ground_range import MAX_COLUMNS
+from sonarpost.sonar.survey import Side
+
+SAMPLES, RANGE_M = 512, 30.0
+SECOND = pytest.mark.parametrize(
+    ("samples", "range_m"),
+    [
+        pytest.param(SAMPLES, 10.0, id="shorter"),
+        pytest.param(SAMPLES, 90.0, id="longer"),
+        pytest.param(4 * SAMPLES, RANGE_M, id="finer"),
+        pytest.param(SAMPLES // 4, RANGE_M, id="coarser"),
+    ],
+)
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    return simulate_survey(
+        SurveySpec(seed=3, pings=400, samples=SAMPLES, range_m=RANGE_M, targets=4, clutter=0, seabed=SeabedKind.SAND)
+    )
+
+
+@SECOND
+def test_an_object_has_the_place_and_size_it_has_in_the_first_frequency_alone(samples, range_m, simulated, tmp_path):
+    alone, both = read_both(simulated.survey, tmp_path, samples, range_m)
+    found = detect(both)
+    assert len(found) == len(simulated.truth) == 4
+    for thing in simulated.truth:
+        # A highlight is the near face, so that it lies a little nearer than the object's middle.
+        slant_m = (thing.sample_index + 0.5) * RANGE_M / SAMPLES
+        (one,) = [d for d in found if d.side is thing.side and abs(d.slant_range_m - slant_m) < 0.4]
+        assert one.ping_index == pytest.approx(thing.ping, abs=10)
+        assert one.ground_range_m == pytest.approx(thing.ground_range_m, abs=0.7)
+        assert one.length_m == pytest.approx(thing.length_m, abs=0.5)
+        assert one.width_m == pytest.approx(thing.width_m, abs=0.6)
+        assert one.height_m == pytest.approx(thing.height_m, abs=0.15)
+    assert found == detect(alone)
+
+
+@SECOND
+def test_an_object_without_altitude_and_navigation_too(samples, range_m, make_survey, tmp_path):
+    survey = make_survey({}, navigation=False, altitude=False)
+    alone, both = read_both(survey, tmp_path, samples, range_m)
+    (found,) = detect(both)
+    assert found.slant_range_m == pytest.approx(250.5 * 20 / 512, abs=0.2)
+    assert found.width_m == pytest.approx(12 * 20 / 512, abs=0.2)
+    assert found.altitude_m == pytest.approx(3.0, abs=0.25)
+    assert (found,) == detect(alone)
+
+
+@SECOND
+def test_cells_are_those_of_the_first_frequency(samples, range_m, make_survey, tmp_path):
+    alone, both = (
+        preprocess(survey, Side.PORT, DetectorSettings())
+        for survey in read_both(make_survey({}), tmp_path, samples, range_m)
+    )
+    assert (both.cell_across_m, both.samples_per_cell) == (alone.cell_across_m, alone.samples_per_cell)
+    np.testing.assert_array_equal(both.level, alone.level)
+
+
+@SECOND
+@pytest.mark.parametrize("sample", [250, 505])
+def test_its_pictures_too(sample, samples, range_m, make_survey, tmp_path):
+    alone, both = read_both(make_survey({}), tmp_path, samples, range_m)
+    # At the recording's outer edge the window is shifted.
+    found = replace(detect(alone)[0], sample=sample)
+    for one, other in zip(
+        (cut_snippet(alone, found, 80, 140), cut_snippet(alone, found, 80, 1000)),
+        (cut_snippet(both, found, 80, 140), cut_snippet(both, found, 80, 1000)),
+        strict=True,
+    ):
+        assert (other.first_sample, other.target_column) == (one.first_sample, one.target_column)
+        np.testing.assert_array_equal(other.image16, one.image16)
+    np.testing.assert_array_equal(cut_expanded(both, found, 80, 140), cut_expanded(alone, found, 80, 140))
+    np.testing.assert_array_equal(cut_ground_snippet(both, found).image, cut_ground_snippet(alone, found).image)
+    np.testing.assert_array_equal(
+        ground_projected_image(both, found, 80, 140, 0.1), ground_projected_image(alone, found, 80, 140, 0.1)
+    )
+
+
+def test_a_second_frequency_of_long_range_does_not_forbid_small_pixels(make_survey, tmp_path):
+    alone, both = read_both(make_survey({}), tmp_path, 512, 8000.0)
+    (found,) = detect(alone)
+    pixel_m = 8000.0 / MAX_COLUMNS / 2
+    picture = ground_projected_image(alone, found, 8, 14, pixel_m)
+    assert picture is not None
+    np.testing.assert_array_equal(ground_projected_image(both, found, 8, 14, pixel_m), picture)
+
+
+def test_a_sample_that_only_the_second_frequency_has_is_not_of_the_survey(make_survey):
+    survey = make_survey({})
+    found = replace(detect(survey)[0], sample=600)
+    with pytest.raises(ValueError, match="512 samples"):
+        cut_snippet(with_second_frequency(survey, 1024, 20.0), found)
+
+
+@SECOND
+def test_contacts_are_drawn_where_they_are(samples, range_m, make_survey, tmp_path):
+    alone, both = read_both(make_survey({}), tmp_path, samples, range_m)
+    pictures = [np.asarray(annotated_waterfall(survey, detect(survey))) for survey in (alone, both)]
+    np.testing.assert_array_equal(*pictures)
+
+
+@SECOND
+def test_a_line_of_several_files_too(samples, range_m, make_survey, tmp_path):
+    found = []
+    for survey in read_both(make_survey({}), tmp_path, samples, range_m):
+        detector = StreamDetector()
+        files = (replace(survey, pings=survey.pings[:98]), replace(survey, pings=survey.pings[98:]))
+        contacts = [contact for file in files for contact in detector.feed(file)] + list(detector.finish())
+        found.append([(contact.file, contact.ping, contact.detection) for contact in contacts])
+    assert found[0] == found[1] != []
+
+
+def test_files_whose_frequencies_change_places_are_not_one_line(make_survey):
+    survey = with_second_frequency(make_survey({}), 512, 10.0)
+    first, second = replace(survey, pings=survey.pings[:98]), replace(survey, pings=survey.pings[98:])
+    assert follows(first, second)
+    # Both sides' second channels come first: the picture would go on at another scale.
+    turned = tuple(replace(p, channels=(*p.channels[2:], *p.channels[:2])) for p in second.pings)
+    assert not follows(first, replace(second, pings=turned))
+
+
+@SECOND
+def test_a_coded_picture_is_put_back_into_the_first_frequency_alone(samples, range_m, make_survey, tmp_path):
+    alone, both = read_both(make_survey({}), tmp_path, samples, range_m)
+    (found,) = detect(alone)
+    cut = cut_snippet(alone, found, 80, 140)
+    confidence = confidence_with(alone, found, cut, cut.image)
+    assert confidence > 1.0
+    assert confidence_with(both, found, cut, cut.image) == confidence

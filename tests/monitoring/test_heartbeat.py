@@ -1,0 +1,178 @@
+"""A service's heartbeat file, and the check that a container engine makes of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from builders.common import eventually
+
+from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.messages import Health, Record
+from sonarpost.monitoring import healthcheck, heartbeat
+from sonarpost.monitoring.healthcheck import check, health_problem
+from sonarpost.monitoring.heartbeat import Heartbeat
+from sonarpost.runtime.service import Service, UnitOfWork
+
+NOW_S = 1000.0
+
+
+def health(state: str = "ok", detail: str = "", inbox: float = 0, handled: int = 0) -> Health:
+    return Health(
+        platform_id="vessel-1",
+        service="relay",
+        time_utc_s=0.0,
+        started_utc_s=0.0,
+        state=state,
+        detail=detail,
+        counters={"records_handled": handled},
+        gauges={"inbox": inbox, "outbox": 0.0, "refused": 0.0},
+    )
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "heartbeat.json"
+
+
+@pytest.fixture
+def heart(path: Path, tmp_path: Path) -> Heartbeat:
+    return Heartbeat(path, tmp_path, 5.0)
+
+
+def test_both_modules_name_the_same_variable() -> None:
+    assert heartbeat.VARIABLE == healthcheck.VARIABLE
+
+
+def test_a_service_that_beats_is_well(heart: Heartbeat, path: Path) -> None:
+    heart.beat(health(), NOW_S)
+    assert health_problem(path, NOW_S + 1) == ""
+    assert check({"SONARPOST_HEARTBEAT": str(path)}, NOW_S + 1) == (0, "well")
+
+
+def test_no_heartbeat_is_a_service_that_has_not_started(path: Path) -> None:
+    assert "has not started" in health_problem(path, NOW_S)
+
+
+def test_an_old_heartbeat_is_a_process_that_hangs(heart: Heartbeat, path: Path) -> None:
+    heart.beat(health(), NOW_S)
+    assert health_problem(path, NOW_S + 15.0) == ""
+    assert health_problem(path, NOW_S + 15.1).startswith("hangs: last heartbeat 15 s ago")
+
+
+def test_slow_beats_are_given_their_time(path: Path, tmp_path: Path) -> None:
+    Heartbeat(path, tmp_path, 60.0).beat(health(), NOW_S)
+    assert health_problem(path, NOW_S + 180.0) == ""
+    assert health_problem(path, NOW_S + 181.0).startswith("hangs")
+
+
+@pytest.mark.parametrize("state", ["degraded", "stopping"])
+def test_a_service_that_says_it_cannot_work_is_ill_with_its_own_words(heart: Heartbeat, path: Path, state: str) -> None:
+    heart.beat(health(state, "records cannot be stored"), NOW_S)
+    assert health_problem(path, NOW_S) == f"{state}: records cannot be stored"
+
+
+def test_records_that_wait_while_none_is_finished_are_a_stall(heart: Heartbeat, path: Path) -> None:
+    heart.beat(health(inbox=3, handled=1), NOW_S)
+    heart.beat(health(inbox=3, handled=1), NOW_S + 1800.0)
+    assert health_problem(path, NOW_S + 1800.0) == ""
+    heart.beat(health(inbox=4, handled=1), NOW_S + 1805.0)
+    assert health_problem(path, NOW_S + 1805.0) == "stalled: 4 records wait and none was finished for 1805 s"
+    heart.beat(health(inbox=4, handled=2), NOW_S + 1810.0)
+    assert health_problem(path, NOW_S + 1810.0) == ""
+
+
+def test_an_idle_service_has_not_stalled(heart: Heartbeat, path: Path) -> None:
+    heart.beat(health(handled=1), NOW_S)
+    heart.beat(health(handled=1), NOW_S + 9000.0)
+    heart.beat(health(inbox=1, handled=1), NOW_S + 9005.0)
+    assert health_problem(path, NOW_S + 9005.0) == ""
+
+
+def test_how_long_a_stall_may_last_is_configurable(heart: Heartbeat, path: Path) -> None:
+    heart.beat(health(inbox=1), NOW_S)
+    heart.beat(health(inbox=1), NOW_S + 10.0)
+    environment = {"SONARPOST_HEARTBEAT": str(path), "SONARPOST_STALLED_AFTER_S": "9"}
+    status, line = check(environment, NOW_S + 10.0)
+    assert (status, line[:8]) == (1, "stalled:")
+    assert check({**environment, "SONARPOST_STALLED_AFTER_S": "11"}, NOW_S + 10.0) == (0, "well")
+    assert check({**environment, "SONARPOST_STALLED_AFTER_S": "soon"}, NOW_S)[1].endswith(
+        "got 'soon', expected seconds"
+    )
+
+
+def test_a_full_disk_is_told_before_a_record_meets_it(
+    heart: Heartbeat, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heart.beat(health(), NOW_S)
+    monkeypatch.setattr(healthcheck, "MIN_FREE_BYTES", 1 << 62)
+    assert "B free, expected at least" in health_problem(path, NOW_S)
+
+
+def test_a_store_that_went_away_is_named(path: Path, tmp_path: Path) -> None:
+    Heartbeat(path, tmp_path / "gone", 5.0).beat(health(), NOW_S)
+    assert health_problem(path, NOW_S) == f"{tmp_path / 'gone'}: No such file or directory"
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"[]", b"{}", b"\xff", b'{"beat_monotonic_s": "x"}', b'{"beat_monotonic_s": []}']
+)
+def test_a_file_that_is_no_heartbeat_is_named(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+    assert str(path) in health_problem(path, NOW_S)
+    assert "expected a heartbeat file" in health_problem(path, NOW_S)
+
+
+def test_without_a_file_there_is_nothing_to_check() -> None:
+    status, line = check({}, NOW_S)
+    assert status == 1
+    assert line.startswith("SONARPOST_HEARTBEAT is not set")
+
+
+def test_a_heartbeat_that_cannot_be_written_is_told_once_and_stops_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    heart = Heartbeat(tmp_path / "no" / "heartbeat", tmp_path, 5.0)
+    heart.beat(health(), NOW_S)
+    heart.beat(health(), NOW_S + 5)
+    assert [record.getMessage() for record in caplog.records] == ["Heartbeat not written"]
+
+
+class Idle(Service[ServiceConfig]):
+    """Does nothing."""
+
+    NAME = "relay"
+
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+        raise AssertionError(key)
+
+
+def test_a_running_service_beats_and_the_command_finds_it_well(
+    platform: Callable[[str], PlatformConfig], path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(heartbeat.VARIABLE, str(path))
+    service = Idle(platform("vessel-1"), ServiceConfig())
+    assert service.start()
+    try:
+        eventually(path.exists, 10, "a heartbeat")
+        done = subprocess.run(
+            [sys.executable, "-m", "sonarpost.monitoring.healthcheck"],
+            env={**os.environ, heartbeat.VARIABLE: str(path)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert (done.returncode, done.stdout) == (0, "well\n")
+        service.problem("the disk is full")
+        eventually(
+            lambda: health_problem(path, time.monotonic()) == "degraded: the disk is full", 10, "the problem told"
+        )
+    finally:
+        service.stop()
+    assert json.loads(path.read_bytes())["state"] == "stopping"

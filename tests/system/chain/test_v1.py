@@ -1,0 +1,132 @@
+"""The chain with v1 in real processes: every preview through lossy water, detail by reports, orders to the vehicle."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+import zenoh
+from builders.chain import RunningChain
+
+from sonarpost import keys, wire
+from sonarpost.bus.session import open_with_retry
+from sonarpost.cli.demo.account import settle
+from sonarpost.cli.demo.settings import UUV, VESSEL
+from sonarpost.messages import Command
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.xtf_writer import write_xtf
+
+pytestmark = pytest.mark.chain
+
+StartChain = Callable[..., RunningChain]
+PICTURES = 6
+
+
+def whole(run: RunningChain) -> bool:
+    """All that was encoded is ashore, complete."""
+    encoded = run.watcher.encoded
+    return len(encoded) == PICTURES and all(i in run.watcher.shore and run.watcher.shore[i].complete for i in encoded)
+
+
+@pytest.mark.parametrize(
+    "killed",
+    [pytest.param(None, marks=pytest.mark.long), "op_modem", pytest.param("uuv_modem", marks=pytest.mark.long)],
+)
+def test_with_a_third_of_the_frames_lost_every_picture_is_ashore(start_chain: StartChain, killed: str | None) -> None:
+    run = start_chain(link="v1", loss=0.3)
+    run.deposit(PICTURES)
+    if killed is not None:
+        run.until(lambda: len(run.watcher.shore) >= 1, 60, "first preview ashore")
+        run.chain.kill(killed)
+        run.chain.start(killed)
+    run.until(lambda: len(run.watcher.shore) == PICTURES, 60, "every preview ashore")
+    run.until(lambda: whole(run), 120, "every picture ashore")
+    run.until_idle()
+    result = settle(run.settings, PICTURES, 0.0)
+    assert result.frames_lost > 0
+    assert result.images_vessel == result.images_shore == result.images_complete == PICTURES
+    assert result.sha256_match
+    assert result.missing_ashore == ()
+    assert all(image.codec == "emb" and image.missing_fraction == 0.0 for image in run.watcher.shore.values())
+
+
+@pytest.fixture
+def order():
+    """Publishes a command as a program on the vessel does that has no outbox."""
+    sessions: list[zenoh.Session] = []
+
+    def give(run: RunningChain, kind: str, image_id: str) -> None:
+        if not sessions:
+            session = open_with_retry([f"tcp/127.0.0.1:{run.settings.router_ports[1]}"], threading.Event())
+            assert session is not None
+            sessions.append(session)
+        key = keys.command(VESSEL, kind)
+        record = Command(
+            command_id=f"{kind}-{time.time_ns()}",
+            kind=kind,
+            vehicle_id=UUV,
+            image_id=image_id,
+            issued_by="test",
+            issued_utc_s=time.time(),
+        )
+        publisher = sessions[0].declare_publisher(key)
+        run.until(lambda: publisher.matching_status.matching, 20, f"subscriber of {key}")
+        publisher.put(wire.encode(record), encoding=wire.encoding_of(Command))
+        publisher.undeclare()
+
+    yield give
+    for session in sessions:
+        session.close()
+
+
+@pytest.mark.long
+def test_refining_brings_more_of_a_picture_first_from_uuv_modem_then_from_the_compressor(
+    start_chain: StartChain, order: Callable[[RunningChain, str, str], None]
+) -> None:
+    held = 700
+    run = start_chain(link="v1", loss=0.1, extra=(("compressor", f"refine_bytes = {held}"),))
+    begun = run.settings.stream_bytes
+    run.deposit(1)
+    run.until(lambda: len(run.watcher.encoded) == 1, 60, "the picture encoded")
+    [image_id] = run.watcher.encoded
+    assert len(run.watcher.encoded[image_id].stream) > 0.9 * held
+
+    def has(least: int, most: int) -> bool:
+        image = run.watcher.shore.get(image_id)
+        return image is not None and image.complete and least <= image.bytes_received <= most
+
+    # Unasked comes what is planned, and what fills the last frame.
+    run.until(lambda: has(begun, begun + 64), 60, "what is sent unasked ashore")
+    order(run, "refine", image_id)
+    run.until(lambda: has(held - 16, held), 60, "all that uuv_modem has ashore")
+    order(run, "refine", image_id)
+    run.until(lambda: has(int(1.9 * held), 2 * held + 2), 60, "what the compressor has made of it ashore")
+
+
+@pytest.mark.long
+def test_wider_brings_twice_the_ground_as_a_picture_of_its_own(
+    start_chain: StartChain, order: Callable[[RunningChain, str, str], None]
+) -> None:
+    run = start_chain(link="v1", loss=0.1, mode="survey")
+    survey = simulate_survey(SurveySpec(seed=1, pings=400, samples=1024, clutter=0)).survey
+    hidden = run.settings.incoming / ".line.xtf"
+    write_xtf(survey, hidden)
+    hidden.rename(run.settings.incoming / "line.xtf")
+    shore = run.watcher.shore
+    run.until(lambda: any(image.complete for image in shore.values()), 120, "a picture ashore")
+    run.until_idle()
+    before = set(shore)
+    first = next(image for image in shore.values() if image.complete)
+    order(run, "wider", first.image_id)
+    run.until(lambda: any(i not in before and shore[i].complete for i in shore), 120, "the wider picture ashore")
+    (wide_id,) = set(shore) - before
+    near, wide = run.watcher.encoded[first.image_id].contact, run.watcher.encoded[wide_id].contact
+    assert wide.contact_id == near.contact_id
+    assert wide.pixel_across_m == 2 * (near.pixel_across_m or 0.0) > 0
+    # By sound sizes go in steps of 2.5 %.
+    told = shore[wide_id].contact
+    assert told is not None
+    assert told.pixel_across_m == pytest.approx(wide.pixel_across_m, rel=0.03)
+    assert (told.lat_deg, told.lon_deg) == pytest.approx((near.lat_deg, near.lon_deg), abs=1e-6)

@@ -1,0 +1,208 @@
+"""The chain in containers, one story: it starts, carries pictures, is disturbed, stopped, upgraded, filled up.
+
+Each test goes on from where the one before it has left the chain, as a deployment would.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+from builders.compose import KILL, LOG_IN, SERVICES, Project, docker, until
+
+ARRIVAL_S = 120.0
+
+REACHES = """
+import concurrent.futures, socket
+def reach(target):
+    try:
+        socket.create_connection(target, timeout=3).close()
+    except OSError as error:
+        return f"no {{target[0]}} {{target[1]}} {{error}}"
+    return f"reached {{target[0]}} {{target[1]}}"
+with concurrent.futures.ThreadPoolExecutor(64) as pool:
+    print(*pool.map(reach, {targets}), sep="\\n")
+"""
+
+ROGUE = """
+import json, sys, zenoh
+try:
+    zenoh.open(zenoh.Config.from_json5(json.dumps({{
+        "mode": "client", "connect": {{"endpoints": ["{endpoint}"], "timeout_ms": 3000}},
+        "scouting": {{"multicast": {{"enabled": False}}}},
+        "transport": {{"link": {{"tls": {{"root_ca_certificate": "/var/lib/sonarpost/tls/ca.pem"}}}}}},
+    }})))
+    print("let in")
+except zenoh.ZError as error:
+    print("refused", error)
+"""
+
+
+def wait_for_surveys(project: Project, number: int) -> int:
+    """Wait until so many surveys are dealt with and their contacts are with the compressor; how many contacts."""
+    until(lambda: project.surveys_done() >= number, ARRIVAL_S, f"{number} surveys dealt with")
+    return project.contacts()
+
+
+def wait_ashore(project: Project, number: int) -> dict[str, str]:
+    """Wait until so many complete pictures are ashore; name to SHA-256."""
+    until(lambda: project.pictures("c2")[1] >= number, ARRIVAL_S, f"{number} pictures ashore")
+    pictures, complete = project.pictures("c2")
+    assert complete == len(pictures) == number
+    return pictures
+
+
+@pytest.mark.timeout(170)
+def test_every_container_is_well(project: Project) -> None:
+    project.wait_until_healthy()
+    assert project.state("pki")["State"]["ExitCode"] == 0  # type: ignore[index]
+
+
+@pytest.mark.timeout(170)
+def test_a_simulated_survey_is_ashore_as_it_is_aboard(project: Project) -> None:
+    contacts = wait_for_surveys(project, 1)
+    assert contacts >= 4  # as many mine-like objects as the simulator has put there
+    ashore = wait_ashore(project, contacts)
+    aboard, complete = project.pictures("decompressor")
+    assert aboard == ashore
+    assert complete == contacts
+
+
+def test_people_see_the_contacts_on_both_consoles_after_logging_in(project: Project) -> None:
+    contacts = project.contacts()
+    password = "not-a-secret-of-anybody"
+    for service, platform in (("console", "vessel"), ("console-shore", "shore")):
+        add = ["user", "add", "anna", "--role", "operator", "--config", f"/etc/sonarpost/{platform}.toml"]
+        add_user = ["sh", "-c", f"echo {password} | sonarpost console {' '.join(add)} --password-stdin"]
+        docker("exec", project.container(service), *add_user)
+        said = project.inside(service, LOG_IN.format(password=password))
+        assert json.loads(said) == [contacts, 401], service
+
+
+def test_no_container_has_more_rights_than_it_needs(project: Project) -> None:
+    for service in SERVICES:
+        state = project.state(service)
+        host = state["HostConfig"]
+        assert host["ReadonlyRootfs"], service  # type: ignore[index]
+        assert host["CapDrop"] == ["ALL"], service  # type: ignore[index]
+        assert host["RestartPolicy"]["Name"] == "unless-stopped", service  # type: ignore[index]
+        assert 0 < host["Memory"] <= 1 << 30, service  # type: ignore[index]
+        assert state["Config"]["User"] == "10001:10001", service  # type: ignore[index]
+
+
+def test_the_image_holds_no_key_and_no_compiler(project: Project) -> None:
+    script = (
+        "find / -xdev \\( -name '*.key' -o -name 'key.pem' -o -name 'gcc*' -o -name 'cc1' -o -name pip \\) "
+        "-not -path '/proc/*' -not -path '/usr/share/*' -not -path '/var/lib/dpkg/*' 2>/dev/null; true"
+    )
+    assert docker("run", "--rm", project.environment["SONARPOST_IMAGE"], "sh", "-c", script) == ""
+
+
+def test_the_vehicle_reaches_nothing_but_its_modems_line(project: Project) -> None:
+    others = ("router-vessel", "op_modem", "decompressor", "relay", "router-shore", "c2", "router-sim")
+    targets = [(a, p) for s in others for a in project.addresses(s).values() for p in (7447, 7448)]
+    # On the emulator's own address in the vessel's network, too.
+    targets += [(project.addresses("acoustic_channel")["vessel-line"], 4002)]
+    said = project.inside("uuv_modem", REACHES.format(targets=targets))
+    assert "reached" not in said
+    assert said.count("no ") == len(targets)
+    assert "reached water 4001" in project.inside("uuv_modem", REACHES.format(targets=[("water", 4001)]))
+    assert "reached" not in project.inside("atd_stub", REACHES.format(targets=[*targets, ("water", 4001)]))
+
+
+def test_the_shore_lets_in_nobody_without_a_certificate(project: Project) -> None:
+    shore = project.addresses("router-shore")["link"]
+    vessel = project.inside("router-vessel", REACHES.format(targets=[("router-shore", 7447), ("router-shore", 7448)]))
+    # In the clear it listens in the shore's own network only.
+    assert "no router-shore 7447" in vessel
+    assert "reached router-shore 7448" in vessel
+    # It even knows the fleet's authority.
+    options = ["--network", f"{project.name}_link", "-v", f"{project.name}_vessel-tls:/var/lib/sonarpost/tls:ro"]
+    for endpoint in (f"tls/{shore}:7448", f"tcp/{shore}:7448", "tls/router-shore:7448"):
+        rogue = docker(
+            "run",
+            "--rm",
+            *options,
+            project.environment["SONARPOST_IMAGE"],
+            "python",
+            "-c",
+            ROGUE.format(endpoint=endpoint),
+        )
+        assert rogue.startswith("refused"), endpoint
+
+
+@pytest.mark.timeout(175)
+def test_killed_services_come_back_and_lose_nothing(project: Project) -> None:
+    project.survey(2)
+    wait_for_surveys(project, 1)
+    starts = {}
+    for service in ("compressor", "decompressor", "relay", "c2", "router-vessel", "router-shore"):
+        starts[service] = project.state(service)["RestartCount"]
+        # The engine ends this look inside with the container.
+        project.inside(service, KILL, check=False)
+    contacts = wait_for_surveys(project, 2)
+    ashore = wait_ashore(project, contacts)
+    assert project.pictures("decompressor")[0] == ashore
+    for service, count in starts.items():
+        assert project.state(service)["RestartCount"] == count + 1, service  # type: ignore[operator]
+
+
+@pytest.mark.timeout(175)
+def test_a_link_cut_for_ten_seconds_delays_and_loses_nothing(project: Project) -> None:
+    before = project.pictures("c2")[1]
+    link, vessel = f"{project.name}_link", project.container("router-vessel")
+    docker("network", "disconnect", link, vessel)
+    try:
+        cut_at = time.monotonic()
+        project.survey(3)
+        contacts = wait_for_surveys(project, 3)
+        assert contacts > before
+        until(lambda: project.pictures("decompressor")[1] == contacts, ARRIVAL_S, "all pictures aboard")
+        until(lambda: time.monotonic() - cut_at > 10, 12, "ten seconds")
+        assert project.pictures("c2")[1] == before
+    finally:
+        docker("network", "connect", "--alias", "router-vessel", link, vessel)
+    ashore = wait_ashore(project, contacts)
+    assert project.pictures("decompressor")[0] == ashore
+
+
+@pytest.mark.timeout(178)
+def test_down_and_up_again_with_a_newer_image_loses_nothing(project: Project) -> None:
+    aboard, ashore = project.pictures("decompressor")[0], project.pictures("c2")[0]
+    project.compose("down", "-t", "5")
+    assert project.kept("vessel-pictures")[0] == aboard
+    assert project.kept("shore-pictures")[0] == ashore
+    image = project.environment["SONARPOST_IMAGE"]
+    upgrade = f"{image}-next"
+    # What a release changes: the image's identity.
+    container = docker("create", image).strip()
+    docker("commit", "--change", "LABEL release=next", container, upgrade)
+    docker("rm", container)
+    project.environment |= {"SONARPOST_IMAGE": upgrade, "VESSEL_PICTURES": "small-pictures"}
+    project.compose("up", "-d", "--no-build")
+    project.wait_until_healthy()
+    assert project.state("c2")["Config"]["Labels"]["release"] == "next"  # type: ignore[index]
+    assert project.pictures("c2")[0] == ashore
+    # The same surveys are known, and not sent again.
+    assert project.surveys_done() == 3
+
+
+@pytest.mark.timeout(178)
+def test_a_full_disk_is_told_and_nothing_is_lost_by_it(project: Project) -> None:
+    before = project.pictures("c2")[1]
+    ballast = "/var/lib/sonarpost/pictures/ballast"
+    project.inside(
+        "decompressor",
+        f"import os\nwith open('{ballast}', 'wb', buffering=0) as f:\n"
+        "    try:\n        while f.write(bytes(4096)) == 4096: pass\n    except OSError: pass",
+    )
+    project.survey(4)
+    contacts = wait_for_surveys(project, 4)
+    assert contacts > before
+    until(lambda: project.health("decompressor").startswith("unhealthy: degraded"), ARRIVAL_S, "the full disk told")
+    assert "No space left" in project.health("decompressor")
+    assert project.pictures("c2")[1] == before
+    project.inside("decompressor", f"import os; os.unlink('{ballast}')")
+    wait_ashore(project, contacts)
+    project.wait_until_healthy(("decompressor",))

@@ -1,0 +1,118 @@
+"""The compose file says of every service what it must, and .env.example knows every variable."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import tomllib
+
+import pytest
+from builders.common import REPOSITORY
+
+from sonarpost.config import SERVICES
+
+COMPOSE = REPOSITORY / "docker-compose.yml"
+PLATFORMS = {"uuv": "uuv", "vessel": "vessel", "shore": "shore", "sim": "sim"}
+
+
+def variables(text: str) -> dict[str, str]:
+    """Return the variables of a compose file and what each has by default."""
+    return dict(re.findall(r"\$\{([A-Z_]+):?-?([^}]*)\}", text))
+
+
+def blocks() -> dict[str, str]:
+    """Return the text of each service in the compose file."""
+    text = re.sub(r"^ *#.*\n", "", COMPOSE.read_text(), flags=re.MULTILINE)
+    services = text.split("\nservices:\n")[1].split("\nnetworks:\n")[0]
+    parts = re.split(r"^  ([a-z_0-9-]+):\n", services, flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def joins(block: str) -> str:
+    """Return what a service's text says of networks."""
+    return "".join(block.partition("networks:")[1:])
+
+
+def test_every_service_of_the_chain_runs_with_its_platforms_file() -> None:
+    for service in SERVICES:
+        block = blocks()[service]
+        [(platform, name)] = re.findall(r"command: \[(\w+), (\w+)\]", block)
+        assert name == service
+        assert f"profiles: [{PLATFORMS[platform]}]" in block
+        written = tomllib.loads((REPOSITORY / "config" / f"{platform}.toml").read_text())
+        assert service in written
+
+
+def test_networks_of_platforms_lead_nowhere_and_only_routers_meet() -> None:
+    text = COMPOSE.read_text()
+    networks = text.split("\nnetworks:\n")[1].split("\nvolumes:\n")[0]
+    inside = re.findall(r"^  ([a-z-]+): \{ internal: true \}$", networks, flags=re.MULTILINE)
+    assert set(inside) == {"uuv", "uuv-line", "vessel", "vessel-line", "shore", "sim"}
+    on_link = [name for name, block in blocks().items() if re.search(r"\blink\b", joins(block))]
+    assert on_link == ["router-vessel", "router-shore"]
+    assert [name for name, block in blocks().items() if "ports:" in block] == [
+        "console",
+        "router-shore",
+        "console-shore",
+    ]
+    for name in ("console", "console-shore"):
+        # Pages are served to this host alone unless somebody says otherwise.
+        assert re.search(r'ports: \["\$\{\w+:-127\.0\.0\.1:\d+\}:8470"\]', blocks()[name]), name
+    for name, block in blocks().items():
+        if "profiles: [uuv]" in block:
+            assert joins(block), name
+            assert not re.search("vessel|shore|link", joins(block)), name
+
+
+def test_every_variable_is_in_the_example_with_its_default() -> None:
+    example = (REPOSITORY / ".env.example").read_text()
+    known = dict(re.findall(r"^#?([A-Z_]+)=(.*?)(?:[ ]+#.*)?$", example, flags=re.MULTILINE))
+    used = variables(COMPOSE.read_text()) | variables((REPOSITORY / "docker-compose.modem.yml").read_text())
+    assert set(used) <= set(known)
+    assert set(known) - set(used) == {"COMPOSE_FILE"}
+    # Where a value is an example rather than the default, the comment says so.
+    same = {name for name, default in used.items() if known[name].strip() == default}
+    assert {"SONARPOST_IMAGE", "ROUTER_IMAGE", "SHORE_PUBLISH", "SIM_TIME_SCALE", "LOG_LEVEL", "CODEC"} <= same
+
+
+def test_the_dockerfile_and_the_compose_file_name_the_same_base() -> None:
+    [base] = re.findall(r"^ARG BASE=(\S+)$", (REPOSITORY / "Dockerfile").read_text(), flags=re.MULTILINE)
+    assert variables(COMPOSE.read_text())["SONARPOST_BASE"] == base
+    assert not base.endswith((":latest", "debian"))
+    assert re.search(r":\d+\.\d+\.\d+$", variables(COMPOSE.read_text())["ROUTER_IMAGE"])
+
+
+def compose_commands() -> list[list[str]]:
+    found = []
+    if shutil.which("docker"):
+        version = subprocess.run(["docker", "compose", "version"], capture_output=True, check=False)
+        if version.returncode == 0:
+            found.append(["docker", "compose"])
+    if (path := shutil.which("docker-compose")) is not None:
+        found.append([path])
+    return found
+
+
+@pytest.mark.parametrize("files", [["docker-compose.yml"], ["docker-compose.yml", "docker-compose.modem.yml"]])
+def test_compose_accepts_the_files(files: list[str]) -> None:
+    commands = compose_commands()
+    if not commands:
+        pytest.skip("neither `docker compose` nor docker-compose is installed")
+    for command in commands:
+        options = [option for file in files for option in ("-f", file)]
+        profiles = [option for profile in PLATFORMS for option in ("--profile", profile)]
+        done = subprocess.run(
+            [*command, *options, *profiles, "config", "--services"],
+            cwd=REPOSITORY,
+            env={**os.environ, "COMPOSE_DISABLE_ENV_FILE": "1"},
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        assert set(done.stdout.split()) >= {*SERVICES, "router-uuv", "router-vessel", "router-shore", "pki"}
+        assert json.dumps(done.stderr).count("level=warning") == 0

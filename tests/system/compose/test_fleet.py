@@ -1,0 +1,146 @@
+"""The script that makes the fleet's certificates for the containers."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import json
+import stat
+import sys
+import tarfile
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from builders.common import REPOSITORY
+
+from sonarpost.bus import router
+from sonarpost.errors import ConfigError
+from sonarpost.security.fleet import Fleet
+from sonarpost.security.index import FleetIndex
+
+FILES = {"ca.pem": 0o644, "certificate.pem": 0o644, "key.pem": 0o600, "router.json5": 0o644}
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    # Its name has no .py: it is a command.
+    loader = SourceFileLoader("fleet_script", str(REPOSITORY / "packaging" / "bin" / "sonarpost-fleet"))
+    spec = importlib.util.spec_from_loader(loader.name, loader)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    for name in ("pki", "tls/shore", "tls/vessel"):
+        (tmp_path / name).mkdir(parents=True)
+    return tmp_path
+
+
+def test_one_host_gets_what_both_routers_need(script: ModuleType, root: Path) -> None:
+    assert script.run(["make"], {}, root) == 0
+    for platform, listens in (("shore", "shore-1"), ("vessel", "vessel-1")):
+        folder = root / "tls" / platform
+        assert {path.name: stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == FILES
+        config = router.load(folder / "router.json5", [], [], [])
+        assert json.loads(config.get_json("metadata"))["platform"] == listens
+        assert json.loads(config.get_json("listen/endpoints")) == ["tcp/router:7447", "tls/0.0.0.0:7448"]
+        assert json.loads(config.get_json("access_control/default_permission")) == "deny"
+    connect = json.loads(
+        router.load(root / "tls" / "vessel" / "router.json5", [], [], []).get_json("connect/endpoints")
+    )
+    assert connect == ["tls/router-shore:7448"]
+
+
+def test_a_second_time_changes_no_certificate(script: ModuleType, root: Path) -> None:
+    script.run(["make"], {}, root)
+    before = (root / "tls" / "vessel" / "certificate.pem").read_bytes()
+    script.run(["make"], {"FLEET_OBSERVERS": "desk-1"}, root)
+    assert (root / "tls" / "vessel" / "certificate.pem").read_bytes() == before
+    assert "desk-1" in (root / "tls" / "shore" / "router.json5").read_text()
+
+
+def test_a_renewed_certificate_is_the_one_laid_out(script: ModuleType, root: Path) -> None:
+    script.run(["make"], {}, root)
+    before = (root / "tls" / "vessel" / "certificate.pem").read_bytes()
+    assert script.run(["pki", "renew", "vessel-1"], {}, root) == 0
+    script.run(["make"], {}, root)
+    assert (root / "tls" / "vessel" / "certificate.pem").read_bytes() != before
+
+
+def test_a_revoked_platform_gets_nothing_by_itself(
+    script: ModuleType, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script.run(["make"], {}, root)
+    script.run(["pki", "revoke", "vessel-1"], {}, root)
+    script.run(["make"], {}, root)
+    assert list((root / "tls" / "vessel").iterdir()) == []
+    assert "vessel-1: revoked" in capsys.readouterr().out
+    assert '"vessel-1"' not in (root / "tls" / "shore" / "router.json5").read_text()
+    with pytest.raises(ConfigError, match="a platform with a certificate"):
+        script.Depot(root, script.Plan.from_environment({})).files("vessel-1")
+
+
+def test_a_bundle_carries_a_vessel_to_its_own_host(
+    script: ModuleType, root: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment = {"FLEET_VESSELS": "vessel-1 vessel-2", "SHORE_HOST": "c2.example", "SHORE_PORT": "9448"}
+    script.run(["make"], environment, root)
+    archive = script.pack(script.Depot(root, script.Plan.from_environment(environment)).files("vessel-2"))
+    aboard = tmp_path_factory.mktemp("aboard")
+    (aboard / "tls" / "vessel").mkdir(parents=True)
+    monkeypatch.setattr(sys, "stdin", type("In", (), {"buffer": io.BytesIO(archive)}))
+    assert script.run(["install"], {}, aboard) == 0
+    folder = aboard / "tls" / "vessel"
+    assert {path.name: stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == FILES
+    config = router.load(folder / "router.json5", [], [], [])
+    assert json.loads(config.get_json("connect/endpoints")) == ["tls/c2.example:9448"]
+    index = FleetIndex.read(root / "pki" / "fleet")
+    shore = index.current("shore-1")
+    assert shore is not None
+    assert shore.hosts == ("c2.example",)
+
+
+def tar_of(name: str, kind: bytes = tarfile.REGTYPE) -> bytes:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w") as archive:
+        entry = tarfile.TarInfo(name)
+        entry.type = kind
+        archive.addfile(entry)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"not a tar", tar_of("../../etc/passwd"), tar_of("key.pem", tarfile.SYMTYPE), tar_of("ca.pem")]
+)
+def test_anything_else_than_a_bundle_is_refused(script: ModuleType, data: bytes) -> None:
+    with pytest.raises(ConfigError, match="bundle"):
+        script.unpack(data)
+
+
+def test_what_is_wrong_in_the_environment_is_named(script: ModuleType) -> None:
+    with pytest.raises(ConfigError, match="SHORE_PORT: got 'x'"):
+        script.Plan.from_environment({"SHORE_PORT": "x"})
+    with pytest.raises(ConfigError, match="observer: got 'vessel-1', expected a name that no vessel has"):
+        script.Plan.from_environment({"FLEET_OBSERVERS": "vessel-1"})
+
+
+def test_unknown_arguments_are_answered_with_the_known_ones(
+    script: ModuleType, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert script.run(["mak"], {}, root) == 2
+    assert "got 'mak'" in capsys.readouterr().err
+
+
+def test_the_authority_is_made_once(script: ModuleType, root: Path) -> None:
+    script.run(["make"], {}, root)
+    key = (root / "pki" / "fleet" / "ca.key").read_bytes()
+    script.run(["make"], {}, root)
+    assert (root / "pki" / "fleet" / "ca.key").read_bytes() == key
+    assert Fleet(root / "pki" / "fleet", lambda: b"").authority_days_left() > 3000

@@ -1,0 +1,92 @@
+"""The example as a process of its own: a router, c2 and the example, as on shore; it knows nothing of sonarpost."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from builders.common import REPOSITORY, eventually, free_port
+from builders.exports import decision, image
+from PIL import Image
+
+from sonarpost import keys, wire
+from sonarpost.bus.session import client_config
+from sonarpost.config import PlatformConfig
+from sonarpost.messages import Decision, Pixels, ReconstructedImage, Relayed
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
+
+EXAMPLE = REPOSITORY / "examples" / "shore_subscriber.py"
+
+
+@pytest.fixture
+def router() -> Iterator[str]:
+    """A router in a process of its own."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    command = [sys.executable, "-m", "sonarpost.bus.router", "--listen", endpoint]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+
+        def answers() -> bool:
+            try:
+                zenoh.open(client_config([endpoint])).close()
+            except zenoh.ZError:
+                return False
+            return True
+
+        eventually(answers, what="router")
+        yield endpoint
+        process.terminate()
+
+
+@pytest.fixture
+def c2(router: str, platform: Callable[[str], PlatformConfig], tmp_path: Path) -> Iterator[C2Service]:
+    service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out"))
+    assert service.start()
+    yield service
+    service.stop()
+
+
+def relay(c2: C2Service, record: ReconstructedImage | Decision) -> None:
+    is_image = isinstance(record, ReconstructedImage)
+    key = keys.image_reconstructed("vessel-1") if is_image else keys.contact_decision("vessel-1")
+    envelope = Relayed(vessel_id="vessel-1", key=key, payload=wire.encode(record), relayed_utc_s=1.0)
+    c2.session.put(keys.shore_inbox("vessel-1"), wire.encode(envelope))
+
+
+def test_it_is_twenty_lines_with_zenoh_and_msgpack_alone() -> None:
+    text = EXAMPLE.read_text()
+    assert len(text.splitlines()) <= 20
+    modules = set(re.findall(r"^(?:import|from) (\w+)", text, re.MULTILINE))
+    assert modules - set(sys.stdlib_module_names) == {"zenoh", "msgpack"}
+
+
+def test_it_prints_contacts_and_decisions_and_saves_pictures(router: str, c2: C2Service, tmp_path: Path) -> None:
+    saved = tmp_path / "saved"
+    saved.mkdir()
+    wide = np.array([[0, 255, 256], [40_000, 65_535, 1]], np.uint16)
+    grey = np.arange(6, dtype=np.uint8).reshape(2, 3)
+    publisher = c2.session.declare_publisher(keys.shore_image("vessel-1"))
+    command = [sys.executable, "-I", str(EXAMPLE), router, str(saved)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        eventually(lambda: publisher.matching_status.matching, what="the example's subscription")
+        relay(c2, image("0001", picture=Pixels.from_array(wide)))
+        relay(c2, image("0002", picture=Pixels.from_array(grey), version=2).model_copy(update={"contact": None}))
+        relay(c2, decision("0001", verdict="mine_like"))
+        assert process.stdout is not None
+        lines = [process.stdout.readline() for _ in range(3)]
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=10)
+    assert lines[0].startswith("reconstructed_image uuv-1 0001 None {'contact_id': 'uuv-1/0001'")
+    assert "'lat_deg': 41.52513339" in lines[0]
+    assert lines[1:] == ["reconstructed_image uuv-1 0002 None None\n", "decision uuv-1 0001 mine_like None\n"]
+    found = {path.name: np.asarray(Image.open(path)) for path in saved.iterdir()}
+    assert sorted(found) == ["uuv-1_1476262801_0001_v1.pgm", "uuv-1_1476262801_0002_v2.pgm"]
+    np.testing.assert_array_equal(found["uuv-1_1476262801_0001_v1.pgm"], wide)
+    np.testing.assert_array_equal(found["uuv-1_1476262801_0002_v2.pgm"], grey)

@@ -1,0 +1,80 @@
+"""Fuzz the decoding of codec streams, guided by coverage of the Python code (Atheris, on libFuzzer).
+
+    python -m pip install 'sonarpost[fuzz]'       # x86-64 and Python 3.11 to 3.13: Atheris has no other wheels
+    python tests/system/fuzz/run_atheris.py --codecs emb -max_total_time=180
+
+Options with one dash are libFuzzer's; without any it runs until it finds something or is stopped. It begins with the
+golden streams and new ones, whole and as bodies behind a good header. What it found of interest is kept in
+`build/fuzz/<codecs>`, an input that fails is written to the current folder: `run_atheris.py --codecs emb crash-…`
+repeats it.
+
+emb's machine code is compiled with bounds checks here, so that an index outside an array is an error and not a stray
+read; it is not instrumented, nor are the libraries behind the other codecs. libFuzzer holds each input to 10 s and the
+process to 2 GiB.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[3]
+WORK = ROOT / "build" / "fuzz"
+os.environ.setdefault("NUMBA_BOUNDSCHECK", "1")
+os.environ.setdefault("NUMBA_CACHE_DIR", str(WORK / "numba"))
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "common")]
+
+try:
+    import atheris
+except ImportError:
+    sys.exit("run_atheris: Atheris is not installed here: python -m pip install 'sonarpost[fuzz]'")
+
+# Functions that numba compiles must not be instrumented.
+COMPILED = [
+    "sonarpost.codec.vq.tile_search",
+    *(f"sonarpost.codec.emb.{name}" for name in ("aim", "enhance", "fit", "kernel", "likeness", "transform")),
+]
+
+with atheris.instrument_imports(include=["sonarpost", "fuzz"], exclude=COMPILED):
+    from builders.codec_oracle import check, codec_for, codec_ids, stream_of
+    from builders.fuzz_seeds import as_input, golden_streams, new_streams
+
+    from sonarpost.codec.emb import codec as emb  # noqa: F401
+    from sonarpost.codec.vq import codec as vq  # noqa: F401
+
+MAX_INPUT_BYTES = 1200
+DEFAULTS = {"-max_len": MAX_INPUT_BYTES, "-timeout": 10, "-rss_limit_mb": 2048, "-print_final_stats": 1}
+
+
+def main() -> None:
+    """Run until libFuzzer ends the process."""
+    arguments = sys.argv[1:]
+    names = None
+    if "--codecs" in arguments:
+        place = arguments.index("--codecs")
+        names = arguments[place + 1].split(",")
+        del arguments[place : place + 2]
+    ids = codec_ids(names)
+    corpus = WORK / ("-".join(names) if names else "all")
+    corpus.mkdir(parents=True, exist_ok=True)
+    if not any(Path(argument).is_file() for argument in arguments):
+        streams = [*golden_streams(ids), *new_streams(ids)]
+        for number, stream in enumerate(streams):
+            for flags in range(4):
+                (corpus / f"seed-{number:03}-{flags}").write_bytes(as_input(stream, flags, ids)[:MAX_INPUT_BYTES])
+        arguments.append(str(corpus))
+    for codec_id in ids:
+        codec_for(codec_id)  # what is loaded on first use is not an input's time
+
+    def test_one_input(data: bytes) -> None:
+        stream, received = stream_of(data, ids)
+        check(stream, received, ids)
+
+    options = [f"{name}={value}" for name, value in DEFAULTS.items() if not any(a.startswith(name) for a in arguments)]
+    atheris.Setup([sys.argv[0], *options, *arguments], test_one_input)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

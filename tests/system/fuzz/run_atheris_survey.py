@@ -1,0 +1,52 @@
+"""Fuzz the survey readers, guided by coverage of the Python code (Atheris, on libFuzzer).
+
+    python -m pip install 'sonarpost[fuzz]'       # x86-64 and Python 3.11 to 3.13: Atheris has no other wheels
+    python tests/system/fuzz/run_atheris_survey.py -max_total_time=180
+
+Options with one dash are libFuzzer's. An input's first byte says which file it is (`survey_oracle.FILES`), the rest is
+the file. It begins with whole recordings; what it found of interest is kept in `build/fuzz/survey`, an input that
+fails is written to the current folder, and `run_atheris_survey.py crash-…` repeats it.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[3]
+WORK = ROOT / "build" / "fuzz" / "survey"
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "common")]
+
+try:
+    import atheris
+except ImportError:
+    sys.exit("run_atheris_survey: Atheris is not installed here: python -m pip install 'sonarpost[fuzz]'")
+
+with atheris.instrument_imports(include=["sonarpost.sonar", "fuzz"]):
+    from builders.survey_oracle import Readers
+
+DEFAULTS = {"-max_len": 4096, "-timeout": 10, "-rss_limit_mb": 2048, "-print_final_stats": 1}
+
+
+def main() -> None:
+    """Run until libFuzzer ends the process."""
+    arguments = sys.argv[1:]
+    WORK.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix="survey-", dir=WORK.parent))  # libFuzzer ends the process: it stays
+    readers = Readers(folder)
+    if not any(Path(argument).is_file() for argument in arguments):
+        for number, seed in enumerate(readers.seeds()):
+            (WORK / f"seed-{number}").write_bytes(seed)
+        arguments.append(str(WORK))
+
+    def test_one_input(data: bytes) -> None:
+        readers.check(data)
+
+    options = [f"{name}={value}" for name, value in DEFAULTS.items() if not any(a.startswith(name) for a in arguments)]
+    atheris.Setup([sys.argv[0], *options, *arguments], test_one_input)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

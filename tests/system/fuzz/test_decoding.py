@@ -1,0 +1,140 @@
+"""The fuzzer's check on a fixed set of inputs: damaged golden streams and random bodies, in bounded time and memory."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from builders.codec_oracle import check, codec_for, codec_ids, good_header, stream_of
+from builders.fuzz_seeds import as_input, golden_streams, new_streams
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonarpost.codec.interface import MAX_SIDE_PX, StreamHeader
+from sonarpost.codec.registry import default_registry
+
+NAMES = default_registry().names()
+MUTATIONS = 6
+MOST_CPU_S = 5.0
+"""Of processor time that any input may take; the slowest codec takes a tenth of it for the largest picture."""
+MOST_MIB = 200.0
+"""That all inputs together may add to what the process held at its peak before."""
+
+
+def damaged(stream: bytes, rng: np.random.Generator, others: list[bytes]) -> Iterator[bytes]:
+    """Yield the stream cut, with bits and bytes changed, bytes left out, doubled, and joined with another's."""
+    body = StreamHeader.unpack(stream).size
+    for number in range(MUTATIONS):
+        data = bytearray(stream)
+        first, last = sorted(rng.integers(0, len(data), 2).tolist())
+        match number % 6:
+            case 0:
+                del data[first:]
+            case 1:
+                data[int(rng.integers(0, len(data)))] ^= 1 << int(rng.integers(0, 8))
+            case 2:
+                data[first:last] = rng.integers(0, 256, last - first, dtype=np.uint8).tobytes()
+            case 3:
+                del data[first:last]
+            case 4:
+                data[first:first] = data[first : first + 40]
+            case _:
+                data[max(first, body) :] = others[int(rng.integers(0, len(others)))][first:]
+        yield bytes(data)
+
+
+def random_bodies(codec_id: int, rng: np.random.Generator) -> Iterator[bytes]:
+    """Yield bodies of noise, zeros and ones behind good headers, of the smallest to the largest picture."""
+    for height_px, width_px in ((16, 16), (33, 47), (MAX_SIDE_PX, MAX_SIDE_PX)):
+        header = good_header(codec_id, height_px, width_px).pack()
+        for length in (0, 1, 2, 3, 7, 60, 700):
+            yield header + rng.integers(0, 256, length, dtype=np.uint8).tobytes()
+            yield header + bytes([int(rng.choice((0, 0x7F, 0x80, 0xFF)))]) * length
+
+
+def peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def checked(stream: bytes, ids: tuple[int, ...], received: np.ndarray | None = None) -> str:
+    start_s = time.process_time()
+    outcome = check(stream, received, ids)
+    assert time.process_time() - start_s < MOST_CPU_S, (len(stream), stream[:16].hex())
+    return outcome
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_damaged_streams_are_refused_or_decode_in_bounded_time_and_memory(name: str) -> None:
+    rng, ids = np.random.default_rng(0), codec_ids([name])
+    streams = [stream for stream in (*golden_streams(ids), *new_streams(ids)) if len(stream) <= 1500]
+    assert streams
+    largest = good_header(ids[0], MAX_SIDE_PX, MAX_SIDE_PX).pack()
+    for start in (streams[0], largest + bytes(range(1, 200))):  # libraries and machine code take their room here
+        check(start, None, ids)
+    before_mib = peak_mib()
+    outcomes = Counter(checked(bad, ids) for stream in streams for bad in damaged(stream, rng, streams))
+    outcomes += Counter(checked(bad, ids) for codec_id in ids for bad in random_bodies(codec_id, rng))
+    assert peak_mib() - before_mib < MOST_MIB
+    assert outcomes["refused"] > 0
+    assert outcomes["whole"] + outcomes["concealed"] > 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_good_streams_are_whole_and_with_a_gap_never_raise_anything_else(name: str) -> None:
+    rng, ids = np.random.default_rng(1), codec_ids([name])
+    for stream in new_streams(ids):
+        assert check(stream, None, ids) == "whole"
+        length = len(stream) - StreamHeader.unpack(stream).size
+        first = int(rng.integers(0, length))
+        received = np.ones(length, dtype=np.bool_)
+        received[first : first + 1 + length // 3] = False
+        checked(stream, ids, received)
+
+
+@given(data=st.binary(max_size=120))
+@settings(max_examples=300, deadline=None)
+def test_random_bytes_are_refused_or_decode(data: bytes) -> None:
+    ids = codec_ids()
+    stream, received = stream_of(data, ids)
+    checked(stream, ids, received)
+
+
+def test_the_fuzzers_inputs_are_the_streams_they_are_made_from() -> None:
+    ids = codec_ids()
+    for codec_id in ids:
+        stream = next(s for s in new_streams([codec_id]) if StreamHeader.unpack(s).height_px != 17)
+        for flags in range(4):
+            read, received = stream_of(as_input(stream, flags, ids), ids)
+            assert read == stream
+            assert (received is None) == (flags < 2)
+            if received is not None:
+                assert np.flatnonzero(~received).tolist() == [3, 4]
+
+
+def test_the_check_finds_what_it_is_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A decoder that shows what it says is missing, one of another size, and one that raises anything else."""
+    from dataclasses import replace
+
+    codec, (codec_id,) = type(codec_for(0x04)), codec_ids(["spiht"])
+    stream = next(new_streams([codec_id]))
+    good = codec.decode
+
+    def shown(self: object, stream: bytes, received: object = None) -> object:
+        decoded = good(self, stream, received)
+        return replace(decoded, image=decoded.image | 1, missing=~decoded.missing)
+
+    def small(self: object, stream: bytes, received: object = None) -> object:
+        decoded = good(self, stream, received)
+        return replace(decoded, image=decoded.image[1:], missing=decoded.missing[1:])
+
+    def crashing(self: object, stream: bytes, received: object = None) -> object:
+        raise IndexError(len(stream))
+
+    for wrong, error in ((shown, AssertionError), (small, AssertionError), (crashing, IndexError)):
+        monkeypatch.setattr(codec, "decode", wrong)
+        with pytest.raises(error):
+            check(stream, None, [codec_id])

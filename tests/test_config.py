@@ -1,0 +1,410 @@
+"""Configuration files: every mistake is named with file, line and key; the environment overrides."""
+
+from __future__ import annotations
+
+import tomllib
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+from builders.common import REPOSITORY
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import Field, model_validator
+
+from sonarpost import config
+from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.errors import ConfigError
+from sonarpost.toml_lines import key_lines
+
+
+class Kind(StrEnum):
+    ONE = "one"
+    TWO = "two"
+
+
+class Part(ServiceConfig):
+    depth_m: float
+    name: str = ""
+
+
+class Table(ServiceConfig):
+    """A table with every kind of key that services have."""
+
+    out_dir: Path = Path("out")
+    poll_s: Annotated[float, Field(gt=0, le=60)] = 1.0
+    rate: Annotated[int, Field(ge=0, le=6)] = 1
+    loud: bool = False
+    kind: Kind = Kind.ONE
+    names: tuple[str, ...] = ()
+    by_address: dict[Annotated[str, Field(pattern="^[0-9]+$")], str] = Field(default_factory=dict)
+    airtime_s: dict[int, float] = Field(default_factory=dict)
+    part: tuple[Part, ...] = ()
+    quiet_dir: Path | None = None
+
+    @model_validator(mode="after")
+    def _goes_together(self) -> Table:
+        if self.loud and self.rate == 6:
+            raise ValueError("not loud at rate 6")
+        return self
+
+
+class Needy(ServiceConfig):
+    port: str
+
+
+def load(
+    tmp_path: Path, text: str, model: type[ServiceConfig] = Table, **environment: str
+) -> tuple[PlatformConfig, ServiceConfig]:
+    path = tmp_path / "vessel.toml"
+    path.write_text(text, encoding="utf-8")
+    return config.load(path, "relay", model, environment)
+
+
+def error(tmp_path: Path, text: str, model: type[ServiceConfig] = Table, **environment: str) -> ConfigError:
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, text, model, **environment)
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+PLATFORM = '[platform]\nid = "vessel-1"\n'
+
+
+def test_every_kind_of_value_is_taken(tmp_path: Path) -> None:
+    platform, table = load(
+        tmp_path,
+        PLATFORM + 'router = ["tcp/a:1", "tcp/b:2"]\nstate_dir = "/x"\nhealth_interval_s = 2\nlog_format = "json"\n'
+        '[relay]\nout_dir = "o"\npoll_s = 5\nrate = 6\nkind = "two"\nnames = ["a"]\nby_address = { 3 = "uuv-1" }\n'
+        'airtime_s = { 4 = 1, 1 = 2.5 }\n[[relay.part]]\ndepth_m = 1\n[[relay.part]]\ndepth_m = 2.5\nname = "n"\n'
+        '[c2]\nsomebody_elses = "concern"\n',
+    )
+    assert platform == PlatformConfig(
+        id="vessel-1",
+        router=("tcp/a:1", "tcp/b:2"),
+        state_dir=Path("/x"),
+        health_interval_s=2.0,
+        log_format="json",
+    )
+    assert table == Table(
+        out_dir=Path("o"),
+        poll_s=5.0,
+        rate=6,
+        kind=Kind.TWO,
+        names=("a",),
+        by_address={"3": "uuv-1"},
+        airtime_s={4: 1.0, 1: 2.5},
+        part=(Part(depth_m=1.0), Part(depth_m=2.5, name="n")),
+    )
+
+
+def test_absent_tables_mean_defaults(tmp_path: Path) -> None:
+    platform, table = load(tmp_path, PLATFORM)
+    assert table == Table()
+    assert (platform.router, platform.health_interval_s) == (("tcp/127.0.0.1:7447",), 5.0)
+
+
+# Mistakes: (text, line or None, key, what the message says)
+MISTAKES: dict[str, tuple[str, int | None, str, str]] = {
+    "unknown table": (PLATFORM + "\n[relais]\nx = 1\n", 4, "relais", "got 'an unknown table', expected platform, atd_"),
+    "unknown table below another": (PLATFORM + "[relais.a.b]\n", 3, "relais", "an unknown table"),
+    "key before any table": ("# c\nrate = 1\n" + PLATFORM, 2, "rate", "an unknown table"),
+    "a table that is a value": ("relay = 3\n" + PLATFORM, 1, "relay", "got 3, expected a table [relay]"),
+    "an array of tables": (PLATFORM + "[[relay]]\nrate = 1\n", 3, "relay", "expected a table [relay]"),
+    "unknown key": (
+        PLATFORM + "[relay]\nrate = 1\nrates = 2\n",
+        5,
+        "relay.rates",
+        "got 'an unknown key', expected one of",
+    ),
+    "unknown key in platform": (
+        '[platform]\nid = "a"\nnaem = 1\n',
+        3,
+        "platform.naem",
+        "health_interval_s, id, log_format",
+    ),
+    "wrong type": (PLATFORM + '[relay]\nrate = "1"\n', 4, "relay.rate", "got '1', expected a valid integer"),
+    "truth for a number": (PLATFORM + "[relay]\nrate = true\n", 4, "relay.rate", "got True, expected a valid integer"),
+    "real for whole": (PLATFORM + "[relay]\nrate = 1.0\n", 4, "relay.rate", "expected a valid integer"),
+    "number for text": (PLATFORM + "[relay]\nnames = [1]\n", 4, "relay.names.0", "got 1, expected a valid string"),
+    "number for truth": (PLATFORM + "[relay]\nloud = 1\n", 4, "relay.loud", "got 1, expected a valid boolean"),
+    "text for real": (PLATFORM + '[relay]\npoll_s = "1.0"\n', 4, "relay.poll_s", "expected a valid number"),
+    "not finite": (PLATFORM + "[relay]\npoll_s = nan\n", 4, "relay.poll_s", "expected a finite number"),
+    "out of range": (PLATFORM + "[relay]\nrate = 7\n", 4, "relay.rate", "got 7, expected less than or equal to 6"),
+    "not of an enumeration": (PLATFORM + '[relay]\nkind = "six"\n', 4, "relay.kind", "expected 'one' or 'two'"),
+    "a wrong key of a map": (
+        PLATFORM + '[relay]\nby_address = { x = "a" }\n',
+        4,
+        "relay.by_address.x",
+        "match pattern",
+    ),
+    "missing": (PLATFORM.replace("id", "log_level").replace("vessel-1", "info"), 1, "platform.id", "got 'nothing'"),
+    "missing without the table": ("[relay]\nrate = 1\n", None, "platform.id", "expected a value"),
+    "a wrong name": ('[platform]\nid = "Vessel 1"\n', 2, "platform.id", "match pattern"),
+    "values that do not go together": (PLATFORM + "[relay]\nloud = true\nrate = 6\n", 3, "relay", "not loud at rate 6"),
+    "after a long array": (
+        PLATFORM + '[relay]\nnames = [\n  "a", # ]\n  "[platform]",\n]\nrate = 9\n',
+        8,
+        "relay.rate",
+        "got 9",
+    ),
+    "inside a long array": (PLATFORM + '[relay]\nnames = [\n  "a",\n\n  2,\n]\n', 7, "relay.names.1", "got 2"),
+    "after a long string": (
+        PLATFORM + '[relay]\nout_dir = """\nrate = 1\n[c2]\n"""\nrate = 9\n',
+        8,
+        "relay.rate",
+        "got 9",
+    ),
+    "after a literal string": (
+        PLATFORM + "[relay]\nout_dir = '''\nrate = 1 \"\"\"\n'''\nrate = 9\n",
+        7,
+        "relay.rate",
+        "got 9",
+    ),
+    "with a quoted key": (PLATFORM + '["relay"]\n"rate" = 9\n', 4, "relay.rate", "got 9"),
+    "with an escaped key": (PLATFORM + '[relay]\n"r\\u0061te" = 9\n', 4, "relay.rate", "got 9"),
+    "with a literal key": (PLATFORM + "['relay']\n'rate'=9\n", 4, "relay.rate", "got 9"),
+    "with dots": ("relay.rate = 9\n" + PLATFORM, 1, "relay.rate", "got 9"),
+    "with dots and space": ('relay . "rate" = 9\n' + PLATFORM, 1, "relay.rate", "got 9"),
+    "dots within a table": (PLATFORM + "[relay]\n# c\nairtime_s.4 = true\n", 5, "relay.airtime_s.4", "got True"),
+    "an inline table": ("relay = { loud = true, rate = 9 }\n" + PLATFORM, 1, "relay.rate", "got 9"),
+    "an inline table further down": (
+        PLATFORM + '\n[relay]\nairtime_s = { 1 = 2, 4 = "x" }\n',
+        5,
+        "relay.airtime_s.4",
+        "'x'",
+    ),
+    "a table of its own": (
+        PLATFORM + "[relay]\nrate = 1\n[relay.airtime_s]\n1 = 2\n4 = true\n",
+        7,
+        "relay.airtime_s.4",
+        "True",
+    ),
+    "the second of an array of tables": (
+        PLATFORM + "[[relay.part]]\ndepth_m = 1\n[[relay.part]]\ndepth_m = 'deep'\n",
+        6,
+        "relay.part.1.depth_m",
+        "got 'deep'",
+    ),
+    "missing in the second": (
+        PLATFORM + "[[relay.part]]\ndepth_m = 1\n[[relay.part]]\nname = 'n'\n",
+        5,
+        "relay.part.1.depth_m",
+        "got 'nothing'",
+    ),
+    "unknown in the second": (
+        PLATFORM + "[relay]\npart = [\n  {depth_m = 1},\n  {depth_m = 1, colour = 2},\n]\n",
+        6,
+        "relay.part.1.colour",
+        "an unknown key",
+    ),
+    "after a comment with a key": (
+        PLATFORM + "[relay] # rate = 1\n#rate = 2\n  rate = 9 # x\n",
+        5,
+        "relay.rate",
+        "got 9",
+    ),
+    "with carriage returns": ((PLATFORM + "[relay]\nrate = 9\n").replace("\n", "\r\n"), 4, "relay.rate", "got 9"),
+    "without an end of line": (PLATFORM + "[relay]\nrate=9", 4, "relay.rate", "got 9"),
+}
+
+
+@pytest.mark.parametrize(("text", "line", "key", "message"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_is_named_with_file_line_and_key(
+    tmp_path: Path, text: str, line: int | None, key: str, message: str
+) -> None:
+    caught = error(tmp_path, text)
+    where = str(tmp_path / "vessel.toml")
+    assert caught.where == (where if line is None else f"{where}:{line}")
+    assert caught.field == key
+    assert message in str(caught)
+
+
+def test_a_missing_key_of_an_absent_table_is_named(tmp_path: Path) -> None:
+    caught = error(tmp_path, PLATFORM, Needy)
+    assert str(caught) == f"{tmp_path / 'vessel.toml'}: relay.port: got 'nothing', expected a value"
+
+
+def test_a_service_without_keys_says_so(tmp_path: Path) -> None:
+    caught = error(tmp_path, PLATFORM + "[relay]\nx = 1\n", ServiceConfig)
+    assert "expected no keys in this table" in str(caught)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[platform\n", "at line 1"),
+        ("[platform]\nid = \n", "at line 2"),
+        ("[platform]\nid = 'a'\nid = 'b'\n", "Cannot overwrite"),
+        ("x = " + "9" * 5000, "digits"),
+        ("x = " + "[" * 5000, "recursion"),
+        ("x = " + "[" * 5000 + "]" * 5000, "recursion"),
+        ("\ufeff[platform]\n", "at line 1"),
+    ],
+)
+def test_what_is_not_toml_is_refused_with_its_place(tmp_path: Path, text: str, message: str) -> None:
+    caught = error(tmp_path, text)
+    assert caught.expected == "valid TOML"
+    assert message in str(caught.value)
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"[platform]\nid = '\xff'\n")
+    for path, message in ((tmp_path / "absent", "No such file"), (tmp_path, "Is a directory"), (binary, "codec")):
+        with pytest.raises(ConfigError) as caught:
+            config.load(path, "relay", Table, {})
+        assert caught.value.where == str(path)
+        assert message in str(caught.value)
+        assert "a readable TOML file" in str(caught.value)
+
+
+@given(st.text(max_size=60))
+def test_any_text_is_a_configuration_or_a_config_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.toml"
+    path.write_text(text, encoding="utf-8", newline="")
+    with pytest.raises(ConfigError):  # none of them names the platform
+        config.load(path, "relay", Table, {})
+
+
+# The environment
+
+
+def test_the_environment_overrides_the_file(tmp_path: Path) -> None:
+    platform, table = load(
+        tmp_path,
+        PLATFORM + "[relay]\nrate = 1\nnames = ['a']\nquiet_dir = 'q'\n",
+        SONARPOST_PLATFORM__ID="vessel-2",
+        SONARPOST_PLATFORM__ROUTER='["tcp/r:7447"]',
+        SONARPOST_PLATFORM__STATE_DIR="/var/state",
+        SONARPOST_RELAY__RATE="4",
+        SONARPOST_RELAY__POLL_S="0.5 # a comment",
+        SONARPOST_RELAY__LOUD="true",
+        SONARPOST_RELAY__OUT_DIR="'7'",
+        SONARPOST_RELAY__KIND="two",
+        SONARPOST_RELAY__BY_ADDRESS='{ 3 = "uuv-1" }',
+        SONARPOST_C2__OUT_DIR="somebody else's",
+        SONARPOST_DATA="no override",
+        SONARPOST_EXIT_WITH_PARENT="1",
+        OTHER_RELAY__RATE="9",
+        PATH="/bin",
+    )
+    assert (platform.id, platform.router, platform.state_dir) == ("vessel-2", ("tcp/r:7447",), Path("/var/state"))
+    assert isinstance(table, Table)
+    assert (table.rate, table.poll_s, table.loud, table.out_dir) == (4, 0.5, True, Path("7"))
+    assert (table.kind, table.by_address, table.names) == (Kind.TWO, {"3": "uuv-1"}, ("a",))
+
+
+def test_the_environment_can_give_what_the_file_lacks(tmp_path: Path) -> None:
+    platform, table = load(tmp_path, "", Needy, SONARPOST_PLATFORM__ID="v", SONARPOST_RELAY__PORT="/dev/ttyUSB0")
+    assert (platform.id, table) == ("v", Needy(port="/dev/ttyUSB0"))
+
+
+def test_text_of_several_lines_is_one_value(tmp_path: Path) -> None:
+    _, table = load(tmp_path, PLATFORM, Needy, SONARPOST_RELAY__PORT='"a"\nother = 1')
+    assert table == Needy(port='"a"\nother = 1')
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("SONARPOST_RELAIS__RATE", "1", "got '1', expected SONARPOST_{platform or a service's name}__{KEY}"),
+        ("SONARPOST__RATE", "1", "expected SONARPOST_{"),
+        ("SONARPOST_RELAY__", "1", "expected SONARPOST_{"),
+        ("SONARPOST_RELAY__RATES", "1", "got 'an unknown key', expected one of: airtime_s"),
+        ("SONARPOST_RELAY__RATE", "fast", "got 'fast', expected a valid integer"),
+        ("SONARPOST_RELAY__RATE", "9", "got 9, expected less than or equal to 6"),
+        ("SONARPOST_RELAY__RATE", "", "got '', expected a valid integer"),
+        ("SONARPOST_RELAY__OUT_DIR", "7", "got 7"),
+        ("SONARPOST_RELAY__NAMES", "a,b", "got 'a,b', expected a valid array"),
+        ("SONARPOST_RELAY__POLL_S", "9" * 5000, "expected a valid number"),
+        ("SONARPOST_RELAY__POLL_S", "[" * 5000, "expected a valid number"),
+        ("SONARPOST_RELAY__BY_ADDRESS__3", "uuv-1", "got 'an unknown key'"),
+        ("SONARPOST_PLATFORM__ID", "No Name", "match pattern"),
+    ],
+)
+def test_a_wrong_override_is_named_by_its_variable(tmp_path: Path, name: str, value: str, message: str) -> None:
+    # The file has the same key, right, on a line that must not be blamed.
+    caught = error(tmp_path, PLATFORM + "[relay]\nrate = 1\n", Table, **{name: value})
+    assert caught.where == "environment"
+    assert caught.field == name
+    assert message in str(caught)
+
+
+# Lines of keys
+
+_keys = st.text(st.sampled_from("ab-_1é \"'\\.#[]{}="), max_size=4)
+_values = st.recursive(
+    st.integers() | st.booleans() | st.text(max_size=6),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_keys, inner, max_size=3),
+    max_leaves=8,
+)
+
+
+def quoted(text: str) -> str:
+    return '"' + "".join(c if c.isalnum() and c.isascii() else f"\\U{ord(c):08x}" for c in text) + '"'
+
+
+class Writer:
+    """Writes a document and notes for itself where each key comes to lie."""
+
+    def __init__(self, draw: st.DrawFn) -> None:
+        self.draw, self.text = draw, ""
+        self.lines: dict[tuple[str, ...], int] = {}
+
+    def note(self, path: tuple[str, ...]) -> None:
+        self.lines[path] = self.text.count("\n") + 1
+
+    def filler(self, *choices: str) -> None:
+        self.text += self.draw(st.sampled_from(choices))
+
+    def value(self, path: tuple[str, ...], value: object) -> None:
+        if isinstance(value, dict):
+            self.text += "{"
+            for number, (key, inner) in enumerate(value.items()):
+                self.text += ", " if number else " "
+                self.note((*path, key))
+                self.text += quoted(key) + " = "
+                self.value((*path, key), inner)
+            self.text += " }"
+        elif isinstance(value, list):
+            self.text += "["
+            for number, inner in enumerate(value):
+                self.filler("", "\n", " # ] x = 1\n", "\n\n ")
+                self.note((*path, str(number)))
+                self.value((*path, str(number)), inner)
+                self.text += ","
+            self.text += "]"
+        elif isinstance(value, str):
+            self.text += self.draw(st.sampled_from([quoted(value), f'"""\n{quoted(value)[1:-1]}\\\n  """']))
+        else:
+            self.text += str(value).lower()
+
+
+@given(st.data())
+def test_every_key_of_any_document_is_found_on_its_line(data: st.DataObject) -> None:
+    tables = data.draw(st.dictionaries(_keys, st.dictionaries(_keys, _values, max_size=3), max_size=3))
+    writer = Writer(data.draw)
+    for name, table in tables.items():
+        writer.filler("", "\n", "# [x]\n", " \n")
+        writer.note((name,))
+        writer.text += f"[{quoted(name)}]\n"
+        for key, value in table.items():
+            writer.filler("", "\n", "  # y = 2\n", "\t")
+            writer.note((name, key))
+            writer.text += quoted(key) + "="
+            writer.value((name, key), value)
+            writer.filler("\n", " # c\n", "\n\n")
+    assert tomllib.loads(writer.text).keys() == tables.keys()
+    assert key_lines(writer.text) == writer.lines
+
+
+@pytest.mark.parametrize("name", ["uuv", "vessel", "shore"])
+def test_the_files_that_come_with_the_project_have_every_key_on_a_line(name: str) -> None:
+    text = (REPOSITORY / "config" / f"{name}.toml").read_text(encoding="utf-8")
+    lines = key_lines(text)
+    for table, keys in tomllib.loads(text).items():
+        for key in keys:
+            line = text.splitlines()[lines[table, key] - 1]
+            assert line.startswith(f"{key} =")
