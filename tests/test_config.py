@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import tomllib
 from enum import StrEnum
 from pathlib import Path
@@ -408,3 +409,31 @@ def test_the_files_that_come_with_the_project_have_every_key_on_a_line(name: str
         for key in keys:
             line = text.splitlines()[lines[table, key] - 1]
             assert line.startswith(f"{key} =")
+
+
+@pytest.mark.parametrize(
+    ("table", "old", "new"), [(t, o, n) for t, keys in config.RENAMED_KEYS.items() for o, n in keys.items()]
+)
+def test_a_renamed_key_is_refused_with_its_new_name(tmp_path: Path, table: str, old: str, new: str) -> None:
+    model = service_config(table)
+    assert new in model.model_fields
+    assert old not in model.model_fields
+    path = tmp_path / "platform.toml"
+    path.write_text(f'[platform]\nid = "uuv-1"\n[{table}]\n{old} = 1\n')
+    with pytest.raises(ConfigError, match=rf"platform.toml:4: {table}.{old}: .* expected its new name, {new}$"):
+        config.load(path, table, model, {})
+    path.write_text('[platform]\nid = "uuv-1"\n')
+    variable = f"SONARPOST_{table.upper()}__{old.upper()}"
+    with pytest.raises(ConfigError, match=rf"environment: {variable}: .* expected its new name, {new}$"):
+        config.load(path, table, model, {variable: "1"})
+
+
+def service_config(name: str) -> type[ServiceConfig]:
+    """Return the type of a service's table."""
+    module = importlib.import_module(f"sonarpost.services.{name}.config")
+    (found,) = [
+        kind
+        for kind in vars(module).values()
+        if isinstance(kind, type) and issubclass(kind, ServiceConfig) and kind.__module__ == module.__name__
+    ]
+    return found

@@ -39,6 +39,40 @@ SERVICES = (
 # Tables inside a table that the environment can set key by key.
 TABLES_INSIDE = {("platform", "tls")}
 
+# Keys of version 0.1 and their names since version 0.2; a configuration that uses an old name is refused.
+RENAMED_KEYS: Mapping[str, Mapping[str, str]] = {
+    "atd_stub": {
+        "max_on_the_way": "max_in_flight",
+        "needs_done": "require_done_marker",
+        "seam_pings": "join_overlap_pings",
+        "seam_wait_s": "join_timeout_s",
+    },
+    "compressor": {"catalogue": "codebook", "keep_pictures": "cache_images", "keep_s": "cache_s"},
+    "uuv_modem": {
+        "frame_s": "tdma_cycle_s",
+        "frames_per_picture": "frames_per_image",
+        "gather_s": "group_delay_s",
+        "listen_every_s": "tx_burst_s",
+        "listen_s": "rx_window_s",
+        "mean_wait_s": "mean_backoff_s",
+        "medium": "mac",
+        "more_rates": "allowed_rates",
+        "picture_share": "image_airtime_share",
+        "quiet_s": "holdoff_s",
+    },
+    "op_modem": {
+        "frame_s": "tdma_cycle_s",
+        "medium": "mac",
+        "order_lifetime_s": "command_lifetime_s",
+        "patience_s": "max_defer_s",
+        "quiet_s": "holdoff_s",
+        "report_frames": "feedback_interval_frames",
+        "report_s": "feedback_interval_s",
+    },
+    "decompressor": {"catalogues": "codebooks", "links": "wire_formats", "picture_consumers": "image_consumers"},
+    "console": {"session_most_s": "session_max_s", "side": "role"},
+}
+
 
 class ServiceConfig(BaseModel):
     """Base of every configuration table: unknown keys are errors."""
@@ -190,6 +224,7 @@ def _validated(
     written = tables.get(table, {})
     assert isinstance(written, dict)
     extra = overrides.get(table, {})
+    _refuse_renamed(table, written, extra, source)
     try:
         # As JSON, because pydantic's strictness (no "5" for 5, no true for 1) is made for the types that JSON has.
         return model.model_validate_json(to_json(_with_extra(table, written, extra)), strict=True)
@@ -205,6 +240,16 @@ def _validated(
             name = f"{ENVIRONMENT_PREFIX}{table.upper()}__{by_environment.upper()}"
             raise ConfigError("environment", name, value, expected) from error
         raise source.error((table, *names), value, expected) from error
+
+
+def _refuse_renamed(table: str, written: Mapping[str, object], extra: Mapping[str, object], source: _Source) -> None:
+    """Raise ConfigError where a key has its name of version 0.1, naming the new one."""
+    for old, new in RENAMED_KEYS.get(table, {}).items():
+        value, expected = "the key's name of version 0.1", f"its new name, {new}"
+        if old in written:
+            raise source.error((table, old), value, expected)
+        if old in extra:
+            raise ConfigError("environment", f"{ENVIRONMENT_PREFIX}{table.upper()}__{old.upper()}", value, expected)
 
 
 def _known_keys(model: type[ServiceConfig], names: Sequence[str]) -> str:

@@ -62,7 +62,7 @@ class ConfigError(BadInputError):
 
 
 class CodebookError(BadInputError):
-    """A tile catalogue cannot be read, or is not the one the other end used."""
+    """A tile codebook cannot be read, or is not the one the other end used."""
 
 
 class StoredFileError(BadInputError):

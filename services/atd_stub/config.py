@@ -22,15 +22,15 @@ class AtdStubConfig(ServiceConfig):
         quarantine_dir: Where bad files are moved, each with its reason; by default `quarantine` in `input_dir`.
         poll_s: Time between two looks at the folder.
         settle_s: A file counts when its size and date have not changed for this long; at once with `NAME.done` beside.
-        needs_done: A file counts only when `NAME.done` lies beside it.
+        require_done_marker: A file counts only when `NAME.done` lies beside it.
         confidence_threshold: Least ATD confidence (0 to 2) of a contact that is sent.
         max_contacts: Most contacts a survey file may give, most confident first; 0 for no limit.
-        max_on_the_way: Most pictures between this service and the water; what else was found waits here, and the most
+        max_in_flight: Most pictures between this service and the water; what else was found waits here, and the most
             confident goes first.
-        seam_pings: Last pings of a file that are kept, to be looked at together with the file that goes on there; and
-            what pieces of a long file have in common. Twice a snippet's height is enough.
-        seam_wait_s: How long a contact in the later half of these pings waits for the next file, which shows the rest
-            of it; 0 sends it as it is.
+        join_overlap_pings: Last pings of a file that are searched again together with the continuation file; also
+            the overlap between parts of a long file. Twice a snippet's height is enough.
+        join_timeout_s: How long a contact in the later half of these pings waits for the continuation file; 0 sends it
+            at once.
         snippet_height_px: Rows (along-track) of a snippet.
         snippet_width_px: Columns (across-track) of a snippet.
         snippet_pixel_m: Side of a snippet's pixels on the ground; 0 for the sonar's own, ping by sample.
@@ -47,12 +47,12 @@ class AtdStubConfig(ServiceConfig):
     quarantine_dir: Path | None = None
     poll_s: Annotated[float, Field(gt=0, le=3600)] = 1.0
     settle_s: Annotated[float, Field(ge=0, le=3600)] = 3.0
-    needs_done: bool = False
+    require_done_marker: bool = False
     confidence_threshold: Annotated[float, Field(ge=0, le=2)] = 1.0
     max_contacts: Annotated[int, Field(ge=0)] = 0
-    max_on_the_way: Annotated[int, Field(ge=1, le=100_000)] = 32
-    seam_pings: Annotated[int, Field(ge=0, le=900)] = 200
-    seam_wait_s: Annotated[float, Field(ge=0, le=86400)] = 0.0
+    max_in_flight: Annotated[int, Field(ge=1, le=100_000)] = 32
+    join_overlap_pings: Annotated[int, Field(ge=0, le=900)] = 200
+    join_timeout_s: Annotated[float, Field(ge=0, le=86400)] = 0.0
     snippet_height_px: SidePx = 80
     snippet_width_px: SidePx = 140
     snippet_pixel_m: Annotated[float, Field(ge=0, le=10)] = 0.0

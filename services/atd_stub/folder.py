@@ -24,12 +24,12 @@ class SettledFiles:
 
     Args:
         settle_s: How long size and date must stay as they are; not at all where a file is done.
-        needs_done: Nothing counts that is not done.
+        require_done_marker: Nothing counts that is not done.
     """
 
-    def __init__(self, settle_s: float, *, needs_done: bool = False) -> None:
+    def __init__(self, settle_s: float, *, require_done_marker: bool = False) -> None:
         self._settle_s = settle_s
-        self._needs_done = needs_done
+        self._needs_done = require_done_marker
         self._since: dict[FileSeen, float] = {}
 
     def look(self, files: tuple[FileSeen, ...], now: float) -> tuple[FileSeen, ...]:

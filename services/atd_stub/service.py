@@ -44,10 +44,10 @@ class AtdStubService(Service[AtdStubConfig]):
     def __init__(self, platform: PlatformConfig, config: AtdStubConfig) -> None:
         super().__init__(platform, config)
         self._suffixes = SUPPORTED_SUFFIXES if config.mode == "survey" else PICTURE_SUFFIXES
-        self._settled = SettledFiles(config.settle_s, needs_done=config.needs_done)
+        self._settled = SettledFiles(config.settle_s, require_done_marker=config.require_done_marker)
         self._dealt_with: set[FileSeen] = set()
         self._waiting = -1
-        self._outgoing = Outgoing(platform, self.store, config.max_on_the_way, self.commit)
+        self._outgoing = Outgoing(platform, self.store, config.max_in_flight, self.commit)
         self._seams = SeamStore(self.store)
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
@@ -193,7 +193,7 @@ class AtdStubService(Service[AtdStubConfig]):
     def _end_seams(self) -> None:
         """Let go what waited long enough for a file that has not come."""
         effects = UnitOfWork()
-        freed = self._seams.end(effects, time.time(), self.config.seam_wait_s)
+        freed = self._seams.end(effects, time.time(), self.config.join_timeout_s)
         if freed:
             log.info("No file goes on where the last one ended", extra=kv(contacts=len(freed)))
             self._commit_contacts(effects, freed)

@@ -68,7 +68,7 @@ class SurveyWalk:
         self._origin = origin
         self._vehicle_id = vehicle_id
         self._config = config
-        self._overlap = config.seam_pings
+        self._overlap = config.join_overlap_pings
         self._settings = DetectorSettings(confidence_threshold=config.confidence_threshold)
         self._before: Seam | None = None
         self._first_wanted = 0
@@ -147,7 +147,7 @@ class SurveyWalk:
         info, config = self._source.info, self._config
         end = last.first_row + len(last.pings)
         kept = last_pings(last.pings, self._overlap)
-        held_from = max(end - self._overlap // 2, end - kept) if config.seam_wait_s > 0 and kept else math.inf
+        held_from = max(end - self._overlap // 2, end - kept) if config.join_timeout_s > 0 and kept else math.inf
         held = [found for found in self._found if found.look.row >= held_from]
         # What waited at the end of the file before and was not seen again goes as it was.
         unseen = tuple(wire.decode(Snippet, look.held, "seam") for look in self._held if look.held is not None)
@@ -162,7 +162,7 @@ class SurveyWalk:
             )
             origins = tuple(self._origin_of(row) for row in range(start, end))
             pings = last.pings[len(last.pings) - kept :]
-            seam = Seam(info.sonar_id, pings, origins, looks, now_utc_s + config.seam_wait_s)
+            seam = Seam(info.sonar_id, pings, origins, looks, now_utc_s + config.join_timeout_s)
         return Finding(
             snippets=(*unseen, *(found.snippet for found in self._found if found.look.row < held_from)),
             contacts=sum(found.is_new for found in self._found),

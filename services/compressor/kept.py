@@ -36,13 +36,13 @@ class EncodeCache:
     Args:
         store: The service's.
         most: How many are kept; the oldest go first.
-        keep_s: How long.
+        cache_s: How long.
     """
 
-    def __init__(self, store: Store, most: int, keep_s: float) -> None:
+    def __init__(self, store: Store, most: int, cache_s: float) -> None:
         self._store = store
         self._most = most
-        self._keep_s = keep_s
+        self._keep_s = cache_s
 
     def _index(self) -> dict[str, float]:
         packed = self._store.get_state(_INDEX)

@@ -35,7 +35,7 @@ class CompressorService(Service[CompressorConfig]):
     """Encodes every snippet once.
 
     Raises:
-        CatalogueError: The catalogue cannot be read.
+        CodebookError: The codebook cannot be read.
         ConfigError: No such codec.
     """
 
@@ -43,10 +43,10 @@ class CompressorService(Service[CompressorConfig]):
 
     def __init__(self, platform: PlatformConfig, config: CompressorConfig) -> None:
         # Before the store is opened: what is wrong with the configuration leaves nothing open behind it.
-        tiles = open_codebook(config.catalogue).tiles
+        tiles = open_codebook(config.codebook).tiles
         self._codec: Codec = default_registry().create(config.codec, CodecResources(tiles, config.packing))
         super().__init__(platform, config)
-        self._kept = EncodeCache(self.store, config.keep_pictures, config.keep_s)
+        self._kept = EncodeCache(self.store, config.cache_images, config.cache_s)
         log.info("Codec ready", extra=kv(codec=self._codec.name, model=self._codec.model_hash[:16]))
 
     def consumes(self) -> Mapping[str, type[Record]]:
@@ -61,7 +61,7 @@ class CompressorService(Service[CompressorConfig]):
             return
         assert isinstance(record, Snippet)
         image_id, kept = self._encode(record, effects, effects.payload)
-        if self.config.keep_pictures:
+        if self.config.cache_images:
             self._kept.keep(effects, {image_id: kept}, time.time())
 
     def _encode(

@@ -58,10 +58,10 @@ class ConsoleApp:
         self._board = board
         self._platform_id = platform_id
         self._training = training
-        self._gate = Gate(users, config.side, behind_proxy=config.behind_proxy)
+        self._gate = Gate(users, config.role, behind_proxy=config.behind_proxy)
         self._places = PlaceRoutes(board)
         self._stream = Stream(board, training=training)
-        sessions = SessionRoutes(users, config.side, tls=config.tls, most_s=config.session_most_s)
+        sessions = SessionRoutes(users, config.role, tls=config.tls, most_s=config.session_max_s)
         routes = [
             Route("/api/info", self._gate.open(self._info)),
             *sessions.routes(self._gate),
@@ -93,7 +93,7 @@ class ConsoleApp:
         config = self._board.config
         return json_answer(
             {
-                "side": config.side,
+                "side": config.role,
                 "platform_id": self._platform_id,
                 "version": version("sonarpost"),
                 "training": self._training,

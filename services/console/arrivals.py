@@ -92,7 +92,7 @@ class Arrivals:
         """Keep a decision made elsewhere; tell whether it was new."""
         with self.database.writing() as db:
             known = decisions.find(db, record.decision_id) is not None
-            contact_id = decisions.take(db, record, self.clock(), ashore=self.config.side == "shore")
+            contact_id = decisions.take(db, record, self.clock(), ashore=self.config.role == "shore")
         if contact_id is not None:
             self._tell_contact(contact_id)
             self._tell_decision(record.decision_id)

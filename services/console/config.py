@@ -20,7 +20,7 @@ class ConsoleConfig(ServiceConfig):
     """Where the page is served, to whom what is sent, and when what is shown is old.
 
     Attributes:
-        side: On a vessel operators decide; ashore experts advise.
+        role: On a vessel operators decide; ashore experts advise.
         site: Ashore: name of the c2's site in keys.
         host: Address that is listened on; other than the host's own only with TLS, or with `insecure`.
         port: TCP port.
@@ -36,7 +36,7 @@ class ConsoleConfig(ServiceConfig):
         assumed_rate: Rate of vehicles that were not heard yet.
         group_radius_m: How near looks at one object lie where positions are well known.
         session_s: A session ends after so long without use ...
-        session_most_s: ... and in any case after so long.
+        session_max_s: ... and in any case after so long.
         vehicle_stale_s: A vehicle not heard for so long is shown as stale.
         classes: Classes of mine-like objects that are offered.
         vessel_lat_deg: Where the vessel lies, together with `vessel_lon_deg`, for the map; not known by default.
@@ -45,7 +45,7 @@ class ConsoleConfig(ServiceConfig):
         tiles_dir: Folder of map tiles, `{z}/{x}/{y}.png`; none by default.
     """
 
-    side: Literal["vessel", "shore"] = "vessel"
+    role: Literal["vessel", "shore"] = "vessel"
     site: PlatformId = SHORE
     host: HostName = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8470
@@ -61,7 +61,7 @@ class ConsoleConfig(ServiceConfig):
     assumed_rate: Annotated[int, Field(ge=0, le=6)] | None = None
     group_radius_m: Annotated[float, Field(gt=0, le=1000)] = 8.0
     session_s: Annotated[float, Field(gt=0, le=604800)] = 4 * 3600.0
-    session_most_s: Annotated[float, Field(gt=0, le=604800)] = 24 * 3600.0
+    session_max_s: Annotated[float, Field(gt=0, le=604800)] = 24 * 3600.0
     vehicle_stale_s: Annotated[float, Field(gt=0, le=86400)] = 120.0
     classes: tuple[Annotated[str, Field(min_length=1, max_length=60)], ...] = ("manta", "rockan", "cylinder", "sphere")
     vessel_lat_deg: Latitude | None = None

@@ -77,7 +77,7 @@ class ConsoleService(Service[ConsoleConfig]):
             raise ConfigError("[console]", "tls", "true", "a certificate in [platform] tls")
         super().__init__(platform, config)
         self._database = Database(platform.state_dir / DATABASE_NAME)
-        self._users = Users(platform.state_dir / FILE_NAME, config.session_s, config.session_most_s)
+        self._users = Users(platform.state_dir / FILE_NAME, config.session_s, config.session_max_s)
         self.board = Board(config, self._database)
         self._app = ConsoleApp(self.board, self._users, platform.id)
         self._server: WebServer | None = None
@@ -93,7 +93,7 @@ class ConsoleService(Service[ConsoleConfig]):
 
     @property
     def _on_vessel(self) -> bool:
-        return self.config.side == "vessel"
+        return self.config.role == "vessel"
 
     def consumes(self) -> Mapping[str, type[Record]]:
         """On a vessel its pictures and the shore's advice; ashore what c2 shows."""

@@ -67,7 +67,7 @@ class Users:
     Args:
         path: The file.
         session_s: A session ends after so long without use ...
-        session_most_s: ... and in any case after so long.
+        session_max_s: ... and in any case after so long.
         clock: UTC seconds.
 
     Raises:
@@ -78,12 +78,12 @@ class Users:
         self,
         path: Path,
         session_s: float = 4 * 3600.0,
-        session_most_s: float = 24 * 3600.0,
+        session_max_s: float = 24 * 3600.0,
         clock: Callable[[], float] = time.time,
     ) -> None:
         self.path = path
         self._session_s = session_s
-        self._session_most_s = session_most_s
+        self._session_most_s = session_max_s
         self._clock = clock
         self._lock = threading.RLock()
         self._hashing = threading.Lock()

@@ -17,17 +17,17 @@ class DecompressorConfig(ServiceConfig):
 
     Attributes:
         out_dir: Folder of the pictures.
-        links: Wire formats that are understood; each frame tells which it is of.
+        wire_formats: Wire formats that are understood; each frame tells which it is of.
         pairing_timeout_s: How long an image waits for what it lacks after its last frame.
-        catalogues: Tile catalogues (nominal-10, nominal-20 or files) that vehicles may use.
-        picture_consumers: Services on the vessel that are owed every picture.
+        codebooks: Tile codebooks (nominal-10, nominal-20 or files) that vehicles may use.
+        image_consumers: Services on the vessel that are owed every picture.
         vehicles: Names of the vehicles by the modem addresses they send from; an address that is not listed gets
             the name modem-{address}.
     """
 
     out_dir: Path = Path("out")
-    links: Annotated[tuple[LinkName, ...], Field(min_length=1)] = ("v1", "paper")
+    wire_formats: Annotated[tuple[LinkName, ...], Field(min_length=1)] = ("v1", "paper")
     pairing_timeout_s: Annotated[float, Field(gt=0, le=86400)] = 120.0
-    catalogues: Annotated[tuple[str, ...], Field(min_length=1)] = ("nominal-10", "nominal-20")
-    picture_consumers: tuple[ConsumerName, ...] = ("relay",)
+    codebooks: Annotated[tuple[str, ...], Field(min_length=1)] = ("nominal-10", "nominal-20")
+    image_consumers: tuple[ConsumerName, ...] = ("relay",)
     vehicles: dict[Annotated[str, Field(pattern=r"^[0-9]{1,3}$")], PlatformId] = Field(default_factory=dict)

@@ -22,20 +22,20 @@ from sonarpost.messages import Contact, Pixels, ReconstructedImage
 
 
 class Decoder:
-    """Decodes with whichever of its catalogues the sender used.
+    """Decodes with whichever of its codebooks the sender used.
 
     Args:
         vessel_id: Name of the vessel in the records.
-        catalogues: Names or files of tile catalogues.
+        codebooks: Names or files of tile codebooks.
 
     Raises:
-        CodebookError: A catalogue cannot be read, or two have the same tag.
+        CodebookError: A codebook cannot be read, or two have the same tag.
     """
 
-    def __init__(self, vessel_id: str, catalogues: Sequence[str]) -> None:
+    def __init__(self, vessel_id: str, codebooks: Sequence[str]) -> None:
         self._vessel_id = vessel_id
         self._tiles: dict[int, TileDatabase] = {}
-        for name in catalogues:
+        for name in codebooks:
             tiles = open_codebook(name).tiles
             tag = codebook_tag(tiles)
             if tag in self._tiles and self._tiles[tag].identity != tiles.identity:
@@ -46,7 +46,7 @@ class Decoder:
         """Decode an image, or what there is of it.
 
         Raises:
-            CodebookError: It was made with a catalogue that is not at hand.
+            CodebookError: It was made with a codebook that is not at hand.
             StreamError: It cannot be decoded.
         """
         codec = self._codec(event.header, event)
@@ -62,7 +62,7 @@ class Decoder:
         Nothing is filled in: what an embedded codec shows of each pixel is what the stream says of it so far.
 
         Raises:
-            CodebookError: It was made with a catalogue that is not at hand.
+            CodebookError: It was made with a codebook that is not at hand.
             StreamError: It cannot be decoded.
         """
         if not _has_header(event.stream):
@@ -89,7 +89,7 @@ class Decoder:
             if tiles is None:
                 own = ", ".join(f"{known:#06x}" for known in self._tiles)
                 where = f"image {image_id_of(event)}"
-                raise CodebookError(where, "model_tag", f"{tag:#06x}", f"a catalogue at hand: {own}")
+                raise CodebookError(where, "model_tag", f"{tag:#06x}", f"a codebook at hand: {own}")
         return registry.create_for_stream(event.stream, CodecResources(tiles))
 
     def _record(

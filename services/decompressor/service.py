@@ -40,7 +40,7 @@ class DecompressorService(Service[DecompressorConfig]):
     changed it, so a process killed at any moment goes on as if nothing had happened.
 
     Raises:
-        CatalogueError: A configured catalogue cannot be read.
+        CodebookError: A configured codebook cannot be read.
         ConfigError: The key file cannot be read or is not the owner's alone, or nothing could be understood with it.
     """
 
@@ -48,11 +48,14 @@ class DecompressorService(Service[DecompressorConfig]):
 
     def __init__(self, platform: PlatformConfig, config: DecompressorConfig) -> None:
         # Before the store is opened: what is wrong with the configuration leaves nothing open behind it.
-        self._decoder = Decoder(platform.id, config.catalogues)
+        self._decoder = Decoder(platform.id, config.codebooks)
         self._key = None if platform.acoustic_key_file is None else read_key(platform.acoustic_key_file)
-        if self._key is not None and "v1" not in config.links:
+        if self._key is not None and "v1" not in config.wire_formats:
             raise ConfigError(
-                "[decompressor]", "links", config.links, '"v1" among them where there is an acoustic_key_file'
+                "[decompressor]",
+                "wire_formats",
+                config.wire_formats,
+                '"v1" where acoustic_key_file is set',
             )
         super().__init__(platform, config)
         self._hearing = self._new_hearing()
@@ -65,7 +68,7 @@ class DecompressorService(Service[DecompressorConfig]):
     def _new_hearing(self) -> FrameReceivers:
         # It seals nothing: its address, which counters belong to, is of no account.
         seal = None if self._key is None else FrameAuthenticator(self._key, 0, Direction.TO_VEHICLE)
-        return FrameReceivers(self.config.links, self.config.pairing_timeout_s, seal)
+        return FrameReceivers(self.config.wire_formats, self.config.pairing_timeout_s, seal)
 
     def consumes(self) -> Mapping[str, type[Record]]:
         """Frames this vessel's modem received."""
@@ -157,7 +160,7 @@ class DecompressorService(Service[DecompressorConfig]):
             return
         path, _ = write_image(self.config.out_dir, image)
         payload, key = wire.encode(image), keys.image_reconstructed(self.platform.id)
-        for consumer in self.config.picture_consumers:
+        for consumer in self.config.image_consumers:
             effects.send_payload(key, consumer, payload, ReconstructedImage, priority=5)
         effects.count("images_reconstructed")
         effects.count("images_complete", int(image.complete))

@@ -27,15 +27,15 @@ class OpModemConfig(ModemServiceConfig):
             name modem-{address}.
         downlink_rate: v1: Micro-Modem rate of what is sent; 0 carries farthest.
         retry_s: v1: wait for a confirmation before an order is sent again; doubled each time, up to eightfold.
-        order_lifetime_s: v1: how long after it was issued an order is repeated.
+        command_lifetime_s: v1: how long after it was issued an order is repeated.
         feedback: v1: whether vehicles are told what is lacking of their pictures.
-        report_s: v1: least time between two reports while something is lacking, ...
-        report_frames: v1: ... and so many frames.
-        medium: v1: "quiet" speaks when no vehicle has been heard for a while, "tdma" in its slot, "poll" asks each
+        feedback_interval_s: v1: least time between two reports while something is lacking, ...
+        feedback_interval_frames: v1: ... and so many frames.
+        mac: v1: "csma" speaks when no vehicle has been heard for a while, "tdma" in its slot, "polled" asks each
             vehicle in turn, and speaks between.
-        quiet_s: v1: how long nothing must have been heard.
-        patience_s: v1: after so long without a quiet moment it speaks between two packets.
-        frame_s: TDMA: length of the frame of slots; it begins at multiples of this since 1970-01-01 UTC.
+        holdoff_s: v1: how long nothing must have been heard.
+        max_defer_s: v1: after so long without a quiet moment it speaks between two packets.
+        tdma_cycle_s: TDMA: length of the frame of slots; it begins at multiples of this since 1970-01-01 UTC.
         slot_start_s: TDMA: where in the frame the slot begins.
         slot_s: TDMA: length of the slot.
         guard_s: TDMA: end of the slot that stays silent.
@@ -49,14 +49,14 @@ class OpModemConfig(ModemServiceConfig):
     vehicles: dict[Annotated[str, Field(pattern=r"^[0-9]{1,3}$")], PlatformId] = Field(default_factory=dict)
     downlink_rate: RateNumber = 0
     retry_s: Seconds = 60.0
-    order_lifetime_s: Annotated[float, Field(gt=0, le=604800)] = 6 * 3600.0
+    command_lifetime_s: Annotated[float, Field(gt=0, le=604800)] = 6 * 3600.0
     feedback: bool = True
-    report_s: Seconds = 60.0
-    report_frames: Annotated[int, Field(ge=1, le=65535)] = 48
-    medium: Literal["quiet", "tdma", "poll"] = "quiet"
-    quiet_s: Seconds = 2.0
-    patience_s: Seconds = 120.0
-    frame_s: Seconds = 60.0
+    feedback_interval_s: Seconds = 60.0
+    feedback_interval_frames: Annotated[int, Field(ge=1, le=65535)] = 48
+    mac: Literal["csma", "tdma", "polled"] = "csma"
+    holdoff_s: Seconds = 2.0
+    max_defer_s: Seconds = 120.0
+    tdma_cycle_s: Seconds = 60.0
     slot_start_s: Annotated[float, Field(ge=0, le=86400)] = 50.0
     slot_s: Seconds = 10.0
     guard_s: Annotated[float, Field(ge=0, le=86400)] = 1.0
@@ -69,10 +69,10 @@ class OpModemConfig(ModemServiceConfig):
         addresses = [int(address) for address in self.vehicles]
         if len(set(self.vehicles.values())) != len(addresses) or any(address > 127 for address in addresses):
             raise ValueError("addresses 0 to 127, and each vehicle's name once")
-        if self.medium != "tdma":
+        if self.mac != "tdma":
             return self
-        if self.slot_start_s + self.slot_s > self.frame_s:
-            raise ValueError(f"a slot that ends within frame_s = {self.frame_s}")
+        if self.slot_start_s + self.slot_s > self.tdma_cycle_s:
+            raise ValueError(f"a slot that ends within tdma_cycle_s = {self.tdma_cycle_s}")
         packet_s = RATES[self.downlink_rate].airtime_s
         if self.slot_s - self.guard_s < packet_s:
             raise ValueError(f"slot_s - guard_s of at least {packet_s} s, a packet of downlink_rate")
@@ -80,11 +80,13 @@ class OpModemConfig(ModemServiceConfig):
 
     def slots(self) -> Tdma:
         """Return the slots of "tdma"."""
-        return Tdma(self.frame_s, self.slot_start_s, self.slot_s, self.guard_s)
+        return Tdma(self.tdma_cycle_s, self.slot_start_s, self.slot_s, self.guard_s)
 
     def receiver_config(self) -> ReceiverConfig:
         """Return when reports are due."""
-        return ReceiverConfig(report_s=self.report_s, report_frames=self.report_frames)
+        return ReceiverConfig(
+            feedback_interval_s=self.feedback_interval_s, feedback_interval_frames=self.feedback_interval_frames
+        )
 
     def name_of(self, address: int) -> str:
         """Return the name of the vehicle with a modem address."""

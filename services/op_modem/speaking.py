@@ -56,20 +56,20 @@ class TransmitGate:
             self.wanted_since_s = now_s
         if receiving or now_s < self.not_before_s:
             return False
-        if self.config.medium == "tdma":
+        if self.config.mac == "tdma":
             packet_s = RATES[self.config.downlink_rate].airtime_s
             slots = self.config.slots()
             # The margin for the modem's own start is given up where the slot has no room for it.
             wait_s = slots.wait_s(packet_s + _PACKET_MARGIN_S, utc_s)
             return (slots.wait_s(packet_s, utc_s) if wait_s is None else wait_s) == 0.0
-        if self.config.medium == "poll":
+        if self.config.mac == "polled":
             return True
-        quiet = now_s - self.heard_s >= self.config.quiet_s
-        return quiet or now_s - self.wanted_since_s >= self.config.patience_s
+        quiet = now_s - self.heard_s >= self.config.holdoff_s
+        return quiet or now_s - self.wanted_since_s >= self.config.max_defer_s
 
     def vehicle_to_poll(self, now_s: float, addresses: Sequence[int]) -> int | None:
         """Return the vehicle whose turn it is to be asked for a packet, None for none now."""
-        if self.config.medium != "poll" or not addresses or now_s - self.polled_s < self.config.poll_interval_s:
+        if self.config.mac != "polled" or not addresses or now_s - self.polled_s < self.config.poll_interval_s:
             return None
         self.polled_s = now_s
         address = addresses[self._next_vehicle % len(addresses)]

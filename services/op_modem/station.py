@@ -71,7 +71,7 @@ class VesselStation:
         token = self.book.free_token(kind, record_id)
         message = dl.pack(order_of(record, token), self.message_room)
         # A clock ashore that is ahead of ours must not make an order last longer.
-        expires_at = min(_issued_utc_s(record), now) + self._config.order_lifetime_s
+        expires_at = min(_issued_utc_s(record), now) + self._config.command_lifetime_s
         order = PendingCommand(kind, record_id, record.vehicle_id, address, token, message, now, expires_at)
         return self.book.ask(order, now)
 

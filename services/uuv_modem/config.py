@@ -25,25 +25,25 @@ class UuvModemConfig(ModemServiceConfig):
         link: Wire format: "v1", or "paper" for the paper's.
         rate: Micro-Modem rate 0 to 6; the paper uses 4 in a tank and 1 at sea.
         retry_s: Wait before a packet that the modem could not send is tried again.
-        more_rates: v1: other rates that may be used when the measured loss makes them better.
+        allowed_rates: v1: other rates that may be used when the measured loss makes them better.
         expected_loss: v1: share of frames lost, until reports tell.
         feedback: v1: "auto" sends what reports ask for as long as reports come, "never" ignores them.
-        frames_per_picture: v1: frames a picture costs on average without reports.
+        frames_per_image: v1: frames a picture costs on average without reports.
         stream_bytes: v1: most bytes of a picture's stream that are sent unasked with reports.
-        gather_s: v1: how long a picture, once announced, waits for others: coded together they are better protected.
-        picture_share: v1: share of frames that pictures get however many messages wait.
+        group_delay_s: v1: how long an image waits, after its preview, for others to be coded together with it.
+        image_airtime_share: v1: share of frames that pictures get however many messages wait.
         aging_s: v1: a message becomes one level more urgent for each such time that it waits.
         max_messages: v1: most messages that wait; more stay with their programs.
-        medium: v1: "continuous" sends at once, "tdma" in slots, "poll" when asked, "random" after random waits.
-        listen_every_s: Continuous: it sends for so long, ...
-        listen_s: ... and then listens for so long, 0 for never. What begins meanwhile is heard to its end, so it has to
-            cover the vessel's `quiet_s`, sound's way there and back, and a second.
-        quiet_s: Continuous and random: how long after others were heard it does not begin; they may go on.
-        frame_s: TDMA: length of the frame of slots; it begins at multiples of this since 1970-01-01 UTC.
+        mac: v1: "continuous" sends at once, "tdma" in slots, "polled" when asked, "csma" after random waits.
+        tx_burst_s: Continuous: time of transmission between two receive windows.
+        rx_window_s: Continuous: length of a receive window, 0 for none. A packet that begins in it is received to its
+            end, so it must cover the vessel's `holdoff_s`, the two-way travel time and one second.
+        holdoff_s: Continuous and random: how long after others were heard it does not begin; they may go on.
+        tdma_cycle_s: TDMA: length of the frame of slots; it begins at multiples of this since 1970-01-01 UTC.
         slot_start_s: TDMA: where in the frame the slot begins.
         slot_s: TDMA: length of the slot.
         guard_s: TDMA: end of the slot that stays silent.
-        mean_wait_s: Random: mean of the waits.
+        mean_backoff_s: Random: mean of the waits.
         queue_interval_s: v1: how often the state of the queue is published.
         refine_consumers: v1: services that take commands to refine, resend or widen a picture.
         revisit_consumers: v1: services that take commands to revisit a position.
@@ -55,24 +55,24 @@ class UuvModemConfig(ModemServiceConfig):
     link: Literal["v1", "paper"] = "v1"
     rate: RateNumber = 1
     retry_s: Annotated[float, Field(gt=0, le=600)] = 2.0
-    more_rates: tuple[RateNumber, ...] = ()
+    allowed_rates: tuple[RateNumber, ...] = ()
     expected_loss: Annotated[float, Field(ge=0, le=0.95)] = 0.2
     feedback: Literal["auto", "never"] = "auto"
-    frames_per_picture: Annotated[float, Field(ge=1, le=255)] = 6.0
+    frames_per_image: Annotated[float, Field(ge=1, le=255)] = 6.0
     stream_bytes: Annotated[int, Field(ge=16, le=65535)] = 512
-    gather_s: Annotated[float, Field(ge=0, le=86400)] = 20.0
-    picture_share: Annotated[float, Field(ge=0, le=1)] = 0.25
+    group_delay_s: Annotated[float, Field(ge=0, le=86400)] = 20.0
+    image_airtime_share: Annotated[float, Field(ge=0, le=1)] = 0.25
     aging_s: Seconds = 600.0
     max_messages: Annotated[int, Field(ge=1, le=100_000)] = 2000
-    medium: Literal["continuous", "tdma", "poll", "random"] = "continuous"
-    listen_every_s: Seconds = 150.0
-    listen_s: Annotated[float, Field(ge=0, le=86400)] = 5.0
-    quiet_s: Annotated[float, Field(ge=0, le=600)] = 5.0
-    frame_s: Seconds = 60.0
+    mac: Literal["continuous", "tdma", "polled", "csma"] = "continuous"
+    tx_burst_s: Seconds = 150.0
+    rx_window_s: Annotated[float, Field(ge=0, le=86400)] = 5.0
+    holdoff_s: Annotated[float, Field(ge=0, le=600)] = 5.0
+    tdma_cycle_s: Seconds = 60.0
     slot_start_s: Annotated[float, Field(ge=0, le=86400)] = 0.0
     slot_s: Seconds = 20.0
     guard_s: Annotated[float, Field(ge=0, le=86400)] = 1.0
-    mean_wait_s: Annotated[float, Field(ge=0, le=86400)] = 10.0
+    mean_backoff_s: Annotated[float, Field(ge=0, le=86400)] = 10.0
     queue_interval_s: Annotated[float, Field(ge=0.05, le=3600)] = 5.0
     refine_consumers: tuple[ConsumerName, ...] = ("compressor",)
     revisit_consumers: tuple[ConsumerName, ...] = ()
@@ -80,38 +80,38 @@ class UuvModemConfig(ModemServiceConfig):
 
     @model_validator(mode="after")
     def _packets_fit_the_slot(self) -> UuvModemConfig:
-        if self.medium != "tdma":
+        if self.mac != "tdma":
             return self
-        if self.slot_start_s + self.slot_s > self.frame_s:
-            raise ValueError(f"a slot that ends within frame_s = {self.frame_s}")
-        longest_s = max(RATES[number].airtime_s for number in (self.rate, *self.more_rates))
+        if self.slot_start_s + self.slot_s > self.tdma_cycle_s:
+            raise ValueError(f"a slot that ends within tdma_cycle_s = {self.tdma_cycle_s}")
+        longest_s = max(RATES[number].airtime_s for number in (self.rate, *self.allowed_rates))
         if self.slot_s - self.guard_s < longest_s:
             raise ValueError(f"slot_s - guard_s of at least {longest_s} s, the longest packet")
         return self
 
-    def new_medium(self) -> MediumAccess:
-        """Return the policy of medium access."""
-        match self.medium:
+    def new_mac(self) -> MediumAccess:
+        """Return the medium access control (MAC) policy."""
+        match self.mac:
             case "continuous":
-                return Continuous(self.listen_every_s, self.listen_s, self.quiet_s)
+                return Continuous(self.tx_burst_s, self.rx_window_s, self.holdoff_s)
             case "tdma":
-                return Tdma(self.frame_s, self.slot_start_s, self.slot_s, self.guard_s)
-            case "poll":
+                return Tdma(self.tdma_cycle_s, self.slot_start_s, self.slot_s, self.guard_s)
+            case "polled":
                 return Polled()
-            case "random":
-                return Csma(self.mean_wait_s, quiet_s=self.quiet_s, seed=self.address)
+            case "csma":
+                return Csma(self.mean_backoff_s, holdoff_s=self.holdoff_s, seed=self.address)
 
     def queue_config(self) -> QueueConfig:
         """Return how the queue behaves."""
         return QueueConfig(
-            rates=tuple(sorted({self.rate, *self.more_rates})),
+            rates=tuple(sorted({self.rate, *self.allowed_rates})),
             first_rate=self.rate,
             expected_loss=self.expected_loss,
             feedback=self.feedback,
-            picture_share=self.picture_share,
+            image_airtime_share=self.image_airtime_share,
             aging_s=self.aging_s,
             max_messages=self.max_messages,
-            frames_per_picture=self.frames_per_picture,
+            frames_per_image=self.frames_per_image,
             stream_bytes=self.stream_bytes,
-            gather_s=self.gather_s,
+            group_delay_s=self.group_delay_s,
         )

@@ -43,7 +43,7 @@ class LineRunner:
         line: Used by nobody else while `run` runs, but for its `arrival_name` and `check`.
         modem: The modem.
         config: The service's.
-        medium: When to send.
+        mac: When to send.
         stopping: Ends `run`.
         show: Called with each packet that has gone.
         tell: Called when the state of the queue is to be published.
@@ -56,7 +56,7 @@ class LineRunner:
         line: VehicleEndpoint,
         modem: ModemRunner,
         config: UuvModemConfig,
-        medium: MediumAccess,
+        mac: MediumAccess,
         stopping: threading.Event,
         *,
         show: Callable[[PacketSent], None],
@@ -67,7 +67,7 @@ class LineRunner:
         self._line = line
         self._modem = modem
         self._config = config
-        self._medium = medium
+        self._mac = mac
         self._stopping = stopping
         self._show = show
         self._tell = tell
@@ -99,7 +99,7 @@ class LineRunner:
 
     def run(self) -> None:
         """Work until the service stops."""
-        if self._config.medium == "poll":
+        if self._config.mac == "polled":
             self._modem.answer_polls(self.answer_poll)
         wait_s = 0.0
         while not self._stopping.is_set():
@@ -131,7 +131,7 @@ class LineRunner:
             case PacketFailed():
                 self._packet_failed(event, now)
             case FrameOverheard():
-                self._medium.heard(now)
+                self._mac.heard(now)
             case FrameReceived(dest=dest) if dest == self._config.address:
                 self._line.hear(event.src, [event.data], now)
                 self._changed = True
@@ -147,7 +147,7 @@ class LineRunner:
         self._asked = None
         taken_s = max(0.0, sent.finished_s - sent.started_s)
         self._packet_s[sent.rate] = taken_s
-        self._medium.sent(now - taken_s, now)
+        self._mac.sent(now - taken_s, now)
         began = self._ended_at if self._ended_at is not None else now - taken_s
         self._line.queue.sent(now - began)
         self._ended_at = now
@@ -191,7 +191,7 @@ class LineRunner:
 
     def _send(self, now: float) -> float:
         rate = self._line.under_way.rate if self._line.under_way else self._line.queue.rate
-        wait_s = self._medium.wait_s(self._packet_s.get(rate, RATES[rate].airtime_s), now)
+        wait_s = self._mac.wait_s(self._packet_s.get(rate, RATES[rate].airtime_s), now)
         polled = wait_s is None
         wait_s = max(wait_s or 0.0, self._retry_at - now if self._retry_at - now <= self._config.retry_s else 0.0)
         if wait_s > 0 or not (polled or self._modem.ready):

@@ -74,7 +74,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
             line,
             self.modem,
             self.config,
-            self.config.new_medium(),
+            self.config.new_mac(),
             self.stopping,
             show=self._show,
             tell=self._tell_queue,

@@ -26,7 +26,7 @@ PREFIX_BYTES = 6
 
 @cache
 def resources() -> CodecResources:
-    """Return the golden catalogue, small enough to be quick."""
+    """Return the golden codebook, small enough to be quick."""
     return CodecResources(load(GOLDEN / "vq" / "small.tiles").tiles)
 
 

@@ -164,7 +164,7 @@ def make_console(tmp_path: Path, users_file: Path) -> Iterator[ConsoleMaker]:
         folder.mkdir()
         shutil.copy(users_file, folder)
         config = ConsoleConfig(**options)
-        users = Users(folder / users_file.name, config.session_s, config.session_most_s)
+        users = Users(folder / users_file.name, config.session_s, config.session_max_s)
         board = Board(config, Database(folder / "console-review.db"))
         made.append(Console(board, users, ConsoleApp(board, users, "vessel-1")))
         return made[-1]

@@ -1,4 +1,4 @@
-"""What the golden files of the v1 format hold, and how they are written: `PYTHONPATH=tests python -m builders.v1_golden`.
+"""Content of the v1 golden files; `PYTHONPATH=tests python -m builders.v1_golden` adds missing ones.
 
 Files that exist are not written again: bytes of a wire format may be added, never changed.
 """
@@ -178,7 +178,7 @@ def exchange() -> dict[str, Any]:
         ((LossChannel(0.05), LossChannel(0.6)), 64),
         ((LossChannel(0.2),), 32),
     ):
-        sender = LinkSender(SenderConfig(frame_bytes=size, channels=channels, frames_per_picture=9.0), first_block=30)
+        sender = LinkSender(SenderConfig(frame_bytes=size, channels=channels, frames_per_image=9.0), first_block=30)
         source = 3 + len(channels) + size
         for number in range(1, 7):
             length = 250 if number % 2 else 12

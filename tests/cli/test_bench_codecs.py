@@ -124,7 +124,7 @@ def test_a_row_without_most_pictures_has_no_figures_but_the_details_do(
     assert found["pictures"] == 4
 
 
-def test_of_vq_the_best_catalogue_that_fits_a_budget_counts(folder: Path, tmp_path: Path) -> None:
+def test_of_vq_the_best_codebook_that_fits_a_budget_counts(folder: Path, tmp_path: Path) -> None:
     subjects, _ = measuring.subjects(measuring_registry(), ["vq"])
     pictures = read_folder(folder).pictures
     variants = [measure(subject, pictures, [])[0] for subject in subjects]
@@ -139,19 +139,19 @@ def test_of_vq_the_best_catalogue_that_fits_a_budget_counts(folder: Path, tmp_pa
     assert sum(none.reasons.values()) == len(pictures)
 
 
-def test_vq_is_measured_with_any_catalogue(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_vq_is_measured_with_any_codebook(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tiles = np.random.default_rng(3).integers(0, 256, (9, 400), np.uint8)
     own = tmp_path / "own.tiles"
     save(own, Codebook(TileDatabase.from_tiles(20, tiles), {}))
     found = {}
-    for catalogue in (own, "nominal-20"):
+    for codebook in (own, "nominal-20"):
         options = ("--images", folder, "--codecs", "vq", "--budgets", "90", "--json")
-        assert run("codecs", *options, "--catalogues", catalogue) == 0
-        (found[catalogue],) = json.loads(capsys.readouterr().out)["results"]
+        assert run("codecs", *options, "--codebooks", codebook) == 0
+        (found[codebook],) = json.loads(capsys.readouterr().out)["results"]
     assert found[own]["bytes"] == found["nominal-20"]["bytes"]
     assert found[own]["psnr"] < found["nominal-20"]["psnr"] - 1  # nine tiles of noise
     with pytest.raises(CodebookError, match=r"absent\.tiles"):
-        run("codecs", "--images", folder, "--codecs", "vq", "--catalogues", tmp_path / "absent.tiles")
+        run("codecs", "--images", folder, "--codecs", "vq", "--codebooks", tmp_path / "absent.tiles")
 
 
 def test_bd_rate_of_the_flagship_against_every_other(

@@ -1,4 +1,4 @@
-"""`sonarpost catalogue`, `sonarpost encode` and `sonarpost decode`."""
+"""`sonarpost codebook`, `sonarpost encode` and `sonarpost decode`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.cli import catalogue, encode
-from sonarpost.cli.catalogue import nominal
-from sonarpost.cli.catalogue.build import parse_rounds
-from sonarpost.cli.catalogue.default_codebooks import Recipe
-from sonarpost.cli.catalogue.progress import ProgressDisplay
+from sonarpost.cli import codebook, encode
+from sonarpost.cli.codebook import nominal
+from sonarpost.cli.codebook.build import parse_rounds
+from sonarpost.cli.codebook.default_codebooks import Recipe
+from sonarpost.cli.codebook.progress import ProgressDisplay
 from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.vq.codebook import load, load_default
 from sonarpost.codec.vq.patches import PatchPlan, cut_line
@@ -29,7 +29,7 @@ Run = Callable[..., int]
 def run() -> Run:
     parser = argparse.ArgumentParser()
     subparsers = parser.add_subparsers()
-    catalogue.add_parser(subparsers)
+    codebook.add_parser(subparsers)
     encode.add_parser(subparsers)
 
     def go(*arguments: object) -> int:
@@ -77,15 +77,15 @@ def test_a_folder_goes_there_and_back(run: Run, folder: Path, text: bool, packin
     assert not list((folder / "out").glob("*missing*"))
 
 
-def test_one_file_with_another_catalogue_into_a_folder(run: Run, folder: Path, tmp_path: Path) -> None:
+def test_one_file_with_another_codebook_into_a_folder(run: Run, folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / "deeper"
-    assert run("encode", folder / "b.png", "--catalogue", "nominal-20", "--out", out) == 0
+    assert run("encode", folder / "b.png", "--codebook", "nominal-20", "--out", out) == 0
     assert [path.name for path in out.iterdir()] == ["b.vq"]
-    # The decoder finds the shipped catalogue by the tag in the stream.
+    # The decoder finds the shipped codebook by the tag in the stream.
     assert run("decode", out / "b.vq", "--out", tmp_path / "pictures") == 0
     assert read_image(tmp_path / "pictures" / "b.tiff").shape == (37, 81)
     with pytest.raises(StreamError, match="another identity"):
-        run("decode", out / "b.vq", "--catalogue", "nominal-10")
+        run("decode", out / "b.vq", "--codebook", "nominal-10")
 
 
 def test_bad_files_of_a_folder_are_told_and_counted_and_the_rest_goes_on(
@@ -131,16 +131,16 @@ def test_wrong_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Path
         ("encode", empty),
         ("encode", folder / "notes.md"),
         ("encode", folder / "a.tiff", "--codec", "zip"),
-        ("encode", folder / "a.tiff", "--catalogue", tmp_path / "absent.tiles"),
+        ("encode", folder / "a.tiff", "--codebook", tmp_path / "absent.tiles"),
         ("encode", folder / "a.tiff", "--budget", 30),
         ("encode", folder / "a.tiff", "--out", tmp_path / "file" / "x"),
         ("decode", tmp_path / "absent.vq"),
         ("decode", tmp_path / "big.vq"),
-        ("decode", folder, "--catalogue", tmp_path / "absent.tiles"),
-        ("catalogue", "info", tmp_path / "file"),
-        ("catalogue", "build", "--images", empty, "--out", tmp_path / "x.tiles"),
-        ("catalogue", "nominal", "--humminbird", empty, "--out", tmp_path),
-        ("catalogue", "nominal", "--humminbird", empty, "--out", tmp_path, "--refine", -1),
+        ("decode", folder, "--codebook", tmp_path / "absent.tiles"),
+        ("codebook", "info", tmp_path / "file"),
+        ("codebook", "build", "--images", empty, "--out", tmp_path / "x.tiles"),
+        ("codebook", "nominal", "--humminbird", empty, "--out", tmp_path),
+        ("codebook", "nominal", "--humminbird", empty, "--out", tmp_path, "--refine", -1),
     ]
     for arguments in wrong:
         with pytest.raises(SonarpostError):
@@ -148,7 +148,7 @@ def test_wrong_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Path
     assert not (tmp_path / "x.tiles").exists()
 
 
-def test_a_nominal_catalogue_can_be_left_unrefined(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_nominal_codebook_can_be_left_unrefined(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     speckle = 60 * np.random.default_rng(4).rayleigh(1.0, (200, 200))
     images = list(cut_line("x", speckle.astype(np.float32), PatchPlan(copies=2)))
     monkeypatch.setattr(nominal, "humminbird_images", lambda _: images)
@@ -156,9 +156,7 @@ def test_a_nominal_catalogue_can_be_left_unrefined(run: Run, tmp_path: Path, mon
     monkeypatch.setattr(nominal, "RECIPES", (Recipe(10, 80, (Round(100.0, 60.0),), 2),))
     made = []
     for options in (("--refine", 0), ("--refine", 2), ()):
-        assert (
-            run("catalogue", "nominal", "--humminbird", tmp_path, "--out", tmp_path / "new" / "folder", *options) == 0
-        )
+        assert run("codebook", "nominal", "--humminbird", tmp_path, "--out", tmp_path / "new" / "folder", *options) == 0
         made.append(load(tmp_path / "new" / "folder" / "nominal-10.tiles"))
     alone, twice, usual = made
     assert twice.tiles.identity == usual.tiles.identity != alone.tiles.identity
@@ -167,7 +165,7 @@ def test_a_nominal_catalogue_can_be_left_unrefined(run: Run, tmp_path: Path, mon
     assert all(tile.tobytes() in pieces for tile in alone.tiles.tiles)  # Table IV keeps tiles as they are
     (tmp_path / "file").touch()
     with pytest.raises(SonarpostError, match="--out"):
-        run("catalogue", "nominal", "--humminbird", tmp_path, "--out", tmp_path / "file" / "folder")
+        run("codebook", "nominal", "--humminbird", tmp_path, "--out", tmp_path / "file" / "folder")
 
 
 def test_the_codecs_are_listed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
@@ -175,37 +173,37 @@ def test_the_codecs_are_listed(run: Run, capsys: pytest.CaptureFixture[str]) -> 
     assert "vector quantisation" in capsys.readouterr().out
 
 
-def test_info_shows_a_shipped_catalogue(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("catalogue", "info", "nominal-10") == 0
+def test_info_shows_a_shipped_codebook(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("codebook", "info", "nominal-10") == 0
     shown = capsys.readouterr().out
     assert load_default(10).tiles.identity in shown
     assert "10 x 10 px" in shown
-    assert run("catalogue") == 0
+    assert run("codebook") == 0
     assert "build" in capsys.readouterr().out
 
 
-def test_a_catalogue_is_built_from_a_folder_and_used(run: Run, folder: Path, tmp_path: Path) -> None:
+def test_a_codebook_is_built_from_a_folder_and_used(run: Run, folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "mine.tiles"
     (folder / "broken.tif").write_bytes(b"II*\0")
-    assert run("catalogue", "build", "--images", folder, "--tile", 8, "--out", out, "--rounds", "90:8,99:1:2") == 1
+    assert run("codebook", "build", "--images", folder, "--tile", 8, "--out", out, "--rounds", "90:8,99:1:2") == 1
     built = load(out)
     assert built.notes["images"] == "3"
     assert built.tiles.tile_px == 8
     assert not out.with_name("mine.tiles.journal").exists()
-    assert run("encode", folder / "a.tiff", "--catalogue", out) == 0
-    with pytest.raises(CodebookError, match="the catalogue it was made with"):
+    assert run("encode", folder / "a.tiff", "--codebook", out) == 0
+    with pytest.raises(CodebookError, match="the codebook it was made with"):
         run("decode", folder / "a.vq")
-    assert run("decode", folder / "a.vq", "--catalogue", out) == 0
-    # The first image's tiles are all in the catalogue, so it comes back as it was.
+    assert run("decode", folder / "a.vq", "--codebook", out) == 0
+    # The first image's tiles are all in the codebook, so it comes back as it was.
     assert np.array_equal(read_image(folder / "out" / "a.tiff"), snippet(0))
     more = tmp_path / "more.tiles"
-    assert run("catalogue", "build", "--images", folder / "b.png", "--tile", 8, "--out", more, "--core", out) == 0
+    assert run("codebook", "build", "--images", folder / "b.png", "--tile", 8, "--out", more, "--core", out) == 0
     assert np.array_equal(load(more).tiles.tiles[: len(built.tiles)], built.tiles.tiles)
 
 
 def test_a_stopped_build_is_resumed_only_when_asked(run: Run, folder: Path, tmp_path: Path, monkeypatch) -> None:
     out = tmp_path / "mine.tiles"
-    arguments = ("catalogue", "build", "--images", folder, "--out", out, "--rounds", "90:4", "--refine", 1)
+    arguments = ("codebook", "build", "--images", folder, "--out", out, "--rounds", "90:4", "--refine", 1)
     assert run(*arguments) == 0
     expected = out.read_bytes()
     out.unlink()
@@ -232,35 +230,35 @@ def test_rounds_are_read_in_grey_levels() -> None:
             parse_rounds(wrong, 10)
 
 
-def test_catalogues_are_compared(run: Run, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_codebooks_are_compared(run: Run, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     one, other = tmp_path / "one.tiles", tmp_path / "other.tiles"
-    assert run("catalogue", "build", "--images", folder / "a.tiff", "--tile", 8, "--out", one) == 0
-    assert run("catalogue", "build", "--images", folder / "b.png", "--tile", 8, "--out", other, "--core", one) == 0
+    assert run("codebook", "build", "--images", folder / "a.tiff", "--tile", 8, "--out", one) == 0
+    assert run("codebook", "build", "--images", folder / "b.png", "--tile", 8, "--out", other, "--core", one) == 0
     capsys.readouterr()
-    assert run("catalogue", "diff", one, one) == 0
+    assert run("codebook", "diff", one, one) == 0
     told = capsys.readouterr().out
     assert "the same" in told
     assert "principal angles up to 0.00 deg" in told
-    assert run("catalogue", "diff", one, other) == 1
+    assert run("codebook", "diff", one, other) == 1
     told = capsys.readouterr().out
     assert load(one).tiles.identity in told
     assert load(other).tiles.identity in told
     assert "only in A      0 tiles" in told
     assert f"{len(load(one).tiles)} tiles have the same number in both" in told
     with pytest.raises(CodebookError, match="tile_px"):
-        run("catalogue", "diff", one, "nominal-10")
+        run("codebook", "diff", one, "nominal-10")
 
 
-def test_a_catalogue_is_adapted_to_a_folder(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_codebook_is_adapted_to_a_folder(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     images = tmp_path / "images"
     images.mkdir()
     for seed in range(8):
         write_png(images / f"{seed}.png", snippet(seed))
     base, out = tmp_path / "base.tiles", tmp_path / "out.tiles"
-    run("catalogue", "build", "--images", images / "0.png", "--tile", 8, "--out", base, "--max-tiles", 40)
+    run("codebook", "build", "--images", images / "0.png", "--tile", 8, "--out", base, "--max-tiles", 40)
     (images / "broken.tif").write_bytes(b"II*\0")
     capsys.readouterr()
-    assert run("catalogue", "adapt", base, "--images", images, "--out", out, "--keep", 10, "--max-tiles", 60) == 1
+    assert run("codebook", "adapt", base, "--images", images, "--out", out, "--keep", 10, "--max-tiles", 60) == 1
     told = capsys.readouterr()
     assert "broken.tif" in told.err.replace("\n", "")  # lines are folded where the terminal ends
     assert "6 to learn from, 2 held out" in told.out
@@ -271,9 +269,9 @@ def test_a_catalogue_is_adapted_to_a_folder(run: Run, tmp_path: Path, capsys: py
     assert len(adapted.tiles) == 60
     assert (adapted.tiles.tiles[:40] == original.tiles.tiles).all(axis=1).sum() >= 10
     with pytest.raises(ConfigError, match="keep"):
-        run("catalogue", "adapt", base, "--images", images, "--out", out, "--keep", 41)
+        run("codebook", "adapt", base, "--images", images, "--out", out, "--keep", 41)
     with pytest.raises(ConfigError, match="at least 2"):
-        run("catalogue", "adapt", base, "--images", images / "0.png", "--out", out)
+        run("codebook", "adapt", base, "--images", images / "0.png", "--out", out)
 
 
 def test_no_gain_is_told(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -282,9 +280,9 @@ def test_no_gain_is_told(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture
     for number in range(2):
         write_png(images / f"{number}.png", np.full((24, 24), 90, np.uint8))
     base = tmp_path / "base.tiles"
-    run("catalogue", "build", "--images", images / "0.png", "--tile", 8, "--out", base)
+    run("codebook", "build", "--images", images / "0.png", "--tile", 8, "--out", base)
     capsys.readouterr()
-    assert run("catalogue", "adapt", base, "--images", images, "--out", tmp_path / "out.tiles") == 0
+    assert run("codebook", "adapt", base, "--images", images, "--out", tmp_path / "out.tiles") == 0
     told = capsys.readouterr()
     assert "no gain" in told.err
     assert "99.00 before, 99.00 after; better in 0 of 1" in told.out

@@ -6,7 +6,7 @@ import io
 
 from rich.console import Console
 
-from sonarpost.cli.catalogue.progress import ProgressDisplay
+from sonarpost.cli.codebook.progress import ProgressDisplay
 from sonarpost.codec.vq.training_config import BuildProgress, RefinementProgress
 
 

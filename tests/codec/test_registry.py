@@ -94,7 +94,7 @@ def test_a_name_or_id_is_taken_once(registry: CodecRegistry, name: str, ids: tup
 
 
 @pytest.mark.parametrize("codec_id", [0x0F, 0x20, 0x7F])
-def test_a_codec_with_a_catalogue_takes_an_id_whose_streams_can_name_it(registry: CodecRegistry, codec_id: int) -> None:
+def test_a_codec_with_a_codebook_takes_an_id_whose_streams_can_name_it(registry: CodecRegistry, codec_id: int) -> None:
     with pytest.raises(ConfigError, match=r"0x10\.\.0x1f or 0x80\.\.0xff"):
         registry.register(CodecSpec("other", (0x90, codec_id), make_nothing, needs_tiles=True))
     assert "other" not in registry.names()
@@ -105,7 +105,7 @@ def test_a_codec_with_a_catalogue_takes_an_id_whose_streams_can_name_it(registry
 
 
 @pytest.mark.parametrize("codec_id", [0x14, 0x1F, 0x80, 0xFF])
-def test_a_registered_codec_with_a_catalogue_finds_it_by_the_tag(registry: CodecRegistry, codec_id: int) -> None:
+def test_a_registered_codec_with_a_codebook_finds_it_by_the_tag(registry: CodecRegistry, codec_id: int) -> None:
     registry.register(CodecSpec("other", (codec_id,), make_nothing, needs_tiles=True))
     header = StreamHeader(codec_id, codebook_tag(TILES), 16, 24)
     assert StreamHeader.unpack(header.pack()).model_tag == codebook_tag(TILES)

@@ -285,7 +285,7 @@ def test_a_refused_decision_says_why(console):
 
 
 def test_what_came_before_its_picture_waits_for_it(make_console):
-    console = make_console(side="shore")
+    console = make_console(role="shore")
     at = FIRST_UTC_S + 50
     names = {"vessel_id": "vessel-1", "vehicle_id": "uuv-1", "image_id": "00A7", "image_version": 1}
     decision = Decision(decision_id="d-1", verdict="mine_like", operator="anna", decided_utc_s=at, **names)
@@ -366,7 +366,7 @@ def test_what_leads_to_nothing_is_not_asked(console, changes, possible):
 
 
 def test_ashore_experts_advise_and_nobody_decides(make_console):
-    console = make_console(side="shore")
+    console = make_console(role="shore")
     console.board.take_image(picture_record())
     eva, anna = console.browser("eva"), console.browser("anna")
     assert console.decide(eva, ID).status_code == 403

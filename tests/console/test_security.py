@@ -82,7 +82,7 @@ def test_a_role_does_what_it_may_and_no_more(with_contact, path, act):
 
 
 def test_ashore_only_experts_act(make_console):
-    console = make_console(side="shore")
+    console = make_console(role="shore")
     may = {user: console.browser(user).get("/api/session").json()["may"] for user in ("watch", "anna", "eva")}
     assert not any(may["watch"].values())
     assert may["anna"] == {"decide": False, "measure": True, "request": False, "advise": False}
@@ -134,7 +134,7 @@ def test_a_session_ends(console, tmp_path):
     browser.client.cookies.set("sonarpost_session", cookie)
     assert browser.get("/api/contacts").status_code == 401
     now = [1000.0]
-    users = Users(tmp_path / "users.db", session_s=100, session_most_s=250, clock=lambda: now[0])
+    users = Users(tmp_path / "users.db", session_s=100, session_max_s=250, clock=lambda: now[0])
     users.add("anna", "operator", PASSWORD)
     token = users.begin("anna").token
     for now[0], use, there in ((1090, True, True), (1185, True, True), (1240, True, True), (1251, True, False)):

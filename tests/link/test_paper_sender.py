@@ -22,7 +22,7 @@ RATES = {0: (1, 32), 1: (3, 64), 2: (3, 64), 3: (2, 256), 4: (2, 256), 5: (8, 25
 CONTACT = ContactSummary(height_px=80, width_px=140, lat_deg=44.7, lon_deg=-63.6, confidence=1.5)
 
 
-# By their length: no model, a small one, a catalogue; each with common sides and with another height.
+# By their length: no model, a small one, a codebook; each with common sides and with another height.
 HEADERS = {
     header.size: header
     for height_px in (80, 81)

@@ -96,7 +96,7 @@ def test_programs_of_one_priority_share_the_water_whatever_they_send():
 
 
 def test_pictures_keep_their_share_in_a_flood_and_a_flood_is_not_starved():
-    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0, picture_share=0.25)), 4)
+    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0, image_airtime_share=0.25)), 4)
     for n in range(1500):
         queue.add_message(f"m{n}", "flood", b"F" * 55, 0.0, priority=1, lifetime_s=1e5)
     receiver, now, pictures, frames = LinkReceiver(), 0.0, 0, 0
@@ -271,7 +271,13 @@ def test_a_rate_that_is_no_longer_configured_is_left():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"expected_loss": 1.0}, {"picture_share": -0.1}, {"aging_s": 0.0}, {"feedback": "perhaps"}, {"max_messages": 0}],
+    [
+        {"expected_loss": 1.0},
+        {"image_airtime_share": -0.1},
+        {"aging_s": 0.0},
+        {"feedback": "perhaps"},
+        {"max_messages": 0},
+    ],
 )
 def test_values_out_of_range_are_named(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
@@ -310,7 +316,7 @@ def test_a_picture_that_is_given_again_goes_again_unless_it_waits():
 
 
 def test_a_picture_of_which_more_is_here_is_refined_at_once():
-    queue = TransmitQueue(QueueConfig(expected_loss=0.0, frames_per_picture=3.0))
+    queue = TransmitQueue(QueueConfig(expected_loss=0.0, frames_per_image=3.0))
     queue.add_picture(1, ImageName("0001", "c1"), CONTACT, stream(1, 900), 0.0)
     receiver = LinkReceiver()
     _, now = run(queue, 200.0, receiver=receiver)

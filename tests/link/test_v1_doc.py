@@ -61,8 +61,8 @@ def test_the_numbers_of_the_page_are_those_of_the_code() -> None:
     assert f"with 6 frames a picture {sender.group_size}," in PAGE
     assert f"at most {sender.block_symbols} source symbols" in PAGE
     assert f"up to {100 * sender.uncertainty:g} % wrong" in PAGE
-    assert f"after {receiver.report_frames} frames or a minute" in PAGE
-    assert (receiver.report_s, receiver.block_memory_s) == (60.0, 3600.0)
+    assert f"after {receiver.feedback_interval_frames} frames or a minute" in PAGE
+    assert (receiver.feedback_interval_s, receiver.block_memory_s) == (60.0, 3600.0)
     for kind in SegmentKind:
         if kind != SegmentKind.END:
             assert f"| {int(kind)} {kind.name.lower()} |" in PAGE

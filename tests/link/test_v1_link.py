@@ -32,7 +32,7 @@ SIZES = (32, 64, 256, 100)
 
 @pytest.mark.parametrize("frame_bytes", SIZES)
 def test_a_broadcast_without_loss_delivers_every_contact_and_costs_what_was_planned(frame_bytes: int) -> None:
-    world = World.make(0.0, frame_bytes=frame_bytes, frames_per_picture=6.0)
+    world = World.make(0.0, frame_bytes=frame_bytes, frames_per_image=6.0)
     world.add(30, 700)
     world.run()
     assert set(world.latest) == set(range(1, 31))
@@ -43,7 +43,7 @@ def test_a_broadcast_without_loss_delivers_every_contact_and_costs_what_was_plan
 @pytest.mark.parametrize("frame_bytes", SIZES)
 @pytest.mark.parametrize("count", [1, 2, 7, 30])
 def test_a_broadcast_for_a_third_lost_shows_contacts_and_most_pictures(frame_bytes: int, count: int) -> None:
-    world = World.make(0.3, seed=count, frame_bytes=frame_bytes, frames_per_picture=8.0)
+    world = World.make(0.3, seed=count, frame_bytes=frame_bytes, frames_per_image=8.0)
     world.add(count, 900)
     world.run()
     assert len(world.latest) >= 0.96 * count - 0.5
@@ -63,7 +63,7 @@ def test_previews_of_every_contact_go_before_the_detail_of_any() -> None:
 
 def test_receivers_with_good_and_bad_water_both_get_what_their_water_allows() -> None:
     channels = (LossChannel(0.05), LossChannel(0.6))
-    config = SenderConfig(channels=channels, frames_per_picture=9.0)
+    config = SenderConfig(channels=channels, frames_per_image=9.0)
     sender, receivers = LinkSender(config), [LinkReceiver(), LinkReceiver()]
     for number in range(1, 25):
         sender.add_picture(number, contact(number), stream(number, 900), 0.0)
@@ -100,7 +100,13 @@ def test_with_feedback_all_is_complete_close_to_the_erasure_bound(loss: float, l
     ratios = []
     for seed in range(3):
         world = World.make(
-            loss, seed, channels=(LossChannel(loss),), feedback=True, stream_bytes=420, patience_s=600.0, frame_bytes=64
+            loss,
+            seed,
+            channels=(LossChannel(loss),),
+            feedback=True,
+            stream_bytes=420,
+            max_defer_s=600.0,
+            frame_bytes=64,
         )
         world.add(120, 500)
         world.run()
@@ -135,7 +141,7 @@ def test_messages_come_through_once_and_share_frames() -> None:
 
 
 def test_several_messages_go_in_one_frame_and_contacts_fill_it() -> None:
-    sender = LinkSender(SenderConfig(frame_bytes=128, gather_s=100.0))
+    sender = LinkSender(SenderConfig(frame_bytes=128, group_delay_s=100.0))
     sender.add_picture(1, contact(1), stream(1, 300), 0.0)
     for data in (b"one", b"two"):
         sender.add_message(data, 0.0, times=1)
@@ -216,7 +222,7 @@ def test_a_new_frame_size_keeps_what_fits_and_starts_again_what_does_not() -> No
 
 
 def test_numbers_of_blocks_and_contacts_wrap() -> None:
-    world = World.make(0.2, 3, channels=(LossChannel(0.2),), group_pictures=2, frames_per_picture=9.0)
+    world = World.make(0.2, 3, channels=(LossChannel(0.2),), group_pictures=2, frames_per_image=9.0)
     number = 65500
     for _ in range(60):
         world.add(2, 200, first=number)
@@ -361,7 +367,7 @@ def test_unknown_segments_are_told_and_do_not_hide_the_others() -> None:
 
 
 def test_one_frame_that_passed_damaged_does_not_replace_a_block() -> None:
-    sender, receiver = LinkSender(SenderConfig(channels=(LossChannel(0.0),), frames_per_picture=20.0)), LinkReceiver()
+    sender, receiver = LinkSender(SenderConfig(channels=(LossChannel(0.0),), frames_per_image=20.0)), LinkReceiver()
     sender.add_picture(1, contact(1), stream(1, 900), 0.0)
     frames = []
     while (frame := sender.next_frame(0.0)) is not None:

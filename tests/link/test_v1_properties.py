@@ -29,7 +29,7 @@ def deliveries(draw: st.DrawFn) -> list[tuple[float, bytes]]:
             channels=channels,
             feedback=draw(st.booleans()),
             stream_bytes=200,
-            frames_per_picture=8.0,
+            frames_per_image=8.0,
         ),
         first_block=draw(st.integers(0, 31)),
     )

@@ -169,10 +169,10 @@ CONTACT = ContactSummary(height_px=40, width_px=60, lat_deg=56.4, lon_deg=-5.6, 
 
 def test_reports_make_the_vehicle_complete_what_was_lost():
     rng = np.random.default_rng(5)
-    vehicle = Vehicle(SenderConfig(frame_bytes=64, channels=(LossChannel(0.1),), feedback=True, patience_s=120.0))
+    vehicle = Vehicle(SenderConfig(frame_bytes=64, channels=(LossChannel(0.1),), feedback=True, max_defer_s=120.0))
     for number in range(1, 9):
         vehicle.sender.add_picture(number, replace(CONTACT, time_utc_s=float(number)), PICTURE, 0.0)
-    link = VesselEndpoint(CommandTracker(30.0), ReceiverConfig(report_s=60.0))
+    link = VesselEndpoint(CommandTracker(30.0), ReceiverConfig(feedback_interval_s=60.0))
     now, reports = 0.0, 0
     while vehicle.sender.blocks or vehicle.sender.waiting:
         now += 6.0
@@ -194,7 +194,7 @@ def test_reports_into_silence_become_rare_and_end():
     vehicle = Vehicle(SenderConfig(frame_bytes=64, feedback=True))
     for number in range(1, 5):
         vehicle.sender.add_picture(number, CONTACT, PICTURE, 0.0)
-    link = VesselEndpoint(CommandTracker(30.0), ReceiverConfig(report_s=10.0))
+    link = VesselEndpoint(CommandTracker(30.0), ReceiverConfig(feedback_interval_s=10.0))
     link.hear(UUV, vehicle.sender.next_frame(0.0), 0.0)
     at = []
     for now in range(1, 3000):

@@ -191,7 +191,7 @@ def test_packets_wait_for_the_modem_and_fail_when_it_takes_too_long() -> None:
     modem = started()
     modem.dead = True
     packet_id = modem.driver.send_packet(1, 4, [b"x"], now=0.0)
-    modem.run(CONFIG.patience_s + 1.0)
+    modem.run(CONFIG.max_defer_s + 1.0)
     (failed,) = modem.of(PacketFailed)
     assert (failed.packet_id, failed.reason) == (packet_id, FailureReason.WAITED_TOO_LONG)
     assert not failed.maybe_sent
@@ -260,7 +260,7 @@ def test_half_a_line_of_before_does_not_meet_the_new_port() -> None:
         ("queued_packets", 0),
         ("airtime_margin", 0.5),
         ("reply_timeout_s", 0.0),
-        ("patience_s", float("inf")),
+        ("max_defer_s", float("inf")),
         ("keepalive_s", float("nan")),
         ("airtimes_s", {9: 1.0}),
         ("airtimes_s", {1: 0.0}),

@@ -15,7 +15,7 @@ from sonarpost.monitoring.log_context import image_ids_of_frame
 
 
 def frames(frame_bytes: int, *numbers: int, seal: FrameAuthenticator | None = None) -> list[bytes]:
-    sender = LinkSender(SenderConfig(frame_bytes=frame_bytes, gather_s=0.0), seal=seal)
+    sender = LinkSender(SenderConfig(frame_bytes=frame_bytes, group_delay_s=0.0), seal=seal)
     for number in numbers:
         sender.add_picture(number, ContactSummary(80, 80), np.random.default_rng(number).bytes(300), 0.0)
     found = []
@@ -37,7 +37,7 @@ def test_several_pictures_of_a_frame_are_named_in_their_order() -> None:
 
 
 def test_announced_contacts_are_named() -> None:
-    sender = LinkSender(SenderConfig(frame_bytes=64, gather_s=60.0, announce=True))
+    sender = LinkSender(SenderConfig(frame_bytes=64, group_delay_s=60.0, announce=True))
     sender.add_picture(5, ContactSummary(80, 80), b"a stream of some bytes, and more of it than that", 0.0)
     frame = sender.next_frame(0.0)
     assert frame is not None

@@ -348,7 +348,7 @@ def test_a_done_file_counts_at_once_and_where_it_is_needed_nothing_else_does(tmp
     assert {seen.path.name: seen.is_done for seen in here} == {"a.xtf": True, "b.xtf": False}
     names = lambda found: [seen.path.name for seen in found]  # noqa: E731
     assert names(SettledFiles(5.0).look(here, 0.0)) == ["a.xtf"]
-    patient = SettledFiles(5.0, needs_done=True)
+    patient = SettledFiles(5.0, require_done_marker=True)
     assert names(patient.look(here, 0.0)) == ["a.xtf"]
     assert names(patient.look(here, 100.0)) == ["a.xtf"]
     done = tuple(replace(seen, is_done=True) for seen in here)

@@ -28,7 +28,7 @@ KEY = keys.contact_detected("uuv-1")
 @pytest.mark.parametrize("cut", [100, 146, 149, 151, 155])
 def test_an_object_is_found_once_wherever_the_recorder_cuts(cut, wait_s, tmp_path):
     survey = survey_of(300, Box(150))
-    sent = run(cut_into(tmp_path, survey, (0, cut), (cut, 300)), seam_wait_s=wait_s)
+    sent = run(cut_into(tmp_path, survey, (0, cut), (cut, 300)), join_timeout_s=wait_s)
     (found,) = near(sent, 150)
     assert len({s.contact.contact_id for s in sent}) == len(sent)
     if wait_s:
@@ -44,7 +44,7 @@ def test_an_object_is_found_once_wherever_the_recorder_cuts(cut, wait_s, tmp_pat
 def test_what_lies_far_from_the_seam_does_not_wait(tmp_path):
     survey = survey_of(300, Box(100), Box(260, Side.STARBOARD))
     (path,) = cut_into(tmp_path, survey, (0, 300))
-    found = from_survey(path, "0" * 64, "uuv-1", AtdStubConfig(seam_wait_s=30.0), {}, 100.0)
+    found = from_survey(path, "0" * 64, "uuv-1", AtdStubConfig(join_timeout_s=30.0), {}, 100.0)
     assert near(list(found.snippets), 100)
     assert not near(list(found.snippets), 260, Side.STARBOARD)
     assert near(held_of(found.seam), 260, Side.STARBOARD)
@@ -54,7 +54,7 @@ def test_what_lies_far_from_the_seam_does_not_wait(tmp_path):
 def test_many_short_files_are_one_stream(tmp_path):
     survey = survey_of(250, Box(40), Box(100), Box(150, Side.STARBOARD), Box(199))
     spans = list(pairwise(range(0, 251, 50)))
-    sent = run(cut_into(tmp_path, survey, *spans), seam_wait_s=30.0)
+    sent = run(cut_into(tmp_path, survey, *spans), join_timeout_s=30.0)
     for row, side in ((40, Side.PORT), (100, Side.PORT), (150, Side.STARBOARD), (199, Side.PORT)):
         assert len(near(sent, row, side)) == 1, row
 
@@ -62,7 +62,7 @@ def test_many_short_files_are_one_stream(tmp_path):
 @pytest.mark.parametrize("wait_s", [0.0, 30.0])
 def test_pings_recorded_twice_are_looked_at_once(wait_s, tmp_path):
     survey = survey_of(300, Box(130), Box(100, Side.STARBOARD))
-    sent = run(cut_into(tmp_path, survey, (0, 150), (90, 300)), seam_wait_s=wait_s)
+    sent = run(cut_into(tmp_path, survey, (0, 150), (90, 300)), join_timeout_s=wait_s)
     assert len(near(sent, 130)) == len(near(sent, 100, Side.STARBOARD)) == 1
 
 
@@ -92,7 +92,7 @@ def test_a_file_that_does_not_go_on_there_lets_what_waited_go(what, tmp_path):
         case "one more channel":
             later = with_second_frequency(replace(survey, pings=later), SAMPLES, RANGE_M).pings
     write_xtf(replace(survey, pings=later, sonar_id="else" if what == "other sonar" else "made"), second)
-    config = AtdStubConfig(seam_wait_s=30.0)
+    config = AtdStubConfig(join_timeout_s=30.0)
     seam = from_survey(first, "0" * 64, "uuv-1", config, {}, 100.0).seam
     assert near(held_of(seam), 97)
     assert not from_survey(second, "1" * 64, "uuv-1", config, {seam.sonar_id: seam}, 100.0).joined
@@ -114,7 +114,7 @@ def test_most_contacts_of_a_file_are_its_most_confident(tmp_path):
 
 def test_a_seam_survives_the_store(tmp_path):
     (path,) = cut_into(tmp_path, survey_of(150, Box(130)), (0, 150))
-    seam = from_survey(path, "0" * 64, "uuv-1", AtdStubConfig(seam_wait_s=30.0), {}, 100.0).seam
+    seam = from_survey(path, "0" * 64, "uuv-1", AtdStubConfig(join_timeout_s=30.0), {}, 100.0).seam
     again = unpack(pack(seam))
     assert (again.sonar_id, again.origins, again.looks, again.until_utc_s) == (
         seam.sonar_id,
@@ -187,14 +187,14 @@ def processed(service):
 @pytest.mark.parametrize("restarted", [False, True])
 def test_a_contact_on_the_seam_waits_for_the_next_file_and_goes_once(restarted, begin, crew, halves):
     compressor = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
-    service = begin(seam_wait_s=3600.0)
+    service = begin(join_timeout_s=3600.0)
     halves(0)
     eventually(lambda: processed(service) == 1)
     eventually(lambda: service.health().gauges["contacts_waiting"] >= 1)
     assert near(compressor.got, 120) == []
     if restarted:
         crew.stop(service)
-        service = begin(seam_wait_s=3600.0)
+        service = begin(join_timeout_s=3600.0)
         eventually(lambda service=service: service.health().gauges["contacts_waiting"] >= 1)
     halves(1)
     eventually(lambda: len(near(compressor.got, 120)) == 1)
@@ -203,7 +203,7 @@ def test_a_contact_on_the_seam_waits_for_the_next_file_and_goes_once(restarted, 
 
 def test_a_contact_goes_as_it_is_when_no_file_comes(begin, crew, halves):
     compressor = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
-    service = begin(seam_wait_s=0.2)
+    service = begin(join_timeout_s=0.2)
     halves(0)
     eventually(lambda: len(near(compressor.got, 120)) == 1)
     eventually(lambda: service.health().gauges["contacts_waiting"] == 0)

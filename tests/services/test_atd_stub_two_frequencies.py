@@ -40,8 +40,8 @@ def test_files_of_two_frequencies_go_on_where_the_one_before_ended(samples, rang
     read = [read_xtf(path) for path in paths]
     assert [len(ping.channels) for ping in (read[0].pings[-1], read[1].pings[0])] == [4, 4]
     assert follows(*read), "commands join them"
-    assert len(near(run(paths, seam_wait_s=30.0), 150)) == 1
-    seam = from_survey(paths[0], "0" * 64, "uuv-1", AtdStubConfig(seam_wait_s=30.0), {}, 100.0).seam
+    assert len(near(run(paths, join_timeout_s=30.0), 150)) == 1
+    seam = from_survey(paths[0], "0" * 64, "uuv-1", AtdStubConfig(join_timeout_s=30.0), {}, 100.0).seam
     assert from_survey(paths[1], "1" * 64, "uuv-1", AtdStubConfig(), {seam.sonar_id: unpack(pack(seam))}, 100.0).joined
 
 

@@ -209,7 +209,7 @@ def slow_compressor(crew):
 def test_the_most_confident_go_first_and_never_too_many_are_on_the_way(begin, slow_compressor, put_pictures):
     confidences = random.Random(3).sample([n / 10 for n in range(20)], 8)
     put_pictures(confidences)
-    service = begin(max_on_the_way=2)
+    service = begin(max_in_flight=2)
     eventually(lambda: service.health().counters.get("contacts_detected") == 8)
     eventually(lambda: slow_compressor.store.inbox_depth() == 2)
     eventually(lambda: service.health().gauges["contacts_on_the_way"] == 2)
@@ -231,7 +231,7 @@ def test_a_full_acoustic_queue_holds_contacts_over_a_restart(begin, crew, put_pi
     modem = crew.neighbour("uuv-1", "uuv_modem")
     modem.gauges = lambda: {"messages_waiting": 0.0}
     put_pictures([1.0])
-    service = begin(max_on_the_way=3)
+    service = begin(max_in_flight=3)
     eventually(lambda: len(compressor.got) == 1)
     full = wire.encode(queue_of(3))
 
@@ -243,7 +243,7 @@ def test_a_full_acoustic_queue_holds_contacts_over_a_restart(begin, crew, put_pi
     put_pictures([1.0, 0.5, 1.5])
     eventually(lambda: service.health().gauges["contacts_waiting"] == 2)
     crew.stop(service)
-    service = begin(max_on_the_way=3)
+    service = begin(max_in_flight=3)
     eventually(lambda: tell(full) and service.health().gauges["contacts_on_the_way"] >= 3)
     assert service.health().gauges["contacts_waiting"] == 2
     assert len(compressor.got) == 1

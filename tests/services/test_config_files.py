@@ -106,5 +106,5 @@ def test_both_ends_of_the_link_fit_together():
     assert isinstance(uuv, ModemServiceConfig)
     assert isinstance(vessel, ModemServiceConfig)
     assert uuv.destination == vessel.address != uuv.address
-    assert compressor.catalogue in decompressor.catalogues
+    assert compressor.codebook in decompressor.codebooks
     assert decompressor.vehicles[str(uuv.address)] == load(path_of("uuv"), "atd_stub", table_of("atd_stub"), {})[0].id

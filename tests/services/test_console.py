@@ -285,7 +285,7 @@ def test_a_picture_of_another_vessel_is_refused(start, client, refused):
 
 def test_ashore_c2s_pictures_are_shown_and_advice_goes_to_c2(crew, start, client):
     c2 = crew.neighbour("shore-1", "c2", {keys.tasking_advice_all(): Advice, keys.tasking_command_all(): Command})
-    console = start(side="shore")
+    console = start(role="shore")
     put(client, keys.shore_image(VESSEL), picture())
     eva = Page(console, "eva", "expert")
     eventually(lambda: eva.get("/api/contacts")["total"] == 1, what="picture")
@@ -307,7 +307,7 @@ def test_ashore_c2s_pictures_are_shown_and_advice_goes_to_c2(crew, start, client
 def test_ashore_what_came_meanwhile_is_taken_from_c2s_folder(start, tmp_path):
     write_image(tmp_path / "out" / VESSEL, picture(2, complete=False))
     (tmp_path / "out" / VESSEL / "broken.json").write_text("{")
-    console = start(side="shore", out_dir=tmp_path / "out")
+    console = start(role="shore", out_dir=tmp_path / "out")
     eventually(lambda: console.board.counts().total == 1, what="kept picture")
     kept = console.board.image(ID, 2)
     assert (kept.missing() == picture(2, complete=False).missing()).all()

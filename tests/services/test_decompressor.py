@@ -54,7 +54,7 @@ def out(tmp_path):
 @pytest.fixture
 def begin(crew, platform, out):
     def start(**options):
-        usual = {"out_dir": out, "catalogues": ("nominal-10",), "vehicles": {"3": "uuv-1"}, "pairing_timeout_s": 60.0}
+        usual = {"out_dir": out, "codebooks": ("nominal-10",), "vehicles": {"3": "uuv-1"}, "pairing_timeout_s": 60.0}
         return crew.start(DecompressorService(platform("vessel-1"), DecompressorConfig(**(usual | options))))
 
     return start
@@ -207,7 +207,7 @@ def test_only_the_contact_record_arrives(begin, modem, relay, out):
     assert len(list(out.glob("*.json"))) == 1
 
 
-def test_an_index_beyond_the_catalogue_is_a_black_tile(begin, modem, relay, stream, vq):
+def test_an_index_beyond_the_codebook_is_a_black_tile(begin, modem, relay, stream, vq):
     begin()
     data = bytearray(stream())
     assert len(vq.tiles) < 1 << 14
@@ -225,7 +225,7 @@ def test_an_index_beyond_the_catalogue_is_a_black_tile(begin, modem, relay, stre
     assert image.notes
 
 
-def test_a_picture_of_another_catalogue_is_kept_apart_by_name(begin, modem, relay, texture, refused, vq, stream):
+def test_a_picture_of_another_codebook_is_kept_apart_by_name(begin, modem, relay, texture, refused, vq, stream):
     service = begin()
     other = default_registry().create("vq", CodecResources(open_codebook("nominal-20").tiles))
     hear(modem, *frames_of("AAAA", other.encode(texture())), *frames_of("BBBB", stream()))
@@ -238,8 +238,8 @@ def test_a_picture_of_another_catalogue_is_kept_apart_by_name(begin, modem, rela
     assert service.health().state == "ok"
 
 
-def test_every_configured_catalogue_is_used(begin, modem, relay, texture, stream):
-    begin(catalogues=("nominal-10", "nominal-20"))
+def test_every_configured_codebook_is_used(begin, modem, relay, texture, stream):
+    begin(codebooks=("nominal-10", "nominal-20"))
     other = default_registry().create("vq", CodecResources(open_codebook("nominal-20").tiles))
     hear(modem, *frames_of("AAAA", other.encode(texture())), *frames_of("BBBB", stream()))
     eventually(lambda: len(relay.got) == 2)
@@ -382,13 +382,13 @@ def test_a_defect_in_decoding_costs_one_image(path, begin, modem, relay, stream,
     assert not service.failed
 
 
-def test_a_catalogue_that_cannot_be_read_is_said_at_the_start(platform, tmp_path):
-    config = DecompressorConfig(catalogues=("nominal-10", str(tmp_path / "absent.tiles")))
+def test_a_codebook_that_cannot_be_read_is_said_at_the_start(platform, tmp_path):
+    config = DecompressorConfig(codebooks=("nominal-10", str(tmp_path / "absent.tiles")))
     with pytest.raises(CodebookError, match=r"absent\.tiles"):
         DecompressorService(platform("vessel-1"), config)
 
 
-def test_two_catalogues_that_look_alike_on_the_link_are_refused(platform, tmp_path, monkeypatch):
+def test_two_codebooks_that_look_alike_on_the_link_are_refused(platform, tmp_path, monkeypatch):
     names = []
     for number in range(2):
         rng = np.random.default_rng(number)
@@ -398,8 +398,8 @@ def test_two_catalogues_that_look_alike_on_the_link_are_refused(platform, tmp_pa
         save(tmp_path / f"{number}.tiles", Codebook(database, {}))
     monkeypatch.setattr("sonarpost.services.decompressor.decoder.codebook_tag", lambda tiles: 0x1234)
     with pytest.raises(CodebookError, match="0x1234"):
-        DecompressorService(platform("vessel-1"), DecompressorConfig(catalogues=tuple(names)))
-    DecompressorService(platform("vessel-1"), DecompressorConfig(catalogues=(names[0], names[0]))).store.close()
+        DecompressorService(platform("vessel-1"), DecompressorConfig(codebooks=tuple(names)))
+    DecompressorService(platform("vessel-1"), DecompressorConfig(codebooks=(names[0], names[0]))).store.close()
 
 
 def test_a_damaged_side_car_is_written_anew(begin, crew, modem, relay, stream, out, tmp_path):

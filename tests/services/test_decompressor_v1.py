@@ -31,7 +31,7 @@ from sonarpost.services.decompressor.service import DecompressorService
 
 IN, OUT = keys.acoustic_rx("vessel-1"), keys.image_reconstructed("vessel-1")
 CONTACT = ContactSummary(height_px=40, width_px=60, lat_deg=56.4, lon_deg=-5.6, time_utc_s=1_475_568_000.0)
-LOSS_30 = SenderConfig(frame_bytes=64, channels=(LossChannel(0.3),), frames_per_picture=6)
+LOSS_30 = SenderConfig(frame_bytes=64, channels=(LossChannel(0.3),), frames_per_image=6)
 
 
 @pytest.fixture(scope="session")
@@ -178,7 +178,7 @@ def test_both_formats_are_heard_side_by_side(begin, modem, relay, streams, textu
 
 @pytest.mark.parametrize(("links", "images"), [(("v1",), {"0001"}), (("paper",), {"0A1B"})])
 def test_a_format_that_is_not_configured_is_rejected(links, images, begin, modem, relay, streams, texture):
-    service = begin(links=links)
+    service = begin(wire_formats=links)
     vq = default_registry().create("vq", CodecResources(open_codebook("nominal-10").tiles))
     halves = [data for packet in plan_packets("0A1B", vq.encode(texture()), CONTACT, 3, 64) for data in packet]
     hear(modem, [*halves, *sent(streams[:1])])
@@ -271,5 +271,5 @@ def test_a_sealed_frame_whose_commit_failed_is_no_replay(begin, streams, key_fil
 
 
 def test_a_key_and_a_format_without_seals_exclude_each_other(begin, key_file):
-    with pytest.raises(ConfigError, match="links"):
-        begin(key_file=key_file, links=("paper",))
+    with pytest.raises(ConfigError, match="wire_formats"):
+        begin(key_file=key_file, wire_formats=("paper",))

@@ -71,7 +71,7 @@ def key_file(tmp_path):
 @pytest.fixture
 def begin(crew, platform, sea):
     def start(*, key_file=None, **options):
-        usual = {"port": sea.port(sea.VESSEL), "vehicles": {"3": "uuv-1"}, "retry_s": 0.5, "quiet_s": 0.05}
+        usual = {"port": sea.port(sea.VESSEL), "vehicles": {"3": "uuv-1"}, "retry_s": 0.5, "holdoff_s": 0.05}
         there = platform(VESSEL).model_copy(update={"acoustic_key_file": key_file})
         return crew.start(OpModemService(there, OpModemConfig(**(usual | options))))
 
@@ -246,7 +246,7 @@ def test_without_consumers_messages_are_shown(begin, watch):
 
 
 def test_an_order_that_nobody_confirms_expires(sea, begin, console, states):
-    begin(order_lifetime_s=0.3)
+    begin(command_lifetime_s=0.3)
     console.owe(keys.command(VESSEL, "refine"), "op_modem", command())
     eventually(lambda: [state.state for state in states("c-1")] == ["asked", "expired"])
     console.owe(DECISION, "op_modem", VERDICT)  # decided long ago
@@ -257,7 +257,7 @@ def test_reports_tell_the_vehicle_what_is_lacking(sea, begin, vehicle, crew):
     decompressor = crew.neighbour(VESSEL, "decompressor", {RX: AcousticFrame})
     sea.start()
     far = vehicle()
-    service = begin(report_s=0.5)
+    service = begin(feedback_interval_s=0.5)
     eventually(lambda: far.modem.ready and service.modem.ready)
     contact = ContactSummary(height_px=40, width_px=60, time_utc_s=1.0)
     for number in range(1, 5):
@@ -331,7 +331,7 @@ def turn(**options):
 
 
 def test_it_speaks_when_it_has_been_quiet_or_it_has_waited_long():
-    mine = turn(quiet_s=2.0, patience_s=60.0)
+    mine = turn(holdoff_s=2.0, max_defer_s=60.0)
     ask = {"receiving": False, "wanted": True}
     mine.heard(100.0)
     assert not mine.may_speak(101.0, 0.0, **ask)
@@ -348,13 +348,13 @@ def test_it_speaks_when_it_has_been_quiet_or_it_has_waited_long():
 
 
 def test_it_speaks_in_its_slot_only():
-    mine = turn(medium="tdma", frame_s=60.0, slot_start_s=50.0, slot_s=10.0, guard_s=1.0)
+    mine = turn(mac="tdma", tdma_cycle_s=60.0, slot_start_s=50.0, slot_s=10.0, guard_s=1.0)
     spoken = [at for at in range(120) if mine.may_speak(float(at), float(at), receiving=False, wanted=True)]
     assert spoken == [50, 51, 52, 53, 54, 110, 111, 112, 113, 114]
 
 
 def test_vehicles_are_polled_in_turn():
-    mine = turn(medium="poll", poll_interval_s=10.0)
+    mine = turn(mac="polled", poll_interval_s=10.0)
     asked = [(at, mine.vehicle_to_poll(float(at), [3, 5])) for at in range(0, 40, 5)]
     assert [pair for pair in asked if pair[1] is not None] == [(0, 3), (10, 5), (20, 3), (30, 5)]
     assert turn().vehicle_to_poll(0.0, [3]) is None
@@ -365,8 +365,8 @@ def test_vehicles_are_polled_in_turn():
     [
         {"vehicles": {"3": "uuv-1", "4": "uuv-1"}},
         {"vehicles": {"300": "uuv-1"}},
-        {"medium": "tdma", "slot_start_s": 55.0},
-        {"medium": "tdma", "slot_start_s": 0.0, "slot_s": 3.0},
+        {"mac": "tdma", "slot_start_s": 55.0},
+        {"mac": "tdma", "slot_start_s": 0.0, "slot_s": 3.0},
     ],
 )
 def test_configurations_that_cannot_work_are_refused(options):
@@ -386,6 +386,6 @@ def test_a_vehicle_is_asked_for_a_packet_and_answers(sea, begin, vehicle, crew):
 
     far.modem.answer_polls(uplink)
     eventually(lambda: far.modem.ready)
-    begin(medium="poll", poll_interval_s=0.2)
+    begin(mac="polled", poll_interval_s=0.2)
     assert asked.wait(30)
     eventually(lambda: any(frame.data.startswith(b"polled") for frame in decompressor.got), timeout_s=30)

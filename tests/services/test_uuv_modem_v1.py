@@ -78,9 +78,9 @@ def begin(crew, platform, sea):
             "port": sea.port(sea.VEHICLE),
             "rate": 1,
             "retry_s": 0.05,
-            "listen_s": 0.0,
-            "gather_s": 0.3,
-            "quiet_s": 0.15,
+            "rx_window_s": 0.0,
+            "group_delay_s": 0.3,
+            "holdoff_s": 0.15,
             "queue_interval_s": 0.1,
         }
         return crew.start(UuvModemService(platform_config or platform("uuv-1"), UuvModemConfig(**(usual | options))))
@@ -310,7 +310,7 @@ def test_an_order_that_nobody_takes_is_told(vessel, begin):
 
 
 def test_what_a_report_lacks_is_sent(vessel, begin, programs):
-    service = begin(stream_bytes=300, listen_every_s=0.2, listen_s=0.2)
+    service = begin(stream_bytes=300, tx_burst_s=0.2, rx_window_s=0.2)
     programs.owe(IN, "uuv_modem", *[image(n) for n in range(1, 5)])
     eventually(lambda: len(vessel.frames) > 10)
 
@@ -388,7 +388,7 @@ def ears_of(key: AcousticKey) -> FrameAuthenticator:
 
 
 def test_polled_it_sends_what_it_is_asked_for_and_nothing_else(vessel, begin, programs):
-    service = begin(medium="poll", gather_s=0.0)
+    service = begin(mac="polled", group_delay_s=0.0)
     programs.owe(IN, "uuv_modem", image(1), image(2))
     eventually(lambda: bool(service._runner._offered))
     assert sent(service) == 0
@@ -405,7 +405,7 @@ def test_polled_it_sends_what_it_is_asked_for_and_nothing_else(vessel, begin, pr
 def test_of_a_state_that_cannot_be_read_pictures_and_messages_are_queued_anew(
     spoilt, begin, programs, crew, vessel, refused
 ):
-    service = begin(gather_s=3600.0)  # the pictures wait
+    service = begin(group_delay_s=3600.0)  # the pictures wait
     programs.owe(IN, "uuv_modem", *[image(n) for n in range(1, 4)])
     programs.owe(OUT, "uuv_modem", message("kept", priority=6))
     eventually(lambda: len(service._line.queue.names) == 3 and not service._line.accepted())
@@ -442,8 +442,8 @@ def test_a_picture_that_can_never_be_sent_is_refused_to_its_sender(change, said,
 
 
 @pytest.mark.parametrize(
-    "slot", [{"frame_s": 10.0, "slot_s": 20.0}, {"slot_s": 6.0}, {"slot_s": 20.0, "slot_start_s": 50.0}]
+    "slot", [{"tdma_cycle_s": 10.0, "slot_s": 20.0}, {"slot_s": 6.0}, {"slot_s": 20.0, "slot_start_s": 50.0}]
 )
 def test_a_slot_that_no_packet_fits_is_refused_at_once(slot):
     with pytest.raises(ValueError, match="slot"):
-        UuvModemConfig(port="x", medium="tdma", **slot)
+        UuvModemConfig(port="x", mac="tdma", **slot)

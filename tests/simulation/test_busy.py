@@ -17,14 +17,14 @@ def test_at_rate_5_the_water_is_busy_and_every_report_is_heard() -> None:
 
 
 def test_without_pauses_nothing_but_the_turn_from_packet_to_packet_is_lost() -> None:
-    result = run_busy(BusySpec(rate=1, listen_s=0.0, frame_loss=0.0, seconds=600.0))
+    result = run_busy(BusySpec(rate=1, rx_window_s=0.0, frame_loss=0.0, seconds=600.0))
     assert result.busy > 0.995
     assert result.reports == 0
 
 
 def test_a_slow_serial_line_limits_rate_5() -> None:
-    slow = run_busy(BusySpec(rate=5, serial_baud=19_200.0, listen_s=0.0, seconds=120.0))
-    fast = run_busy(BusySpec(rate=5, serial_baud=115_200.0, listen_s=0.0, seconds=120.0))
+    slow = run_busy(BusySpec(rate=5, serial_baud=19_200.0, rx_window_s=0.0, seconds=120.0))
+    fast = run_busy(BusySpec(rate=5, serial_baud=115_200.0, rx_window_s=0.0, seconds=120.0))
     assert 0.5 < slow.busy < 0.7
     assert 0.85 < fast.busy < 0.95
 

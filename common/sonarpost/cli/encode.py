@@ -34,7 +34,7 @@ def _add_encode(subparsers: argparse._SubParsersAction[argparse.ArgumentParser])
     parser.add_argument("input", type=Path, metavar="IMAGE_OR_DIR", help="TIFF or PNG, grey, 8 or 16 bits")
     parser.add_argument("--codec", default="vq", help="codec, one of those `--codec help` lists (default: vq)")
     parser.add_argument(
-        "--catalogue", default="nominal-10", metavar="NAME_OR_FILE", help="nominal-10 (default), nominal-20 or a file"
+        "--codebook", default="nominal-10", metavar="NAME_OR_FILE", help="nominal-10 (default), nominal-20 or a file"
     )
     parser.add_argument(
         "--packing",
@@ -52,7 +52,7 @@ def _add_decode(subparsers: argparse._SubParsersAction[argparse.ArgumentParser])
     parser = subparsers.add_parser("decode", help="decode a stream or a folder of streams to TIFF and PNG")
     parser.add_argument("input", type=Path, metavar="FILE_OR_DIR", help="what `sonarpost encode` wrote")
     parser.add_argument(
-        "--catalogue", metavar="NAME_OR_FILE", help="default: the shipped catalogue the stream was made with"
+        "--codebook", metavar="NAME_OR_FILE", help="default: the shipped codebook the stream was made with"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="where images go (default: out/ beside the stream)")
     parser.set_defaults(run=run_decode)
@@ -62,14 +62,14 @@ def run_encode(args: argparse.Namespace) -> int:
     """Encode; return 0, or 1 if any file of the folder could not be encoded.
 
     Raises:
-        SonarpostError: The codec or the catalogue cannot be had, or the one image given is bad.
+        SonarpostError: The codec or the codebook cannot be had, or the one image given is bad.
     """
     registry = default_registry()
     if args.codec == "help":
         for name in registry.names():
             print(f"{name:12} {registry.spec(name).summary}")
         return 0
-    tiles = open_codebook(args.catalogue).tiles if registry.spec(args.codec).needs_tiles else None
+    tiles = open_codebook(args.codebook).tiles if registry.spec(args.codec).needs_tiles else None
     codec = registry.create(args.codec, CodecResources(tiles, IndexPacking(args.packing)))
     suffix = TEXT_SUFFIX if args.text else f".{codec.name}"
 
@@ -83,15 +83,15 @@ def run_decode(args: argparse.Namespace) -> int:
     """Decode; return 0, or 1 if any file of the folder could not be decoded.
 
     Raises:
-        SonarpostError: The catalogue cannot be had, or the one stream given is bad.
+        SonarpostError: The codebook cannot be had, or the one stream given is bad.
     """
     registry = default_registry()
     suffixes = (*(f".{name}" for name in registry.names()), TEXT_SUFFIX)
-    if args.catalogue is not None:
-        open_codebook(args.catalogue)  # a wrong catalogue is one error, not one for each file of the folder
+    if args.codebook is not None:
+        open_codebook(args.codebook)  # a wrong codebook is one error, not one for each file of the folder
 
     def decode_one(path: Path) -> str:
-        return _decode_file(registry, path, _target_folder(args.out, path.parent / "out"), args.catalogue)
+        return _decode_file(registry, path, _target_folder(args.out, path.parent / "out"), args.codebook)
 
     return _over_files(args.input, suffixes, decode_one)
 
@@ -130,12 +130,12 @@ def _encode_file(codec: Codec, path: Path, target: Path, args: argparse.Namespac
     return f"{path} -> {target}: {image.nbytes} B -> {len(stream)} B ({image.nbytes / len(stream):.1f}:1)"
 
 
-def _decode_file(registry: CodecRegistry, path: Path, folder: Path, catalogue: str | None) -> str:
+def _decode_file(registry: CodecRegistry, path: Path, folder: Path, codebook: str | None) -> str:
     stream = _read_stream(path)
     header = StreamHeader.unpack(stream, str(path))
     tiles = None
     if registry.spec_for_id(header.codec_id).needs_tiles:
-        tiles = (open_codebook(catalogue) if catalogue is not None else default_for_tag(header.model_tag)).tiles
+        tiles = (open_codebook(codebook) if codebook is not None else default_for_tag(header.model_tag)).tiles
     decoded = registry.create_for_stream(stream, CodecResources(tiles)).decode(stream)
     target = folder / f"{path.stem}.tiff"
     write_tiff(target, decoded.image)

@@ -26,7 +26,7 @@ COMMANDS = {
     "detect": "detect",
     "encode": "encode",
     "decode": "encode",
-    "catalogue": "catalogue",
+    "codebook": "codebook",
     "bench": "bench",
     "pki": "pki",
     "modem-emulator": "modem_emulator",

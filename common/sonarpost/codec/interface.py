@@ -138,7 +138,7 @@ class Codec(Protocol):
 
     @property
     def model_hash(self) -> str:
-        """Hex sha256 of the trained model or catalogue in use; empty for codecs without one."""
+        """Hex sha256 of the trained model or codebook in use; empty for codecs without one."""
 
     def encode(self, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], budget_bytes: int | None = None) -> bytes:
         """Return the stream, header included.

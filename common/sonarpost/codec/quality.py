@@ -1,4 +1,4 @@
-"""How good a rebuilt picture is: PSNR, SSIM, MS-SSIM, and the figure of merit that decides what enters a catalogue."""
+"""How good a rebuilt picture is: PSNR, SSIM, MS-SSIM, and the figure of merit that decides what enters a codebook."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def fom(original: GreyImage, rebuilt: GreyImage) -> float:
 
     The paper leaves its figure of merit "user-defined" and gives the threshold 39. SSIM is chosen because operators
     judge structure (highlight, shadow, texture), which PSNR hardly measures on speckle; any other callable of the
-    same shape (`FigureOfMerit`) can be handed to the catalogue builder.
+    same shape (`FigureOfMerit`) can be handed to the codebook builder.
     """
     return 100.0 * ssim(original, rebuilt)
 

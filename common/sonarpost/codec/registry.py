@@ -33,7 +33,7 @@ class CodecResources:
     """What a codec may need to be made. A codec ignores what it does not use.
 
     Attributes:
-        tiles: The tile database, for codecs with a catalogue.
+        tiles: The tile database, for codecs with a codebook.
         packing: How vq writes indices.
         codec_id: Which of its ids the codec is wanted for; None for the one that follows from the rest. Set when a
             stream is to be decoded.
@@ -69,7 +69,7 @@ class CodecSpec:
 
 def _create_vq(resources: CodecResources) -> Codec:
     if resources.tiles is None:
-        raise ConfigError("codec vq", "tiles", None, "a tile catalogue, for example nominal-10")
+        raise ConfigError("codec vq", "tiles", None, "a tile codebook, for example nominal-10")
     packing = resources.packing
     if resources.codec_id is not None:
         packing = IndexPacking.from_codec_id(resources.codec_id) or packing
@@ -119,7 +119,7 @@ BUILTINS = (
         "vq",
         tuple(packing.codec_id for packing in IndexPacking),
         _create_vq,
-        "vector quantisation with a shared tile catalogue (the paper's codec)",
+        "vector quantisation with a shared tile codebook (the paper's codec)",
         needs_tiles=True,
     ),
     CodecSpec("huffman", (0x01,), lambda _: HuffmanCodec(), "quantised grey levels in a Huffman code (in the paper)"),
@@ -161,7 +161,7 @@ class CodecRegistry:
             if not 0 <= codec_id <= 0xFF:
                 raise ConfigError(where, "codec_ids", codec_id, "0..255")
             if spec.needs_tiles and tag_length(codec_id) != CODEBOOK_TAG_BYTES:
-                expected = "0x10..0x1f or 0x80..0xff, whose streams say in two bytes which catalogue they need"
+                expected = "0x10..0x1f or 0x80..0xff, whose streams say in two bytes which codebook they need"
                 raise ConfigError(where, "codec_ids", f"{codec_id:#04x}", expected)
             if codec_id in self._by_id:
                 taken = self._by_id[codec_id].name

@@ -26,12 +26,12 @@ class SenderConfig:
         uncertainty: How far off a measured loss may be, as a share of it: detail is planned for losses that much
             smaller and greater too. 0.15 costs less than 0.01 dB where the measure is right.
         feedback: Whether a receiver reports what it lacks. Without, each block is sent once, with layers.
-        frames_per_picture: Frames a picture may cost on average, previews included; of use without feedback.
+        frames_per_image: Frames a picture may cost on average, previews included; of use without feedback.
         stream_bytes: Most bytes of a stream that are planned at first; of use with feedback.
         group_pictures: Most pictures in a group; 0 for so many that a group has about 144 frames (`group_size`).
         depth: Groups under way at a time: their frames are interleaved, against bursts.
-        gather_s: How long a picture waits for others to make a group with.
-        patience_s: With feedback, how long without a report before a few more symbols are sent.
+        group_delay_s: How long a picture waits for others to make a group with.
+        max_defer_s: With feedback, how long without a report before a few more symbols are sent.
         receiver_memory_s: How long after its last report a receiver counts.
         block_symbols: With feedback, most source symbols of a block.
         caution: See `v1_plan.symbols_to_send`.
@@ -46,12 +46,12 @@ class SenderConfig:
     channels: tuple[LossChannel, ...] = (LossChannel(0.3),)
     uncertainty: float = 0.15
     feedback: bool = False
-    frames_per_picture: float = 6.0
+    frames_per_image: float = 6.0
     stream_bytes: int = 512
     group_pictures: int = 0
     depth: int = 2
-    gather_s: float = 0.0
-    patience_s: float = 600.0
+    group_delay_s: float = 0.0
+    max_defer_s: float = 600.0
     receiver_memory_s: float = 3600.0
     block_symbols: int = 96
     caution: float = 1.5
@@ -62,12 +62,12 @@ class SenderConfig:
         _check("frame_bytes", self.frame_bytes, MIN_FRAME_BYTES, MAX_FRAME_BYTES)
         _check("channels", len(self.channels), 1, 64)
         _check("uncertainty", self.uncertainty, 0, 0.9)
-        _check("frames_per_picture", self.frames_per_picture, 1, 255)
+        _check("frames_per_image", self.frames_per_image, 1, 255)
         _check("stream_bytes", self.stream_bytes, 16, 65535)
         _check("group_pictures", self.group_pictures, 0, 120)
         _check("depth", self.depth, 1, WINDOW // 4)
-        _check("gather_s", self.gather_s, 0, 86400)
-        _check("patience_s", self.patience_s, 0.001, 86400)
+        _check("group_delay_s", self.group_delay_s, 0, 86400)
+        _check("max_defer_s", self.max_defer_s, 0.001, 86400)
         _check("receiver_memory_s", self.receiver_memory_s, 0.001, 1e9)
         _check("block_symbols", self.block_symbols, 1, 200)
         _check("caution", self.caution, 0, 10)
@@ -85,9 +85,7 @@ class SenderConfig:
         if self.group_pictures:
             return self.group_pictures
         return (
-            _FEEDBACK_GROUP
-            if self.feedback
-            else min(_MOST_GROUP, max(1, round(_GROUP_FRAMES / self.frames_per_picture)))
+            _FEEDBACK_GROUP if self.feedback else min(_MOST_GROUP, max(1, round(_GROUP_FRAMES / self.frames_per_image)))
         )
 
     @property
@@ -105,8 +103,8 @@ class ReceiverConfig:
         max_contacts: Contacts remembered of each.
         block_memory_s: A block is forgotten after this long without a symbol of it.
         contact_memory_s: A contact, after this long without news of it.
-        report_frames: A report is due after so many frames ...
-        report_s: ... or this long without one, while something is lacking.
+        feedback_interval_frames: A report is due after so many frames ...
+        feedback_interval_s: ... or this long without one, while something is lacking.
         presence_s: While frames come, a report goes after this long even where nothing is lacking.
 
     Raises:
@@ -117,16 +115,16 @@ class ReceiverConfig:
     max_contacts: int = 512
     block_memory_s: float = 3600.0
     contact_memory_s: float = 6 * 3600.0
-    report_frames: int = 48
-    report_s: float = 60.0
+    feedback_interval_frames: int = 48
+    feedback_interval_s: float = 60.0
     presence_s: float = 600.0
 
     def __post_init__(self) -> None:
         _check("max_sources", self.max_sources, 1, 128)
         _check("max_contacts", self.max_contacts, 1, 65535)
-        for name in ("block_memory_s", "contact_memory_s", "report_s", "presence_s"):
+        for name in ("block_memory_s", "contact_memory_s", "feedback_interval_s", "presence_s"):
             _check(name, getattr(self, name), 0.001, 1e9)
-        _check("report_frames", self.report_frames, 1, 65535)
+        _check("feedback_interval_frames", self.feedback_interval_frames, 1, 65535)
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:

@@ -39,22 +39,22 @@ class Continuous:
     Modems are half-duplex: a station that always sends hears nothing.
 
     Args:
-        listen_every_s: How long it sends before it listens; a silence of its own counts as listening.
-        listen_s: How long it then listens; 0 never.
-        quiet_s: How long after others were last heard it does not begin: what they say may go on.
+        tx_burst_s: How long it sends before it listens; a silence of its own counts as listening.
+        rx_window_s: How long it then listens; 0 never.
+        holdoff_s: How long after others were last heard it does not begin: what they say may go on.
 
     Raises:
         ConfigError: A time out of range.
     """
 
-    def __init__(self, listen_every_s: float = 60.0, listen_s: float = 0.0, quiet_s: float = 0.0) -> None:
-        _check("listen_every_s", listen_every_s, 0.001, 86400)
-        _check("listen_s", listen_s, 0, 86400)
-        _check("quiet_s", quiet_s, 0, 86400)
-        self._quiet_s = quiet_s
+    def __init__(self, tx_burst_s: float = 60.0, rx_window_s: float = 0.0, holdoff_s: float = 0.0) -> None:
+        _check("tx_burst_s", tx_burst_s, 0.001, 86400)
+        _check("rx_window_s", rx_window_s, 0, 86400)
+        _check("holdoff_s", holdoff_s, 0, 86400)
+        self._quiet_s = holdoff_s
         self._heard = -math.inf
-        self._every_s = listen_every_s
-        self._listen_s = listen_s
+        self._every_s = tx_burst_s
+        self._listen_s = rx_window_s
         self._begun: float | None = None
         self._ended = -math.inf
 
@@ -86,11 +86,11 @@ class Continuous:
 class Tdma:
     """Sends in its own slot of a frame of time (TDMA): no two stations at once, however many there are.
 
-    Slots repeat every `frame_s` from 1970-01-01 UTC on. The last `guard_s` of a slot are silent: they take up what the
-    clocks differ by and how long sound travels.
+    Slots repeat every `tdma_cycle_s` from 1970-01-01 UTC on. The last `guard_s` of a slot are silent: they cover the
+    difference between clocks and the travel time of sound.
 
     Args:
-        frame_s: Length of the frame.
+        tdma_cycle_s: Length of the frame.
         slot_start_s: Where in the frame the slot begins.
         slot_s: Length of the slot.
         guard_s: See above.
@@ -99,12 +99,12 @@ class Tdma:
         ConfigError: A slot that does not lie within the frame, or a guard that leaves nothing of it.
     """
 
-    def __init__(self, frame_s: float, slot_start_s: float, slot_s: float, guard_s: float) -> None:
-        _check("frame_s", frame_s, 0.001, 86400)
-        _check("slot_start_s", slot_start_s, 0, frame_s)
-        _check("slot_s", slot_s, 0.001, frame_s - slot_start_s)
+    def __init__(self, tdma_cycle_s: float, slot_start_s: float, slot_s: float, guard_s: float) -> None:
+        _check("tdma_cycle_s", tdma_cycle_s, 0.001, 86400)
+        _check("slot_start_s", slot_start_s, 0, tdma_cycle_s)
+        _check("slot_s", slot_s, 0.001, tdma_cycle_s - slot_start_s)
         _check("guard_s", guard_s, 0, slot_s)
-        self._frame_s = frame_s
+        self._frame_s = tdma_cycle_s
         self._start_s = slot_start_s
         self._usable_s = slot_s - guard_s
 
@@ -145,19 +145,19 @@ class Csma:
     the most of the water; far below that, packets meet.
 
     Args:
-        mean_wait_s: Mean of the waits.
-        quiet_s: How long after others were last heard it does not begin.
+        mean_backoff_s: Mean of the waits.
+        holdoff_s: How long after others were last heard it does not begin.
         seed: Of the waits; another one for each station.
 
     Raises:
         ConfigError: A time out of range.
     """
 
-    def __init__(self, mean_wait_s: float, quiet_s: float = 0.0, seed: int = 0) -> None:
-        _check("mean_wait_s", mean_wait_s, 0, 86400)
-        _check("quiet_s", quiet_s, 0, 86400)
-        self._mean_s = mean_wait_s
-        self._quiet_s = quiet_s
+    def __init__(self, mean_backoff_s: float, holdoff_s: float = 0.0, seed: int = 0) -> None:
+        _check("mean_backoff_s", mean_backoff_s, 0, 86400)
+        _check("holdoff_s", holdoff_s, 0, 86400)
+        self._mean_s = mean_backoff_s
+        self._quiet_s = holdoff_s
         self._random = random.Random(seed)  # noqa: S311 no secret
         self._not_before: float | None = None
         self._heard = -math.inf
@@ -178,9 +178,9 @@ class Csma:
         self._heard = now
 
 
-def _quiet_for_s(quiet_s: float, heard: float, now: float) -> float:
+def _quiet_for_s(holdoff_s: float, heard: float, now: float) -> float:
     """Return how much of a silence is left; none where the clock was set back."""
-    return max(0.0, quiet_s - (now - heard)) if heard <= now else 0.0
+    return max(0.0, holdoff_s - (now - heard)) if heard <= now else 0.0
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:

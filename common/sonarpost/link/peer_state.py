@@ -191,6 +191,6 @@ class PeerState:
         silent_s = now - self.reported_at
         helps = self.is_lacking or self.needless > 0 or self.reported_frames == 0
         news = self.frames - self.reported_frames
-        return (helps and (silent_s >= config.report_s or news >= config.report_frames)) or (
+        return (helps and (silent_s >= config.feedback_interval_s or news >= config.feedback_interval_frames)) or (
             news > 0 and silent_s >= config.presence_s
         )

@@ -242,7 +242,7 @@ class LinkSender:
         symbol_bytes = self.symbol_bytes
         while self.waiting:
             limit = group_limit(self.config, symbol_bytes)
-            due = len(self.waiting) >= limit or now - self.waiting[0].added_at >= self.config.gather_s
+            due = len(self.waiting) >= limit or now - self.waiting[0].added_at >= self.config.group_delay_s
             group = self.waiting[:limit]
             if not due or not self._may_begin(group):
                 return
@@ -385,7 +385,7 @@ class LinkSender:
             block.planned += max(1, block.source_symbols // 16)
 
     def _forgotten(self, now: float) -> list[SendBlock]:
-        return [b for b in self.blocks if b.lacks <= 0 and now - b.asked_at >= self.config.patience_s]
+        return [b for b in self.blocks if b.lacks <= 0 and now - b.asked_at >= self.config.max_defer_s]
 
     def pictures_are_due(self, now: float) -> bool:
         """Whether something of pictures is to be sent, be it a reminder of what nobody has reported of."""

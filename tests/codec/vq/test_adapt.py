@@ -1,4 +1,4 @@
-"""Adapting a catalogue to a seabed: which tiles go, which come, and what it is good for."""
+"""Adapting a codebook to a seabed: which tiles go, which come, and what it is good for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Table IV: what goes into a catalogue, in which order, and what a killed build loses."""
+"""Table IV: what goes into a codebook, in which order, and what a killed build loses."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize("killed_after", [1, 2, 4, 6, 9])
-def test_a_killed_build_goes_on_to_the_same_catalogue(tmp_path: Path, killed_after: int) -> None:
+def test_a_killed_build_goes_on_to_the_same_codebook(tmp_path: Path, killed_after: int) -> None:
     pictures = [image(seed) for seed in range(6)]
     rounds = [Round(ALWAYS, rms_distance(45, 8)), Round(ALWAYS, rms_distance(40, 8), 4)]
     whole = build(training(*pictures), 8, rounds)

@@ -1,4 +1,4 @@
-"""The catalogue file: round trip, damage, the shipped ones."""
+"""The codebook file: round trip, damage, the shipped ones."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def test_saved_and_loaded_it_is_the_same(tmp_path: Path) -> None:
 
 
 def test_the_layout_is_the_documented_one() -> None:
-    catalogue = small()
-    data = to_bytes(catalogue)
-    notes = json.dumps(dict(catalogue.notes), sort_keys=True, ensure_ascii=False).encode()
-    tiles = catalogue.tiles
+    codebook = small()
+    data = to_bytes(codebook)
+    notes = json.dumps(dict(codebook.notes), sort_keys=True, ensure_ascii=False).encode()
+    tiles = codebook.tiles
     header = b"SPTILES\n" + (1).to_bytes(2, "big") + (4).to_bytes(2, "big") + (7).to_bytes(4, "big")
     header += (3).to_bytes(2, "big") + len(notes).to_bytes(4, "big")
     content = header + notes + tiles.mean.tobytes() + tiles.basis.astype(">i2").tobytes() + tiles.tiles.tobytes()
@@ -57,7 +57,7 @@ def test_the_layout_is_the_documented_one() -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(data=st.data())
-def test_any_damage_is_a_catalogue_error(data: st.DataObject) -> None:
+def test_any_damage_is_a_codebook_error(data: st.DataObject) -> None:
     good = to_bytes(small())
     damaged = bytearray(good)
     for _ in range(data.draw(st.integers(1, 4))):
@@ -125,7 +125,7 @@ def test_a_file_that_cannot_be_read_or_written_is_named(tmp_path: Path) -> None:
         save(tmp_path / "nowhere" / "a.tiles", small())
 
 
-def test_a_failed_write_leaves_the_old_catalogue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_write_leaves_the_old_codebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.tiles"
     save(path, small())
     before = path.read_bytes()
@@ -141,18 +141,18 @@ def test_a_failed_write_leaves_the_old_catalogue(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize("tile_px", DEFAULT_TILE_PX)
-def test_the_shipped_catalogues_are_whole_and_fit_14_bits(tile_px: int) -> None:
-    catalogue = load_default(tile_px)
-    assert catalogue.tiles.tile_px == tile_px
-    assert 1000 <= len(catalogue.tiles) <= 15_992
-    assert catalogue.tiles.dims == 70
-    assert "public domain" in catalogue.notes["source"]
-    assert len(np.unique(catalogue.tiles.tiles, axis=0)) == len(catalogue.tiles)
-    assert VqCodec(catalogue.tiles).model_hash == catalogue.tiles.identity
-    assert open_codebook(f"nominal-{tile_px}") is catalogue
+def test_the_shipped_codebooks_are_whole_and_fit_14_bits(tile_px: int) -> None:
+    codebook = load_default(tile_px)
+    assert codebook.tiles.tile_px == tile_px
+    assert 1000 <= len(codebook.tiles) <= 15_992
+    assert codebook.tiles.dims == 70
+    assert "public domain" in codebook.notes["source"]
+    assert len(np.unique(codebook.tiles.tiles, axis=0)) == len(codebook.tiles)
+    assert VqCodec(codebook.tiles).model_hash == codebook.tiles.identity
+    assert open_codebook(f"nominal-{tile_px}") is codebook
 
 
-def test_a_shipped_catalogue_is_found_by_the_tag_in_a_stream() -> None:
+def test_a_shipped_codebook_is_found_by_the_tag_in_a_stream() -> None:
     tags = {tile_px: codebook_tag(load_default(tile_px).tiles) for tile_px in DEFAULT_TILE_PX}
     assert len(set(tags.values())) == len(tags)
     for tile_px, tag in tags.items():

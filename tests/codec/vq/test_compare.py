@@ -1,4 +1,4 @@
-"""How two catalogues differ."""
+"""How two codebooks differ."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def database(seed: int, count: int = 60, tile_px: int = 8) -> TileDatabase:
     return TileDatabase.from_tiles(tile_px, rng.integers(0, 256, (count, tile_px**2), dtype=np.uint8), 20)
 
 
-def test_a_catalogue_does_not_differ_from_itself() -> None:
+def test_a_codebook_does_not_differ_from_itself() -> None:
     one = database(0)
     difference = compare(one, one)
     assert difference.same_identity

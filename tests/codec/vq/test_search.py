@@ -96,7 +96,7 @@ def test_far_blocks_are_spared(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sum(compared) < 0.25 * 64 * len(stored)
 
 
-def test_the_shipped_catalogue_is_searched_exactly() -> None:
+def test_the_shipped_codebook_is_searched_exactly() -> None:
     database = load_default(10).tiles
     rng = np.random.default_rng(2)
     noise = np.clip(60 * rng.rayleigh(1.0, (60, 100)), 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Training windows, the Humminbird recording, the recipe of the shipped catalogues."""
+"""Training windows, the Humminbird recording, the recipe of the shipped codebooks."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from builders.common import REPOSITORY
 
-from sonarpost.cli.catalogue.default_codebooks import RECIPES, Recipe, build_nominal, humminbird_images
-from sonarpost.cli.catalogue.humminbird_lines import humminbird_lines, read_channel
+from sonarpost.cli.codebook.default_codebooks import RECIPES, Recipe, build_nominal, humminbird_images
+from sonarpost.cli.codebook.humminbird_lines import humminbird_lines, read_channel
 from sonarpost.codec.vq.codebook import to_bytes
 from sonarpost.codec.vq.patches import PatchPlan, ToneMapping, cut_around, cut_line, reduce_line, shuffled, stretch
 from sonarpost.codec.vq.training_config import Round
@@ -121,7 +121,7 @@ def test_a_recording_and_an_image_of_it_give_the_same_lines(tmp_path: Path) -> N
         assert np.isnan(values).any()
 
 
-def test_damaged_recordings_are_catalogue_errors(tmp_path: Path) -> None:
+def test_damaged_recordings_are_codebook_errors(tmp_path: Path) -> None:
     ping = np.arange(1, 30, dtype=np.uint8)
     recording(tmp_path, "B002", [ping] * 3)
     son, idx = tmp_path / "B002.SON", tmp_path / "B002.IDX"
@@ -157,7 +157,7 @@ def test_a_missing_or_ambiguous_channel_is_named(tmp_path: Path) -> None:
         humminbird_lines(tmp_path)
 
 
-def test_a_nominal_catalogue_is_the_same_bytes_in_any_order_of_its_images() -> None:
+def test_a_nominal_codebook_is_the_same_bytes_in_any_order_of_its_images() -> None:
     images = list(cut_line("x", line(), PatchPlan(copies=2)))
     recipe = Recipe(10, 200, (Round(39.0, 400.0, 10), Round(100.0, 60.0)), 2)
     one, other = build_nominal(recipe, images), build_nominal(recipe, images[::-1])
@@ -166,7 +166,7 @@ def test_a_nominal_catalogue_is_the_same_bytes_in_any_order_of_its_images() -> N
     assert one.notes["refine passes"] == "2"
 
 
-def test_the_recipes_fill_14_bit_catalogues_of_both_sizes() -> None:
+def test_the_recipes_fill_14_bit_codebooks_of_both_sizes() -> None:
     assert [recipe.tile_px for recipe in RECIPES] == [10, 20]
     assert all(recipe.max_tiles < 1 << 14 for recipe in RECIPES)
     assert sum(recipe.max_tiles * recipe.tile_px**2 for recipe in RECIPES) <= 8_000_000

@@ -129,7 +129,7 @@ def test_an_index_above_the_last_tile_is_black_and_missing(tiles: TileDatabase, 
     assert decoded.missing[10:, 10:20].all()
     assert decoded.missing.sum() == 100
     assert not decoded.image[decoded.missing].any()
-    assert "outside the catalogue" in decoded.notes[0]
+    assert "outside the codebook" in decoded.notes[0]
     indices[4] = len(tiles)
     assert not codec.decode(header + pack_indices(indices, packing)).missing.any()
 
@@ -177,7 +177,7 @@ def test_a_short_body_and_trailing_bytes_are_told(tiles: TileDatabase) -> None:
     assert longer.notes == ("3 B after the body ignored",)
 
 
-def test_a_catalogue_of_another_identity_is_named_with_both_tags(tiles: TileDatabase) -> None:
+def test_a_codebook_of_another_identity_is_named_with_both_tags(tiles: TileDatabase) -> None:
     other = TileDatabase.from_tiles(tiles.tile_px, tiles.tiles[::-1])
     stream = VqCodec(other).encode(picture(20, 20))
     with pytest.raises(StreamError, match="another identity") as caught:

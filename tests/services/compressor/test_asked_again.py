@@ -14,7 +14,7 @@ IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
 
 
 def test_a_picture_that_is_asked_for_again_is_given_again_until_it_is_forgotten(begin, crew, atd, modem, snippet):
-    service = begin(keep_pictures=2)
+    service = begin(cache_images=2)
     uuv_modem = crew.neighbour("uuv-1", "orders")
     atd.owe(IN, "compressor", *[snippet(f"c{n}") for n in range(3)])
     eventually(lambda: len(modem.got) == 3)

@@ -167,8 +167,8 @@ def test_every_packing_is_what_the_configuration_says(packing, begin, atd, modem
 @pytest.mark.parametrize(
     ("options", "error", "said"),
     [
-        ({"catalogue": "/nowhere/own.tiles"}, CodebookError, "/nowhere/own.tiles"),
-        ({"catalogue": "nominal-11"}, CodebookError, "nominal-11"),
+        ({"codebook": "/nowhere/own.tiles"}, CodebookError, "/nowhere/own.tiles"),
+        ({"codebook": "nominal-11"}, CodebookError, "nominal-11"),
         ({"codec": "jpeg-of-the-future"}, ConfigError, "one of"),
     ],
 )
@@ -178,11 +178,11 @@ def test_a_wrong_configuration_is_said_before_anything_is_opened(options, error,
     assert not (platform("uuv-1").state_dir / "compressor.db").exists()
 
 
-def test_a_damaged_catalogue_is_named(platform, tmp_path):
+def test_a_damaged_codebook_is_named(platform, tmp_path):
     path = tmp_path / "own.tiles"
     path.write_bytes(b"SPTILES\n" + bytes(100))
     with pytest.raises(CodebookError, match=r"own\.tiles"):
-        CompressorService(platform("uuv-1"), CompressorConfig(catalogue=str(path)))
+        CompressorService(platform("uuv-1"), CompressorConfig(codebook=str(path)))
 
 
 def test_a_full_disk_leaves_the_snippet_with_its_sender(begin, atd, modem, snippet):

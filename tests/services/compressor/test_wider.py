@@ -120,7 +120,7 @@ def test_wider_asked_again_gives_the_same_picture_again(begin, crew, ask, atd, m
 
 
 def test_a_wider_picture_that_is_forgotten_is_made_again(begin, ask, atd, modem, with_wide):
-    begin(codec="emb", budget_bytes=120, keep_pictures=2)
+    begin(codec="emb", budget_bytes=120, cache_images=2)
     atd.owe(IN, "compressor", with_wide("c1"))
     eventually(lambda: len(modem.got) == 1)
     first = modem.got[0].image_id

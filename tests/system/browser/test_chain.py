@@ -144,13 +144,15 @@ def test_seen_measured_decided_and_told(
     users = Users(tmp_path / "state" / "vessel-1" / FILE_NAME)
     users.add("anna", "operator", "correct horse battery")
     console = start(ConsoleService(platform("vessel-1"), vessel))
-    into = {"out_dir": tmp_path / "out", "picture_consumers": ("relay", "console"), "vehicles": VEHICLES}
+    into = {"out_dir": tmp_path / "out", "image_consumers": ("relay", "console"), "vehicles": VEHICLES}
     start(DecompressorService(platform("vessel-1"), DecompressorConfig(**into)))
     start(
-        OpModemService(platform("vessel-1"), OpModemConfig(port=ports[0], vehicles=VEHICLES, retry_s=0.5, quiet_s=0.05))
+        OpModemService(
+            platform("vessel-1"), OpModemConfig(port=ports[0], vehicles=VEHICLES, retry_s=0.5, holdoff_s=0.05)
+        )
     )
     takers = {"decision_consumers": ("autonomy",), "revisit_consumers": ("autonomy",)}
-    line = {"rate": 1, "gather_s": 0.3, "listen_s": 0.0, "quiet_s": 0.15, "retry_s": 0.05, **takers}
+    line = {"rate": 1, "group_delay_s": 0.3, "rx_window_s": 0.0, "holdoff_s": 0.15, "retry_s": 0.05, **takers}
     start(UuvModemService(platform("uuv-1"), UuvModemConfig(port=ports[1], **line)))
 
     there = visit(console.address, users.begin("anna").token)

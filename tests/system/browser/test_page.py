@@ -384,7 +384,7 @@ def test_expert_advice_appears_beside_the_picture(serve):
     vessel.board.take_advice(advice)
     there.wait(".advice >> text=seen before, mark 3")
     # Ashore the same page lets an expert give it.
-    shore = serve(side="shore")
+    shore = serve(role="shore")
     few(shore, 1)
     expert = shore.visit("eva")
     expert.shows("0000")

@@ -128,8 +128,8 @@ def test_lost_frames_are_shown_as_missing_exactly_where_the_channel_lost_them(st
     assert result.sha256_match
 
 
-def test_a_vessel_with_another_catalogue_says_so_and_shows_no_wrong_picture(start_chain: StartChain) -> None:
-    run = start_chain(rate=4, catalogue="nominal-20", vessel_catalogues=("nominal-10",))
+def test_a_vessel_with_another_codebook_says_so_and_shows_no_wrong_picture(start_chain: StartChain) -> None:
+    run = start_chain(rate=4, codebook="nominal-20", vessel_codebooks=("nominal-10",))
     run.deposit(2)
     run.until(lambda: run.watcher.packets_sent >= 4, 60, "all packets sent")
     run.until_idle()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from sonarpost.cli.bench.figures import SheetCell, new_figure, plot_rate_distortion, save_figure, write_sheet
-from sonarpost.cli.bench.measure import SHIPPED_CATALOGUES, Subject, code, measure, subjects
+from sonarpost.cli.bench.measure import SHIPPED_CODEBOOKS, Subject, code, measure, subjects
 from sonarpost.cli.bench.pictures import BenchPicture, PictureSet, read_folder, simulated_pictures
 from sonarpost.cli.bench.report import details, json_line, miss_lines, rate_differences, result_rows, text
 from sonarpost.cli.bench.sdvd import sdvd_crops
@@ -47,9 +47,9 @@ def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     )
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="draw pictures as each codec rebuilds them")
     parser.add_argument(
-        "--catalogues",
+        "--codebooks",
         nargs="+",
-        default=SHIPPED_CATALOGUES,
+        default=SHIPPED_CODEBOOKS,
         metavar="NAME_OR_FILE",
         help="that vq is measured with (default: nominal-10 nominal-20)",
     )
@@ -109,16 +109,16 @@ def chosen_subjects(
     *,
     all_packings: bool = True,
     cut: bool = False,
-    catalogues: Sequence[str] = SHIPPED_CATALOGUES,
+    codebooks: Sequence[str] = SHIPPED_CODEBOOKS,
 ) -> list[Subject]:
     """Return the codecs that the options ask for; say on stderr which cannot be made here.
 
     Raises:
         ConfigError: A codec asked for is unknown or cannot be made.
-        CatalogueError: A catalogue cannot be read.
+        CodebookError: A codebook cannot be read.
     """
     names = None if args.codecs is None else [name.strip() for name in args.codecs.split(",")]
-    found, absent = subjects(default_registry(), names, all_packings=all_packings, cut=cut, catalogues=catalogues)
+    found, absent = subjects(default_registry(), names, all_packings=all_packings, cut=cut, codebooks=codebooks)
     for line in absent:
         say(f"left out: {line}")
     return found
@@ -148,7 +148,7 @@ def run(args: argparse.Namespace) -> int:
     _check_folders(args)
     if args.plot is not None:
         new_figure(1, 1)  # an absent extra is said before the work, not after it
-    tested = chosen_subjects(args, cut=args.cut, catalogues=args.catalogues)
+    tested = chosen_subjects(args, cut=args.cut, codebooks=args.codebooks)
     measured = chosen_pictures(args)
     points = [point for subject in tested for point in measure(subject, measured.pictures, budgets, say)]
     weights = bootstrap_weights([picture.source for picture in measured.pictures])

@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 PSNR_LIMIT_DB: Final = 60.0
 """A picture rebuilt without error has an infinite PSNR, which no mean survives; it counts as this."""
-SHIPPED_CATALOGUES: Final = tuple(f"nominal-{tile_px}" for tile_px in DEFAULT_TILE_PX)
+SHIPPED_CODEBOOKS: Final = tuple(f"nominal-{tile_px}" for tile_px in DEFAULT_TILE_PX)
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Subject:
 
     Attributes:
         codec: The codec.
-        variant: What tells several of one name apart (for vq catalogue and packing); empty for the only one.
+        variant: What tells several of one name apart (for vq codebook and packing); empty for the only one.
         is_embedded: Whether one stream, made for the largest budget, is cut for the others; else each budget has a
             stream of its own.
         is_natural: Whether its size follows from the picture alone, so that it is one point, whatever the budgets.
@@ -110,7 +110,7 @@ def subjects(
     *,
     all_packings: bool = True,
     cut: bool = False,
-    catalogues: Sequence[str] = SHIPPED_CATALOGUES,
+    codebooks: Sequence[str] = SHIPPED_CODEBOOKS,
 ) -> tuple[list[Subject], list[str]]:
     """Make the codecs to measure.
 
@@ -119,14 +119,14 @@ def subjects(
         names: Which; None for every one that can be made here.
         all_packings: Whether vq is measured with every packing of an index, or the tightest only.
         cut: Whether embedded codecs make one stream, cut for each budget.
-        catalogues: Names of shipped catalogues, or paths of others, that vq is measured with.
+        codebooks: Names of shipped codebooks, or paths of others, that vq is measured with.
 
     Returns:
         The codecs, and one line for each that cannot be made here (only with `names` None).
 
     Raises:
         ConfigError: A codec asked for by name is unknown or cannot be made.
-        CatalogueError: A catalogue cannot be read.
+        CodebookError: A codebook cannot be read.
     """
     packings = tuple(IndexPacking) if all_packings else (IndexPacking.BITS14,)
     found: list[Subject] = []
@@ -134,7 +134,7 @@ def subjects(
     for name in registry.names() if names is None else dict.fromkeys(names):
         try:
             if registry.spec(name).needs_tiles:
-                found += _with_tiles(registry, name, packings, catalogues)
+                found += _with_tiles(registry, name, packings, codebooks)
             else:
                 codec = registry.create(name, CodecResources())
                 found.append(Subject(codec, is_embedded=cut and registry.is_embedded(name)))
@@ -146,14 +146,14 @@ def subjects(
 
 
 def _with_tiles(
-    registry: CodecRegistry, name: str, packings: Sequence[IndexPacking], catalogues: Sequence[str]
+    registry: CodecRegistry, name: str, packings: Sequence[IndexPacking], codebooks: Sequence[str]
 ) -> list[Subject]:
     made = []
-    for catalogue in catalogues:
-        tiles = open_codebook(catalogue).tiles
+    for codebook in codebooks:
+        tiles = open_codebook(codebook).tiles
         for packing in packings:
             codec = registry.create(name, CodecResources(tiles, packing))
-            made.append(Subject(codec, f"{catalogue} {packing.value}", is_natural=True))
+            made.append(Subject(codec, f"{codebook} {packing.value}", is_natural=True))
     return made
 
 

@@ -83,7 +83,7 @@ _FIG3_NOTE = (
 _VQ_NOTE = (
     "The paper leaves edge pixels that fill no tile unsent (10 tiles of 20 x 20 px in this picture, 44 of 10 x 10 px) "
     "and has no header. Here the whole picture is sent, 18 and 60 tiles at 14 bits, behind 7 bytes that say codec, "
-    "catalogue and size, so a stream is longer and says what it is."
+    "codebook and size, so a stream is longer and says what it is."
 )
 _MAXLOOP_NOTE = (
     "The paper bounds SPIHT by the number of its passes (maxloop); here by the bytes that those passes took there."

@@ -24,7 +24,7 @@ JPEG_SUFFIXES: Final = (".jpg", ".jpeg")
 SUFFIXES: Final = (*JPEG_SUFFIXES, ".png", ".tif", ".tiff")
 MAX_PICTURES: Final = 100_000
 
-# Apart from the seeds of the shipped catalogues (7000 to 7051): nobody is tested on what was learnt.
+# Apart from the seeds of the shipped codebooks (7000 to 7051): nobody is tested on what was learnt.
 _FIRST_SEED: Final = 910_000
 _OBJECTS_A_LINE: Final = 6
 _PINGS: Final = 500

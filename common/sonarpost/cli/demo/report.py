@@ -39,7 +39,7 @@ def show(watcher: Watcher, settings: ChainSettings, result: Result, console: Con
 
 def _as_sent(image: EncodedImage, settings: ChainSettings) -> DecodedImage:
     """Decode the stream as it left the vehicle, nothing lost."""
-    resources = CodecResources(open_codebook(settings.catalogue).tiles)
+    resources = CodecResources(open_codebook(settings.codebook).tiles)
     return default_registry().create_for_stream(image.stream, resources).decode(image.stream)
 
 

@@ -39,8 +39,8 @@ class ChainSettings:
         loss: Probability that a frame is lost.
         seed: Of the water.
         time_scale: Simulated seconds in the water a real second.
-        catalogue: Of the vehicle.
-        vessel_catalogues: Of the vessel; normally the same.
+        codebook: Of the vehicle.
+        vessel_codebooks: Of the vessel; normally the same.
         router_ports: TCP ports of the uuv, vessel and shore routers.
         shore_port_for_vessel: Where the vessel's router looks for the shore's; another than the shore's own where a
             test puts a link in between that can be cut.
@@ -55,8 +55,8 @@ class ChainSettings:
     loss: float = 0.0
     seed: int = 1
     time_scale: float = 20.0
-    catalogue: str = "nominal-10"
-    vessel_catalogues: tuple[str, ...] = ("nominal-10", "nominal-20")
+    codebook: str = "nominal-10"
+    vessel_codebooks: tuple[str, ...] = ("nominal-10", "nominal-20")
     router_ports: tuple[int, int, int] = (0, 0, 0)
     shore_port_for_vessel: int = 0
     console_port: int | None = None
@@ -99,7 +99,7 @@ class ChainSettings:
         return min(packets * rate.frames * (rate.frame_bytes - HEADER_BYTES) - _RECORD_BYTES, _MOST_STREAM_BYTES)
 
     @property
-    def report_s(self) -> float:
+    def feedback_interval_s(self) -> float:
         """Real seconds from one report of the vessel to the next, with v1."""
         return 30.0 / self.time_scale + 0.5
 
@@ -112,7 +112,7 @@ class ChainSettings:
     def settled_s(self) -> float:
         """Real seconds without any change after which pictures that lack something will not get it any more."""
         airtime_s = RATES[self.rate].airtime_s / self.time_scale
-        return 3 * self.report_s + 4 * airtime_s if self.link == "v1" else airtime_s
+        return 3 * self.feedback_interval_s + 4 * airtime_s if self.link == "v1" else airtime_s
 
     @property
     def ports_folder(self) -> Path:
@@ -166,20 +166,20 @@ def _platform_table(settings: ChainSettings, platform: str, port: int) -> str:
 def _service_table(settings: ChainSettings, service: str) -> str:
     page = settings.console_port
     modem = '[{name}]\nport = "{port}"\naddress = {address}\n'
-    catalogues = ", ".join(f'"{name}"' for name in settings.vessel_catalogues)
+    codebooks = ", ".join(f'"{name}"' for name in settings.vessel_codebooks)
     tables = {
         "atd_stub": f'[atd_stub]\nmode = "{settings.mode}"\ninput_dir = "{settings.incoming}"\n'
         "poll_s = 0.2\nsettle_s = 0.5\n",
-        "compressor": f'[compressor]\ncatalogue = "{settings.catalogue}"\n' + _codec(settings),
+        "compressor": f'[compressor]\ncodebook = "{settings.codebook}"\n' + _codec(settings),
         "uuv_modem": modem.format(name="uuv_modem", port=settings.modem_port(UUV_ADDRESS), address=UUV_ADDRESS)
         + f"destination = {VESSEL_ADDRESS}\nrate = {settings.rate}\n"
         + _vehicle_link(settings),
         "op_modem": modem.format(name="op_modem", port=settings.modem_port(VESSEL_ADDRESS), address=VESSEL_ADDRESS)
         + _vessel_link(settings),
         "decompressor": f'[decompressor]\nout_dir = "{settings.vessel_pictures}"\n'
-        f"pairing_timeout_s = {settings.pairing_timeout_s:.3f}\ncatalogues = [{catalogues}]\n"
+        f"pairing_timeout_s = {settings.pairing_timeout_s:.3f}\ncodebooks = [{codebooks}]\n"
         f'vehicles = {{ {UUV_ADDRESS} = "{UUV}" }}\n'
-        + ("" if page is None else 'picture_consumers = ["relay", "console"]\n'),
+        + ("" if page is None else 'image_consumers = ["relay", "console"]\n'),
         "relay": "[relay]\n" + ("" if page is None else 'advice_consumers = ["console"]\n'),
         "c2": f'[c2]\nout_dir = "{settings.shore_pictures.parent}"\n',
         "acoustic_channel": f'[acoustic_channel]\npty_dir = "{settings.ports_folder}"\nlog = "{settings.channel_log}"\n'
@@ -210,8 +210,8 @@ def _vehicle_link(settings: ChainSettings) -> str:
     scale = settings.time_scale
     return (
         f'link = "v1"\nexpected_loss = {min(settings.loss, 0.9)}\nstream_bytes = {settings.stream_bytes}\n'
-        f"listen_every_s = {60 / scale:.3f}\nlisten_s = {10 / scale + 0.5:.3f}\nqueue_interval_s = 0.2\n"
-        f"gather_s = {20 / scale:.3f}\nretry_s = 0.2\nreply_timeout_s = {settings.reply_timeout_s:.3f}\n"
+        f"tx_burst_s = {60 / scale:.3f}\nlisten_s = {10 / scale + 0.5:.3f}\nqueue_interval_s = 0.2\n"
+        f"group_delay_s = {20 / scale:.3f}\nretry_s = 0.2\nreply_timeout_s = {settings.reply_timeout_s:.3f}\n"
     )
 
 
@@ -221,7 +221,7 @@ def _vessel_link(settings: ChainSettings) -> str:
         return 'link = "paper"\n' + vehicles
     scale = settings.time_scale
     return (
-        f'link = "v1"\n{vehicles}quiet_s = {2 / scale + 0.1:.3f}\npatience_s = {120 / scale + 1:.3f}\n'
-        f"retry_s = {60 / scale + 0.5:.3f}\nreport_s = {settings.report_s:.3f}\n"
+        f'link = "v1"\n{vehicles}holdoff_s = {2 / scale + 0.1:.3f}\npatience_s = {120 / scale + 1:.3f}\n'
+        f"retry_s = {60 / scale + 0.5:.3f}\nreport_s = {settings.feedback_interval_s:.3f}\n"
         f"reply_timeout_s = {settings.reply_timeout_s:.3f}\n"
     )

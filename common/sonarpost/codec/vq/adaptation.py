@@ -1,11 +1,11 @@
-"""Adapt a catalogue to a type of seabed: its least used tiles make room for tiles that a set of images needs.
+"""Adapt a codebook to a type of seabed: its least used tiles make room for tiles that a set of images needs.
 
 The rule:
 
 1. Each image is cut into tiles four times: from its corner and from half a tile further, as it is and mirrored (port
    and starboard cast shadows to opposite sides). Without this a tile learned stands for too few pieces of bottom:
    measured, it doubles the gain.
-2. Every training tile is encoded with the base catalogue, and the uses of each base tile are counted. Base tiles are
+2. Every training tile is encoded with the base codebook, and the uses of each base tile are counted. Base tiles are
    given up from the least used (of equals the last) on; free places up to `max_tiles` are taken first. At least `keep`
    base tiles stay, the most used. All stay at their numbers, unchanged.
 3. New tiles are drawn from the training tiles in eight steps. In each, the squared distances of all training tiles to
@@ -44,7 +44,7 @@ Squared = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class AdaptedCodebook:
-    """An adapted catalogue.
+    """An adapted codebook.
 
     Attributes:
         tiles: The database.
@@ -61,7 +61,7 @@ class AdaptedCodebook:
 
 @dataclass(frozen=True)
 class CodebookQuality:
-    """How well a catalogue rebuilds one picture, as the codec does: PSNR in dB, and the figure of merit."""
+    """How well a codebook rebuilds one picture, as the codec does: PSNR in dB, and the figure of merit."""
 
     psnr_db: float
     fom: float
@@ -76,10 +76,10 @@ def adapt(
     passes: int = 4,
     told: Callable[[str, int, int], None] | None = None,
 ) -> AdaptedCodebook:
-    """Adapt a catalogue (module docstring). The same base and images in the same order give the same catalogue.
+    """Adapt a codebook (module docstring). The same base and images in the same order give the same codebook.
 
     Args:
-        base: The catalogue to start from.
+        base: The codebook to start from.
         images: Pictures of the seabed to adapt to.
         max_tiles: Most tiles of the result; no fewer than the base has.
         keep: Base tiles that stay at least; half of them if None.
@@ -120,7 +120,7 @@ def split(images: Sequence[TrainingImage]) -> tuple[list[TrainingImage], list[Tr
         ConfigError: Fewer than two images.
     """
     if len(images) < 2:
-        raise ConfigError("catalogue adaptation", "images", len(images), "at least 2: some to learn from, some to test")
+        raise ConfigError("codebook adaptation", "images", len(images), "at least 2: some to learn from, some to test")
     held_out = max(1, len(images) // 4)
     return list(images[:-held_out]), list(images[-held_out:])
 
@@ -137,7 +137,7 @@ def measure(database: TileDatabase, images: Sequence[TrainingImage]) -> list[Cod
 
 
 def _check(base: TileDatabase, images: Sequence[TrainingImage], max_tiles: int, keep: int) -> None:
-    where = "catalogue adaptation"
+    where = "codebook adaptation"
     if not images:
         raise ConfigError(where, "images", 0, "at least one image")
     if max_tiles < len(base):

@@ -1,4 +1,4 @@
-r"""The journal of a catalogue build: what each image added, and each refinement pass, appended as soon as it is known.
+r"""The journal of a codebook build: what each image added, and each refinement pass, appended as soon as it is known.
 
 A build over hundreds of images takes minutes to hours on a small computer. Rewriting the whole database after each
 image would cost megabytes every time; a record appended and forced to disk costs only its own tiles. A record that

@@ -1,4 +1,4 @@
-"""One file that holds a tile database (docs/catalogue.md has the layout), and the catalogues shipped with the package.
+"""One file that holds a tile database (docs/codebook.md has the layout), and the codebooks shipped with the package.
 
 Everything in the file is stored plainly, not compressed, so the same database and notes are the same bytes on every
 machine and with every version of every library.
@@ -44,16 +44,16 @@ class Codebook:
     notes: Mapping[str, str]
 
 
-def to_bytes(catalogue: Codebook) -> bytes:
+def to_bytes(codebook: Codebook) -> bytes:
     """Return the file's bytes.
 
     Raises:
         CodebookError: The notes take more than 1 MiB.
     """
-    tiles = catalogue.tiles
-    notes = json.dumps(dict(catalogue.notes), sort_keys=True, ensure_ascii=False).encode()
+    tiles = codebook.tiles
+    notes = json.dumps(dict(codebook.notes), sort_keys=True, ensure_ascii=False).encode()
     if len(notes) > MAX_NOTES_BYTES:
-        raise CodebookError("tile catalogue", "notes", f"{len(notes)} B", f"at most {MAX_NOTES_BYTES} B")
+        raise CodebookError("tile codebook", "notes", f"{len(notes)} B", f"at most {MAX_NOTES_BYTES} B")
     header = _HEADER.pack(MAGIC, VERSION, tiles.tile_px, len(tiles), tiles.dims, len(notes))
     content = b"".join(
         (header, notes, tiles.mean.tobytes(), tiles.basis.astype(">i2").tobytes(), tiles.tiles.tobytes())
@@ -62,17 +62,17 @@ def to_bytes(catalogue: Codebook) -> bytes:
 
 
 def from_bytes(data: bytes, where: str) -> Codebook:
-    """Parse a catalogue.
+    """Parse a codebook.
 
     Args:
         data: The whole file.
         where: Its name, for messages.
 
     Raises:
-        CodebookError: Not a catalogue, of another version, cut off, or damaged (the sha256 at its end differs).
+        CodebookError: Not a codebook, of another version, cut off, or damaged (the sha256 at its end differs).
     """
     if len(data) < _HEADER.size + _HASH_BYTES:
-        raise CodebookError(where, "", f"{len(data)} B", f"a tile catalogue of at least {_HEADER.size + 32} B")
+        raise CodebookError(where, "", f"{len(data)} B", f"a tile codebook of at least {_HEADER.size + 32} B")
     magic, version, tile_px, count, dims, notes_bytes = _HEADER.unpack_from(data)
     if magic != MAGIC:
         raise CodebookError(where, "magic", magic, repr(MAGIC))
@@ -109,20 +109,20 @@ def _parse_notes(data: bytes, where: str) -> dict[str, str]:
     return notes
 
 
-def save(path: Path, catalogue: Codebook) -> None:
-    """Write a catalogue atomically.
+def save(path: Path, codebook: Codebook) -> None:
+    """Write a codebook atomically.
 
     Raises:
         CodebookError: It cannot be written.
     """
     try:
-        write_atomically(path, to_bytes(catalogue))
+        write_atomically(path, to_bytes(codebook))
     except OSError as error:
         raise CodebookError(str(path), "", str(error), "a place that can be written to") from error
 
 
 def load(path: Path) -> Codebook:
-    """Read a catalogue and verify its hash.
+    """Read a codebook and verify its hash.
 
     Raises:
         CodebookError: The file cannot be read or is damaged.
@@ -130,20 +130,20 @@ def load(path: Path) -> Codebook:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise CodebookError(str(path), "", str(error), "a tile catalogue file") from error
+        raise CodebookError(str(path), "", str(error), "a tile codebook file") from error
     return from_bytes(data, str(path))
 
 
 @cache
 def load_default(tile_px: int) -> Codebook:
-    """Return the catalogue shipped with the package for tiles of 10 or 20 px; kept in memory after the first call.
+    """Return the codebook shipped with the package for tiles of 10 or 20 px; kept in memory after the first call.
 
     Raises:
         CodebookError: There is none for that size, or the installed file is damaged.
     """
     if tile_px not in DEFAULT_TILE_PX:
         sizes = " or ".join(str(size) for size in DEFAULT_TILE_PX)
-        raise CodebookError("nominal catalogues", "tile_px", tile_px, sizes)
+        raise CodebookError("nominal codebooks", "tile_px", tile_px, sizes)
     name = f"nominal-{tile_px}.tiles"
     try:
         data = (resources.files("sonarpost.codec.vq") / "data" / name).read_bytes()
@@ -153,7 +153,7 @@ def load_default(tile_px: int) -> Codebook:
 
 
 def open_codebook(name_or_path: str) -> Codebook:
-    """Return a shipped catalogue by its name (`nominal-10`, `nominal-20`) or any other by its path.
+    """Return a shipped codebook by its name (`nominal-10`, `nominal-20`) or any other by its path.
 
     Raises:
         CodebookError: It cannot be read.
@@ -165,17 +165,17 @@ def open_codebook(name_or_path: str) -> Codebook:
 
 
 def default_for_tag(tag: int) -> Codebook:
-    """Return the shipped catalogue whose identity has the 16-bit tag that a stream header carries.
+    """Return the shipped codebook whose identity has the 16-bit tag that a stream header carries.
 
     Raises:
-        CodebookError: The stream was made with a catalogue that is not one of the shipped ones.
+        CodebookError: The stream was made with a codebook that is not one of the shipped ones.
     """
     tags = {}
     for tile_px in DEFAULT_TILE_PX:
-        catalogue = load_default(tile_px)
-        own = codebook_tag(catalogue.tiles)
+        codebook = load_default(tile_px)
+        own = codebook_tag(codebook.tiles)
         if own == tag:
-            return catalogue
+            return codebook
         tags[f"nominal-{tile_px}"] = own
     known = ", ".join(f"{own:#06x} ({name})" for name, own in tags.items())
-    raise CodebookError("stream", "model_tag", f"{tag:#06x}", f"one of {known}, or the catalogue it was made with")
+    raise CodebookError("stream", "model_tag", f"{tag:#06x}", f"one of {known}, or the codebook it was made with")

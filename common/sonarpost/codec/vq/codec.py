@@ -152,7 +152,7 @@ class VqCodec:
 
         Raises:
             StreamError: The header is wrong, the stream is of another codec or packing, or it was made with a
-                catalogue of another identity.
+                codebook of another identity.
         """
         header = self._check_header(stream)
         length = self._body_length(header.height_px, header.width_px)
@@ -168,7 +168,7 @@ class VqCodec:
             for count, what in (
                 (lost.sum(), "did not arrive"),
                 (empty.sum(), "carry the reserved index 0 (zero padding)"),
-                (damaged.sum(), "have an index outside the catalogue (damaged packet)"),
+                (damaged.sum(), "have an index outside the codebook (damaged packet)"),
             )
             if count
         ]
@@ -192,7 +192,7 @@ class VqCodec:
             expected = f"{self.codec_id:#04x} (vq, {self.packing.value} indices)"
             raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", expected)
         if header.model_tag != self._tag:
-            expected = f"{self._tag:#06x}: the stream was made with a catalogue of another identity"
+            expected = f"{self._tag:#06x}: the stream was made with a codebook of another identity"
             raise StreamError("stream", "model_tag", f"{header.model_tag:#06x}", expected)
         return header
 

@@ -1,4 +1,4 @@
-"""How two catalogues differ: which tiles only one has, how far apart the others lie, how alike their bases are."""
+"""How two codebooks differ: which tiles only one has, how far apart the others lie, how alike their bases are."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sonarpost.errors import CodebookError
 
 @dataclass(frozen=True)
 class UnmatchedTiles:
-    """One catalogue as seen from the other.
+    """One codebook as seen from the other.
 
     Attributes:
         tiles: How many it has, doubles counted once.
@@ -37,7 +37,7 @@ class UnmatchedTiles:
 
 @dataclass(frozen=True)
 class CodebookDifference:
-    """How two catalogues of the same tile size differ.
+    """How two codebooks of the same tile size differ.
 
     Attributes:
         same_identity: Whether streams made with one are read with the other.
@@ -59,14 +59,14 @@ class CodebookDifference:
 
 
 def compare(first: TileDatabase, second: TileDatabase) -> CodebookDifference:
-    """Compare two catalogues.
+    """Compare two codebooks.
 
     Raises:
         CodebookError: Their tiles are of different size, so no distance is defined between them.
     """
     if first.tile_px != second.tile_px:
         expected = f"{first.tile_px} px as in the first: tiles of different size cannot be compared"
-        raise CodebookError("second catalogue", "tile_px", second.tile_px, expected)
+        raise CodebookError("second codebook", "tile_px", second.tile_px, expected)
     tiles = [{row.tobytes() for row in database.tiles} for database in (first, second)]
     both = min(len(first), len(second))
     angles = principal_angles_deg(first.basis, second.basis)

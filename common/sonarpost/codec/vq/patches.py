@@ -1,6 +1,6 @@
 """Training images cut from whole side-scan lines, stretched to 8 bits as snippets are.
 
-A catalogue serves many sonars, so a line is looked at in several scales and tones: each window is reduced by block
+A codebook serves many sonars, so a line is looked at in several scales and tones: each window is reduced by block
 means (finer or coarser sampling than the line's own), mirrored in turn (port and starboard cast shadows to opposite
 sides), and shown in one of a few tones (a snippet may be dark with one bright target, or bright all over).
 """

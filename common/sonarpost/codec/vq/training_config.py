@@ -1,4 +1,4 @@
-"""What a catalogue is built from: training images, rounds, and the fingerprint by which a stopped build is known."""
+"""What a codebook is built from: training images, rounds, and the fingerprint by which a stopped build is known."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class RefinementProgress:
         passes: How many there are.
         done_images: Images of this pass that are done.
         images: How many it has.
-        rms: Error of the catalogue as it was before the pass, grey levels RMS over all training tiles; NaN until the
+        rms: Error of the codebook as it was before the pass, grey levels RMS over all training tiles; NaN until the
             pass is done.
     """
 
@@ -128,7 +128,7 @@ def check_plan(
     """
 
     def refuse(field: str, value: object, expected: str) -> None:
-        raise ConfigError("catalogue build", field, value, expected)
+        raise ConfigError("codebook build", field, value, expected)
 
     if not images:
         refuse("images", 0, "at least one image")

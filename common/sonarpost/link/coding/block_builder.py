@@ -33,7 +33,7 @@ def group_limit(config: SenderConfig, symbol_bytes: int) -> int:
         most = max(most, min(_MOST_GROUP, config.block_symbols * symbol_bytes // config.stream_bytes))
     while most > 1 and (
         _planned_previews(config, shape.source_symbols(most), most) >= fec.MAX_SYMBOLS
-        or (not config.feedback and most * config.frames_per_picture > fec.MAX_SYMBOLS)
+        or (not config.feedback and most * config.frames_per_image > fec.MAX_SYMBOLS)
     ):
         most -= 1
     return most
@@ -50,7 +50,7 @@ def numbers_needed(pictures: Sequence[OutgoingImage], config: SenderConfig, symb
 def _planned_previews(config: SenderConfig, source: int, pictures: int) -> int:
     if config.feedback:
         return symbols_to_send(source, config.worst, config.caution)
-    limit = round(_PREVIEW_SHARE * config.frames_per_picture * pictures)
+    limit = round(_PREVIEW_SHARE * config.frames_per_image * pictures)
     return max(preview_frames(source, channel.spread(config.depth + 1), limit=limit) for channel in config.channels)
 
 
@@ -80,7 +80,7 @@ def make_group(
             picture.sent -= 1  # an entry that is just full cannot say that the stream ends: a piece of one byte does
     if config.feedback:
         return [previews, *whole_blocks(pictures, config, symbol_bytes, take_number, now)]
-    frames = min(round(config.frames_per_picture * len(pictures)) - planned, fec.MAX_SYMBOLS)
+    frames = min(round(config.frames_per_image * len(pictures)) - planned, fec.MAX_SYMBOLS)
     return [previews, *_layered(pictures, config, symbol_bytes, frames, take_number, now)]
 
 

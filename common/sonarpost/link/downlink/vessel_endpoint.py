@@ -174,7 +174,7 @@ class VesselEndpoint:
             return True
         silent = self._silent.get(source, -1)
         if silent >= 0:
-            wait_s = self.receiver.config.report_s * 2**silent
+            wait_s = self.receiver.config.feedback_interval_s * 2**silent
             last = self._reported_at.get(source, 0.0)
             if silent >= _MOST_SILENT or now - last < wait_s:
                 return False

@@ -49,14 +49,14 @@ class QueueConfig:
         burst_frames: Mean length of a run of lost frames.
         feedback: "never", or "auto": with feedback as long as reports come.
         feedback_memory_s: How long after the last report another is expected, while frames are sent.
-        patience_s: How long without a report before a few more symbols are sent, should all before be lost.
-        picture_share: Share of frames that pictures get however many messages wait.
+        max_defer_s: How long without a report before a few more symbols are sent, should all before be lost.
+        image_airtime_share: Share of frames that pictures get however many messages wait.
         aging_s: A message becomes one level more urgent for each such time that it waits.
         message_missed: With what probability a message may be lost: it is sent as often as the loss demands.
         max_messages: Most that wait.
-        frames_per_picture: See `SenderConfig`.
+        frames_per_image: See `SenderConfig`.
         stream_bytes: See `SenderConfig`.
-        gather_s: How long a picture, once announced, waits for others to be coded with.
+        group_delay_s: How long a picture, once announced, waits for others to be coded with.
         kept_pictures: See `SenderConfig`.
 
     Raises:
@@ -69,14 +69,14 @@ class QueueConfig:
     burst_frames: float = 1.0
     feedback: str = "auto"
     feedback_memory_s: float = 900.0
-    patience_s: float = 120.0
-    picture_share: float = 0.25
+    max_defer_s: float = 120.0
+    image_airtime_share: float = 0.25
     aging_s: float = 600.0
     message_missed: float = 0.01
     max_messages: int = 2000
-    frames_per_picture: float = 6.0
+    frames_per_image: float = 6.0
     stream_bytes: int = 512
-    gather_s: float = 0.0
+    group_delay_s: float = 0.0
     kept_pictures: int = 256
 
     def __post_init__(self) -> None:
@@ -84,7 +84,7 @@ class QueueConfig:
             ("expected_loss", 0.0, 0.95),
             ("burst_frames", 1.0, 1000.0),
             ("feedback_memory_s", 0.001, 86400.0),
-            ("picture_share", 0.0, 1.0),
+            ("image_airtime_share", 0.0, 1.0),
             ("aging_s", 0.001, 86400.0),
             ("message_missed", 1e-6, 0.5),
             ("max_messages", 1, 100_000),
@@ -140,10 +140,10 @@ class TransmitQueue:
             SenderConfig(
                 frame_bytes=RATES[config.first_rate].frame_bytes,
                 channels=(LossChannel(config.expected_loss, config.burst_frames),),
-                frames_per_picture=config.frames_per_picture,
+                frames_per_image=config.frames_per_image,
                 stream_bytes=config.stream_bytes,
-                gather_s=config.gather_s,
-                patience_s=config.patience_s,
+                group_delay_s=config.group_delay_s,
+                max_defer_s=config.max_defer_s,
                 kept_pictures=config.kept_pictures,
                 announce=True,
             ),
@@ -319,7 +319,9 @@ class TransmitQueue:
         frame = self.sender.next_frame(now, pictures_first=due)
         if frame is not None and pictures_wait:
             is_messages = frame[2] >> 5 & 3 == _SEGMENTS and not due
-            self.picture_credit = min(4.0, self.picture_credit + self.config.picture_share) if is_messages else 0.0
+            self.picture_credit = (
+                min(4.0, self.picture_credit + self.config.image_airtime_share) if is_messages else 0.0
+            )
         return frame
 
     def _keep_up(self, now: float) -> None:
@@ -410,6 +412,6 @@ class TransmitQueue:
     def _planned_frames(self, stream_bytes: int) -> float:
         config = self.sender.config
         if not config.feedback:
-            return config.frames_per_picture
+            return config.frames_per_image
         wanted = min(stream_bytes, config.stream_bytes) + 32
         return wanted / self.sender.symbol_bytes / (1 - min(config.worst.loss, 0.9))

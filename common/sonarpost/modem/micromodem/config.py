@@ -37,7 +37,7 @@ class MicroModemConfig:
             after the last line of it, but
         dump_limit_s: no longer than this in all.
         queued_packets: How many packets may wait.
-        patience_s: How long one may wait before it fails.
+        max_defer_s: How long one may wait before it fails.
     """
 
     address: int
@@ -57,7 +57,7 @@ class MicroModemConfig:
     dump_quiet_s: float = 2.0
     dump_limit_s: float = 30.0
     queued_packets: int = 8
-    patience_s: float = 120.0
+    max_defer_s: float = 120.0
 
     def __post_init__(self) -> None:
         """Check every field.

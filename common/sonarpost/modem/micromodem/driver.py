@@ -172,7 +172,7 @@ class MicroModem(DriverStateMachine):
     def next_wakeup(self) -> float | None:
         """Return when `poll` has something to do, or None; a time in the past means at once."""
         times_s = [self._events_since_s if self._events else None]
-        times_s += [packet.queued_s + self.config.patience_s for packet in self._queue]
+        times_s += [packet.queued_s + self.config.max_defer_s for packet in self._queue]
         if self.phase is not Phase.CLOSED:
             busy_s = self._requester.deadline_s if self._cycle is None else self._cycle.deadline_s
             # In the middle of a cycle the modem is not asked whether it is there: the cycle will tell.

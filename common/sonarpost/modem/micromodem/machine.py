@@ -76,7 +76,7 @@ class DriverStateMachine:
 
     def _advance(self, now: float) -> None:
         self._events_since_s = now
-        while self._queue and now >= self._queue[0].queued_s + self.config.patience_s:
+        while self._queue and now >= self._queue[0].queued_s + self.config.max_defer_s:
             self._events.append(self._queue.popleft().failed(FailureReason.WAITED_TOO_LONG))
         if self.phase is Phase.CLOSED:
             return

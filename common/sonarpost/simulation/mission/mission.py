@@ -168,7 +168,7 @@ class _Vehicle:
         self._spec = spec
         self._rng = rng
         self.config = QueueConfig(
-            rates=(_RATE,), first_rate=_RATE, expected_loss=spec.loss, gather_s=60.0, kept_pictures=_KEPT
+            rates=(_RATE,), first_rate=_RATE, expected_loss=spec.loss, group_delay_s=60.0, kept_pictures=_KEPT
         )
         self.queue = TransmitQueue(self.config)
         self.number = 0

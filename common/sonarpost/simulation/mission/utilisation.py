@@ -47,8 +47,8 @@ class BusySpec:
     Attributes:
         rate: Of the vehicle, 0..6.
         serial_baud: Of both serial lines; 0 for lines without delay.
-        listen_every_s: See `Continuous`.
-        listen_s: See `Continuous`.
+        tx_burst_s: See `Continuous`.
+        rx_window_s: See `Continuous`.
         range_m: Between the modems.
         frame_loss: Share of frames lost.
         seconds: For how long, simulated.
@@ -59,8 +59,8 @@ class BusySpec:
 
     rate: int = 5
     serial_baud: float = 0.0
-    listen_every_s: float = 150.0
-    listen_s: float = 5.0
+    tx_burst_s: float = 150.0
+    rx_window_s: float = 5.0
     range_m: float = 500.0
     frame_loss: float = 0.1
     seconds: float = 3600.0
@@ -134,7 +134,7 @@ class _Vehicle:
     def __init__(self, spec: BusySpec) -> None:
         self._rate = spec.rate
         self.queue = TransmitQueue(QueueConfig(rates=(spec.rate,), first_rate=spec.rate, expected_loss=spec.frame_loss))
-        self._medium = Continuous(spec.listen_every_s, spec.listen_s, quiet_s=2.0)
+        self._medium = Continuous(spec.tx_burst_s, spec.rx_window_s, holdoff_s=2.0)
         self._receiver = LinkReceiver()
         self._asked = False
         self._rng = np.random.default_rng(1)

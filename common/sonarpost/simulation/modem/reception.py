@@ -90,8 +90,8 @@ class ReceptionReporter:
 
     def expect(self, header: AcousticPacket, now: float) -> None:
         """Wait for the data that `header` announces."""
-        patience_s = self._settings["CTO"] + header.announced_frames * self._settings["DTO"]
-        self._expected = _Expected(header, now + patience_s)
+        max_defer_s = self._settings["CTO"] + header.announced_frames * self._settings["DTO"]
+        self._expected = _Expected(header, now + max_defer_s)
 
     def forget(self) -> None:
         """Forget everything (the modem reboots)."""

@@ -15,38 +15,38 @@ TIMES = st.floats(1e9, 2e9)
 
 
 def test_continuous_listens_now_and_then_and_a_silence_counts():
-    medium, now = Continuous(60.0, 8.0), 1000.0
+    mac, now = Continuous(60.0, 8.0), 1000.0
     begun, pauses = now, []
     for _ in range(40):
-        wait_s = medium.wait_s(6.0, now)
+        wait_s = mac.wait_s(6.0, now)
         if wait_s:
             pauses.append((now - begun, wait_s))
             now += wait_s
             begun = now
-            assert medium.wait_s(6.0, now) == 0.0
-        medium.sent(now, now + 6.0)
+            assert mac.wait_s(6.0, now) == 0.0
+        mac.sent(now, now + 6.0)
         now += 6.0
     assert pauses == [(60.0, 8.0)] * 3
     now += 8.0
-    medium.sent(now, now + 6.0)
-    assert medium.wait_s(6.0, now + 6.0) == 0.0
+    mac.sent(now, now + 6.0)
+    assert mac.wait_s(6.0, now + 6.0) == 0.0
 
 
 def test_continuous_without_listening_never_waits_but_for_others():
-    medium = Continuous(1.0, 0.0, quiet_s=5.0)
+    mac = Continuous(1.0, 0.0, holdoff_s=5.0)
     for n in range(100):
-        assert medium.wait_s(6.0, 6.0 * n) == 0.0
-        medium.sent(6.0 * n, 6.0 * n + 6.0)
-    medium.heard(1000.0)
-    assert medium.wait_s(6.0, 1002.0) == 3.0
-    assert medium.wait_s(6.0, 1005.0) == 0.0
-    assert medium.wait_s(6.0, 900.0) == 0.0, "the clock was set back"
+        assert mac.wait_s(6.0, 6.0 * n) == 0.0
+        mac.sent(6.0 * n, 6.0 * n + 6.0)
+    mac.heard(1000.0)
+    assert mac.wait_s(6.0, 1002.0) == 3.0
+    assert mac.wait_s(6.0, 1005.0) == 0.0
+    assert mac.wait_s(6.0, 900.0) == 0.0, "the clock was set back"
 
 
 @given(now=TIMES, packet_s=st.floats(0.5, 9.0), start_s=st.floats(0, 40.0))
 def test_a_packet_in_a_slot_ends_before_its_guard(now, packet_s, start_s):
-    medium = Tdma(60.0, start_s, 12.0, 2.0)
-    wait_s = medium.wait_s(packet_s, now)
+    mac = Tdma(60.0, start_s, 12.0, 2.0)
+    wait_s = mac.wait_s(packet_s, now)
     assert wait_s is not None
     assert 0 <= wait_s <= 60.0
     into = (now + wait_s - start_s) % 60.0
@@ -60,8 +60,8 @@ def test_no_two_stations_in_slots_meet(now, packet_s, stations):
     slot_s, travel_s = 8.0, 1.0
     sent = []
     for n in range(stations):
-        medium = Tdma(stations * slot_s, n * slot_s, slot_s, 2.0)
-        start = now + (medium.wait_s(packet_s, now) or 0.0)
+        mac = Tdma(stations * slot_s, n * slot_s, slot_s, 2.0)
+        start = now + (mac.wait_s(packet_s, now) or 0.0)
         sent.append((start, start + packet_s + travel_s))
     sent.sort()
     assert all(first[1] <= second[0] + 1e-5 for first, second in pairwise(sent))
@@ -72,32 +72,32 @@ def test_a_slot_that_is_too_short_says_so():
 
 
 def test_who_is_polled_never_begins():
-    medium = Polled()
-    medium.sent(0.0, 1.0)
-    medium.heard(2.0)
-    assert medium.wait_s(1.0, 1e6) is None
+    mac = Polled()
+    mac.sent(0.0, 1.0)
+    mac.heard(2.0)
+    assert mac.wait_s(1.0, 1e6) is None
 
 
 @given(seed=st.integers(0, 1000), mean_s=st.floats(0.1, 100.0))
 def test_random_access_waits_between_none_and_twice_the_mean(seed, mean_s):
-    medium = Csma(mean_s, quiet_s=0.0, seed=seed)
+    mac = Csma(mean_s, holdoff_s=0.0, seed=seed)
     now, waits = 1e9, []
     for _ in range(60):
-        medium.sent(now - 1.0, now)
-        wait_s = medium.wait_s(6.0, now)
+        mac.sent(now - 1.0, now)
+        wait_s = mac.wait_s(6.0, now)
         waits.append(wait_s)
         assert 0 <= wait_s <= 2 * mean_s
-        assert medium.wait_s(6.0, now + wait_s) < 1e-5
+        assert mac.wait_s(6.0, now + wait_s) < 1e-5
         now += wait_s
     assert 0.5 * mean_s < sum(waits) / 60 < 1.5 * mean_s
 
 
 def test_random_access_defers_to_others_and_survives_a_clock_that_is_set_back():
-    medium = Csma(1.0, quiet_s=4.0, seed=1)
-    medium.sent(0.0, 1000.0)
-    medium.heard(1003.0)
-    assert medium.wait_s(6.0, 1003.0) == 4.0
-    assert medium.wait_s(6.0, 0.0) <= 2.0
+    mac = Csma(1.0, holdoff_s=4.0, seed=1)
+    mac.sent(0.0, 1000.0)
+    mac.heard(1003.0)
+    assert mac.wait_s(6.0, 1003.0) == 4.0
+    assert mac.wait_s(6.0, 0.0) <= 2.0
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`sonarpost catalogue nominal`: rebuild the shipped catalogues."""
+"""`sonarpost codebook nominal`: rebuild the shipped codebooks."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from sonarpost.cli.catalogue.default_codebooks import RECIPES, Recipe, build_nominal, humminbird_images
-from sonarpost.cli.catalogue.progress import ProgressDisplay
+from sonarpost.cli.codebook.default_codebooks import RECIPES, Recipe, build_nominal, humminbird_images
+from sonarpost.cli.codebook.progress import ProgressDisplay
 from sonarpost.codec.vq.codebook import load, save
 from sonarpost.codec.vq.patches import PatchPlan, SonarLine, cut_around, cut_line
 from sonarpost.codec.vq.training_config import TrainingImage
@@ -29,12 +29,12 @@ SIMULATED_SURVEYS = tuple(
 
 def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action."""
-    parser = actions.add_parser("nominal", help="rebuild the shipped catalogues: same input, same bytes")
+    parser = actions.add_parser("nominal", help="rebuild the shipped codebooks: same input, same bytes")
     parser.add_argument(
         "--humminbird", type=Path, required=True, metavar="DIR", help="folder with the PyHum recording's channels"
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the catalogues, made where absent"
+        "--out", type=Path, required=True, metavar="DIR", help="folder for the codebooks, made where absent"
     )
     parser.add_argument(
         "--refine", type=int, metavar="N", help="passes of refinement, other than the recipe's 2; 0: Table IV alone"
@@ -43,10 +43,10 @@ def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Rebuild the shipped catalogues; return 0.
+    """Rebuild the shipped codebooks; return 0.
 
     Raises:
-        SonarpostError: The recording cannot be read or a catalogue not be written.
+        SonarpostError: The recording cannot be read or a codebook not be written.
     """
     if args.refine is not None and args.refine < 0:
         raise ConfigError("--refine", "", args.refine, "zero or more passes")

@@ -1,4 +1,4 @@
-"""The two side-scan channels of a Humminbird recording, as the shipped catalogues are built from them.
+"""The two side-scan channels of a Humminbird recording, as the shipped codebooks are built from them.
 
 Layout of a channel, as found in the recording that comes with the source distribution of PyHum 1.4.6 and checked ping
 by ping there: `B002.IDX` holds (time, offset) pairs, u32 big endian, one a ping; at each offset of `B002.SON` a header

@@ -1,15 +1,15 @@
-"""The actions of `sonarpost catalogue`."""
+"""The actions of `sonarpost codebook`."""
 
 from __future__ import annotations
 
 import argparse
 
-from sonarpost.cli.catalogue import adapt, build, diff, info, nominal
+from sonarpost.cli.codebook import adapt, build, diff, info, nominal
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command and its actions."""
-    parser = subparsers.add_parser("catalogue", help="build, compare and adapt tile catalogues")
+    parser = subparsers.add_parser("codebook", help="build, compare and adapt tile codebooks")
 
     def show_help(_: argparse.Namespace) -> int:
         parser.print_help()

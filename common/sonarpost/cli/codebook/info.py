@@ -1,4 +1,4 @@
-"""`sonarpost catalogue info`: what a catalogue holds."""
+"""`sonarpost codebook info`: what a codebook holds."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from sonarpost.codec.vq.codec import codebook_tag
 
 def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action."""
-    parser = actions.add_parser("info", help="show what a catalogue holds")
-    parser.add_argument("catalogue", metavar="NAME_OR_FILE", help="nominal-10, nominal-20 or a file")
+    parser = actions.add_parser("info", help="show what a codebook holds")
+    parser.add_argument("codebook", metavar="NAME_OR_FILE", help="nominal-10, nominal-20 or a file")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print what a catalogue holds; return 0.
+    """Print what a codebook holds; return 0.
 
     Raises:
-        CatalogueError: It cannot be read.
+        CodebookError: It cannot be read.
     """
-    show(open_codebook(args.catalogue))
+    show(open_codebook(args.codebook))
     return 0
 
 
-def show(catalogue: Codebook) -> None:
+def show(codebook: Codebook) -> None:
     """Print size, identity and notes."""
-    tiles = catalogue.tiles
+    tiles = codebook.tiles
     print_facts(
         {
             "tiles": f"{len(tiles)} of {tiles.tile_px} x {tiles.tile_px} px",
             "dimensions": f"{tiles.dims} of {tiles.tile_px**2}",
             "identity": tiles.identity,
             "tag in streams": f"{codebook_tag(tiles):#06x}",
-            **catalogue.notes,
+            **codebook.notes,
         }
     )
 

@@ -1,8 +1,8 @@
-"""The recipe of the catalogues shipped with the package.
+"""The recipe of the codebooks shipped with the package.
 
-A catalogue holds pieces of the images it was built from, so what goes in must be free to pass on: the project's own
+A codebook holds pieces of the images it was built from, so what goes in must be free to pass on: the project's own
 survey simulator, and the public-domain Humminbird recording that comes with the source distribution of PyHum 1.4.6 (US
-Geological Survey). Nothing else. The simulated lines are made by the command `sonarpost catalogue nominal`.
+Geological Survey). Nothing else. The simulated lines are made by the command `sonarpost codebook nominal`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sonarpost.cli.catalogue.humminbird_lines import humminbird_lines
+from sonarpost.cli.codebook.humminbird_lines import humminbird_lines
 from sonarpost.codec.vq.builder import ProgressCallback, build
 from sonarpost.codec.vq.codebook import Codebook
 from sonarpost.codec.vq.patches import PatchPlan, cut_line, shuffled
@@ -25,13 +25,13 @@ SOURCES = (
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a shipped catalogue is made from training images.
+    """How a shipped codebook is made from training images.
 
     Attributes:
         tile_px: Side of a tile.
-        max_tiles: Size of the catalogue.
+        max_tiles: Size of the codebook.
         rounds: Table IV's passes: first poorly rebuilt images and their most unusual tiles (targets, shadows, edges),
-            then what comes until the catalogue is full.
+            then what comes until the codebook is full.
         passes: Passes of `refine` afterwards.
     """
 
@@ -43,7 +43,7 @@ class Recipe:
 
 def _rounds(tile_px: int) -> tuple[Round, ...]:
     # The first round takes the unusual from everywhere (highlights, shadows, edges). An image of speckle is never
-    # rebuilt with a figure of merit of 100, so the second takes in order what comes until the catalogue is full:
+    # rebuilt with a figure of merit of 100, so the second takes in order what comes until the codebook is full:
     # measured, thresholds in between spend the places on rare grains and rebuild ordinary bottom worse.
     return (Round(39.0, rms_distance(56.0, tile_px), 500), Round(100.0, rms_distance(6.0, tile_px)))
 
@@ -62,7 +62,7 @@ def build_nominal(
     images: Sequence[TrainingImage],
     progress: ProgressCallback | None = None,
 ) -> Codebook:
-    """Build one of the shipped catalogues; the same images, in any order, give the same bytes."""
+    """Build one of the shipped codebooks; the same images, in any order, give the same bytes."""
     images = shuffled(images)
     tiles = build(
         images, recipe.tile_px, recipe.rounds, max_tiles=recipe.max_tiles, passes=recipe.passes, progress=progress

@@ -1,10 +1,10 @@
-"""`sonarpost catalogue diff`: how two catalogues differ."""
+"""`sonarpost codebook diff`: how two codebooks differ."""
 
 from __future__ import annotations
 
 import argparse
 
-from sonarpost.cli.catalogue.info import print_facts
+from sonarpost.cli.codebook.info import print_facts
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.comparison import UnmatchedTiles, compare
 
@@ -14,7 +14,7 @@ EXIT_DIFFERENT = 1
 def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action."""
     parser = actions.add_parser(
-        "diff", help="show how two catalogues differ", description="Exit status 0: same identity; 1: different."
+        "diff", help="show how two codebooks differ", description="Exit status 0: same identity; 1: different."
     )
     parser.add_argument("first", metavar="A", help="nominal-10, nominal-20 or a file")
     parser.add_argument("second", metavar="B", help="the other")
@@ -25,7 +25,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the differences; return 0 if the identity is the same, else 1, as `diff` does.
 
     Raises:
-        CatalogueError: One cannot be read, or their tiles are of different size.
+        CodebookError: One cannot be read, or their tiles are of different size.
     """
     first, second = open_codebook(args.first).tiles, open_codebook(args.second).tiles
     difference = compare(first, second)

@@ -19,7 +19,7 @@ IMAGE_SUFFIXES = (".tiff", ".tif", ".png")
 def training_images(sources: list[Path], console: Console) -> tuple[list[TrainingImage], int]:
     """Return the readable images of folders and files, sorted within each folder, and how many are not readable.
 
-    The order decides what a catalogue becomes. Images are read again when needed: a folder may hold more than memory.
+    The order decides what a codebook becomes. Images are read again when needed: a folder may hold more than memory.
     """
     images, failed = [], 0
     for path in _paths(sources):

@@ -1,9 +1,9 @@
-"""Build a catalogue of 16,000 tiles from 500 simulated images, on one core: time and peak memory.
+"""Build a codebook of 16,000 tiles from 500 simulated images, on one core: time and peak memory.
 
-    python bench/catalogue_build.py [--tile 10] [--refine 2]
+    python bench/codebook_build.py [--tile 10] [--refine 2]
 
 The images, 100 to 200 px a side, are cut from simulated survey lines over every kind of bottom, written as TIFF, and
-learned from by the command `sonarpost catalogue build` in a process of its own, whose time and peak resident memory
+learned from by the command `sonarpost codebook build` in a process of its own, whose time and peak resident memory
 are those printed. The process is bound to one core, and its libraries to one thread. Simulating is not counted.
 Besides the time on the clock, processor time is printed, which other users of the machine do not lengthen.
 """
@@ -32,8 +32,8 @@ PER_SIDE = 25
 
 
 def main() -> int:
-    """Run; return 1 if it took five minutes or more, or the catalogue is not full."""
-    parser = argparse.ArgumentParser(description="time and memory of a catalogue build")
+    """Run; return 1 if it took five minutes or more, or the codebook is not full."""
+    parser = argparse.ArgumentParser(description="time and memory of a codebook build")
     parser.add_argument("--images", type=int, default=500, metavar="N", help="default: 500")
     parser.add_argument("--max-tiles", type=int, default=16_000, metavar="N", help="default: 16000")
     parser.add_argument("--tile", type=int, default=10, metavar="PX", help="default: 10")
@@ -45,7 +45,7 @@ def main() -> int:
         print(f"{args.images} images ...", file=sys.stderr)
         pixels = _write_images(folder, args.images)
         out = folder / "out.tiles"
-        arguments = ["catalogue", "build", "--images", str(folder), "--out", str(out), "--rounds", args.rounds]
+        arguments = ["codebook", "build", "--images", str(folder), "--out", str(out), "--rounds", args.rounds]
         arguments += ["--tile", str(args.tile), "--max-tiles", str(args.max_tiles), "--refine", str(args.refine)]
         seconds, cpu_seconds, peak_mib = _run(arguments)
         tiles = load(out).tiles
@@ -94,7 +94,7 @@ def _run(arguments: list[str]) -> tuple[float, float, float]:
     _, status, usage = os.wait4(child.pid, 0)
     seconds = time.perf_counter() - start
     if status != 0:
-        sys.exit(f"catalogue_build: the build ended with status {os.waitstatus_to_exitcode(status)}")
+        sys.exit(f"codebook_build: the build ended with status {os.waitstatus_to_exitcode(status)}")
     peak_mib = usage.ru_maxrss / (1024 if sys.platform != "darwin" else 1 << 20)
     return seconds, usage.ru_utime + usage.ru_stime, peak_mib
 

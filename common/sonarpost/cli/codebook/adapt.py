@@ -1,4 +1,4 @@
-"""`sonarpost catalogue adapt`: a catalogue for one type of seabed, from a folder of images of it."""
+"""`sonarpost codebook adapt`: a codebook for one type of seabed, from a folder of images of it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from sonarpost.cli.catalogue.images import training_images
-from sonarpost.cli.catalogue.info import print_facts
-from sonarpost.cli.catalogue.progress import ProgressDisplay
+from sonarpost.cli.codebook.images import training_images
+from sonarpost.cli.codebook.info import print_facts
+from sonarpost.cli.codebook.progress import ProgressDisplay
 from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split
 from sonarpost.codec.vq.codebook import Codebook, open_codebook, save
 from sonarpost.codec.vq.training_config import MAX_TILES
@@ -22,7 +22,7 @@ def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     """Add the action."""
     parser = actions.add_parser(
         "adapt",
-        help="adapt a catalogue to a type of seabed",
+        help="adapt a codebook to a type of seabed",
         description="Replaces the least used tiles by tiles that the images need. The last quarter of the images is "
         "not learned from: on it the gain is measured.",
     )
@@ -30,7 +30,7 @@ def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.add_argument(
         "--images", type=Path, nargs="+", required=True, metavar="DIR", help="folders of TIFF or PNG images, or files"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the catalogue to write")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the codebook to write")
     parser.add_argument(
         "--keep", type=int, metavar="N", help="tiles of the base that stay at least (default: half of them)"
     )
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Adapt, measure and write; return 0, or 1 if an image had to be left out.
 
     Raises:
-        SonarpostError: Fewer than two images can be read, an argument is wrong, or the catalogue cannot be written.
+        SonarpostError: Fewer than two images can be read, an argument is wrong, or the codebook cannot be written.
     """
     console = Console(stderr=True)
     base = open_codebook(args.base).tiles

@@ -1,4 +1,4 @@
-"""`sonarpost catalogue build`: the paper's Table IV over folders of images."""
+"""`sonarpost codebook build`: the paper's Table IV over folders of images."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from sonarpost.cli.catalogue.images import training_images
-from sonarpost.cli.catalogue.info import show
-from sonarpost.cli.catalogue.progress import ProgressDisplay
+from sonarpost.cli.codebook.images import training_images
+from sonarpost.cli.codebook.info import show
+from sonarpost.cli.codebook.progress import ProgressDisplay
 from sonarpost.codec.vq.builder import build
 from sonarpost.codec.vq.codebook import Codebook, open_codebook, save
 from sonarpost.codec.vq.tiles import MAX_DIMS
@@ -24,12 +24,12 @@ _ROUND = re.compile(r"(?P<fom>\d{1,6}(\.\d{1,6})?):(?P<rms>\d{1,6}(\.\d{1,6})?)(
 
 def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action."""
-    parser = actions.add_parser("build", help="build a catalogue from images (the paper's Table IV)")
+    parser = actions.add_parser("build", help="build a codebook from images (the paper's Table IV)")
     parser.add_argument(
         "--images", type=Path, nargs="+", required=True, metavar="DIR", help="folders of TIFF or PNG images, or files"
     )
     parser.add_argument("--tile", type=int, default=10, metavar="PX", help="side of a tile (default: 10)")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the catalogue to write")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the codebook to write")
     parser.add_argument(
         "--rounds",
         default=DEFAULT_ROUNDS,
@@ -44,7 +44,7 @@ def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.add_argument(
         "--refine", type=int, default=0, metavar="N", help="passes of refinement afterwards (default: 0)"
     )
-    parser.add_argument("--core", metavar="NAME_OR_FILE", help="a catalogue to add to")
+    parser.add_argument("--core", metavar="NAME_OR_FILE", help="a codebook to add to")
     parser.add_argument("--resume", action="store_true", help="go on with a build that was stopped")
     parser.set_defaults(run=run)
 
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     """Build; return 0, or 1 if an image had to be left out.
 
     Raises:
-        SonarpostError: No image can be read, an argument is wrong, or the catalogue cannot be written.
+        SonarpostError: No image can be read, an argument is wrong, or the codebook cannot be written.
     """
     rounds = parse_rounds(args.rounds, args.tile)
     if args.refine < 0:
@@ -79,10 +79,10 @@ def run(args: argparse.Namespace) -> int:
     notes = {"images": str(len(images)), "rounds": args.rounds, "refine passes": str(args.refine)}
     if core is not None:
         notes["core"] = f"{args.core} {core.identity}"
-    catalogue = Codebook(database, notes)
-    save(args.out, catalogue)
+    codebook = Codebook(database, notes)
+    save(args.out, codebook)
     journal.unlink()
-    show(catalogue)
+    show(codebook)
     return EXIT_SOME_FAILED if failed else 0
 
 

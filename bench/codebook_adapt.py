@@ -1,11 +1,11 @@
-"""What adapting the shipped catalogues to real seabeds gains on pieces of them that nothing was learned from.
+"""What adapting the shipped codebooks to real seabeds gains on pieces of them that nothing was learned from.
 
-    python bench/catalogue_adapt.py [--data ../shared/data]
+    python bench/codebook_adapt.py [--data ../shared/data]
 
 Three sets of real images are cut into pieces of 140 x 80 px that do not overlap: a Marine Sonic survey line of 2013,
 a survey line of a river bed of 2009, and synthetic-aperture tiles. Both sides of a line are cut at the same pings and
 in their order, so what is held out, the last quarter, is the end of the line on either side. Each is adapted to from
-both catalogues; a row of the table in `docs/catalogue.md` is printed for each. Times are processor time, which other
+both codebooks; a row of the table in `docs/codebook.md` is printed for each. Times are processor time, which other
 users of the machine do not lengthen.
 """
 
@@ -36,8 +36,8 @@ SETS = {
 
 
 def main() -> int:
-    """Run; return 1 if an adapted catalogue is no better than its base on what was held out."""
-    parser = argparse.ArgumentParser(description="gain of adapted catalogues on real images")
+    """Run; return 1 if an adapted codebook is no better than its base on what was held out."""
+    parser = argparse.ArgumentParser(description="gain of adapted codebooks on real images")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR", help="default: %(default)s")
     args = parser.parse_args()
     if os.environ.get("OMP_NUM_THREADS") != "1":
@@ -50,7 +50,7 @@ def main() -> int:
     for title, pattern in SETS.items():
         images = list(_pieces(sorted(args.data.glob(pattern))))
         if not images:
-            print(f"catalogue_adapt: no {pattern} in {args.data}", file=sys.stderr)
+            print(f"codebook_adapt: no {pattern} in {args.data}", file=sys.stderr)
             return 2
         for tile_px in DEFAULT_TILE_PX:
             good &= _row(title, images, tile_px)
