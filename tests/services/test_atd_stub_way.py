@@ -273,7 +273,7 @@ def test_killed_again_and_again_it_sends_every_contact_once(crew, router, tmp_pa
     config.write_text(
         f'[platform]\nid = "uuv-1"\nrouter = ["{router}"]\nstate_dir = "{tmp_path / "vehicle"}"\n'
         f'health_interval_s = 0.1\n[atd_stub]\nmode = "snippets"\ninput_dir = "{tmp_path / "incoming"}"\n'
-        "poll_s = 0.05\nsettle_s = 0.0\nmax_on_the_way = 8\n"
+        "poll_s = 0.05\nsettle_s = 0.0\nmax_in_flight = 8\n"
     )
     rng = random.Random(5)
     command = [sys.executable, "-m", "sonarpost.services.atd_stub", "--config", str(config)]

@@ -210,7 +210,7 @@ def _vehicle_link(settings: ChainSettings) -> str:
     scale = settings.time_scale
     return (
         f'link = "v1"\nexpected_loss = {min(settings.loss, 0.9)}\nstream_bytes = {settings.stream_bytes}\n'
-        f"tx_burst_s = {60 / scale:.3f}\nlisten_s = {10 / scale + 0.5:.3f}\nqueue_interval_s = 0.2\n"
+        f"tx_burst_s = {60 / scale:.3f}\nrx_window_s = {10 / scale + 0.5:.3f}\nqueue_interval_s = 0.2\n"
         f"group_delay_s = {20 / scale:.3f}\nretry_s = 0.2\nreply_timeout_s = {settings.reply_timeout_s:.3f}\n"
     )
 
@@ -221,7 +221,7 @@ def _vessel_link(settings: ChainSettings) -> str:
         return 'link = "paper"\n' + vehicles
     scale = settings.time_scale
     return (
-        f'link = "v1"\n{vehicles}holdoff_s = {2 / scale + 0.1:.3f}\npatience_s = {120 / scale + 1:.3f}\n'
-        f"retry_s = {60 / scale + 0.5:.3f}\nreport_s = {settings.feedback_interval_s:.3f}\n"
+        f'link = "v1"\n{vehicles}holdoff_s = {2 / scale + 0.1:.3f}\nmax_defer_s = {120 / scale + 1:.3f}\n'
+        f"retry_s = {60 / scale + 0.5:.3f}\nfeedback_interval_s = {settings.feedback_interval_s:.3f}\n"
         f"reply_timeout_s = {settings.reply_timeout_s:.3f}\n"
     )
