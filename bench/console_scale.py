@@ -27,8 +27,8 @@ from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
-from sonarpost.services.console.training import VESSEL, Training
-from sonarpost.services.console.training_contacts import simulated_contacts
+from sonarpost.services.console.training.contacts import simulated_contacts
+from sonarpost.services.console.training.simulator import VESSEL, Training
 
 PASSWORD = "a password for the bench"
 LISTS = (

@@ -27,9 +27,9 @@ from sonarpost.config import PlatformConfig
 from sonarpost.messages import ReconstructedImage
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
-from sonarpost.services.console.training import VESSEL, Training
-from sonarpost.services.console.training_contacts import simulated_contacts
-from sonarpost.services.console.users import FILE_NAME, Users
+from sonarpost.services.console.store.users import FILE_NAME, Users
+from sonarpost.services.console.training.contacts import simulated_contacts
+from sonarpost.services.console.training.simulator import VESSEL, Training
 
 # When the first row was drawn, in ms since the navigation began; and when a wanted change was, in ms since 1970.
 WATCH = """() => {

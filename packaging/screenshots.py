@@ -18,18 +18,15 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from sonarpost.messages import Advice
-from sonarpost.services.console.app import ConsoleApp
-from sonarpost.services.console.audit import OnScreen
-from sonarpost.services.console.board import Board
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.contacts import Filter
-from sonarpost.services.console.database import Database
-from sonarpost.services.console.decisions import DecisionInput
-from sonarpost.services.console.people import Actor
-from sonarpost.services.console.rows import Json
-from sonarpost.services.console.server import WebServer
-from sonarpost.services.console.training import VESSEL, Training
-from sonarpost.services.console.users import Users
+from sonarpost.services.console.state import Board
+from sonarpost.services.console.store.contacts import Filter
+from sonarpost.services.console.store.database import Database, OnScreen
+from sonarpost.services.console.store.decisions import DecisionInput
+from sonarpost.services.console.store.serialisers import Json
+from sonarpost.services.console.store.users import Actor, Users
+from sonarpost.services.console.training.simulator import VESSEL, Training
+from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "screenshots"
 SMALL, LARGE = (1366, 768), (1920, 1080)

@@ -15,16 +15,14 @@ from typing import TYPE_CHECKING
 
 from sonarpost.config import load
 from sonarpost.errors import ConfigError
-from sonarpost.services.console.app import ConsoleApp
-from sonarpost.services.console.board import Board
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.database import Database
-from sonarpost.services.console.people import ROLES
-from sonarpost.services.console.server import WebServer
-from sonarpost.services.console.users import FILE_NAME, Users
+from sonarpost.services.console.state import Board
+from sonarpost.services.console.store.database import Database
+from sonarpost.services.console.store.users import FILE_NAME, ROLES, Users
+from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 if TYPE_CHECKING:
-    from sonarpost.services.console.training import Training
+    from sonarpost.services.console.training.simulator import Training
 
 DATABASE_NAME = "console-review.db"
 TRAINING_USERS = (("watch", "observer"), ("op", "operator"), ("expert", "expert"))
@@ -140,7 +138,7 @@ def _ls(parsed: argparse.Namespace) -> int:
 
 
 def _train(parsed: argparse.Namespace) -> int:
-    from sonarpost.services.console.training import VESSEL, Training  # noqa: PLC0415  it brings codecs and their compiler
+    from sonarpost.services.console.training.simulator import VESSEL, Training  # noqa: PLC0415  it brings codecs and their compiler
 
     with tempfile.TemporaryDirectory(prefix="sonarpost-training-") as scratch:
         folder: Path = parsed.state or Path(scratch)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from sonarpost.messages import AcousticFrame, Health, QueueState
 from sonarpost.monitoring.fleet import FleetTracker, ServiceStatus
-from sonarpost.services.console.rows import Json
+from sonarpost.services.console.store.serialisers import Json
 
 PACKETS_KEPT = 20
 MOST_VEHICLES = 200

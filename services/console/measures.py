@@ -8,7 +8,7 @@ from typing import Literal
 from sonarpost.messages import ReconstructedImage
 from sonarpost.review.measuring import NotMeasurableError, height_from_shadow, measure_length
 from sonarpost.review.rendering import LAYERS
-from sonarpost.services.console.rows import Json
+from sonarpost.services.console.store.serialisers import Json
 
 Measure = Literal["length", "width", "shadow"]
 

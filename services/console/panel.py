@@ -22,8 +22,8 @@ from starlette.types import ASGIApp
 from sonarpost.errors import ConfigError, DeliveryError
 from sonarpost.review import rendering
 from sonarpost.review.panel import NONE_OF_THEM, Answer, Decoded, Trial, results, trials_for
-from sonarpost.services.console.app import STATIC, not_routed, page_file, static_routes
-from sonarpost.services.console.web import Body, Call, Endpoint, Gate, Guard, Handler, RefusedError, json_answer
+from sonarpost.services.console.web.access import Body, Call, Endpoint, Gate, Guard, Handler, RefusedError, json_answer
+from sonarpost.services.console.web.server import STATIC, not_routed, page_file, static_routes
 from sonarpost.sonar.image_files import read_image
 
 SUFFIXES: Final = (".png", ".tif", ".tiff")

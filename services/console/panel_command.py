@@ -11,7 +11,7 @@ from pathlib import Path
 from sonarpost.errors import ConfigError
 from sonarpost.review.panel import results, table
 from sonarpost.services.console.panel import Answers, Folders, PanelApp
-from sonarpost.services.console.server import WebServer
+from sonarpost.services.console.web.server import WebServer
 
 FILE_NAME = "panel.db"
 

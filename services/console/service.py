@@ -29,17 +29,16 @@ from sonarpost.messages import (
     TaskingState,
 )
 from sonarpost.runtime.service import Service, UnitOfWork
-from sonarpost.services.console.app import ConsoleApp
-from sonarpost.services.console.asking import Table
-from sonarpost.services.console.board import Board, Unsent
-from sonarpost.services.console.catch_up import kept_in
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.database import Database
 from sonarpost.services.console.events import Pace
 from sonarpost.services.console.fleet import frame_event
-from sonarpost.services.console.place_routes import fleet
-from sonarpost.services.console.server import WebServer
-from sonarpost.services.console.users import FILE_NAME, Users
+from sonarpost.services.console.shore_import import kept_in
+from sonarpost.services.console.state import Board, Unsent
+from sonarpost.services.console.store.database import Database
+from sonarpost.services.console.store.requests import Table
+from sonarpost.services.console.store.users import FILE_NAME, Users
+from sonarpost.services.console.web.map_routes import fleet
+from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 log = logging.getLogger(__name__)
 

@@ -13,11 +13,11 @@ import pytest
 from starlette.testclient import TestClient
 
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
-from sonarpost.services.console.app import ConsoleApp
-from sonarpost.services.console.board import Board
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.database import Database
-from sonarpost.services.console.users import Users
+from sonarpost.services.console.state import Board
+from sonarpost.services.console.store.database import Database
+from sonarpost.services.console.store.users import Users
+from sonarpost.services.console.web.server import ConsoleApp
 
 PASSWORD = "correct horse battery"
 PEOPLE = {"watch": "observer", "anna": "operator", "bo": "operator", "eva": "expert"}
@@ -139,7 +139,7 @@ ConsoleMaker = Callable[..., Console]
 @pytest.fixture(autouse=True)
 def cheap_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hashing costs time on purpose; how much of it is no matter here."""
-    monkeypatch.setattr("sonarpost.services.console.users.COST", 2**4)
+    monkeypatch.setattr("sonarpost.services.console.store.users.COST", 2**4)
 
 
 @pytest.fixture(scope="session")
@@ -147,7 +147,7 @@ def users_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The file of those who may log in, made once."""
     path = tmp_path_factory.mktemp("users") / "console-users.db"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sonarpost.services.console.users.COST", 2**4)
+        patch.setattr("sonarpost.services.console.store.users.COST", 2**4)
         users = Users(path)
         for name, role in PEOPLE.items():
             users.add(name, role, PASSWORD)

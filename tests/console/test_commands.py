@@ -18,10 +18,10 @@ from sonarpost.cli.main import main
 from sonarpost.config import TlsConfig
 from sonarpost.errors import ConfigError
 from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
-from sonarpost.services.console.server import WebServer
-from sonarpost.services.console.training import VESSEL, Training
-from sonarpost.services.console.training_contacts import simulated_contacts
-from sonarpost.services.console.users import FILE_NAME, Users
+from sonarpost.services.console.store.users import FILE_NAME, Users
+from sonarpost.services.console.training.contacts import simulated_contacts
+from sonarpost.services.console.training.simulator import VESSEL, Training
+from sonarpost.services.console.web.server import WebServer
 
 
 def user(state: Path, *words: str) -> int:

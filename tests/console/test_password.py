@@ -8,7 +8,7 @@ import re
 import pytest
 from builders.console import PASSWORD, PEOPLE
 
-from sonarpost.services.console.users import MAX_PASSWORD, MIN_PASSWORD
+from sonarpost.services.console.store.users import MAX_PASSWORD, MIN_PASSWORD
 
 NEW = "another fine one"
 

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from sonarpost.errors import DeliveryError
 from sonarpost.messages import Advice, Decision, DownlinkState
 from sonarpost.review.grouping import Place, nearest_group
-from sonarpost.services.console.asking import is_news
-from sonarpost.services.console.audit import OnScreen
-from sonarpost.services.console.contacts import Filter
-from sonarpost.services.console.decisions import ConflictError, DecisionInput
-from sonarpost.services.console.people import Actor
+from sonarpost.services.console.store.contacts import Filter
+from sonarpost.services.console.store.database import OnScreen
+from sonarpost.services.console.store.decisions import ConflictError, DecisionInput
+from sonarpost.services.console.store.requests import is_news
+from sonarpost.services.console.store.users import Actor
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 SECONDS = count()

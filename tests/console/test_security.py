@@ -10,7 +10,7 @@ from starlette.testclient import TestClient
 
 from sonarpost.errors import BadInputError
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.users import Attempts, Users
+from sonarpost.services.console.store.users import Attempts, Users
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 ONE = f"/api/contacts/{ID}"

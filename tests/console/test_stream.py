@@ -13,7 +13,7 @@ import pytest
 from builders.common import eventually
 from builders.console import PASSWORD, picture_record
 
-from sonarpost.services.console.server import WebServer
+from sonarpost.services.console.web.server import WebServer
 
 
 class Follower:
@@ -49,7 +49,7 @@ class Follower:
 
 @pytest.fixture
 def served(console, monkeypatch):
-    monkeypatch.setattr("sonarpost.services.console.stream.KEEP_ALIVE_S", 0.1)
+    monkeypatch.setattr("sonarpost.services.console.web.event_stream.KEEP_ALIVE_S", 0.1)
     server = WebServer(console.app.asgi, "127.0.0.1", 0)
     server.start()
     yield server

@@ -121,7 +121,7 @@ class Page:
 
 @pytest.fixture(autouse=True)
 def cheap_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sonarpost.services.console.users.COST", 2**4)
+    monkeypatch.setattr("sonarpost.services.console.store.users.COST", 2**4)
 
 
 @pytest.fixture

@@ -12,9 +12,8 @@ import pytest
 from builders.console import cheap_hashes, console, make_console, users_file
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, sync_playwright
 
-from sonarpost.services.console.app import ConsoleApp
-from sonarpost.services.console.server import WebServer
-from sonarpost.services.console.users import Users
+from sonarpost.services.console.store.users import Users
+from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 __all__ = ["cheap_hashes", "console", "make_console", "users_file"]
 

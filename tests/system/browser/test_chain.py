@@ -21,7 +21,7 @@ from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
-from sonarpost.services.console.users import FILE_NAME, Users
+from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.service import DecompressorService
 from sonarpost.services.op_modem.config import OpModemConfig

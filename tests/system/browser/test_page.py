@@ -54,7 +54,7 @@ def few(served, count=6):
 
 
 def contact_ids(served):
-    from sonarpost.services.console.contacts import Filter
+    from sonarpost.services.console.store.contacts import Filter
 
     return {row["image_id"]: row["id"] for row in served.board.contacts(Filter(limit=500))["items"]}
 
@@ -338,7 +338,7 @@ def test_contrast_and_names(served, theme):
 
 
 def test_thousands_of_contacts(served):
-    from sonarpost.services.console import contacts
+    from sonarpost.services.console.store import contacts
 
     with served.board.database.writing() as db:
         for number in range(5000):
@@ -362,7 +362,7 @@ def test_thousands_of_contacts(served):
 
 def test_expert_advice_appears_beside_the_picture(serve):
     from sonarpost.messages import Advice
-    from sonarpost.services.console.contacts import Filter
+    from sonarpost.services.console.store.contacts import Filter
 
     vessel = serve()
     few(vessel, 1)

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from sonarpost.services.console.panel import Answers, Folders, PanelApp
-from sonarpost.services.console.server import WebServer
+from sonarpost.services.console.web.server import WebServer
 
 PICTURES = 4
 

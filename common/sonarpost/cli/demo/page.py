@@ -25,7 +25,7 @@ class Page:
         self._password = secrets.token_urlsafe(9)
         self.address = f"http://127.0.0.1:{settings.console_port}/"
         # Commands know services by name only.
-        users_file = importlib.import_module("sonarpost.services.console.users")
+        users_file = importlib.import_module("sonarpost.services.console.store.users")
         users = users_file.Users(settings.folder / "state" / VESSEL / users_file.FILE_NAME)
         try:
             users.add(USER, "operator", self._password)

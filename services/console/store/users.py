@@ -13,12 +13,47 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final, Literal
 
 from cryptography.exceptions import InvalidKey
 from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
 
 from sonarpost.errors import BadInputError, DeliveryError
-from sonarpost.services.console.people import ROLES, Role
+
+Role = Literal["observer", "operator", "expert"]
+Side = Literal["vessel", "shore"]
+Act = Literal["decide", "measure", "request", "advise"]
+
+ROLES: Final[tuple[Role, ...]] = ("observer", "operator", "expert")
+
+
+@dataclass(frozen=True, slots=True)
+class Actor:
+    """Somebody who is logged in.
+
+    Attributes:
+        user: Name.
+        role: Of the user.
+        address: From where.
+    """
+
+    user: str
+    role: Role
+    address: str
+
+    def may(self, act: Act, side: Side) -> bool:
+        """Tell whether this person may do something on this side of the water.
+
+        Decisions are made where the vehicle can be told at once: on a vessel. Ashore experts advise and ask.
+        """
+        if act == "advise":
+            return side == "shore" and self.role == "expert"
+        if act == "decide":
+            return side == "vessel" and self.role != "observer"
+        if act == "request" and side == "shore":
+            return self.role == "expert"
+        return self.role != "observer"
+
 
 FILE_NAME = "console-users.db"
 COST = 2**15

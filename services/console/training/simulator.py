@@ -24,10 +24,10 @@ from sonarpost.messages import (
     ReconstructedImage,
 )
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.services.console.board import Board
 from sonarpost.services.console.fleet import frame_event
-from sonarpost.services.console.place_routes import fleet
-from sonarpost.services.console.training_contacts import VEHICLES, Simulated, simulated_contacts, wider_image_id
+from sonarpost.services.console.state import Board
+from sonarpost.services.console.training.contacts import VEHICLES, Simulated, simulated_contacts, wider_image_id
+from sonarpost.services.console.web.map_routes import fleet
 
 log = logging.getLogger(__name__)
 

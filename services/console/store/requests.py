@@ -10,11 +10,11 @@ from sonarpost import wire
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Advice, Command, CommandKind, DownlinkState, TaskingState
-from sonarpost.services.console import audit
-from sonarpost.services.console.audit import OnScreen
-from sonarpost.services.console.contacts import contact_of_picture, find_row
-from sonarpost.services.console.people import Actor
-from sonarpost.services.console.rows import Json, advice_of, request_of
+from sonarpost.services.console.store import database
+from sonarpost.services.console.store.contacts import contact_of_picture, find_row
+from sonarpost.services.console.store.database import OnScreen
+from sonarpost.services.console.store.serialisers import Json, advice_of, request_of
+from sonarpost.services.console.store.users import Actor
 
 KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider")
 _RANK: Final = {
@@ -102,7 +102,7 @@ def ask(
         ),
     )
     detail = {"command_id": record.command_id, "kind": kind, "airtime_s": airtime_s}
-    audit.write(db, contact_id, actor, "request", now_utc_s, OnScreen(row["version"]), detail)
+    database.write(db, contact_id, actor, "request", now_utc_s, OnScreen(row["version"]), detail)
     return record.command_id
 
 
@@ -146,7 +146,7 @@ def advise(db: sqlite3.Connection, contact_id: str, record: Advice, actor: Actor
     _insert_advice(db, contact_id, record, "waiting")
     detail = record.model_dump(include={"advice_id", "verdict", "confidence", "mlo_class", "remark"})
     screen = OnScreen(record.image_version)
-    audit.write(db, contact_id, actor, "advise", record.advised_utc_s, screen, detail)
+    database.write(db, contact_id, actor, "advise", record.advised_utc_s, screen, detail)
 
 
 def take_advice(db: sqlite3.Connection, record: Advice) -> str | None:

@@ -25,11 +25,11 @@ from sonarpost.export.geojson import geojson_bytes
 from sonarpost.export.kml import kmz_bytes
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review import rendering
-from sonarpost.services.console.board import Board
-from sonarpost.services.console.contact_routes import filter_of
-from sonarpost.services.console.contacts import Filter, list_contacts
-from sonarpost.services.console.rows import Json, image_of
-from sonarpost.services.console.web import Call, Gate, RefusedError
+from sonarpost.services.console.state import Board
+from sonarpost.services.console.store.contacts import Filter, list_contacts
+from sonarpost.services.console.store.serialisers import Json, image_of
+from sonarpost.services.console.web.access import Call, Gate, RefusedError
+from sonarpost.services.console.web.contact_routes import filter_of
 
 MOST: Final = 10_000
 _PAGE: Final = 500

@@ -10,10 +10,9 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from sonarpost.logs import kv
-from sonarpost.services.console.people import Actor, Side
-from sonarpost.services.console.rows import Json
-from sonarpost.services.console.users import MAX_PASSWORD, MIN_PASSWORD, Attempts, Session, Users
-from sonarpost.services.console.web import COOKIE, Body, Call, Gate, RefusedError, json_answer
+from sonarpost.services.console.store.serialisers import Json
+from sonarpost.services.console.store.users import MAX_PASSWORD, MIN_PASSWORD, Actor, Attempts, Session, Side, Users
+from sonarpost.services.console.web.access import COOKIE, Body, Call, Gate, RefusedError, json_answer
 
 log = logging.getLogger(__name__)
 

@@ -9,11 +9,10 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
 from sonarpost.review.local import LocalFrame, distance_m
-from sonarpost.services.console.arrivals import NoSuchError
-from sonarpost.services.console.board import Board
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.rows import Json
-from sonarpost.services.console.web import Call, Gate, json_answer
+from sonarpost.services.console.state import Board, NoSuchError
+from sonarpost.services.console.store.serialisers import Json
+from sonarpost.services.console.web.access import Call, Gate, json_answer
 
 MOST_ON_MAP = 10_000
 

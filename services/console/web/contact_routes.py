@@ -15,13 +15,12 @@ from starlette.routing import Route
 from sonarpost.messages import Advice, CommandKind, ReconstructedImage, Verdict
 from sonarpost.review import rendering
 from sonarpost.review.rendering import LAYERS, MAPS
-from sonarpost.services.console.arrivals import NoSuchError
-from sonarpost.services.console.audit import OnScreen
-from sonarpost.services.console.board import Board
-from sonarpost.services.console.contacts import REVIEWS, SORTS, Filter
-from sonarpost.services.console.decisions import DecisionInput
 from sonarpost.services.console.measures import Line
-from sonarpost.services.console.web import Body, Call, Gate, RefusedError, json_answer
+from sonarpost.services.console.state import Board, NoSuchError
+from sonarpost.services.console.store.contacts import REVIEWS, SORTS, Filter
+from sonarpost.services.console.store.database import OnScreen
+from sonarpost.services.console.store.decisions import DecisionInput
+from sonarpost.services.console.web.access import Body, Call, Gate, RefusedError, json_answer
 
 _NUMBER = re.compile(r"-?\d{1,9}(\.\d{1,9})?")
 _Sure = Annotated[float, Field(ge=0, le=1)] | None

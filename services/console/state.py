@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 
 from sonarpost import wire
+from sonarpost.errors import BadInputError
 from sonarpost.messages import (
     Advice,
     Command,
     CommandKind,
     Decision,
+    DownlinkState,
     ReconstructedImage,
+    TaskingState,
 )
 from sonarpost.review.costs import request_cost
-from sonarpost.services.console import asking, audit, contacts, decisions
-from sonarpost.services.console.arrivals import Arrivals, NoSuchError
-from sonarpost.services.console.asking import ID_COLUMN, Table
-from sonarpost.services.console.audit import OnScreen
-from sonarpost.services.console.contacts import Filter
-from sonarpost.services.console.decisions import DecisionInput
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.events import Hub
+from sonarpost.services.console.fleet import FleetPanel
 from sonarpost.services.console.measures import Line, measured
-from sonarpost.services.console.people import Actor
-from sonarpost.services.console.rows import (
+from sonarpost.services.console.store import contacts, database, decisions, requests
+from sonarpost.services.console.store.contacts import Counts, Filter
+from sonarpost.services.console.store.database import Database, OnScreen
+from sonarpost.services.console.store.decisions import DecisionInput
+from sonarpost.services.console.store.requests import ID_COLUMN, Table
+from sonarpost.services.console.store.serialisers import (
     Json,
     advice_of,
     audit_of,
@@ -34,6 +39,172 @@ from sonarpost.services.console.rows import (
     request_of,
     version_of,
 )
+from sonarpost.services.console.store.users import Actor
+
+
+class NoSuchError(BadInputError):
+    """There is no such contact, version or file."""
+
+
+class Arrivals:
+    """What arrives, and what pages hear of it.
+
+    Args:
+        config: Of the console.
+        database: Where everything is kept.
+        clock: UTC seconds.
+    """
+
+    def __init__(self, config: ConsoleConfig, database: Database, clock: Callable[[], float] = time.time) -> None:
+        self.config = config
+        self.database = database
+        self.hub = Hub()
+        self.fleet = FleetPanel(config.vehicle_stale_s)
+        self.clock = clock
+        self.on_unsent: Callable[[], None] = lambda: None
+
+    # What arrives
+
+    def take_image(self, image: ReconstructedImage) -> bool:
+        """Keep a version of a picture; tell whether it was new.
+
+        Raises:
+            HandoffError: It cannot be kept now.
+        """
+        now = self.clock()
+        rate = self.fleet.rate_of(image.vehicle_id, self.config.assumed_rate)
+        with self.database.writing() as db:
+            taken = contacts.take_image(db, image, rate, now, self.config.group_radius_m)
+            if taken is not None and taken[1]:
+                decisions.adopt(db, taken[0], now)
+        if taken is None:
+            return False
+        self._tell_contact(taken[0], new=taken[1])
+        return True
+
+    def take_images(self, images: Sequence[ReconstructedImage]) -> int:
+        """Keep many versions with one write to the disk; return how many were new. Pages load anew.
+
+        Raises:
+            HandoffError: They cannot be kept now; none is.
+        """
+        now, new = self.clock(), 0
+        with self.database.writing() as db:
+            for image in images:
+                rate = self.fleet.rate_of(image.vehicle_id, self.config.assumed_rate)
+                taken = contacts.take_image(db, image, rate, now, self.config.group_radius_m)
+                if taken is not None and taken[1]:
+                    decisions.adopt(db, taken[0], now)
+                new += taken is not None
+        if new:
+            self.hub.publish("reset", {})
+        return new
+
+    def take_decision(self, record: Decision) -> bool:
+        """Keep a decision made elsewhere; tell whether it was new."""
+        with self.database.writing() as db:
+            known = decisions.find(db, record.decision_id) is not None
+            contact_id = decisions.take(db, record, self.clock(), ashore=self.config.role == "shore")
+        if contact_id is not None:
+            self._tell_contact(contact_id)
+            self._tell_decision(record.decision_id)
+        return not known
+
+    def take_advice(self, record: Advice) -> None:
+        """Keep advice from ashore."""
+        with self.database.writing() as db:
+            contact_id = requests.take_advice(db, record)
+        if contact_id is not None:
+            self._tell_contact(contact_id)
+            self._tell("advice", contact_id, record.advice_id)
+
+    def take_downlink(self, state: DownlinkState) -> None:
+        """Note how far something has come on its way to a vehicle."""
+        with self.database.writing() as db:
+            if state.kind == "decision":
+                changed = decisions.downlink(db, state)
+                contact_id = None
+            else:
+                changed, contact_id = False, requests.downlink(db, state)
+        if changed:
+            self._tell_decision(state.record_id)
+        elif contact_id is not None:
+            self._tell("request", contact_id, state.record_id)
+            self._tell_contact(contact_id)
+
+    def take_tasking(self, state: TaskingState) -> None:
+        """Note how far advice or a command has come on its way to a vessel."""
+        with self.database.writing() as db:
+            changed = requests.tasking(db, state)
+        if changed is not None:
+            self._tell(changed[0], changed[1], state.record_id)
+
+    def settled(self, table: Table, record_id: str, consumer: str, reason: str | None) -> None:
+        """Note that a consumer has a record on its disk (None), or refused it for a reason."""
+        now = self.clock()
+        contact_id = None
+        with self.database.writing() as db:
+            if table == "decision":
+                if decisions.handed(db, record_id, consumer, reason, now):
+                    row = decisions.find(db, record_id)
+                    contact_id = row and str(row["contact_id"])
+            elif table == "request":
+                state = "refused" if reason is not None else "asked"
+                contact_id = requests.request_state(db, record_id, state, reason or "", None, now)
+            elif reason is not None:
+                db.execute(
+                    "UPDATE advice SET state = 'refused', reason = ? WHERE advice_id = ? AND state = 'waiting'",
+                    (reason, record_id),
+                )
+                row = db.execute("SELECT contact_id FROM advice WHERE advice_id = ?", (record_id,)).fetchone()
+                contact_id = row and str(row["contact_id"])
+        if contact_id:
+            self._tell(table, contact_id, record_id)
+            self._tell_contact(contact_id)
+
+    def all_ashore_before(self, utc_s: float) -> None:
+        """Note that decisions which the relay had before a time are ashore."""
+        with self.database.reading() as db:
+            waiting = db.execute("SELECT 1 FROM decision WHERE shore = 'relay' LIMIT 1").fetchone()
+        if waiting is None:
+            return
+        with self.database.writing() as db:
+            found = decisions.ashore_before(db, utc_s)
+        for decision_id in found:
+            self._tell_decision(decision_id)
+
+    def counts(self) -> Counts:
+        """Count the contacts."""
+        with self.database.reading() as db:
+            return contacts.counts(db)
+
+    # Telling the pages
+
+    def _row(self, contact_id: str) -> Json:
+        with self.database.reading() as db:
+            row = contacts.find_row(db, contact_id)
+        if row is None:
+            raise NoSuchError("contact", "id", contact_id, "a contact")
+        return contact_row(row)
+
+    def _tell_contact(self, contact_id: str, *, new: bool = False) -> None:
+        self.hub.publish("contact", {"contact": self._row(contact_id), "new": new, **asdict(self.counts())})
+
+    def _tell_decision(self, decision_id: str) -> None:
+        with self.database.reading() as db:
+            row = decisions.find(db, decision_id)
+        if row is not None and row["contact_id"]:
+            self.hub.publish("decision", {"id": row["contact_id"], "decision": decision_of(row)})
+
+    def _tell(self, table: Table, contact_id: str, record_id: str) -> None:
+        if table == "decision":
+            self._tell_decision(record_id)
+            return
+        with self.database.reading() as db:
+            row = db.execute(f"SELECT * FROM {table} WHERE {ID_COLUMN[table]} = ?", (record_id,)).fetchone()  # noqa: S608
+        body = request_of(row) if table == "request" else advice_of(row)
+        self.hub.publish(table, {"id": contact_id, table: body})
+
 
 FRAME_HEADER_BYTES = 13
 """Of a frame of the paper's format; v1's are shorter."""
@@ -82,8 +253,8 @@ class Board(Arrivals):
                 "record": record_of(image_of(rows[-1])),
                 "versions": [version_of(version) for version in rows],
                 "decisions": decisions.of_contact(db, contact_id),
-                "advice": asking.advice_for(db, contact_id),
-                "requests": asking.requests_of(db, contact_id),
+                "advice": requests.advice_for(db, contact_id),
+                "requests": requests.requests_of(db, contact_id),
                 "measurements": [{**json.loads(m["body"]), "id": m["id"]} for m in measurements],
                 "group": looks,
                 "audit": [audit_of(entry) for entry in entries],
@@ -115,8 +286,8 @@ class Board(Arrivals):
             first = contacts.find_version(db, contact_id, 1)
         # A wider picture is as long as this one was before more of it was asked for.
         new_bytes = (0 if first is None else image_of(first).bytes_total) or full["bytes_total"]
-        for kind in asking.KINDS:
-            reason = asking.why_not(full, kind)
+        for kind in requests.KINDS:
+            reason = requests.why_not(full, kind)
             cost = request_cost(
                 kind,
                 downlink_rate=self.config.downlink_rate,
@@ -186,7 +357,7 @@ class Board(Arrivals):
         """Write a request down, to be sent; return it."""
         self._row(contact_id)
         with self.database.writing() as db:
-            command_id = asking.ask(db, contact_id, kind, airtime_s, actor, self.clock())
+            command_id = requests.ask(db, contact_id, kind, airtime_s, actor, self.clock())
         self.on_unsent()
         self._tell("request", contact_id, command_id)
         self._tell_contact(contact_id)
@@ -197,7 +368,7 @@ class Board(Arrivals):
         """Write advice down, to be sent; return it."""
         self.image(contact_id, record.image_version)
         with self.database.writing() as db:
-            asking.advise(db, contact_id, record, actor)
+            requests.advise(db, contact_id, record, actor)
         self.on_unsent()
         self._tell("advice", contact_id, record.advice_id)
         self._tell_contact(contact_id)
@@ -222,7 +393,7 @@ class Board(Arrivals):
                 (contact_id, body["utc_s"], json.dumps(body)),
             )
             screen = OnScreen(line.version, image.picture_sha256, line.layer)
-            audit.write(db, contact_id, actor, "measure", self.clock(), screen, body)
+            database.write(db, contact_id, actor, "measure", self.clock(), screen, body)
         return {"id": added.lastrowid, **body}
 
     # Sending

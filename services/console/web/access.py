@@ -17,11 +17,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.logs import kv
 from sonarpost.review.measuring import NotMeasurableError
-from sonarpost.services.console.arrivals import NoSuchError
-from sonarpost.services.console.decisions import ConflictError
-from sonarpost.services.console.people import Act, Actor, Side
-from sonarpost.services.console.rows import Json
-from sonarpost.services.console.users import Session, Users, same
+from sonarpost.services.console.state import NoSuchError
+from sonarpost.services.console.store.decisions import ConflictError
+from sonarpost.services.console.store.serialisers import Json
+from sonarpost.services.console.store.users import Act, Actor, Session, Side, Users, same
 from sonarpost.wire import expected_text
 
 log = logging.getLogger(__name__)

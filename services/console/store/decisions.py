@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from sonarpost import wire
 from sonarpost.errors import BadInputError, SonarpostError
 from sonarpost.messages import Decision, DownlinkState, Verdict
-from sonarpost.services.console import audit
-from sonarpost.services.console.asking import is_news
-from sonarpost.services.console.audit import OnScreen
-from sonarpost.services.console.contacts import contact_of_picture, find_row
-from sonarpost.services.console.people import Actor
-from sonarpost.services.console.rows import Json, contact_row, decision_of, image_of
+from sonarpost.services.console.store import database
+from sonarpost.services.console.store.contacts import contact_of_picture, find_row
+from sonarpost.services.console.store.database import OnScreen
+from sonarpost.services.console.store.requests import is_news
+from sonarpost.services.console.store.serialisers import Json, contact_row, decision_of, image_of
+from sonarpost.services.console.store.users import Actor
 
 
 class ConflictError(SonarpostError):
@@ -88,7 +88,9 @@ def decide(
     _insert(db, contact_id, record, judgement.screen, None, now_utc_s, ends)
     _settle_contact(db, contact_id, now_utc_s)
     detail = record.model_dump(include={"decision_id", "verdict", "confidence", "mlo_class", "remark"})
-    audit.write(db, contact_id, actor, "decide", now_utc_s, judgement.screen, {**detail, "revision": row["revision"]})
+    database.write(
+        db, contact_id, actor, "decide", now_utc_s, judgement.screen, {**detail, "revision": row["revision"]}
+    )
     return record.decision_id
 
 
@@ -130,7 +132,7 @@ def undo(
     _insert(db, contact_id, record, screen, decision_id, now_utc_s, ends)
     _settle_contact(db, contact_id, now_utc_s)
     detail = {"decision_id": record.decision_id, "undoes": decision_id, "verdict": record.verdict, "revision": revision}
-    audit.write(db, contact_id, actor, "undo", now_utc_s, screen, detail)
+    database.write(db, contact_id, actor, "undo", now_utc_s, screen, detail)
     return record.decision_id
 
 

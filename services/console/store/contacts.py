@@ -12,7 +12,7 @@ from sonarpost import wire
 from sonarpost.messages import ReconstructedImage
 from sonarpost.review.grouping import Place, nearest_group
 from sonarpost.review.local import vehicle_position
-from sonarpost.services.console.rows import CONTACT, Json, contact_row, percent_of
+from sonarpost.services.console.store.serialisers import CONTACT, Json, contact_row, percent_of
 
 SORTS: Final[Mapping[str, str]] = {
     "arrived": "arrived_utc_s",

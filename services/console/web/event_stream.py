@@ -13,9 +13,9 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from sonarpost.services.console.board import Board
 from sonarpost.services.console.events import Event
-from sonarpost.services.console.web import Gate, RefusedError, answer
+from sonarpost.services.console.state import Board
+from sonarpost.services.console.web.access import Gate, RefusedError, answer
 
 KEEP_ALIVE_S = 5.0
 MOST_OF_A_SESSION = 4

@@ -1,0 +1,1 @@
+"""Database of the console: contacts, decisions, requests, users."""

@@ -1,0 +1,1 @@
+"""Web application of the console: server, access control, routes, event stream."""
