@@ -64,7 +64,7 @@ class Sink(Service[ServiceConfig]):
     NAME = "c2"
     BATCH = 512
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         """What vessels relay."""
         return {keys.shore_inbox_all(): Relayed}
 
@@ -161,7 +161,7 @@ def measure_relay(endpoint: str, folder: Path, key: str, payloads: Sequence[byte
         started, used = time.perf_counter(), time.process_time()
         relay.start()
         try:
-            while relay.delivered_to("c2") < len(payloads) or relay.store.outbox_depth():
+            while relay.acknowledged_count("c2") < len(payloads) or relay.store.outbox_depth():
                 time.sleep(0.005)
             seconds, used_s = time.perf_counter() - started, time.process_time() - used
         finally:

@@ -263,7 +263,7 @@ class Taker(Service[ServiceConfig]):
         super().__init__(platform, ServiceConfig())
         self.got: list[Any] = []
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         return {self.key: self.takes}
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:

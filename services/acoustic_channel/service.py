@@ -47,7 +47,7 @@ class AcousticChannelService(Service[AcousticChannelConfig]):
 
     def on_start(self) -> None:
         """Watch the channel: when it fails, so does the service."""
-        self.spawn(self._watch, "watch")
+        self.start_thread(self._watch, "watch")
 
     def gauges(self) -> Mapping[str, float]:
         """Return what the water did so far, and how many modems have a host."""

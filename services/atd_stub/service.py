@@ -57,8 +57,8 @@ class AtdStubService(Service[AtdStubConfig]):
     def on_start(self) -> None:
         """Watch what waits on the way to the water, and start to poll."""
         self._outgoing.listen(self.session)
-        self.spawn(self._poll, "poll")
-        self.spawn(lambda: self._outgoing.run(self.stopping), "release")
+        self.start_thread(self._poll, "poll")
+        self.start_thread(lambda: self._outgoing.run(self.stopping), "release")
 
     def on_stop(self) -> None:
         """Let the threads look up."""
@@ -72,16 +72,16 @@ class AtdStubService(Service[AtdStubConfig]):
             "contacts_on_the_way": float(self._outgoing.on_the_way),
         }
 
-    def trouble(self) -> str:
+    def degraded_reason(self) -> str:
         """Return what keeps contacts from being handed on."""
         return self._outgoing.trouble
 
-    def remark(self) -> str:
+    def warning(self) -> str:
         """Say that contacts wait for the water."""
         waiting = self._outgoing.waiting
         return f"{waiting} contacts wait for room on the way to the water" if waiting else ""
 
-    def settled(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
+    def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Count what the compressor has taken."""
         if reason is None:
             self._outgoing.taken()
@@ -94,9 +94,9 @@ class AtdStubService(Service[AtdStubConfig]):
                 self._end_seams()
                 self._look()
             except (OSError, DeliveryError) as error:
-                self.problem(f"{type(error).__name__}: {error}")
+                self.set_degraded(f"{type(error).__name__}: {error}")
             else:
-                self.problem("")
+                self.set_degraded("")
             self.stopping.wait(self.config.poll_s)
 
     def _look(self) -> None:

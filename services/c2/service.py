@@ -60,7 +60,7 @@ class C2Service(Service[C2Config]):
         self._to_show: list[tuple[str, Record]] = []
         self._uncommitted: dict[str, bytes] = {}
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Whatever vessels relay to this site, and what the shore wants to say to them."""
         site = self.config.site
         return {
@@ -71,7 +71,7 @@ class C2Service(Service[C2Config]):
 
     # From the vessels
 
-    def check(self, key: str, record: Record) -> None:
+    def validate(self, key: str, record: Record) -> None:
         """Refuse what would not be understood later, while its sender can still be told."""
         if isinstance(record, Relayed):
             if key != keys.shore_inbox(record.vessel_id, self.config.site):
@@ -121,7 +121,7 @@ class C2Service(Service[C2Config]):
         effects.count("decisions_stored" if new else "decisions_repeated")
         self._to_show.append((keys.shore_decision(decision.vessel_id, self.config.site), decision))
 
-    def commit_all(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
+    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """Commit when the files of all are on the disk and have been shown.
 
         Raises:
@@ -131,7 +131,7 @@ class C2Service(Service[C2Config]):
             self._archive.flush()
             for key, record in self._to_show:
                 self._show(key, record)
-            superseded = super().commit_all(handled)
+            superseded = super().commit_batch(handled)
         finally:
             self._to_show.clear()
             self._uncommitted.clear()
@@ -176,7 +176,7 @@ class C2Service(Service[C2Config]):
             ),
         )
 
-    def settled(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
+    def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Remember, with the acknowledgement itself, that a vessel has taken or refused a record."""
         vessel = item.consumer.partition("@")[2]
         was = tasking.of_payload(vessel, item.key, item.payload)
@@ -227,8 +227,8 @@ class C2Service(Service[C2Config]):
 
     def on_start(self) -> None:
         """Begin to remove what is too old, and to show how far advice and commands have come."""
-        self.spawn(self._retain, "retention")
-        self.spawn(self._show_states, "tasking")
+        self.start_thread(self._retain, "retention")
+        self.start_thread(self._show_states, "tasking")
         hello.declare_presence(self.session, self.platform.id, self.NAME, self.config.site)
 
     def on_stop(self) -> None:
@@ -254,7 +254,7 @@ class C2Service(Service[C2Config]):
                 log.error("Retention cannot work", extra=kv(reason=str(error)))
             self._retain_now.wait(RETAIN_EVERY_S)
 
-    def trouble(self) -> str:
+    def degraded_reason(self) -> str:
         """Return what keeps the background work from being done."""
         return "; ".join(tuple(self._background_problem.values()))
 

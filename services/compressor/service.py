@@ -49,7 +49,7 @@ class CompressorService(Service[CompressorConfig]):
         self._kept = EncodeCache(self.store, config.cache_images, config.cache_s)
         log.info("Codec ready", extra=kv(codec=self._codec.name, model=self._codec.model_hash[:16]))
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Snippets of this vehicle, and what the vessel asks of pictures."""
         commands = {keys.command(self.platform.id, kind): Command for kind in ("refine", "resend", "wider")}
         return {keys.contact_detected(self.platform.id): Snippet, **commands}

@@ -94,7 +94,7 @@ class ConsoleService(Service[ConsoleConfig]):
     def _on_vessel(self) -> bool:
         return self.config.role == "vessel"
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         """On a vessel its pictures and the shore's advice; ashore what c2 shows."""
         if self._on_vessel:
             vessel = self.platform.id
@@ -102,7 +102,7 @@ class ConsoleService(Service[ConsoleConfig]):
         site = self.config.site
         return {keys.shore_image_all(site): ReconstructedImage, keys.shore_decision_all(site): Decision}
 
-    def check(self, key: str, record: Record) -> None:
+    def validate(self, key: str, record: Record) -> None:
         """Refuse what speaks for another vessel, while its sender can be told."""
         if self._on_vessel and isinstance(record, (ReconstructedImage, Advice)):
             if record.vessel_id != self.platform.id:
@@ -161,7 +161,7 @@ class ConsoleService(Service[ConsoleConfig]):
         # Killed in between, it is owed once more, and its consumers know it by its identifier.
         self.board.mark_sent(item)
 
-    def settled(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
+    def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Remember that a consumer has taken a record or refused it; the board is told outside of this transaction."""
         table, record_id = _what(item)
         tx.put_state(f"{_SETTLED}{table}/{item.consumer}/{record_id}", b"" if reason is None else reason.encode())
@@ -202,10 +202,10 @@ class ConsoleService(Service[ConsoleConfig]):
         health = keys.health_everywhere() if self._on_vessel else keys.health_all(self.platform.id)
         self.session.declare_subscriber(health, self._on_health)
         self._server.start()
-        self.spawn(self._send_unsent, "send")
-        self.spawn(self._tick, "tick")
+        self.start_thread(self._send_unsent, "send")
+        self.start_thread(self._tick, "tick")
         if not self._on_vessel and self.config.out_dir is not None:
-            self.spawn(self._catch_up, "catch-up")
+            self.start_thread(self._catch_up, "catch-up")
 
     def _watch(self, key: str, record_type: type[R], take: Callable[[R], object]) -> None:
         def on_sample(sample: zenoh.Sample) -> None:
@@ -290,11 +290,11 @@ class ConsoleService(Service[ConsoleConfig]):
         self._database.close()
         self._users.close()
 
-    def trouble(self) -> str:
+    def degraded_reason(self) -> str:
         """Return what keeps decisions from being handed on."""
         return self._send_problem
 
-    def remark(self) -> str:
+    def warning(self) -> str:
         """Say that nobody may log in."""
         return "" if self._users.all() else "nobody may log in yet"
 

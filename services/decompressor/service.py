@@ -70,14 +70,14 @@ class DecompressorService(Service[DecompressorConfig]):
         seal = None if self._key is None else FrameAuthenticator(self._key, 0, Direction.TO_VEHICLE)
         return FrameReceivers(self.config.wire_formats, self.config.pairing_timeout_s, seal)
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Frames this vessel's modem received."""
         return {keys.acoustic_rx(self.platform.id): AcousticFrame}
 
     def on_start(self) -> None:
         """Start to watch the waiting time."""
         self._last_frame_s = time.monotonic()
-        self.spawn(self._watch_deadlines, "pairing")
+        self.start_thread(self._watch_deadlines, "pairing")
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Give a frame to the receiver and act on what follows."""
@@ -113,7 +113,7 @@ class DecompressorService(Service[DecompressorConfig]):
                 log.exception("Picture not given out, trying again")
                 self.stopping.wait(RETRY_AFTER_S)
 
-    def trouble(self) -> str:
+    def degraded_reason(self) -> str:
         """Return what keeps pictures whose time is up from being given out."""
         return self._pairing_problem
 
@@ -177,7 +177,7 @@ class DecompressorService(Service[DecompressorConfig]):
     def _keep_apart_image(self, event: Picture, vehicle: str, reason: str, effects: UnitOfWork) -> None:
         effects.count("images_undecodable")
         body = b"" if isinstance(event, ContactOnly) else event.stream
-        effects.keep_apart(f"image {vehicle}/{image_id_of(event)}", body, reason)
+        effects.quarantine(f"image {vehicle}/{image_id_of(event)}", body, reason)
 
     def _decode(self, event: Picture, vehicle: str) -> ReconstructedImage:
         match event:

@@ -67,7 +67,7 @@ class DownlinkService(ModemService[OpModemConfig]):
             still_open = station.book.open_orders
             self._in_step = True
         self._show(still_open, time.time())
-        self.spawn(self._speak, "speak")
+        self.start_thread(self._speak, "speak")
 
     def _new_station(self) -> VesselStation:
         seal = None
@@ -76,13 +76,13 @@ class DownlinkService(ModemService[OpModemConfig]):
             seal = FrameAuthenticator(self._key, self.config.address, Direction.TO_VEHICLE, first_counter=limit)
         return VesselStation(self.platform.id, self.config, seal)
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Commands and decisions for vehicles; nothing where the vessel only listens."""
         if not self._speaks:
             return {}
         return {keys.command_all(self.platform.id): Command, keys.contact_decision(self.platform.id): Decision}
 
-    def check(self, key: str, record: Record) -> None:
+    def validate(self, key: str, record: Record) -> None:
         """Refuse what can never be sent, while its sender can still be told."""
         assert isinstance(record, (Command, Decision))
         if isinstance(record, Command) and key != keys.command(self.platform.id, record.kind):
@@ -290,9 +290,9 @@ class DownlinkService(ModemService[OpModemConfig]):
                 gauges |= {"frames_genuine": float(counts.genuine), "key_frames_left": float(seal.frames_left)}
             return gauges
 
-    def trouble(self) -> str:
+    def degraded_reason(self) -> str:
         """Return what is wrong with the port, the modem, or what is to be sent."""
-        return super().trouble() or self._link_problem
+        return super().degraded_reason() or self._link_problem
 
     def _hear(self, packet: PacketReceived, heard_utc_s: float, effects: UnitOfWork) -> tuple[PendingCommand, ...]:
         """Give the station the frames that were for this vessel; return the orders that changed by them."""

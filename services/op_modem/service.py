@@ -70,7 +70,7 @@ class OpModemService(DownlinkService):
             self._keep(*interrupted)
             self._save()
         super().on_start()
-        self.spawn(self._save_later, "save")
+        self.start_thread(self._save_later, "save")
         self.begin_speaking()
 
     def on_stop(self) -> None:
@@ -131,9 +131,9 @@ class OpModemService(DownlinkService):
                     self._commit_packet(*self._unsaved[0])
                     self._unsaved.popleft()
             except DeliveryError as error:
-                self.problem(str(error))
+                self.set_degraded(str(error))
                 return
-        self.problem("")
+        self.set_degraded("")
 
     def _save_later(self) -> None:
         while not self.stopping.wait(SAVE_AGAIN_S):
@@ -172,7 +172,7 @@ class OpModemService(DownlinkService):
                 # No Micro-Modem sends such a frame: a fault on the serial line that its checksum missed.
                 reason = f"frame {frame.frame_number} of {len(frame.data)} bytes: {error.errors()[0]['msg']}"
                 log.error("Frame refused", extra=kv(source=frame.src, reason=reason))
-                effects.keep_apart(key, frame.data, reason)
+                effects.quarantine(key, frame.data, reason)
                 effects.count("frames_refused")
         effects.put_state(_PACKETS, str(number).encode())
         # The frames of the next packet may have begun to arrive.

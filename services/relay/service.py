@@ -61,7 +61,7 @@ class RelayService(Service[RelayConfig]):
     def _open_session(self, endpoints: Sequence[str], stop: threading.Event) -> zenoh.Session | None:
         return open_with_retry(endpoints, stop, self.platform.tls)
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Pictures and decisions of this vessel, and what the shore says to it."""
         vessel = self.platform.id
         return {
@@ -71,17 +71,17 @@ class RelayService(Service[RelayConfig]):
             keys.command_all(vessel): Command,
         }
 
-    def handed_only(self) -> Collection[str]:
+    def delivery_only_keys(self) -> Collection[str]:
         """On these keys the vessel's own programs speak to the consumers that this service hands on to."""
         return (keys.advice(self.platform.id), keys.command_all(self.platform.id))
 
-    def admit(self, key: str) -> None:
+    def check_capacity(self, key: str) -> None:
         """Leave pictures with their senders while the disk is as good as full; what is small is taken for longer."""
-        super().admit(key)
+        super().check_capacity(key)
         if key == keys.image_reconstructed(self.platform.id):
-            self._picture_room.need()
+            self._picture_room.require()
 
-    def check(self, key: str, record: Record) -> None:
+    def validate(self, key: str, record: Record) -> None:
         """Refuse what c2 or nobody on this vessel would take, while its sender can be told."""
         vessel = self.platform.id
         if isinstance(record, Command):
@@ -127,9 +127,9 @@ class RelayService(Service[RelayConfig]):
         effects.count(f"{record.TYPE}s_relayed")
         log.info("Owed to the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
 
-    def commit_all(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
+    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """Commit, then keep each site's queue within its quota."""
-        superseded = super().commit_all(handled)
+        superseded = super().commit_batch(handled)
         if superseded:
             self.count("records_superseded", superseded)
         for upstream in self._upstreams.values():
@@ -149,13 +149,13 @@ class RelayService(Service[RelayConfig]):
                 extra=kv(site=upstream.site, pictures=dropped, max_bytes=max_bytes),
             )
 
-    def lane(self, queue: str) -> QueuePolicy:
+    def queue_policy(self, queue: str) -> QueuePolicy:
         """Return how a queue is sent: to a site, or to a consumer on the vessel."""
         if not is_upstream_queue(queue):
             wanted = {*self.config.advice_consumers, *self.config.command_consumers}
             return QueuePolicy(held=queue not in wanted)
         upstream = self._upstreams.get(queue)
-        return QueuePolicy(held=True) if upstream is None else upstream.lane()
+        return QueuePolicy(held=True) if upstream is None else upstream.queue_policy()
 
     def on_start(self) -> None:
         """Look for the sites' own routers; say what waits for sites that are gone."""
@@ -167,7 +167,7 @@ class RelayService(Service[RelayConfig]):
                 log.warning("Records for a removed site dropped", extra=kv(queue=queue, records=depth.records))
         for upstream in self._upstreams.values():
             upstream.start()
-        self.spawn(lambda: self._watch.run(self.stopping), "shore-watch")
+        self.start_thread(lambda: self._watch.run(self.stopping), "shore-watch")
 
     def on_stop(self) -> None:
         """Close the sites' own sessions."""
@@ -177,13 +177,13 @@ class RelayService(Service[RelayConfig]):
     def _removed_queues(self) -> list[str]:
         return [q for q in self.store.consumers() if is_upstream_queue(q) and q not in self._upstreams]
 
-    def trouble(self) -> str:
+    def degraded_reason(self) -> str:
         """Say that pictures wait with their senders for want of space, or that a site does not let this vessel in."""
-        return self._picture_room.trouble() or self._watch.trouble()
+        return self._picture_room.degraded_reason() or self._watch.degraded_reason()
 
-    def remark(self) -> str:
+    def warning(self) -> str:
         """Say which sites are away."""
-        return self._watch.remark()
+        return self._watch.warning()
 
     def gauges(self) -> Mapping[str, float]:
         """Return for each site what waits, how old the oldest of it is, and whether the site answers."""
@@ -194,8 +194,8 @@ class RelayService(Service[RelayConfig]):
             found[f"waiting_for_{upstream.site}"] = float(depth.records)
             found[f"waiting_bytes_for_{upstream.site}"] = float(depth.size_bytes)
             found[f"oldest_s_for_{upstream.site}"] = age_s
-            found[f"delivered_to_{upstream.site}"] = float(self.delivered_to(upstream.queue))
-            found[f"answering_{upstream.site}"] = float(self.answering(upstream.queue))
+            found[f"delivered_to_{upstream.site}"] = float(self.acknowledged_count(upstream.queue))
+            found[f"answering_{upstream.site}"] = float(self.is_responding(upstream.queue))
         # While it is 0, and the inbox too, every decision is ashore: the console tells people by that.
         urgent = (self.store.queue_depth(queue, DECISION_PRIORITY).records for queue in self._upstreams)
         found["decisions_waiting"] = float(sum(urgent))

@@ -52,7 +52,7 @@ class Upstream:
         self._stop = threading.Event()
         self._lock = threading.Lock()
 
-    def lane(self) -> QueuePolicy:
+    def queue_policy(self) -> QueuePolicy:
         """Return how the queue is sent: c2 shows accepted records ashore, a second copy would only load the radio."""
         own = (lambda: self._session) if self._config.router else None
         return QueuePolicy(session=own, publish=False, bytes_per_s=self._config.bandwidth_bytes_per_s)

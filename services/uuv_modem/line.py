@@ -140,7 +140,7 @@ class VehicleEndpoint:
             for name, reason in reasons.items():
                 log.error("A part of the link's state cannot be read", extra=kv(part=name, reason=reason))
             self.count("states_discarded")
-            self._parts.keep_apart(reasons)
+            self._parts.quarantine(reasons)
 
     def _load_others(self, parts: Mapping[str, Mapping[str, object]], platform_id: str) -> dict[str, str]:
         """Take up what is kept beside the queue; return why, by part, where that cannot be."""

@@ -46,7 +46,7 @@ class LineStore:
                 unreadable[name] = data
         return parts, unreadable
 
-    def keep_apart(self, reasons: Mapping[str, str]) -> None:
+    def quarantine(self, reasons: Mapping[str, str]) -> None:
         """Keep parts apart as they are on the disk, where a person can find them, before others take their place.
 
         Args:
@@ -57,7 +57,7 @@ class LineStore:
         """
         with self._store.transaction() as tx:
             for name, reason in reasons.items():
-                tx.refuse("in", f"state {_PREFIX}{name}", self._store.get_state(_PREFIX + name) or b"", reason)
+                tx.quarantine("in", f"state {_PREFIX}{name}", self._store.get_state(_PREFIX + name) or b"", reason)
 
     def write(self, tx: Transaction, parts: Mapping[str, Mapping[str, object]]) -> dict[str, bytes]:
         """Write the parts that differ from what is on the disk; return what `wrote` wants once it is committed."""

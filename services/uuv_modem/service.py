@@ -83,14 +83,14 @@ class UuvModemService(ModemService[UuvModemConfig]):
         )
         return line, runner
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Encoded images of this vehicle, and with v1 other traffic."""
         images: dict[str, type[Record]] = {keys.image_encoded(self.platform.id): EncodedImage}
         if self.config.link == "v1":
             images[keys.message_outgoing(self.platform.id)] = OutgoingMessage
         return images
 
-    def check(self, key: str, record: Record) -> None:
+    def validate(self, key: str, record: Record) -> None:
         """Refuse what can never be sent, while its sender can still be told."""
         assert isinstance(record, (EncodedImage, OutgoingMessage))
         if self._line is not None:
@@ -98,7 +98,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
         elif isinstance(record, EncodedImage):
             self._plan(record)
 
-    def admit(self, key: str) -> None:
+    def check_capacity(self, key: str) -> None:
         """Leave messages with their programs while too many wait."""
         if self._line is not None and key == keys.message_outgoing(self.platform.id) and not self._line.queue.has_room:
             raise RetryLaterError(f"{key}: {self.config.max_messages} messages wait already")
@@ -108,11 +108,11 @@ class UuvModemService(ModemService[UuvModemConfig]):
         super().on_start()
         if self._line is not None and self._runner is not None:
             self._line.load(self.platform.id, time.time())
-            self.spawn(self._runner.run, "link")
+            self.start_thread(self._runner.run, "link")
 
-    def commit_all(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
+    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """As the base does, and wake the link."""
-        superseded = super().commit_all(handled)
+        superseded = super().commit_batch(handled)
         if self._runner is not None:
             self._runner.take(None)
         return superseded
@@ -131,9 +131,9 @@ class UuvModemService(ModemService[UuvModemConfig]):
             "frame_loss": line.queue.sender.config.worst.loss,
         }
 
-    def trouble(self) -> str:
+    def degraded_reason(self) -> str:
         """Return what is wrong with the port, the modem or the link's disk."""
-        return super().trouble() or self._line_trouble
+        return super().degraded_reason() or self._line_trouble
 
     def _line_problem(self, detail: str) -> None:
         if detail and detail != self._line_trouble:

@@ -41,7 +41,7 @@ class Neighbour(Service[ServiceConfig]):
         self._takes = takes
         self.got: list[Any] = []
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         return self._takes
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:

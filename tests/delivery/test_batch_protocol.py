@@ -256,7 +256,7 @@ def test_each_record_of_a_query_has_an_answer_of_its_own(producer: Producer, cli
     with running(producer):
         eventually(lambda: producer.store.outbox_depth() == 0)
         assert producer.store._query("SELECT payload, reason FROM refused") == [(decision(4), "never")]
-        assert producer.delivered_to("consumer") == 9
+        assert producer.acknowledged_count("consumer") == 9
     assert waited == {7}
     assert sorted(set(listener.records)) == list(range(1, 11))
     assert all(listener.records.count(seq) == (2 if seq == 7 else 1) for seq in range(1, 11))
@@ -275,10 +275,10 @@ class Consumer(Service[ServiceConfig]):
         self.got: list[str] = []
         self.full = False
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         return {KEY: Decision}
 
-    def admit(self, key: str) -> None:
+    def check_capacity(self, key: str) -> None:
         if self.full:
             raise RetryLaterError("no room")
 
@@ -345,7 +345,7 @@ def test_records_for_which_there_is_no_room_stay_with_their_producer(
         assert isinstance(asked, tuple)
         assert [reply.status for reply in asked] == ["later", "later"]
         producer.owe(*(decision(n) for n in range(1, 40)))
-        eventually(lambda: not producer.answering("consumer"))
+        eventually(lambda: not producer.is_responding("consumer"))
         assert producer.store.outbox_depth() == 39
         consumer.full = False
         eventually(lambda: len(consumer.got) == 40)

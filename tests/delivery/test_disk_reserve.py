@@ -23,13 +23,13 @@ def disk(monkeypatch):
 def test_below_the_reserve_records_are_not_admitted_and_it_is_said_until_there_is_room(store, disk):
     room = DiskReserve(store, 1000, "records wait")
     disk[0] = 999
-    assert room.trouble() == "", "nobody was turned away yet"
+    assert room.degraded_reason() == "", "nobody was turned away yet"
     with pytest.raises(RetryLaterError, match="999 bytes free, below the reserve of 1000: records wait"):
-        room.need()
-    assert "records wait" in room.trouble()
+        room.require()
+    assert "records wait" in room.degraded_reason()
     disk[0] = 1000
-    assert room.trouble() == ""
-    room.need()
+    assert room.degraded_reason() == ""
+    room.require()
 
 
 def test_a_store_that_was_full_and_is_empty_takes_records_again(store, disk):
@@ -38,9 +38,9 @@ def test_a_store_that_was_full_and_is_empty_takes_records_again(store, disk):
             tx.accept("k", RECORD)
     room = DiskReserve(store, 1_000_000, "records wait")
     with pytest.raises(RetryLaterError):
-        room.need()
+        room.require()
     with store.transaction() as tx:
         for item in store.pending(20):
             tx.done(item)
     assert store.reusable_bytes() >= 20 * len(RECORD)
-    room.need()
+    room.require()

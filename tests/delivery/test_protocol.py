@@ -63,7 +63,7 @@ class Consumer(Service[ServiceConfig]):
         self.got: list[str] = []
         self.fail_on: dict[str, Exception] = {}
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         return {KEY: Decision}
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
@@ -214,7 +214,7 @@ class Bulky(Decision):
 
 
 class BulkyConsumer(Consumer):
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         return {KEY: Bulky}
 
 

@@ -83,7 +83,7 @@ def test_of_what_was_refused_the_latest_are_kept_and_the_beginning_of_each(
     monkeypatch.setattr("sonarpost.delivery.transaction.REFUSED_BYTES", 3)
     for number in range(12):
         with store.transaction() as tx:
-            tx.refuse("in", "k", b"%02d and more" % number, "no")
+            tx.quarantine("in", "k", b"%02d and more" % number, "no")
     assert store.refused_count() == 5
     kept = [payload for (payload,) in store._query("SELECT payload FROM refused ORDER BY id")]
     assert kept == [b"%02d " % number for number in range(7, 12)]

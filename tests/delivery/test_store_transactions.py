@@ -44,7 +44,6 @@ def test_state_is_remembered_replaced_and_forgotten(tmp_path: Path) -> None:
 KILLED = """
 import itertools, sys
 from pathlib import Path
-from sonarpost.runtime import rows
 from sonarpost.delivery.store import Store
 store = Store(Path(sys.argv[1]))
 first = int(store.get_state("n") or b"0") + 1

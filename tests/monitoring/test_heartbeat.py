@@ -169,7 +169,7 @@ def test_a_running_service_beats_and_the_command_finds_it_well(
             check=False,
         )
         assert (done.returncode, done.stdout) == (0, "well\n")
-        service.problem("the disk is full")
+        service.set_degraded("the disk is full")
         eventually(
             lambda: health_problem(path, time.monotonic()) == "degraded: the disk is full", 10, "the problem told"
         )

@@ -36,7 +36,7 @@ class Tiny(Service[TinyConfig]):
     '''Takes decisions.'''
     NAME = "relay"
 
-    def consumes(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
         return {"sonarpost/v1/vessel-1/contact/decision": Decision}
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
@@ -44,7 +44,7 @@ class Tiny(Service[TinyConfig]):
 
     def on_start(self) -> None:
         if self.config.breaks:
-            self.spawn(lambda: 1 // 0, "breaks")
+            self.start_thread(lambda: 1 // 0, "breaks")
 
     def on_stop(self) -> None:
         if self.config.loops_forever_on_stop:

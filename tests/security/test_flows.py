@@ -44,7 +44,7 @@ class Console(Service[ServiceConfig]):
         super().__init__(platform, config)
         self.got: list[Record] = []
 
-    def consumes(self):
+    def consumed_keys(self):
         return {keys.advice(self.platform.id): Advice, keys.command_all(self.platform.id): Command}
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:

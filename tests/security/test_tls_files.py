@@ -131,15 +131,15 @@ def test_health_warns_before_the_end_and_says_when_it_has_come(fleet, tmp_path, 
     folder = fleet.issue("vessel-90", "vessel", days=10, out=tmp_path / "tls").folder
     own, now_utc_s = TlsMonitor(tls_of(folder)), time.time()
     assert "The certificate ends soon" in caplog.text
-    assert "ends in 10.0 days" in own.remark(now_utc_s)
-    assert own.trouble(now_utc_s) == ""
-    assert own.remark(now_utc_s + 11 * DAY_S) == ""
-    assert "has expired" in own.trouble(now_utc_s + 11 * DAY_S)
+    assert "ends in 10.0 days" in own.warning(now_utc_s)
+    assert own.degraded_reason(now_utc_s) == ""
+    assert own.warning(now_utc_s + 11 * DAY_S) == ""
+    assert "has expired" in own.degraded_reason(now_utc_s + 11 * DAY_S)
     assert own.gauges(now_utc_s)["certificate_days_left"] == pytest.approx(10, abs=0.01)
     late = TlsMonitor(tls_of(folder).model_copy(update={"warn_days": 5.0}))
-    assert late.remark(now_utc_s) == ""
+    assert late.warning(now_utc_s) == ""
     nothing = TlsMonitor(None)
-    assert (nothing.remark(now_utc_s), nothing.trouble(now_utc_s), nothing.gauges(now_utc_s)) == ("", "", {})
+    assert (nothing.warning(now_utc_s), nothing.degraded_reason(now_utc_s), nothing.gauges(now_utc_s)) == ("", "", {})
 
 
 # In the configuration

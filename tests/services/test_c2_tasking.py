@@ -140,7 +140,7 @@ def test_over_a_link_that_is_cut_advice_waits_and_arrives_once_when_it_is_mended
         proxy.cut()
         expert.owe(ADVICE, "c2", advice("meanwhile"))
         eventually(lambda: states(out).get(("vessel-1", "advice", "meanwhile")) == "waiting")
-        eventually(lambda: not service.answering("relay@vessel-1"), timeout_s=20)
+        eventually(lambda: not service.is_responding("relay@vessel-1"), timeout_s=20)
         assert [a.advice_id for a in screen.got] == ["before"]
         proxy.mend()
         eventually(lambda: [a.advice_id for a in screen.got] == ["before", "meanwhile"], timeout_s=30)

@@ -283,7 +283,7 @@ def test_reports_tell_the_vehicle_what_is_lacking(sea, begin, vehicle, crew):
 def test_what_can_never_be_sent_is_refused(key, record, field, begin):
     service = begin()
     with pytest.raises(PayloadError) as caught:
-        service.check(key, record)
+        service.validate(key, record)
     assert caught.value.field == field
 
 
@@ -297,12 +297,12 @@ def test_an_order_is_checked_while_the_station_is_busy(begin, console, states):
 
 
 def test_vehicles_without_a_name_can_be_told_too(begin):
-    begin().check(keys.command(VESSEL, "refine"), command(vehicle_id="modem-5"))
+    begin().validate(keys.command(VESSEL, "refine"), command(vehicle_id="modem-5"))
 
 
 def test_with_the_papers_link_it_only_listens(begin):
     service = begin(link="paper")
-    assert service.consumes() == {}
+    assert service.consumed_keys() == {}
     service.on_modem_event(packet(confirmation_of("c-1")))
     assert "frames_foreign" not in service.health().counters
 

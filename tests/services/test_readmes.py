@@ -166,14 +166,14 @@ def test_every_configuration_key_is_there_and_no_other(name, page, made):
 @every_service
 def test_every_consumed_key_is_there_with_its_record(name, page, made):
     told = {filled(quoted(row[1])[0]): quoted(row[2])[0] for row in page.key_rows() if row[0] == "in"}
-    assert told == {key: record.TYPE for key, record in made[0].consumes().items()}
+    assert told == {key: record.TYPE for key, record in made[0].consumed_keys().items()}
 
 
 @every_service
 def test_every_produced_key_is_there_and_no_other(name, page, made):
     told = [filled(quoted(row[1])[0]) for row in page.key_rows() if row[0] == "out"]
     assert len(told) == len(set(told))
-    produced = keys_in_code(name) - set(made[0].consumes()) - ONLY_COMPARED.get(name, set())
+    produced = keys_in_code(name) - set(made[0].consumed_keys()) - ONLY_COMPARED.get(name, set())
     assert set(told) == produced | {keys.health("x", name), keys.alive("x", name)}
 
 
@@ -201,7 +201,7 @@ def test_every_counter_and_gauge_is_there_and_no_other(name, page, made):
     if isinstance(service.config, ModemServiceConfig):
         sources.append(ast.parse((RUNTIME / "modem_service.py").read_text(encoding="utf-8")))
     own = counters_in_code(sources) | COMPOSED_COUNTERS.get(name, set())
-    if service.consumes():
+    if service.consumed_keys():
         own |= counters_in_code([ast.parse((RUNTIME / "service.py").read_text(encoding="utf-8"))])
     gauges = set(service.gauges()) | BASE_GAUGES
     told = [word for row in page.rows("Health") for word in quoted(row[0])]

@@ -97,11 +97,11 @@ class SiteMonitor:
         else:
             log.warning("Shore not reached", extra=kv(site=name, why=outcome.reach.value, detail=outcome.detail))
 
-    def trouble(self) -> str:
+    def degraded_reason(self) -> str:
         """Return what somebody has to put right, empty when nothing."""
         return self._said(lambda outcome: outcome.reach in FAULTS)
 
-    def remark(self) -> str:
+    def warning(self) -> str:
         """Return what is away and may come back by itself, empty when nothing."""
         return self._said(
             lambda outcome: outcome.reach not in FAULTS and outcome.reach is not ConnectivityState.REACHED

@@ -30,14 +30,14 @@ class TlsMonitor:
         self._own = tls_files.check(tls.ca, tls.certificate, tls.key, now_utc_s)
         for remark in self._own.remarks:
             log.warning("TLS files", extra=kv(remark=remark))
-        if warning := self.remark(now_utc_s):
+        if warning := self.warning(now_utc_s):
             log.warning("The certificate ends soon", extra=kv(remark=warning))
 
-    def remark(self, now_utc_s: float) -> str:
+    def warning(self, now_utc_s: float) -> str:
         """Return what health says of the certificate's end, empty while it is far away or past."""
-        return "" if self._own is None or self.trouble(now_utc_s) else self._warning(now_utc_s)
+        return "" if self._own is None or self.degraded_reason(now_utc_s) else self._warning(now_utc_s)
 
-    def trouble(self, now_utc_s: float) -> str:
+    def degraded_reason(self, now_utc_s: float) -> str:
         """Return that the certificate has expired, empty while it has not: no new connection comes about then."""
         expired = self._own is not None and self._own.days_left(now_utc_s) <= 0
         return self._warning(now_utc_s) if expired else ""

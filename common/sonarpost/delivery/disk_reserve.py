@@ -37,7 +37,7 @@ class DiskReserve:
         """
         return shutil.disk_usage(self._store.path.parent).free + self._store.reusable_bytes()
 
-    def need(self) -> None:
+    def require(self) -> None:
         """Check for room.
 
         Raises:
@@ -47,7 +47,7 @@ class DiskReserve:
         if text:
             raise RetryLaterError(text)
 
-    def trouble(self) -> str:
+    def degraded_reason(self) -> str:
         """Say that records are left with their senders, while that is so; looks again only where it was."""
         return self._lacking() if self._full else ""
 

@@ -58,8 +58,8 @@ class Inbox:
     Args:
         check: Called with (key, payload) before a record is stored; raises BadInputError to refuse it.
         on_refused: Called with every error that made a record be refused.
-        admit: Called with the key before anything of a record is stored; raises RetryLaterError where there is no room.
-        handed_only: Key expressions on which plain publications are not for this consumer.
+        check_capacity: Called with the key before a record is stored; raises RetryLaterError if there is no space.
+        delivery_only_keys: Key expressions on which plain publications are not for this consumer.
     """
 
     def __init__(
@@ -71,17 +71,17 @@ class Inbox:
         check: Callable[[str, bytes], None],
         on_refused: Callable[[BadInputError], None],
         *,
-        admit: Callable[[str], None] = lambda _: None,
-        handed_only: Collection[str] = (),
+        check_capacity: Callable[[str], None] = lambda _: None,
+        delivery_only_keys: Collection[str] = (),
     ) -> None:
         self._store = store
         self._suffix = "/handoff/" + consumer
         self._check = check
         self._on_refused = on_refused
-        self._admit = admit
+        self._check_capacity = check_capacity
         self._arrivals: queue.Queue[_PendingAck] = queue.Queue(QUEUE_LIMIT)
         self._stop = threading.Event()
-        self._trouble = False
+        self._storage_failing = False
         self._kept: list[_PendingAck] = []
         self._no_room: dict[str, str | None] = {}
         self._thread = threading.Thread(target=self._run, name=f"inbox-{consumer}", daemon=True)
@@ -89,13 +89,13 @@ class Inbox:
         self._declared: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         for key in key_expressions:
             self._declared.append(session.declare_queryable(keys.handoff(key, consumer), self._on_query))
-            if key not in handed_only:
+            if key not in delivery_only_keys:
                 self._declared.append(session.declare_subscriber(key, self._on_sample))
 
     @property
-    def in_trouble(self) -> bool:
+    def storage_failing(self) -> bool:
         """True while records cannot be stored (a full disk, for example)."""
-        return self._trouble
+        return self._storage_failing
 
     def close(self) -> None:
         """Stop taking records; what was not committed is not acknowledged and will be sent again."""
@@ -157,15 +157,15 @@ class Inbox:
             with self._store.transaction() as tx:
                 replies = [self._take(tx, arrival) for arrival in batch]
         except DeliveryError as error:
-            if not self._trouble:
+            if not self._storage_failing:
                 log.exception("Records cannot be stored, their senders keep them", extra=kv(error=str(error)))
-            self._trouble = True
+            self._storage_failing = True
             self._kept = [arrival for arrival in batch if arrival.query is None]
             later: Replies = AckReply("later", reason=str(error)[:MAX_REASON])
             return [later] * len(batch)
-        if self._trouble:
+        if self._storage_failing:
             log.info("Records can be stored again")
-        self._trouble = False
+        self._storage_failing = False
         return replies
 
     def _take(self, tx: Transaction, arrival: _PendingAck) -> Replies:
@@ -193,7 +193,7 @@ class Inbox:
         """Ask once a batch whether there is room for what comes on a key."""
         if key not in self._no_room:
             try:
-                self._admit(key)
+                self._check_capacity(key)
             except RetryLaterError as error:
                 self._no_room[key] = str(error)
             else:
@@ -249,7 +249,7 @@ class Inbox:
         return AckReply("stored")
 
     def _refuse(self, tx: Transaction, key: str, payload: bytes, chunk: ReceivedChunk | None, reason: str) -> AckReply:
-        tx.refuse("in", key, payload, reason)
+        tx.quarantine("in", key, payload, reason)
         if chunk is not None:
             tx.mark_refused(chunk.origin, chunk.seq)
         return AckReply("refused", reason=reason)

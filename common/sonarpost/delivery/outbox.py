@@ -26,8 +26,8 @@ class Outbox:
     Args:
         session: Of the platform's router.
         store: Whose outbox this is.
-        lane: Tells how a queue is sent; by default all are published and sent as fast as they are taken.
-        settled: Called in the transaction that forgets a record its consumer has taken or refused.
+        queue_policy: Tells how a queue is sent; by default all are published and sent as fast as they are taken.
+        on_acknowledged: Called in the transaction that forgets a record its consumer has taken or refused.
     """
 
     def __init__(
@@ -35,13 +35,13 @@ class Outbox:
         session: zenoh.Session,
         store: Store,
         *,
-        lane: Callable[[str], QueuePolicy] | None = None,
-        settled: OnAcknowledged | None = None,
+        queue_policy: Callable[[str], QueuePolicy] | None = None,
+        on_acknowledged: OnAcknowledged | None = None,
     ) -> None:
         self._session = session
         self._store = store
-        self._lane = lane or (lambda _: QueuePolicy())
-        self._settled = settled
+        self._queue_policy = queue_policy or (lambda _: QueuePolicy())
+        self._on_acknowledged = on_acknowledged
         self._stop = threading.Event()
         self._wake = threading.Event()
         self._senders: dict[str, QueueSender] = {}
@@ -68,17 +68,17 @@ class Outbox:
                     self._open(queue)
 
     def _open(self, queue: str) -> None:
-        lane = self._lane(queue)
-        if lane.held:
+        policy = self._queue_policy(queue)
+        if policy.held:
             self._held.add(queue)
             log.warning("Records wait for a consumer that is not configured", extra=kv(consumer=queue))
             return
-        self._senders[queue] = QueueSender(self._session, self._store, queue, lane, self._settled)
+        self._senders[queue] = QueueSender(self._session, self._store, queue, policy, self._on_acknowledged)
 
-    def answering(self, queue: str) -> bool:
+    def is_responding(self, queue: str) -> bool:
         """Tell whether a queue's consumer answered what it was asked last; False where nothing was asked yet."""
         sender = self._senders.get(queue)
-        return sender is not None and sender.answering
+        return sender is not None and sender.is_responding
 
     @property
     def rejected(self) -> int:
@@ -90,7 +90,7 @@ class Outbox:
         """How many records consumers have acknowledged in this run."""
         return sum(sender.delivered for sender in tuple(self._senders.values()))
 
-    def delivered_to(self, queue: str) -> int:
+    def acknowledged_count(self, queue: str) -> int:
         """How many records one queue's consumer has acknowledged in this run."""
         sender = self._senders.get(queue)
         return 0 if sender is None else sender.delivered

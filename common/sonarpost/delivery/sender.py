@@ -56,7 +56,7 @@ class QueueSender:
     def __init__(
         self, session: zenoh.Session, store: Store, queue: str, how: QueuePolicy, settled: OnAcknowledged | None
     ) -> None:
-        self.answering = False
+        self.is_responding = False
         self.rejected = 0
         self.delivered = 0
         self._default_session = session
@@ -253,7 +253,7 @@ class QueueSender:
     def _act_on(self, piece: Chunk, reply: AckReply) -> None:
         transfer = piece.transfer
         self._failures = 0
-        self.answering = True
+        self.is_responding = True
         self._schedule.probing = False
         self._schedule.takes = 0 if self._one_by_one else self._takes
         if transfer.item.seq not in self._schedule.active:
@@ -307,7 +307,7 @@ class QueueSender:
 
     def _back_off(self, reason: str) -> None:
         """Forget what is in flight and wait a little; everything is asked again."""
-        self.answering = False
+        self.is_responding = False
         self._in_flight.clear()
         self._schedule.start_again()
         for transfer in self._schedule.active.values():

@@ -165,7 +165,7 @@ class Transaction:
 
     def rejected(self, item: OutboxItem, reason: str) -> None:
         """Keep what the consumer refused apart, where a person can find it."""
-        self.refuse("out", item.key, item.payload, reason)
+        self.quarantine("out", item.key, item.payload, reason)
         self.acknowledged(item.consumer, item.seq)
 
     def accept(self, key: str, payload: bytes, origin: bytes | None = None, seq: int | None = None) -> bool:
@@ -180,7 +180,7 @@ class Transaction:
         """Remove a handled record from the inbox."""
         self._done.append(item.id)
 
-    def refuse(self, direction: str, key: str, payload: bytes, reason: str) -> None:
+    def quarantine(self, direction: str, key: str, payload: bytes, reason: str) -> None:
         """Keep a record that cannot be handled, with the reason: the latest 1000, of each at most 256 kB."""
         row = self._db.execute(
             "INSERT INTO refused (direction, key, payload, reason, at_utc_s) VALUES (?, ?, ?, ?, ?) RETURNING id",

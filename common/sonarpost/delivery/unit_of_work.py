@@ -48,7 +48,7 @@ class UnitOfWork:
         """Forget `name`."""
         self._state[name] = None
 
-    def keep_apart(self, key: str, payload: bytes, reason: str) -> None:
+    def quarantine(self, key: str, payload: bytes, reason: str) -> None:
         """Keep something that cannot be used, with the reason, in the store's `refused` table."""
         self._apart.append((key, payload, reason))
 
@@ -66,7 +66,7 @@ class UnitOfWork:
             else:
                 tx.put_state(name, value)
         for key, payload, reason in self._apart:
-            tx.refuse("in", key, payload, reason)
+            tx.quarantine("in", key, payload, reason)
 
     @property
     def counts(self) -> Mapping[str, int]:

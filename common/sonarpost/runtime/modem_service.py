@@ -72,7 +72,7 @@ class ModemService(Service[M]):
         """Return whether the modem is ready."""
         return {"modem_ready": float(self.modem.ready)}
 
-    def trouble(self) -> str:
+    def degraded_reason(self) -> str:
         """Return what is wrong with the port or the modem."""
         if not self._link.is_open:
             return f"{self.config.port}: {self._link.problem or 'not open yet'}"

@@ -1,9 +1,9 @@
-"""The base of every service: a process that takes records, handles each once, and owes what follows from them.
+"""Base class of every service: a process that receives records, handles each exactly once and queues new records.
 
-A service names the records it consumes in `consumes()` and handles each in `handle()`, which returns nothing but
-writes what follows into an `UnitOfWork`: records to send on and state to keep. The base commits these together with the
-record's removal from the inbox. A service with other sources (a folder, a modem) starts them in `on_start()` and
-commits with `self.store.transaction()`.
+A service lists the records that it receives in `consumed_keys()` and handles each in `handle()`. That method adds
+outgoing records and state changes to a `UnitOfWork`. The base class commits them together with the removal of the
+record from the inbox. A service with other inputs (a folder, a modem) starts them in `on_start()` and commits with
+`self.store.transaction()`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ C = TypeVar("C", bound=ServiceConfig)
 RETRY_AFTER_S = 1.0
 MAX_DETAIL = 2000
 TYPES_KEPT = 1000
-"""Of how many keys a service remembers what they carry."""
+"""Maximum number of keys in the cache of record types."""
 
 
 class ServiceStoppingError(Exception):
@@ -54,11 +54,11 @@ class ServiceStoppingError(Exception):
 
 
 def disk_gauges(folder: Path) -> dict[str, float]:
-    """Return how much is free on a folder's disk, nothing where that cannot be told at the moment."""
+    """Return the free disk space of a folder as a gauge; an empty map if it cannot be determined."""
     try:
         return {"disk_free_bytes": float(shutil.disk_usage(folder).free)}
     except OSError as error:
-        log.debug("Free space not told", extra=kv(folder=folder, error=str(error)))
+        log.debug("Free disk space unknown", extra=kv(folder=folder, error=str(error)))
         return {}
 
 
@@ -66,12 +66,11 @@ class Service(ABC, Generic[C]):
     """One process of the chain.
 
     Class attributes:
-        NAME: Name in configurations, keys and hand-offs.
-        PUBLISH: Whether records it owes are also published on their keys for watchers.
-        BATCH: How many records are handled with one write to the disk. Above 1, what `handle` does outside its effects
-            may be done again for a whole batch after a power cut.
-        BATCH_BYTES: How many bytes of records at most, whatever their number; what is written lies in the write-ahead
-            log once more until then.
+        NAME: Name of the service in configuration files, key expressions and delivery queues.
+        PUBLISH: Whether queued records are also published on their keys for subscribers.
+        BATCH: Maximum number of records that are committed in one transaction. Above 1, a power cut can repeat the
+            side effects of `handle` outside the `UnitOfWork` for a whole batch.
+        BATCH_BYTES: Maximum size of the records of one batch; it bounds the write-ahead log.
     """
 
     NAME: ClassVar[str]
@@ -88,11 +87,11 @@ class Service(ABC, Generic[C]):
         self.started_utc_s = time.time()
         self._tls = TlsMonitor(platform.tls)
         self.store = Store(platform.state_dir / f"{self.NAME}.db")
-        self._room = DiskReserve(self.store, HANDLING_RESERVE_BYTES, "records wait with their senders")
+        self._disk_reserve = DiskReserve(self.store, HANDLING_RESERVE_BYTES, "senders keep their records")
         self._counters: Counter[str] = Counter()
         self._counter_lock = threading.Lock()
         self._types: dict[str, type[Record]] = {}
-        self._problem = ""
+        self._degraded = ""
         self._session: zenoh.Session | None = None
         self._inbox: Inbox | None = None
         self._outbox: Outbox | None = None
@@ -100,65 +99,82 @@ class Service(ABC, Generic[C]):
         self._threads: list[threading.Thread] = []
         self._heartbeat = Heartbeat.from_environment(os.environ, platform.state_dir, platform.health_interval_s)
 
-    # What a service says of itself
+    # Hooks of a subclass
 
-    def consumes(self) -> Mapping[str, type[Record]]:
-        """Return the key expressions this service takes records from, and what each carries."""
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
+        """Return the key expressions that this service consumes, with the record type of each."""
         return {}
 
     @abstractmethod
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """Handle one record; called once a record, one at a time, in the order of arrival.
+        """Handle one record. Records are handled one at a time, in the order of arrival.
+
+        Args:
+            key: Key on which the record arrived.
+            record: The decoded record.
+            effects: Collects the records to send and the state to change; committed by the caller.
 
         Raises:
-            BadInputError: The record cannot be handled, now or ever: it is kept apart, logged and counted.
-            OSError, DeliveryError: It cannot be handled now (a full disk): it is tried again.
+            BadInputError: The record is invalid: it is quarantined, logged and counted.
+            OSError, DeliveryError: A temporary failure, for example a full disk: the record is retried.
             ServiceStoppingError: The service is stopping; the record is handled after the next start.
         """
 
-    def check(self, key: str, record: Record) -> None:
-        """Refuse a record that came on `key` before it is accepted, by raising BadInputError; by default none is.
+    def validate(self, key: str, record: Record) -> None:
+        """Check a record before it is accepted; the default accepts every record.
 
-        Called within a transaction: it must not wait for a lock whose holder may begin one.
+        Called inside a store transaction: it must not wait for a lock whose holder opens another one.
+
+        Raises:
+            BadInputError: The record is refused; its sender quarantines it.
         """
 
-    def admit(self, key: str) -> None:
-        """Leave a record with its sender while there is no room for it, by raising NotNowError.
+    def check_capacity(self, key: str) -> None:
+        """Check that a record on `key` can be stored; the default checks the disk reserve.
 
-        By default while there is not even the room to handle what is here already. Called as `check` is.
+        Called inside a store transaction, as `validate` is.
+
+        Raises:
+            RetryLaterError: The record is not accepted now; its sender keeps it and retries.
         """
-        self._room.need()
+        self._disk_reserve.require()
 
-    def handed_only(self) -> Collection[str]:
-        """Return those of the consumed key expressions on which plain publications are for somebody else."""
+    def delivery_only_keys(self) -> Collection[str]:
+        """Return the consumed key expressions on which plain publications are ignored."""
         return ()
 
-    def lane(self, queue: str) -> QueuePolicy:
-        """Return how a queue of the outbox is sent."""
+    def queue_policy(self, queue: str) -> QueuePolicy:
+        """Return the settings with which an outbox queue is sent."""
         return QueuePolicy(publish=self.PUBLISH)
 
-    def settled(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
-        """Act, within the transaction, on a record's consumer having taken it (None) or refused it for a reason."""
+    def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
+        """React to a consumer's acknowledgement, in the transaction that removes the record from the outbox.
+
+        Args:
+            tx: The open transaction.
+            item: The record.
+            reason: None if the consumer accepted the record, else its reason for refusing it.
+        """
 
     def on_start(self) -> None:
-        """Start the service's own sources; called when the session is open."""
+        """Start the service's own inputs; called after the session has opened."""
 
     def on_stop(self) -> None:
-        """Stop what `on_start` began, within a second."""
+        """Stop what `on_start` started, within one second."""
 
     def gauges(self) -> Mapping[str, float]:
-        """Return momentary values for the health record."""
+        """Return current values for the health record."""
         return {}
 
-    def trouble(self) -> str:
-        """Return what keeps the service from working at this moment, for the health record; empty when nothing."""
+    def degraded_reason(self) -> str:
+        """Return why the service cannot work at present, for the health record; empty if it can."""
         return ""
 
-    def remark(self) -> str:
-        """Return what people should know of while the service does its work, for the health record."""
+    def warning(self) -> str:
+        """Return a warning for the health record that does not make the service degraded; empty for none."""
         return ""
 
-    # Life
+    # Start and stop
 
     @property
     def session(self) -> zenoh.Session:
@@ -167,14 +183,20 @@ class Service(ABC, Generic[C]):
         return self._session
 
     def start(self) -> bool:
-        """Open the session and begin; False when stopped before a router was reached."""
+        """Open the session and start all threads.
+
+        Returns:
+            False if the service was stopped before it reached a router.
+        """
         endpoints = self.platform.router
         self._session = open_with_retry(endpoints, self.stopping, self.platform.tls)
         if self._session is None:
             return False
         self._token = self._session.liveliness().declare_token(keys.alive(self.platform.id, self.NAME))
-        self._outbox = Outbox(self._session, self.store, lane=self.lane, settled=self.settled)
-        wanted = self.consumes()
+        self._outbox = Outbox(
+            self._session, self.store, queue_policy=self.queue_policy, on_acknowledged=self.on_acknowledged
+        )
+        wanted = self.consumed_keys()
         if wanted:
             self._inbox = Inbox(
                 self._session,
@@ -183,17 +205,17 @@ class Service(ABC, Generic[C]):
                 tuple(wanted),
                 self._check_payload,
                 self._refused,
-                admit=self.admit,
-                handed_only=self.handed_only(),
+                check_capacity=self.check_capacity,
+                delivery_only_keys=self.delivery_only_keys(),
             )
-            self.spawn(self._work, "work")
+            self.start_thread(self._work, "work")
         self.on_start()
-        self.spawn(self._report, "health")
+        self.start_thread(self._report, "health")
         log.info("Service started", extra=kv(platform=self.platform.id, router=", ".join(endpoints)))
         return True
 
     def stop(self) -> None:
-        """Stop everything and close the session; what is not finished is in the store. A second call does nothing."""
+        """Stop all threads, close the session and the store. A second call does nothing."""
         if self._stopped:
             return
         self._stopped = True
@@ -211,14 +233,14 @@ class Service(ABC, Generic[C]):
         self.store.close()
         log.info("Service stopped")
 
-    def spawn(self, target: Callable[[], None], name: str) -> None:
-        """Run `target` in a thread that `stop` waits for; a defect in it ends the service instead of maiming it."""
+    def start_thread(self, target: Callable[[], None], name: str) -> None:
+        """Run `target` in a thread that `stop` joins. An unhandled exception in it stops the service."""
 
         def guarded() -> None:
             try:
                 target()
             except Exception:
-                log.exception("Defect in a thread, the service ends", extra=kv(thread=name))
+                log.exception("Unhandled exception in a thread; stopping the service", extra=kv(thread=name))
                 self.failed = True
                 self.stopping.set()
 
@@ -237,13 +259,13 @@ class Service(ABC, Generic[C]):
         return known
 
     def _find_type(self, key: str) -> type[Record]:
-        for expression, record_type in self.consumes().items():
+        for expression, record_type in self.consumed_keys().items():
             if zenoh.KeyExpr(expression).intersects(key):
                 return record_type
-        raise BadInputError(key, "", key, "a key this service consumes: " + ", ".join(self.consumes()))
+        raise BadInputError(key, "", key, "a key this service consumes: " + ", ".join(self.consumed_keys()))
 
     def _check_payload(self, key: str, payload: bytes) -> None:
-        self.check(key, wire.decode(self._record_type(key), payload, key))
+        self.validate(key, wire.decode(self._record_type(key), payload, key))
 
     def _refused(self, error: BadInputError) -> None:
         self.count("records_refused")
@@ -259,12 +281,12 @@ class Service(ABC, Generic[C]):
                         return
                     self._handle_batch(items[first : first + self.BATCH])
             except (OSError, DeliveryError) as error:
-                self.problem(f"{type(error).__name__}: {error}")
+                self.set_degraded(f"{type(error).__name__}: {error}")
                 self.stopping.wait(RETRY_AFTER_S)
                 continue
             except ServiceStoppingError:
                 return
-            self.problem("")
+            self.set_degraded("")
             if not items:
                 self.store.inbox_changed.wait(1.0)
 
@@ -280,9 +302,9 @@ class Service(ABC, Generic[C]):
                 if effects is not None:
                     handled.append((effects, item))
         finally:
-            # What comes before a record that has to wait is done with.
+            # Records before the one that has to be retried are complete.
             if handled:
-                self.commit_all(handled)
+                self.commit_batch(handled)
 
     def _handle_item(self, item: InboxItem) -> None:
         effects = self._effects_of(item)
@@ -290,9 +312,9 @@ class Service(ABC, Generic[C]):
             self.commit(effects, item)
 
     def _effects_of(self, item: InboxItem) -> UnitOfWork | None:
-        """Handle a record; return what follows, None where it cannot be handled and is kept apart.
+        """Handle a record; return its effects, or None if it was quarantined.
 
-        Every line that is logged meanwhile says which contact it concerns.
+        Log lines of this thread carry the record's context until the record is handled.
         """
         about = LogContext(item.payload, item.key)
         with lazy_log_context(about.fields):
@@ -307,31 +329,31 @@ class Service(ABC, Generic[C]):
             raise
         except BadInputError as error:
             self._refused(error)
-            self._keep_apart(item, str(error))
+            self._quarantine_record(item, str(error))
             return None
         except Exception as error:
-            # A defect of ours must not stop the records behind this one, and must not lose this one either.
-            log.exception("Record not handled, it is kept apart", extra=kv(key=item.key))
+            # An unexpected exception must neither block later records nor lose this one.
+            log.exception("Record quarantined after an unexpected exception", extra=kv(key=item.key))
             self.count("records_failed")
-            self._keep_apart(item, f"{type(error).__name__}: {error}")
+            self._quarantine_record(item, f"{type(error).__name__}: {error}")
             return None
         effects.count("records_handled")
         return effects
 
-    def _keep_apart(self, item: InboxItem, reason: str) -> None:
+    def _quarantine_record(self, item: InboxItem, reason: str) -> None:
         with self.store.transaction() as tx:
-            tx.refuse("in", item.key, item.payload, reason)
+            tx.quarantine("in", item.key, item.payload, reason)
             tx.done(item)
 
     def commit(self, effects: UnitOfWork, item: InboxItem | None = None) -> None:
-        """Write effects, and the end of the record they come from, in one transaction."""
-        self.commit_all([(effects, item)])
+        """Write the effects and remove the record that caused them, in one transaction."""
+        self.commit_batch([(effects, item)])
 
-    def commit_all(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
-        """Write the effects of several records, and the ends of these, in one transaction.
+    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
+        """Write the effects of several records and remove these records, in one transaction.
 
         Returns:
-            How many records in the outbox were dropped for newer editions.
+            Number of queued records that were replaced by newer editions.
         """
         with self.store.transaction() as tx:
             for effects, item in handled:
@@ -344,39 +366,44 @@ class Service(ABC, Generic[C]):
                     self._counters[name] += by
         return tx.superseded
 
-    def answering(self, queue: str) -> bool:
-        """Tell whether the consumer of a queue answered what it was asked last."""
-        return self._outbox is not None and self._outbox.answering(queue)
+    def is_responding(self, queue: str) -> bool:
+        """Return whether the consumer of a queue replied to the last request."""
+        return self._outbox is not None and self._outbox.is_responding(queue)
 
-    def delivered_to(self, queue: str) -> int:
-        """Return how many records the consumer of a queue has acknowledged in this run."""
-        return 0 if self._outbox is None else self._outbox.delivered_to(queue)
+    def acknowledged_count(self, queue: str) -> int:
+        """Return the number of records that the consumer of a queue has acknowledged since the start."""
+        return 0 if self._outbox is None else self._outbox.acknowledged_count(queue)
 
     # Health
 
     def count(self, name: str, by: int = 1) -> None:
-        """Add to a health counter."""
+        """Increase a health counter."""
         with self._counter_lock:
             self._counters[name] += by
 
-    def problem(self, detail: str) -> None:
-        """Say in health and log that the service is degraded, or with an empty text that it is well again."""
-        if detail == self._problem:
+    def set_degraded(self, reason: str) -> None:
+        """Report the service as degraded in health and log; an empty reason reports it as recovered."""
+        if reason == self._degraded:
             return
-        if detail:
-            log.error("Service degraded", extra=kv(reason=detail))
+        if reason:
+            log.error("Service degraded", extra=kv(reason=reason))
         else:
-            log.info("Service well again")
-        self._problem = detail
+            log.info("Service recovered")
+        self._degraded = reason
 
     def health(self, state: ServiceState | None = None) -> Health:
-        """Return the service's state now."""
-        detail = self._problem
-        if self._inbox is not None and self._inbox.in_trouble:
+        """Return the health record of this moment."""
+        detail = self._degraded
+        if self._inbox is not None and self._inbox.storage_failing:
             detail = detail or "records cannot be stored"
         now_utc_s = time.time()
-        detail = detail or self._room.trouble() or self.trouble() or self._tls.trouble(now_utc_s)
-        remarks = (self.remark(), self._tls.remark(now_utc_s))
+        detail = (
+            detail
+            or self._disk_reserve.degraded_reason()
+            or self.degraded_reason()
+            or self._tls.degraded_reason(now_utc_s)
+        )
+        warnings = (self.warning(), self._tls.warning(now_utc_s))
         with self._counter_lock:
             counters = dict(self._counters)
         gauges = {
@@ -393,7 +420,7 @@ class Service(ABC, Generic[C]):
             time_utc_s=time.time(),
             started_utc_s=self.started_utc_s,
             state=state or ("degraded" if detail else "ok"),
-            detail="; ".join(text for text in (detail, *remarks) if text)[:MAX_DETAIL],
+            detail="; ".join(text for text in (detail, *warnings) if text)[:MAX_DETAIL],
             counters=counters,
             gauges=gauges,
         )
@@ -405,7 +432,7 @@ class Service(ABC, Generic[C]):
     def _publish_health(self, state: ServiceState | None) -> None:
         try:
             record = self.health(state)
-            # Before the network is asked to take anything: a router that hangs does not make this service ill.
+            # Before the publication, which can block: a router that hangs must not make this service unhealthy.
             self._heartbeat.beat(record, time.monotonic())
             key = keys.health(self.platform.id, self.NAME)
             self.session.put(key, wire.encode(record), encoding=wire.encoding_of(Health))
