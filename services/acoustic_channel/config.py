@@ -11,12 +11,12 @@ from pydantic import Field, model_validator
 
 from sonarpost.config import ServiceConfig
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_presets import make_channel
-from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
+from sonarpost.simulation.channel.channel_presets import build_parameters
+from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
 from sonarpost.simulation.channel.random_draws import TailDamage
-from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.modem.config import EmulatedModemConfig
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 
@@ -143,7 +143,7 @@ class AcousticChannelConfig(ServiceConfig):
         self.channel()
         return self
 
-    def channel(self) -> ChannelConfig:
+    def channel(self) -> EmulatorConfig:
         """Return the same as the library's own configuration.
 
         Raises:
@@ -156,16 +156,16 @@ class AcousticChannelConfig(ServiceConfig):
         }
         if "tail_damage_kind" in given:
             given["tail_damage_kind"] = self.tail_damage_kind.value
-        water = make_channel(given | {"preset": self.preset}, "acoustic_channel")
-        template = ModemConfig(
+        water = build_parameters(given | {"preset": self.preset}, "acoustic_channel")
+        template = EmulatedModemConfig(
             address=0,
             generation=self.generation,
             statistics_version=self.statistics_version,
             airtimes_s=self.airtime_s,
             promiscuous=self.promiscuous,
         )
-        return ChannelConfig(
-            sites=tuple(ModemSite(m.address, Position(m.east_m, m.north_m, m.depth_m)) for m in self.modem),
+        return EmulatorConfig(
+            sites=tuple(ModemSite(m.address, LocalPosition(m.east_m, m.north_m, m.depth_m)) for m in self.modem),
             water=water,
             modem=template,
             pty_dir=None if self.tcp_ports else self.pty_dir,
@@ -174,5 +174,5 @@ class AcousticChannelConfig(ServiceConfig):
             time_scale=self.time_scale,
             serial_baud=self.serial_baud or None,
             log_path=self.log,
-            transponders={t.letter: Position(t.east_m, t.north_m, t.depth_m) for t in self.transponder},
+            transponders={t.letter: LocalPosition(t.east_m, t.north_m, t.depth_m) for t in self.transponder},
         )

@@ -16,9 +16,9 @@ from sonarpost.errors import DeliveryError
 from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame, LinkQuality
 from sonarpost.modem.micromodem.events import (
-    Event,
-    FrameOverheard,
+    FrameDecoded,
     FrameReceived,
+    ModemEvent,
     PacketFailed,
     PacketReceived,
     PacketSent,
@@ -80,11 +80,11 @@ class OpModemService(DownlinkService):
         if self._unsaved:
             log.error("Packets are lost, the disk refused them to the end", extra=kv(packets=len(self._unsaved)))
 
-    def on_modem_event(self, event: Event) -> None:
+    def on_modem_event(self, event: ModemEvent) -> None:
         """Take a packet, whose frames come with it, and before its end each of them."""
         if isinstance(event, (PacketSent, PacketFailed)):
             self._packet_is_over(event)
-        elif isinstance(event, FrameOverheard):
+        elif isinstance(event, FrameDecoded):
             self._turn.heard(time.monotonic())
             self._arriving.append(event.frame)
             self._keep_arriving()

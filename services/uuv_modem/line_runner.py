@@ -15,13 +15,13 @@ from sonarpost.link.mac import MediumAccess
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
 from sonarpost.modem.micromodem.events import (
-    Event,
-    FrameOverheard,
+    FrameDecoded,
     FrameReceived,
     MiniPacketReceived,
+    ModemEvent,
     PacketFailed,
     PacketSent,
-    Polled,
+    PollReceived,
 )
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.runtime.modem_runner import ModemRunner
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 LONGEST_WAIT_S: Final = 0.2
 _LEAST_WAIT_S: Final = 0.005
-TAKEN = (PacketSent, PacketFailed, FrameReceived, FrameOverheard, MiniPacketReceived)
+TAKEN = (PacketSent, PacketFailed, FrameReceived, FrameDecoded, MiniPacketReceived)
 """Events of the modem that the link acts on."""
 
 
@@ -73,7 +73,7 @@ class LineRunner:
         self._tell = tell
         self._problem = problem
         self.count = count
-        self._inputs: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
+        self._inputs: queue.SimpleQueue[ModemEvent | None] = queue.SimpleQueue()
         self._asked: int | None = None
         self._offered: tuple[bytes, ...] = ()
         self._changed = False
@@ -83,11 +83,11 @@ class LineRunner:
         self._packet_s: dict[int, float] = {}
         self._told_at: float | None = None
 
-    def take(self, event: Event | None) -> None:
+    def take(self, event: ModemEvent | None) -> None:
         """Give an event of the modem, or None where records were accepted; from any thread."""
         self._inputs.put(event)
 
-    def answer_poll(self, polled: Polled) -> Sequence[bytes]:
+    def answer_poll(self, polled: PollReceived) -> Sequence[bytes]:
         """Return frames for another modem that asks for a packet; called in the modem's thread."""
         fitting = self._offered[: polled.frames]
         if any(len(frame) > polled.frame_bytes for frame in fitting):
@@ -123,14 +123,14 @@ class LineRunner:
         except queue.Empty:
             return
 
-    def _act(self, event: Event | None) -> None:
+    def _act(self, event: ModemEvent | None) -> None:
         now = time.time()
         match event:
             case PacketSent():
                 self._packet_sent(event, now)
             case PacketFailed():
                 self._packet_failed(event, now)
-            case FrameOverheard():
+            case FrameDecoded():
                 self._mac.heard(now)
             case FrameReceived(dest=dest) if dest == self._config.address:
                 self._line.hear(event.src, [event.data], now)

@@ -26,7 +26,7 @@ from sonarpost.messages import (
     QueueState,
     Record,
 )
-from sonarpost.modem.micromodem.events import Event, PacketFailed, PacketSent
+from sonarpost.modem.micromodem.events import ModemEvent, PacketFailed, PacketSent
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import ServiceStoppingError, UnitOfWork
@@ -157,7 +157,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
         effects.count("images_sent")
         log.info("Image sent", extra=kv(image_id=record.image_id, contact_id=record.contact.contact_id))
 
-    def on_modem_event(self, event: Event) -> None:
+    def on_modem_event(self, event: ModemEvent) -> None:
         """Hand the fate of packets, and with v1 what is heard, to the sending thread."""
         if self._runner is not None:
             if isinstance(event, TAKEN):

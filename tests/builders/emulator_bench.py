@@ -5,11 +5,11 @@ from __future__ import annotations
 from datetime import UTC, datetime
 
 from sonarpost.modem.micromodem import nmea
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_events import Transmission
-from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
-from sonarpost.simulation.modem.config import ModemConfig, Report
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem
+from sonarpost.simulation.modem.config import EmulatedModemConfig, PacketReport
 
 START_UTC_S = datetime(2016, 10, 12, 9, 0, 0, tzinfo=UTC).timestamp()
 RANGE_M = 150.0
@@ -21,12 +21,14 @@ class Bench:
     def __init__(self, modems: int = 2, serial_baud: float | None = None, **config: object) -> None:
         water = {name: config.pop(name) for name in list(config) if name in ChannelParameters.__dataclass_fields__}
         places = {
-            n: ModemPlace(ModemConfig(n, utc_at_zero_s=START_UTC_S, **config), Position(RANGE_M * (n - 1)))  # type: ignore[arg-type]
+            n: PlacedModem(
+                EmulatedModemConfig(n, utc_at_zero_s=START_UTC_S, **config), LocalPosition(RANGE_M * (n - 1))
+            )  # type: ignore[arg-type]
             for n in range(1, modems + 1)
         }
         self.world = ChannelSimulator(ChannelParameters(**water), places, serial_baud)  # type: ignore[arg-type]
         self.told = dict.fromkeys(places, b"")
-        self.reports: list[Report] = []
+        self.reports: list[PacketReport] = []
         self.transmissions: list[Transmission] = []
         self.now = 0.0
         self.advance(1.0)
@@ -35,7 +37,7 @@ class Bench:
     def advance(self, now: float) -> None:
         self.now = now
         for happened in self.world.advance(now):
-            (self.reports if isinstance(happened, Report) else self.transmissions).append(happened)  # type: ignore[arg-type]
+            (self.reports if isinstance(happened, PacketReport) else self.transmissions).append(happened)  # type: ignore[arg-type]
         for n in self.told:
             for output in self.world.take_outputs(n):
                 self.told[n] += output.data

@@ -9,7 +9,7 @@ from itertools import count
 
 from sonarpost.modem.micromodem import nmea
 from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import Event, FrameOverheard
+from sonarpost.modem.micromodem.events import FrameDecoded, ModemEvent
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.modem.micromodem.sentences import Cycle
 
@@ -42,8 +42,8 @@ class FakeModem:
         self.loses = loses
         self.now = 0.0
         self.settings = {"SRC": "0", "CST": "0", "RXP": "0"}
-        self.events: list[Event] = []
-        self.frames_heard: list[FrameOverheard] = []
+        self.events: list[ModemEvent] = []
+        self.frames_heard: list[FrameDecoded] = []
         self.heard: list[nmea.Sentence] = []
         self.on_air: list[tuple[bytes, ...]] = []
         self.dead = False
@@ -68,10 +68,10 @@ class FakeModem:
         """Send any bytes to the driver now."""
         self._note(self.driver.receive(data, self.now))
 
-    def _note(self, events: list[Event]) -> None:
+    def _note(self, events: list[ModemEvent]) -> None:
         """Keep the events; a frame's first news apart from the packets' story."""
-        self.frames_heard += [event for event in events if isinstance(event, FrameOverheard)]
-        self.events += [event for event in events if not isinstance(event, FrameOverheard)]
+        self.frames_heard += [event for event in events if isinstance(event, FrameDecoded)]
+        self.events += [event for event in events if not isinstance(event, FrameDecoded)]
 
     def later(self, delay_s: float, action: Callable[[], None]) -> None:
         heapq.heappush(self._due, (self.now + delay_s, next(self._order), action))
@@ -98,7 +98,7 @@ class FakeModem:
             )
         self.now = until_s
 
-    def of(self, *kinds: type) -> list[Event]:
+    def of(self, *kinds: type) -> list[ModemEvent]:
         """The events of some types."""
         return [event for event in self.events if isinstance(event, kinds)]
 

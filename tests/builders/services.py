@@ -21,10 +21,10 @@ from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Contact, Health, Pixels, Record, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
+from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -279,8 +279,8 @@ class Sea:
         return str(self.folder / f"modem-{modem}")
 
     def start(self, **water: Any) -> ChannelEmulator:
-        sites = (ModemSite(1), ModemSite(3, Position(150.0)))
-        config = ChannelConfig(sites, ChannelParameters(**water), pty_dir=self.folder, time_scale=150.0)
+        sites = (ModemSite(1), ModemSite(3, LocalPosition(150.0)))
+        config = EmulatorConfig(sites, ChannelParameters(**water), pty_dir=self.folder, time_scale=150.0)
         self._channel = ChannelEmulator(config)
         self._channel.start()
         return self._channel

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from sonarpost.modem.micromodem import nmea
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import Event
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.modem.micromodem.events import ModemEvent
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
-from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem
+from sonarpost.simulation.modem.config import EmulatedModemConfig
 
 Spoil = Callable[[bytes], bytes]
 
@@ -65,10 +65,10 @@ class TwoDrivers:
     config: Callable[[int], MicroModemConfig] = MicroModemConfig
 
     def __post_init__(self) -> None:
-        places = {n: ModemPlace(ModemConfig(n, self.generation), Position(150.0 * n)) for n in (1, 2)}
+        places = {n: PlacedModem(EmulatedModemConfig(n, self.generation), LocalPosition(150.0 * n)) for n in (1, 2)}
         self.world = ChannelSimulator(self.water, places)
         self.drivers = {n: MicroModem(self.config(n)) for n in (1, 2)}
-        self.events: dict[int, list[Event]] = {1: [], 2: []}
+        self.events: dict[int, list[ModemEvent]] = {1: [], 2: []}
         self.passed: list[Passed] = []
         self.armed = False
         self.spoiled: Passed | None = None
@@ -95,7 +95,7 @@ class TwoDrivers:
         self._exchange()
         return done()
 
-    def got(self, host: int, *kinds: type) -> list[Event]:
+    def got(self, host: int, *kinds: type) -> list[ModemEvent]:
         """The events of some types at a host."""
         return [event for event in self.events[host] if isinstance(event, kinds)]
 

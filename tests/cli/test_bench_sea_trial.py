@@ -18,8 +18,8 @@ from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_events import ArrivalEnded, ArrivalStarted, Fate
-from sonarpost.simulation.channel.channel_presets import make_channel
+from sonarpost.simulation.channel.channel_events import ArrivalEnded, ArrivalStarted, FrameOutcome
+from sonarpost.simulation.channel.channel_presets import build_parameters
 from sonarpost.simulation.channel.propagation import ChannelModel
 
 
@@ -41,7 +41,7 @@ def test_in_still_water_everything_arrives(samples: list[Sample], rate: int) -> 
 
 
 def test_beyond_hearing_nothing_arrives(samples: list[Sample]) -> None:
-    found = cross(make_channel({"preset": "sea-trial"}, "test"), 300.0, 1, samples)
+    found = cross(build_parameters({"preset": "sea-trial"}, "test"), 300.0, 1, samples)
     assert found == Delivered(12, 0, 0, 36, 0, 6, 0, 0, 0)
 
 
@@ -56,14 +56,14 @@ def test_what_is_counted_is_what_the_water_let_through(samples: list[Sample], mo
         return happened
 
     monkeypatch.setattr(ChannelModel, "poll", poll)
-    found = cross(make_channel({"frame_loss": 0.3, "packet_loss": 0.1, "seed": 4}, "test"), 50.0, 1, samples)
+    found = cross(build_parameters({"frame_loss": 0.3, "packet_loss": 0.1, "seed": 4}, "test"), 50.0, 1, samples)
     fates = [[frame.fate for frame in event.frames] for event in resolved if event.frames]
     assert len(fates) == found.packets == 12
-    assert sum(fate is Fate.DELIVERED for packet in fates for fate in packet) == found.good_frames
-    assert sum(all(fate is Fate.DELIVERED for fate in packet) for packet in fates) == found.whole_packets
+    assert sum(fate is FrameOutcome.DELIVERED for packet in fates for fate in packet) == found.good_frames
+    assert sum(all(fate is FrameOutcome.DELIVERED for fate in packet) for packet in fates) == found.whole_packets
     assert 0 < found.good_frames < found.frames == 36
     pairs = zip(fates[::2], fates[1::2], strict=True)
-    lost = [Fate.LOST in second for first, second in pairs if Fate.LOST not in first]
+    lost = [FrameOutcome.LOST in second for first, second in pairs if FrameOutcome.LOST not in first]
     assert sum(lost) == found.second_lost
     assert found.whole_pictures + found.partial_pictures + found.contacts_only <= found.pictures == 6
     assert found.partial_pictures > 0

@@ -10,9 +10,9 @@ from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import (
     FrameAcknowledged,
     FrameReceived,
+    ModemMessageReceived,
     ModemReady,
     ModemRebooted,
-    ModemText,
     PacketReceived,
     PacketSent,
     SentenceRejected,
@@ -154,7 +154,7 @@ def test_modem_that_stops_waiting_for_a_packet() -> None:
     for step in packet_steps(modem)[:3]:
         step()
     modem.say("CAMSG", "PACKET_TIMEOUT", 4)
-    assert [type(event) for event in modem.events] == [ModemText]
+    assert [type(event) for event in modem.events] == [ModemMessageReceived]
     modem.run(5.0 + CONFIG.statistics_timeout_s + 0.1)
     assert frames_of(modem) == [FRAMES[0]]
     assert not modem.of(PacketReceived)[0].complete

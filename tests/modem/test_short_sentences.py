@@ -23,12 +23,12 @@ from sonarpost.modem.micromodem.events import (
     PacketReceived,
     PacketSent,
     PingAnswered,
-    PingOverheard,
-    Polled,
+    PingReceived,
+    PollReceived,
     RequestDone,
     RequestFailed,
     SentenceRejected,
-    SettingRefused,
+    SettingUnconfirmed,
     StatisticsReceived,
 )
 from sonarpost.modem.micromodem.sentences import ReceivedData
@@ -117,7 +117,7 @@ def test_what_others_say_is_told() -> None:
     driver = ready()
     told = tell(driver, "CAMPA,2,1", "CAMUA,2,1,1ABC", "CAMPR,2,1,0.1000", "CAMUR,2,1", "CARDP,2,1,1,0,0,1;1;AA,")
     assert told[:4] == [
-        PingOverheard(2, 1),
+        PingReceived(2, 1),
         MiniPacketReceived(2, 1, 0x1ABC),
         PingAnswered(2, 1, 0.1),
         MiniPacketAnswered(2, 1),
@@ -204,15 +204,15 @@ def test_what_cannot_be_asked_for_is_refused(ask, field: str) -> None:  # type: 
 
 def test_a_poll_is_answered_with_what_the_application_gives() -> None:
     driver = ready()
-    asked: list[Polled] = []
+    asked: list[PollReceived] = []
 
-    def uplink(polled: Polled) -> list[bytes]:
+    def uplink(polled: PollReceived) -> list[bytes]:
         asked.append(polled)
         return [b"one"]
 
     driver.answer_polls(uplink)
     told = tell(driver, "CARXP,0", "CACYC,0,1,2,1,1,3", "CADRQ,120000,1,2,1,64,1")
-    assert asked == [Polled(2, 1, 3, 64, True)] == [e for e in told if isinstance(e, Polled)]
+    assert asked == [PollReceived(2, 1, 3, 64, True)] == [e for e in told if isinstance(e, PollReceived)]
     assert driver.bytes_to_send() == nmea.format("CCTXD", 1, 2, 1, "6F6E65")
     tell(driver, "CATXD,1,2,1,3", "CADRQ,120000,1,2,1,64,2")
     assert driver.bytes_to_send() == nmea.format("CCTXD", 1, 2, 1, ""), "there is no more"
@@ -261,4 +261,4 @@ def test_the_clock_is_set_in_the_words_of_the_generation(firmware: str, command:
     assert tell(driver, answer) == [ClockConfirmed(utc)]
     assert driver.set_clock(utc + timedelta(seconds=9), 2.0)
     tell(driver, answer, now=2.0)
-    assert [type(e) for e in driver.poll(8.0)] == [SettingRefused], "the answer to another time is no answer"
+    assert [type(e) for e in driver.poll(8.0)] == [SettingUnconfirmed], "the answer to another time is no answer"

@@ -13,11 +13,11 @@ from sonarpost.modem.micromodem.events import (
     ModemReady,
     ModemRebooted,
     ModemUnresponsive,
-    OtherSentence,
     PacketFailed,
     PacketSent,
     SentenceRejected,
-    SettingRefused,
+    SettingUnconfirmed,
+    UnhandledSentence,
 )
 from sonarpost.modem.micromodem.supervisor import Phase
 
@@ -54,7 +54,7 @@ def test_more_settings_are_sent_and_one_without_answer_is_done_without() -> None
     config = MicroModemConfig(address=3, settings=(("RXP", 1), ("gain.x", 7)))
     modem = started(config, loses=lambda sentence, _: sentence.fields[:1] == ("gain.x",))
     modem.run(30.0)
-    assert modem.events == [SettingRefused("CCCFG,gain.x,7"), ModemReady(3, None)]
+    assert modem.events == [SettingUnconfirmed("CCCFG,gain.x,7"), ModemReady(3, None)]
 
 
 @pytest.mark.parametrize("kind", ["CCCFG", "CACFG", "CCCFQ"])
@@ -214,7 +214,7 @@ def test_clock_is_set_once_and_confirmed() -> None:
     assert modem.driver.set_clock(utc, modem.now)
     modem.run(40.0)
     assert len(modem.commands("CCCLK")) == 2, "an old time is not sent again"
-    assert modem.events[2:] == [SettingRefused("CCCLK,2016,10,12,9,0,5")]
+    assert modem.events[2:] == [SettingUnconfirmed("CCCLK,2016,10,12,9,0,5")]
     assert modem.driver.phase is Phase.READY
 
 
@@ -225,7 +225,7 @@ def test_what_the_driver_does_not_know_is_passed_on() -> None:
     modem.say("CACFG", "BW", 2)
     modem.raw(b"$CATXF,28*00\r\nnoise\r\n")
     modem.say("CAREV", "000000")
-    assert [event.sentence.kind for event in modem.of(OtherSentence)] == ["CATOA", "CACFG"]
+    assert [event.sentence.kind for event in modem.of(UnhandledSentence)] == ["CATOA", "CACFG"]
     assert [event.error.field for event in modem.of(SentenceRejected)] == ["checksum", "", "fields"]
 
 

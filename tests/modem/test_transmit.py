@@ -14,10 +14,10 @@ from sonarpost.modem.micromodem.events import (
     ModemReady,
     ModemRebooted,
     ModemUnresponsive,
-    OtherSentence,
     PacketFailed,
     PacketSent,
     SentenceRejected,
+    UnhandledSentence,
 )
 from sonarpost.modem.micromodem.rates import RATES
 
@@ -310,7 +310,7 @@ def test_unreadable_statistics_still_end_the_cycle() -> None:
 def test_statistics_of_nothing_are_passed_on() -> None:
     modem = ready()
     modem.say("CAXST", 7, "20250606", "230117.336548")
-    assert [type(event) for event in modem.events] == [OtherSentence]
+    assert [type(event) for event in modem.events] == [UnhandledSentence]
 
 
 def acknowledge(modem: FakeModem, *numbers: int, src: int = 1) -> None:
@@ -409,5 +409,5 @@ def test_rate_0_is_given_the_time_its_announcement_takes() -> None:
 def test_late_echo_of_our_own_command_is_no_reception() -> None:
     modem = ready()
     modem.say("CACYC", 0, 3, 1, 4, 0, 2)
-    assert [type(event) for event in modem.events] == [OtherSentence]
+    assert [type(event) for event in modem.events] == [UnhandledSentence]
     assert not modem.driver.receiving

@@ -16,11 +16,11 @@ from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import (
     ClockConfirmed,
-    Event,
     FailureReason,
     FlexibleDataReceived,
     FrameReceived,
     MiniPacketReceived,
+    ModemEvent,
     ModemReady,
     PacketFailed,
     PacketReceived,
@@ -30,9 +30,9 @@ from sonarpost.modem.micromodem.events import (
 )
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
+from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
 
 CONFIG = MicroModemConfig(address=3, settings=())
 
@@ -105,11 +105,11 @@ class PtyModem:
 class Rig:
     def __init__(self, modem: PtyModem) -> None:
         self.modem = modem
-        self.events: list[Event] = []
+        self.events: list[ModemEvent] = []
         self.link = SerialLink(str(modem.path), first_retry_s=0.02, longest_retry_s=0.1)
         self.runner = ModemRunner(MicroModem(CONFIG), self.link, self.events.append)
 
-    def of(self, *kinds: type) -> list[Event]:
+    def of(self, *kinds: type) -> list[ModemEvent]:
         return [event for event in self.events if isinstance(event, kinds)]
 
 
@@ -202,7 +202,7 @@ def test_callback_may_send_and_may_fail(tmp_path: Path, caplog: pytest.LogCaptur
     def fail() -> None:
         raise RuntimeError("a careless consumer")
 
-    def on_event(event: Event) -> None:
+    def on_event(event: ModemEvent) -> None:
         if isinstance(event, ModemReady):
             runner.send_packet(1, 4, [b"from the callback"])
             fail()
@@ -242,7 +242,7 @@ def test_timers_run_without_a_byte_from_the_port(tmp_path: Path) -> None:
     """A clock that runs fifty times faster: the silent modem is asked again and again."""
     modem = PtyModem(tmp_path / "ttyMODEM")
     modem.answers = False
-    events: list[Event] = []
+    events: list[ModemEvent] = []
     runner = ModemRunner(
         MicroModem(CONFIG),
         SerialLink(str(modem.path)),
@@ -259,10 +259,10 @@ def test_timers_run_without_a_byte_from_the_port(tmp_path: Path) -> None:
 
 
 def test_two_runners_ping_poll_and_exchange_small_things(tmp_path: Path) -> None:
-    sites = (ModemSite(1), ModemSite(2, Position(150.0)))
-    channel = ChannelEmulator(ChannelConfig(sites, pty_dir=tmp_path / "modems", time_scale=50.0))
+    sites = (ModemSite(1), ModemSite(2, LocalPosition(150.0)))
+    channel = ChannelEmulator(EmulatorConfig(sites, pty_dir=tmp_path / "modems", time_scale=50.0))
     channel.start()
-    events: dict[int, list[Event]] = {1: [], 2: []}
+    events: dict[int, list[ModemEvent]] = {1: [], 2: []}
     runners = {
         device.address: ModemRunner(
             MicroModem(MicroModemConfig(device.address)), SerialLink(device.device), events[device.address].append

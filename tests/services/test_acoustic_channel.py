@@ -28,12 +28,12 @@ from sonarpost.messages import Health
 from sonarpost.modem.micromodem import nmea
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.services.acoustic_channel.service import AcousticChannelService, ChannelEmulator
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
-from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
+from sonarpost.simulation.modem.config import EmulatedModemConfig
 
-SITES = (ModemSite(1), ModemSite(2, Position(150.0)))
+SITES = (ModemSite(1), ModemSite(2, LocalPosition(150.0)))
 SCALE = 100.0
 
 
@@ -108,7 +108,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
         defaults: dict[str, object] = {"sites": SITES, "time_scale": SCALE, "log_path": tmp_path / "water.jsonl"}
         if "tcp_ports" not in config:
             defaults["pty_dir"] = tmp_path / "ports"
-        channel = ChannelEmulator(ChannelConfig(**(defaults | config)))  # type: ignore[arg-type]
+        channel = ChannelEmulator(EmulatorConfig(**(defaults | config)))  # type: ignore[arg-type]
         running.append(channel)
         channel.start()
         return channel
@@ -291,7 +291,7 @@ def test_a_client_that_does_not_read_loses_whole_sentences_only(make: Make):
 
 
 def test_air_time_runs_at_the_time_scale(make: Make):
-    channel = make(time_scale=10.0, modem=ModemConfig(address=0, airtimes_s={1: 5.0}))
+    channel = make(time_scale=10.0, modem=EmulatedModemConfig(address=0, airtimes_s={1: 5.0}))
     host = Host(channel.devices()[0].device)
     host.say("CCCYC", 0, 1, 2, 1, 0, 1)
     host.expect("CADRQ")
@@ -304,7 +304,7 @@ def test_air_time_runs_at_the_time_scale(make: Make):
 def test_a_moved_modem_is_elsewhere(make: Make, tmp_path: Path):
     channel = make()
     sender, receiver = hosts_of(channel)
-    channel.move(2, Position(300.0))
+    channel.move(2, LocalPosition(300.0))
     sender.send(2, 1, [b"abc"])
     receiver.expect("CACST")
     channel.stop()
@@ -327,7 +327,7 @@ def test_ports_that_cannot_be_had_are_named(make: Make, tmp_path: Path):
 
 
 def test_a_log_that_cannot_be_written_ends_the_channel(tmp_path: Path):
-    config = ChannelConfig(sites=SITES, pty_dir=tmp_path / "ports", log_path=Path("/dev/full"))
+    config = EmulatorConfig(sites=SITES, pty_dir=tmp_path / "ports", log_path=Path("/dev/full"))
     channel = ChannelEmulator(config)
     channel.start()
     eventually(lambda: channel.failure is not None, what="failure")
@@ -351,7 +351,7 @@ def test_a_log_that_cannot_be_written_ends_the_channel(tmp_path: Path):
 def test_configurations_that_make_no_sense_are_refused(config: dict[str, object], tmp_path: Path):
     complete = {"sites": SITES} | ({} if "tcp_ports" in config else {"pty_dir": tmp_path}) | config
     with pytest.raises(ValueError, match=next(iter(config))):
-        ChannelConfig(**complete)  # type: ignore[arg-type]
+        EmulatorConfig(**complete)  # type: ignore[arg-type]
 
 
 # The command

@@ -14,9 +14,9 @@ import pytest
 from builders.common import eventually
 
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
+from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
 
 with warnings.catch_warnings():
     # Strings of that package have escapes that Python no longer likes; it shows when the package is compiled.
@@ -76,8 +76,8 @@ class Client:
 
 @pytest.fixture
 def clients(tmp_path: Path) -> Iterator[tuple[Client, Client]]:
-    sites = (ModemSite(1), ModemSite(2, Position(RANGE_M)))
-    channel = ChannelEmulator(ChannelConfig(sites, pty_dir=tmp_path / "modems", time_scale=SCALE))
+    sites = (ModemSite(1), ModemSite(2, LocalPosition(RANGE_M)))
+    channel = ChannelEmulator(EmulatorConfig(sites, pty_dir=tmp_path / "modems", time_scale=SCALE))
     channel.start()
     pair = [Client(f"m{d.address}", d.device, tmp_path) for d in channel.devices()]
     yield pair[0], pair[1]

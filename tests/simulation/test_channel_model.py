@@ -11,10 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.channel.acoustics import Position, absorption_db_per_km, noise_db_per_hz
+from sonarpost.simulation.channel.acoustics import LocalPosition, absorption_db_per_km, noise_db_per_hz
 from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, Fate, FrameFate, PacketKind
-from sonarpost.simulation.channel.channel_presets import make_channel, read_channel
+from sonarpost.simulation.channel.channel_events import (
+    AcousticPacket,
+    ArrivalEnded,
+    FrameOutcome,
+    PacketKind,
+    PacketOutcome,
+)
+from sonarpost.simulation.channel.channel_presets import build_parameters, read_parameters
 from sonarpost.simulation.channel.delivery_table import RANGES_M, deliver, table
 from sonarpost.simulation.channel.fading import Fading
 from sonarpost.simulation.channel.propagation import ChannelModel
@@ -29,12 +35,12 @@ def send(sea: ChannelModel, count: int, now: float, airtime_s: float) -> Arrival
 
 
 def two_modems(range_m: float, config: ChannelParameters) -> ChannelModel:
-    return ChannelModel(config, {1: Position(), 2: Position(range_m)})
+    return ChannelModel(config, {1: LocalPosition(), 2: LocalPosition(range_m)})
 
 
 def test_the_sea_trial_comes_out():
     """The paper's: 2 to 300 m at rate 1, most packets arrive below 130 m, most are lost beyond."""
-    sea = make_channel({"preset": "sea-trial", "seed": 5}, "test")
+    sea = build_parameters({"preset": "sea-trial", "seed": 5}, "test")
     near = [deliver(sea, 1, range_m, 60).packets for range_m in range(2, 130, 9)]
     far = [deliver(sea, 1, range_m, 60).packets for range_m in range(135, 301, 11)]
     assert min(near) > 0.85
@@ -104,7 +110,7 @@ def test_a_fade_takes_the_frames_in_it_and_only_those():
     for n in range(200):
         arrival = send(sea, 8, 10.0 * n, 8.0)
         expected = [fading.faded(1, 2, 10.0 * n + k + 0.5) for k in range(8)]
-        assert [frame.fate is Fate.LOST for frame in arrival.frames] == expected
+        assert [frame.fate is FrameOutcome.LOST for frame in arrival.frames] == expected
         lost += sum(expected)
         partly += 0 < sum(expected) < 8
     assert lost > 100
@@ -114,13 +120,13 @@ def test_a_fade_takes_the_frames_in_it_and_only_those():
 def test_a_deep_fade_hides_a_packet():
     config = ChannelParameters(range_loss=True, mean_clear_s=0.5, mean_fade_s=1e6, fade_loss=0.0, fade_depth_db=60.0)
     arrival = send(two_modems(50.0, config), 1, 1000.0, 3.0)
-    assert (arrival.detected, arrival.outcome) == (False, FrameFate.LOST)
+    assert (arrival.detected, arrival.outcome) == (False, PacketOutcome.LOST)
 
 
 def test_water_from_preset_file_and_options(tmp_path: Path):
     file = tmp_path / "water.toml"
     file.write_text('preset = "sea-trial"\nsnr_at_1m_db = 45\ntail_damage_kind = "zeros"\n', encoding="utf-8")
-    config = make_channel(read_channel(file) | {"seed": 9}, "test")
+    config = build_parameters(read_parameters(file) | {"seed": 9}, "test")
     assert (config.snr_at_1m_db, config.seed, config.range_loss) == (45, 9, True)
     assert config.tail_damage_kind is TailDamage.ZEROS
 
@@ -142,7 +148,7 @@ def test_a_water_file_that_is_wrong_names_file_key_and_value(tmp_path: Path, tex
     file = tmp_path / "water.toml"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=named) as caught:
-        make_channel(read_channel(file), str(file))
+        build_parameters(read_parameters(file), str(file))
     assert "water.toml" in str(caught.value)
 
 

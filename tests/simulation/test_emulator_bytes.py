@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from sonarpost.modem.micromodem import nmea
 from sonarpost.simulation.channel.channel_events import Transmission
-from sonarpost.simulation.modem.config import ModemConfig
-from sonarpost.simulation.modem.emulator import EmulatedMicromodem
+from sonarpost.simulation.modem.config import EmulatedModemConfig
+from sonarpost.simulation.modem.emulator import EmulatedMicroModem
 from sonarpost.simulation.modem.serial_timing import SerialLineTiming
 
 
@@ -37,7 +37,7 @@ from sonarpost.simulation.modem.serial_timing import SerialLineTiming
     ],
 )
 def test_what_does_not_parse_is_answered_with_an_error(line: bytes, answer: str):
-    modem = EmulatedMicromodem(ModemConfig(1, utc_at_zero_s=START_UTC_S))
+    modem = EmulatedMicroModem(EmulatedModemConfig(1, utc_at_zero_s=START_UTC_S))
     modem.bytes_to_send()
     modem.receive(line, 2.0)
     assert modem.bytes_to_send() == nmea.format("CAERR", "090002", *answer.split(","))

@@ -8,8 +8,8 @@ from builders.emulator_bench import Bench
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import (
-    Event,
     ModemError,
+    ModemEvent,
     ModemRebooted,
     ModemUnresponsive,
     PacketFailed,
@@ -20,9 +20,9 @@ from sonarpost.modem.micromodem.events import (
 from sonarpost.modem.micromodem.rates import RATES
 
 
-def drive(bench: Bench, drivers: dict[int, MicroModem], until_s: float) -> dict[int, list[Event]]:
+def drive(bench: Bench, drivers: dict[int, MicroModem], until_s: float) -> dict[int, list[ModemEvent]]:
     """Run the project's own drivers on the emulated modems, without any real time."""
-    events: dict[int, list[Event]] = {n: [] for n in drivers}
+    events: dict[int, list[ModemEvent]] = {n: [] for n in drivers}
     while bench.now < until_s:
         for n, driver in drivers.items():
             told, bench.told[n] = bench.told[n], b""

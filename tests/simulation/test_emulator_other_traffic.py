@@ -6,10 +6,10 @@ import pytest
 from builders.emulator_bench import START_UTC_S, Bench
 
 from sonarpost.modem.micromodem import nmea
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
-from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem
+from sonarpost.simulation.modem.config import EmulatedModemConfig
 
 
 def test_text_travels_as_text():
@@ -67,8 +67,16 @@ def test_lost_flexible_data_is_told_as_bad():
 
 @pytest.mark.parametrize("kind", ["PDT", "PNT"])
 def test_ranging_to_transponders(kind: str):
-    places = {1: ModemPlace(ModemConfig(1, utc_at_zero_s=START_UTC_S)), 2: ModemPlace(ModemConfig(2), Position(50.0))}
-    transponders = {"A": Position(300.0), "B": Position(0.0, 600.0), "C": Position(5000.0), "D": Position(30.0)}
+    places = {
+        1: PlacedModem(EmulatedModemConfig(1, utc_at_zero_s=START_UTC_S)),
+        2: PlacedModem(EmulatedModemConfig(2), LocalPosition(50.0)),
+    }
+    transponders = {
+        "A": LocalPosition(300.0),
+        "B": LocalPosition(0.0, 600.0),
+        "C": LocalPosition(5000.0),
+        "D": LocalPosition(30.0),
+    }
     world = ChannelSimulator(ChannelParameters(), places, transponders=transponders)
     world.advance(1.0)
     for number in places:

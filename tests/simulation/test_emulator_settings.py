@@ -6,8 +6,8 @@ import pytest
 from builders.emulator_bench import START_UTC_S, Bench
 
 from sonarpost.modem.micromodem import nmea
-from sonarpost.simulation.modem.config import ModemConfig
-from sonarpost.simulation.modem.emulator import EmulatedMicromodem
+from sonarpost.simulation.modem.config import EmulatedModemConfig
+from sonarpost.simulation.modem.emulator import EmulatedMicroModem
 
 
 def test_the_clock_shows_the_second_to_come_and_runs_from_the_pulse():
@@ -67,7 +67,7 @@ def test_settings_switch_sentences_off():
 
 
 def test_the_known_start_up_query_has_the_known_answer():
-    modem = EmulatedMicromodem(ModemConfig(1, utc_at_zero_s=START_UTC_S))
+    modem = EmulatedMicroModem(EmulatedModemConfig(1, utc_at_zero_s=START_UTC_S))
     assert modem.bytes_to_send() == b"$CAREV,090000,INIT,2.0.27087*44\r\n"
     modem.receive(b"$CCCFQ,SRC*3A\r\n", 0.5)
     assert modem.bytes_to_send() == b"$CACFG,SRC,1*33\r\n"
@@ -142,7 +142,7 @@ def test_the_revision_comes_every_ten_seconds():
 
 
 def test_settings_cannot_grow_without_end():
-    modem = EmulatedMicromodem(ModemConfig(1))
+    modem = EmulatedMicroModem(EmulatedModemConfig(1))
     for number in range(2000):
         modem.receive(nmea.format("CCCFG", f"name.{number}", 1), 0.0)
     assert len(modem.settings.items()) == 512
@@ -160,4 +160,4 @@ def test_settings_cannot_grow_without_end():
 )
 def test_a_modem_that_cannot_be_built_is_refused(config: dict[str, object]):
     with pytest.raises(ValueError, match=next(iter(config))):
-        ModemConfig(1, **config)  # type: ignore[arg-type]
+        EmulatedModemConfig(1, **config)  # type: ignore[arg-type]

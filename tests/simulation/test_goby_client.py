@@ -8,10 +8,10 @@ from datetime import UTC, datetime
 import pytest
 from builders.goby_host import FRAME_BYTES, Delivery, GobyHost
 
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
-from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem
+from sonarpost.simulation.modem.config import EmulatedModemConfig
 
 RANGE_M = 150.0
 SETTINGS = ("AGC,0", "AGN,0")
@@ -23,9 +23,10 @@ class Pair:
     def __init__(self, mm: int, start_utc: datetime = datetime(2024, 2, 29, 23, 59, 51, 430_000, tzinfo=UTC)) -> None:
         start_utc_s = start_utc.timestamp()
         places = {
-            n: ModemPlace(ModemConfig(n, mm, utc_at_zero_s=start_utc_s), Position(RANGE_M * (n - 1))) for n in (1, 2)
+            n: PlacedModem(EmulatedModemConfig(n, mm, utc_at_zero_s=start_utc_s), LocalPosition(RANGE_M * (n - 1)))
+            for n in (1, 2)
         }
-        transponders = {"A": Position(300.0), "B": Position(450.0)}
+        transponders = {"A": LocalPosition(300.0), "B": LocalPosition(450.0)}
         self.world = ChannelSimulator(ChannelParameters(), places, transponders=transponders)
         settings = SETTINGS + (("psk.packet.mod_hdr_version,0",) if mm == 2 else ())
         self.hosts = {n: GobyHost(n, mm, start_utc_s, settings) for n in (1, 2)}

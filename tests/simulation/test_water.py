@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.simulation.channel.acoustics import Position, frame_error_rate
+from sonarpost.simulation.channel.acoustics import LocalPosition, frame_error_rate
 from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_events import (
     AcousticPacket,
     ArrivalEnded,
     ArrivalStarted,
-    Fate,
-    FrameFate,
+    FrameOutcome,
     PacketKind,
+    PacketOutcome,
 )
 from sonarpost.simulation.channel.propagation import ChannelModel
 from sonarpost.simulation.channel.random_draws import RandomDraws, TailDamage, damage_tail
@@ -33,7 +33,7 @@ def packet(*frames: bytes, rate: int = 1, airtime_s: float = 3.0) -> AcousticPac
 
 
 def water(*positions_m: float, **config: object) -> ChannelModel:
-    places = {number: Position(east_m) for number, east_m in enumerate(positions_m, start=1)}
+    places = {number: LocalPosition(east_m) for number, east_m in enumerate(positions_m, start=1)}
     return ChannelModel(ChannelParameters(**config), places)  # type: ignore[arg-type]
 
 
@@ -41,7 +41,7 @@ def ended(events: list[ArrivalStarted | ArrivalEnded]) -> list[ArrivalEnded]:
     return [event for event in events if isinstance(event, ArrivalEnded)]
 
 
-def fates(arrival: ArrivalEnded) -> list[Fate]:
+def fates(arrival: ArrivalEnded) -> list[FrameOutcome]:
     return [frame.fate for frame in arrival.frames]
 
 
@@ -56,7 +56,7 @@ def test_a_packet_arrives_after_its_travel_time_and_lasts_its_air_time():
     assert sea.poll(13.49) == []
     (end,) = sea.poll(13.5)
     assert isinstance(end, ArrivalEnded)
-    assert (end.at_s, end.delay_s, end.range_m, end.outcome) == (13.5, 0.5, 750.0, FrameFate.ARRIVED)
+    assert (end.at_s, end.delay_s, end.range_m, end.outcome) == (13.5, 0.5, 750.0, PacketOutcome.ARRIVED)
     assert end.frames[0].received == b"abc"
     assert sea.next_event_s() is None
     assert sea.in_flight == 0
@@ -65,7 +65,7 @@ def test_a_packet_arrives_after_its_travel_time_and_lasts_its_air_time():
 def test_sound_speed_and_position_change_the_travel_time_of_later_packets_only():
     sea = water(0.0, 140.0, sound_speed_m_per_s=1400.0)
     sea.transmit(1, packet(b"a"), now=0.0)
-    sea.move(2, Position(280.0))
+    sea.move(2, LocalPosition(280.0))
     assert ended(sea.poll(100.0))[0].delay_s == pytest.approx(0.1)
     sea.transmit(1, packet(b"a"), now=100.0)
     assert ended(sea.poll(200.0))[0].delay_s == pytest.approx(0.2)
@@ -80,8 +80,11 @@ def test_half_duplex_a_modem_hears_nothing_that_overlaps_its_own_transmission(st
         events += ended(sea.poll(now))
         sea.transmit(modem, packet(b"x"), now)
     events += ended(sea.poll(100.0))
-    assert {event.receiver: event.outcome for event in events} == {1: FrameFate.TRANSMITTING, 2: FrameFate.TRANSMITTING}
-    assert all(fates(event) == [Fate.LOST] for event in events)
+    assert {event.receiver: event.outcome for event in events} == {
+        1: PacketOutcome.TRANSMITTING,
+        2: PacketOutcome.TRANSMITTING,
+    }
+    assert all(fates(event) == [FrameOutcome.LOST] for event in events)
 
 
 def test_transmissions_that_only_touch_are_both_heard():
@@ -90,7 +93,7 @@ def test_transmissions_that_only_touch_are_both_heard():
     events = ended(sea.poll(2.0))
     sea.transmit(2, packet(b"y", airtime_s=2.0), 2.0)
     events += ended(sea.poll(4.0))
-    assert [event.outcome for event in events] == [FrameFate.ARRIVED, FrameFate.ARRIVED]
+    assert [event.outcome for event in events] == [PacketOutcome.ARRIVED, PacketOutcome.ARRIVED]
 
 
 def test_overlapping_arrivals_destroy_each_other_at_that_receiver_only():
@@ -99,10 +102,10 @@ def test_overlapping_arrivals_destroy_each_other_at_that_receiver_only():
     sea.transmit(1, packet(b"one"), 0.0)
     sea.transmit(2, packet(b"two"), 1.0)
     outcomes = {(e.transmission.transmitter, e.receiver): e for e in ended(sea.poll(100.0))}
-    assert outcomes[1, 3].outcome is FrameFate.ARRIVED
-    assert outcomes[1, 4].outcome is FrameFate.COLLISION
-    assert outcomes[2, 4].outcome is FrameFate.COLLISION
-    assert fates(outcomes[1, 4]) == [Fate.LOST]
+    assert outcomes[1, 3].outcome is PacketOutcome.ARRIVED
+    assert outcomes[1, 4].outcome is PacketOutcome.COLLISION
+    assert outcomes[2, 4].outcome is PacketOutcome.COLLISION
+    assert fates(outcomes[1, 4]) == [FrameOutcome.LOST]
     assert outcomes[1, 4].detected
     assert not outcomes[2, 4].detected
 
@@ -113,10 +116,10 @@ def test_a_collision_counts_even_with_a_packet_that_was_resolved_before():
     sea.transmit(1, packet(b"long", airtime_s=10.0), 0.0)
     sea.transmit(2, packet(b"s1", airtime_s=1.0), 1.0)
     outcomes = [(e.transmission.transmitter, e.receiver, e.outcome) for e in ended(sea.poll(9.0))]
-    assert outcomes == [(2, 1, FrameFate.TRANSMITTING), (2, 3, FrameFate.COLLISION)]
+    assert outcomes == [(2, 1, PacketOutcome.TRANSMITTING), (2, 3, PacketOutcome.COLLISION)]
     assert [(e.receiver, e.outcome) for e in ended(sea.poll(10.0))] == [
-        (2, FrameFate.TRANSMITTING),
-        (3, FrameFate.COLLISION),
+        (2, PacketOutcome.TRANSMITTING),
+        (3, PacketOutcome.COLLISION),
     ]
 
 
@@ -139,22 +142,22 @@ def run_packets(count: int, **config: object) -> list[ArrivalEnded]:
 
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.5, 1.0])
 def test_frame_loss_is_what_was_asked_for(loss: float):
-    lost = [frame.fate is Fate.LOST for a in run_packets(1000, frame_loss=loss, seed=7) for frame in a.frames]
+    lost = [frame.fate is FrameOutcome.LOST for a in run_packets(1000, frame_loss=loss, seed=7) for frame in a.frames]
     deviation = math.sqrt(loss * (1 - loss) / len(lost))
     assert abs(sum(lost) / len(lost) - loss) <= 3 * deviation
 
 
 def test_packet_loss_takes_whole_packets_and_nothing_is_detected():
     arrivals = run_packets(1000, packet_loss=0.25, seed=3)
-    lost = [a for a in arrivals if a.outcome is FrameFate.LOST]
+    lost = [a for a in arrivals if a.outcome is PacketOutcome.LOST]
     assert abs(len(lost) / 1000 - 0.25) <= 3 * math.sqrt(0.25 * 0.75 / 1000)
     assert not any(a.detected for a in lost)
-    assert all(fates(a) == [Fate.LOST] * 3 for a in lost)
+    assert all(fates(a) == [FrameOutcome.LOST] * 3 for a in lost)
 
 
 def test_frames_are_lost_independently_of_each_other():
     pairs = [fates(a)[:2] for a in run_packets(2000, frame_loss=0.5, seed=11)]
-    both = sum(pair == [Fate.LOST, Fate.LOST] for pair in pairs) / len(pairs)
+    both = sum(pair == [FrameOutcome.LOST, FrameOutcome.LOST] for pair in pairs) / len(pairs)
     assert abs(both - 0.25) < 3 * math.sqrt(0.25 * 0.75 / 2000)
 
 
@@ -186,7 +189,7 @@ def test_a_damaged_tail_passes_for_good_and_keeps_its_length(kind: TailDamage):
     for n in range(50):
         sea.transmit(1, packet(b"\x55" * 64, b"\xaa" * 40, b""), now=10.0 * n)
         (arrival,) = ended(sea.poll(10.0 * n + 9))
-        assert fates(arrival) == [Fate.DELIVERED, Fate.DAMAGED, Fate.EMPTY]
+        assert fates(arrival) == [FrameOutcome.DELIVERED, FrameOutcome.DAMAGED, FrameOutcome.EMPTY]
         received = arrival.frames[1].received
         assert len(received) == 40
         assert received[:30] == b"\xaa" * 30
@@ -204,7 +207,7 @@ def test_zeros_over_zeros_are_no_damage():
     sea = water(0.0, 100.0, tail_damage=1.0, tail_damage_kind=TailDamage.ZEROS)
     sea.transmit(1, packet(bytes(32)), now=0.0)
     (arrival,) = ended(sea.poll(9.0))
-    assert fates(arrival) == [Fate.DELIVERED]
+    assert fates(arrival) == [FrameOutcome.DELIVERED]
 
 
 @given(st.binary(min_size=1, max_size=300), st.integers(0, 2**63), st.floats(0.01, 1.0), st.sampled_from(TailDamage))

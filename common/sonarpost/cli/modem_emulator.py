@@ -13,12 +13,12 @@ from types import FrameType
 
 from sonarpost.errors import ConfigError
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_presets import PRESETS, make_channel, read_channel
+from sonarpost.simulation.channel.channel_presets import PRESETS, build_parameters, read_parameters
 from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
-from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
+from sonarpost.simulation.modem.config import EmulatedModemConfig
 
 WATCH_S = 0.2
 EXIT_FAILED = 1
@@ -128,7 +128,7 @@ def _drop_unread() -> None:
         os.close(nowhere)
 
 
-def _config(parsed: argparse.Namespace) -> ChannelConfig:
+def _config(parsed: argparse.Namespace) -> EmulatorConfig:
     """Turn the command line into a configuration.
 
     Raises:
@@ -138,12 +138,12 @@ def _config(parsed: argparse.Namespace) -> ChannelConfig:
         raise ConfigError("command line", "--modems", parsed.modems, f"1..{MOST_MODEMS}")
     try:
         water = _water(parsed)
-        sites = tuple(ModemSite(n + 1, Position(east_m=n * parsed.spacing)) for n in range(parsed.modems))
+        sites = tuple(ModemSite(n + 1, LocalPosition(east_m=n * parsed.spacing)) for n in range(parsed.modems))
         airtimes_s = dict(_airtime(text) for text in parsed.airtime)
-        return ChannelConfig(
+        return EmulatorConfig(
             sites=sites,
             water=water,
-            modem=ModemConfig(address=0, generation=parsed.mm, airtimes_s=airtimes_s),
+            modem=EmulatedModemConfig(address=0, generation=parsed.mm, airtimes_s=airtimes_s),
             pty_dir=None if parsed.tcp is not None else parsed.pty or Path("modems"),
             tcp_ports=tuple(parsed.tcp or (0,) * parsed.modems) if parsed.tcp is not None else (),
             time_scale=parsed.time_scale,
@@ -168,8 +168,8 @@ def _water(parsed: argparse.Namespace) -> ChannelParameters:
         "range_loss": parsed.range_loss or None,
     }
     given = {name: value for name, value in options.items() if value is not None}
-    from_file = read_channel(parsed.water) if parsed.water else {}
-    return make_channel(from_file | given | dict(_parameter(text) for text in parsed.set), "command line")
+    from_file = read_parameters(parsed.water) if parsed.water else {}
+    return build_parameters(from_file | given | dict(_parameter(text) for text in parsed.set), "command line")
 
 
 def _parameter(text: str) -> tuple[str, float | bool | str]:
@@ -191,10 +191,10 @@ def _airtime(text: str) -> tuple[int, float]:
         raise ConfigError("command line", "--airtime", text, expected) from error
 
 
-def _transponder(text: str) -> tuple[str, Position]:
+def _transponder(text: str) -> tuple[str, LocalPosition]:
     letter, _, place = text.partition("=")
     try:
         east_m, north_m, depth_m = (float(metres) for metres in [*place.split(","), "0", "0"][:3])
-        return letter, Position(east_m, north_m, depth_m)
+        return letter, LocalPosition(east_m, north_m, depth_m)
     except ValueError as error:
         raise ConfigError("command line", "--transponder", text, "LETTER=EAST[,NORTH[,DEPTH]] in metres") from error

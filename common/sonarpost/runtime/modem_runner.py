@@ -11,7 +11,7 @@ from datetime import datetime
 
 from sonarpost.errors import PortError
 from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import Event, Polled
+from sonarpost.modem.micromodem.events import ModemEvent, PollReceived
 from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialLink
 
 log = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ class ModemRunner:
         self,
         driver: MicroModem,
         link: SerialLink,
-        on_event: Callable[[Event], None],
+        on_event: Callable[[ModemEvent], None],
         clock: Callable[[], float] = time.monotonic,
         *,
         longest_wait_s: float = 0.25,
@@ -133,7 +133,7 @@ class ModemRunner:
         """
         return self._ask(lambda now: self._driver.request_packet(source, rate, frames, ack=ack, now=now))
 
-    def answer_polls(self, uplink: Callable[[Polled], Sequence[bytes]] | None) -> None:
+    def answer_polls(self, uplink: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
         """Give the function that is asked for frames when another modem polls; see `MicroModem.answer_polls`.
 
         It is called in the runner's thread and must neither wait nor call the runner.
@@ -183,7 +183,7 @@ class ModemRunner:
             self._write(data)
         self._deliver(events)
 
-    def _take(self, item: PortEvent | None, now: float) -> list[Event]:
+    def _take(self, item: PortEvent | None, now: float) -> list[ModemEvent]:
         if isinstance(item, bytes):
             return self._driver.receive(item, now)
         if isinstance(item, PortOpened):
@@ -199,7 +199,7 @@ class ModemRunner:
             # The link tells the loss itself, and the driver's time-outs cover what was not written.
             log.debug("%s", error)
 
-    def _deliver(self, events: list[Event]) -> None:
+    def _deliver(self, events: list[ModemEvent]) -> None:
         for event in events:
             try:
                 self._on_event(event)

@@ -14,7 +14,7 @@ from sonarpost.logs import kv
 from sonarpost.modem.micromodem import events as ev
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import Event
+from sonarpost.modem.micromodem.events import ModemEvent
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
 from sonarpost.runtime.service import Service
@@ -57,7 +57,7 @@ class ModemService(Service[M]):
         self._modem_problem = f"{config.port}: the modem has not answered yet"
 
     @abstractmethod
-    def on_modem_event(self, event: Event) -> None:
+    def on_modem_event(self, event: ModemEvent) -> None:
         """Act on an event of the driver; called in the modem's thread."""
 
     def on_start(self) -> None:
@@ -78,7 +78,7 @@ class ModemService(Service[M]):
             return f"{self.config.port}: {self._link.problem or 'not open yet'}"
         return "" if self.modem.ready else self._modem_problem
 
-    def _on_event(self, event: Event) -> None:
+    def _on_event(self, event: ModemEvent) -> None:
         match event:
             case ev.ModemReady():
                 log.info("Modem ready", extra=kv(port=self.config.port, address=event.address, firmware=event.firmware))
@@ -89,7 +89,7 @@ class ModemService(Service[M]):
             case ev.ModemRebooted():
                 self.count("modem_restarts")
                 log.warning("Modem restarted", extra=kv(firmware=event.firmware))
-            case ev.SettingRefused():
+            case ev.SettingUnconfirmed():
                 log.warning("Modem did not confirm a setting", extra=kv(command=event.command))
             case ev.ModemError():
                 self.count("modem_errors")

@@ -30,10 +30,10 @@ from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.channel.emulator_config import ChannelConfig, ModemSite
+from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 
 TIME_SCALE = 60.0
@@ -98,9 +98,9 @@ def start() -> Iterator[Callable[[Service[Any]], Any]]:
 @pytest.fixture
 def ports(tmp_path: Path) -> Iterator[tuple[str, str]]:
     """Modem ports of vessel and vehicle, 150 m apart, where time runs fast."""
-    sites = (ModemSite(1), ModemSite(3, Position(150.0)))
+    sites = (ModemSite(1), ModemSite(3, LocalPosition(150.0)))
     channel = ChannelEmulator(
-        ChannelConfig(sites, ChannelParameters(), pty_dir=tmp_path / "sea", time_scale=TIME_SCALE)
+        EmulatorConfig(sites, ChannelParameters(), pty_dir=tmp_path / "sea", time_scale=TIME_SCALE)
     )
     channel.start()
     yield str(tmp_path / "sea" / "modem-1"), str(tmp_path / "sea" / "modem-2")

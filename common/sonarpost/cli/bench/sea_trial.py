@@ -18,7 +18,7 @@ from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.errors import ConfigError
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.simulation.channel.channel_presets import make_channel
+from sonarpost.simulation.channel.channel_presets import build_parameters
 
 BOUNDARY_M: Final = 130
 """Where the paper's trial turns."""
@@ -115,7 +115,7 @@ def measure(pictures: int, seed: int, ranges_m: Sequence[int], sizes_px: Sequenc
         ranges_m: Distances.
         sizes_px: (width, height), 140 px at most.
     """
-    water = make_channel({"preset": _PRESET}, "bench sea-trial")
+    water = build_parameters({"preset": _PRESET}, "bench sea-trial")
     drawn = simulated_pictures(pictures, seed, max(max(size) for size in SIZES_PX)).pictures
     codec = VqCodec(load_default(_TILE_PX).tiles, IndexPacking.ASCII5)
     cells = []

@@ -18,10 +18,10 @@ from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import FrameReceived, ModemReady, PacketFailed, PacketSent
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
-from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem
+from sonarpost.simulation.modem.config import EmulatedModemConfig
 
 VESSEL: Final = 1
 VEHICLE: Final = 2
@@ -88,7 +88,7 @@ class Rig:
 
     def __init__(self, water: ChannelParameters, range_m: float) -> None:
         places = {
-            number: ModemPlace(ModemConfig(number), Position(east_m, depth_m=_DEPTH_M))
+            number: PlacedModem(EmulatedModemConfig(number), LocalPosition(east_m, depth_m=_DEPTH_M))
             for number, east_m in ((VESSEL, 0.0), (VEHICLE, range_m))
         }
         self._world = ChannelSimulator(water, places, serial_baud=_SERIAL_BAUD)

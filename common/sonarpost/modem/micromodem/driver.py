@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from datetime import datetime
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.micromodem.events import Event, FailureReason, Polled, SentenceRejected
+from sonarpost.modem.micromodem.events import FailureReason, ModemEvent, PollReceived, SentenceRejected
 from sonarpost.modem.micromodem.machine import DriverStateMachine
 from sonarpost.modem.micromodem.requests import RequestKind, flexible_command, mini_command, ping_command, poll_command
 from sonarpost.modem.micromodem.supervisor import Phase
@@ -133,7 +133,7 @@ class MicroModem(DriverStateMachine):
         command = poll_command(source, self.config.address, rate, frames, ack=ack)
         return self._request(RequestKind.POLL, source, command, now, rate)
 
-    def answer_polls(self, uplink: Callable[[Polled], Sequence[bytes]] | None) -> None:
+    def answer_polls(self, uplink: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
         """Give the function that is asked for frames when another modem polls this one.
 
         It is called inside `receive` and must not call back. No frames are a right answer: the modem then has nothing
@@ -152,7 +152,7 @@ class MicroModem(DriverStateMachine):
         self._supervisor.set_clock(utc, now)
         return True
 
-    def receive(self, data: bytes, now: float) -> list[Event]:
+    def receive(self, data: bytes, now: float) -> list[ModemEvent]:
         """Take bytes from the port, in pieces of any size; whatever they are, the answer is events."""
         if self.phase is Phase.CLOSED:
             return self._take_events()
@@ -164,7 +164,7 @@ class MicroModem(DriverStateMachine):
             self._advance(now)
         return self._take_events()
 
-    def poll(self, now: float) -> list[Event]:
+    def poll(self, now: float) -> list[ModemEvent]:
         """Do what is due; call at `next_wakeup` or at any other time."""
         self._advance(now)
         return self._take_events()

@@ -68,7 +68,7 @@ class ModemRebooted:
 
 
 @dataclass(frozen=True, slots=True)
-class SettingRefused:
+class SettingUnconfirmed:
     """A setting the driver can do without was not confirmed; the driver goes on."""
 
     command: str
@@ -89,7 +89,7 @@ class ModemError:
 
 
 @dataclass(frozen=True, slots=True)
-class ModemText:
+class ModemMessageReceived:
     """A `CAMSG` that is no news of a frame."""
 
     message: ModemMessage
@@ -103,7 +103,7 @@ class SentenceRejected:
 
 
 @dataclass(frozen=True, slots=True)
-class OtherSentence:
+class UnhandledSentence:
     """A valid sentence that the driver has no use for (a setting nobody asked for, ranging, debugging)."""
 
     sentence: Sentence
@@ -181,7 +181,7 @@ class FrameReceived:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameOverheard:
+class FrameDecoded:
     """A good frame has arrived, of a packet that may not be over: what must not be lost is kept now.
 
     The same frame comes again as `FrameReceived`, with its packet.
@@ -257,7 +257,7 @@ class RequestFailed:
 
 
 @dataclass(frozen=True, slots=True)
-class PingOverheard:
+class PingReceived:
     """Somebody pings `dest`; its modem answers by itself."""
 
     src: int
@@ -304,7 +304,7 @@ class FlexibleDataReceived:
 
 
 @dataclass(frozen=True, slots=True)
-class Polled:
+class PollReceived:
     """Another modem asks this one for a packet; what it was given is told by `PacketSent` or `PacketFailed`.
 
     Attributes:
@@ -322,29 +322,29 @@ class Polled:
     ack: bool
 
 
-Event = (
+ModemEvent = (
     ModemReady
     | ModemUnresponsive
     | ModemRebooted
-    | SettingRefused
+    | SettingUnconfirmed
     | ClockConfirmed
     | ModemError
-    | ModemText
+    | ModemMessageReceived
     | SentenceRejected
-    | OtherSentence
+    | UnhandledSentence
     | PacketSent
     | PacketFailed
     | FrameReceived
-    | FrameOverheard
+    | FrameDecoded
     | PacketReceived
     | FrameAcknowledged
     | StatisticsReceived
     | RequestDone
     | RequestFailed
-    | PingOverheard
+    | PingReceived
     | PingAnswered
     | MiniPacketReceived
     | MiniPacketAnswered
     | FlexibleDataReceived
-    | Polled
+    | PollReceived
 )

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import Event, FrameOverheard, ModemText, SentenceRejected, StatisticsReceived
+from sonarpost.modem.micromodem.events import (
+    FrameDecoded,
+    ModemEvent,
+    ModemMessageReceived,
+    SentenceRejected,
+    StatisticsReceived,
+)
 from sonarpost.modem.micromodem.nmea import Sentence
 from sonarpost.modem.micromodem.receive import PacketReception
 from sonarpost.modem.micromodem.sentences import Cycle, ModemMessage, ReceivedData
@@ -26,7 +32,7 @@ class ReceptionTracker:
         """When the present reception is closed without its statistics."""
         return None if self.reception is None else self.reception.deadline_s
 
-    def on_start(self, now: float) -> list[Event]:
+    def on_start(self, now: float) -> list[ModemEvent]:
         """Something begins to arrive; what came before it is over."""
         if self.reception is not None and self.reception.waits_for_data:
             self.reception.on_start(now)
@@ -35,37 +41,37 @@ class ReceptionTracker:
         self.reception = PacketReception(self._config, now)
         return events
 
-    def on_cycle(self, cycle: Cycle, now: float) -> list[Event]:
+    def on_cycle(self, cycle: Cycle, now: float) -> list[ModemEvent]:
         """A far modem announces a packet."""
-        events: list[Event] = []
+        events: list[ModemEvent] = []
         if self.reception is not None and self.reception.announced:
             events = self.flush()
         self._open(now).on_cycle(cycle, now)
         return events
 
-    def on_frame(self, data: ReceivedData, now: float) -> list[Event]:
+    def on_frame(self, data: ReceivedData, now: float) -> list[ModemEvent]:
         """A good frame, even where the sentences that should come before it were lost."""
-        events: list[Event] = []
+        events: list[ModemEvent] = []
         if self.reception is not None and not self.reception.belongs(data):
             events = self.flush()
         frame = self._open(now).on_frame(data, now)
-        return [*events, FrameOverheard(frame)]
+        return [*events, FrameDecoded(frame)]
 
-    def on_message(self, message: ModemMessage, now: float) -> list[Event]:
+    def on_message(self, message: ModemMessage, now: float) -> list[ModemEvent]:
         """A damaged frame, the end of waiting, or something else the modem says."""
         if message.text == "BAD_CRC":
             self._open(now).on_bad_frame(now)
             return []
         if message.text == "PACKET_TIMEOUT" and self.reception is not None:
             self.reception.on_timeout(now)
-        return [ModemText(message)]
+        return [ModemMessageReceived(message)]
 
     def on_acknowledgement(self, now: float) -> None:
         """The packet that arrives carries acknowledgements."""
         if self.reception is not None:
             self.reception.on_acknowledgement(now)
 
-    def on_statistics(self, sentence: Sentence, now: float) -> list[Event]:
+    def on_statistics(self, sentence: Sentence, now: float) -> list[ModemEvent]:
         """The statistics, which end a packet even where nobody can read them."""
         try:
             statistics = LinkStatistics.parse(sentence)
@@ -81,13 +87,13 @@ class ReceptionTracker:
             return [StatisticsReceived(statistics)]
         return self._close(statistics, over=True)
 
-    def poll(self, now: float) -> list[Event]:
+    def poll(self, now: float) -> list[ModemEvent]:
         """Close a reception whose end was lost."""
         if self.reception is None or now < self.reception.deadline_s:
             return []
         return self.flush()
 
-    def flush(self) -> list[Event]:
+    def flush(self) -> list[ModemEvent]:
         """Hand over what has arrived of an unfinished packet."""
         return self._close(None, over=False)
 
@@ -96,7 +102,7 @@ class ReceptionTracker:
             self.reception = PacketReception(self._config, now)
         return self.reception
 
-    def _close(self, statistics: LinkStatistics | None, *, over: bool) -> list[Event]:
+    def _close(self, statistics: LinkStatistics | None, *, over: bool) -> list[ModemEvent]:
         reception, self.reception = self.reception, None
         if reception is None or (statistics is None and not reception.announced):
             return []

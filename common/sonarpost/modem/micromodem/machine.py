@@ -12,14 +12,14 @@ from typing import ClassVar
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.events import (
-    Event,
     FailureReason,
     FrameAcknowledged,
     ModemError,
-    OtherSentence,
+    ModemEvent,
     PacketFailed,
-    Polled,
+    PollReceived,
     SentenceRejected,
+    UnhandledSentence,
 )
 from sonarpost.modem.micromodem.listener import ReceptionTracker
 from sonarpost.modem.micromodem.nmea import LineAssembler, Sentence
@@ -54,10 +54,10 @@ class DriverStateMachine:
         self._requester = RequestTracker(config, self._send)
         self._cycle: TransmitCycle | None = None
         self._queue: deque[OutgoingPacket | ModemRequest] = deque()
-        self._uplink: Callable[[Polled], Sequence[bytes]] | None = None
+        self._uplink: Callable[[PollReceived], Sequence[bytes]] | None = None
         self._next_id = 1
         self._out = bytearray()
-        self._events: list[Event] = []
+        self._events: list[ModemEvent] = []
         self._events_since_s = 0.0
         # Until when a transmission that is not this driver's keeps the modem busy.
         self._foreign_until_s: float | None = None
@@ -131,7 +131,7 @@ class DriverStateMachine:
             self._queue.append(item)
         self._advance(now)
 
-    def _hear(self, events: list[Event]) -> None:
+    def _hear(self, events: list[ModemEvent]) -> None:
         self._events += events
         self._requester.heard(events)
 
@@ -147,7 +147,7 @@ class DriverStateMachine:
     def _send(self, sentence: Sentence) -> None:
         self._out += sentence.encode()
 
-    def _take_events(self) -> list[Event]:
+    def _take_events(self) -> list[ModemEvent]:
         events, self._events = self._events, []
         return events
 
@@ -161,7 +161,7 @@ class DriverStateMachine:
             self._events.append(SentenceRejected(error))
 
     def _on_other(self, sentence: Sentence, now: float) -> None:
-        self._events.append(OtherSentence(sentence))
+        self._events.append(UnhandledSentence(sentence))
 
     def _on_revision(self, sentence: Sentence, now: float) -> None:
         revision = Revision.parse(sentence)
@@ -187,14 +187,14 @@ class DriverStateMachine:
         elif cycle.src != self.config.address:
             self._hear(self._listener.on_cycle(cycle, now))
         elif not self._start_polled(cycle, now):
-            self._events.append(OtherSentence(sentence))
+            self._events.append(UnhandledSentence(sentence))
 
     def _start_polled(self, cycle: Cycle, now: float) -> bool:
         """Give another modem, or one's own after all, the packet it asks for; tell whether there is one."""
         if self._uplink is None or self._cycle is not None or cycle.rate not in RATES or cycle.nframes < 1:
             return False
         rate = RATES[cycle.rate]
-        polled = Polled(cycle.dest, cycle.rate, min(cycle.nframes, rate.frames), rate.frame_bytes, cycle.ack)
+        polled = PollReceived(cycle.dest, cycle.rate, min(cycle.nframes, rate.frames), rate.frame_bytes, cycle.ack)
         self._events.append(polled)
         frames = tuple(bytes(frame) for frame in self._uplink(polled))
         if not frames:
@@ -239,7 +239,7 @@ class DriverStateMachine:
         elif self._requester.exchange is not None:
             self._requester.exchange.on_transmit_statistics(now)
         else:
-            self._events.append(OtherSentence(sentence))
+            self._events.append(UnhandledSentence(sentence))
 
     def _on_reception_started(self, sentence: Sentence, now: float) -> None:
         ReceptionStarted.parse(sentence)

@@ -7,14 +7,14 @@ from typing import ClassVar
 
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.events import (
-    Event,
     FailureReason,
     FlexibleDataReceived,
     MiniPacketAnswered,
     MiniPacketReceived,
+    ModemEvent,
     PacketReceived,
     PingAnswered,
-    PingOverheard,
+    PingReceived,
     RequestFailed,
 )
 from sonarpost.modem.micromodem.nmea import Sentence
@@ -50,7 +50,7 @@ class RequestTracker:
         """Begin a request; there is none under way."""
         self.exchange = RequestExchange(request, self._config, self._send, now)
 
-    def receive(self, sentence: Sentence, now: float) -> list[Event]:
+    def receive(self, sentence: Sentence, now: float) -> list[ModemEvent]:
         """Take a sentence of the kinds in `KINDS`.
 
         Raises:
@@ -61,14 +61,14 @@ class RequestTracker:
         tell = self.KINDS[sentence.kind]
         return [] if tell is None else tell(self, sentence, now)
 
-    def heard(self, events: Iterable[Event]) -> None:
+    def heard(self, events: Iterable[ModemEvent]) -> None:
         """See what the listener says: the packet of a polled modem ends the poll."""
         if self.exchange is not None:
             for event in events:
                 if isinstance(event, PacketReceived):
                     self.exchange.on_answer(RequestKind.POLL, event.src)
 
-    def poll(self, now: float) -> list[Event]:
+    def poll(self, now: float) -> list[ModemEvent]:
         """Do what is due; return the end of the request, once."""
         if self.exchange is None:
             return []
@@ -79,35 +79,35 @@ class RequestTracker:
         self.exchange = None
         return [result]
 
-    def abort(self, reason: FailureReason) -> list[Event]:
+    def abort(self, reason: FailureReason) -> list[ModemEvent]:
         """End the request from outside."""
         exchange, self.exchange = self.exchange, None
         return [] if exchange is None else [exchange.abort(reason)]
 
-    def _on_ping(self, sentence: Sentence, _now: float) -> list[Event]:
+    def _on_ping(self, sentence: Sentence, _now: float) -> list[ModemEvent]:
         ping = PingCommand.parse(sentence)
-        return [PingOverheard(ping.src, ping.dest)]
+        return [PingReceived(ping.src, ping.dest)]
 
-    def _on_ping_reply(self, sentence: Sentence, _now: float) -> list[Event]:
+    def _on_ping_reply(self, sentence: Sentence, _now: float) -> list[ModemEvent]:
         reply = PingReply.parse(sentence)
         if self.exchange is not None:
             self.exchange.on_answer(RequestKind.PING, reply.src)
         return [PingAnswered(reply.src, reply.dest, reply.travel_s)]
 
-    def _on_mini(self, sentence: Sentence, _now: float) -> list[Event]:
+    def _on_mini(self, sentence: Sentence, _now: float) -> list[ModemEvent]:
         mini = MiniPacket.parse(sentence)
         return [MiniPacketReceived(mini.src, mini.dest, mini.bits)]
 
-    def _on_mini_reply(self, sentence: Sentence, _now: float) -> list[Event]:
+    def _on_mini_reply(self, sentence: Sentence, _now: float) -> list[ModemEvent]:
         reply = MiniReply.parse(sentence)
         if self.exchange is not None:
             self.exchange.on_answer(RequestKind.MINI_PACKET, reply.src)
         return [MiniPacketAnswered(reply.src, reply.dest)]
 
-    def _on_flexible(self, sentence: Sentence, now: float) -> list[Event]:
+    def _on_flexible(self, sentence: Sentence, now: float) -> list[ModemEvent]:
         return [FlexibleDataReceived(ReceivedFlexibleData.parse(sentence), now)]
 
-    KINDS: ClassVar[Mapping[str, Callable[[RequestTracker, Sentence, float], list[Event]] | None]] = {
+    KINDS: ClassVar[Mapping[str, Callable[[RequestTracker, Sentence, float], list[ModemEvent]] | None]] = {
         "CAMPC": None,
         "CAMPA": _on_ping,
         "CAMPR": _on_ping_reply,
@@ -119,6 +119,6 @@ class RequestTracker:
     }
 
 
-def is_modems_fault(event: Event) -> bool:
+def is_modems_fault(event: ModemEvent) -> bool:
     """Tell whether a request failed for a reason that lies with the own modem and not with the water."""
     return isinstance(event, RequestFailed) and event.reason is FailureReason.NO_ECHO

@@ -17,12 +17,12 @@ from sonarpost.modem.micromodem.dialogue import (
 )
 from sonarpost.modem.micromodem.events import (
     ClockConfirmed,
-    Event,
+    ModemEvent,
     ModemReady,
     ModemRebooted,
     ModemUnresponsive,
-    OtherSentence,
-    SettingRefused,
+    SettingUnconfirmed,
+    UnhandledSentence,
 )
 from sonarpost.modem.micromodem.nmea import Sentence
 from sonarpost.modem.micromodem.settings import ClockSetting, ConfigurationSetting, Revision
@@ -94,7 +94,7 @@ class ModemSupervisor:
         """Send the time."""
         self.check(now, clock_command(utc, self.generation))
 
-    def on_revision(self, revision: Revision, now: float) -> list[Event]:
+    def on_revision(self, revision: Revision, now: float) -> list[ModemEvent]:
         """The modem tells its firmware, and perhaps that it has restarted."""
         self.firmware = revision.version or self.firmware
         if not revision.rebooted:
@@ -102,7 +102,7 @@ class ModemSupervisor:
         self._configure(now + self._config.init_pause_s)
         return [ModemRebooted(revision.version)]
 
-    def on_setting(self, sentence: Sentence, now: float) -> list[Event]:
+    def on_setting(self, sentence: Sentence, now: float) -> list[ModemEvent]:
         """A setting: the answer to a command, a line of a dump, or somebody else's doing.
 
         Raises:
@@ -115,9 +115,9 @@ class ModemSupervisor:
             # Another program has set it, or a restart went unnoticed.
             self._configure(now)
             return []
-        return [OtherSentence(sentence)]
+        return [UnhandledSentence(sentence)]
 
-    def on_clock(self, sentence: Sentence, now: float) -> list[Event]:
+    def on_clock(self, sentence: Sentence, now: float) -> list[ModemEvent]:
         """The modem echoes the time it was given.
 
         Raises:
@@ -127,9 +127,9 @@ class ModemSupervisor:
         utc = ClockSetting.parse(sentence).utc if is_old else TimeSetting.parse(sentence).utc
         if self._dialogue.receive(sentence, now):
             return [ClockConfirmed(utc)]
-        return [OtherSentence(sentence)]
+        return [UnhandledSentence(sentence)]
 
-    def poll(self, now: float, *, may_check: bool) -> list[Event]:
+    def poll(self, now: float, *, may_check: bool) -> list[ModemEvent]:
         """Do what is due.
 
         Args:
@@ -143,14 +143,14 @@ class ModemSupervisor:
                 self.check(now)
             return []
         self._dialogue.poll(now)
-        events: list[Event] = [SettingRefused(command.text) for command in self._dialogue.take_refused()]
+        events: list[ModemEvent] = [SettingUnconfirmed(command.text) for command in self._dialogue.take_refused()]
         if self._dialogue.progress is CommandProgress.DONE:
             return events + self._done(now)
         if self._dialogue.progress is CommandProgress.FAILED:
             return events + self._failed(now)
         return events
 
-    def _done(self, now: float) -> list[Event]:
+    def _done(self, now: float) -> list[ModemEvent]:
         self._dialogue.stop()
         was_configuring, self.phase = self.phase is Phase.CONFIGURING, Phase.READY
         self._alive_s = now
@@ -160,8 +160,8 @@ class ModemSupervisor:
         self._unresponsive = False
         return [ModemReady(self._config.address, self.firmware)]
 
-    def _failed(self, now: float) -> list[Event]:
-        events: list[Event] = []
+    def _failed(self, now: float) -> list[ModemEvent]:
+        events: list[ModemEvent] = []
         self._attempts += self._config.tries
         if not self._unresponsive:
             self._unresponsive = True

@@ -27,7 +27,7 @@ _TABLE_OF_RATE: Mapping[int, int] = MappingProxyType({0: 1, 1: 1, 2: 1, 3: 3, 4:
 
 
 @dataclass(frozen=True, slots=True)
-class Position:
+class LocalPosition:
     """Where a modem is, in metres: east, north, depth (down)."""
 
     east_m: float = 0.0
@@ -38,7 +38,7 @@ class Position:
         if not all(math.isfinite(value) for value in (self.east_m, self.north_m, self.depth_m)):
             raise ValueError(f"position: got {self!r}, expected finite metres")
 
-    def range_m(self, other: Position) -> float:
+    def range_m(self, other: LocalPosition) -> float:
         """Return the straight distance to `other` in metres."""
         return math.dist((self.east_m, self.north_m, self.depth_m), (other.east_m, other.north_m, other.depth_m))
 

@@ -20,7 +20,7 @@ class PacketKind(Enum):
     NAVIGATION = "navigation"
 
 
-class Fate(Enum):
+class FrameOutcome(Enum):
     """What became of one frame at one receiver."""
 
     DELIVERED = "delivered"
@@ -29,7 +29,7 @@ class Fate(Enum):
     EMPTY = "empty"
 
 
-class FrameFate(Enum):
+class PacketOutcome(Enum):
     """What became of a packet as a whole at one receiver."""
 
     ARRIVED = "arrived"
@@ -87,7 +87,7 @@ class FrameArrival:
     """One frame at one receiver: `sent` left the transmitter, `received` is what the receiver takes for it."""
 
     number: int
-    fate: Fate
+    fate: FrameOutcome
     sent: bytes
     received: bytes
 
@@ -120,7 +120,7 @@ class ArrivalEnded:
     receiver: int
     at_s: float
     transmission: Transmission
-    outcome: FrameFate
+    outcome: PacketOutcome
     detected: bool
     frames: tuple[FrameArrival, ...]
     range_m: float

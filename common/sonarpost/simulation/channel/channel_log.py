@@ -28,8 +28,8 @@ from pathlib import Path
 from typing import IO
 
 from sonarpost.errors import PortError
-from sonarpost.simulation.channel.channel_events import Fate, FrameArrival
-from sonarpost.simulation.modem.config import Report
+from sonarpost.simulation.channel.channel_events import FrameArrival, FrameOutcome
+from sonarpost.simulation.modem.config import PacketReport
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ class Totals:
     frames: Mapping[str, int]
 
 
-class ChannelLog:
+class PacketLog:
     """Writes the log and keeps the totals.
 
     Args:
@@ -72,7 +72,7 @@ class ChannelLog:
             except OSError as error:
                 raise PortError(f"{path}: the log cannot be written: {error}") from error
         self.transmitted = 0
-        self.frames: Counter[str] = Counter({fate.value: 0 for fate in Fate})
+        self.frames: Counter[str] = Counter({fate.value: 0 for fate in FrameOutcome})
         self.heard = 0
         self.not_heard: Counter[str] = Counter()
 
@@ -105,7 +105,7 @@ class ChannelLog:
         except OSError as error:
             raise PortError(f"the log cannot be shown: {error}") from error
 
-    def packet(self, report: Report, not_heard_because: str | None, real_time_utc_s: float) -> None:
+    def packet(self, report: PacketReport, not_heard_because: str | None, real_time_utc_s: float) -> None:
         """Write what became of a packet at a receiver, and count it."""
         arrival = report.arrival
         for frame in arrival.frames:
@@ -128,7 +128,7 @@ class ChannelLog:
                 self._file.close()
 
 
-def packet_fields(report: Report, not_heard_because: str | None) -> dict[str, object]:
+def packet_fields(report: PacketReport, not_heard_because: str | None) -> dict[str, object]:
     """Return the fields of a `packet` line, without event and times."""
     arrival = report.arrival
     sent = arrival.transmission
@@ -155,7 +155,7 @@ def packet_fields(report: Report, not_heard_because: str | None) -> dict[str, ob
 def _frames(frames: Sequence[FrameArrival]) -> list[dict[str, object]]:
     shown: list[dict[str, object]] = []
     for frame in frames:
-        data = frame.sent if frame.fate is Fate.LOST else frame.received
+        data = frame.sent if frame.fate is FrameOutcome.LOST else frame.received
         entry: dict[str, object] = {
             "number": frame.number,
             "bytes": len(data),
@@ -163,7 +163,7 @@ def _frames(frames: Sequence[FrameArrival]) -> list[dict[str, object]]:
             "sha256": hashlib.sha256(data).hexdigest(),
             "hex": data.hex(),
         }
-        if frame.fate is Fate.DAMAGED:
+        if frame.fate is FrameOutcome.DAMAGED:
             entry["sent_hex"] = frame.sent.hex()
         shown.append(entry)
     return shown

@@ -35,7 +35,7 @@ PRESETS: Mapping[str, Mapping[str, Value]] = MappingProxyType(
 _KINDS = MappingProxyType({field.name: str(field.type) for field in fields(ChannelParameters)})
 
 
-def read_channel(path: Path) -> dict[str, Value]:
+def read_parameters(path: Path) -> dict[str, Value]:
     """Read a TOML file of the water's parameters, `preset` among them if it likes.
 
     Raises:
@@ -48,7 +48,7 @@ def read_channel(path: Path) -> dict[str, Value]:
     return {name: _checked(str(path), name, value) for name, value in table.items()}
 
 
-def make_channel(values: Mapping[str, Value], where: str) -> ChannelParameters:
+def build_parameters(values: Mapping[str, Value], where: str) -> ChannelParameters:
     """Return the water of a preset, where `values` names one, and the other values over it.
 
     Raises:

@@ -12,31 +12,31 @@ from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
 
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_events import ArrivalStarted, Transmission
 from sonarpost.simulation.channel.propagation import ChannelModel
-from sonarpost.simulation.modem.config import ModemConfig, Output, Report
-from sonarpost.simulation.modem.emulator import EmulatedMicromodem
+from sonarpost.simulation.modem.config import EmulatedModemConfig, HostOutput, PacketReport
+from sonarpost.simulation.modem.emulator import EmulatedMicroModem
 from sonarpost.simulation.modem.serial_timing import SerialLineTiming
 
 
 @dataclass(frozen=True, slots=True)
-class ModemPlace:
+class PlacedModem:
     """One modem and where it is."""
 
-    config: ModemConfig
-    position: Position = field(default_factory=Position)
+    config: EmulatedModemConfig
+    position: LocalPosition = field(default_factory=LocalPosition)
 
 
 @dataclass(slots=True)
 class _Port:
     """A modem with the two directions of its serial line."""
 
-    modem: EmulatedMicromodem
+    modem: EmulatedMicroModem
     to_modem: SerialLineTiming[bytes]
-    to_host: SerialLineTiming[Output]
-    passed: list[Output] = field(default_factory=list)
+    to_host: SerialLineTiming[HostOutput]
+    passed: list[HostOutput] = field(default_factory=list)
 
 
 class ChannelSimulator:
@@ -52,15 +52,15 @@ class ChannelSimulator:
     def __init__(
         self,
         water: ChannelParameters,
-        modems: Mapping[int, ModemPlace],
+        modems: Mapping[int, PlacedModem],
         serial_baud: float | None = None,
-        transponders: Mapping[str, Position] = MappingProxyType({}),
+        transponders: Mapping[str, LocalPosition] = MappingProxyType({}),
     ) -> None:
         self.now = 0.0
         self.water = ChannelModel(water, {number: place.position for number, place in modems.items()})
         self._ports = {
             number: _Port(
-                EmulatedMicromodem(place.config, travel_times=partial(self.water.travel_times_s, number, transponders)),
+                EmulatedMicroModem(place.config, travel_times=partial(self.water.travel_times_s, number, transponders)),
                 SerialLineTiming(serial_baud),
                 SerialLineTiming(serial_baud),
             )
@@ -69,7 +69,7 @@ class ChannelSimulator:
         # What the modems say when they are switched on belongs to this moment, not to the first event.
         self._step(self.now)
 
-    def modem(self, number: int) -> EmulatedMicromodem:
+    def modem(self, number: int) -> EmulatedMicroModem:
         """Return one modem.
 
         Raises:
@@ -95,33 +95,33 @@ class ChannelSimulator:
         water_s = self.water.next_event_s()
         return min(times_s if water_s is None else [*times_s, water_s])
 
-    def advance(self, now: float) -> list[Transmission | Report]:
+    def advance(self, now: float) -> list[Transmission | PacketReport]:
         """Let everything happen up to `now`.
 
         Returns:
             Every packet put into the water, and of the packets that passed a modem the reports that its host is
             not told; the others come with `take_outputs`, when their bytes do.
         """
-        happened: list[Transmission | Report] = []
+        happened: list[Transmission | PacketReport] = []
         while (due_s := self.next_deadline_s()) <= now:
             happened += self._step(max(due_s, self.now))
         self.now = max(self.now, now)
         return happened
 
-    def take_outputs(self, number: int) -> list[Output]:
+    def take_outputs(self, number: int) -> list[HostOutput]:
         """Return, once, what has come out of a modem's serial line by the last `advance`."""
         port = self._ports[number]
         passed, port.passed = port.passed, []
         return passed
 
-    def abandon_outputs(self, number: int) -> list[Output]:
+    def abandon_outputs(self, number: int) -> list[HostOutput]:
         """Return what has not come out of a modem's serial line, and drop it."""
         return self.take_outputs(number) + self._ports[number].to_host.abandon()
 
-    def _step(self, now: float) -> list[Transmission | Report]:
+    def _step(self, now: float) -> list[Transmission | PacketReport]:
         """Let happen what happens at `now`, which no event lies before."""
         self.now = now
-        happened: list[Transmission | Report] = []
+        happened: list[Transmission | PacketReport] = []
         for event in self.water.poll(now):
             modem = self._ports[event.receiver].modem
             if isinstance(event, ArrivalStarted):

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, Fate, PacketKind
-from sonarpost.simulation.channel.channel_presets import PRESETS, make_channel, read_channel
+from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, FrameOutcome, PacketKind
+from sonarpost.simulation.channel.channel_presets import PRESETS, build_parameters, read_parameters
 from sonarpost.simulation.channel.propagation import ChannelModel
 
 RANGES_M = (2, 30, 60, 90, 110, 120, 130, 140, 160, 200, 250, 300)
@@ -33,7 +33,7 @@ class Delivery:
 
 def deliver(config: ChannelParameters, rate: int, range_m: float, packets: int) -> Delivery:
     """Send full packets of a rate over a range, a few seconds apart, and count what arrives."""
-    water = ChannelModel(config, {1: Position(), 2: Position(east_m=range_m)})
+    water = ChannelModel(config, {1: LocalPosition(), 2: LocalPosition(east_m=range_m)})
     shape = RATES[rate]
     frames = tuple(bytes([number]) * shape.frame_bytes for number in range(1, shape.frames + 1))
     whole = good = 0
@@ -41,7 +41,7 @@ def deliver(config: ChannelParameters, rate: int, range_m: float, packets: int) 
         water.transmit(1, AcousticPacket(PacketKind.DATA, 1, 2, rate, shape.airtime_s, frames), number * GAP_S)
         for event in water.poll((number + 1) * GAP_S):
             if isinstance(event, ArrivalEnded):
-                arrived = sum(frame.fate in {Fate.DELIVERED, Fate.DAMAGED} for frame in event.frames)
+                arrived = sum(frame.fate in {FrameOutcome.DELIVERED, FrameOutcome.DAMAGED} for frame in event.frames)
                 good += arrived
                 whole += arrived == shape.frames
     return Delivery(range_m, water.snr_db(range_m), whole / packets, good / packets / shape.frames)
@@ -67,8 +67,8 @@ def main() -> None:
     parser.add_argument("--water", type=Path, metavar="FILE", help="TOML file of parameters, over the preset")
     parser.add_argument("--packets", type=int, default=500, help="packets for each cell (500)")
     parsed = parser.parse_args()
-    values = {"preset": parsed.preset} | (read_channel(parsed.water) if parsed.water else {})
-    print(table(make_channel(values, str(parsed.water or "command line")), parsed.packets))
+    values = {"preset": parsed.preset} | (read_parameters(parsed.water) if parsed.water else {})
+    print(table(build_parameters(values, str(parsed.water or "command line")), parsed.packets))
 
 
 if __name__ == "__main__":

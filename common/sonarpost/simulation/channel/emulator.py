@@ -18,11 +18,11 @@ from enum import Enum
 from typing import IO
 
 from sonarpost.errors import PortError
-from sonarpost.simulation.channel.acoustics import Position
-from sonarpost.simulation.channel.channel_log import ChannelLog, Totals
-from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
-from sonarpost.simulation.channel.emulator_config import ChannelConfig, Device
-from sonarpost.simulation.modem.config import Output, Report
+from sonarpost.simulation.channel.acoustics import LocalPosition
+from sonarpost.simulation.channel.channel_log import PacketLog, Totals
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem
+from sonarpost.simulation.channel.emulator_config import Device, EmulatorConfig
+from sonarpost.simulation.modem.config import HostOutput, PacketReport
 from sonarpost.simulation.modem.host_ports import HostPort, PtyPort, TcpPort
 from sonarpost.simulation.time_scale import TimeScale
 
@@ -41,7 +41,7 @@ class _Line:
 
     port: HostPort
     was_connected: bool = False
-    waiting: deque[Output] = field(default_factory=deque)
+    waiting: deque[HostOutput] = field(default_factory=deque)
     waiting_bytes: int = 0
     written_of_first: int = 0
 
@@ -61,14 +61,14 @@ class ChannelEmulator:
         echo: A second place for every line of the log.
     """
 
-    def __init__(self, config: ChannelConfig, echo: IO[str] | None = None) -> None:
+    def __init__(self, config: EmulatorConfig, echo: IO[str] | None = None) -> None:
         self.config = config
         self._echo = echo
         self._lock = threading.Lock()
         self._state = _State.NEW
         self._stopping = threading.Event()
         self._lines: dict[int, _Line] = {}
-        self._log = ChannelLog(None)
+        self._log = PacketLog(None)
         self._thread: threading.Thread
         self._world: ChannelSimulator
         self._clock: TimeScale
@@ -87,7 +87,7 @@ class ChannelEmulator:
             raise RuntimeError("an ChannelEmulator is opened once")
         self._state = _State.OPEN
         try:
-            self._log = ChannelLog(self.config.log_path, self._echo)
+            self._log = PacketLog(self.config.log_path, self._echo)
             for number in range(1, len(self.config.sites) + 1):
                 self._lines[number] = _Line(self._open_port(number))
         except PortError:
@@ -138,7 +138,7 @@ class ChannelEmulator:
         with self._lock:
             return sum(line.port.connected for line in self._lines.values())
 
-    def move(self, modem: int, position: Position) -> None:
+    def move(self, modem: int, position: LocalPosition) -> None:
         """Put a modem elsewhere.
 
         Raises:
@@ -159,7 +159,7 @@ class ChannelEmulator:
         timeout_s = math.ceil(max(2.0, 2.0 * self.config.time_scale))
         template = replace(self.config.modem, utc_at_zero_s=time.time(), data_timeout_s=timeout_s)
         places = {
-            number: ModemPlace(replace(template, address=site.address), site.position)
+            number: PlacedModem(replace(template, address=site.address), site.position)
             for number, site in enumerate(self.config.sites, start=1)
         }
         return ChannelSimulator(self.config.water, places, self.config.serial_baud, self.config.transponders)
@@ -205,7 +205,7 @@ class ChannelEmulator:
             line.port.notice()
             self._note_client(number, line)
         for happened in self._world.advance(self._now_s()):
-            if isinstance(happened, Report):
+            if isinstance(happened, PacketReport):
                 self._log.packet(happened, happened.untold, time.time())
             else:
                 self._log.transmitted += 1
@@ -231,7 +231,7 @@ class ChannelEmulator:
             self._world.forget_host(number)
             self._drop(line, "client left")
 
-    def _put(self, line: _Line, output: Output) -> None:
+    def _put(self, line: _Line, output: HostOutput) -> None:
         if not line.port.connected:
             self._untold(output, "no client connected")
         elif line.waiting_bytes + len(output.data) > MOST_WAITING_BYTES:
@@ -259,7 +259,7 @@ class ChannelEmulator:
             self._untold(line.waiting.popleft(), reason)
         line.waiting_bytes = line.written_of_first = 0
 
-    def _untold(self, output: Output, reason: str) -> None:
+    def _untold(self, output: HostOutput, reason: str) -> None:
         if output.report is not None:
             self._log.packet(output.report, reason, time.time())
 

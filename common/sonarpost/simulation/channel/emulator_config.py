@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.modem.config import EmulatedModemConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,11 +18,11 @@ class ModemSite:
     """One modem: its address and where it is."""
 
     address: int
-    position: Position = field(default_factory=Position)
+    position: LocalPosition = field(default_factory=LocalPosition)
 
 
 @dataclass(frozen=True, slots=True)
-class ChannelConfig:
+class EmulatorConfig:
     """What an `AcousticChannel` is made of.
 
     Attributes:
@@ -44,14 +44,14 @@ class ChannelConfig:
 
     sites: tuple[ModemSite, ...]
     water: ChannelParameters = field(default_factory=ChannelParameters)
-    modem: ModemConfig = field(default_factory=lambda: ModemConfig(address=0))
+    modem: EmulatedModemConfig = field(default_factory=lambda: EmulatedModemConfig(address=0))
     pty_dir: Path | None = None
     tcp_ports: tuple[int, ...] = ()
     tcp_host: str = "127.0.0.1"
     time_scale: float = 1.0
     serial_baud: float | None = None
     log_path: Path | None = None
-    transponders: Mapping[str, Position] = field(default_factory=lambda: MappingProxyType({}))
+    transponders: Mapping[str, LocalPosition] = field(default_factory=lambda: MappingProxyType({}))
 
     def __post_init__(self) -> None:
         addresses = [site.address for site in self.sites]

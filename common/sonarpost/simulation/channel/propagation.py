@@ -23,15 +23,15 @@ import heapq
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from sonarpost.simulation.channel.acoustics import Position, frame_error_rate, transmission_loss_db
+from sonarpost.simulation.channel.acoustics import LocalPosition, frame_error_rate, transmission_loss_db
 from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_events import (
     AcousticPacket,
     ArrivalEnded,
     ArrivalStarted,
-    Fate,
     FrameArrival,
-    FrameFate,
+    FrameOutcome,
+    PacketOutcome,
     Transmission,
 )
 from sonarpost.simulation.channel.fading import Fading
@@ -60,7 +60,7 @@ class _PendingArrival:
 class _Place:
     """What the water remembers about one modem."""
 
-    position: Position
+    position: LocalPosition
     sent: int = 0
     transmissions: list[Transmission] = field(default_factory=list)
     arrivals: list[_PendingArrival] = field(default_factory=list)
@@ -74,7 +74,7 @@ class ChannelModel:
         positions: Where each modem is, by its number.
     """
 
-    def __init__(self, config: ChannelParameters, positions: Mapping[int, Position]) -> None:
+    def __init__(self, config: ChannelParameters, positions: Mapping[int, LocalPosition]) -> None:
         self.config = config
         self._places = {modem: _Place(position) for modem, position in positions.items()}
         # (time, 0 for an end and 1 for a start, order, arrival): ends come first, since touching is not overlapping
@@ -89,11 +89,11 @@ class ChannelModel:
         """How many arrivals are still to end."""
         return sum(not arrival.resolved for place in self._places.values() for arrival in place.arrivals)
 
-    def move(self, modem: int, position: Position) -> None:
+    def move(self, modem: int, position: LocalPosition) -> None:
         """Put a modem elsewhere; packets already on their way keep their travel time."""
         self._places[modem].position = position
 
-    def travel_times_s(self, modem: int, places: Mapping[str, Position]) -> dict[str, float]:
+    def travel_times_s(self, modem: int, places: Mapping[str, LocalPosition]) -> dict[str, float]:
         """Return how long sound takes, in seconds, from a modem to places that are no modems, by their names."""
         here = self._places[modem].position
         return {name: here.range_m(place) / self.config.sound_speed_m_per_s for name, place in places.items()}
@@ -134,7 +134,7 @@ class ChannelModel:
                 happened.append(self._resolve(arrival, at_s))
         return happened
 
-    def _send_towards(self, receiver: int, place: _Place, sent: Transmission, origin: Position) -> None:
+    def _send_towards(self, receiver: int, place: _Place, sent: Transmission, origin: LocalPosition) -> None:
         range_m = origin.range_m(place.position)
         start_s = sent.started_s + range_m / self.config.sound_speed_m_per_s
         dice = RandomDraws(self.config.seed, sent.transmitter, sent.number, receiver)
@@ -191,35 +191,35 @@ class ChannelModel:
             arrival.start_s - arrival.transmission.started_s,
         )
 
-    def _outcome(self, arrival: _PendingArrival) -> FrameFate:
+    def _outcome(self, arrival: _PendingArrival) -> PacketOutcome:
         place = self._places[arrival.receiver]
         if any(sent.started_s < arrival.end_s and arrival.start_s < sent.ended_s for sent in place.transmissions):
-            return FrameFate.TRANSMITTING
+            return PacketOutcome.TRANSMITTING
         if any(
             other is not arrival and other.start_s < arrival.end_s and arrival.start_s < other.end_s
             for other in place.arrivals
         ):
-            return FrameFate.COLLISION
-        return FrameFate.LOST if arrival.lost else FrameFate.ARRIVED
+            return PacketOutcome.COLLISION
+        return PacketOutcome.LOST if arrival.lost else PacketOutcome.ARRIVED
 
-    def _frames(self, arrival: _PendingArrival, outcome: FrameFate) -> tuple[FrameArrival, ...]:
+    def _frames(self, arrival: _PendingArrival, outcome: PacketOutcome) -> tuple[FrameArrival, ...]:
         sent = arrival.transmission
         dice = RandomDraws(self.config.seed, sent.transmitter, sent.number, arrival.receiver)
         frame_s = sent.packet.airtime_s / max(1, len(sent.packet.frames))
         last = max((n for n, data in enumerate(sent.packet.frames, start=1) if data), default=0)
         arrivals = []
         for number, data in enumerate(sent.packet.frames, start=1):
-            received, fate = data, Fate.DELIVERED
+            received, fate = data, FrameOutcome.DELIVERED
             middle_s = arrival.start_s + (number - 0.5) * frame_s
             loss = self._frame_loss(sent, arrival.receiver, arrival.snr_db, middle_s)
             if not data:
-                fate = Fate.EMPTY
-            elif outcome is not FrameFate.ARRIVED or dice.happens(loss, "lost frame", number):
-                received, fate = b"", Fate.LOST
+                fate = FrameOutcome.EMPTY
+            elif outcome is not PacketOutcome.ARRIVED or dice.happens(loss, "lost frame", number):
+                received, fate = b"", FrameOutcome.LOST
             elif number == last and dice.happens(self.config.tail_damage, "tail damage"):
                 kind, fraction = self.config.tail_damage_kind, self.config.tail_fraction
                 received = damage_tail(data, dice, number, kind, fraction)
-                fate = Fate.DELIVERED if received == data else Fate.DAMAGED
+                fate = FrameOutcome.DELIVERED if received == data else FrameOutcome.DAMAGED
             arrivals.append(FrameArrival(number, fate, data, received))
         return tuple(arrivals)
 

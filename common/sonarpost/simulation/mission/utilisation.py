@@ -22,13 +22,13 @@ from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, Transmit
 from sonarpost.link.receiver import LinkReceiver
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import Event, FrameOverheard, FrameReceived, PacketFailed, PacketSent
+from sonarpost.modem.micromodem.events import FrameDecoded, FrameReceived, ModemEvent, PacketFailed, PacketSent
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.simulation.channel.acoustics import Position
+from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_events import Transmission
-from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, ModemPlace
-from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem
+from sonarpost.simulation.modem.config import EmulatedModemConfig
 
 _VESSEL: Final = 1
 _VEHICLE: Final = 3
@@ -95,7 +95,10 @@ class BusyResult:
 
 class _Rig:
     def __init__(self, spec: BusySpec) -> None:
-        places = {n: ModemPlace(ModemConfig(n), Position(e)) for n, e in ((_VESSEL, 0.0), (_VEHICLE, spec.range_m))}
+        places = {
+            n: PlacedModem(EmulatedModemConfig(n), LocalPosition(e))
+            for n, e in ((_VESSEL, 0.0), (_VEHICLE, spec.range_m))
+        }
         water = ChannelParameters(frame_loss=spec.frame_loss)
         self.world = ChannelSimulator(water, places, spec.serial_baud or None)
         self.drivers = {n: MicroModem(MicroModemConfig(n)) for n in places}
@@ -114,9 +117,9 @@ class _Rig:
         times_s = [self.world.next_deadline_s(), *(d.next_wakeup() or stop_s for d in self.drivers.values())]
         self.now = min(stop_s, max(min(times_s), self.now + _STEP_S))
 
-    def step(self) -> list[tuple[int, Event]]:
+    def step(self) -> list[tuple[int, ModemEvent]]:
         """Let happen what happens now; return the drivers' events."""
-        events: list[tuple[int, Event]] = []
+        events: list[tuple[int, ModemEvent]] = []
         for number, driver in self.drivers.items():
             events += [(number, event) for event in driver.poll(self.now)]
             self.world.receive(number, driver.bytes_to_send(), self.now)
@@ -141,14 +144,14 @@ class _Vehicle:
         self._number = 0
         self.frames = self.reports = 0
 
-    def take(self, event: Event, now: float) -> None:
+    def take(self, event: ModemEvent, now: float) -> None:
         match event:
             case PacketSent():
                 self._medium.sent(event.started_s, now)
                 self._asked = False
             case PacketFailed():
                 self._asked = False
-            case FrameOverheard():
+            case FrameDecoded():
                 self._medium.heard(now)
             case FrameReceived():
                 for found in self._receiver.accept(event.src, event.data, now):
@@ -182,7 +185,7 @@ class _Vessel:
         self._under_way: DownlinkPacket | None = None
         self.reports = 0
 
-    def take(self, event: Event, now: float) -> None:
+    def take(self, event: ModemEvent, now: float) -> None:
         match event:
             case FrameReceived():
                 self._link.hear(event.src, event.data, now)

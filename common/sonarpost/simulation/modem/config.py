@@ -15,7 +15,7 @@ VERSIONS: Mapping[int, str] = MappingProxyType({1: "0.93.0.09", 2: "2.0.27087"})
 
 
 @dataclass(frozen=True, slots=True)
-class ModemConfig:
+class EmulatedModemConfig:
     """How one emulated modem is built.
 
     Attributes:
@@ -71,7 +71,7 @@ class ModemConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class PacketReport:
     """What the host learns of one packet that passed its modem.
 
     Attributes:
@@ -86,8 +86,8 @@ class Report:
 
 
 @dataclass(frozen=True, slots=True)
-class Output:
+class HostOutput:
     """Bytes for the host, and the report they complete, if any."""
 
     data: bytes
-    report: Report | None = None
+    report: PacketReport | None = None

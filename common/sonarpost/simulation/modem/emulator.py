@@ -31,17 +31,17 @@ from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem import nmea
 from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, ArrivalStarted
 from sonarpost.simulation.modem import commands
-from sonarpost.simulation.modem.config import VERSIONS, ModemConfig, Output, Report
-from sonarpost.simulation.modem.navigation import Navigator, TravelTimes
-from sonarpost.simulation.modem.reception import ReceptionReporter
-from sonarpost.simulation.modem.settings import ModemClock, Settings
+from sonarpost.simulation.modem.config import VERSIONS, EmulatedModemConfig, HostOutput, PacketReport
+from sonarpost.simulation.modem.navigation import TransponderRanging, TravelTimes
+from sonarpost.simulation.modem.reception import Receiver
+from sonarpost.simulation.modem.settings import ModemClock, ModemSettings
 from sonarpost.simulation.modem.transmitter import BusyError, Transmitter
 
 _ERROR_FRAMING, _ERROR_UNKNOWN, _ERROR_FIELD, _ERROR_BUSY = 1, 2, 3, 4
 _UNPRINTABLE = re.compile(r"[^ -~]|[$*,]")
 
 
-class EmulatedMicromodem:
+class EmulatedMicroModem:
     """One emulated modem.
 
     Args:
@@ -50,15 +50,15 @@ class EmulatedMicromodem:
         travel_times: One-way travel times to transponders; none by default.
     """
 
-    def __init__(self, config: ModemConfig, now: float = 0.0, travel_times: TravelTimes = dict) -> None:
+    def __init__(self, config: EmulatedModemConfig, now: float = 0.0, travel_times: TravelTimes = dict) -> None:
         self.config = config
-        self.settings = Settings(config.address, config.data_timeout_s)
+        self.settings = ModemSettings(config.address, config.data_timeout_s)
         self.clock = ModemClock(config.utc_at_zero_s)
-        self._listener = ReceptionReporter(config, self.settings, self.clock)
+        self._listener = Receiver(config, self.settings, self.clock)
         self._transmitter = Transmitter(config, self.settings, self.clock, self._write, self._listener.expect)
-        self._navigator = Navigator(self.settings, self.clock, self._transmitter, travel_times, self._write)
+        self._navigator = TransponderRanging(self.settings, self.clock, self._transmitter, travel_times, self._write)
         self._lines = nmea.LineAssembler("host")
-        self._outputs: deque[Output] = deque()
+        self._outputs: deque[HostOutput] = deque()
         self._rebooted_at_s: float | None = None
         self._next_revision_s = now
         self._handlers = self._first_generation()
@@ -142,21 +142,21 @@ class EmulatedMicromodem:
             for line in self._listener.begin(arrival.transmission.packet):
                 self._write(line)
 
-    def packet_ended(self, arrival: ArrivalEnded) -> Report:
+    def packet_ended(self, arrival: ArrivalEnded) -> PacketReport:
         """The water says that a packet has passed; return what the host learns of it.
 
         When `untold` of the report is None, the report is also attached to the last of the lines that tell it.
         """
         if self.rebooting:
-            return Report(arrival, self.address, "rebooting")
+            return PacketReport(arrival, self.address, "rebooting")
         if self.busy:
             self._next_revision_s = max(self._next_revision_s, arrival.at_s + self.config.revision_period_s)
         hearing = self._listener.hear(arrival)
         untold = hearing.untold if hearing.lines else (hearing.untold or "statistics are off")
-        report = Report(arrival, self.address, untold)
+        report = PacketReport(arrival, self.address, untold)
         last = len(hearing.lines) - 1
         for index, line in enumerate(hearing.lines):
-            self._outputs.append(Output(line, report if index == last and untold is None else None))
+            self._outputs.append(HostOutput(line, report if index == last and untold is None else None))
         if not hearing.missed:
             self._transmitter.answer(arrival, hearing.good_frames)
         return report
@@ -165,7 +165,7 @@ class EmulatedMicromodem:
         """Return, once, the packets that go into the water now."""
         return self._transmitter.packets_to_transmit()
 
-    def take_outputs(self) -> list[Output]:
+    def take_outputs(self) -> list[HostOutput]:
         """Return, once, what is to be written to the host, with the reports it completes."""
         outputs = list(self._outputs)
         self._outputs.clear()
@@ -195,7 +195,7 @@ class EmulatedMicromodem:
             self._complain("NMEA", _ERROR_FIELD, f"{item.kind} bad {error.field}", now)
 
     def _write(self, line: bytes) -> None:
-        self._outputs.append(Output(line))
+        self._outputs.append(HostOutput(line))
 
     def _say(self, kind: str, *fields: str | int) -> None:
         self._write(nmea.format(kind, *fields))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from sonarpost.modem.micromodem import nmea
 from sonarpost.simulation.channel.channel_events import AcousticPacket, PacketKind
 from sonarpost.simulation.modem import commands
-from sonarpost.simulation.modem.settings import ModemClock, Settings
+from sonarpost.simulation.modem.settings import ModemClock, ModemSettings
 from sonarpost.simulation.modem.transmitter import BusyError, Transmitter
 
 PING_S = 0.01
@@ -31,7 +31,7 @@ class _Ranging:
     answers: Mapping[str, float]
 
 
-class Navigator:
+class TransponderRanging:
     """Pings transponders for one modem.
 
     Args:
@@ -44,7 +44,7 @@ class Navigator:
 
     def __init__(
         self,
-        settings: Settings,
+        settings: ModemSettings,
         clock: ModemClock,
         transmitter: Transmitter,
         travel_times: TravelTimes,

@@ -15,21 +15,21 @@ from sonarpost.modem.micromodem import nmea
 from sonarpost.simulation.channel.channel_events import (
     AcousticPacket,
     ArrivalEnded,
-    Fate,
     FrameArrival,
-    FrameFate,
+    FrameOutcome,
     PacketKind,
+    PacketOutcome,
 )
-from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.modem.config import EmulatedModemConfig
 from sonarpost.simulation.modem.sentences import PacketType, ReceivedPacket, ReceiveMode, receive_statistics
-from sonarpost.simulation.modem.settings import ModemClock, Settings
+from sonarpost.simulation.modem.settings import ModemClock, ModemSettings
 
-_GOOD = frozenset({Fate.DELIVERED, Fate.DAMAGED})
+_GOOD = frozenset({FrameOutcome.DELIVERED, FrameOutcome.DAMAGED})
 _NOT_MINE = "addressed to another modem"
 
 
 @dataclass(slots=True)
-class ReceptionReport:
+class HostReport:
     """What comes of a packet at one modem.
 
     Attributes:
@@ -62,7 +62,7 @@ def packet_type(packet: AcousticPacket) -> PacketType:
     return PacketType.FSK if packet.rate == 0 else PacketType.PSK
 
 
-class ReceptionReporter:
+class Receiver:
     """The listening half of one modem.
 
     Args:
@@ -71,7 +71,7 @@ class ReceptionReporter:
         clock: The modem's.
     """
 
-    def __init__(self, config: ModemConfig, settings: Settings, clock: ModemClock) -> None:
+    def __init__(self, config: EmulatedModemConfig, settings: ModemSettings, clock: ModemClock) -> None:
         self._config = config
         self._settings = settings
         self._clock = clock
@@ -116,18 +116,18 @@ class ReceptionReporter:
         psk = packet_type(packet) in {PacketType.PSK, PacketType.FLEXIBLE}
         return [nmea.format("CARXP", int(psk))]
 
-    def hear(self, arrival: ArrivalEnded) -> ReceptionReport:
+    def hear(self, arrival: ArrivalEnded) -> HostReport:
         """Return what the modem tells about a packet that has passed."""
         packet = arrival.transmission.packet
         if packet.kind is PacketKind.NAVIGATION:
-            return ReceptionReport(untold="no communication", missed=True)
+            return HostReport(untold="no communication", missed=True)
         if not arrival.detected:
-            return ReceptionReport(untold=arrival.outcome.value, missed=True)
+            return HostReport(untold=arrival.outcome.value, missed=True)
         if not self._arriving:
-            return ReceptionReport(untold="rebooting", missed=True)
+            return HostReport(untold="rebooting", missed=True)
         self._arriving = False
         expected, self._expected = self._expected, None
-        if arrival.outcome is not FrameFate.ARRIVED:
+        if arrival.outcome is not PacketOutcome.ARRIVED:
             return self._broken(arrival, arrival.outcome.value)
         if packet.kind is PacketKind.DATA:
             missed = packet.rate == 0 and not _announces(expected, packet)
@@ -141,30 +141,30 @@ class ReceptionReporter:
         addressed = destination == self._settings["SRC"] or destination in self._config.broadcast_addresses
         return self._config.promiscuous or addressed
 
-    def _broken(self, arrival: ArrivalEnded, untold: str) -> ReceptionReport:
+    def _broken(self, arrival: ArrivalEnded, untold: str) -> HostReport:
         lines = [nmea.format("CAMSG", "PACKET_TIMEOUT", arrival.transmission.packet.rate)]
         heard = self._heard(arrival)
         heard = replace(heard, mode=ReceiveMode.TIMEOUT, source=0, destination=0, frames=0, bad_frames=0)
-        return ReceptionReport(lines + self._statistics(heard), untold=untold)
+        return HostReport(lines + self._statistics(heard), untold=untold)
 
-    def _cycle(self, arrival: ArrivalEnded) -> ReceptionReport:
+    def _cycle(self, arrival: ArrivalEnded) -> HostReport:
         packet = arrival.transmission.packet
         if packet.source != self._settings["SRC"]:
             self.expect(packet, arrival.at_s)
         lines = [_cycle_line(packet, packet.announced_frames)]
-        return ReceptionReport(lines + self._statistics(replace(self._heard(arrival), frames=0, bad_frames=0)))
+        return HostReport(lines + self._statistics(replace(self._heard(arrival), frames=0, bad_frames=0)))
 
-    def _data(self, arrival: ArrivalEnded) -> ReceptionReport:
+    def _data(self, arrival: ArrivalEnded) -> HostReport:
         packet = arrival.transmission.packet
-        hearing = ReceptionReport()
+        hearing = HostReport()
         if packet.rate != 0:
             hearing.lines.append(_cycle_line(packet, len(packet.frames)))
         if not self._accepts(packet.destination):
             hearing.untold = _NOT_MINE
         for frame in arrival.frames:
-            if frame.fate is Fate.LOST:
+            if frame.fate is FrameOutcome.LOST:
                 hearing.lines.append(nmea.format("CAMSG", "BAD_CRC", frame.number))
-            elif frame.fate is not Fate.EMPTY and hearing.untold != _NOT_MINE:
+            elif frame.fate is not FrameOutcome.EMPTY and hearing.untold != _NOT_MINE:
                 line, switch = self._frame_line(packet, frame)
                 if self._settings.on(switch):
                     hearing.lines.append(line)
@@ -183,9 +183,9 @@ class ReceptionReporter:
             return nmea.format("CARXA", *head, *frame.received.decode("ascii").split(",")), "RXA"
         return nmea.format("CARXD", *head, frame.received.hex().upper()), "RXD"
 
-    def _flexible(self, arrival: ArrivalEnded) -> ReceptionReport:
+    def _flexible(self, arrival: ArrivalEnded) -> HostReport:
         packet = arrival.transmission.packet
-        hearing = ReceptionReport()
+        hearing = HostReport()
         if self._accepts(packet.destination):
             mini, *rest = [_group(frame) for frame in arrival.frames]
             ends = (packet.source, packet.destination, packet.rate, int(packet.ack_requested), 0)
@@ -195,10 +195,10 @@ class ReceptionReporter:
         hearing.lines += self._statistics(self._heard(arrival))
         return hearing
 
-    def _short(self, arrival: ArrivalEnded) -> ReceptionReport:
+    def _short(self, arrival: ArrivalEnded) -> HostReport:
         packet = arrival.transmission.packet
         ends = (packet.source, packet.destination)
-        hearing = ReceptionReport()
+        hearing = HostReport()
         if packet.kind is PacketKind.ACK:
             if self._accepts(packet.destination):
                 hearing.lines += [nmea.format("CAACK", *ends, number, 1) for number in packet.acked_frames]
@@ -213,8 +213,8 @@ class ReceptionReporter:
 
     def _heard(self, arrival: ArrivalEnded) -> ReceivedPacket:
         packet = arrival.transmission.packet
-        held = [frame for frame in arrival.frames if frame.fate is not Fate.EMPTY]
-        bad = sum(frame.fate is Fate.LOST for frame in held)
+        held = [frame for frame in arrival.frames if frame.fate is not FrameOutcome.EMPTY]
+        bad = sum(frame.fate is FrameOutcome.LOST for frame in held)
         arrived_s = arrival.transmission.started_s + arrival.delay_s
         return ReceivedPacket(
             mode=ReceiveMode.BAD_CRC if bad else ReceiveMode.GOOD,
@@ -269,5 +269,5 @@ def _announces(expected: _Expected | None, packet: AcousticPacket) -> bool:
 
 def _group(frame: FrameArrival) -> str:
     """Return `crc;nbytes;hex` of a frame of the flexible data protocol; a bad one's bytes are worth nothing."""
-    data = bytes(len(frame.sent)) if frame.fate is Fate.LOST else frame.received
+    data = bytes(len(frame.sent)) if frame.fate is FrameOutcome.LOST else frame.received
     return f"{int(frame.fate in _GOOD)};{len(frame.sent)};{data.hex().upper()}"

@@ -27,7 +27,7 @@ _BOUNDS = {
 }  # fmt: skip
 
 
-class Settings:
+class ModemSettings:
     """Named integers that survive a reboot; three-letter names are kept in capitals, as hosts write them.
 
     Args:

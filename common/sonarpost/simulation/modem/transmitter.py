@@ -14,12 +14,12 @@ from dataclasses import dataclass, field
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem import nmea
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, FrameFate, PacketKind
+from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, PacketKind, PacketOutcome
 from sonarpost.simulation.modem import commands
-from sonarpost.simulation.modem.config import ModemConfig
+from sonarpost.simulation.modem.config import EmulatedModemConfig
 from sonarpost.simulation.modem.reception import packet_type
 from sonarpost.simulation.modem.sentences import TransmittedPacket, transmit_statistics
-from sonarpost.simulation.modem.settings import ModemClock, Settings
+from sonarpost.simulation.modem.settings import ModemClock, ModemSettings
 
 _ANSWERS = frozenset({PacketKind.ACK, PacketKind.PING_REPLY, PacketKind.MINI_REPLY})
 _WITH_STATISTICS = frozenset({PacketKind.DATA, PacketKind.CYCLE, PacketKind.FLEXIBLE})
@@ -60,8 +60,8 @@ class Transmitter:
 
     def __init__(
         self,
-        config: ModemConfig,
-        settings: Settings,
+        config: EmulatedModemConfig,
+        settings: ModemSettings,
         clock: ModemClock,
         write: Callable[[bytes], None],
         expect: Callable[[AcousticPacket, float], None],
@@ -246,7 +246,7 @@ class Transmitter:
     def answer(self, arrival: ArrivalEnded, good_frames: tuple[int, ...]) -> None:
         """Plan the automatic answer to a packet that was heard whole and was meant for this modem, if it wants one."""
         packet = arrival.transmission.packet
-        if arrival.outcome is not FrameFate.ARRIVED:
+        if arrival.outcome is not PacketOutcome.ARRIVED:
             return
         own = self._settings["SRC"]
         if packet.kind is PacketKind.CYCLE and packet.source == own:
