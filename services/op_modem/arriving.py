@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgpack
 
-from sonarpost.modem.micromodem.events import FrameReceived, PacketReceived
+from sonarpost.modem.micromodem import FrameReceived, PacketReceived
 
 
 def pack(frames: list[FrameReceived], heard_utc_s: float) -> bytes:

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.mac import Tdma
 from sonarpost.messages import PlatformId
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 from sonarpost.runtime.modem_service import ModemServiceConfig
 
 ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]

@@ -20,8 +20,7 @@ from sonarpost.link.downlink.commands import PendingCommand
 from sonarpost.link.downlink.vessel_endpoint import DownlinkPacket
 from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame, Command, Decision, ReceivedMessage, Record
-from sonarpost.modem.micromodem.events import FrameReceived, PacketFailed, PacketReceived, PacketSent
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES, FrameReceived, PacketFailed, PacketReceived, PacketSent
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import UnitOfWork
 from sonarpost.security.acoustic_key import read_key

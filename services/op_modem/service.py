@@ -15,16 +15,16 @@ from sonarpost.config import PlatformConfig
 from sonarpost.errors import DeliveryError
 from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame, LinkQuality
-from sonarpost.modem.micromodem.events import (
+from sonarpost.modem.micromodem import (
+    RATES,
     FrameDecoded,
     FrameReceived,
+    LinkStatistics,
     ModemEvent,
     PacketFailed,
     PacketReceived,
     PacketSent,
 )
-from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.modem.micromodem.statistics import LinkStatistics
 from sonarpost.monitoring.log_context import image_ids_of_frame
 from sonarpost.runtime.service import UnitOfWork
 from sonarpost.services.op_modem.arriving import pack, unpack

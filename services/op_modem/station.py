@@ -11,7 +11,7 @@ from sonarpost.link.downlink.commands import MAX_PENDING, CommandTracker, Pendin
 from sonarpost.link.downlink.vessel_endpoint import VesselEndpoint
 from sonarpost.link.frames.v1.frame import segments_room
 from sonarpost.messages import Command, Decision, DownlinkState
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 from sonarpost.services.op_modem.config import OpModemConfig
 
 _MESSAGE_OVERHEAD_BYTES = 3  # kind, length and number of a message segment

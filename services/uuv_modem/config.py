@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from sonarpost.link.mac import Continuous, Csma, MediumAccess, Polled, Tdma
 from sonarpost.link.queue.transmit_queue import QueueConfig
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 from sonarpost.runtime.modem_service import ModemServiceConfig
 
 ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]

@@ -38,7 +38,7 @@ from sonarpost.link.queue.transmit_queue import ImageName, TransmitQueue
 from sonarpost.link.receiver import LinkReceiver
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.line_store import LineStore

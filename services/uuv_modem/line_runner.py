@@ -14,7 +14,8 @@ from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.link.mac import MediumAccess
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
-from sonarpost.modem.micromodem.events import (
+from sonarpost.modem.micromodem import (
+    RATES,
     FrameDecoded,
     FrameReceived,
     MiniPacketReceived,
@@ -23,7 +24,6 @@ from sonarpost.modem.micromodem.events import (
     PacketSent,
     PollReceived,
 )
-from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.line import VehicleEndpoint
@@ -100,7 +100,7 @@ class LineRunner:
     def run(self) -> None:
         """Work until the service stops."""
         if self._config.mac == "polled":
-            self._modem.answer_polls(self.answer_poll)
+            self._modem.set_poll_handler(self.answer_poll)
         wait_s = 0.0
         while not self._stopping.is_set():
             self._take_inputs(wait_s)

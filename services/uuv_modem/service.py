@@ -26,8 +26,7 @@ from sonarpost.messages import (
     QueueState,
     Record,
 )
-from sonarpost.modem.micromodem.events import ModemEvent, PacketFailed, PacketSent
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES, ModemEvent, PacketFailed, PacketSent
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import ServiceStoppingError, UnitOfWork
 from sonarpost.services.uuv_modem.config import UuvModemConfig

@@ -7,10 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from itertools import count
 
-from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import FrameDecoded, ModemEvent
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES, FrameDecoded, MicroModem, ModemEvent, nmea
 from sonarpost.modem.micromodem.sentences import Cycle
 
 Loses = Callable[[nmea.Sentence, int], bool]

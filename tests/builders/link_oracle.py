@@ -14,9 +14,7 @@ from builders import v1_fuzz
 from builders.modem_fuzz import ENDS, LIKELY, Fuzz, real_lines
 from sonarpost.link.events import ContactUpdate, MessageReceived
 from sonarpost.link.receiver import LinkReceiver
-from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, nmea
 
 VEHICLE: Final = 3
 STRANGER: Final = 4

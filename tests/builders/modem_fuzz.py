@@ -16,10 +16,15 @@ from dataclasses import dataclass, field
 
 from builders.two_drivers import TwoDrivers
 from sonarpost.errors import SentenceError
-from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import PacketFailed, PacketSent, RequestDone, RequestFailed
+from sonarpost.modem.micromodem import (
+    MicroModem,
+    MicroModemConfig,
+    PacketFailed,
+    PacketSent,
+    RequestDone,
+    RequestFailed,
+    nmea,
+)
 
 KINDS = (
     "CAREV CACFG CACLK CATMS CATMQ CATMG CACYC CADRQ CATXD CATXA CATXP CATXF CAXST CARXP CARXD CARXA CAMSG CACST CAACK "
@@ -64,7 +69,7 @@ class Fuzz:
 
     def _round(self, count: int) -> None:
         driver = MicroModem(MicroModemConfig(1))
-        driver.answer_polls(lambda polled: [b"x" * min(3, polled.frame_bytes)] * (polled.frames // 2))
+        driver.set_poll_handler(lambda polled: [b"x" * min(3, polled.frame_bytes)] * (polled.frames // 2))
         parser = nmea.LineAssembler()
         now, asked, ended = 0.0, [], []
         driver.start(now)
@@ -174,7 +179,7 @@ class Fuzz:
 def real_lines() -> list[bytes]:
     """Return what the modem says to a driver in an exchange of each kind."""
     rig = TwoDrivers()
-    rig.drivers[2].answer_polls(lambda polled: [b"polled"])
+    rig.drivers[2].set_poll_handler(lambda polled: [b"polled"])
     rig.arm()
     rig.run(10.0)
     for rate in (0, 1, 4):

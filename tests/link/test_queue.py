@@ -14,7 +14,7 @@ from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.queue.state import export_queue, restore_queue
 from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, TransmitQueue
 from sonarpost.link.receiver import LinkReceiver
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 
 CONTACT = ContactSummary(height_px=80, width_px=80, lat_deg=56.4, lon_deg=-5.6, confidence=1.5)
 

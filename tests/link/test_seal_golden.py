@@ -19,7 +19,7 @@ from sonarpost.link.auth.replay_window import WINDOW
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, Symbol, checksum, parse_frame
 from sonarpost.link.sender import LinkSender
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 
 SEAL = FrameAuthenticator(parse_key(seal_golden.KEY, "golden"), 3, Direction.FROM_VEHICLE)
 GOLDEN: dict[str, Any] = json.loads((FOLDER / "sealed.json").read_text(encoding="utf-8"))

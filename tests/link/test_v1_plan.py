@@ -20,7 +20,7 @@ from sonarpost.link.coding.redundancy_plan import (
     preview_frames,
     symbols_to_send,
 )
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 
 
 def curve(scale: float, length: int = 400) -> np.ndarray:

@@ -14,7 +14,7 @@ from sonarpost.link.events import ContactUpdate, MessageReceived
 from sonarpost.link.queue.state import export_queue, restore_queue
 from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, TransmitQueue
 from sonarpost.link.receiver import LinkReceiver
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 
 VESSEL = 1
 

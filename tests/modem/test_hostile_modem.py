@@ -4,10 +4,7 @@ from builders.fake_modem import FakeModem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import PacketFailed, PacketSent
+from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, PacketFailed, PacketSent, nmea
 
 KINDS = ["CAREV", "CACFG", "CACLK", "CACYC", "CADRQ", "CATXD", "CATXP", "CATXF", "CAXST", "CARXP", "CARXD", "CAMSG",
          "CACST", "CAACK", "CAERR", "CAMPR"]  # fmt: skip

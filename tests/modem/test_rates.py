@@ -1,6 +1,6 @@
 import pytest
 
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 
 
 @pytest.mark.parametrize(("rate", "packet_bytes"), [(0, 32), (1, 192), (4, 512), (5, 2048)])

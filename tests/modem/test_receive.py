@@ -5,11 +5,11 @@ from builders.fake_modem import FakeModem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import (
+from sonarpost.modem.micromodem import (
     FrameAcknowledged,
     FrameReceived,
+    MicroModem,
+    MicroModemConfig,
     ModemMessageReceived,
     ModemReady,
     ModemRebooted,

@@ -9,14 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError, SentenceError
-from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import (
+from sonarpost.modem.micromodem import (
     ClockConfirmed,
     FailureReason,
     FlexibleDataReceived,
     FrameReceived,
+    MicroModem,
+    MicroModemConfig,
     MiniPacketAnswered,
     MiniPacketReceived,
     PacketFailed,
@@ -30,6 +29,7 @@ from sonarpost.modem.micromodem.events import (
     SentenceRejected,
     SettingUnconfirmed,
     StatisticsReceived,
+    nmea,
 )
 from sonarpost.modem.micromodem.sentences import ReceivedData
 from sonarpost.modem.micromodem.short_sentences import (
@@ -210,7 +210,7 @@ def test_a_poll_is_answered_with_what_the_application_gives() -> None:
         asked.append(polled)
         return [b"one"]
 
-    driver.answer_polls(uplink)
+    driver.set_poll_handler(uplink)
     told = tell(driver, "CARXP,0", "CACYC,0,1,2,1,1,3", "CADRQ,120000,1,2,1,64,1")
     assert asked == [PollReceived(2, 1, 3, 64, True)] == [e for e in told if isinstance(e, PollReceived)]
     assert driver.bytes_to_send() == nmea.format("CCTXD", 1, 2, 1, "6F6E65")
@@ -223,17 +223,17 @@ def test_a_poll_is_answered_with_what_the_application_gives() -> None:
 
 def test_a_poll_with_nothing_to_send_gets_an_empty_answer() -> None:
     driver = ready()
-    driver.answer_polls(lambda polled: [])
+    driver.set_poll_handler(lambda polled: [])
     tell(driver, "CACYC,0,1,2,1,0,3", "CADRQ,120000,1,2,0,64,1")
     assert driver.bytes_to_send() == nmea.format("CCTXD", 1, 2, 0, "")
-    driver.answer_polls(lambda polled: [b"x" * 65])
+    driver.set_poll_handler(lambda polled: [b"x" * 65])
     with pytest.raises(FrameError):
         tell(driver, "CACYC,0,1,2,1,0,3")
 
 
 def test_a_polled_packet_that_does_not_go_has_its_end_too() -> None:
     driver = ready()
-    driver.answer_polls(lambda polled: [b"one"])
+    driver.set_poll_handler(lambda polled: [b"one"])
     tell(driver, "CACYC,0,1,2,1,0,1")
     (failed,) = [e for e in driver.poll(100.0) if isinstance(e, PacketFailed)]
     assert failed.reason is FailureReason.NO_DATA_REQUEST

@@ -5,11 +5,11 @@ import pytest
 from builders.fake_modem import FakeModem, nth_of
 
 from sonarpost.errors import ConfigError
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import (
+from sonarpost.modem.micromodem import (
     ClockConfirmed,
     FailureReason,
+    MicroModem,
+    MicroModemConfig,
     ModemReady,
     ModemRebooted,
     ModemUnresponsive,

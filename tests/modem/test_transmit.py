@@ -4,12 +4,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
-from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import (
+from sonarpost.modem.micromodem import (
+    RATES,
     FailureReason,
     FrameAcknowledged,
+    MicroModem,
+    MicroModemConfig,
     ModemError,
     ModemReady,
     ModemRebooted,
@@ -18,8 +18,8 @@ from sonarpost.modem.micromodem.events import (
     PacketSent,
     SentenceRejected,
     UnhandledSentence,
+    nmea,
 )
-from sonarpost.modem.micromodem.rates import RATES
 
 CONFIG = MicroModemConfig(address=3)
 FIRST = [b"a" * 256, b"b"]

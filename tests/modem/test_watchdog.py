@@ -11,8 +11,8 @@ from collections.abc import Callable
 import pytest
 from builders.two_drivers import Spoil, TwoDrivers, cut, double, drop, garble, kinds_of
 
-from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.micromodem.events import (
+from sonarpost.modem.micromodem import (
+    RATES,
     FlexibleDataReceived,
     FrameReceived,
     MiniPacketReceived,
@@ -23,8 +23,8 @@ from sonarpost.modem.micromodem.events import (
     PingAnswered,
     RequestDone,
     RequestFailed,
+    nmea,
 )
-from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.simulation.channel.channel_config import ChannelParameters
 
 READY_S = 30.0
@@ -62,7 +62,7 @@ def run_exchange(
 ) -> TwoDrivers:
     """Do the exchange with one sentence spoiled or a mishap at that moment, then send the next packet."""
     rig = TwoDrivers(number, spoil, mishap)
-    rig.drivers[2].answer_polls(lambda polled: UPLINK)
+    rig.drivers[2].set_poll_handler(lambda polled: UPLINK)
     assert rig.run(READY_S, lambda: all(rig.got(n, ModemReady) for n in (1, 2)))
     rig.run(rig.now + 1.0)
     rig.arm()

@@ -11,14 +11,13 @@ from pathlib import Path
 import pytest
 
 from sonarpost.errors import FrameError, PortError
-from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import (
+from sonarpost.modem.micromodem import (
     ClockConfirmed,
     FailureReason,
     FlexibleDataReceived,
     FrameReceived,
+    MicroModem,
+    MicroModemConfig,
     MiniPacketReceived,
     ModemEvent,
     ModemReady,
@@ -27,6 +26,7 @@ from sonarpost.modem.micromodem.events import (
     PacketSent,
     PingAnswered,
     RequestDone,
+    nmea,
 )
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
@@ -272,7 +272,7 @@ def test_two_runners_ping_poll_and_exchange_small_things(tmp_path: Path) -> None
     try:
         for runner in runners.values():
             runner.start()
-        runners[2].answer_polls(lambda polled: [b"polled"])
+        runners[2].set_poll_handler(lambda polled: [b"polled"])
         eventually(lambda: all(runner.ready for runner in runners.values()))
         asked = [
             runners[1].ping(2),

@@ -9,9 +9,7 @@ from hypothesis import strategies as st
 
 from sonarpost import keys
 from sonarpost.messages import AcousticFrame
-from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.micromodem.events import FrameReceived, PacketReceived
-from sonarpost.modem.micromodem.statistics import LinkStatistics
+from sonarpost.modem.micromodem import FrameReceived, LinkStatistics, PacketReceived, nmea
 from sonarpost.services.op_modem import service as op_modem
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService, quality_of

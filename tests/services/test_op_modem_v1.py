@@ -22,9 +22,7 @@ from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
 from sonarpost.link.receiver import LinkReceiver
 from sonarpost.link.sender import LinkSender
 from sonarpost.messages import AcousticFrame, Command, Decision, DownlinkState, ReceivedMessage
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import FrameReceived, PacketReceived
+from sonarpost.modem.micromodem import FrameReceived, MicroModem, MicroModemConfig, PacketReceived
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
 from sonarpost.security.acoustic_key import read_key
@@ -384,7 +382,7 @@ def test_a_vehicle_is_asked_for_a_packet_and_answers(sea, begin, vehicle, crew):
         asked.set()
         return (b"polled",)
 
-    far.modem.answer_polls(uplink)
+    far.modem.set_poll_handler(uplink)
     eventually(lambda: far.modem.ready)
     begin(mac="polled", poll_interval_s=0.2)
     assert asked.wait(30)

@@ -19,8 +19,7 @@ from sonarpost.errors import ConfigError
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.messages import AcousticFrame, Contact, EncodedImage
-from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES, nmea
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService
 from sonarpost.services.uuv_modem.config import UuvModemConfig

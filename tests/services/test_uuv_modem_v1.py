@@ -42,7 +42,7 @@ from sonarpost.messages import (
     OutgoingMessage,
     QueueState,
 )
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService
 from sonarpost.services.uuv_modem.config import UuvModemConfig

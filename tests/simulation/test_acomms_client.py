@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from builders.common import eventually
 
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.emulator import ChannelEmulator
 from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite

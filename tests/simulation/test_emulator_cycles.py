@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from builders.emulator_bench import Bench, cst
 
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 
 
 def test_a_whole_cycle_at_rate_1_on_both_sides():

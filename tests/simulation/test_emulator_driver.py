@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 from builders.emulator_bench import Bench
 
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import (
+from sonarpost.modem.micromodem import (
+    RATES,
+    MicroModem,
+    MicroModemConfig,
     ModemError,
     ModemEvent,
     ModemRebooted,
@@ -17,7 +18,6 @@ from sonarpost.modem.micromodem.events import (
     PacketSent,
     SentenceRejected,
 )
-from sonarpost.modem.micromodem.rates import RATES
 
 
 def drive(bench: Bench, drivers: dict[int, MicroModem], until_s: float) -> dict[int, list[ModemEvent]]:

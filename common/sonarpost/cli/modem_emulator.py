@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 
 from sonarpost.errors import ConfigError
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_presets import PRESETS, build_parameters, read_parameters

@@ -10,8 +10,7 @@ from collections.abc import Callable, Sequence
 from datetime import datetime
 
 from sonarpost.errors import PortError
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import ModemEvent, PollReceived
+from sonarpost.modem.micromodem import MicroModem, ModemEvent, PollReceived
 from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialLink
 
 log = logging.getLogger(__name__)
@@ -133,13 +132,13 @@ class ModemRunner:
         """
         return self._ask(lambda now: self._driver.request_packet(source, rate, frames, ack=ack, now=now))
 
-    def answer_polls(self, uplink: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
-        """Give the function that is asked for frames when another modem polls; see `MicroModem.answer_polls`.
+    def set_poll_handler(self, uplink: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
+        """Give the function that is asked for frames when another modem polls; see `MicroModem.set_poll_handler`.
 
         It is called in the runner's thread and must neither wait nor call the runner.
         """
         with self._lock:
-            self._driver.answer_polls(uplink)
+            self._driver.set_poll_handler(uplink)
 
     def set_clock(self, utc: datetime) -> bool:
         """Set the modem's clock if it is free at this moment, from any thread; see `MicroModem.set_clock`."""

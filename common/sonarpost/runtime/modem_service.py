@@ -11,10 +11,8 @@ from pydantic import Field
 
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.logs import kv
+from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, ModemEvent
 from sonarpost.modem.micromodem import events as ev
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import ModemEvent
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
 from sonarpost.runtime.service import Service

@@ -23,7 +23,7 @@ from sonarpost.messages import (
     QueueState,
     ReconstructedImage,
 )
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 from sonarpost.services.console.fleet import frame_event
 from sonarpost.services.console.state import Board
 from sonarpost.services.console.training.contacts import VEHICLES, Simulated, simulated_contacts, wider_image_id

@@ -14,10 +14,15 @@ from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.link.frames.paper.receiver import ContactOnly, Event, ImageReady, PaperReceiver
 from sonarpost.link.frames.paper.sender import Packet, plan_packets
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import FrameReceived, ModemReady, PacketFailed, PacketSent
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import (
+    RATES,
+    FrameReceived,
+    MicroModem,
+    MicroModemConfig,
+    ModemReady,
+    PacketFailed,
+    PacketSent,
+)
 from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem

@@ -18,7 +18,7 @@ from sonarpost.cli.demo.report import show
 from sonarpost.cli.demo.settings import ChainSettings, free_ports
 from sonarpost.cli.demo.watch import Watcher
 from sonarpost.errors import ConfigError, SurveyFileError
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.readers.registry import SUPPORTED_SUFFIXES

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from sonarpost.link.frames.v1.frame import HEADER_BYTES
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 
 UUV, VESSEL, SHORE, WATER = "uuv-1", "vessel-1", "shore-1", "water"
 UUV_ADDRESS, VESSEL_ADDRESS = 3, 1

@@ -21,7 +21,7 @@ from sonarpost.link.frames.paper.frame import parse_frame
 from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.link.receiver import LinkReceiver
 from sonarpost.messages import AcousticFrame, EncodedImage, Health, QueueState, ReconstructedImage, Record, Snippet
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 
 log = logging.getLogger(__name__)
 

@@ -21,7 +21,7 @@ from sonarpost.link.coding.channel_capacity import LossChannel, Values, frames_f
 from sonarpost.link.coding.rate_distortion import GroupDistortion
 from sonarpost.link.frames.v1.frame import HEADER_BYTES
 from sonarpost.link.frames.v1.layers import DESCRIPTOR_SYMBOLS, MAX_LAYERS, MAX_STEP, SHARES, Layering
-from sonarpost.modem.micromodem.rates import Rate
+from sonarpost.modem.micromodem import Rate
 
 PREVIEWS_UNSEEN: Final = 0.004
 """Share of previews that may stay unseen at the loss that is planned for."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from sonarpost.errors import ConfigError
 from sonarpost.link.coding.redundancy_plan import best_rate
-from sonarpost.modem.micromodem.rates import RATES, Rate
+from sonarpost.modem.micromodem import RATES, Rate
 
 
 @dataclass(eq=False)

@@ -21,7 +21,7 @@ from sonarpost.link.queue.messages import LOWEST_PRIORITY, QueuedMessage, Waitin
 from sonarpost.link.queue.transmit_queue import ImageName, TransmitQueue
 from sonarpost.link.receiver_state import read_field, read_list, read_map, read_number, read_time
 from sonarpost.link.sender_state import export_sender, import_picture, restore_sender
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 
 _FORMAT: Final = 1
 _WHERE: Final = "queue state"

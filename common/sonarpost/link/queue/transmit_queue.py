@@ -25,7 +25,7 @@ from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
 from sonarpost.link.queue.messages import FILLS_FROM, WaitingMessages
 from sonarpost.link.queue.rate_choice import RateSelector
 from sonarpost.link.sender import LinkSender
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 
 _SEGMENTS: Final = 2
 _LEAST_CHANGE: Final = 0.02

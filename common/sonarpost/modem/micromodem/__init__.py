@@ -1,1 +1,73 @@
-"""Driver of the WHOI Micro-Modem: NMEA sentences and pure state machines."""
+"""Driver of the WHOI Micro-Modem.
+
+`MicroModem` is the driver, `MicroModemConfig` its configuration, `ModemEvent` the union of the events it returns.
+`RATES` holds packet size and air time of every rate. The driver does no input or output and reads no clock.
+"""
+
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.driver import MicroModem
+from sonarpost.modem.micromodem.events import (
+    ClockConfirmed,
+    FailureReason,
+    FlexibleDataReceived,
+    FrameAcknowledged,
+    FrameDecoded,
+    FrameReceived,
+    MiniPacketAnswered,
+    MiniPacketReceived,
+    ModemError,
+    ModemEvent,
+    ModemMessageReceived,
+    ModemReady,
+    ModemRebooted,
+    ModemUnresponsive,
+    PacketFailed,
+    PacketReceived,
+    PacketSent,
+    PingAnswered,
+    PingReceived,
+    PollReceived,
+    RequestDone,
+    RequestFailed,
+    SentenceRejected,
+    SettingUnconfirmed,
+    StatisticsReceived,
+    UnhandledSentence,
+)
+from sonarpost.modem.micromodem.rates import RATES, Rate
+from sonarpost.modem.micromodem.statistics import LinkStatistics, TransmitStatistics
+
+__all__ = [
+    "RATES",
+    "ClockConfirmed",
+    "FailureReason",
+    "FlexibleDataReceived",
+    "FrameAcknowledged",
+    "FrameDecoded",
+    "FrameReceived",
+    "LinkStatistics",
+    "MicroModem",
+    "MicroModemConfig",
+    "MiniPacketAnswered",
+    "MiniPacketReceived",
+    "ModemError",
+    "ModemEvent",
+    "ModemMessageReceived",
+    "ModemReady",
+    "ModemRebooted",
+    "ModemUnresponsive",
+    "PacketFailed",
+    "PacketReceived",
+    "PacketSent",
+    "PingAnswered",
+    "PingReceived",
+    "PollReceived",
+    "Rate",
+    "RequestDone",
+    "RequestFailed",
+    "SentenceRejected",
+    "SettingUnconfirmed",
+    "StatisticsReceived",
+    "TransmitStatistics",
+    "UnhandledSentence",
+]

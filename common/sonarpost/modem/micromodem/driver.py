@@ -133,7 +133,7 @@ class MicroModem(DriverStateMachine):
         command = poll_command(source, self.config.address, rate, frames, ack=ack)
         return self._request(RequestKind.POLL, source, command, now, rate)
 
-    def answer_polls(self, uplink: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
+    def set_poll_handler(self, uplink: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
         """Give the function that is asked for frames when another modem polls this one.
 
         It is called inside `receive` and must not call back. No frames are a right answer: the modem then has nothing

@@ -22,7 +22,7 @@ from sonarpost.link.mac import Tdma
 from sonarpost.link.queue.state import export_queue, restore_queue
 from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, TransmitQueue
 from sonarpost.link.receiver import LinkReceiver
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 
 _SLOT_S: Final = 7.5
 _GUARD_S: Final = 1.0

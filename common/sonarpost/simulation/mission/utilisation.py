@@ -20,10 +20,16 @@ from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.mac import Continuous
 from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, TransmitQueue
 from sonarpost.link.receiver import LinkReceiver
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.driver import MicroModem
-from sonarpost.modem.micromodem.events import FrameDecoded, FrameReceived, ModemEvent, PacketFailed, PacketSent
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import (
+    RATES,
+    FrameDecoded,
+    FrameReceived,
+    MicroModem,
+    MicroModemConfig,
+    ModemEvent,
+    PacketFailed,
+    PacketSent,
+)
 from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.channel_config import ChannelParameters
 from sonarpost.simulation.channel.channel_events import Transmission

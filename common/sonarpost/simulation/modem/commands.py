@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from sonarpost.errors import SentenceError
+from sonarpost.modem.micromodem import RATES
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.rates import RATES
 
 MOST_ADDRESS = 127
 FLEXIBLE_RATES = (1, 3, 5)

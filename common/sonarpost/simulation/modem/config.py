@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.channel.channel_events import ArrivalEnded
 
 VERSIONS: Mapping[int, str] = MappingProxyType({1: "0.93.0.09", 2: "2.0.27087"})

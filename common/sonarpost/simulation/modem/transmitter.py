@@ -12,8 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem import RATES, nmea
 from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, PacketKind, PacketOutcome
 from sonarpost.simulation.modem import commands
 from sonarpost.simulation.modem.config import EmulatedModemConfig
