@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,6 +16,10 @@ from xdist.scheduler import LoadFileScheduling
 
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.config import PlatformConfig
+
+# A suite that a script starts in the background has SIGINT ignored, and child processes would inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # An example that waits for the disk of a loaded machine is slow, not wrong; pytest-timeout ends what hangs.
 settings.register_profile("sonarpost", deadline=None)
