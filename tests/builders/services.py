@@ -1,4 +1,4 @@
-"""What the tests of services share: neighbours that owe and take records, starting, stopping, and being watched."""
+"""Shared by the tests of services: peer services, start and stop, monitoring, serial cables and emulated modems."""
 
 from __future__ import annotations
 
@@ -31,45 +31,45 @@ from sonarpost.sonar.xtf_writer import write_xtf
 PlatformMaker = Callable[[str], PlatformConfig]
 
 
-class Neighbour(Service[ServiceConfig]):
-    """Stands in for the service before or behind the one under test, with the same durable hand-off."""
+class PeerService(Service[ServiceConfig]):
+    """Replaces the service before or after the one under test, with the same durable delivery."""
 
     NAME = "neighbour"
 
-    def __init__(self, platform: PlatformConfig, takes: Mapping[str, type[Record]]) -> None:
+    def __init__(self, platform: PlatformConfig, consumed: Mapping[str, type[Record]]) -> None:
         super().__init__(platform, ServiceConfig())
-        self._takes = takes
-        self.got: list[Any] = []
+        self._consumed = consumed
+        self.received: list[Any] = []
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
-        return self._takes
+        return self._consumed
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        self.got.append(record)
+        self.received.append(record)
 
-    def owe(self, key: str, consumer: str, *records: Record, priority: int = 4) -> None:
+    def send(self, key: str, consumer: str, *records: Record, priority: int = 4) -> None:
         effects = UnitOfWork()
         for record in records:
             effects.send(key, consumer, record, priority=priority)
         self.commit(effects)
 
-    def owe_bytes(self, key: str, consumer: str, payload: bytes) -> None:
-        """Owe something that is no record."""
+    def send_bytes(self, key: str, consumer: str, payload: bytes) -> None:
+        """Send a payload that is not a record."""
         with self.store.transaction() as tx:
             tx.send(key, consumer, payload, encoding="")
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Waits before another attempt are shortened; they are counted in tries, never in seconds, here."""
+def short_retry_delays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorten the delays before retries; these tests count retries, not seconds."""
     monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.05)
     monkeypatch.setattr("sonarpost.services.decompressor.service.RETRY_AFTER_S", 0.05)
     monkeypatch.setattr("sonarpost.services.decompressor.service.QUIET_S", 0.05)
     monkeypatch.setattr("sonarpost.services.op_modem.service.SAVE_AGAIN_S", 0.05)
 
 
-class Crew:
-    """The services of one test; whatever still runs at its end is stopped."""
+class ServiceRunner:
+    """Starts the services of one test and stops those that still run at its end."""
 
     def __init__(self, platform: PlatformMaker) -> None:
         self._platform = platform
@@ -84,12 +84,12 @@ class Crew:
         self._running.remove(service)
         service.stop()
 
-    def neighbour(self, platform_id: str, name: str, takes: Mapping[str, type[Record]] | None = None) -> Neighbour:
-        named = type("Named", (Neighbour,), {"NAME": name})
-        return self.start(named(self._platform(platform_id), takes or {}))
+    def peer(self, platform_id: str, name: str, consumed: Mapping[str, type[Record]] | None = None) -> PeerService:
+        named = type("Named", (PeerService,), {"NAME": name})
+        return self.start(named(self._platform(platform_id), consumed or {}))
 
     def stop_all(self) -> None:
-        """Stop all at once, as a platform that is switched off does, and as quickly."""
+        """Stop all services at the same time, as a platform that is switched off does."""
         running, self._running = self._running, []
         with ThreadPoolExecutor() as pool:
             for stopped in [pool.submit(service.stop) for service in running]:
@@ -97,15 +97,15 @@ class Crew:
 
 
 @pytest.fixture
-def crew(platform: PlatformMaker) -> Iterator[Crew]:
-    crew = Crew(platform)
-    yield crew
-    crew.stop_all()
+def runner(platform: PlatformMaker) -> Iterator[ServiceRunner]:
+    runner = ServiceRunner(platform)
+    yield runner
+    runner.stop_all()
 
 
 @pytest.fixture
-def is_told(client: zenoh.Session, crew: Crew) -> Callable[[Service[Any]], None]:
-    """Checks a running service's liveliness token and health record, and that the token ends with it."""
+def check_monitoring(client: zenoh.Session, runner: ServiceRunner) -> Callable[[Service[Any]], None]:
+    """Check liveliness token and health records of a running service, then stop it and check the last ones."""
 
     def tokens(key: str) -> list[str]:
         return [str(reply.ok.key_expr) for reply in client.liveliness().get(key, timeout=5.0) if reply.ok]
@@ -113,16 +113,17 @@ def is_told(client: zenoh.Session, crew: Crew) -> Callable[[Service[Any]], None]
     def check(service: Service[Any]) -> None:
         key = keys.alive(service.platform.id, service.NAME)
         eventually(lambda: tokens(key) == [key], what=f"token {key}")
-        heard: list[Health] = []
+        health_records: list[Health] = []
         subscriber = client.declare_subscriber(
             keys.health_all(service.platform.id),
-            lambda sample: heard.append(wire.decode(Health, sample.payload.to_bytes(), str(sample.key_expr))),
+            lambda sample: health_records.append(wire.decode(Health, sample.payload.to_bytes(), str(sample.key_expr))),
         )
-        eventually(lambda: any(h.service == service.NAME for h in heard), what="health record")
-        crew.stop(service)
+        eventually(lambda: any(h.service == service.NAME for h in health_records), what="health record")
+        runner.stop(service)
         eventually(lambda: tokens(key) == [], what=f"end of token {key}")
         eventually(
-            lambda: "stopping" in [h.state for h in heard if h.service == service.NAME], what="last health record"
+            lambda: "stopping" in [h.state for h in health_records if h.service == service.NAME],
+            what="last health record",
         )
         subscriber.undeclare()
 
@@ -131,7 +132,7 @@ def is_told(client: zenoh.Session, crew: Crew) -> Callable[[Service[Any]], None]
 
 @pytest.fixture
 def refused() -> Callable[[Service[Any]], list[tuple[str, str]]]:
-    """Reads what a service keeps apart: (key, reason), oldest first."""
+    """Return what a service has quarantined: (key, reason), oldest first."""
 
     def read(service: Service[Any]) -> list[tuple[str, str]]:
         return [(str(k), str(r)) for k, r in service.store._query("SELECT key, reason FROM refused ORDER BY id")]
@@ -141,13 +142,13 @@ def refused() -> Callable[[Service[Any]], list[tuple[str, str]]]:
 
 @pytest.fixture
 def publish(client: zenoh.Session) -> Callable[[str, bytes], None]:
-    """Publishes as a program without an outbox does, once somebody listens."""
+    """Publish without an outbox, as soon as a subscriber exists."""
     return partial(publish_once, client)
 
 
 @pytest.fixture
 def watch(client: zenoh.Session) -> Callable[[str], list[zenoh.Sample]]:
-    """Collects what is published on a key, as a plain subscriber."""
+    """Collect what is published on a key."""
 
     def collect(key: str) -> list[zenoh.Sample]:
         samples: list[zenoh.Sample] = []
@@ -158,8 +159,8 @@ def watch(client: zenoh.Session) -> Callable[[str], list[zenoh.Sample]]:
 
 
 @pytest.fixture(scope="session")
-def xtf(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], bytes]:
-    """Small surveys with contacts in them, as bytes of XTF files; the same seed gives the same bytes."""
+def survey_bytes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], bytes]:
+    """Make the bytes of a small XTF survey with contacts; the same seed gives the same bytes."""
     folder = tmp_path_factory.mktemp("xtf")
     made: dict[int, bytes] = {}
 
@@ -175,7 +176,7 @@ def xtf(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], bytes]:
 
 @pytest.fixture(scope="session")
 def texture() -> Callable[..., np.ndarray]:
-    """Pictures with something in them."""
+    """Make an image with structure."""
 
     def make(height_px: int = 40, width_px: int = 60, seed: int = 1, dtype: type = np.uint8) -> np.ndarray:
         rng = np.random.default_rng(seed)
@@ -188,7 +189,7 @@ def texture() -> Callable[..., np.ndarray]:
 
 @pytest.fixture(scope="session")
 def snippet(texture: Callable[..., np.ndarray]) -> Callable[..., Snippet]:
-    """Snippets by name."""
+    """Make a snippet by its contact identifier."""
 
     def make(contact_id: str, height_px: int = 40, width_px: int = 60, **options: Any) -> Snippet:
         picture = Pixels.from_array(texture(height_px, width_px, **options))
@@ -199,7 +200,7 @@ def snippet(texture: Callable[..., np.ndarray]) -> Callable[..., Snippet]:
 
 @pytest.fixture
 def put_file(tmp_path: Path) -> Callable[[str, bytes], Path]:
-    """Puts a whole file into the folder that is polled, as a copy under a hidden name and a rename do."""
+    """Put a complete file into the polled folder: written under a hidden name, then renamed."""
     folder = tmp_path / "incoming"
     folder.mkdir()
 
@@ -212,10 +213,10 @@ def put_file(tmp_path: Path) -> Callable[[str, bytes], Path]:
 
 
 class SerialCable:
-    """A pseudo-terminal between a service and an emulated modem, into which a test can speak.
+    """A pseudo-terminal between a service and an emulated modem, into which a test can write.
 
     Args:
-        device: The emulated modem's port, or None for a cable with nothing at its end.
+        device: Port of the emulated modem, or None for a cable that is connected to nothing.
     """
 
     def __init__(self, device: str | None) -> None:
@@ -231,7 +232,7 @@ class SerialCable:
         self._thread.start()
 
     def say(self, data: bytes) -> None:
-        """Let the service read these bytes."""
+        """Send bytes to the service."""
         while data:
             data = data[os.write(self._master, data) :]
 
@@ -253,21 +254,21 @@ class SerialCable:
 
 
 @pytest.fixture
-def cable() -> Iterator[Callable[[str | None], SerialCable]]:
-    """Lays serial cables."""
-    laid: list[SerialCable] = []
+def serial_cable() -> Iterator[Callable[[str | None], SerialCable]]:
+    """Make serial cables."""
+    made: list[SerialCable] = []
 
-    def lay(device: str | None) -> SerialCable:
-        laid.append(SerialCable(device))
-        return laid[-1]
+    def make(device: str | None) -> SerialCable:
+        made.append(SerialCable(device))
+        return made[-1]
 
-    yield lay
-    for each in laid:
+    yield make
+    for each in made:
         each.close()
 
 
-class Sea:
-    """Two emulated modems, the vessel's (1) and the vehicle's (3), 150 m apart, where time runs fast."""
+class ModemPair:
+    """Two emulated modems, the vessel's (1) and the vehicle's (3), 150 m apart, on accelerated time."""
 
     VESSEL, VEHICLE = 1, 2
 
@@ -278,9 +279,9 @@ class Sea:
     def port(self, modem: int) -> str:
         return str(self.folder / f"modem-{modem}")
 
-    def start(self, **water: Any) -> ChannelEmulator:
+    def start(self, **channel: Any) -> ChannelEmulator:
         sites = (ModemSite(1), ModemSite(3, LocalPosition(150.0)))
-        config = EmulatorConfig(sites, ChannelParameters(**water), pty_dir=self.folder, time_scale=150.0)
+        config = EmulatorConfig(sites, ChannelParameters(**channel), pty_dir=self.folder, time_scale=150.0)
         self._channel = ChannelEmulator(config)
         self._channel.start()
         return self._channel
@@ -292,7 +293,7 @@ class Sea:
 
 
 @pytest.fixture
-def sea(tmp_path: Path) -> Iterator[Sea]:
-    sea = Sea(tmp_path / "modems")
-    yield sea
-    sea.stop()
+def modem_pair(tmp_path: Path) -> Iterator[ModemPair]:
+    modem_pair = ModemPair(tmp_path / "modems")
+    yield modem_pair
+    modem_pair.stop()

@@ -3,31 +3,31 @@
 from __future__ import annotations
 
 from builders.services import (
-    cable,
-    crew,
-    impatient,
-    is_told,
+    check_monitoring,
+    modem_pair,
     publish,
     put_file,
     refused,
-    sea,
+    runner,
+    serial_cable,
+    short_retry_delays,
     snippet,
+    survey_bytes,
     texture,
     watch,
-    xtf,
 )
 
 __all__ = [
-    "cable",
-    "crew",
-    "impatient",
-    "is_told",
+    "check_monitoring",
+    "modem_pair",
     "publish",
     "put_file",
     "refused",
-    "sea",
+    "runner",
+    "serial_cable",
+    "short_retry_delays",
     "snippet",
+    "survey_bytes",
     "texture",
     "watch",
-    "xtf",
 ]

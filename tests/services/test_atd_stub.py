@@ -37,18 +37,18 @@ def config(tmp_path, put_file):
 
 
 @pytest.fixture
-def begin(crew, platform, config):
+def begin(runner, platform, config):
     """Starts the service, with what differs from the usual configuration."""
 
     def start(**changes):
-        return crew.start(AtdStubService(platform("uuv-1"), config.model_copy(update=changes)))
+        return runner.start(AtdStubService(platform("uuv-1"), config.model_copy(update=changes)))
 
     return start
 
 
 @pytest.fixture
-def compressor(crew):
-    return crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
+def compressor(runner):
+    return runner.peer("uuv-1", "compressor", {KEY: Snippet})
 
 
 @pytest.fixture
@@ -56,12 +56,14 @@ def sent_picture(texture, put_file, compressor):
     """Proves that a service in snippets mode still works: a good picture goes through."""
 
     def check():
-        compressor.got.clear()
+        compressor.received.clear()
         # Whole when it appears: an empty file would be taken as it is and set aside.
         path = put_file(".good.tiff", b"")
         write_tiff(path, texture(seed=99))
         path.rename(path.with_name("good.tiff"))
-        eventually(lambda: [s.source for s in compressor.got] == ["good.tiff"], what="the picture after the bad one")
+        eventually(
+            lambda: [s.source for s in compressor.received] == ["good.tiff"], what="the picture after the bad one"
+        )
 
     return check
 
@@ -79,13 +81,13 @@ def settled(service):
     return service.health().gauges["files_waiting"] == 0
 
 
-def test_a_survey_gives_its_contacts_most_confident_first(begin, compressor, put_file, xtf, is_told):
-    path = put_file("line.xtf", xtf(1))
+def test_a_survey_gives_its_contacts_most_confident_first(begin, compressor, put_file, survey_bytes, check_monitoring):
+    path = put_file("line.xtf", survey_bytes(1))
     service = begin()
-    eventually(lambda: len(compressor.got) == 3)
+    eventually(lambda: len(compressor.received) == 3)
     best = best_of(path)
-    assert [s.contact.atd_confidence for s in compressor.got] == [d.confidence for d in best]
-    for snippet, detection in zip(compressor.got, best, strict=True):
+    assert [s.contact.atd_confidence for s in compressor.received] == [d.confidence for d in best]
+    for snippet, detection in zip(compressor.received, best, strict=True):
         contact = snippet.contact
         assert (contact.vehicle_id, contact.ping_number, contact.channel) == (
             "uuv-1",
@@ -94,39 +96,39 @@ def test_a_survey_gives_its_contacts_most_confident_first(begin, compressor, put
         )
         assert (contact.lat_deg, contact.lon_deg) == (detection.position.lat_deg, detection.position.lon_deg)
         assert (snippet.picture.height_px, snippet.picture.width_px, snippet.source) == (80, 140, "line.xtf")
-    assert len({s.contact.contact_id for s in compressor.got}) == 3
+    assert len({s.contact.contact_id for s in compressor.received}) == 3
     health = service.health()
     assert (health.state, health.counters) == ("ok", {"files_processed": 1, "contacts_detected": 3})
     assert path.is_file(), "a good file stays where it is"
-    is_told(service)
+    check_monitoring(service)
 
 
-def test_a_file_is_processed_once_ever_whatever_its_name(begin, crew, compressor, put_file, xtf):
-    put_file("a.xtf", xtf(1))
+def test_a_file_is_processed_once_ever_whatever_its_name(begin, runner, compressor, put_file, survey_bytes):
+    put_file("a.xtf", survey_bytes(1))
     service = begin()
-    eventually(lambda: len(compressor.got) == 3)
-    put_file("b.xtf", xtf(1))
+    eventually(lambda: len(compressor.received) == 3)
+    put_file("b.xtf", survey_bytes(1))
     eventually(lambda: settled(service) and len(service._dealt_with) == 2)
     os.utime(service.config.input_dir / "a.xtf", (1, 1))
-    put_file("c.xtf", xtf(2))
-    eventually(lambda: len(compressor.got) == 6)
-    crew.stop(service)
-    put_file("d.xtf", xtf(1))
+    put_file("c.xtf", survey_bytes(2))
+    eventually(lambda: len(compressor.received) == 6)
+    runner.stop(service)
+    put_file("d.xtf", survey_bytes(1))
     again = begin()
     eventually(lambda: settled(again) and len(again._dealt_with) == 4)
     assert counter(again, "files_processed") == 0
-    assert len({s.contact.contact_id for s in compressor.got}) == len(compressor.got) == 6
+    assert len({s.contact.contact_id for s in compressor.received}) == len(compressor.received) == 6
 
 
-def test_contacts_found_while_nobody_takes_them_wait_in_the_store(begin, crew, put_file, xtf):
-    put_file("a.xtf", xtf(1))
+def test_contacts_found_while_nobody_takes_them_wait_in_the_store(begin, runner, put_file, survey_bytes):
+    put_file("a.xtf", survey_bytes(1))
     service = begin()
     eventually(lambda: counter(service, "contacts_detected") == 3)
     eventually(lambda: service.health().gauges["outbox"] == 3)
-    crew.stop(service)
+    runner.stop(service)
     begin()
-    late = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
-    eventually(lambda: len(late.got) == 3)
+    late = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    eventually(lambda: len(late.received) == 3)
 
 
 def test_files_are_taken_oldest_first(begin, compressor, put_file, texture):
@@ -135,8 +137,8 @@ def test_files_are_taken_oldest_first(begin, compressor, put_file, texture):
         (write_png if name.endswith("png") else write_tiff)(path, texture(seed=age + ord(name[0])))
         os.utime(path, (1_000_000 - age, 1_000_000 - age))
     begin(mode="snippets")
-    eventually(lambda: len(compressor.got) == 4)
-    assert [s.source for s in compressor.got] == ["a.tiff", "b.png", "c.tiff", "d.tiff"]
+    eventually(lambda: len(compressor.received) == 4)
+    assert [s.source for s in compressor.received] == ["a.tiff", "b.png", "c.tiff", "d.tiff"]
 
 
 @pytest.mark.parametrize(
@@ -148,9 +150,11 @@ def test_files_are_taken_oldest_first(begin, compressor, put_file, texture):
         ("text.XTF", lambda data: b"this is no survey\n" * 200, "text.XTF"),
     ],
 )
-def test_a_bad_survey_goes_to_quarantine_with_its_reason(name, spoil, said, begin, compressor, put_file, xtf, caplog):
+def test_a_bad_survey_goes_to_quarantine_with_its_reason(
+    name, spoil, said, begin, compressor, put_file, survey_bytes, caplog
+):
     service = begin()
-    path = put_file(name, spoil(xtf(1)))
+    path = put_file(name, spoil(survey_bytes(1)))
     aside = path.parent / "quarantine" / name
     eventually(lambda: aside.is_file() and not path.exists(), what="quarantine")
     reason = (aside.parent / f"{name}.reason.txt").read_text()
@@ -158,8 +162,8 @@ def test_a_bad_survey_goes_to_quarantine_with_its_reason(name, spoil, said, begi
     assert "expected" in reason
     assert any(r.message == "File quarantined" for r in caplog.records)
     eventually(lambda: counter(service, "files_quarantined") == 1)
-    put_file("good.xtf", xtf(2))
-    eventually(lambda: len(compressor.got) == 3, what="the file after the bad one")
+    put_file("good.xtf", survey_bytes(2))
+    eventually(lambda: len(compressor.received) == 3, what="the file after the bad one")
     assert service.health().state == "ok"
 
 
@@ -187,9 +191,9 @@ def test_a_growing_file_is_left_until_it_rests():
     assert settle.look((grown,), 9.0) == (), "one that was away is new"
 
 
-def test_a_file_that_is_still_written_is_not_taken(begin, compressor, put_file, xtf):
+def test_a_file_that_is_still_written_is_not_taken(begin, compressor, put_file, survey_bytes):
     service = begin(settle_s=0.4)
-    data = xtf(1)
+    data = survey_bytes(1)
     path = put_file("growing.xtf", data[:1000])
     with path.open("ab") as file:
         for start in range(1000, len(data), len(data) // 8):
@@ -198,7 +202,7 @@ def test_a_file_that_is_still_written_is_not_taken(begin, compressor, put_file, 
             looks = service._settled._since.copy()
             eventually(lambda looks=looks: service._settled._since != looks, what="another look at the folder")
             assert counter(service, "files_quarantined") == 0
-    eventually(lambda: len(compressor.got) == 3)
+    eventually(lambda: len(compressor.received) == 3)
     assert counter(service, "files_quarantined") == 0
 
 
@@ -217,8 +221,8 @@ def test_pictures_are_sent_as_they_are(begin, compressor, put_file, texture):
     for name, pixels in pictures.items():
         write_tiff(put_file(name, b""), pixels)
     begin(mode="snippets")
-    eventually(lambda: len(compressor.got) == 2)
-    for snippet in compressor.got:
+    eventually(lambda: len(compressor.received) == 2)
+    for snippet in compressor.received:
         wanted = pictures[snippet.source]
         assert snippet.picture.bits == 8 * wanted.dtype.itemsize
         np.testing.assert_array_equal(snippet.picture.to_array(), wanted)
@@ -251,7 +255,7 @@ def test_a_picture_that_cannot_be_sent_goes_to_quarantine(name, pixels, said, be
 
 
 def test_a_folder_that_takes_nothing_keeps_bad_files_and_is_not_asked_again(
-    begin, crew, tmp_path, put_file, sent_picture, caplog
+    begin, runner, tmp_path, put_file, sent_picture, caplog
 ):
     # A file where the quarantine's parent should be refuses like a read-only folder does, also to the superuser.
     (tmp_path / "occupied").write_text("")
@@ -262,7 +266,7 @@ def test_a_folder_that_takes_nothing_keeps_bad_files_and_is_not_asked_again(
     assert path.is_file()
     assert sum(r.message == "File cannot be moved" for r in caplog.records) == 1
     sent_picture()
-    crew.stop(service)
+    runner.stop(service)
     (tmp_path / "occupied").unlink()
     again = begin(mode="snippets", quarantine_dir=nowhere)
     eventually(lambda: (nowhere / "bad.tiff").is_file() and not path.exists())
@@ -270,28 +274,28 @@ def test_a_folder_that_takes_nothing_keeps_bad_files_and_is_not_asked_again(
     assert counter(again, "files_quarantined") == 0, "it was counted when it was met first"
 
 
-def test_a_file_that_cannot_be_read_does_not_stop_the_others(begin, compressor, put_file, xtf, tmp_path):
+def test_a_file_that_cannot_be_read_does_not_stop_the_others(begin, compressor, put_file, survey_bytes, tmp_path):
     # Reading this process's memory from its beginning is an input/output error, as a bad sector is.
     broken = tmp_path / "incoming" / "broken.xtf"
     broken.symlink_to("/proc/self/mem")
     service = begin()
     eventually(lambda: service.health().state == "degraded")
     assert "Input/output error" in service.health().detail
-    put_file("good.xtf", xtf(1))
-    eventually(lambda: len(compressor.got) == 3, what="the file behind the broken one")
+    put_file("good.xtf", survey_bytes(1))
+    eventually(lambda: len(compressor.received) == 3, what="the file behind the broken one")
     broken.unlink()
     eventually(lambda: service.health().state == "ok")
 
 
-def test_a_folder_that_is_not_there_is_waited_for(begin, tmp_path, compressor, xtf):
+def test_a_folder_that_is_not_there_is_waited_for(begin, tmp_path, compressor, survey_bytes):
     (tmp_path / "disk").write_text("not mounted yet")
     service = begin(input_dir=tmp_path / "disk" / "incoming")
     eventually(lambda: service.health().state == "degraded")
     assert str(tmp_path / "disk") in service.health().detail
     (tmp_path / "disk").unlink()
     eventually(lambda: service.health().state == "ok")
-    (tmp_path / "disk" / "incoming" / "line.xtf").write_bytes(xtf(1))
-    eventually(lambda: len(compressor.got) == 3)
+    (tmp_path / "disk" / "incoming" / "line.xtf").write_bytes(survey_bytes(1))
+    eventually(lambda: len(compressor.received) == 3)
     # Away at one stroke: the service makes its folder anew whenever it finds none.
     (tmp_path / "disk").rename(tmp_path / "unmounted")
     (tmp_path / "disk").mkdir(exist_ok=True)
@@ -301,7 +305,7 @@ def test_a_folder_that_is_not_there_is_waited_for(begin, tmp_path, compressor, x
 
 @pytest.mark.parametrize("when", ["before", "during"])
 def test_a_file_that_vanishes_is_taken_when_it_comes_back(
-    when, begin, compressor, put_file, xtf, tmp_path, monkeypatch
+    when, begin, compressor, put_file, survey_bytes, tmp_path, monkeypatch
 ):
     read, hashed, gone = atd_stub.snippets.from_survey, atd_stub.content_hash, []
 
@@ -323,47 +327,47 @@ def test_a_file_that_vanishes_is_taken_when_it_comes_back(
     else:
         monkeypatch.setattr(atd_stub.snippets, "from_survey", vanish_then_read)
     service = begin()
-    path = put_file("line.xtf", xtf(1))
+    path = put_file("line.xtf", survey_bytes(1))
     eventually(lambda: bool(gone) and settled(service))
     assert counter(service, "files_quarantined") == 0
     (tmp_path / "away").rename(path)
-    eventually(lambda: len(compressor.got) == 3)
+    eventually(lambda: len(compressor.received) == 3)
     assert service.health().state == "ok"
 
 
-def test_a_file_that_changes_while_it_is_read_is_read_again(begin, compressor, put_file, xtf, monkeypatch):
+def test_a_file_that_changes_while_it_is_read_is_read_again(begin, compressor, put_file, survey_bytes, monkeypatch):
     read, changed = atd_stub.snippets.from_survey, []
 
     def change_then_read(path, *rest):
         found = read(path, *rest)
         if not changed:
             changed.append(path)
-            path.write_bytes(xtf(2))
+            path.write_bytes(survey_bytes(2))
         return found
 
     monkeypatch.setattr(atd_stub.snippets, "from_survey", change_then_read)
     service = begin()
-    path = put_file("line.xtf", xtf(1))
-    eventually(lambda: len(compressor.got) == 3)
+    path = put_file("line.xtf", survey_bytes(1))
+    eventually(lambda: len(compressor.received) == 3)
     eventually(lambda: counter(service, "files_processed") == 1)
-    assert [s.contact.atd_confidence for s in compressor.got] == [d.confidence for d in best_of(path)]
+    assert [s.contact.atd_confidence for s in compressor.received] == [d.confidence for d in best_of(path)]
 
 
-def test_a_name_that_is_not_text_is_no_obstacle(begin, compressor, tmp_path, xtf, put_file):
+def test_a_name_that_is_not_text_is_no_obstacle(begin, compressor, tmp_path, survey_bytes, put_file):
     folder = os.fsencode(tmp_path / "incoming")
-    for name, data in ((b"gr\xfcn.xtf", xtf(1)), (b"\xff\xfe.xtf", b"no survey")):
+    for name, data in ((b"gr\xfcn.xtf", survey_bytes(1)), (b"\xff\xfe.xtf", b"no survey")):
         with open(os.path.join(folder, name), "wb") as file:  # noqa: PTH118, PTH123 a name of bytes
             file.write(data)
     service = begin()
-    eventually(lambda: len(compressor.got) == 3)
-    assert compressor.got[0].source == "gr\\udcfcn.xtf"
+    eventually(lambda: len(compressor.received) == 3)
+    assert compressor.received[0].source == "gr\\udcfcn.xtf"
     eventually(lambda: counter(service, "files_quarantined") == 1)
-    put_file("after.xtf", xtf(2))
-    eventually(lambda: len(compressor.got) == 6)
+    put_file("after.xtf", survey_bytes(2))
+    eventually(lambda: len(compressor.received) == 6)
     assert not service.failed
 
 
-def test_a_defect_costs_one_file(begin, compressor, put_file, xtf, monkeypatch, caplog):
+def test_a_defect_costs_one_file(begin, compressor, put_file, survey_bytes, monkeypatch, caplog):
     read = atd_stub.snippets.from_survey
 
     def stumble(path, *rest):
@@ -371,23 +375,23 @@ def test_a_defect_costs_one_file(begin, compressor, put_file, xtf, monkeypatch, 
 
     monkeypatch.setattr(atd_stub.snippets, "from_survey", stumble)
     service = begin()
-    path = put_file("odd.xtf", xtf(1))
+    path = put_file("odd.xtf", survey_bytes(1))
     eventually((path.parent / "quarantine" / "odd.xtf").is_file)
-    put_file("good.xtf", xtf(2))
-    eventually(lambda: len(compressor.got) == 3)
+    put_file("good.xtf", survey_bytes(2))
+    eventually(lambda: len(compressor.received) == 3)
     assert "ZeroDivisionError" in (path.parent / "quarantine" / "odd.xtf.reason.txt").read_text()
     assert any(r.exc_info for r in caplog.records if r.message == "File not processed")
     assert not service.failed
 
 
-def test_a_full_disk_finds_nothing_twice_and_loses_nothing(begin, compressor, put_file, xtf):
+def test_a_full_disk_finds_nothing_twice_and_loses_nothing(begin, compressor, put_file, survey_bytes):
     service = begin()
     service.store._db.execute("PRAGMA max_page_count=1")
-    put_file("line.xtf", xtf(1))
+    put_file("line.xtf", survey_bytes(1))
     eventually(lambda: "disk is full" in service.health().detail)
-    assert compressor.got == []
+    assert compressor.received == []
     service.store._db.execute("PRAGMA max_page_count=1000000")
-    eventually(lambda: len(compressor.got) == 3)
+    eventually(lambda: len(compressor.received) == 3)
     eventually(lambda: service.health().state == "ok")
     eventually(lambda: counter(service, "files_processed") == 1)
 
@@ -400,7 +404,7 @@ def test_real_pictures_go_through_unchanged(begin, compressor, data_dir, put_fil
     for path in found:
         put_file(path.name, path.read_bytes())
     begin(mode="snippets")
-    eventually(lambda: len(compressor.got) == len(found))
-    for snippet in compressor.got:
+    eventually(lambda: len(compressor.received) == len(found))
+    for snippet in compressor.received:
         path = next(p for p in found if p.name == snippet.source)
         np.testing.assert_array_equal(snippet.picture.to_array(), read_image(path))

@@ -299,29 +299,29 @@ def test_a_snippet_on_the_disk_is_named_by_its_contact_and_stays_in_its_folder(t
 
 
 @pytest.fixture
-def begin(crew, platform, tmp_path):
+def begin(runner, platform, tmp_path):
     (tmp_path / "incoming").mkdir(exist_ok=True)
 
     def start(**changes):
         given = {"input_dir": tmp_path / "incoming", "poll_s": 0.02, "settle_s": 0.0, **changes}
-        return crew.start(AtdStubService(platform("uuv-1"), AtdStubConfig(**given)))
+        return runner.start(AtdStubService(platform("uuv-1"), AtdStubConfig(**given)))
 
     return start
 
 
-def test_what_is_kept_on_the_vehicle_can_be_sent_again_with_its_position(begin, crew, tmp_path, line):
-    compressor = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
+def test_what_is_kept_on_the_vehicle_can_be_sent_again_with_its_position(begin, runner, tmp_path, line):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
     service = begin(snippet_dir=tmp_path / "kept", confidence_threshold=0.3, max_contacts=2)
     os.link(line, tmp_path / "incoming" / "line-7.xtf")
-    eventually(lambda: len(compressor.got) == 2)
-    crew.stop(service)
-    first = {s.contact.contact_id: s for s in compressor.got}
+    eventually(lambda: len(compressor.received) == 2)
+    runner.stop(service)
+    first = {s.contact.contact_id: s for s in compressor.received}
     assert sorted(p.name for p in (tmp_path / "kept").iterdir()) == sorted(
         f"{name}.{suffix}" for name in first for suffix in ("tiff", "txt")
     )
     begin(mode="snippets", input_dir=tmp_path / "kept")
-    eventually(lambda: len(compressor.got) == 4)
-    for again in compressor.got[2:]:
+    eventually(lambda: len(compressor.received) == 4)
+    for again in compressor.received[2:]:
         before = first[again.contact.contact_id]
         assert again.picture == before.picture
         assert again.contact.model_copy(update={"time_utc_s": 0.0}) == before.contact.model_copy(
@@ -356,9 +356,9 @@ def test_a_done_file_counts_at_once_and_where_it_is_needed_nothing_else_does(tmp
     assert FileSeen(Path("a"), 1, 2, is_done=True) == FileSeen(Path("a"), 1, 2), "what is dealt with stays so"
 
 
-def test_the_same_file_under_another_name_is_said(begin, crew, tmp_path, line, caplog):
+def test_the_same_file_under_another_name_is_said(begin, runner, tmp_path, line, caplog):
     caplog.set_level("INFO")
-    crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
+    runner.peer("uuv-1", "compressor", {KEY: Snippet})
     service = begin()
     os.link(line, tmp_path / "incoming" / "line-7.xtf")
     eventually(lambda: service.health().counters.get("files_processed") == 1)

@@ -158,12 +158,12 @@ def test_a_seam_of_very_long_pings_is_short():
 
 
 @pytest.fixture
-def begin(crew, platform, tmp_path):
+def begin(runner, platform, tmp_path):
     (tmp_path / "incoming").mkdir(exist_ok=True)
 
     def start(**changes):
         config = AtdStubConfig(input_dir=tmp_path / "incoming", poll_s=0.02, settle_s=0.0, **changes)
-        return crew.start(AtdStubService(platform("uuv-1"), config))
+        return runner.start(AtdStubService(platform("uuv-1"), config))
 
     return start
 
@@ -185,32 +185,32 @@ def processed(service):
 
 
 @pytest.mark.parametrize("restarted", [False, True])
-def test_a_contact_on_the_seam_waits_for_the_next_file_and_goes_once(restarted, begin, crew, halves):
-    compressor = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
+def test_a_contact_on_the_seam_waits_for_the_next_file_and_goes_once(restarted, begin, runner, halves):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
     service = begin(join_timeout_s=3600.0)
     halves(0)
     eventually(lambda: processed(service) == 1)
     eventually(lambda: service.health().gauges["contacts_waiting"] >= 1)
-    assert near(compressor.got, 120) == []
+    assert near(compressor.received, 120) == []
     if restarted:
-        crew.stop(service)
+        runner.stop(service)
         service = begin(join_timeout_s=3600.0)
         eventually(lambda service=service: service.health().gauges["contacts_waiting"] >= 1)
     halves(1)
-    eventually(lambda: len(near(compressor.got, 120)) == 1)
-    assert near(compressor.got, 120)[0].picture.height_px == 80
+    eventually(lambda: len(near(compressor.received, 120)) == 1)
+    assert near(compressor.received, 120)[0].picture.height_px == 80
 
 
-def test_a_contact_goes_as_it_is_when_no_file_comes(begin, crew, halves):
-    compressor = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
+def test_a_contact_goes_as_it_is_when_no_file_comes(begin, runner, halves):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
     service = begin(join_timeout_s=0.2)
     halves(0)
-    eventually(lambda: len(near(compressor.got, 120)) == 1)
+    eventually(lambda: len(near(compressor.received, 120)) == 1)
     eventually(lambda: service.health().gauges["contacts_waiting"] == 0)
     halves(1)
     eventually(lambda: processed(service) == 2)
     eventually(lambda: service.health().gauges["contacts_waiting"] == service.health().gauges["outbox"] == 0)
-    assert len(near(compressor.got, 120)) == 1, "it is known"
+    assert len(near(compressor.received, 120)) == 1, "it is known"
 
 
 def test_read_back_the_pings_of_the_file_are_those_that_were_cut(tmp_path):

@@ -166,10 +166,10 @@ def test_the_pool_gives_the_most_confident_first_and_survives(tmp_path):
 
 
 @pytest.fixture
-def begin(crew, platform, tmp_path):
+def begin(runner, platform, tmp_path):
     def start(**changes):
         config = AtdStubConfig(mode="snippets", input_dir=tmp_path / "incoming", poll_s=0.02, settle_s=0.0, **changes)
-        return crew.start(AtdStubService(platform("uuv-1"), config))
+        return runner.start(AtdStubService(platform("uuv-1"), config))
 
     return start
 
@@ -191,16 +191,16 @@ def put_pictures(tmp_path, texture):
 
 
 @pytest.fixture
-def slow_compressor(crew):
+def slow_compressor(runner):
     """A compressor that takes everything into its inbox and handles one record a permit."""
-    compressor = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
     compressor.permits = 0
 
     def handle(key, record, effects):
         if compressor.permits <= 0:
             raise OSError("busy with an image")
         compressor.permits -= 1
-        compressor.got.append(record)
+        compressor.received.append(record)
 
     compressor.handle = handle
     return compressor
@@ -218,21 +218,21 @@ def test_the_most_confident_go_first_and_never_too_many_are_on_the_way(begin, sl
     assert "6 contacts wait" in service.health().detail
     for number in range(1, 9):
         slow_compressor.permits = 1
-        eventually(lambda number=number: len(slow_compressor.got) == number)
+        eventually(lambda number=number: len(slow_compressor.received) == number)
         left = min(2, 8 - number)
         eventually(lambda left=left: slow_compressor.store.inbox_depth() == left)
-    got = [s.contact.atd_confidence for s in slow_compressor.got]
+    got = [s.contact.atd_confidence for s in slow_compressor.received]
     assert sorted(got) == sorted(confidences)
     assert got[2:] == sorted(got[2:], reverse=True), "the first two went before the others were known"
 
 
-def test_a_full_acoustic_queue_holds_contacts_over_a_restart(begin, crew, put_pictures, client):
-    compressor = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
-    modem = crew.neighbour("uuv-1", "uuv_modem")
+def test_a_full_acoustic_queue_holds_contacts_over_a_restart(begin, runner, put_pictures, client):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    modem = runner.peer("uuv-1", "uuv_modem")
     modem.gauges = lambda: {"messages_waiting": 0.0}
     put_pictures([1.0])
     service = begin(max_in_flight=3)
-    eventually(lambda: len(compressor.got) == 1)
+    eventually(lambda: len(compressor.received) == 1)
     full = wire.encode(queue_of(3))
 
     def tell(payload):
@@ -242,33 +242,33 @@ def test_a_full_acoustic_queue_holds_contacts_over_a_restart(begin, crew, put_pi
     eventually(lambda: tell(full) and service.health().gauges["contacts_on_the_way"] >= 3)
     put_pictures([1.0, 0.5, 1.5])
     eventually(lambda: service.health().gauges["contacts_waiting"] == 2)
-    crew.stop(service)
+    runner.stop(service)
     service = begin(max_in_flight=3)
     eventually(lambda: tell(full) and service.health().gauges["contacts_on_the_way"] >= 3)
     assert service.health().gauges["contacts_waiting"] == 2
-    assert len(compressor.got) == 1
+    assert len(compressor.received) == 1
     empty = wire.encode(queue_of(2))
-    eventually(lambda: tell(empty) and len(compressor.got) == 2)
+    eventually(lambda: tell(empty) and len(compressor.received) == 2)
     empty = wire.encode(queue_of(0))
-    eventually(lambda: tell(empty) and len(compressor.got) == 3)
-    assert [s.contact.atd_confidence for s in compressor.got] == [1.0, 1.5, 0.5]
+    eventually(lambda: tell(empty) and len(compressor.received) == 3)
+    assert [s.contact.atd_confidence for s in compressor.received] == [1.0, 1.5, 0.5]
 
 
-def test_a_report_that_is_none_is_left_out(begin, crew, put_pictures, publish, caplog):
-    compressor = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
+def test_a_report_that_is_none_is_left_out(begin, runner, put_pictures, publish, caplog):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
     service = begin()
     publish(keys.acoustic_queue("uuv-1"), b"\xc1")
     publish(keys.health("uuv-1", "uuv_modem"), b"no report")
     eventually(lambda: sum(r.message == "A report is left out" for r in caplog.records) == 2)
     put_pictures([1.0])
-    eventually(lambda: len(compressor.got) == 1)
+    eventually(lambda: len(compressor.received) == 1)
     assert not service.failed
 
 
-def test_killed_again_and_again_it_sends_every_contact_once(crew, router, tmp_path, put_pictures):
+def test_killed_again_and_again_it_sends_every_contact_once(runner, router, tmp_path, put_pictures):
     pictures, kills = 40, 3
     put_pictures([round(random.Random(n).uniform(0, 2), 3) for n in range(pictures)])
-    compressor = crew.neighbour("uuv-1", "compressor", {KEY: Snippet})
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
     config = tmp_path / "uuv.toml"
     config.write_text(
         f'[platform]\nid = "uuv-1"\nrouter = ["{router}"]\nstate_dir = "{tmp_path / "vehicle"}"\n'
@@ -283,9 +283,9 @@ def test_killed_again_and_again_it_sends_every_contact_once(crew, router, tmp_pa
         try:
             # A little further each time, and then somewhere within what it does next.
             wanted = pictures if life == kills else (life + 1) * pictures // (kills + 2)
-            eventually(lambda wanted=wanted: len(compressor.got) >= wanted)
+            eventually(lambda wanted=wanted: len(compressor.received) >= wanted)
             time.sleep(rng.uniform(0, 0.02))
         finally:
             process.kill()
             process.wait()
-    assert sorted(s.contact.contact_id for s in compressor.got) == [f"p{n:03d}" for n in range(pictures)]
+    assert sorted(s.contact.contact_id for s in compressor.received) == [f"p{n:03d}" for n in range(pictures)]

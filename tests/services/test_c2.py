@@ -25,13 +25,13 @@ def out(tmp_path):
 
 
 @pytest.fixture
-def begin(crew, platform, out):
-    return lambda folder=None: crew.start(C2Service(platform("shore-1"), C2Config(out_dir=folder or out)))
+def begin(runner, platform, out):
+    return lambda folder=None: runner.start(C2Service(platform("shore-1"), C2Config(out_dir=folder or out)))
 
 
 @pytest.fixture
-def relay(crew):
-    return crew.neighbour("vessel-1", "relay")
+def relay(runner):
+    return runner.peer("vessel-1", "relay")
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def envelope(record, vessel="vessel-1", **changes):
 
 
 def send(relay, *records, vessel="vessel-1"):
-    relay.owe(
+    relay.send(
         keys.shore_inbox(vessel), "c2", *(envelope(r, vessel) if not isinstance(r, Relayed) else r for r in records)
     )
 
@@ -75,7 +75,7 @@ def files(folder):
     return sorted(name for name in found if not name.startswith("index.db"))
 
 
-def test_a_picture_is_kept_and_shown_for_msgpack_alone(begin, relay, image, out, watch, is_told):
+def test_a_picture_is_kept_and_shown_for_msgpack_alone(begin, relay, image, out, watch, check_monitoring):
     seen = watch(keys.shore_image("vessel-1"))
     service = begin()
     sent = image()
@@ -98,7 +98,7 @@ def test_a_picture_is_kept_and_shown_for_msgpack_alone(begin, relay, image, out,
     )
     eventually(lambda: relay.store.outbox_depth() == 0)
     eventually(lambda: service.health().counters == {"records_handled": 1, "images_stored": 1})
-    is_told(service)
+    check_monitoring(service)
 
 
 def test_a_decision_is_kept_and_shown(begin, relay, out, watch):
@@ -213,7 +213,7 @@ def test_an_envelope_with_the_wrong_content_is_refused_and_said(make, field, beg
 def test_no_vessel_speaks_for_another(begin, relay, image, refused, out):
     service = begin()
     forged = envelope(image(vessel="vessel-2"), "vessel-2")
-    relay.owe(keys.shore_inbox("vessel-1"), "c2", forged)
+    relay.send(keys.shore_inbox("vessel-1"), "c2", forged)
     send(relay, image())
     eventually(lambda: service.health().counters.get("images_stored") == 1)
     [(key, reason)] = refused(service)
@@ -222,9 +222,9 @@ def test_no_vessel_speaks_for_another(begin, relay, image, refused, out):
     assert not (out / "vessel-2").exists()
 
 
-def test_two_vessels_are_kept_apart(begin, crew, relay, image, out):
+def test_two_vessels_are_kept_apart(begin, runner, relay, image, out):
     begin()
-    other = crew.neighbour("vessel-2", "relay")
+    other = runner.peer("vessel-2", "relay")
     send(relay, image(seed=1), decision_record())
     send(other, image(vessel="vessel-2", seed=2), decision_record(vessel_id="vessel-2"), vessel="vessel-2")
     eventually(lambda: len(list(out.rglob("*.json"))) == 4)
@@ -233,7 +233,7 @@ def test_two_vessels_are_kept_apart(begin, crew, relay, image, out):
     assert one["picture_sha256"] != two["picture_sha256"]
 
 
-def test_what_was_committed_before_a_stop_is_handled_after_it(begin, crew, platform, relay, image, out, watch):
+def test_what_was_committed_before_a_stop_is_handled_after_it(begin, runner, platform, relay, image, out, watch):
     seen = watch(keys.shore_image("vessel-1"))
     idle = C2Service(platform("shore-1"), C2Config(out_dir=out))
     with idle.store.transaction() as tx:
@@ -243,7 +243,7 @@ def test_what_was_committed_before_a_stop_is_handled_after_it(begin, crew, platf
     service = begin()
     eventually(lambda: len(seen) == 1)
     assert len(files(out)) == 3
-    crew.stop(service)
+    runner.stop(service)
     again = begin()
     assert again.store.inbox_depth() == 0
     assert len(seen) == 1

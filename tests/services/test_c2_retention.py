@@ -213,20 +213,20 @@ def test_a_picture_is_found_by_name_and_newest_version():
         find_picture(twice, "uuv-1/AAAA", None, None)
 
 
-def test_the_service_removes_counts_and_logs(crew, platform, tmp_path, caplog):
+def test_the_service_removes_counts_and_logs(runner, platform, tmp_path, caplog):
     from sonarpost import keys, wire
     from sonarpost.messages import Relayed
     from sonarpost.services.c2.service import C2Service
 
-    service = crew.start(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out", max_bytes=0)))
-    relay = crew.neighbour("vessel-1", "relay")
+    service = runner.start(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out", max_bytes=0)))
+    relay = runner.peer("vessel-1", "relay")
     envelope = Relayed(
         vessel_id="vessel-1",
         key=keys.image_reconstructed("vessel-1"),
         payload=wire.encode(image()),
         relayed_utc_s=5.0,
     )
-    relay.owe(keys.shore_inbox("vessel-1"), "c2", envelope)
+    relay.send(keys.shore_inbox("vessel-1"), "c2", envelope)
     eventually(lambda: service.health().counters.get("images_removed") == 1)
     assert service.health().gauges["pictures_bytes"] == 0
     assert pictures_in(tmp_path / "out") == []

@@ -27,32 +27,32 @@ def out(tmp_path):
 
 
 @pytest.fixture
-def begin(crew, platform, out):
-    return lambda **options: crew.start(C2Service(platform("shore-1"), C2Config(out_dir=out, **options)))
+def begin(runner, platform, out):
+    return lambda **options: runner.start(C2Service(platform("shore-1"), C2Config(out_dir=out, **options)))
 
 
 @pytest.fixture
-def relay(crew, platform):
+def relay(runner, platform):
     def make(advice=("console",), commands=("op_modem",)):
         config = RelayConfig(advice_consumers=advice, command_consumers=commands)
-        return crew.start(RelayService(platform("vessel-1"), config))
+        return runner.start(RelayService(platform("vessel-1"), config))
 
     return make
 
 
 @pytest.fixture
-def expert(crew):
-    return crew.neighbour("shore-1", "expert")
+def expert(runner):
+    return runner.peer("shore-1", "expert")
 
 
 @pytest.fixture
-def console(crew):
-    return lambda: crew.neighbour("vessel-1", "console", {keys.advice("vessel-1"): Advice})
+def console(runner):
+    return lambda: runner.peer("vessel-1", "console", {keys.advice("vessel-1"): Advice})
 
 
 @pytest.fixture
-def op_modem(crew):
-    return lambda: crew.neighbour("vessel-1", "op_modem", {keys.command_all("vessel-1"): Command})
+def op_modem(runner):
+    return lambda: runner.peer("vessel-1", "op_modem", {keys.command_all("vessel-1"): Command})
 
 
 def advice(advice_id="a1", vessel="vessel-1", **changes):
@@ -93,9 +93,9 @@ def test_advice_and_a_command_reach_their_consumers_on_the_vessel(begin, relay, 
     service = begin()
     relay()
     screen, modem = console(), op_modem()
-    expert.owe(ADVICE, "c2", advice())
-    expert.owe(COMMAND, "c2", command())
-    eventually(lambda: screen.got == [advice()] and modem.got == [command()])
+    expert.send(ADVICE, "c2", advice())
+    expert.send(COMMAND, "c2", command())
+    eventually(lambda: screen.received == [advice()] and modem.received == [command()])
     eventually(lambda: set(states(out).values()) == {"delivered"})
     assert set(states(out)) == {("vessel-1", "advice", "a1"), ("vessel-1", "command", "c1")}
     eventually(lambda: len(shown) >= 2)
@@ -106,23 +106,23 @@ def test_advice_and_a_command_reach_their_consumers_on_the_vessel(begin, relay, 
     assert service.health().counters["tasking_accepted"] == 2
 
 
-def test_with_the_vessel_away_it_waits_and_arrives_when_the_vessel_is_back(begin, relay, expert, console, out, crew):
+def test_with_the_vessel_away_it_waits_and_arrives_when_the_vessel_is_back(begin, relay, expert, console, out, runner):
     service = begin()
-    expert.owe(ADVICE, "c2", advice("a1"), advice("a2"))
+    expert.send(ADVICE, "c2", advice("a1"), advice("a2"))
     eventually(lambda: service.gauges()["waiting_for_vessels"] == 2)
     eventually(lambda: list(states(out).values()) == ["waiting"] * 2)
-    crew.stop(service)
+    runner.stop(service)
     service = begin()
     assert service.gauges()["waiting_for_vessels"] == 2
     screen = console()
     relay(commands=())
-    eventually(lambda: [a.advice_id for a in screen.got] == ["a1", "a2"])
+    eventually(lambda: [a.advice_id for a in screen.received] == ["a1", "a2"])
     eventually(lambda: list(states(out).values()) == ["delivered"] * 2)
     assert service.gauges()["waiting_for_vessels"] == 0
 
 
 def test_over_a_link_that_is_cut_advice_waits_and_arrives_once_when_it_is_mended(
-    begin, crew, platform, expert, out, tmp_path, router
+    begin, runner, platform, expert, out, tmp_path, router
 ):
     """Two routers, the vessel's linked to the shore's through a proxy that can be cut."""
     proxy = TcpProxy(int(router.rpartition(":")[2]))
@@ -132,21 +132,21 @@ def test_over_a_link_that_is_cut_advice_waits_and_arrives_once_when_it_is_mended
     screen_type = type("Console", (type(expert),), {"NAME": "console"})
     try:
         service = begin()
-        crew.start(RelayService(aboard, RelayConfig(advice_consumers=("console",))))
-        screen = crew.start(screen_type(aboard, {keys.advice("vessel-1"): Advice}))
-        expert.owe(ADVICE, "c2", advice("before"))
-        eventually(lambda: [a.advice_id for a in screen.got] == ["before"])
+        runner.start(RelayService(aboard, RelayConfig(advice_consumers=("console",))))
+        screen = runner.start(screen_type(aboard, {keys.advice("vessel-1"): Advice}))
+        expert.send(ADVICE, "c2", advice("before"))
+        eventually(lambda: [a.advice_id for a in screen.received] == ["before"])
         eventually(lambda: states(out).get(("vessel-1", "advice", "before")) == "delivered")
         proxy.cut()
-        expert.owe(ADVICE, "c2", advice("meanwhile"))
+        expert.send(ADVICE, "c2", advice("meanwhile"))
         eventually(lambda: states(out).get(("vessel-1", "advice", "meanwhile")) == "waiting")
         eventually(lambda: not service.is_responding("relay@vessel-1"), timeout_s=20)
-        assert [a.advice_id for a in screen.got] == ["before"]
+        assert [a.advice_id for a in screen.received] == ["before"]
         proxy.mend()
-        eventually(lambda: [a.advice_id for a in screen.got] == ["before", "meanwhile"], timeout_s=30)
+        eventually(lambda: [a.advice_id for a in screen.received] == ["before", "meanwhile"], timeout_s=30)
         eventually(lambda: states(out).get(("vessel-1", "advice", "meanwhile")) == "delivered")
     finally:
-        crew.stop_all()
+        runner.stop_all()
         vessel_router.close()
         proxy.close()
 
@@ -155,10 +155,10 @@ def test_a_vessel_that_is_away_holds_no_other_back(begin, relay, expert, console
     begin()
     relay()
     screen = console()
-    expert.owe(keys.tasking_advice("vessel-9"), "c2", advice("far", vessel="vessel-9"))
+    expert.send(keys.tasking_advice("vessel-9"), "c2", advice("far", vessel="vessel-9"))
     eventually(lambda: states(out) == {("vessel-9", "advice", "far"): "waiting"})
-    expert.owe(ADVICE, "c2", advice("near"))
-    eventually(lambda: [a.advice_id for a in screen.got] == ["near"])
+    expert.send(ADVICE, "c2", advice("near"))
+    eventually(lambda: [a.advice_id for a in screen.received] == ["near"])
     eventually(lambda: states(out)["vessel-1", "advice", "near"] == "delivered")
     assert states(out)["vessel-9", "advice", "far"] == "waiting"
 
@@ -166,8 +166,8 @@ def test_a_vessel_that_is_away_holds_no_other_back(begin, relay, expert, console
 def test_what_nobody_on_the_vessel_takes_is_refused_and_the_shore_is_told(begin, relay, expert, out, refused):
     service = begin()
     relay(advice=(), commands=())
-    expert.owe(ADVICE, "c2", advice())
-    expert.owe(COMMAND, "c2", command())
+    expert.send(ADVICE, "c2", advice())
+    expert.send(COMMAND, "c2", command())
     eventually(lambda: list(states(out).values()) == ["refused"] * 2)
     reasons = [reason for _, reason in refused(service)]
     assert any("a name in [relay] advice_consumers" in reason for reason in reasons)
@@ -180,10 +180,10 @@ def test_the_same_advice_again_is_taken_once_and_another_under_its_name_refused(
     service = begin()
     relay()
     screen = console()
-    expert.owe(ADVICE, "c2", advice(), advice())
+    expert.send(ADVICE, "c2", advice(), advice())
     eventually(lambda: service.health().counters.get("tasking_repeated") == 1)
-    expert.owe(ADVICE, "c2", advice(remark="something else"), advice("a2"))
-    eventually(lambda: [a.advice_id for a in screen.got] == ["a1", "a2"])
+    expert.send(ADVICE, "c2", advice(remark="something else"), advice("a2"))
+    eventually(lambda: [a.advice_id for a in screen.received] == ["a1", "a2"])
     eventually(lambda: len(refused(expert)) == 1)
     assert "advice_id: got 'a1', expected an identifier that no other record" in refused(expert)[0][1]
 
@@ -198,17 +198,17 @@ def test_the_same_advice_again_is_taken_once_and_another_under_its_name_refused(
 )
 def test_what_is_not_for_the_vessel_of_the_key_is_refused_at_once(key, record, field, begin, expert, refused):
     service = begin()
-    expert.owe(key, "c2", record)
+    expert.send(key, "c2", record)
     eventually(lambda: len(refused(expert)) == 1)
     assert f"{field}: got" in refused(expert)[0][1]
     assert service.gauges()["waiting_for_vessels"] == 0
 
 
-def test_the_relay_refuses_advice_for_another_vessel_and_a_command_under_another_kind(relay, crew, refused):
+def test_the_relay_refuses_advice_for_another_vessel_and_a_command_under_another_kind(relay, runner, refused):
     relay()
-    other = crew.neighbour("shore-9", "c2")
-    other.owe(keys.advice("vessel-1"), "relay", advice(vessel="vessel-2"))
-    other.owe(keys.command("vessel-1", "resend"), "relay", command(kind="refine"))
+    other = runner.peer("shore-9", "c2")
+    other.send(keys.advice("vessel-1"), "relay", advice(vessel="vessel-2"))
+    other.send(keys.command("vessel-1", "resend"), "relay", command(kind="refine"))
     eventually(lambda: len(refused(other)) == 2)
     reasons = " ".join(reason for _, reason in refused(other))
     assert "vessel_id: got 'vessel-2', expected vessel-1" in reasons
@@ -221,16 +221,16 @@ def test_what_a_program_aboard_publishes_is_not_the_relays(relay, console, publi
 
     service, screen = relay(), console()
     publish(keys.advice("vessel-1"), wire.encode(advice()))
-    eventually(lambda: len(screen.got) == 1)
+    eventually(lambda: len(screen.received) == 1)
     assert "advice_taken" not in service.health().counters
     assert service.store.inbox_depth() == 0
 
 
-def test_another_vessels_envelope_is_refused_while_its_sender_can_be_told(begin, crew, refused):
+def test_another_vessels_envelope_is_refused_while_its_sender_can_be_told(begin, runner, refused):
     from sonarpost import wire
     from sonarpost.messages import Relayed
 
-    service, sender = begin(), crew.neighbour("vessel-1", "relay")
+    service, sender = begin(), runner.peer("vessel-1", "relay")
     inner = Decision(
         decision_id="d",
         vessel_id="vessel-2",
@@ -244,7 +244,7 @@ def test_another_vessels_envelope_is_refused_while_its_sender_can_be_told(begin,
     forged = Relayed(
         vessel_id="vessel-2", key=keys.contact_decision("vessel-2"), payload=wire.encode(inner), relayed_utc_s=1.0
     )
-    sender.owe(keys.shore_inbox("vessel-1"), "c2", forged)
+    sender.send(keys.shore_inbox("vessel-1"), "c2", forged)
     eventually(lambda: len(refused(sender)) == 1)
     assert "vessel_id: got 'vessel-2', expected the vessel in the key" in refused(sender)[0][1]
     assert service.health().counters == {"records_refused": 1}

@@ -125,11 +125,11 @@ def cheap_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def start(crew, platform):
+def start(runner, platform):
     def make(**options: Any) -> ConsoleService:
         side = options.get("side", "vessel")
         config = ConsoleConfig(port=0, **options)
-        return crew.start(ConsoleService(platform(VESSEL if side == "vessel" else "shore-1"), config))
+        return runner.start(ConsoleService(platform(VESSEL if side == "vessel" else "shore-1"), config))
 
     return make
 
@@ -138,25 +138,25 @@ def put(client: zenoh.Session, key: str, record: Any) -> None:
     publish_once(client, key, wire.encode(record), wire.encoding_of(type(record)))
 
 
-def test_a_picture_is_shown_as_it_refines_and_a_decision_reaches_relay_and_modem(crew, start):
-    relay = crew.neighbour(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
-    modem = crew.neighbour(
+def test_a_picture_is_shown_as_it_refines_and_a_decision_reaches_relay_and_modem(runner, start):
+    relay = runner.peer(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
+    modem = runner.peer(
         VESSEL, "op_modem", {keys.contact_decision(VESSEL): Decision, keys.command_all(VESSEL): Command}
     )
-    decompressor = crew.neighbour(VESSEL, "decompressor")
+    decompressor = runner.peer(VESSEL, "decompressor")
     console = start()
     anna = Page(console, "anna", "operator")
     stream, events = anna.events()
     eventually(lambda: [name for name, _ in events] == ["hello"], what="stream")
     key = keys.image_reconstructed(VESSEL)
-    decompressor.owe(key, "console", picture(1, complete=False))
+    decompressor.send(key, "console", picture(1, complete=False))
     eventually(lambda: any(name == "contact" and data["new"] for name, data in events), what="contact")
-    decompressor.owe(key, "console", picture(2))
+    decompressor.send(key, "console", picture(2))
     eventually(lambda: any(name == "contact" and data["contact"]["complete"] for name, data in events), what="refined")
     decision = anna.decide(remark="clean edge")
-    eventually(lambda: len(relay.got) == len(modem.got) == 1, what="decision handed on")
-    assert relay.got == modem.got
-    assert (relay.got[0].decision_id, relay.got[0].operator, relay.got[0].image_version) == (
+    eventually(lambda: len(relay.received) == len(modem.received) == 1, what="decision handed on")
+    assert relay.received == modem.received
+    assert (relay.received[0].decision_id, relay.received[0].operator, relay.received[0].image_version) == (
         decision["decision_id"],
         "anna",
         2,
@@ -169,9 +169,9 @@ def test_a_picture_is_shown_as_it_refines_and_a_decision_reaches_relay_and_modem
     stream.close()
 
 
-def test_how_far_a_decision_has_come_is_watched(crew, start, client):
+def test_how_far_a_decision_has_come_is_watched(runner, start, client):
     for name in ("relay", "op_modem"):
-        crew.neighbour(VESSEL, name, {keys.contact_decision(VESSEL): Decision})
+        runner.peer(VESSEL, name, {keys.contact_decision(VESSEL): Decision})
     console = start()
     put(client, keys.image_reconstructed(VESSEL), picture())
     anna = Page(console, "anna", "operator")
@@ -193,9 +193,9 @@ def test_how_far_a_decision_has_come_is_watched(crew, start, client):
     eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "relay", what="relay's receipt")
 
 
-def test_a_relay_with_nothing_waiting_means_that_decisions_are_ashore(start, client, crew, monkeypatch):
+def test_a_relay_with_nothing_waiting_means_that_decisions_are_ashore(start, client, runner, monkeypatch):
     monkeypatch.setattr("sonarpost.services.console.service.ASHORE_MARGIN_S", -1.0)
-    relay = crew.neighbour(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
+    relay = runner.peer(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
     console = start(decision_consumers=("relay",))
     put(client, keys.image_reconstructed(VESSEL), picture())
     anna = Page(console, "anna", "operator")
@@ -214,15 +214,15 @@ def test_a_relay_with_nothing_waiting_means_that_decisions_are_ashore(start, cli
         assert anna.contact()["contact"]["delivery"]["shore"] == ashore
 
 
-def test_requests_go_to_the_modem(crew, start, client):
-    modem = crew.neighbour(VESSEL, "op_modem", {keys.command_all(VESSEL): Command})
+def test_requests_go_to_the_modem(runner, start, client):
+    modem = runner.peer(VESSEL, "op_modem", {keys.command_all(VESSEL): Command})
     console = start(decision_consumers=())
     put(client, keys.image_reconstructed(VESSEL), picture(1, complete=False))
     anna = Page(console, "anna", "operator")
     eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
     asked = anna.post(f"/api/contacts/{ID}/requests", {"kind": "resend", "airtime_s": 9.3})
-    eventually(lambda: len(modem.got) == 1, what="request")
-    assert (modem.got[0].command_id, modem.got[0].image_id, modem.got[0].issued_by) == (
+    eventually(lambda: len(modem.received) == 1, what="request")
+    assert (modem.received[0].command_id, modem.received[0].image_id, modem.received[0].issued_by) == (
         asked["command_id"],
         "00A7",
         "anna",
@@ -232,15 +232,15 @@ def test_requests_go_to_the_modem(crew, start, client):
     assert (decision["delivery"]["shore"], decision["delivery"]["vehicle"]) == ("none", "none")
 
 
-def test_advice_from_ashore_appears_beside_the_contact(crew, start, client):
+def test_advice_from_ashore_appears_beside_the_contact(runner, start, client):
     console = start()
     put(client, keys.image_reconstructed(VESSEL), picture())
-    relay = crew.neighbour(VESSEL, "relay")
+    relay = runner.peer(VESSEL, "relay")
     anna = Page(console, "anna", "operator")
     eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
     names = {"vessel_id": VESSEL, "vehicle_id": "uuv-1", "image_id": "00A7", "image_version": 1}
     advice = Advice(advice_id="a-1", author="eva", advised_utc_s=time.time(), remark="look again", **names)
-    relay.owe(keys.advice(VESSEL), "console", advice)
+    relay.send(keys.advice(VESSEL), "console", advice)
     eventually(lambda: anna.contact()["contact"]["advised"], what="advice")
     assert anna.contact()["advice"][0]["remark"] == "look again"
 
@@ -283,15 +283,15 @@ def test_a_picture_of_another_vessel_is_refused(start, client, refused):
     assert console.board.counts().total == 0
 
 
-def test_ashore_c2s_pictures_are_shown_and_advice_goes_to_c2(crew, start, client):
-    c2 = crew.neighbour("shore-1", "c2", {keys.tasking_advice_all(): Advice, keys.tasking_command_all(): Command})
+def test_ashore_c2s_pictures_are_shown_and_advice_goes_to_c2(runner, start, client):
+    c2 = runner.peer("shore-1", "c2", {keys.tasking_advice_all(): Advice, keys.tasking_command_all(): Command})
     console = start(role="shore")
     put(client, keys.shore_image(VESSEL), picture())
     eva = Page(console, "eva", "expert")
     eventually(lambda: eva.get("/api/contacts")["total"] == 1, what="picture")
     advice = eva.post(f"/api/contacts/{ID}/advice", {"version": 1, "verdict": "unsure", "remark": "shadow too long"})
-    eventually(lambda: len(c2.got) == 1, what="advice")
-    assert (c2.got[0].advice_id, c2.got[0].author) == (advice["advice_id"], "eva")
+    eventually(lambda: len(c2.received) == 1, what="advice")
+    assert (c2.received[0].advice_id, c2.received[0].author) == (advice["advice_id"], "eva")
     state = TaskingState(
         vessel_id=VESSEL, kind="advice", record_id=advice["advice_id"], state="delivered", changed_utc_s=time.time()
     )
@@ -314,23 +314,23 @@ def test_ashore_what_came_meanwhile_is_taken_from_c2s_folder(start, tmp_path):
     assert kept.picture == picture(2).picture
 
 
-def test_what_people_did_outlives_the_service(crew, start, client):
+def test_what_people_did_outlives_the_service(runner, start, client):
     console = start()
     put(client, keys.image_reconstructed(VESSEL), picture())
     anna = Page(console, "anna", "operator")
     eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
     decision = anna.decide()
-    crew.stop(console)
+    runner.stop(console)
     again = start()
-    relay = crew.neighbour(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
-    eventually(lambda: len(relay.got) == 1, what="decision after the restart")
-    assert relay.got[0].decision_id == decision["decision_id"]
+    relay = runner.peer(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
+    eventually(lambda: len(relay.received) == 1, what="decision after the restart")
+    assert relay.received[0].decision_id == decision["decision_id"]
     bo = Page(again, "bo", "operator")
     assert bo.contact()["contact"]["review"] == "mine_like"
     assert [entry["user"] for entry in bo.contact()["audit"]] == ["anna"]
 
 
-def test_a_decision_that_was_written_and_not_handed_on_goes_after_a_kill(crew, start, client, monkeypatch):
+def test_a_decision_that_was_written_and_not_handed_on_goes_after_a_kill(runner, start, client, monkeypatch):
     console = start()
     put(client, keys.image_reconstructed(VESSEL), picture())
     anna = Page(console, "anna", "operator")
@@ -338,10 +338,10 @@ def test_a_decision_that_was_written_and_not_handed_on_goes_after_a_kill(crew, s
     # As if it were killed between the two writes.
     monkeypatch.setattr(console, "_send", lambda _item: console.stopping.wait())
     decision = anna.decide()
-    crew.stop(console)
+    runner.stop(console)
     start()
-    relay = crew.neighbour(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
-    eventually(lambda: [d.decision_id for d in relay.got] == [decision["decision_id"]], what="decision")
+    relay = runner.peer(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
+    eventually(lambda: [d.decision_id for d in relay.received] == [decision["decision_id"]], what="decision")
 
 
 def test_tls_needs_a_certificate_and_a_port_its_place(platform, start):
@@ -355,8 +355,8 @@ def test_tls_needs_a_certificate_and_a_port_its_place(platform, start):
     second.stop()
 
 
-def test_health_token_and_last_word(start, is_told):
-    is_told(start())
+def test_health_token_and_last_word(start, check_monitoring):
+    check_monitoring(start())
 
 
 def test_a_wrong_configuration_ends_the_process(tmp_path, capsys):
@@ -366,8 +366,8 @@ def test_a_wrong_configuration_ends_the_process(tmp_path, capsys):
     assert "passwords go over this connection" in capsys.readouterr().err
 
 
-def test_a_decision_is_ashore_when_the_real_relay_has_none_left(crew, start, client, platform):
-    relay = crew.start(RelayService(platform(VESSEL), RelayConfig()))
+def test_a_decision_is_ashore_when_the_real_relay_has_none_left(runner, start, client, platform):
+    relay = runner.start(RelayService(platform(VESSEL), RelayConfig()))
     console = start(decision_consumers=("relay",))
     put(client, keys.image_reconstructed(VESSEL), picture())
     anna = Page(console, "anna", "operator")
@@ -375,6 +375,6 @@ def test_a_decision_is_ashore_when_the_real_relay_has_none_left(crew, start, cli
     anna.decide()
     eventually(lambda: relay.gauges()["decisions_waiting"] == 1.0, what="decision at the relay")
     eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "relay", what="relay's receipt")
-    c2 = crew.neighbour("shore-1", "c2", {keys.shore_inbox_all(): Relayed})
+    c2 = runner.peer("shore-1", "c2", {keys.shore_inbox_all(): Relayed})
     eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "delivered", what="ashore")
-    assert keys.contact_decision(VESSEL) in [envelope.key for envelope in c2.got]
+    assert keys.contact_decision(VESSEL) in [envelope.key for envelope in c2.received]

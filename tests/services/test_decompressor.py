@@ -52,22 +52,22 @@ def out(tmp_path):
 
 
 @pytest.fixture
-def begin(crew, platform, out):
+def begin(runner, platform, out):
     def start(**options):
         usual = {"out_dir": out, "codebooks": ("nominal-10",), "vehicles": {"3": "uuv-1"}, "pairing_timeout_s": 60.0}
-        return crew.start(DecompressorService(platform("vessel-1"), DecompressorConfig(**(usual | options))))
+        return runner.start(DecompressorService(platform("vessel-1"), DecompressorConfig(**(usual | options))))
 
     return start
 
 
 @pytest.fixture
-def relay(crew):
-    return crew.neighbour("vessel-1", "relay", {OUT: ReconstructedImage})
+def relay(runner):
+    return runner.peer("vessel-1", "relay", {OUT: ReconstructedImage})
 
 
 @pytest.fixture
-def modem(crew):
-    return crew.neighbour("vessel-1", "op_modem")
+def modem(runner):
+    return runner.peer("vessel-1", "op_modem")
 
 
 def frame(data, *, at_utc_s=None, source=3, number=1):
@@ -87,7 +87,7 @@ def frame(data, *, at_utc_s=None, source=3, number=1):
 
 def hear(modem, *frames, **options):
     """What op_modem owes for frames that came out of the water."""
-    modem.owe(IN, "decompressor", *(frame(data, **options) for data in frames))
+    modem.send(IN, "decompressor", *(frame(data, **options) for data in frames))
 
 
 def frames_of(image_id, stream, contact=CONTACT):
@@ -101,14 +101,14 @@ def half(image_id, stream, name):
     return found
 
 
-def test_both_halves_and_the_contact_make_a_picture(begin, modem, relay, stream, vq, out, is_told, watch):
+def test_both_halves_and_the_contact_make_a_picture(begin, modem, relay, stream, vq, out, check_monitoring, watch):
     seen = watch(OUT)
     service = begin()
     data = stream()
     size = StreamHeader.unpack(data).size
     hear(modem, *frames_of("0A1B", data), at_utc_s=1_700_000_000.0)
-    eventually(lambda: len(relay.got) == 1)
-    image = relay.got[0]
+    eventually(lambda: len(relay.received) == 1)
+    image = relay.received[0]
     assert (image.vessel_id, image.vehicle_id, image.image_id, image.version) == ("vessel-1", "uuv-1", "0A1B", 1)
     assert (image.complete, image.missing_fraction, image.missing_halves, image.missing_mask) == (True, 0.0, (), b"")
     assert (image.codec, image.model) == ("vq", vq.model_hash)
@@ -120,14 +120,14 @@ def test_both_halves_and_the_contact_make_a_picture(begin, modem, relay, stream,
     eventually(lambda: len(seen) == 1, what="the copy for watchers")
     shown = msgpack.unpackb(seen[0].payload.to_bytes())
     assert hashlib.sha256(shown["picture"]["data"]).hexdigest() == shown["picture_sha256"] == image.picture.sha256
-    is_told(service)
+    check_monitoring(service)
 
 
 def test_files_and_record_are_the_same_picture(begin, modem, relay, stream, out):
     begin()
     hear(modem, *frames_of("0A1B", stream()), at_utc_s=1_700_000_000.0)
-    eventually(lambda: len(relay.got) == 1)
-    image = relay.got[0]
+    eventually(lambda: len(relay.received) == 1)
+    image = relay.received[0]
     name = f"uuv-1_{datetime.fromtimestamp(1_700_000_000, UTC):%Y%m%dT%H%M%SZ}_0A1B_v1"
     assert image_file_name(image) == name
     assert {p.name for p in out.iterdir()} == {f"{name}.{kind}" for kind in ("tiff", "png", "json")}
@@ -145,8 +145,8 @@ def test_a_half_of_the_next_image_flushes_the_one_before(heard, missing, begin, 
     begin()
     first = stream(1)
     hear(modem, half("AAAA", first, heard), half("BBBB", stream(2), "top"))
-    eventually(lambda: len(relay.got) == 1)
-    image = relay.got[0]
+    eventually(lambda: len(relay.received) == 1)
+    image = relay.received[0]
     assert (image.image_id, image.complete, image.missing_halves) == ("AAAA", False, (missing,))
     assert image.missing_fraction == pytest.approx(0.5, abs=0.1)
     pixels, black = image.picture.to_array(), image.missing()
@@ -160,8 +160,8 @@ def test_a_contact_of_another_image_flushes_nothing(begin, modem, relay, stream)
     service = begin()
     data = stream(1)
     hear(modem, half("AAAA", data, "top"), ContactFrame("BBBB", CONTACT).pack(), half("AAAA", data, "bottom"))
-    eventually(lambda: len(relay.got) == 1)
-    assert relay.got[0].complete
+    eventually(lambda: len(relay.received) == 1)
+    assert relay.received[0].complete
     assert service.health().gauges["images_waiting"] == 1.0
 
 
@@ -172,33 +172,33 @@ def test_two_vehicles_do_not_flush_each_other(begin, modem, relay, stream):
     hear(modem, half("AAAA", two, "top"), source=9)
     hear(modem, half("AAAA", two, "bottom"), source=9)
     hear(modem, half("AAAA", one, "bottom"), source=3)
-    eventually(lambda: len(relay.got) == 2)
-    assert [(i.vehicle_id, i.complete) for i in relay.got] == [("modem-9", True), ("uuv-1", True)]
+    eventually(lambda: len(relay.received) == 2)
+    assert [(i.vehicle_id, i.complete) for i in relay.received] == [("modem-9", True), ("uuv-1", True)]
 
 
 def test_a_half_that_stays_alone_is_given_out_after_the_time_out(begin, modem, relay, stream):
     begin(pairing_timeout_s=0.3)
     hear(modem, half("AAAA", stream(), "bottom"))
-    eventually(lambda: len(relay.got) == 1)
-    assert relay.got[0].missing_halves == ("top",)
+    eventually(lambda: len(relay.received) == 1)
+    assert relay.received[0].missing_halves == ("top",)
 
 
 def test_a_late_half_makes_the_next_version(begin, modem, relay, stream, out):
     begin(pairing_timeout_s=0.3)
     data = stream()
     hear(modem, half("AAAA", data, "top"))
-    eventually(lambda: len(relay.got) == 1)
+    eventually(lambda: len(relay.received) == 1)
     hear(modem, half("AAAA", data, "bottom"))
-    eventually(lambda: len(relay.got) == 2)
-    assert [(i.version, i.complete) for i in relay.got] == [(1, False), (2, True)]
+    eventually(lambda: len(relay.received) == 2)
+    assert [(i.version, i.complete) for i in relay.received] == [(1, False), (2, True)]
     assert len(list(out.glob("*.tiff"))) == 2
 
 
 def test_only_the_contact_record_arrives(begin, modem, relay, out):
     begin(pairing_timeout_s=0.3)
     hear(modem, ContactFrame("AAAA", CONTACT).pack())
-    eventually(lambda: len(relay.got) == 1)
-    image = relay.got[0]
+    eventually(lambda: len(relay.received) == 1)
+    image = relay.received[0]
     assert (image.contact.lat_deg, image.contact.time_utc_s) == (56.4, 1_475_568_000.0)
     assert (image.codec, image.bytes_total, image.missing_fraction, image.complete) == ("", 0, 1.0, False)
     assert image.missing_halves == ("top", "bottom")
@@ -214,8 +214,8 @@ def test_an_index_beyond_the_codebook_is_a_black_tile(begin, modem, relay, strea
     start = StreamHeader.unpack(data).size
     data[start : start + 2] = b"\xff\xff"
     hear(modem, *frames_of("AAAA", bytes(data)))
-    eventually(lambda: len(relay.got) == 1)
-    image, whole = relay.got[0], vq.decode(stream()).image
+    eventually(lambda: len(relay.received) == 1)
+    image, whole = relay.received[0], vq.decode(stream()).image
     pixels, black = image.picture.to_array(), image.missing()
     assert black[:10, :10].all()
     assert (pixels[black] == 0).all()
@@ -229,7 +229,7 @@ def test_a_picture_of_another_codebook_is_kept_apart_by_name(begin, modem, relay
     service = begin()
     other = default_registry().create("vq", CodecResources(open_codebook("nominal-20").tiles))
     hear(modem, *frames_of("AAAA", other.encode(texture())), *frames_of("BBBB", stream()))
-    eventually(lambda: [i.image_id for i in relay.got] == ["BBBB"])
+    eventually(lambda: [i.image_id for i in relay.received] == ["BBBB"])
     [(key, reason)] = refused(service)
     assert key == "image uuv-1/AAAA"
     for codec in (other, vq):
@@ -242,9 +242,9 @@ def test_every_configured_codebook_is_used(begin, modem, relay, texture, stream)
     begin(codebooks=("nominal-10", "nominal-20"))
     other = default_registry().create("vq", CodecResources(open_codebook("nominal-20").tiles))
     hear(modem, *frames_of("AAAA", other.encode(texture())), *frames_of("BBBB", stream()))
-    eventually(lambda: len(relay.got) == 2)
-    assert [i.complete for i in relay.got] == [True, True]
-    assert relay.got[0].model == other.model_hash != relay.got[1].model
+    eventually(lambda: len(relay.received) == 2)
+    assert [i.complete for i in relay.received] == [True, True]
+    assert relay.received[0].model == other.model_hash != relay.received[1].model
 
 
 def test_repeated_frames_change_nothing(begin, modem, relay, stream):
@@ -252,7 +252,7 @@ def test_repeated_frames_change_nothing(begin, modem, relay, stream):
     frames = frames_of("AAAA", stream())
     hear(modem, *frames, *frames, *reversed(frames))
     eventually(lambda: service.health().counters.get("records_handled") == 3 * len(frames))
-    assert [(i.version, i.complete) for i in relay.got[:1]] == [(1, True)]
+    assert [(i.version, i.complete) for i in relay.received[:1]] == [(1, True)]
     assert service.health().counters["images_reconstructed"] == 1
 
 
@@ -260,8 +260,8 @@ def test_repeated_frames_change_nothing(begin, modem, relay, stream):
 def test_a_frame_that_is_none_is_counted_and_passed_over(data, begin, modem, relay, stream, caplog):
     service = begin()
     hear(modem, data, *frames_of("AAAA", stream()))
-    eventually(lambda: len(relay.got) == 1)
-    assert relay.got[0].complete
+    eventually(lambda: len(relay.received) == 1)
+    assert relay.received[0].complete
     assert service.health().counters["frames_rejected"] == 1
     told = next(r for r in caplog.records if r.message == "Frame rejected")
     assert "acoustic frame from modem 3" in str(vars(told)["fields"])
@@ -269,24 +269,28 @@ def test_a_frame_that_is_none_is_counted_and_passed_over(data, begin, modem, rel
 
 def test_a_malformed_record_is_refused_and_the_next_taken(begin, modem, relay, stream, refused):
     service = begin()
-    modem.owe_bytes(IN, "decompressor", b"\x80")
+    modem.send_bytes(IN, "decompressor", b"\x80")
     hear(modem, *frames_of("AAAA", stream()))
-    eventually(lambda: len(relay.got) == 1)
+    eventually(lambda: len(relay.received) == 1)
     assert refused(service) == refused(modem)
     assert "expected 'acoustic_frame'" in refused(service)[0][1]
 
 
-def test_a_stop_in_the_middle_of_an_image_changes_nothing(begin, crew, modem, relay, stream, vq):
+def test_a_stop_in_the_middle_of_an_image_changes_nothing(begin, runner, modem, relay, stream, vq):
     data = stream(1, 80, 140)
     for number, one in enumerate(frames_of("AAAA", data, None), start=1):
         service = begin()
         hear(modem, one)
         eventually(lambda n=number, s=service: s.health().counters.get("records_handled") == 1)
-        crew.stop(service)
+        runner.stop(service)
     begin()
-    eventually(lambda: len(relay.got) == 1)
-    assert (relay.got[0].complete, relay.got[0].version, relay.got[0].frames_received) == (True, 1, number)
-    np.testing.assert_array_equal(relay.got[0].picture.to_array(), vq.decode(data).image)
+    eventually(lambda: len(relay.received) == 1)
+    assert (relay.received[0].complete, relay.received[0].version, relay.received[0].frames_received) == (
+        True,
+        1,
+        number,
+    )
+    np.testing.assert_array_equal(relay.received[0].picture.to_array(), vq.decode(data).image)
 
 
 def test_frames_that_waited_long_are_looked_at_before_time_is_up(begin, modem, relay, stream, monkeypatch, platform):
@@ -295,11 +299,11 @@ def test_frames_that_waited_long_are_looked_at_before_time_is_up(begin, modem, r
     monkeypatch.setattr(decompressor, "QUIET_S", 2.0)
     streams = {f"{n:04d}": stream(n) for n in range(30)}
     for image_id, data in streams.items():
-        modem.owe(IN, "decompressor", *(frame(f, at_utc_s=1_700_000_000.0) for f in frames_of(image_id, data)))
+        modem.send(IN, "decompressor", *(frame(f, at_utc_s=1_700_000_000.0) for f in frames_of(image_id, data)))
     eventually(lambda: modem.store.outbox_depth() > 60)
     begin(pairing_timeout_s=5.0)
-    eventually(lambda: len(relay.got) >= len(streams))
-    assert [(i.image_id, i.version, i.complete) for i in relay.got] == [(name, 1, True) for name in streams]
+    eventually(lambda: len(relay.received) >= len(streams))
+    assert [(i.image_id, i.version, i.complete) for i in relay.received] == [(name, 1, True) for name in streams]
 
 
 def test_pictures_wait_while_the_folder_takes_none(begin, modem, relay, stream, tmp_path):
@@ -309,10 +313,10 @@ def test_pictures_wait_while_the_folder_takes_none(begin, modem, relay, stream, 
     hear(modem, *frames_of("AAAA", stream(1)), *frames_of("BBBB", stream(2)))
     eventually(lambda: service.health().state == "degraded")
     assert str(blocker) in service.health().detail
-    assert relay.got == []
+    assert relay.received == []
     blocker.unlink()
-    eventually(lambda: [i.image_id for i in relay.got] == ["AAAA", "BBBB"])
-    assert all(i.complete and i.version == 1 for i in relay.got)
+    eventually(lambda: [i.image_id for i in relay.received] == ["AAAA", "BBBB"])
+    assert all(i.complete and i.version == 1 for i in relay.received)
     assert len(list((blocker / "out").glob("*.json"))) == 2
     eventually(lambda: service.health().state == "ok")
 
@@ -336,7 +340,7 @@ def test_health_stays_degraded_while_a_picture_whose_time_is_up_cannot_be_writte
     eventually(tried_again)
     assert set(states) == {"degraded"}
     blocker.unlink()
-    eventually(lambda: len(relay.got) == 1)
+    eventually(lambda: len(relay.received) == 1)
     eventually(lambda: service.health().state == "ok")
 
 
@@ -358,10 +362,10 @@ def test_a_full_disk_keeps_the_frames_with_the_modem(begin, modem, relay, stream
     service.store._db.execute("PRAGMA max_page_count=1")
     hear(modem, *frames_of("AAAA", stream(1, 200, 200)))
     eventually(lambda: service.health().state == "degraded")
-    assert relay.got == []
+    assert relay.received == []
     service.store._db.execute("PRAGMA max_page_count=1000000")
-    eventually(lambda: len(relay.got) == 1)
-    assert (relay.got[0].complete, relay.got[0].version) == (True, 1)
+    eventually(lambda: len(relay.received) == 1)
+    assert (relay.received[0].complete, relay.received[0].version) == (True, 1)
     eventually(lambda: service.health().state == "ok")
 
 
@@ -378,7 +382,7 @@ def test_a_defect_in_decoding_costs_one_image(path, begin, modem, relay, stream,
     assert refused(service)[0][0] == "image uuv-1/AAAA"
     assert "ZeroDivisionError" in refused(service)[0][1]
     hear(modem, *frames_of("BBBB", stream(2)))
-    eventually(lambda: [i.image_id for i in relay.got] == ["BBBB"])
+    eventually(lambda: [i.image_id for i in relay.received] == ["BBBB"])
     assert not service.failed
 
 
@@ -402,19 +406,19 @@ def test_two_codebooks_that_look_alike_on_the_link_are_refused(platform, tmp_pat
     DecompressorService(platform("vessel-1"), DecompressorConfig(codebooks=(names[0], names[0]))).store.close()
 
 
-def test_a_damaged_side_car_is_written_anew(begin, crew, modem, relay, stream, out, tmp_path):
+def test_a_damaged_side_car_is_written_anew(begin, runner, modem, relay, stream, out, tmp_path):
     service = begin()
     frames = frames_of("AAAA", stream())
     hear(modem, *frames, at_utc_s=1_700_000_000.0)
-    eventually(lambda: len(relay.got) == 1)
+    eventually(lambda: len(relay.received) == 1)
     [side] = out.glob("*.json")
     whole = side.read_bytes()
-    crew.stop(service)
+    runner.stop(service)
     side.write_bytes(b"\xff\xfe half of it")
     (service.platform.state_dir / "decompressor.db").unlink()
     for suffix in ("-wal", "-shm"):
         (service.platform.state_dir / f"decompressor.db{suffix}").unlink(missing_ok=True)
     begin()
     hear(modem, *frames, at_utc_s=1_700_000_000.0)
-    eventually(lambda: len(relay.got) == 2)
+    eventually(lambda: len(relay.received) == 2)
     assert side.read_bytes() == whole

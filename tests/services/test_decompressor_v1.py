@@ -45,23 +45,23 @@ def streams(emb, texture):
 
 
 @pytest.fixture
-def begin(crew, platform, tmp_path):
+def begin(runner, platform, tmp_path):
     def start(*, key_file=None, **options):
         usual = {"out_dir": tmp_path / "out", "vehicles": {"3": "uuv-1"}, "pairing_timeout_s": 0.3}
         there = platform("vessel-1").model_copy(update={"acoustic_key_file": key_file})
-        return crew.start(DecompressorService(there, DecompressorConfig(**(usual | options))))
+        return runner.start(DecompressorService(there, DecompressorConfig(**(usual | options))))
 
     return start
 
 
 @pytest.fixture
-def relay(crew):
-    return crew.neighbour("vessel-1", "relay", {OUT: ReconstructedImage})
+def relay(runner):
+    return runner.peer("vessel-1", "relay", {OUT: ReconstructedImage})
 
 
 @pytest.fixture
-def modem(crew):
-    return crew.neighbour("vessel-1", "op_modem")
+def modem(runner):
+    return runner.peer("vessel-1", "op_modem")
 
 
 def frame(data, source=3, at_utc_s=None):
@@ -91,7 +91,7 @@ def sent(streams, config=LOSS_30, first=1, seal=None):
 
 
 def hear(modem, frames, **options):
-    modem.owe(IN, "decompressor", *(frame(data, **options) for data in frames))
+    modem.send(IN, "decompressor", *(frame(data, **options) for data in frames))
 
 
 def latest(images):
@@ -102,9 +102,11 @@ def test_pictures_refine_version_by_version(begin, modem, relay, streams, emb):
     service = begin()
     hear(modem, sent(streams[:4]))
     whole = [image_of_number(number) for number in range(1, 5)]
-    eventually(lambda: [i for i in whole if i in latest(relay.got) and latest(relay.got)[i].complete] == whole)
+    eventually(
+        lambda: [i for i in whole if i in latest(relay.received) and latest(relay.received)[i].complete] == whole
+    )
     for number, image_id in enumerate(whole):
-        versions = [image for image in relay.got if image.image_id == image_id]
+        versions = [image for image in relay.received if image.image_id == image_id]
         assert [image.version for image in versions] == list(range(1, len(versions) + 1))
         assert len(versions) >= 2
         lengths = [image.bytes_received for image in versions]
@@ -126,8 +128,8 @@ def test_with_a_third_of_the_frames_lost_every_preview_is_shown(begin, modem, re
     rng = np.random.default_rng(3)
     frames = sent(streams)
     hear(modem, [data for data in frames if rng.random() >= 0.3])
-    eventually(lambda: len(latest(relay.got)) == len(streams), what="every contact")
-    assert all(image.missing_fraction == 0.0 for image in latest(relay.got).values())
+    eventually(lambda: len(latest(relay.received)) == len(streams), what="every contact")
+    assert all(image.missing_fraction == 0.0 for image in latest(relay.received).values())
 
 
 def entry(number, prefix, *, ended=False):
@@ -138,8 +140,8 @@ def test_a_record_without_a_picture_is_all_missing(begin, modem, relay):
     begin()
     record = entry(9, b"").pack(ENTRY_HEAD_BYTES)
     hear(modem, [pack_segments([Segment(SegmentKind.CONTACT, record)], 32)])
-    eventually(lambda: len(relay.got) == 1)
-    image = relay.got[0]
+    eventually(lambda: len(relay.received) == 1)
+    image = relay.received[0]
     assert (image.image_id, image.complete, image.contact.lat_deg) == ("0009", False, 56.4)
     assert (image.missing_fraction, image.missing_halves, image.codec) == (1.0, ("top", "bottom"), "")
     assert (image.bytes_received, image.notes) == (0, ("only the contact record arrived",))
@@ -152,8 +154,8 @@ def test_what_a_codec_that_is_not_embedded_lacks_is_missing(begin, modem, relay,
     beginning = stream[:24]
     preview = entry(9, beginning).pack(ENTRY_HEAD_BYTES + len(beginning))
     hear(modem, [pack_segments([Segment(SegmentKind.PREVIEW, preview)], 64)])
-    eventually(lambda: len(relay.got) == 1)
-    image, whole = relay.got[0], vq.decode(stream).image
+    eventually(lambda: len(relay.received) == 1)
+    image, whole = relay.received[0], vq.decode(stream).image
     assert 0.2 < image.missing_fraction < 0.8
     assert not image.complete
     black = image.missing()
@@ -168,8 +170,8 @@ def test_both_formats_are_heard_side_by_side(begin, modem, relay, streams, textu
     hear(modem, halves, source=4)
     hear(modem, sent(streams[:1]))
     hear(modem, [b"neither the one nor the other"])
-    eventually(lambda: sum(image.complete for image in relay.got) == 2)
-    assert {(i.vehicle_id, i.image_id, i.codec) for i in relay.got} == {
+    eventually(lambda: sum(image.complete for image in relay.received) == 2)
+    assert {(i.vehicle_id, i.image_id, i.codec) for i in relay.received} == {
         ("modem-4", "0A1B", "vq"),
         ("uuv-1", "0001", "emb"),
     }
@@ -182,23 +184,23 @@ def test_a_format_that_is_not_configured_is_rejected(links, images, begin, modem
     vq = default_registry().create("vq", CodecResources(open_codebook("nominal-10").tiles))
     halves = [data for packet in plan_packets("0A1B", vq.encode(texture()), CONTACT, 3, 64) for data in packet]
     hear(modem, [*halves, *sent(streams[:1])])
-    eventually(lambda: any(image.complete for image in relay.got))
-    assert {i.image_id for i in relay.got} == images
+    eventually(lambda: any(image.complete for image in relay.received))
+    assert {i.image_id for i in relay.received} == images
     eventually(lambda: service.health().counters.get("frames_rejected", 0) > 0)
 
 
-def test_a_restart_in_the_middle_goes_on_with_what_was_there(begin, modem, relay, crew, streams):
+def test_a_restart_in_the_middle_goes_on_with_what_was_there(begin, modem, relay, runner, streams):
     frames = sent(streams[:4])
     service = begin()
     middle = len(frames) * 2 // 3
     hear(modem, frames[:middle])
     eventually(lambda: service.health().counters.get("records_handled") == middle)
-    crew.stop(service)
+    runner.stop(service)
     service = begin()
     hear(modem, frames[middle:])
     whole = {image_of_number(number) for number in range(1, 5)}
-    eventually(lambda: {i for i, image in latest(relay.got).items() if image.complete} == whole)
-    told = [(image.image_id, image.version) for image in relay.got]
+    eventually(lambda: {i for i, image in latest(relay.received).items() if image.complete} == whole)
+    told = [(image.image_id, image.version) for image in relay.received]
     assert len(told) == len(set(told))
 
 
@@ -238,23 +240,23 @@ def vehicle_seal(key_file, first_counter=0):
     return seal
 
 
-def test_with_a_key_only_sealed_frames_count_and_each_once(begin, modem, relay, crew, streams, key_file):
+def test_with_a_key_only_sealed_frames_count_and_each_once(begin, modem, relay, runner, streams, key_file):
     service = begin(key_file=key_file)
     genuine = sent(streams[:2], seal=vehicle_seal(key_file))
     hear(modem, sent(streams[2:4], first=3))  # without a seal
     hear(modem, genuine)
     both = {"0001", "0002"}
-    eventually(lambda: {i for i, image in latest(relay.got).items() if image.complete} == both)
+    eventually(lambda: {i for i, image in latest(relay.received).items() if image.complete} == both)
     rejected = service.health().counters["frames_rejected"]
     hear(modem, genuine, source=4)  # passed off as another vehicle's
     eventually(lambda: service.health().counters["frames_rejected"] == rejected + len(genuine))
-    crew.stop(service)
+    runner.stop(service)
     service = begin(key_file=key_file)
     hear(modem, genuine)  # recorded and played again, over a restart
     eventually(lambda: service.health().counters.get("frames_rejected") == len(genuine))
     hear(modem, sent(streams[4:5], first=5, seal=vehicle_seal(key_file, len(genuine))))
-    eventually(lambda: "0005" in latest(relay.got))
-    assert set(latest(relay.got)) == {*both, "0005"}
+    eventually(lambda: "0005" in latest(relay.received))
+    assert set(latest(relay.received)) == {*both, "0005"}
 
 
 def test_a_sealed_frame_whose_commit_failed_is_no_replay(begin, streams, key_file):

@@ -67,18 +67,23 @@ def key_file(tmp_path):
 
 
 @pytest.fixture
-def begin(crew, platform, sea):
+def begin(runner, platform, modem_pair):
     def start(*, key_file=None, **options):
-        usual = {"port": sea.port(sea.VESSEL), "vehicles": {"3": "uuv-1"}, "retry_s": 0.5, "holdoff_s": 0.05}
+        usual = {
+            "port": modem_pair.port(modem_pair.VESSEL),
+            "vehicles": {"3": "uuv-1"},
+            "retry_s": 0.5,
+            "holdoff_s": 0.05,
+        }
         there = platform(VESSEL).model_copy(update={"acoustic_key_file": key_file})
-        return crew.start(OpModemService(there, OpModemConfig(**(usual | options))))
+        return runner.start(OpModemService(there, OpModemConfig(**(usual | options))))
 
     return start
 
 
 @pytest.fixture
-def console(crew):
-    return crew.neighbour(VESSEL, "console")
+def console(runner):
+    return runner.peer(VESSEL, "console")
 
 
 @pytest.fixture
@@ -128,11 +133,11 @@ class Vehicle:
 
 
 @pytest.fixture
-def vehicle(sea):
+def vehicle(modem_pair):
     made = []
 
     def make(**options):
-        made.append(Vehicle(sea.port(sea.VEHICLE), **options))
+        made.append(Vehicle(modem_pair.port(modem_pair.VEHICLE), **options))
         made[-1].modem.start()
         return made[-1]
 
@@ -152,8 +157,8 @@ def confirmation_of(record_id, kind="command", outcome=dl.CommandOutcome.TAKEN):
 
 
 @pytest.mark.parametrize("sealed", [False, True])
-def test_orders_go_through_the_water_and_are_confirmed(sealed, sea, begin, console, states, vehicle, key_file):
-    sea.start()
+def test_orders_go_through_the_water_and_are_confirmed(sealed, modem_pair, begin, console, states, vehicle, key_file):
+    modem_pair.start()
     far = vehicle(key=read_key(key_file) if sealed else None)
     service = begin(key_file=key_file if sealed else None)
     sent = {
@@ -163,9 +168,9 @@ def test_orders_go_through_the_water_and_are_confirmed(sealed, sea, begin, conso
         "c-4": command("wider", "c-4"),
     }
     for record in sent.values():
-        console.owe(keys.command(VESSEL, record.kind), "op_modem", record)
+        console.send(keys.command(VESSEL, record.kind), "op_modem", record)
     fresh = VERDICT.model_copy(update={"decided_utc_s": time.time()})
-    console.owe(DECISION, "op_modem", fresh)
+    console.send(DECISION, "op_modem", fresh)
     for record_id in (*sent, "d-1"):
         eventually(
             lambda r=record_id: states(r) and states(r)[-1].state == "confirmed",
@@ -186,37 +191,39 @@ def test_orders_go_through_the_water_and_are_confirmed(sealed, sea, begin, conso
         assert service.health().gauges["frames_genuine"] >= 4
 
 
-def test_an_order_is_repeated_until_it_is_confirmed(sea, begin, console, states, vehicle):
-    sea.start()
+def test_an_order_is_repeated_until_it_is_confirmed(modem_pair, begin, console, states, vehicle):
+    modem_pair.start()
     far = vehicle(silent=2)
     begin()
-    console.owe(keys.command(VESSEL, "refine"), "op_modem", command())
+    console.send(keys.command(VESSEL, "refine"), "op_modem", command())
     eventually(lambda: states("c-1") and states("c-1")[-1].state == "confirmed", timeout_s=60)
     assert len(far.orders) >= 3
     assert len(set(far.orders)) == 1
     assert states("c-1")[-1].times_sent >= 3
 
 
-def test_an_order_waits_over_a_kill_and_the_same_record_is_one_order(sea, begin, crew, console, states, vehicle):
+def test_an_order_waits_over_a_kill_and_the_same_record_is_one_order(
+    modem_pair, begin, runner, console, states, vehicle
+):
     service = begin()  # no modem yet
     asked = command()
-    console.owe(keys.command(VESSEL, "refine"), "op_modem", asked, asked)
+    console.send(keys.command(VESSEL, "refine"), "op_modem", asked, asked)
     eventually(lambda: service.health().counters.get("orders_repeated") == 1)
-    crew.stop(service)
-    sea.start()
+    runner.stop(service)
+    modem_pair.start()
     far = vehicle()
     service = begin()
     eventually(lambda: states("c-1") and states("c-1")[-1].state == "confirmed", timeout_s=60)
     assert {order.token for order in far.orders} == {dl.token_of("c-1", "command")}
-    console.owe(keys.command(VESSEL, "refine"), "op_modem", asked)  # a second site asks the same
+    console.send(keys.command(VESSEL, "refine"), "op_modem", asked)  # a second site asks the same
     eventually(lambda: service.health().counters.get("orders_repeated") == 1)
     assert service.health().gauges["orders_open"] == 0.0
 
 
-def test_confirmations_and_messages_are_kept_with_the_frame_they_came_in(begin, crew, console, states):
-    takes = crew.neighbour(VESSEL, "bridge", {keys.message_received(VESSEL): ReceivedMessage})
+def test_confirmations_and_messages_are_kept_with_the_frame_they_came_in(begin, runner, console, states):
+    takes = runner.peer(VESSEL, "bridge", {keys.message_received(VESSEL): ReceivedMessage})
     service = begin(message_consumers=("bridge",))
-    console.owe(keys.command(VESSEL, "refine"), "op_modem", command())
+    console.send(keys.command(VESSEL, "refine"), "op_modem", command())
     eventually(lambda: service.health().gauges["orders_open"] == 1.0)
     data = pack_segments([Segment(SegmentKind.MESSAGE, b"\x02" + dl.pack(dl.DataMessage(b"battery 80")))], 32)
     elsewhere = confirmation_of("c-1")
@@ -225,11 +232,11 @@ def test_confirmations_and_messages_are_kept_with_the_frame_they_came_in(begin, 
     service.on_modem_event(packet(data, confirmation_of("c-1", outcome=dl.CommandOutcome.UNKNOWN_IMAGE), data))
     eventually(lambda: states("c-1") and states("c-1")[-1].state == "refused")
     assert states("c-1")[-1].reason == "unknown image"
-    crew.stop(service)
+    runner.stop(service)
     service = begin(message_consumers=("bridge",))
     service.on_modem_event(packet(data))
     assert service.health().gauges["orders_open"] == 0.0
-    eventually(lambda: [(m.vehicle_id, m.data) for m in takes.got] == [("uuv-1", b"battery 80")])
+    eventually(lambda: [(m.vehicle_id, m.data) for m in takes.received] == [("uuv-1", b"battery 80")])
 
 
 def test_without_consumers_messages_are_shown(begin, watch):
@@ -243,17 +250,17 @@ def test_without_consumers_messages_are_shown(begin, watch):
     assert (record.vehicle_id, record.data) == ("modem-5", b"x")
 
 
-def test_an_order_that_nobody_confirms_expires(sea, begin, console, states):
+def test_an_order_that_nobody_confirms_expires(modem_pair, begin, console, states):
     begin(command_lifetime_s=0.3)
-    console.owe(keys.command(VESSEL, "refine"), "op_modem", command())
+    console.send(keys.command(VESSEL, "refine"), "op_modem", command())
     eventually(lambda: [state.state for state in states("c-1")] == ["asked", "expired"])
-    console.owe(DECISION, "op_modem", VERDICT)  # decided long ago
+    console.send(DECISION, "op_modem", VERDICT)  # decided long ago
     eventually(lambda: [state.state for state in states("d-1")] == ["expired"])
 
 
-def test_reports_tell_the_vehicle_what_is_lacking(sea, begin, vehicle, crew):
-    decompressor = crew.neighbour(VESSEL, "decompressor", {RX: AcousticFrame})
-    sea.start()
+def test_reports_tell_the_vehicle_what_is_lacking(modem_pair, begin, vehicle, runner):
+    decompressor = runner.peer(VESSEL, "decompressor", {RX: AcousticFrame})
+    modem_pair.start()
     far = vehicle()
     service = begin(feedback_interval_s=0.5)
     eventually(lambda: far.modem.ready and service.modem.ready)
@@ -264,7 +271,7 @@ def test_reports_tell_the_vehicle_what_is_lacking(sea, begin, vehicle, crew):
     far.send()
     eventually(lambda: len(far.reports) >= 1, timeout_s=60)
     assert sum(far.reports[0].needs) > 0
-    assert len(decompressor.got) == 3
+    assert len(decompressor.received) == 3
 
 
 @pytest.mark.parametrize(
@@ -289,7 +296,7 @@ def test_an_order_is_checked_while_the_station_is_busy(begin, console, states):
     service = begin()
     with service._station_lock:
         # Taken into the inbox, within a transaction, while a thread that will want a transaction has the station.
-        console.owe(keys.command(VESSEL, "refine"), "op_modem", command())
+        console.send(keys.command(VESSEL, "refine"), "op_modem", command())
         eventually(lambda: service.store.inbox_depth() == 1, timeout_s=10, what="order in the inbox")
     eventually(lambda: [state.state for state in states("c-1")] == ["asked"])
 
@@ -307,18 +314,18 @@ def test_with_the_papers_link_it_only_listens(begin):
 
 def test_frames_without_the_key_change_nothing(begin, console, key_file):
     service = begin(key_file=key_file)
-    console.owe(keys.command(VESSEL, "refine"), "op_modem", command())
+    console.send(keys.command(VESSEL, "refine"), "op_modem", command())
     eventually(lambda: service.health().gauges["orders_open"] == 1.0)
     service.on_modem_event(packet(confirmation_of("c-1")))
     assert service.health().gauges["orders_open"] == 1.0
     assert service.health().counters["frames_foreign"] == 1
 
 
-def test_a_state_that_cannot_be_read_is_left_and_said(begin, crew, caplog):
+def test_a_state_that_cannot_be_read_is_left_and_said(begin, runner, caplog):
     service = begin()
     with service.store.transaction() as tx:
         tx.put_state("station", b"\xc1")
-    crew.stop(service)
+    runner.stop(service)
     service = begin()
     assert service.health().counters["states_discarded"] == 1
     assert service.health().gauges["orders_open"] == 0.0
@@ -372,9 +379,9 @@ def test_configurations_that_cannot_work_are_refused(options):
         OpModemConfig(port="x", **options)
 
 
-def test_a_vehicle_is_asked_for_a_packet_and_answers(sea, begin, vehicle, crew):
-    decompressor = crew.neighbour(VESSEL, "decompressor", {RX: AcousticFrame})
-    sea.start()
+def test_a_vehicle_is_asked_for_a_packet_and_answers(modem_pair, begin, vehicle, runner):
+    decompressor = runner.peer(VESSEL, "decompressor", {RX: AcousticFrame})
+    modem_pair.start()
     far = vehicle()
     asked = threading.Event()
 
@@ -386,4 +393,4 @@ def test_a_vehicle_is_asked_for_a_packet_and_answers(sea, begin, vehicle, crew):
     eventually(lambda: far.modem.ready)
     begin(mac="polled", poll_interval_s=0.2)
     assert asked.wait(30)
-    eventually(lambda: any(frame.data.startswith(b"polled") for frame in decompressor.got), timeout_s=30)
+    eventually(lambda: any(frame.data.startswith(b"polled") for frame in decompressor.received), timeout_s=30)

@@ -17,18 +17,18 @@ INBOX = keys.shore_inbox("vessel-1")
 
 
 @pytest.fixture
-def begin(crew, platform):
-    return lambda: crew.start(RelayService(platform("vessel-1"), RelayConfig()))
+def begin(runner, platform):
+    return lambda: runner.start(RelayService(platform("vessel-1"), RelayConfig()))
 
 
 @pytest.fixture
-def c2(crew):
-    return lambda: crew.neighbour("shore-1", "c2", {keys.shore_inbox_all(): Relayed})
+def c2(runner):
+    return lambda: runner.peer("shore-1", "c2", {keys.shore_inbox_all(): Relayed})
 
 
 @pytest.fixture
-def source(crew):
-    return crew.neighbour("vessel-1", "decompressor")
+def source(runner):
+    return runner.peer("vessel-1", "decompressor")
 
 
 @pytest.fixture
@@ -39,33 +39,33 @@ def image(texture):
     return make
 
 
-def test_each_record_travels_in_an_envelope_unchanged(begin, c2, source, image, is_told):
+def test_each_record_travels_in_an_envelope_unchanged(begin, c2, source, image, check_monitoring):
     shore, service = c2(), begin()
     records = {IMAGES: image(), DECISIONS: decision_record()}
     for key, record in records.items():
-        source.owe(key, "relay", record)
-    eventually(lambda: len(shore.got) == 2)
-    for envelope in shore.got:
+        source.send(key, "relay", record)
+    eventually(lambda: len(shore.received) == 2)
+    for envelope in shore.received:
         assert envelope.vessel_id == "vessel-1"
         assert envelope.payload == wire.encode(records[envelope.key])
         assert 0 <= envelope.relayed_utc_s - service.started_utc_s < 60
     eventually(lambda: service.health().gauges["waiting_for_shore"] == 0.0)
     counters = service.health().counters
     assert (counters["reconstructed_images_relayed"], counters["decisions_relayed"]) == (1, 1)
-    is_told(service)
+    check_monitoring(service)
 
 
-def test_without_the_shore_everything_waits_and_decisions_go_first(begin, crew, c2, source, image):
+def test_without_the_shore_everything_waits_and_decisions_go_first(begin, runner, c2, source, image):
     service = begin()
-    source.owe(IMAGES, "relay", *(image(f"{n:04d}") for n in range(3)))
+    source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(3)))
     eventually(lambda: service.health().gauges["waiting_for_shore"] == 3.0)
-    source.owe(DECISIONS, "relay", decision_record("d1"), decision_record("d2"))
+    source.send(DECISIONS, "relay", decision_record("d1"), decision_record("d2"))
     eventually(lambda: service.health().gauges["waiting_for_shore"] == 5.0)
-    crew.stop(service)
+    runner.stop(service)
     shore = c2()
     begin()
-    eventually(lambda: len(shore.got) == 5)
-    inner = [msgpack.unpackb(e.payload) for e in shore.got]
+    eventually(lambda: len(shore.received) == 5)
+    inner = [msgpack.unpackb(e.payload) for e in shore.received]
     assert [m.get("decision_id", m["image_id"]) for m in inner] == ["d1", "d2", "0000", "0001", "0002"]
 
 
@@ -73,18 +73,18 @@ def test_nothing_is_shown_on_the_vessel_a_second_time(begin, c2, source, watch):
     seen = watch(INBOX)
     shore = c2()
     begin()
-    source.owe(DECISIONS, "relay", decision_record())
-    eventually(lambda: len(shore.got) == 1)
+    source.send(DECISIONS, "relay", decision_record())
+    eventually(lambda: len(shore.received) == 1)
     assert seen == []
 
 
 def test_another_vessels_record_is_refused_while_its_sender_can_be_told(begin, c2, source, image, refused):
     shore, service = c2(), begin()
-    source.owe(DECISIONS, "relay", decision_record("strange", vessel_id="vessel-2"))
-    source.owe(IMAGES, "relay", image("BBBB", vessel="vessel-2"))
-    source.owe(DECISIONS, "relay", decision_record("own"))
-    eventually(lambda: len(shore.got) == 1)
-    assert msgpack.unpackb(shore.got[0].payload)["decision_id"] == "own"
+    source.send(DECISIONS, "relay", decision_record("strange", vessel_id="vessel-2"))
+    source.send(IMAGES, "relay", image("BBBB", vessel="vessel-2"))
+    source.send(DECISIONS, "relay", decision_record("own"))
+    eventually(lambda: len(shore.received) == 1)
+    assert msgpack.unpackb(shore.received[0].payload)["decision_id"] == "own"
     eventually(lambda: len(refused(source)) == 2)
     assert all("vessel_id: got 'vessel-2', expected vessel-1" in reason for _, reason in refused(service))
     assert service.health().counters["records_refused"] == 2
@@ -95,15 +95,15 @@ def test_another_vessels_record_is_refused_while_its_sender_can_be_told(begin, c
 )
 def test_what_is_no_record_is_refused_and_the_next_one_relayed(payload, begin, c2, source, refused):
     shore, service = c2(), begin()
-    source.owe_bytes(DECISIONS, "relay", payload)
-    source.owe(DECISIONS, "relay", decision_record())
-    eventually(lambda: len(shore.got) == 1)
+    source.send_bytes(DECISIONS, "relay", payload)
+    source.send(DECISIONS, "relay", decision_record())
+    eventually(lambda: len(shore.received) == 1)
     assert [key for key, _ in refused(service)] == [DECISIONS]
     assert "expected" in refused(service)[0][1]
     assert service.health().state == "ok"
 
 
-def test_a_record_is_relayed_once_over_a_stop_between_taking_and_sending(begin, crew, c2, platform, image):
+def test_a_record_is_relayed_once_over_a_stop_between_taking_and_sending(begin, runner, c2, platform, image):
     idle = RelayService(platform("vessel-1"), RelayConfig())
     with idle.store.transaction() as tx:
         tx.accept(IMAGES, wire.encode(image()), b"o" * 16, 1)
@@ -111,18 +111,18 @@ def test_a_record_is_relayed_once_over_a_stop_between_taking_and_sending(begin, 
     idle.store.close()
     service = begin()
     eventually(lambda: service.health().gauges["waiting_for_shore"] == 1.0)
-    crew.stop(service)
+    runner.stop(service)
     shore, again = c2(), begin()
     eventually(lambda: again.health().gauges["waiting_for_shore"] == 0.0)
-    assert [e.key for e in shore.got] == [IMAGES]
+    assert [e.key for e in shore.received] == [IMAGES]
 
 
 def test_a_full_disk_leaves_the_record_with_its_sender(begin, c2, source, image):
     shore, service = c2(), begin()
     service.store._db.execute("PRAGMA max_page_count=1")
-    source.owe(IMAGES, "relay", *(image(f"{n:04d}") for n in range(6)))
+    source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(6)))
     eventually(lambda: service.health().state == "degraded")
     assert source.store.outbox_depth() > 0
     service.store._db.execute("PRAGMA max_page_count=1000000")
-    eventually(lambda: len(shore.got) == 6)
+    eventually(lambda: len(shore.received) == 6)
     eventually(lambda: service.health().state == "ok")

@@ -46,15 +46,15 @@ def relay_process(router, tmp_path):
 
 
 def identifiers(neighbour):
-    return [msgpack.unpackb(envelope.payload)["decision_id"] for envelope in neighbour.got]
+    return [msgpack.unpackb(envelope.payload)["decision_id"] for envelope in neighbour.received]
 
 
-def test_every_site_gets_every_record_once_however_often_the_relay_is_killed(crew, relay_process):
-    first = crew.neighbour("shore-1", "c2", {keys.shore_inbox_all("shore"): Relayed})
-    second = crew.neighbour("shore-2", "c2", {keys.shore_inbox_all("shore-2"): Relayed})
-    console = crew.neighbour("vessel-1", "console")
+def test_every_site_gets_every_record_once_however_often_the_relay_is_killed(runner, relay_process):
+    first = runner.peer("shore-1", "c2", {keys.shore_inbox_all("shore"): Relayed})
+    second = runner.peer("shore-2", "c2", {keys.shore_inbox_all("shore-2"): Relayed})
+    console = runner.peer("vessel-1", "console")
     wanted = [f"d{n}" for n in range(RECORDS)]
-    console.owe(
+    console.send(
         keys.contact_decision("vessel-1"),
         "relay",
         *(
@@ -75,12 +75,12 @@ def test_every_site_gets_every_record_once_however_often_the_relay_is_killed(cre
     for kill in range(1, KILLS + 1):
         process = relay_process()
         # A little further each time, and then somewhere within the next batches.
-        eventually(lambda kill=kill: len(first.got) >= kill * RECORDS // (KILLS + 2), timeout_s=60)
+        eventually(lambda kill=kill: len(first.received) >= kill * RECORDS // (KILLS + 2), timeout_s=60)
         time.sleep(rng.uniform(0, 0.02))
         process.kill()
         process.wait()
     relay_process()
     for site in (first, second):
-        eventually(lambda site=site: len(site.got) >= RECORDS, timeout_s=60)
+        eventually(lambda site=site: len(site.received) >= RECORDS, timeout_s=60)
         assert sorted(identifiers(site)) == sorted(wanted)
     eventually(lambda: console.store.outbox_depth() == 0)

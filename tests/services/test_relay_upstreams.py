@@ -22,23 +22,23 @@ IMAGES, DECISIONS = keys.image_reconstructed("vessel-1"), keys.contact_decision(
 
 
 @pytest.fixture
-def begin(crew, platform):
-    return lambda *upstreams, **options: crew.start(
+def begin(runner, platform):
+    return lambda *upstreams, **options: runner.start(
         RelayService(platform("vessel-1"), RelayConfig(upstreams=upstreams, **options))
     )
 
 
 @pytest.fixture
-def c2(crew):
+def c2(runner):
     def make(site="shore", platform_id="shore-1"):
-        return crew.neighbour(platform_id, "c2", {keys.shore_inbox_all(site): Relayed})
+        return runner.peer(platform_id, "c2", {keys.shore_inbox_all(site): Relayed})
 
     return make
 
 
 @pytest.fixture
-def source(crew):
-    return crew.neighbour("vessel-1", "decompressor")
+def source(runner):
+    return runner.peer("vessel-1", "decompressor")
 
 
 def image(image_id="AAAA", version=1, height_px=40, **changes):
@@ -48,16 +48,16 @@ def image(image_id="AAAA", version=1, height_px=40, **changes):
 
 def names(neighbour):
     """What a site got: identifiers of decisions, identifier and version of pictures."""
-    inner = [msgpack.unpackb(envelope.payload) for envelope in neighbour.got]
+    inner = [msgpack.unpackb(envelope.payload) for envelope in neighbour.received]
     return [m.get("decision_id") or f"{m['image_id']}v{m['version']}" for m in inner]
 
 
-def test_every_site_gets_everything_and_one_that_is_away_holds_none_back(begin, crew, c2, source):
+def test_every_site_gets_everything_and_one_that_is_away_holds_none_back(begin, runner, c2, source):
     first = c2("shore")
     service = begin(UpstreamOptions(), UpstreamOptions(site="shore-2"))
-    source.owe(IMAGES, "relay", *(image(f"{n:04d}") for n in range(20)))
-    source.owe(DECISIONS, "relay", decision_record())
-    eventually(lambda: len(first.got) == 21)
+    source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(20)))
+    source.send(DECISIONS, "relay", decision_record())
+    eventually(lambda: len(first.received) == 21)
     eventually(lambda: service.gauges()["waiting_for_shore"] == 0)
     gauges = service.gauges()
     assert (gauges["waiting_for_shore-2"], gauges["answering_shore-2"]) == (21, 0)
@@ -65,22 +65,22 @@ def test_every_site_gets_everything_and_one_that_is_away_holds_none_back(begin, 
     assert gauges["waiting_bytes_for_shore-2"] > 20 * 4000
     assert 0 < gauges["oldest_s_for_shore-2"] < 60
     assert gauges["oldest_s_for_shore"] == 0
-    crew.stop(service)
+    runner.stop(service)
     service = begin(UpstreamOptions(), UpstreamOptions(site="shore-2"))
     second = c2("shore-2", "shore-2")
-    eventually(lambda: len(second.got) == 21)
+    eventually(lambda: len(second.received) == 21)
     assert names(second)[0] == "d1"
     assert sorted(names(second)) == sorted(names(first))
     eventually(lambda: service.gauges()["waiting_for_shore-2"] == 0)
-    assert len(first.got) == 21
+    assert len(first.received) == 21
 
 
 def test_a_site_with_a_router_of_its_own_is_reached_when_that_comes_up(begin, source, c2):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     near = c2("shore")
     service = begin(UpstreamOptions(), UpstreamOptions(site="far", router=(endpoint,)))
-    source.owe(DECISIONS, "relay", decision_record())
-    eventually(lambda: len(near.got) == 1)
+    source.send(DECISIONS, "relay", decision_record())
+    eventually(lambda: len(near.received) == 1)
     assert service.gauges()["waiting_for_far"] == 1
     far_router = zenoh.open(router_config([endpoint]))
     far = zenoh.open(client_config([endpoint]))
@@ -100,52 +100,52 @@ def test_a_site_with_a_router_of_its_own_is_reached_when_that_comes_up(begin, so
         far_router.close()
 
 
-def test_a_renamed_site_gets_its_records_although_its_c2_knows_the_old_numbers(begin, crew, c2, source, platform):
+def test_a_renamed_site_gets_its_records_although_its_c2_knows_the_old_numbers(begin, runner, c2, source, platform):
     shore = c2("shore")
     service = begin(UpstreamOptions())
-    source.owe(DECISIONS, "relay", decision_record("d1"), decision_record("d2"))
-    eventually(lambda: len(shore.got) == 2)
+    source.send(DECISIONS, "relay", decision_record("d1"), decision_record("d2"))
+    eventually(lambda: len(shore.received) == 2)
     eventually(lambda: service.gauges()["waiting_for_shore"] == 0)
-    crew.stop(service)
-    crew.stop(shore)
+    runner.stop(service)
+    runner.stop(shore)
     renamed = c2("hq")
     begin(UpstreamOptions(site="hq"))
-    source.owe(DECISIONS, "relay", decision_record("d3"))
+    source.send(DECISIONS, "relay", decision_record("d3"))
     eventually(lambda: names(renamed) == ["d3"])
 
 
-def test_first_versions_come_before_more_detail_and_decisions_before_both(begin, c2, source, crew):
+def test_first_versions_come_before_more_detail_and_decisions_before_both(begin, c2, source, runner):
     service = begin(supersede=False)
-    source.owe(IMAGES, "relay", image("AAAA", 1), image("AAAA", 2), image("AAAA", 3), image("BBBB", 1))
-    source.owe(DECISIONS, "relay", decision_record())
+    source.send(IMAGES, "relay", image("AAAA", 1), image("AAAA", 2), image("AAAA", 3), image("BBBB", 1))
+    source.send(DECISIONS, "relay", decision_record())
     eventually(lambda: service.gauges()["waiting_for_shore"] == 5)
-    crew.stop(service)
+    runner.stop(service)
     shore = c2()
     begin(supersede=False)
-    eventually(lambda: len(shore.got) == 5)
+    eventually(lambda: len(shore.received) == 5)
     assert names(shore) == ["d1", "AAAAv1", "BBBBv1", "AAAAv2", "AAAAv3"]
 
 
-def test_a_newer_version_takes_the_place_of_those_not_sent_yet(begin, c2, source, crew):
+def test_a_newer_version_takes_the_place_of_those_not_sent_yet(begin, c2, source, runner):
     service = begin()
     # The first record is on its way as soon as the relay looks for c2; the ones behind it wait.
-    source.owe(DECISIONS, "relay", decision_record())
+    source.send(DECISIONS, "relay", decision_record())
     eventually(lambda: service.gauges()["waiting_for_shore"] == 1)
     for version in (1, 2, 3):
-        source.owe(IMAGES, "relay", image("AAAA", version))
+        source.send(IMAGES, "relay", image("AAAA", version))
         eventually(lambda version=version: service.health().counters.get("reconstructed_images_relayed") == version)
-    source.owe(IMAGES, "relay", image("BBBB", 1))
+    source.send(IMAGES, "relay", image("BBBB", 1))
     eventually(lambda: service.health().counters["reconstructed_images_relayed"] == 4)
     assert service.gauges()["waiting_for_shore"] == 3
     assert service.health().counters["records_superseded"] == 2
-    crew.stop(service)
+    runner.stop(service)
     shore = c2()
     service = begin()
-    eventually(lambda: len(shore.got) == 3)
+    eventually(lambda: len(shore.received) == 3)
     assert names(shore) == ["d1", "AAAAv3", "BBBBv1"]
     # The gaps in the numbers leave no trace at the consumer.
-    source.owe(IMAGES, "relay", image("CCCC", 1))
-    eventually(lambda: len(shore.got) == 4)
+    source.send(IMAGES, "relay", image("CCCC", 1))
+    eventually(lambda: len(shore.received) == 4)
     assert shore.store._query("SELECT COUNT(*) FROM seen") == [(0,)]
 
 
@@ -158,10 +158,10 @@ def test_with_a_bandwidth_limit_a_decision_passes_a_picture_in_the_middle(begin,
     shore = c2()
     begin(UpstreamOptions(bandwidth_bytes_per_s=20_000))
     started_s = time.monotonic()
-    source.owe(IMAGES, "relay", image("AAAA", height_px=400))
+    source.send(IMAGES, "relay", image("AAAA", height_px=400))
     eventually(lambda: shore.store._query("SELECT COUNT(*) FROM partial") == [(1,)])
-    source.owe(DECISIONS, "relay", decision_record())
-    eventually(lambda: len(shore.got) == 2)
+    source.send(DECISIONS, "relay", decision_record())
+    eventually(lambda: len(shore.received) == 2)
     assert names(shore) == ["d1", "AAAAv1"]
     assert time.monotonic() - started_s > 1.0, "40 kB at 20 kB/s, of which half a second's worth goes at once"
 
@@ -176,10 +176,10 @@ def test_below_the_reserve_pictures_wait_with_their_senders_and_decisions_are_ta
     monkeypatch.setattr("sonarpost.delivery.disk_reserve.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
     shore = c2()
     service = begin(disk_reserve_bytes=50_000_000)
-    source.owe(IMAGES, "relay", image("AAAA"))
+    source.send(IMAGES, "relay", image("AAAA"))
     eventually(lambda: "below the reserve of 50000000" in service.health().detail)
     assert service.health().state == "degraded"
-    source.owe(DECISIONS, "relay", decision_record("d1"), decision_record("d2"), priority=3)
+    source.send(DECISIONS, "relay", decision_record("d1"), decision_record("d2"), priority=3)
     eventually(lambda: sorted(names(shore)) == ["d1", "d2"])
     free[0] = 10**8
     eventually(lambda: sorted(names(shore)) == ["AAAAv1", "d1", "d2"])
@@ -197,28 +197,28 @@ def test_below_the_reserve_a_plain_publication_of_a_picture_is_refused_aloud(beg
     assert service.gauges()["waiting_for_shore"] == 0
 
 
-def test_a_quota_drops_pictures_of_one_site_and_no_decision(begin, crew, c2, source):
+def test_a_quota_drops_pictures_of_one_site_and_no_decision(begin, runner, c2, source):
     service = begin(UpstreamOptions(max_bytes=15_000), UpstreamOptions(site="shore-2"))
-    source.owe(DECISIONS, "relay", decision_record())
-    source.owe(IMAGES, "relay", *(image(f"{n:04d}") for n in range(6)))
+    source.send(DECISIONS, "relay", decision_record())
+    source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(6)))
     eventually(lambda: service.gauges()["waiting_for_shore-2"] == 7)
     eventually(lambda: service.health().counters.get("pictures_dropped") == 3)
     assert service.gauges()["waiting_bytes_for_shore"] <= 15_000
-    crew.stop(service)
+    runner.stop(service)
     shore = c2()
     begin(UpstreamOptions(max_bytes=15_000), UpstreamOptions(site="shore-2"))
-    eventually(lambda: len(shore.got) == 4)
+    eventually(lambda: len(shore.received) == 4)
     assert names(shore) == ["d1", "0003v1", "0004v1", "0005v1"]
 
 
-def test_what_waits_for_a_removed_site_is_kept_until_it_is_dropped_on_purpose(begin, crew, source):
+def test_what_waits_for_a_removed_site_is_kept_until_it_is_dropped_on_purpose(begin, runner, source):
     service = begin(UpstreamOptions(), UpstreamOptions(site="old"))
-    source.owe(DECISIONS, "relay", decision_record())
+    source.send(DECISIONS, "relay", decision_record())
     eventually(lambda: service.gauges().get("waiting_for_old") == 1)
-    crew.stop(service)
+    runner.stop(service)
     service = begin(UpstreamOptions())
     assert service.gauges()["held_for_removed"] == 1
-    crew.stop(service)
+    runner.stop(service)
     service = begin(UpstreamOptions(), drop_removed_upstreams=True)
     assert service.gauges()["held_for_removed"] == 0
     assert service.gauges()["waiting_for_shore"] == 1

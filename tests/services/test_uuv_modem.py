@@ -33,25 +33,25 @@ CONTACT = Contact(contact_id="c", vehicle_id="uuv-1", lat_deg=56.4, lon_deg=-5.6
 
 
 @pytest.fixture
-def begin(crew, platform, sea):
+def begin(runner, platform, modem_pair):
     def start(**options):
-        usual = {"port": sea.port(sea.VEHICLE), "link": "paper", "rate": 1, "retry_s": 0.05}
-        return crew.start(UuvModemService(platform("uuv-1"), UuvModemConfig(**(usual | options))))
+        usual = {"port": modem_pair.port(modem_pair.VEHICLE), "link": "paper", "rate": 1, "retry_s": 0.05}
+        return runner.start(UuvModemService(platform("uuv-1"), UuvModemConfig(**(usual | options))))
 
     return start
 
 
 @pytest.fixture
-def compressor(crew):
-    return crew.neighbour("uuv-1", "compressor")
+def compressor(runner):
+    return runner.peer("uuv-1", "compressor")
 
 
 @pytest.fixture
-def ears(crew, platform, sea):
+def ears(runner, platform, modem_pair):
     """The vessel's modem and what it hears: the list of frames in their order."""
-    hearer = crew.neighbour("vessel-1", "decompressor", {RX: AcousticFrame})
-    service = crew.start(OpModemService(platform("vessel-1"), OpModemConfig(port=sea.port(sea.VESSEL))))
-    return lambda: service.modem.ready, hearer.got
+    hearer = runner.peer("vessel-1", "decompressor", {RX: AcousticFrame})
+    service = runner.start(OpModemService(platform("vessel-1"), OpModemConfig(port=modem_pair.port(modem_pair.VESSEL))))
+    return lambda: service.modem.ready, hearer.received
 
 
 @pytest.fixture(scope="session")
@@ -87,14 +87,14 @@ def flat(packets):
 
 
 @pytest.mark.parametrize("rate", [0, 1, 4, 5])
-def test_frames_arrive_byte_for_byte_at_every_rate(rate, sea, begin, compressor, ears, encoded, watch):
-    sea.start()
+def test_frames_arrive_byte_for_byte_at_every_rate(rate, modem_pair, begin, compressor, ears, encoded, watch):
+    modem_pair.start()
     ready, heard = ears
     seen = watch(TX)
     eventually(ready)
     service = begin(rate=rate)
     image = encoded(height_px=80, width_px=100)
-    compressor.owe(IN, "uuv_modem", image)
+    compressor.send(IN, "uuv_modem", image)
     frames = flat(planned(image, rate))
     eventually(lambda: len(heard) == len(frames))
     assert [f.data for f in heard] == frames
@@ -109,38 +109,38 @@ def test_frames_arrive_byte_for_byte_at_every_rate(rate, sea, begin, compressor,
     assert {(s["direction"], s["rate"]) for s in shown} == {("tx", rate)}
 
 
-def test_it_tells_that_it_lives(sea, begin, is_told):
-    sea.start()
+def test_it_tells_that_it_lives(modem_pair, begin, check_monitoring):
+    modem_pair.start()
     service = begin()
     eventually(lambda: service.health().state == "ok")
     assert service.health().gauges["modem_ready"] == 1.0
-    is_told(service)
+    check_monitoring(service)
 
 
-def test_images_go_in_the_order_of_their_arrival(sea, begin, compressor, ears, encoded):
-    sea.start()
+def test_images_go_in_the_order_of_their_arrival(modem_pair, begin, compressor, ears, encoded):
+    modem_pair.start()
     ready, heard = ears
     eventually(ready)
     service = begin(rate=5)
     images = [encoded(f"{n:04d}") for n in range(4)]
-    compressor.owe(IN, "uuv_modem", *images)
+    compressor.send(IN, "uuv_modem", *images)
     eventually(lambda: service.health().counters.get("images_sent") == 4)
     eventually(lambda: len(heard) == sum(len(flat(planned(i, 5))) for i in images))
     assert [f.data for f in heard] == [frame for i in images for frame in flat(planned(i, 5))]
 
 
-def test_a_stop_in_the_middle_goes_on_with_the_next_packet(sea, begin, crew, compressor, ears, encoded):
-    sea.start()
+def test_a_stop_in_the_middle_goes_on_with_the_next_packet(modem_pair, begin, runner, compressor, ears, encoded):
+    modem_pair.start()
     ready, heard = ears
     eventually(ready)
     service = begin(rate=0)
     image = encoded(height_px=100, width_px=160)
     packets = planned(image, 0)
     assert len(packets) > 12
-    compressor.owe(IN, "uuv_modem", image)
+    compressor.send(IN, "uuv_modem", image)
     eventually(lambda: service.store.get_state("progress") is not None)
     eventually(lambda: len(heard) >= 4)
-    crew.stop(service)
+    runner.stop(service)
     assert 0 < len(heard) < len(packets), "stopped in the middle"
     again = begin(rate=0)
     eventually(lambda: again.health().counters.get("images_sent") == 1)
@@ -152,15 +152,15 @@ def test_a_stop_in_the_middle_goes_on_with_the_next_packet(sea, begin, crew, com
     assert again.store.get_state("progress") is None
 
 
-def test_progress_at_another_rate_is_no_progress(sea, begin, crew, compressor, ears, encoded):
-    sea.start()
+def test_progress_at_another_rate_is_no_progress(modem_pair, begin, runner, compressor, ears, encoded):
+    modem_pair.start()
     ready, heard = ears
     eventually(ready)
     service = begin(rate=0)
     image = encoded(height_px=100, width_px=160)
-    compressor.owe(IN, "uuv_modem", image)
+    compressor.send(IN, "uuv_modem", image)
     eventually(lambda: len(heard) >= 3)
-    crew.stop(service)
+    runner.stop(service)
     before = len(heard)
     again = begin(rate=5)
     eventually(lambda: again.health().counters.get("images_sent") == 1)
@@ -169,62 +169,64 @@ def test_progress_at_another_rate_is_no_progress(sea, begin, crew, compressor, e
     assert len(heard) <= before + 1 + len(frames)
 
 
-def test_progress_counts_for_the_same_image_sent_the_same_way_only(platform, sea, encoded):
+def test_progress_counts_for_the_same_image_sent_the_same_way_only(platform, modem_pair, encoded):
     image = encoded()
     kept = {"image_id": "0001", "rate": 1, "of": 2, "done": 1}
     for changed, done in (({}, 1), ({"rate": 5}, 0), ({"of": 3}, 0), ({"image_id": "0002"}, 0)):
-        service = UuvModemService(platform("uuv-1"), UuvModemConfig(port=sea.port(sea.VEHICLE), link="paper", rate=1))
+        service = UuvModemService(
+            platform("uuv-1"), UuvModemConfig(port=modem_pair.port(modem_pair.VEHICLE), link="paper", rate=1)
+        )
         with service.store.transaction() as tx:
             tx.put_state("progress", msgpack.packb(kept | changed))
         assert service._packets_done(image, 2) == done, changed
         service.store.close()
 
 
-def test_a_port_that_is_not_there_is_named_and_used_when_it_comes(sea, begin, compressor, encoded):
+def test_a_port_that_is_not_there_is_named_and_used_when_it_comes(modem_pair, begin, compressor, encoded):
     service = begin()
-    compressor.owe(IN, "uuv_modem", encoded())
-    eventually(lambda: sea.port(sea.VEHICLE) in service.health().detail)
+    compressor.send(IN, "uuv_modem", encoded())
+    eventually(lambda: modem_pair.port(modem_pair.VEHICLE) in service.health().detail)
     assert (service.health().state, service.health().gauges["modem_ready"]) == ("degraded", 0.0)
     eventually(lambda: service.store.inbox_depth() == 1, what="the image in the store")
-    sea.start()
+    modem_pair.start()
     eventually(lambda: service.health().state == "ok")
     eventually(lambda: service.health().counters.get("images_sent") == 1)
 
 
-def test_a_port_that_goes_away_in_the_middle_costs_no_frame(sea, begin, compressor, encoded, ears):
-    channel = sea.start()
+def test_a_port_that_goes_away_in_the_middle_costs_no_frame(modem_pair, begin, compressor, encoded, ears):
+    channel = modem_pair.start()
     ready, heard = ears
     eventually(ready)
     service = begin(rate=0)
     image = encoded(height_px=100, width_px=160)
-    compressor.owe(IN, "uuv_modem", image)
+    compressor.send(IN, "uuv_modem", image)
     eventually(lambda: len(heard) >= 3)
     assert channel.totals().transmitted >= 3
-    sea.stop()
-    eventually(lambda: sea.port(sea.VEHICLE) in service.health().detail)
-    sea.start()
+    modem_pair.stop()
+    eventually(lambda: modem_pair.port(modem_pair.VEHICLE) in service.health().detail)
+    modem_pair.start()
     eventually(lambda: service.health().counters.get("images_sent") == 1)
     assert service.health().counters["packets_failed"] >= 1
     assert service.health().counters["packets_sent"] == len(planned(image, 0))
 
 
-def test_garbage_on_the_line_is_counted_and_harms_nothing(sea, begin, cable, compressor, encoded, ears):
-    sea.start()
+def test_garbage_on_the_line_is_counted_and_harms_nothing(modem_pair, begin, serial_cable, compressor, encoded, ears):
+    modem_pair.start()
     ready, heard = ears
     eventually(ready)
-    line = cable(sea.port(sea.VEHICLE))
+    line = serial_cable(modem_pair.port(modem_pair.VEHICLE))
     service = begin(port=line.port)
     eventually(lambda: service.modem.ready)
     line.say(b"\x00\xff" * 500 + b"\r\n$CA\r\n$CATXF,*00\r\n$CACYC,1,2*FF\r\n" + nmea.format("CATXF", "x"))
     eventually(lambda: service.health().counters.get("sentences_rejected", 0) >= 3)
     image = encoded()
-    compressor.owe(IN, "uuv_modem", image)
+    compressor.send(IN, "uuv_modem", image)
     eventually(lambda: [f.data for f in heard] == flat(planned(image)))
     assert service.health().state == "ok"
 
 
-def test_a_modem_that_says_nothing_is_named(begin, cable):
-    line = cable(None)
+def test_a_modem_that_says_nothing_is_named(begin, serial_cable):
+    line = serial_cable(None)
     service = begin(port=line.port, reply_timeout_s=0.05)
     eventually(lambda: service.health().counters.get("modem_unresponsive", 0) >= 1)
     health = service.health()
@@ -242,18 +244,18 @@ def test_a_modem_that_says_nothing_is_named(begin, cable):
     ],
 )
 def test_an_image_that_can_never_be_sent_is_refused_to_its_sender(
-    change, said, begin, compressor, encoded, refused, sea, ears
+    change, said, begin, compressor, encoded, refused, modem_pair, ears
 ):
     from sonarpost import wire
 
-    sea.start()
+    modem_pair.start()
     service = begin(rate=5)
     bad = msgpack.packb(msgpack.unpackb(wire.encode(encoded())) | change)
-    compressor.owe_bytes(IN, "uuv_modem", bad)
+    compressor.send_bytes(IN, "uuv_modem", bad)
     eventually(lambda: len(refused(compressor)) == 1)
     assert said in refused(compressor)[0][1]
     assert refused(service) == refused(compressor)
-    compressor.owe(IN, "uuv_modem", encoded())
+    compressor.send(IN, "uuv_modem", encoded())
     eventually(lambda: service.health().counters.get("images_sent") == 1)
 
 
@@ -309,7 +311,7 @@ def busy_fraction(log):
     return len(sent), sum(airtime_s for _, airtime_s in sent) / (end_s - min(start_s for start_s, _ in sent))
 
 
-def test_the_water_is_kept_busy_at_rate_5(tmp_path, crew, platform, compressor, encoded):
+def test_the_water_is_kept_busy_at_rate_5(tmp_path, runner, platform, compressor, encoded):
     # In real time, as what is measured is what the host needs between packets. SONARPOST_BUSY_IMAGES=7 measures 21 full
     # packets, SONARPOST_BUSY_BAUD=19200 a serial line that takes its time.
     baud = float(os.environ.get("SONARPOST_BUSY_BAUD", "0")) or None
@@ -322,13 +324,13 @@ def test_the_water_is_kept_busy_at_rate_5(tmp_path, crew, platform, compressor, 
     channel = ChannelEmulator(EmulatorConfig(sites, pty_dir=ports, serial_baud=baud, log_path=log))
     channel.start()
     try:
-        service = crew.start(
+        service = runner.start(
             UuvModemService(platform("uuv-1"), UuvModemConfig(port=str(ports / "modem-2"), link="paper", rate=5))
         )
         eventually(lambda: service.modem.ready)
-        compressor.owe(IN, "uuv_modem", *images)
+        compressor.send(IN, "uuv_modem", *images)
         eventually(lambda: service.health().counters.get("images_sent") == len(images), timeout_s=120.0)
-        crew.stop(service)
+        runner.stop(service)
     finally:
         channel.stop()
     packets, busy = busy_fraction(log)

@@ -72,10 +72,10 @@ def message(name: str, **options) -> OutgoingMessage:
 
 
 @pytest.fixture
-def begin(crew, platform, sea):
+def begin(runner, platform, modem_pair):
     def start(platform_config: PlatformConfig | None = None, **options):
         usual = {
-            "port": sea.port(sea.VEHICLE),
+            "port": modem_pair.port(modem_pair.VEHICLE),
             "rate": 1,
             "retry_s": 0.05,
             "rx_window_s": 0.0,
@@ -83,28 +83,30 @@ def begin(crew, platform, sea):
             "holdoff_s": 0.15,
             "queue_interval_s": 0.1,
         }
-        return crew.start(UuvModemService(platform_config or platform("uuv-1"), UuvModemConfig(**(usual | options))))
+        return runner.start(UuvModemService(platform_config or platform("uuv-1"), UuvModemConfig(**(usual | options))))
 
     return start
 
 
 @pytest.fixture
-def programs(crew):
+def programs(runner):
     """Whatever on the vehicle owes something to uuv_modem."""
-    return crew.neighbour("uuv-1", "compressor")
+    return runner.peer("uuv-1", "compressor")
 
 
 class Vessel:
     """The vessel's modem, what it hears, and the v1 receiver's view of that."""
 
-    def __init__(self, crew, platform, sea) -> None:
-        self._hearer = crew.neighbour("vessel-1", "decompressor", {RX: AcousticFrame})
-        self.service = crew.start(OpModemService(platform("vessel-1"), OpModemConfig(port=sea.port(sea.VESSEL))))
+    def __init__(self, runner, platform, modem_pair) -> None:
+        self._hearer = runner.peer("vessel-1", "decompressor", {RX: AcousticFrame})
+        self.service = runner.start(
+            OpModemService(platform("vessel-1"), OpModemConfig(port=modem_pair.port(modem_pair.VESSEL)))
+        )
         self.sender = LinkSender(SenderConfig(frame_bytes=RATES[0].frame_bytes))
 
     @property
     def frames(self) -> list[AcousticFrame]:
-        return self._hearer.got
+        return self._hearer.received
 
     def events(self, seal=None):
         receiver = LinkReceiver(seal=seal)
@@ -151,9 +153,9 @@ def soon(condition, within_s: float = 0.5) -> bool:
 
 
 @pytest.fixture
-def vessel(crew, platform, sea):
-    sea.start()
-    vessel = Vessel(crew, platform, sea)
+def vessel(runner, platform, modem_pair):
+    modem_pair.start()
+    vessel = Vessel(runner, platform, modem_pair)
     eventually(lambda: vessel.service.modem.ready)
     return vessel
 
@@ -169,7 +171,7 @@ def idle(service) -> bool:
 def test_pictures_arrive_with_the_preview_of_each_before_the_detail_of_any(vessel, begin, programs):
     begin()
     images = [image(n) for n in range(1, 9)]
-    programs.owe(IN, "uuv_modem", *images)
+    programs.send(IN, "uuv_modem", *images)
     eventually(lambda: len(vessel.streams()) == 8)
     eventually(lambda: all(len(s) > 150 for s in vessel.streams().values()), what="most of every picture")
     for number, stream in vessel.streams().items():
@@ -183,11 +185,11 @@ def test_pictures_arrive_with_the_preview_of_each_before_the_detail_of_any(vesse
     assert first_detail == 8
 
 
-def test_a_killed_process_goes_on_where_it_was(vessel, begin, programs, crew, tmp_path):
+def test_a_killed_process_goes_on_where_it_was(vessel, begin, programs, runner, tmp_path):
     service = begin()
     images = [image(n) for n in range(1, 13)]
-    programs.owe(IN, "uuv_modem", *images)
-    programs.owe(OUT, "uuv_modem", *[message(f"m{n}", priority=6) for n in range(5)])
+    programs.send(IN, "uuv_modem", *images)
+    programs.send(OUT, "uuv_modem", *[message(f"m{n}", priority=6) for n in range(5)])
     eventually(lambda: sent(service) >= 6)
     # What a process that is killed at this moment leaves on the disk.
     killed = tmp_path / "killed"
@@ -198,7 +200,7 @@ def test_a_killed_process_goes_on_where_it_was(vessel, begin, programs, crew, tm
                 shutil.copy(file, killed / file.name)
         at_kill = sent(service)
     heard_before = len(vessel.frames)
-    crew.stop(service)
+    runner.stop(service)
     place = service.platform.model_copy(update={"state_dir": killed})
     time_of_stop = len(vessel.frames)
     again = begin(place)
@@ -211,12 +213,12 @@ def test_a_killed_process_goes_on_where_it_was(vessel, begin, programs, crew, tm
     assert repeated <= 3 * (1 + (time_of_stop - heard_before + 2) // 3) + 3
 
 
-def test_a_stop_repeats_one_packet_at_most(vessel, begin, programs, crew):
+def test_a_stop_repeats_one_packet_at_most(vessel, begin, programs, runner):
     service = begin()
-    programs.owe(IN, "uuv_modem", *[image(n) for n in range(1, 13)])
+    programs.send(IN, "uuv_modem", *[image(n) for n in range(1, 13)])
     for stop_at in (2, 5, 9):
         eventually(lambda at=stop_at: len(vessel.frames) >= 3 * at)
-        crew.stop(service)
+        runner.stop(service)
         service = begin()
     eventually(lambda: idle(service))
     eventually(lambda: len(vessel.streams()) == 12)
@@ -225,8 +227,8 @@ def test_a_stop_repeats_one_packet_at_most(vessel, begin, programs, crew):
 
 def test_other_traffic_goes_by_priority(vessel, begin, programs):
     begin(aging_s=86400.0)
-    programs.owe(IN, "uuv_modem", *[image(n) for n in range(1, 9)])
-    programs.owe(OUT, "uuv_modem", message("urgent", priority=1), message("log", priority=7))
+    programs.send(IN, "uuv_modem", *[image(n) for n in range(1, 9)])
+    programs.send(OUT, "uuv_modem", message("urgent", priority=1), message("log", priority=7))
     eventually(lambda: DataMessage(b"urgent") in vessel.messages())
     eventually(lambda: DataMessage(b"log") in vessel.messages(), what="the rest, when pictures leave room")
 
@@ -234,7 +236,7 @@ def test_other_traffic_goes_by_priority(vessel, begin, programs):
 def test_what_waits_is_told_with_the_time_it_is_expected(begin, programs, watch):
     shown = watch(QUEUE)
     begin()  # no modem answers: everything waits
-    programs.owe(IN, "uuv_modem", *[image(n) for n in range(1, 9)])
+    programs.send(IN, "uuv_modem", *[image(n) for n in range(1, 9)])
 
     def told():
         states = [wire.decode(QueueState, s.payload.to_bytes(), QUEUE) for s in shown]
@@ -251,19 +253,19 @@ def test_what_waits_is_told_with_the_time_it_is_expected(begin, programs, watch)
 def test_what_has_expired_is_counted_and_not_sent(vessel, begin, programs):
     service = begin()
     old = message("old").model_copy(update={"created_utc_s": time.time() - 3600.0})
-    programs.owe(OUT, "uuv_modem", old, message("new"))
+    programs.send(OUT, "uuv_modem", old, message("new"))
     eventually(lambda: DataMessage(b"new") in vessel.messages())
     eventually(lambda: service.health().gauges["messages_expired"] == 1)
     assert DataMessage(b"old") not in vessel.messages()
 
 
-def test_messages_beyond_the_limit_stay_with_their_program(begin, programs, crew):
+def test_messages_beyond_the_limit_stay_with_their_program(begin, programs, runner):
     service = begin(max_messages=3)  # no modem answers: nothing goes
-    autonomy = crew.neighbour("uuv-1", "autonomy")
-    autonomy.owe(OUT, "uuv_modem", *[message(f"m{n}") for n in range(3)])
+    autonomy = runner.peer("uuv-1", "autonomy")
+    autonomy.send(OUT, "uuv_modem", *[message(f"m{n}") for n in range(3)])
     eventually(lambda: service.health().gauges["messages_waiting"] == 3)
-    autonomy.owe(OUT, "uuv_modem", message("m3"))
-    programs.owe(IN, "uuv_modem", image(1))
+    autonomy.send(OUT, "uuv_modem", message("m3"))
+    programs.send(IN, "uuv_modem", image(1))
     eventually(lambda: [e.name.image_id for e in service._line.queue.expected(0.0)] == ["0001"])
     eventually(lambda: programs.store.outbox_depth() == 0)
     assert autonomy.store.outbox_depth() == 1
@@ -278,11 +280,11 @@ ORDERS = [
 ]
 
 
-def test_orders_by_sound_are_handed_on_once_and_confirmed_each_time(vessel, begin, crew):
+def test_orders_by_sound_are_handed_on_once_and_confirmed_each_time(vessel, begin, runner):
     service = begin(revisit_consumers=("autonomy",), decision_consumers=("autonomy",))
-    compressor = crew.neighbour("uuv-1", "compressor", {keys.command_all("uuv-1"): Command})
+    compressor = runner.peer("uuv-1", "compressor", {keys.command_all("uuv-1"): Command})
     takes = {keys.command("uuv-1", "revisit"): Command, keys.command("uuv-1", "decision"): Decision}
-    autonomy = crew.neighbour("uuv-1", "autonomy", takes)
+    autonomy = runner.peer("uuv-1", "autonomy", takes)
     eventually(lambda: service.modem.ready)
     judgement = DecisionMessage(4, 1003, 2, 1, "mine_like", 0.5, "sphere")
     orders = [*[order for order, _, _ in ORDERS], judgement]
@@ -293,10 +295,14 @@ def test_orders_by_sound_are_handed_on_once_and_confirmed_each_time(vessel, begi
     vessel.say(*orders, until=lambda: {token for token, _ in told()} == {1, 2, 3, 4, 5})
     before = told().count((1, CommandOutcome.TAKEN))
     vessel.say(orders[0], until=lambda: told().count((1, CommandOutcome.TAKEN)) > before)
-    eventually(lambda: len(compressor.got) == 3 and len(autonomy.got) == 2)
+    eventually(lambda: len(compressor.received) == 3 and len(autonomy.received) == 2)
     assert {outcome for _, outcome in told()} == {CommandOutcome.TAKEN}
-    assert {(c.kind, c.image_id) for c in compressor.got} == {("refine", "0002"), ("resend", "0003"), ("wider", "0004")}
-    revisit, decision = sorted(autonomy.got, key=lambda r: r.TYPE)
+    assert {(c.kind, c.image_id) for c in compressor.received} == {
+        ("refine", "0002"),
+        ("resend", "0003"),
+        ("wider", "0004"),
+    }
+    revisit, decision = sorted(autonomy.received, key=lambda r: r.TYPE)
     assert (revisit.lat_deg, revisit.lon_deg, revisit.command_id) == (56.5, -5.25, "a1-00000003")
     assert (decision.verdict, decision.mlo_class, decision.image_id) == ("mine_like", "sphere", "0002")
     assert service.health().counters["orders_taken"] == 5
@@ -311,7 +317,7 @@ def test_an_order_that_nobody_takes_is_told(vessel, begin):
 
 def test_what_a_report_lacks_is_sent(vessel, begin, programs):
     service = begin(stream_bytes=300, tx_burst_s=0.2, rx_window_s=0.2)
-    programs.owe(IN, "uuv_modem", *[image(n) for n in range(1, 5)])
+    programs.send(IN, "uuv_modem", *[image(n) for n in range(1, 5)])
     eventually(lambda: len(vessel.frames) > 10)
 
     def report() -> bool:
@@ -325,7 +331,7 @@ def test_what_a_report_lacks_is_sent(vessel, begin, programs):
     assert any(report() for _ in range(20))
     assert service._line.queue.sender.config.feedback
     # Pictures that come now are sent as far as configured, and what is lost of them until a report says it is there.
-    programs.owe(IN, "uuv_modem", *[image(n) for n in range(5, 9)])
+    programs.send(IN, "uuv_modem", *[image(n) for n in range(5, 9)])
 
     def done() -> bool:
         report()
@@ -340,7 +346,7 @@ def test_frames_for_others_and_damaged_ones_do_no_harm(vessel, begin, programs):
     vessel.send(b"no frame of this format")
     vessel.service.modem.send_packet(5, 0, [b"for somebody else"])
     eventually(lambda: service.health().counters.get("frames_refused", 0) == 1)
-    programs.owe(IN, "uuv_modem", image(1))
+    programs.send(IN, "uuv_modem", image(1))
     eventually(lambda: 1 in vessel.streams())
 
 
@@ -353,7 +359,7 @@ def key(tmp_path) -> AcousticKey:
 
 
 def test_with_a_key_only_sealed_frames_count_and_a_restart_uses_no_counter_twice(
-    vessel, begin, programs, crew, platform, key, tmp_path
+    vessel, begin, programs, runner, platform, key, tmp_path
 ):
     place = platform("uuv-1").model_copy(update={"acoustic_key_file": tmp_path / "acoustic.key"})
     service = begin(place)
@@ -371,9 +377,9 @@ def test_with_a_key_only_sealed_frames_count_and_a_restart_uses_no_counter_twice
     forged = counters()["frames_forged"]
     vessel.say(ResendMessage(2, 1000, 4), until=lambda: counters()["frames_forged"] > forged)
     assert counters()["orders_taken"] == 1
-    programs.owe(IN, "uuv_modem", *[image(n) for n in range(1, 9)])
+    programs.send(IN, "uuv_modem", *[image(n) for n in range(1, 9)])
     eventually(lambda: len(vessel.frames) > 6)
-    crew.stop(service)
+    runner.stop(service)
     again = begin(place)
     eventually(lambda: idle(again))
     eventually(lambda: len({e.number for e in vessel.events(ears_of(key)) if isinstance(e, ContactUpdate)}) == 8)
@@ -389,7 +395,7 @@ def ears_of(key: AcousticKey) -> FrameAuthenticator:
 
 def test_polled_it_sends_what_it_is_asked_for_and_nothing_else(vessel, begin, programs):
     service = begin(mac="polled", group_delay_s=0.0)
-    programs.owe(IN, "uuv_modem", image(1), image(2))
+    programs.send(IN, "uuv_modem", image(1), image(2))
     eventually(lambda: bool(service._runner._offered))
     assert sent(service) == 0
     for n in range(1, 4):
@@ -403,14 +409,14 @@ def test_polled_it_sends_what_it_is_asked_for_and_nothing_else(vessel, begin, pr
 
 @pytest.mark.parametrize("spoilt", [msgpack.packb({"format": 99}), b"\xc1 no msgpack"])
 def test_of_a_state_that_cannot_be_read_pictures_and_messages_are_queued_anew(
-    spoilt, begin, programs, crew, vessel, refused
+    spoilt, begin, programs, runner, vessel, refused
 ):
     service = begin(group_delay_s=3600.0)  # the pictures wait
-    programs.owe(IN, "uuv_modem", *[image(n) for n in range(1, 4)])
-    programs.owe(OUT, "uuv_modem", message("kept", priority=6))
+    programs.send(IN, "uuv_modem", *[image(n) for n in range(1, 4)])
+    programs.send(OUT, "uuv_modem", message("kept", priority=6))
     eventually(lambda: len(service._line.queue.names) == 3 and not service._line.accepted())
     eventually(lambda: programs.store.outbox_depth() == 0)
-    crew.stop(service)
+    runner.stop(service)
     store = Store(service.platform.state_dir / "uuv_modem.db")
     with store.transaction() as tx:
         tx.put_state("v1/queue/core", spoilt)
@@ -425,7 +431,7 @@ def test_of_a_state_that_cannot_be_read_pictures_and_messages_are_queued_anew(
     assert len(vessel.streams().get(2, b"")) < 60
     apart = {key for key, _ in refused(again)}
     assert {"state v1/queue/core", "state v1/orders", "state v1/queue/picture/2"} <= apart
-    programs.owe(IN, "uuv_modem", image(4))
+    programs.send(IN, "uuv_modem", image(4))
     eventually(lambda: 4 in vessel.streams(), 60)
 
 
@@ -435,7 +441,7 @@ def test_of_a_state_that_cannot_be_read_pictures_and_messages_are_queued_anew(
 )
 def test_a_picture_that_can_never_be_sent_is_refused_to_its_sender(change, said, begin, programs, refused):
     service = begin()
-    programs.owe_bytes(IN, "uuv_modem", msgpack.packb(msgpack.unpackb(wire.encode(image(1))) | change))
+    programs.send_bytes(IN, "uuv_modem", msgpack.packb(msgpack.unpackb(wire.encode(image(1))) | change))
     eventually(lambda: len(refused(programs)) == 1)
     assert said in refused(programs)[0][1]
     assert refused(service) == refused(programs)

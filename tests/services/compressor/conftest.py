@@ -16,21 +16,21 @@ OUT = keys.image_encoded("uuv-1")
 
 
 @pytest.fixture
-def begin(crew, platform):
+def begin(runner, platform):
     def start(**options):
-        return crew.start(CompressorService(platform("uuv-1"), CompressorConfig(**options)))
+        return runner.start(CompressorService(platform("uuv-1"), CompressorConfig(**options)))
 
     return start
 
 
 @pytest.fixture
-def modem(crew):
-    return crew.neighbour("uuv-1", "uuv_modem", {OUT: EncodedImage})
+def modem(runner):
+    return runner.peer("uuv-1", "uuv_modem", {OUT: EncodedImage})
 
 
 @pytest.fixture
-def atd(crew):
-    return crew.neighbour("uuv-1", "atd_stub")
+def atd(runner):
+    return runner.peer("uuv-1", "atd_stub")
 
 
 @pytest.fixture(scope="session")

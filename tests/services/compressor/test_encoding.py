@@ -19,13 +19,13 @@ from sonarpost.services.compressor.service import IMAGE_IDS, CompressorService
 IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
 
 
-def test_a_snippet_becomes_a_stream_with_its_contact(begin, atd, modem, snippet, vq, is_told, watch):
+def test_a_snippet_becomes_a_stream_with_its_contact(begin, atd, modem, snippet, vq, check_monitoring, watch):
     seen = watch(OUT)
     service = begin()
     sent = snippet("c1")
-    atd.owe(IN, "compressor", sent)
-    eventually(lambda: len(modem.got) == 1)
-    image = modem.got[0]
+    atd.send(IN, "compressor", sent)
+    eventually(lambda: len(modem.received) == 1)
+    image = modem.received[0]
     assert image.contact == sent.contact
     assert (image.vehicle_id, image.codec, image.model) == ("uuv-1", "vq", vq.model_hash)
     assert (image.height_px, image.width_px, image.original_sha256) == (40, 60, sent.picture.sha256)
@@ -37,17 +37,17 @@ def test_a_snippet_becomes_a_stream_with_its_contact(begin, atd, modem, snippet,
     eventually(lambda: service.health().counters == {"records_handled": 1, "images_encoded": 1, "bytes_encoded": size})
     eventually(lambda: len(seen) == 1, what="the copy for watchers")
     assert msgpack.unpackb(seen[0].payload.to_bytes())["image_id"] == image.image_id
-    is_told(service)
+    check_monitoring(service)
 
 
 def test_sixteen_bits_are_mapped_over_their_own_range(begin, atd, modem, snippet, vq):
     begin()
     deep = snippet("deep", dtype=np.uint16)
     assert deep.picture.bits == 16
-    atd.owe(IN, "compressor", deep)
-    eventually(lambda: len(modem.got) == 1)
-    assert modem.got[0].stream == vq.encode(to_uint8(deep.picture.to_array()))
-    assert modem.got[0].original_sha256 == deep.picture.sha256
+    atd.send(IN, "compressor", deep)
+    eventually(lambda: len(modem.received) == 1)
+    assert modem.received[0].stream == vq.encode(to_uint8(deep.picture.to_array()))
+    assert modem.received[0].original_sha256 == deep.picture.sha256
 
 
 @pytest.mark.parametrize(
@@ -56,8 +56,8 @@ def test_sixteen_bits_are_mapped_over_their_own_range(begin, atd, modem, snippet
 )
 def test_a_picture_of_the_wrong_size_is_kept_apart(height_px, width_px, said, begin, atd, modem, snippet, refused):
     service = begin()
-    atd.owe(IN, "compressor", snippet("bad", height_px, width_px), snippet("good"))
-    eventually(lambda: [i.contact.contact_id for i in modem.got] == ["good"])
+    atd.send(IN, "compressor", snippet("bad", height_px, width_px), snippet("good"))
+    eventually(lambda: [i.contact.contact_id for i in modem.received] == ["good"])
     [(key, reason)] = refused(service)
     assert key == IN
     assert said in reason
@@ -68,11 +68,11 @@ def test_a_picture_of_the_wrong_size_is_kept_apart(height_px, width_px, said, be
 
 def test_a_budget_that_cannot_be_met_is_said(begin, atd, modem, snippet, refused):
     service = begin(budget_bytes=9)
-    atd.owe(IN, "compressor", snippet("large"))
+    atd.send(IN, "compressor", snippet("large"))
     eventually(lambda: len(refused(service)) == 1)
     assert "budget" in refused(service)[0][1]
     assert not service.failed
-    assert modem.got == []
+    assert modem.received == []
 
 
 @pytest.mark.parametrize(
@@ -90,9 +90,9 @@ def test_a_budget_that_cannot_be_met_is_said(begin, atd, modem, snippet, refused
 )
 def test_a_payload_that_is_no_snippet_is_refused_and_the_next_one_taken(spoil, begin, atd, modem, snippet, refused):
     service = begin()
-    atd.owe_bytes(IN, "compressor", spoil(msgpack.unpackb(wire.encode(snippet("spoilt")))))
-    atd.owe(IN, "compressor", snippet("good"))
-    eventually(lambda: [i.contact.contact_id for i in modem.got] == ["good"])
+    atd.send_bytes(IN, "compressor", spoil(msgpack.unpackb(wire.encode(snippet("spoilt")))))
+    atd.send(IN, "compressor", snippet("good"))
+    eventually(lambda: [i.contact.contact_id for i in modem.received] == ["good"])
     [(key, reason)] = refused(service)
     assert key == IN
     assert IN in reason
@@ -105,29 +105,29 @@ def test_a_payload_that_is_no_snippet_is_refused_and_the_next_one_taken(spoil, b
 def test_a_plain_publication_is_encoded_too(begin, modem, snippet, publish):
     begin()
     publish(IN, wire.encode(snippet("from somebody's own detector")))
-    eventually(lambda: len(modem.got) == 1)
+    eventually(lambda: len(modem.received) == 1)
 
 
-def test_identifiers_go_on_over_restarts(begin, crew, atd, modem, snippet):
+def test_identifiers_go_on_over_restarts(begin, runner, atd, modem, snippet):
     for turn in range(3):
         service = begin()
-        atd.owe(IN, "compressor", *(snippet(f"{turn}-{n}") for n in range(4)))
-        eventually(lambda turn=turn: len(modem.got) == 4 * (turn + 1))
-        crew.stop(service)
-    first = int(modem.got[0].image_id, 36)
-    assert [i.image_id for i in modem.got] == [format_image_id(first + n) for n in range(12)]
-    assert [i.contact.contact_id for i in modem.got] == [f"{t}-{n}" for t in range(3) for n in range(4)]
+        atd.send(IN, "compressor", *(snippet(f"{turn}-{n}") for n in range(4)))
+        eventually(lambda turn=turn: len(modem.received) == 4 * (turn + 1))
+        runner.stop(service)
+    first = int(modem.received[0].image_id, 36)
+    assert [i.image_id for i in modem.received] == [format_image_id(first + n) for n in range(12)]
+    assert [i.contact.contact_id for i in modem.received] == [f"{t}-{n}" for t in range(3) for n in range(4)]
 
 
-def test_the_last_identifier_is_followed_by_the_first(begin, crew, platform, atd, modem, snippet):
+def test_the_last_identifier_is_followed_by_the_first(begin, runner, platform, atd, modem, snippet):
     service = begin()
     with service.store.transaction() as tx:
         tx.put_state("next_image", str(IMAGE_IDS).encode())
-    atd.owe(IN, "compressor", snippet("a"), snippet("b"))
-    eventually(lambda: [i.image_id for i in modem.got] == ["1EKF", "0001"])
+    atd.send(IN, "compressor", snippet("a"), snippet("b"))
+    eventually(lambda: [i.image_id for i in modem.received] == ["1EKF", "0001"])
 
 
-def test_a_wiped_vehicle_does_not_begin_where_its_last_mission_did(crew, platform, tmp_path):
+def test_a_wiped_vehicle_does_not_begin_where_its_last_mission_did(runner, platform, tmp_path):
     starts = set()
     for number in range(4):
         wiped = platform("uuv-1").model_copy(update={"state_dir": tmp_path / str(number)})
@@ -137,14 +137,14 @@ def test_a_wiped_vehicle_does_not_begin_where_its_last_mission_did(crew, platfor
     assert len(starts) == 4
 
 
-def test_what_was_encoded_before_a_stop_is_sent_after_it(begin, crew, atd, snippet):
+def test_what_was_encoded_before_a_stop_is_sent_after_it(begin, runner, atd, snippet):
     service = begin()
-    atd.owe(IN, "compressor", snippet("a"), snippet("b"))
+    atd.send(IN, "compressor", snippet("a"), snippet("b"))
     eventually(lambda: service.store.outbox_depth() == 2)
-    crew.stop(service)
+    runner.stop(service)
     begin()
-    late = crew.neighbour("uuv-1", "uuv_modem", {OUT: EncodedImage})
-    eventually(lambda: [i.contact.contact_id for i in late.got] == ["a", "b"])
+    late = runner.peer("uuv-1", "uuv_modem", {OUT: EncodedImage})
+    eventually(lambda: [i.contact.contact_id for i in late.received] == ["a", "b"])
 
 
 def test_what_was_accepted_before_a_stop_is_encoded_after_it(begin, platform, modem, snippet):
@@ -153,15 +153,15 @@ def test_what_was_accepted_before_a_stop_is_encoded_after_it(begin, platform, mo
         tx.accept(IN, wire.encode(snippet("waiting")))
     idle.store.close()
     begin()
-    eventually(lambda: [i.contact.contact_id for i in modem.got] == ["waiting"])
+    eventually(lambda: [i.contact.contact_id for i in modem.received] == ["waiting"])
 
 
 @pytest.mark.parametrize("packing", list(IndexPacking))
 def test_every_packing_is_what_the_configuration_says(packing, begin, atd, modem, snippet):
     begin(packing=packing)
-    atd.owe(IN, "compressor", snippet("c"))
-    eventually(lambda: len(modem.got) == 1)
-    assert modem.got[0].stream[0] == packing.codec_id
+    atd.send(IN, "compressor", snippet("c"))
+    eventually(lambda: len(modem.received) == 1)
+    assert modem.received[0].stream[0] == packing.codec_id
 
 
 @pytest.mark.parametrize(
@@ -188,11 +188,11 @@ def test_a_damaged_codebook_is_named(platform, tmp_path):
 def test_a_full_disk_leaves_the_snippet_with_its_sender(begin, atd, modem, snippet):
     service = begin()
     service.store._db.execute("PRAGMA max_page_count=1")
-    atd.owe(IN, "compressor", snippet("late", 200, 200))
+    atd.send(IN, "compressor", snippet("late", 200, 200))
     eventually(lambda: service.health().state == "degraded")
     assert atd.store.outbox_depth() == 1
     service.store._db.execute("PRAGMA max_page_count=1000000")
-    eventually(lambda: len(modem.got) == 1)
+    eventually(lambda: len(modem.received) == 1)
     eventually(lambda: service.health().state == "ok")
 
 
@@ -201,6 +201,6 @@ def test_the_contact_arrives_as_it_was(begin, atd, modem, texture):
     contact = Contact(
         contact_id="full", vehicle_id="uuv-1", lat_deg=56.1, lon_deg=-5.2, atd_confidence=1.5, ping_number=7
     )
-    atd.owe(IN, "compressor", Snippet(contact=contact, picture=Pixels.from_array(texture())))
-    eventually(lambda: len(modem.got) == 1)
-    assert modem.got[0].contact == contact
+    atd.send(IN, "compressor", Snippet(contact=contact, picture=Pixels.from_array(texture())))
+    eventually(lambda: len(modem.received) == 1)
+    assert modem.received[0].contact == contact

@@ -38,15 +38,15 @@ def with_wide(snippet):
 
 
 @pytest.fixture
-def ask(crew):
+def ask(runner):
     """Asks for a picture as uuv_modem does; each time by an order of its own."""
-    orders = crew.neighbour("uuv-1", "orders")
+    orders = runner.peer("uuv-1", "orders")
     asked = []
 
     def give(kind, image_id):
         asked.append(kind)
         record = command_record(kind, image_id).model_copy(update={"command_id": f"c-{len(asked)}"})
-        orders.owe(keys.command("uuv-1", kind), "compressor", record)
+        orders.send(keys.command("uuv-1", kind), "compressor", record)
 
     return give
 
@@ -54,11 +54,11 @@ def ask(crew):
 def test_wider_gives_more_seabed_as_a_picture_of_its_own(begin, ask, atd, modem, with_wide, vq):
     service = begin()
     sent = with_wide("c1")
-    atd.owe(IN, "compressor", sent)
-    eventually(lambda: len(modem.got) == 1)
-    ask("wider", modem.got[0].image_id)
-    eventually(lambda: len(modem.got) == 2)
-    first, wide = modem.got
+    atd.send(IN, "compressor", sent)
+    eventually(lambda: len(modem.received) == 1)
+    ask("wider", modem.received[0].image_id)
+    eventually(lambda: len(modem.received) == 2)
+    first, wide = modem.received
     assert int(wide.image_id, 36) == int(first.image_id, 36) + 1
     assert wide.contact == sent.contact.model_copy(update={"pixel_along_m": 0.1, "pixel_across_m": 0.2})
     assert wide.stream == vq.encode(sent.wide.to_array())
@@ -67,7 +67,7 @@ def test_wider_gives_more_seabed_as_a_picture_of_its_own(begin, ask, atd, modem,
     assert (counters["images_encoded"], counters["images_widened"]) == (2, 1)
 
 
-def test_wider_of_a_real_detection_shows_twice_the_ground_from_the_vessels_order_on(begin, crew, atd, modem, emb):
+def test_wider_of_a_real_detection_shows_twice_the_ground_from_the_vessels_order_on(begin, runner, atd, modem, emb):
     survey = simulate_survey(SurveySpec(seed=1, pings=400, samples=1024, clutter=0)).survey
     config = AtdStubConfig()
     origin = Origin("ab" * 32, "line-7.xtf", "line-7")
@@ -75,18 +75,18 @@ def test_wider_of_a_real_detection_shows_twice_the_ground_from_the_vessels_order
     found = next(each for each in detect(survey) if 80 <= each.ping_index < 320 and 150 <= each.sample < 850)
     sent = of_detection(survey, found, origin, "uuv-1", config)
     begin(codec="emb", budget_bytes=4000)
-    atd.owe(IN, "compressor", sent)
-    eventually(lambda: len(modem.got) == 1)
-    first = modem.got[0]
+    atd.send(IN, "compressor", sent)
+    eventually(lambda: len(modem.received) == 1)
+    first = modem.received[0]
     # On the vessel a command, in the water bytes, on the vehicle a command again.
     in_the_water = dl.pack(order_of(command_record("wider", first.image_id), 7))
     outcome, handed = ReceivedCommands("uuv-1", UuvModemConfig(port="unused")).take(
         1, dl.unpack(in_the_water), first.image_id
     )
     assert (outcome, handed.consumers) == (dl.CommandOutcome.TAKEN, ("compressor",))
-    crew.neighbour("uuv-1", "orders").owe(handed.key, "compressor", handed.record)
-    eventually(lambda: len(modem.got) == 2)
-    wide = modem.got[1]
+    runner.peer("uuv-1", "orders").send(handed.key, "compressor", handed.record)
+    eventually(lambda: len(modem.received) == 2)
+    wide = modem.received[1]
     seen = {image.image_id: emb.decode(image.stream).image.astype(float) for image in (first, wide)}
     around, near = seen[wide.image_id], seen[first.image_id]
     assert around.shape == near.shape == (80, 140)
@@ -103,56 +103,56 @@ def test_wider_of_a_real_detection_shows_twice_the_ground_from_the_vessels_order
     assert likeness[20, 35] > 0.8
 
 
-def test_wider_asked_again_gives_the_same_picture_again(begin, crew, ask, atd, modem, with_wide):
+def test_wider_asked_again_gives_the_same_picture_again(begin, runner, ask, atd, modem, with_wide):
     service = begin()
-    atd.owe(IN, "compressor", with_wide("c1"), with_wide("c2", seed=2))
-    eventually(lambda: len(modem.got) == 2)
-    ask("wider", modem.got[0].image_id)
-    eventually(lambda: len(modem.got) == 3)
-    ask("refine", modem.got[0].image_id)  # what is kept of it is written anew, and still knows its wide one
-    eventually(lambda: len(modem.got) == 4)
-    crew.stop(service)
+    atd.send(IN, "compressor", with_wide("c1"), with_wide("c2", seed=2))
+    eventually(lambda: len(modem.received) == 2)
+    ask("wider", modem.received[0].image_id)
+    eventually(lambda: len(modem.received) == 3)
+    ask("refine", modem.received[0].image_id)  # what is kept of it is written anew, and still knows its wide one
+    eventually(lambda: len(modem.received) == 4)
+    runner.stop(service)
     service = begin()
-    ask("wider", modem.got[0].image_id)
-    eventually(lambda: len(modem.got) == 5)
-    assert modem.got[4] == modem.got[2]
+    ask("wider", modem.received[0].image_id)
+    eventually(lambda: len(modem.received) == 5)
+    assert modem.received[4] == modem.received[2]
     assert "images_encoded" not in service.health().counters
 
 
 def test_a_wider_picture_that_is_forgotten_is_made_again(begin, ask, atd, modem, with_wide):
     begin(codec="emb", budget_bytes=120, cache_images=2)
-    atd.owe(IN, "compressor", with_wide("c1"))
-    eventually(lambda: len(modem.got) == 1)
-    first = modem.got[0].image_id
+    atd.send(IN, "compressor", with_wide("c1"))
+    eventually(lambda: len(modem.received) == 1)
+    first = modem.received[0].image_id
     ask("wider", first)
-    eventually(lambda: len(modem.got) == 2)
+    eventually(lambda: len(modem.received) == 2)
     ask("refine", first)  # now the wide one has been kept longest
-    eventually(lambda: len(modem.got) == 3)
-    atd.owe(IN, "compressor", with_wide("c2", seed=2))
-    eventually(lambda: len(modem.got) == 4)
+    eventually(lambda: len(modem.received) == 3)
+    atd.send(IN, "compressor", with_wide("c2", seed=2))
+    eventually(lambda: len(modem.received) == 4)
     ask("wider", first)
-    eventually(lambda: len(modem.got) == 5)
-    assert modem.got[4].stream == modem.got[1].stream
-    assert modem.got[4].image_id not in {image.image_id for image in modem.got[:4]}
+    eventually(lambda: len(modem.received) == 5)
+    assert modem.received[4].stream == modem.received[1].stream
+    assert modem.received[4].image_id not in {image.image_id for image in modem.received[:4]}
 
 
 def test_wider_where_there_is_nothing_wider_is_said(begin, ask, atd, modem, snippet, with_wide):
     service = begin()
-    atd.owe(IN, "compressor", snippet("plain"), with_wide("c1"))
-    eventually(lambda: len(modem.got) == 2)
-    plain, first = (image.image_id for image in modem.got)
+    atd.send(IN, "compressor", snippet("plain"), with_wide("c1"))
+    eventually(lambda: len(modem.received) == 2)
+    plain, first = (image.image_id for image in modem.received)
     counters = lambda: service.health().counters  # noqa: E731
     ask("wider", plain)
     eventually(lambda: counters().get("commands_nothing_wider") == 1)
     ask("wider", "ZZZZ")
     eventually(lambda: counters().get("commands_unknown_image") == 1)
     ask("wider", first)
-    eventually(lambda: len(modem.got) == 3)
-    ask("wider", modem.got[2].image_id)  # around the wider one nothing more is kept
+    eventually(lambda: len(modem.received) == 3)
+    ask("wider", modem.received[2].image_id)  # around the wider one nothing more is kept
     eventually(lambda: counters().get("commands_nothing_wider") == 2)
-    ask("resend", modem.got[2].image_id)
-    eventually(lambda: len(modem.got) == 4)
-    assert modem.got[3] == modem.got[2]
+    ask("resend", modem.received[2].image_id)
+    eventually(lambda: len(modem.received) == 4)
+    assert modem.received[3] == modem.received[2]
 
 
 def test_pixels_too_large_for_a_record_are_not_known(with_wide):
@@ -163,12 +163,12 @@ def test_pixels_too_large_for_a_record_are_not_known(with_wide):
 
 def test_what_a_version_without_wider_pictures_has_kept_is_still_given(begin, ask, atd, modem, snippet):
     service = begin()
-    atd.owe(IN, "compressor", snippet("c1"))
-    eventually(lambda: len(modem.got) == 1)
-    name = f"kept/{modem.got[0].image_id}"
+    atd.send(IN, "compressor", snippet("c1"))
+    eventually(lambda: len(modem.received) == 1)
+    name = f"kept/{modem.received[0].image_id}"
     image, packed, _ = msgpack.unpackb(service.store.get_state(name))
     with service.store.transaction() as tx:
         tx.put_state(name, msgpack.packb([image, packed]))
-    ask("resend", modem.got[0].image_id)
-    eventually(lambda: len(modem.got) == 2)
-    assert modem.got[1] == modem.got[0]
+    ask("resend", modem.received[0].image_id)
+    eventually(lambda: len(modem.received) == 2)
+    assert modem.received[1] == modem.received[0]
