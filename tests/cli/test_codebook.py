@@ -10,14 +10,10 @@ import numpy as np
 import pytest
 
 from sonarpost.cli import codebook, encode
-from sonarpost.cli.codebook import nominal
 from sonarpost.cli.codebook.build import parse_rounds
-from sonarpost.cli.codebook.default_codebooks import Recipe
 from sonarpost.cli.codebook.progress import ProgressDisplay
 from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.vq.codebook import load, load_default
-from sonarpost.codec.vq.patches import PatchPlan, cut_line
-from sonarpost.codec.vq.tiles import cut_tiles
 from sonarpost.codec.vq.training_config import Round
 from sonarpost.errors import CodebookError, ConfigError, SonarpostError, StreamError
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff
@@ -139,33 +135,11 @@ def test_wrong_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Path
         ("decode", folder, "--codebook", tmp_path / "absent.tiles"),
         ("codebook", "info", tmp_path / "file"),
         ("codebook", "build", "--images", empty, "--out", tmp_path / "x.tiles"),
-        ("codebook", "nominal", "--humminbird", empty, "--out", tmp_path),
-        ("codebook", "nominal", "--humminbird", empty, "--out", tmp_path, "--refine", -1),
     ]
     for arguments in wrong:
         with pytest.raises(SonarpostError):
             run(*arguments)
     assert not (tmp_path / "x.tiles").exists()
-
-
-def test_a_nominal_codebook_can_be_left_unrefined(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    speckle = 60 * np.random.default_rng(4).rayleigh(1.0, (200, 200))
-    images = list(cut_line("x", speckle.astype(np.float32), PatchPlan(copies=2)))
-    monkeypatch.setattr(nominal, "humminbird_images", lambda _: images)
-    monkeypatch.setattr(nominal, "simulated_images", lambda _: iter(()))
-    monkeypatch.setattr(nominal, "RECIPES", (Recipe(10, 80, (Round(100.0, 60.0),), 2),))
-    made = []
-    for options in (("--refine", 0), ("--refine", 2), ()):
-        assert run("codebook", "nominal", "--humminbird", tmp_path, "--out", tmp_path / "new" / "folder", *options) == 0
-        made.append(load(tmp_path / "new" / "folder" / "nominal-10.tiles"))
-    alone, twice, usual = made
-    assert twice.tiles.identity == usual.tiles.identity != alone.tiles.identity
-    assert [one.notes["refine passes"] for one in made] == ["0", "2", "2"]
-    pieces = {tile.tobytes() for image in images for tile in cut_tiles(image.load(), 10)}
-    assert all(tile.tobytes() in pieces for tile in alone.tiles.tiles)  # Table IV keeps tiles as they are
-    (tmp_path / "file").touch()
-    with pytest.raises(SonarpostError, match="--out"):
-        run("codebook", "nominal", "--humminbird", tmp_path, "--out", tmp_path / "file" / "folder")
 
 
 def test_the_codecs_are_listed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import subprocess
 import sys
 
 import pytest
 
-from sonarpost.cli.main import COMMANDS, main, parser
+from sonarpost.cli.main import COMMANDS, RENAMED_COMMANDS, main, parser
 
 
 def commands_of(whole: argparse.ArgumentParser) -> set[str]:
@@ -47,3 +48,20 @@ def test_a_command_does_not_load_the_others() -> None:
         "assert not {'scipy', 'numba', 'sonarpost.cli.demo'} & sys.modules.keys(), 'loaded what pki does not need'"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("command", RENAMED_COMMANDS)
+def test_a_renamed_command_names_its_new_name(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*command.split(), "--json"]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    [line] = printed.err.splitlines()
+    assert line.endswith(RENAMED_COMMANDS[command])
+
+
+@pytest.mark.parametrize(
+    "command",
+    [new.split()[2] for new in RENAMED_COMMANDS.values() if new.startswith("python -m ")],
+)
+def test_the_new_name_of_a_renamed_command_exists(command: str) -> None:
+    assert importlib.util.find_spec(command) is not None

@@ -13,8 +13,8 @@ import pytest
 from builders.common import REPOSITORY
 from builders.console import picture_record
 
+from research.user_study.intervals import clopper_pearson, wilson
 from sonarpost.messages import AcousticFrame, LinkQuality, QueuedImage, QueueState
-from sonarpost.review.choice import clopper_pearson, wilson
 from sonarpost.review.local import LocalFrame, distance_m, moved, vehicle_position
 from sonarpost.services.console.events import Hub, Pace
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from builders.two_frequencies import read_both, with_second_frequency
 
-from sonarpost.cli.bench.detect_codecs import confidence_with
+from research.detection.codec_effect import confidence_with
 from sonarpost.detection.contacts import detect
 from sonarpost.detection.ground_snippet import cut_ground_snippet, ground_projected_image
 from sonarpost.detection.plot import annotated_waterfall

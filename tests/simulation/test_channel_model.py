@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from research.channel_table import RANGES_M, deliver, table
 from sonarpost.errors import ConfigError
 from sonarpost.simulation.channel.acoustics import LocalPosition, absorption_db_per_km, noise_db_per_hz
 from sonarpost.simulation.channel.channel_config import ChannelParameters
@@ -21,7 +22,6 @@ from sonarpost.simulation.channel.channel_events import (
     PacketOutcome,
 )
 from sonarpost.simulation.channel.channel_presets import build_parameters, read_parameters
-from sonarpost.simulation.channel.delivery_table import RANGES_M, deliver, table
 from sonarpost.simulation.channel.fading import Fading
 from sonarpost.simulation.channel.propagation import ChannelModel
 from sonarpost.simulation.channel.random_draws import TailDamage

@@ -6,7 +6,7 @@ import argparse
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from sonarpost import __version__
 from sonarpost.errors import SonarpostError
@@ -19,7 +19,6 @@ COMMANDS = {
     "status": "status",
     "c2": "c2",
     "console": "console",
-    "survey-panel": "survey_panel",
     "metrics": "metrics",
     "simulate": "simulate",
     "survey": "survey",
@@ -27,9 +26,23 @@ COMMANDS = {
     "encode": "encode",
     "decode": "encode",
     "codebook": "codebook",
-    "bench": "bench",
     "pki": "pki",
     "modem-emulator": "modem_emulator",
+}
+# Commands of version 0.1 that have another name now.
+RENAMED_COMMANDS = {
+    "catalogue": "sonarpost codebook",
+    "survey-panel": "python -m research.user_study",
+    "codebook nominal": "python -m research.default_codebooks",
+    "bench": "python -m research.codecs (research/README.md lists the others)",
+    "bench codecs": "python -m research.codecs",
+    "bench link": "python -m research.link",
+    "bench detect": "python -m research.detection",
+    "bench recognition": "python -m research.recognition",
+    "bench paper": "python -m research.paper",
+    "bench sea-trial": "python -m research.sea_trial",
+    "bench mission": "python -m research.mission",
+    "bench busy": "python -m research.utilisation",
 }
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
@@ -51,27 +64,38 @@ def parser(command: str = "") -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the exit status (2: wrong input, with one line that says what)."""
-    given = sys.argv[1:] if arguments is None else arguments
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    new_name = RENAMED_COMMANDS.get(" ".join(given[:2])) or RENAMED_COMMANDS.get(" ".join(given[:1]))
+    if new_name is not None:
+        print(f"sonarpost: {' '.join(given[:2])}: this command is now: {new_name}", file=sys.stderr)
+        return EXIT_ERROR
     whole = parser(given[0] if given else "")
     parsed = whole.parse_args(given)
     if not hasattr(parsed, "run"):
         whole.print_help()
         return 0
+    return exit_status(lambda: parsed.run(parsed))
+
+
+def exit_status(run: Callable[[], int], prog: str = "sonarpost") -> int:
+    """Run a command; return its exit status.
+
+    A SonarpostError or OSError is printed as one line and gives status 2, an interrupt gives status 130.
+    """
     try:
-        status: int = parsed.run(parsed)
+        return run()
     except SonarpostError as error:
-        print(f"sonarpost: {error}", file=sys.stderr)
+        print(f"{prog}: {error}", file=sys.stderr)
         return EXIT_ERROR
     except OSError as error:
         if isinstance(error, BrokenPipeError):
             # The reader of our output has left (`| head`): not an error, and nothing more can be said to it.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
-        print(f"sonarpost: {error}", file=sys.stderr)
+        print(f"{prog}: {error}", file=sys.stderr)
         return EXIT_ERROR
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    return status
 
 
 if __name__ == "__main__":

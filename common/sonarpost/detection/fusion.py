@@ -8,9 +8,9 @@ sure as it can be, so that one filter cannot outvote the rest. A logistic model 
 
 where `clutter` is the evidence that places around reach by chance (module `clutter`). No weight is below 0,
 so the confidence never falls when a score rises. The weights, in `fusion.json` beside this module, are fitted to
-simulated surveys only (`training/detect/train.py`), so that `share` is about the share of contacts of that confidence
-that truly are objects on the bottom: half of those at 1.0. The paper's confidence has the same range (0.0 to 2.0, a
-fusion of several filters); its mapping is not published, so this one is ours.
+simulated surveys only (`research/training/detection.py`), so that `share` is about the share of contacts of that
+confidence that truly are objects on the bottom: half of those at 1.0. The paper's confidence has the same range
+(0.0 to 2.0, a fusion of several filters); its mapping is not published, so this one is ours.
 """
 
 from __future__ import annotations

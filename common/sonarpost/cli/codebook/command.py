@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from sonarpost.cli.codebook import adapt, build, diff, info, nominal
+from sonarpost.cli.codebook import adapt, build, diff, info
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -17,5 +17,5 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
     parser.set_defaults(run=show_help)
     actions = parser.add_subparsers(metavar="ACTION")
-    for module in (build, info, diff, adapt, nominal):
+    for module in (build, info, diff, adapt):
         module.add_action(actions)

@@ -1,1 +1,0 @@
-"""Simulated missions of several vehicles on simulated time."""

@@ -1,0 +1,75 @@
+"""Delivery by range and rate as a table: `python -m research.channel_table --preset sea-trial`.
+
+Every figure is a count over packets sent through the water one after the other, nothing is computed beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from sonarpost.modem.micromodem import RATES
+from sonarpost.simulation.channel.acoustics import LocalPosition
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, FrameOutcome, PacketKind
+from sonarpost.simulation.channel.channel_presets import PRESETS, build_parameters, read_parameters
+from sonarpost.simulation.channel.propagation import ChannelModel
+
+RANGES_M = (2, 30, 60, 90, 110, 120, 130, 140, 160, 200, 250, 300)
+GAP_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """What arrived of the packets sent over one range: whole packets and frames, as fractions."""
+
+    range_m: float
+    snr_db: float
+    packets: float
+    frames: float
+
+
+def deliver(config: ChannelParameters, rate: int, range_m: float, packets: int) -> Delivery:
+    """Send full packets of a rate over a range, a few seconds apart, and count what arrives."""
+    water = ChannelModel(config, {1: LocalPosition(), 2: LocalPosition(east_m=range_m)})
+    shape = RATES[rate]
+    frames = tuple(bytes([number]) * shape.frame_bytes for number in range(1, shape.frames + 1))
+    whole = good = 0
+    for number in range(packets):
+        water.transmit(1, AcousticPacket(PacketKind.DATA, 1, 2, rate, shape.airtime_s, frames), number * GAP_S)
+        for event in water.poll((number + 1) * GAP_S):
+            if isinstance(event, ArrivalEnded):
+                arrived = sum(frame.fate in {FrameOutcome.DELIVERED, FrameOutcome.DAMAGED} for frame in event.frames)
+                good += arrived
+                whole += arrived == shape.frames
+    return Delivery(range_m, water.snr_db(range_m), whole / packets, good / packets / shape.frames)
+
+
+def table(config: ChannelParameters, packets: int) -> str:
+    """Return the table: whole packets and frames that arrive, in percent, for each range and rate."""
+    lines = [
+        "| range m | SNR dB | " + " | ".join(f"rate {rate}" for rate in RATES) + " |",
+        "|" + "---|" * (len(RATES) + 2),
+    ]
+    for range_m in RANGES_M:
+        cells: Mapping[int, Delivery] = {rate: deliver(config, rate, range_m, packets) for rate in RATES}
+        shown = [f"{100 * cell.packets:.0f} / {100 * cell.frames:.0f}" for cell in cells.values()]
+        lines.append(f"| {range_m} | {cells[0].snr_db:.1f} | " + " | ".join(shown) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description="Whole packets / frames that arrive, in percent.")
+    parser.add_argument("--preset", choices=list(PRESETS), default="still")
+    parser.add_argument("--water", type=Path, metavar="FILE", help="TOML file of parameters, over the preset")
+    parser.add_argument("--packets", type=int, default=500, help="packets for each cell (500)")
+    parsed = parser.parse_args()
+    values = {"preset": parsed.preset} | (read_parameters(parsed.water) if parsed.water else {})
+    print(table(build_parameters(values, str(parsed.water or "command line")), parsed.packets))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""What adapting the shipped codebooks to real seabeds gains on pieces of them that nothing was learned from.
+
+    python -m research.codebook_adapt [--data ../shared/data]
+
+Three sets of real images are cut into pieces of 140 x 80 px that do not overlap: a Marine Sonic survey line of 2013,
+a survey line of a river bed of 2009, and synthetic-aperture tiles. Both sides of a line are cut at the same pings and
+in their order, so what is held out, the last quarter, is the end of the line on either side. Each is adapted to from
+both codebooks; a row of the table in `docs/codebook.md` is printed for each. Times are processor time, which other
+users of the machine do not lengthen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split
+from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, load_default
+from sonarpost.codec.vq.patches import stretch
+from sonarpost.codec.vq.training_config import TrainingImage
+from sonarpost.sonar.image_files import read_image
+
+HEIGHT_PX, WIDTH_PX = 140, 80
+SETS = {
+    "Marine Sonic 600 kHz, sand and a wreck": "surveys/derived/scotsman-iver2.xtf.*.png",
+    "river bed, 2009": "surveys/derived/000_1236.xtf.*.png",
+    "synthetic aperture, ripples and rock": "texture/sassed/*.png",
+}
+
+
+def main() -> int:
+    """Run; return 1 if an adapted codebook is no better than its base on what was held out."""
+    parser = argparse.ArgumentParser(description="gain of adapted codebooks on real images")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR", help="default: %(default)s")
+    args = parser.parse_args()
+    if os.environ.get("OMP_NUM_THREADS") != "1":
+        # Libraries read this when they are loaded, so the program starts itself anew, on one core.
+        os.environ.update({f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")})
+        os.execv(sys.executable, [sys.executable, "-m", "research.codebook_adapt", *sys.argv[1:]])
+    print("| images | base | PSNR before / after | FOM before / after | better in | time, one core |")
+    print("|---|---|---|---|---|---|")
+    good = True
+    for title, pattern in SETS.items():
+        images = list(_pieces(sorted(args.data.glob(pattern))))
+        if not images:
+            print(f"codebook_adapt: no {pattern} in {args.data}", file=sys.stderr)
+            return 2
+        for tile_px in DEFAULT_TILE_PX:
+            good &= _row(title, images, tile_px)
+    return 0 if good else 1
+
+
+def _pieces(paths: list[Path]) -> Iterator[TrainingImage]:
+    """Cut files from the top down, both sides of a line in step, other images one after the other."""
+    views = [(path.name, read_image(path).astype(np.float64)) for path in paths]
+    is_line = any("xtf" in path.name for path in paths)
+    for group in [views] if is_line else [[view] for view in views]:
+        for top in range(0, max(view.shape[0] for _, view in group) - HEIGHT_PX + 1, HEIGHT_PX):
+            for name, view in group:
+                for left in range(0, view.shape[1] - WIDTH_PX + 1, WIDTH_PX):
+                    piece = view[top : top + HEIGHT_PX, left : left + WIDTH_PX]
+                    if piece.shape[0] == HEIGHT_PX and piece.min() < piece.max():
+                        yield _image(f"{name} {top} {left}", stretch(piece))
+
+
+def _image(name: str, pixels: npt.NDArray[np.uint8]) -> TrainingImage:
+    return TrainingImage(name, lambda: pixels)
+
+
+def _row(title: str, images: list[TrainingImage], tile_px: int) -> bool:
+    base = load_default(tile_px).tiles
+    training, held_out = split(images)
+    start_s = time.process_time()
+    adapted = adapt(base, training)
+    took_s = time.process_time() - start_s
+    before, after = measure(base, held_out), measure(adapted.tiles, held_out)
+    (psnr, fom), (new_psnr, new_fom) = _means(before), _means(after)
+    better = sum(new.psnr_db > old.psnr_db for old, new in zip(before, after, strict=True))
+    print(
+        f"| {title}: {len(training)} + {len(held_out)} | nominal-{tile_px} | {psnr:.2f} / {new_psnr:.2f} dB "
+        f"| {fom:.1f} / {new_fom:.1f} | {better} of {len(held_out)} | {took_s:.0f} s |",
+        flush=True,
+    )
+    return new_psnr > psnr
+
+
+def _means(measured: list[CodebookQuality]) -> tuple[float, float]:
+    return float(np.mean([q.psnr_db for q in measured])), float(np.mean([q.fom for q in measured]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

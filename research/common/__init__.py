@@ -1,0 +1,1 @@
+"""What several research commands use: images, measurement, statistics, plots."""

@@ -1,0 +1,151 @@
+"""The console with thousands of contacts: how fast lists are, how long from a frame to a page, how much memory.
+
+    python -m research.console_scale --contacts 5000
+
+Runs the real service on an in-process Zenoh router, fills it with simulated contacts, and plays a browser: asks for
+lists by HTTP, and follows the stream of events while new versions of pictures are published as the decompressor does.
+The time on the screen itself is not in it: that is measured by research/console_screen.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import tempfile
+import threading
+import time
+import urllib.request
+from functools import partial
+from http.client import HTTPResponse
+from pathlib import Path
+
+import zenoh
+
+from sonarpost import keys, wire
+from sonarpost.bus.session import client_config, router_config
+from sonarpost.cli.demo.settings import free_ports
+from sonarpost.config import PlatformConfig
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.service import ConsoleService
+from sonarpost.services.console.training.contacts import simulated_contacts
+from sonarpost.services.console.training.simulator import VESSEL, Training
+
+PASSWORD = "a password for the bench"
+LISTS = (
+    "limit=100",
+    "limit=500",
+    "sort=confidence&limit=100&offset=2500",
+    "review=unreviewed&sort=arrived&order=asc&limit=100",
+    "q=00A&limit=100",
+    "min_confidence=1.2&sort=confidence&limit=100",
+)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--contacts", type=int, default=5000)
+    parser.add_argument("--versions", type=int, default=200, help="new versions that are published, one after another")
+    parsed = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="sonarpost-bench-") as folder:
+        endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+        with zenoh.open(router_config([endpoint])):
+            measure(endpoint, Path(folder), parsed.contacts, parsed.versions)
+
+
+def measure(endpoint: str, folder: Path, contacts: int, versions: int) -> None:
+    """Run the service and play a browser."""
+    service = ConsoleService(PlatformConfig(id=VESSEL, router=(endpoint,), state_dir=folder), ConsoleConfig(port=0))
+    assert service.start()
+    try:
+        service._users.add("bench", "operator", PASSWORD)  # noqa: SLF001
+        empty_mb = resident_mb()
+        begun = time.perf_counter()
+        Training(service.board, contacts).backlog(contacts)
+        print(f"{contacts} contacts in {time.perf_counter() - begun:.0f} s")
+        print(f"memory: {empty_mb:.0f} MB empty, {resident_mb():.0f} MB filled (codecs and simulation included)")
+        browser = Browser(service.address)
+        for query in LISTS:
+            show(f"list {query}", [browser.timed(f"api/contacts?{query}") for _ in range(50)])
+        show("map", [browser.timed("api/map") for _ in range(20)])
+        before_mb = resident_mb()
+        show("published to event", latencies(endpoint, browser, versions))
+        print(f"memory: {before_mb:.0f} MB before, {resident_mb():.0f} MB after {versions} versions and the lists")
+    finally:
+        service.stop()
+
+
+class Browser:
+    """Somebody who is logged in."""
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        body = json.dumps({"user": "bench", "password": PASSWORD}).encode()
+        with urllib.request.urlopen(address + "api/login", body, timeout=10) as answer:
+            self._headers = {"Cookie": answer.headers["set-cookie"].partition(";")[0]}
+
+    def open(self, path: str) -> HTTPResponse:
+        """Ask for something."""
+        request = urllib.request.Request(self._address + path, None, self._headers)
+        found: HTTPResponse = urllib.request.urlopen(request, timeout=60)
+        return found
+
+    def timed(self, path: str) -> float:
+        """Return how long an answer takes, read to its end, in seconds."""
+        begun = time.perf_counter()
+        with self.open(path) as answer:
+            answer.read()
+        return time.perf_counter() - begun
+
+
+def latencies(endpoint: str, browser: Browser, versions: int) -> list[float]:
+    """Return the times from the publication of a picture to the line of its event in the stream, in seconds."""
+    arrived: dict[str, float] = {}
+    changed = threading.Condition()
+    stream = browser.open("events")
+
+    def follow() -> None:
+        try:
+            for line in stream:
+                if line.startswith(b'data: {"contact":'):
+                    now = time.perf_counter()
+                    contact = json.loads(line[6:])["contact"]
+                    with changed:
+                        arrived[contact["image_id"]] = now
+                        changed.notify()
+        except (OSError, ValueError, AttributeError):
+            return  # closed
+
+    threading.Thread(target=follow, daemon=True).start()
+    simulated = next(simulated_contacts(7, time.time()))
+    found = []
+    with zenoh.open(client_config([endpoint])) as session:
+        for number in range(versions):
+            record = simulated.record(VESSEL, 0, time.time(), time.time())
+            image_id = f"Z{number:03d}"
+            payload = wire.encode(record.model_copy(update={"image_id": image_id}))
+            begun = time.perf_counter()
+            session.put(keys.image_reconstructed(VESSEL), payload, encoding=wire.encoding_of(type(record)))
+            with changed:
+                assert changed.wait_for(partial(arrived.__contains__, image_id), timeout=30), image_id
+            found.append(arrived[image_id] - begun)
+    stream.close()
+    return found
+
+
+def resident_mb() -> float:
+    """Return the memory of this process."""
+    [line] = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmRSS:")]
+    return int(line.split()[1]) / 1024
+
+
+def show(name: str, times_s: list[float]) -> None:
+    """Print median and the slow end."""
+    ordered = sorted(1e3 * at for at in times_s)
+    slow_ms = ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))]
+    print(f"{name}: p50 {statistics.median(ordered):.1f} ms, p95 {slow_ms:.1f} ms, most {ordered[-1]:.1f} ms")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,150 @@
+"""The console's page with thousands of contacts: until the list can be used, and from a frame's picture to the screen.
+
+    python -m research.console_screen --contacts 5000
+
+Runs the real service on an in-process Zenoh router, fills it with simulated contacts, opens the page in Debian's
+Chromium and measures there. Pictures are published as the decompressor does; what is counted ends with the animation
+frame after the change was drawn. Both clocks are this host's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import zenoh
+from playwright.sync_api import Page, sync_playwright
+
+from sonarpost import keys, wire
+from sonarpost.bus.session import client_config, router_config
+from sonarpost.cli.demo.settings import free_ports
+from sonarpost.config import PlatformConfig
+from sonarpost.messages import ReconstructedImage
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.service import ConsoleService
+from sonarpost.services.console.store.users import FILE_NAME, Users
+from sonarpost.services.console.training.contacts import simulated_contacts
+from sonarpost.services.console.training.simulator import VESSEL, Training
+
+# When the first row was drawn, in ms since the navigation began; and when a wanted change was, in ms since 1970.
+WATCH = """() => {
+  window.firstRow_ms = null;
+  const drawn = () => performance.timeOrigin + performance.now();
+  new MutationObserver((_, observer) => {
+    if (!document.querySelector('.row')) return;
+    observer.disconnect();
+    requestAnimationFrame(() => setTimeout(() => { window.firstRow_ms = performance.now(); }));
+  }).observe(document, {childList: true, subtree: true});
+  window.whenDrawn = (test, argument) => new Promise(resolve => {
+    const is = new Function('argument', `return ${test}`);
+    const done = () => requestAnimationFrame(() => setTimeout(() => resolve(drawn())));
+    if (is(argument)) return done();
+    new MutationObserver((_, observer) => {
+      if (!is(argument)) return;
+      observer.disconnect();
+      done();
+    }).observe(document.body, {childList: true, subtree: true, attributes: true});
+  });
+}"""
+ROW = "document.querySelector('.row[data-id*=\".' + argument + '\"]')"
+PICTURE = "document.querySelector('canvas').dataset.shows?.includes(argument)"
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--contacts", type=int, default=5000)
+    parser.add_argument("--changes", type=int, default=50, help="new contacts, and new versions, one after another")
+    parsed = parser.parse_args()
+    chromium = os.environ.get("SONARPOST_CHROMIUM") or shutil.which("chromium")
+    if chromium is None:
+        raise SystemExit("no Chromium: apt-get install chromium, or set SONARPOST_CHROMIUM")
+    with tempfile.TemporaryDirectory(prefix="sonarpost-bench-") as folder, sync_playwright() as playwright:
+        endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+        router = zenoh.open(router_config([endpoint]))
+        platform = PlatformConfig(id=VESSEL, router=(endpoint,), state_dir=Path(folder))
+        service = ConsoleService(platform, ConsoleConfig(port=0))
+        if not service.start():
+            raise SystemExit("the service did not start")
+        users = Users(Path(folder) / FILE_NAME)
+        users.add("bench", "operator", "a password for the bench")
+        Training(service.board, parsed.contacts).backlog(parsed.contacts)
+        arguments = ["--enable-precise-memory-info", *(["--no-sandbox"] if os.geteuid() == 0 else [])]
+        browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
+        context = browser.new_context(viewport={"width": 1366, "height": 768})
+        token = users.begin("bench").token
+        context.add_cookies([{"name": "sonarpost_session", "value": token, "url": service.address}])
+        page = context.new_page()
+        page.add_init_script(f"({WATCH})()")
+        try:
+            with zenoh.open(client_config([endpoint])) as session:
+                measure(page, service.address, session, parsed.changes)
+        finally:
+            browser.close()
+            users.close()
+            service.stop()
+            router.close()
+
+
+def measure(page: Page, address: str, session: zenoh.Session, changes: int) -> None:
+    """Open the page ten times, then let contacts come and refine."""
+    opened = []
+    for _ in range(10):
+        page.goto(address)
+        page.wait_for_function("() => window.firstRow_ms !== null")
+        opened.append(float(page.evaluate("window.firstRow_ms")))
+    show("page opened to list drawn", opened)
+    page.wait_for_function("() => document.getElementById('live')?.textContent === 'live'")
+    simulated = next(simulated_contacts(7, time.time()))
+    first = simulated.record(VESSEL, 0, time.time(), time.time())
+    rows, pictures = [], []
+    for number in range(changes):
+        image_id = f"Z{number:03d}"
+        record = first.model_copy(update={"image_id": image_id, "first_frame_utc_s": time.time()})
+        rows.append(published_to(page, session, record, ROW, image_id))
+    page.evaluate("document.getElementById('queue').scrollTop = 0")
+    page.click(f".row[data-id*='.{image_id}']")
+    page.wait_for_function("id => document.querySelector('canvas').dataset.shows?.includes(id)", arg=image_id)
+    for version in range(2, changes + 2):
+        newer = record.model_copy(update={"version": version, "last_frame_utc_s": time.time()})
+        pictures.append(published_to(page, session, newer, PICTURE, f" {version} raw"))
+    show("picture of a new contact published to its row drawn", rows)
+    show("newer picture of the shown contact published to it drawn", pictures)
+    page.evaluate("""async () => {
+      const list = document.getElementById('queue');
+      for (let at = 0; at < list.scrollHeight; at += 20000) {
+        list.scrollTop = at;
+        await new Promise(resolve => setTimeout(resolve, 30));
+      }
+    }""")
+    page.wait_for_selector(".row")
+    heap_mb = page.evaluate("performance.memory.usedJSHeapSize") / 2**20
+    total = page.evaluate("Number(document.querySelector('.row')?.ariaSetSize)")
+    print(
+        f"after scrolling through {total} rows: {page.locator('.row').count()} row elements, {heap_mb:.1f} MB of heap"
+    )
+
+
+def published_to(page: Page, session: zenoh.Session, record: ReconstructedImage, test: str, argument: str) -> float:
+    """Publish a picture; return after how many ms its change was on the screen."""
+    payload = wire.encode(record)
+    handle = page.evaluate_handle("([test, argument]) => ({drawn: window.whenDrawn(test, argument)})", [test, argument])
+    begun = time.time()
+    session.put(keys.image_reconstructed(VESSEL), payload, encoding=wire.encoding_of(ReconstructedImage))
+    return float(handle.evaluate("one => one.drawn")) - 1000 * begun
+
+
+def show(name: str, times_ms: list[float]) -> None:
+    """Print median and the slow end."""
+    ordered = sorted(times_ms)
+    slow_ms = ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))]
+    print(f"{name}: p50 {statistics.median(ordered):.0f} ms, p95 {slow_ms:.0f} ms, most {ordered[-1]:.0f} ms")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Images over a lossy acoustic link, by transmission scheme."""

@@ -1,0 +1,206 @@
+"""`python -m research.link`: what arrives of pictures through lossy water, by scheme, at equal bytes on the air."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from research.codecs.__main__ import say
+from research.common.command import command_parser, run_command
+from research.common.images import PictureSet, read_folder, simulated_pictures
+from research.link.images import Codecs, LinkPicture
+from research.link.schemes import (
+    Outcome,
+    Setting,
+    bound_rates,
+    feedback_stream_bytes,
+    pooled_bound_db,
+    run_bound,
+    run_paper,
+    run_sequential,
+    run_v1,
+)
+from sonarpost.errors import ConfigError
+from sonarpost.link.coding.channel_capacity import LossChannel, erasure_bound_frames
+from sonarpost.link.frames.v1.frame import MAX_FRAME_BYTES, MIN_FRAME_BYTES
+
+_Row = dict[str, object]
+_Scheme = Callable[[Sequence[LinkPicture], Codecs, Setting], Outcome]
+_DEFAULT_PICTURES: Final = 200
+_FRAME_ROOM: Final = 2
+"""Streams are coded this many times longer than a picture's frames: a group's easy pictures give to its hard ones."""
+
+
+def new_parser() -> argparse.ArgumentParser:
+    """Return the parser of this command."""
+    parser = command_parser(
+        "link",
+        description="Send pictures through simulated loss with the paper's halves, a plain embedded stream, the wire "
+        "format v1 without and with feedback, at equal bytes on the air, and compare with the erasure bound.",
+    )
+    parser.add_argument(
+        "--loss", default="0.1,0.3,0.5", metavar="P,…", help="shares of frames lost (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--burst",
+        default="1,4",
+        metavar="N,…",
+        help="mean frames lost in a row, 1 = independent (default: %(default)s)",
+    )
+    parser.add_argument("--frames", type=int, default=6, metavar="N", help="frames a picture (default: %(default)s)")
+    parser.add_argument("--frame-bytes", type=int, default=64, metavar="N", help="bytes a frame (default: %(default)s)")
+    parser.add_argument(
+        "--images",
+        default=str(_DEFAULT_PICTURES),
+        metavar="DIR|N",
+        help="pictures, or how many to simulate (%(default)s)",
+    )
+    parser.add_argument(
+        "--groups", metavar="N,…", help="compare v1 broadcast with these numbers of pictures coded jointly too"
+    )
+    parser.add_argument("--depth", type=int, default=2, metavar="N", help="groups interleaved (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of pictures and losses (default: 0)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    return parser
+
+
+def _numbers(option: str, written: str, low: float, high: float) -> list[float]:
+    """Read `0.1,0.3`.
+
+    Raises:
+        ConfigError: Something else than numbers in range.
+    """
+    found = []
+    for part in written.split(","):
+        try:
+            value = float(part)
+        except ValueError:
+            value = float("nan")
+        if not low <= value <= high:
+            raise ConfigError("link", option, part, f"numbers {low}..{high}, separated by commas")
+        found.append(value)
+    return found
+
+
+def _pictures(args: argparse.Namespace) -> PictureSet:
+    written: str = args.images
+    if written.isascii() and written.isdigit():
+        return simulated_pictures(int(written), args.seed)
+    found = read_folder(Path(written))
+    for line in found.refused:
+        say(f"refused: {line}")
+    return found
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure and report; return 0.
+
+    Raises:
+        SonarpostError: Wrong options or folders.
+    """
+    losses = _numbers("--loss", args.loss, 0.0, 0.9)
+    bursts = _numbers("--burst", args.burst, 1.0, 1000.0)
+    groups = [] if args.groups is None else [int(n) for n in _numbers("--groups", args.groups, 1, 120)]
+    for option, value, low, high in (
+        ("--frames", args.frames, 2, 64),
+        ("--frame-bytes", args.frame_bytes, MIN_FRAME_BYTES, MAX_FRAME_BYTES),
+        ("--depth", args.depth, 1, 4),
+        ("--seed", args.seed, 0, 1_000_000),
+    ):
+        if not low <= value <= high:
+            raise ConfigError("link", option, value, f"{low}..{high}")
+    measured = _pictures(args)
+    codecs = Codecs.shipped()
+    say(f"coding {len(measured.pictures)} pictures of {measured.origin}")
+    room = _FRAME_ROOM * args.frames * args.frame_bytes
+    pictures = [codecs.code(p.pixels, n, room) for n, p in enumerate(measured.pictures)]
+    rows: list[_Row] = []
+    for burst in bursts:
+        for loss in losses:
+            say(f"loss {loss}, burst {burst}")
+            setting = Setting(args.frames, args.frame_bytes, LossChannel(loss, burst), 0, args.depth, args.seed)
+            rows += measure_setting(pictures, codecs, setting, groups)
+    if args.json:
+        print(json.dumps({"images": len(pictures), "results": rows}, allow_nan=False))
+    else:
+        print(
+            table(rows, f"{len(pictures)} pictures of {measured.origin}, {args.frames} frames of {args.frame_bytes} B")
+        )
+    return 0
+
+
+def _broadcast(pictures: Sequence[LinkPicture], codecs: Codecs, setting: Setting) -> Outcome:
+    return run_v1(pictures, codecs, setting, feedback=False)
+
+
+def _feedback(pictures: Sequence[LinkPicture], codecs: Codecs, setting: Setting) -> Outcome:
+    return run_v1(pictures, codecs, setting, feedback=True)
+
+
+def measure_setting(
+    pictures: Sequence[LinkPicture], codecs: Codecs, setting: Setting, groups: Sequence[int] = ()
+) -> list[_Row]:
+    """Return a row for each scheme under one condition."""
+    schemes: list[tuple[str, _Scheme, Setting]] = [
+        ("paper", run_paper, setting),
+        ("sequential", run_sequential, setting),
+        ("v1-broadcast", _broadcast, setting),
+        *((f"v1-broadcast, groups of {n}", _broadcast, replace(setting, group=n)) for n in groups),
+        ("v1-feedback", _feedback, setting),
+        ("bound", run_bound, setting),
+    ]
+    rows = [_row(name, scheme(pictures, codecs, its), its) for name, scheme, its in schemes]
+    rows[-1]["preview_rate"], rows[-1]["complete_rate"] = (round(r, 5) for r in bound_rates(setting))
+    rows[-1]["pooled_psnr"] = round(pooled_bound_db(pictures, codecs, setting), 4)
+    rows[-1]["airtime_ratio"] = 1.0
+    return rows
+
+
+def _row(scheme: str, outcome: Outcome, setting: Setting) -> _Row:
+    delivered = outcome.delivered
+    payload = sum(d.payload_bytes for d in delivered)
+    ideal = erasure_bound_frames(payload, setting.frame_bytes, setting.channel.loss)
+    return {
+        "scheme": scheme,
+        "loss": setting.channel.loss,
+        "burst": setting.channel.burst,
+        "bytes": round(outcome.frames * setting.frame_bytes / len(delivered), 2),
+        "psnr": round(float(np.mean([d.quality.psnr for d in delivered])), 4),
+        "ssim": round(float(np.mean([d.quality.ssim for d in delivered])), 5),
+        "preview_rate": round(float(np.mean([d.has_preview for d in delivered])), 5),
+        "complete_rate": round(float(np.mean([d.is_complete for d in delivered])), 5),
+        "airtime_ratio": round(outcome.frames / ideal, 4) if ideal > 0 else None,
+        "frames": outcome.frames,
+        "reports": outcome.reports,
+        **({"stream_bytes": feedback_stream_bytes(setting)} if scheme == "v1-feedback" else {}),
+    }
+
+
+def table(rows: Sequence[_Row], title: str) -> str:
+    """Return the rows for people."""
+    names = ("loss", "burst", "bytes", "PSNR", "SSIM", "preview", "complete", "air")
+    widths = (5, 5, 7, 6, 6, 8, 8, 6)
+    heads = " ".join(f"{name:>{width}}" for name, width in zip(names, widths, strict=True))
+    lines = [title, f"{'scheme':28} {heads}"]
+    for row in rows:
+        values = [row[name] for name in ("bytes", "psnr", "ssim", "preview_rate", "complete_rate", "airtime_ratio")]
+        numbers = [float(v) if isinstance(v, (int, float)) else float("nan") for v in values]
+        cells = "{:7.1f} {:6.2f} {:6.3f} {:8.4f} {:8.4f} {:6.3f}".format(*numbers)
+        lines.append(f"{row['scheme']:28} {row['loss']:5} {row['burst']:5} {cells}")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return the exit status."""
+    return run_command(new_parser(), run, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

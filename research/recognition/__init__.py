@@ -1,0 +1,1 @@
+"""How well a classifier recognises targets in decoded images."""

@@ -1,0 +1,277 @@
+"""Relay throughput, beside bare acknowledged Zenoh queries in the same run, and beside what the disk can do.
+
+    python -m research.relay_throughput [--decisions 20000] [--pictures 2000] [--dir DIR]
+
+Two processes: the far side, with the router, and this one. For records of two sizes (a decision, and a picture of
+100 x 300 px) it measures
+
+- sequential: bare acknowledged queries as a program without further thought makes them: one is asked, its answer is
+  waited for, then the next. The same bytes, through the router, to a queryable that answers at once and stores nothing;
+- pipelined: the same with as many queries in flight as the hand-off has, a record (or a piece of 32 kB) each;
+- relay: a RelayService with the records in its inbox, on the disk: it puts each into its outbox, hands it over to a c2
+  that commits it, and forgets it; until both its tables are empty. It logs to a file as a vessel's does, a line a
+  record; "unlogged" is the same with warnings only. The far side is a durable c2 that does nothing else with a record
+  ("sink"), so that what is measured is the hand-off and not the writing of TIFF files. This process does nothing
+  else meanwhile;
+- disk: how often a second a 4 kB write to the same folder reaches the disk, and how many bytes a second do, 2 MB at a
+  time. From both follows the bound: every record is committed three times (outbox, c2's inbox, forgotten), at most 512
+  with one write, and its bytes are written four times (the log and the table of either side).
+
+One JSON object a line. The exit status is 0 where the relay, logging, reaches half of the pipelined rate or of the
+disk's bound.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr
+from pathlib import Path
+
+import zenoh
+
+from research.common.noise import noise_picture
+from sonarpost import keys, wire
+from sonarpost.bus.session import client_config, router_config
+from sonarpost.cli.demo.settings import free_ports
+from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.delivery.protocol import CHUNK_BYTES
+from sonarpost.delivery.scheduler import WINDOW, WINDOW_BYTES
+from sonarpost.logs import set_up
+from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
+from sonarpost.runtime.service import Service, UnitOfWork
+from sonarpost.services.relay.config import RelayConfig
+from sonarpost.services.relay.service import RelayService
+
+GOAL = 0.5
+COMMITS, WRITES = 3, 4
+SEQUENTIAL = 2000
+BULK_BYTES = 2_000_000
+VESSEL = "vessel-1"
+BARE_KEY = "bench/bare"
+
+
+class Sink(Service[ServiceConfig]):
+    """A c2 that commits records and does nothing else with them."""
+
+    NAME = "c2"
+    BATCH = 512
+
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
+        """What vessels relay."""
+        return {keys.shore_inbox_all(): Relayed}
+
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+        """Nothing: the record is on the disk already."""
+
+
+def far_side(endpoint: str, folder: Path) -> None:
+    """Router, sink and bare queryable, until standard input ends."""
+    router = zenoh.open(router_config([endpoint]))
+    sink = Sink(platform("shore-1", endpoint, folder), ServiceConfig())
+    sink.start()
+    session = zenoh.open(client_config([endpoint]))
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply(query.key_expr, b"stored")
+
+    session.declare_queryable(BARE_KEY, answer)
+    print("ready", flush=True)
+    sys.stdin.read()
+    sink.stop()
+    session.close()
+    router.close()
+
+
+def platform(name: str, endpoint: str, folder: Path) -> PlatformConfig:
+    """Return a platform of this bench."""
+    return PlatformConfig(id=name, router=(endpoint,), state_dir=folder / name, health_interval_s=60.0)
+
+
+def decision(number: int) -> Decision:
+    """Return a decision of about 200 bytes."""
+    return Decision(
+        decision_id=f"d-{number}",
+        vessel_id=VESSEL,
+        vehicle_id="uuv-1",
+        image_id="0001",
+        image_version=1,
+        verdict="unsure",
+        operator="op",
+        decided_utc_s=1.0,
+    )
+
+
+def picture(number: int) -> ReconstructedImage:
+    """Return a picture of 100 x 300 px, 30 kB."""
+    return noise_picture(VESSEL, "uuv-1", f"{number:04d}", number, float(number))
+
+
+@contextmanager
+def bare_session(endpoint: str) -> Iterator[zenoh.Session]:
+    """Return a client's session that reaches the queryable."""
+    session = zenoh.open(client_config([endpoint]))
+    try:
+        while not any(reply.ok is not None for reply in session.get(BARE_KEY, timeout=1.0)):
+            time.sleep(0.01)
+        yield session
+    finally:
+        session.close()
+
+
+def ask(session: zenoh.Session, piece: bytes) -> zenoh.handlers.Handler[zenoh.Reply]:
+    """Send one bare query."""
+    return session.get(BARE_KEY, payload=piece, timeout=5, congestion_control=zenoh.CongestionControl.BLOCK)
+
+
+def measure_bare(endpoint: str, payloads: Sequence[bytes], window: int) -> float:
+    """Return records a second of plain acknowledged queries, in pieces as the relay's are, `window` in flight."""
+    in_flight: deque[zenoh.handlers.Handler[zenoh.Reply]] = deque()
+    with bare_session(endpoint) as session:
+        started = time.perf_counter()
+        for payload in payloads:
+            for offset in range(0, len(payload), CHUNK_BYTES):
+                if len(in_flight) >= window:
+                    in_flight.popleft().recv()
+                in_flight.append(ask(session, payload[offset : offset + CHUNK_BYTES]))
+        while in_flight:
+            in_flight.popleft().recv()
+        return len(payloads) / (time.perf_counter() - started)
+
+
+def measure_relay(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes], level: str) -> tuple[float, float]:
+    """Return records a second from the relay's inbox to c2's store, acknowledged and forgotten, and CPU time of each.
+
+    The CPU time, in microseconds, is this process's: the relay's.
+    """
+    relay = RelayService(platform(VESSEL, endpoint, folder), RelayConfig())
+    with relay.store.transaction() as tx:
+        for payload in payloads:
+            tx.accept(key, payload)
+    with logged_to(folder / "relay.log", level):
+        started, used = time.perf_counter(), time.process_time()
+        relay.start()
+        try:
+            while relay.acknowledged_count("c2") < len(payloads) or relay.store.outbox_depth():
+                time.sleep(0.005)
+            seconds, used_s = time.perf_counter() - started, time.process_time() - used
+        finally:
+            relay.stop()
+    return len(payloads) / seconds, 1e6 * used_s / len(payloads)
+
+
+@contextmanager
+def logged_to(path: Path, level: str) -> Iterator[None]:
+    """Log as the services do, to a file in the place of standard error."""
+    with path.open("w", buffering=1) as file, redirect_stderr(file):
+        set_up("relay", level)
+        try:
+            yield
+        finally:
+            logging.getLogger().handlers.clear()
+
+
+def measure_disk(folder: Path, size: int, seconds: float = 1.0) -> float:
+    """Return how many writes of `size` bytes a second reach the disk one after the other."""
+    path = folder / "fsync"
+    count = 0
+    data = os.urandom(size)
+    with path.open("wb", buffering=0) as file:
+        started = time.perf_counter()
+        while time.perf_counter() - started < seconds:
+            file.seek(0)
+            file.write(data)
+            os.fsync(file.fileno())
+            count += 1
+        took = time.perf_counter() - started
+    path.unlink()
+    return count / took
+
+
+def main() -> int:
+    """Run; return 1 if a rate is below the goal."""
+    parser = argparse.ArgumentParser(description="relay throughput against bare acknowledged queries")
+    parser.add_argument("--decisions", type=int, default=20000, metavar="N", help="default: 20000")
+    parser.add_argument("--pictures", type=int, default=2000, metavar="N", help="default: 2000")
+    parser.add_argument("--dir", type=Path, metavar="DIR", help="where the stores are (default: a temporary folder)")
+    parser.add_argument("--far-side", nargs=2, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.far_side:
+        far_side(args.far_side[0], Path(args.far_side[1]))
+        return 0
+    with tempfile.TemporaryDirectory(dir=args.dir) as name:
+        return compare(Path(name), args.decisions, args.pictures)
+
+
+def measure(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes]) -> dict[str, float]:
+    """Measure one kind of record; the bare rate before and after the relay's, as other work on the host varies."""
+    size = len(payloads[0])
+    window = max(1, min(WINDOW, WINDOW_BYTES // size))
+    sequential = measure_bare(endpoint, payloads[:SEQUENTIAL], 1)
+    before = measure_bare(endpoint, payloads, window)
+    relayed, cpu_us = measure_relay(endpoint, folder, key, payloads, "info")
+    unlogged, unlogged_cpu_us = measure_relay(endpoint, folder, key, payloads, "warning")
+    pipelined = (before + measure_bare(endpoint, payloads, window)) / 2
+    fsyncs, bulk = measure_disk(folder, 4096), measure_disk(folder, BULK_BYTES) * BULK_BYTES
+    bound = 1 / (COMMITS / (RelayService.BATCH * fsyncs) + WRITES * size / bulk)
+    return {
+        "records": len(payloads),
+        "bytes": size,
+        "sequential_per_s": round(sequential),
+        "pipelined_per_s": round(pipelined),
+        "relay_per_s": round(relayed),
+        "unlogged_per_s": round(unlogged),
+        "of_sequential": round(relayed / sequential, 2),
+        "of_pipelined": round(relayed / pipelined, 3),
+        "unlogged_of_pipelined": round(unlogged / pipelined, 3),
+        "relay_cpu_us": round(cpu_us),
+        "unlogged_cpu_us": round(unlogged_cpu_us),
+        "relay_mb_per_s": round(relayed * size / 1e6, 2),
+        "fsync_per_s": round(fsyncs),
+        "disk_mb_per_s": round(bulk / 1e6),
+        "disk_bound_per_s": round(bound),
+        "of_disk_bound": round(relayed / bound, 3),
+        "host_load": round(os.getloadavg()[0], 1),
+    }
+
+
+def compare(folder: Path, decisions: int, pictures: int) -> int:
+    """Measure both kinds of records; return 1 if a rate is below the goal."""
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    child = subprocess.Popen(
+        [sys.executable, "-m", "research.relay_throughput", "--far-side", endpoint, str(folder)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stdout is not None
+    assert child.stdin is not None
+    good = True
+    try:
+        if child.stdout.readline().strip() != "ready":
+            sys.exit("relay_throughput: the far side did not start")
+        kinds: list[tuple[str, str, list[bytes]]] = [
+            ("decision", keys.contact_decision(VESSEL), [wire.encode(decision(n)) for n in range(decisions)]),
+            ("picture", keys.image_reconstructed(VESSEL), [wire.encode(picture(n)) for n in range(pictures)]),
+        ]
+        for name, key, payloads in kinds:
+            result = measure(endpoint, folder, key, payloads)
+            print(json.dumps({"record": name, **result}), flush=True)
+            good = good and result["relay_per_s"] >= GOAL * min(result["pipelined_per_s"], result["disk_bound_per_s"])
+    finally:
+        child.stdin.close()
+        child.wait(timeout=10)
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

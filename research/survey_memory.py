@@ -1,0 +1,96 @@
+"""Memory that reading a survey takes, by the length of the file.
+
+    python -m research.survey_memory [--sizes-mb 100,2048] [--actions read,plot,detect] [--folder DIR]
+
+Writes XTF recordings of the given sizes (the same simulated pings over and over, with numbers and times that go on),
+then walks through each in a process of its own: opened and read ping by ping, drawn as a waterfall, and looked through
+for contacts as the vehicle does (at most 20 contacts a file). Prints the process's peak resident memory and the time.
+The files are removed afterwards; the disk must have room.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from sonarpost.cli.survey.waterfall_picture import draw_waterfall, reduce_survey
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.snippets import from_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.readers.registry import open_survey
+from sonarpost.sonar.xtf_writer import write_xtf
+
+HEADER_BYTES = 1024
+PINGS = 200
+NUMBER_AT, TIME_AT = 28, 14
+START = datetime(2026, 1, 1, tzinfo=UTC)
+
+
+def write_long(path: Path, size_bytes: int) -> int:
+    """Write a recording of about this size; return its pings."""
+    write_xtf(simulate_survey(SurveySpec(seed=3, pings=PINGS, samples=1024)).survey, path)
+    raw = path.read_bytes()
+    ping_bytes = (len(raw) - HEADER_BYTES) // PINGS
+    pings = [bytearray(raw[HEADER_BYTES + row * ping_bytes :][:ping_bytes]) for row in range(PINGS)]
+    count = size_bytes // ping_bytes
+    with path.open("wb") as file:
+        file.write(raw[:HEADER_BYTES])
+        for number in range(count):
+            ping = pings[number % PINGS]
+            when = START + timedelta(milliseconds=100 * number)
+            ping[NUMBER_AT : NUMBER_AT + 4] = number.to_bytes(4, "little")
+            stamp = (when.month, when.day, when.hour, when.minute, when.second, when.microsecond // 10_000)
+            ping[TIME_AT : TIME_AT + 8] = when.year.to_bytes(2, "little") + bytes(stamp)
+            file.write(ping)
+    return count
+
+
+def walk(path: Path, action: str) -> None:
+    """Do one action on a file and print what it took."""
+    began = time.perf_counter()
+    if action == "detect":
+        count = from_survey(path, "0" * 64, "uuv-1", AtdStubConfig(max_contacts=20)).contacts
+    else:
+        with open_survey(path) as source:
+            if action == "read":
+                count = sum(1 for _ in source.pings())
+            else:
+                count = draw_waterfall(reduce_survey(source, over_ground=False), "long", over_ground=False).height
+    taken_s = time.perf_counter() - began
+    peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    size_mb = path.stat().st_size / 1e6
+    what = {"read": "pings", "plot": "rows", "detect": "contacts"}[action]
+    print(f"{size_mb:8.0f} MB  {action:6} {count:8} {what:8} {peak_mib:6.0f} MiB peak {taken_s:7.1f} s", flush=True)
+
+
+def main() -> None:
+    """Measure every size."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--sizes-mb", default="20,100,2048", help="(default: %(default)s)")
+    parser.add_argument("--actions", default="read,plot", help="of read, plot, detect (default: %(default)s)")
+    parser.add_argument(
+        "--folder", type=Path, help="where the files are written (default: the system's temporary folder)"
+    )
+    parser.add_argument("--walk", nargs=2, metavar=("FILE", "ACTION"), help=argparse.SUPPRESS)
+    parsed = parser.parse_args()
+    if parsed.walk:
+        walk(Path(parsed.walk[0]), parsed.walk[1])
+        return
+    with tempfile.TemporaryDirectory(dir=parsed.folder) as folder:
+        for size_mb in map(int, parsed.sizes_mb.split(",")):
+            path = Path(folder) / "long.xtf"
+            write_long(path, size_mb * 1_000_000)
+            for action in parsed.actions.split(","):
+                subprocess.run(
+                    [sys.executable, "-m", "research.survey_memory", "--walk", str(path), action], check=True
+                )
+
+
+if __name__ == "__main__":
+    main()

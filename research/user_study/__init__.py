@@ -1,0 +1,1 @@
+"""User study: how well people recognise decoded images."""

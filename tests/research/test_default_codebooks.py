@@ -1,0 +1,159 @@
+"""The shipped codebooks: the Humminbird recording, the recipes, `python -m research.default_codebooks`."""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders.common import REPOSITORY
+
+from research import default_codebooks
+from research.default_codebooks import RECIPES, Recipe, build_nominal, humminbird_images, humminbird_lines, read_channel
+from sonarpost.codec.vq.codebook import load, to_bytes
+from sonarpost.codec.vq.patches import PatchPlan, cut_line
+from sonarpost.codec.vq.tiles import cut_tiles
+from sonarpost.codec.vq.training_config import Round
+from sonarpost.errors import CodebookError, SonarpostError
+from sonarpost.sonar.image_files import write_png
+
+DATA = Path(os.environ.get("SONARPOST_DATA", REPOSITORY.parent / "shared" / "data"))
+
+
+def run(*arguments: object) -> int:
+    parsed = default_codebooks.new_parser().parse_args([str(argument) for argument in arguments])
+    return default_codebooks.run(parsed)
+
+
+def line(pings: int = 300, samples: int = 260, seed: int = 0) -> np.ndarray:
+    values = 50 * np.random.default_rng(seed).rayleigh(1.0, (pings, samples))
+    return np.clip(values, 1, 255).astype(np.uint8).astype(np.float32)
+
+
+def recording(folder: Path, channel: str, pings: list[np.ndarray]) -> None:
+    data, index = b"", b""
+    for number, ping in enumerate(pings):
+        index += struct.pack(">II", number * 40, len(data))
+        data += b"\xc0\xde\xab\x21" + bytes(57) + b"\xa0" + struct.pack(">I", ping.size) + b"\x21" + ping.tobytes()
+    (folder / f"{channel}.SON").write_bytes(data)
+    (folder / f"{channel}.IDX").write_bytes(index)
+
+
+def test_a_nominal_codebook_can_be_left_unrefined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    speckle = 60 * np.random.default_rng(4).rayleigh(1.0, (200, 200))
+    images = list(cut_line("x", speckle.astype(np.float32), PatchPlan(copies=2)))
+    monkeypatch.setattr(default_codebooks, "humminbird_images", lambda _: images)
+    monkeypatch.setattr(default_codebooks, "simulated_images", lambda _: iter(()))
+    monkeypatch.setattr(default_codebooks, "RECIPES", (Recipe(10, 80, (Round(100.0, 60.0),), 2),))
+    made = []
+    for options in (("--refine", 0), ("--refine", 2), ()):
+        assert run("--humminbird", tmp_path, "--out", tmp_path / "new" / "folder", *options) == 0
+        made.append(load(tmp_path / "new" / "folder" / "nominal-10.tiles"))
+    alone, twice, usual = made
+    assert twice.tiles.identity == usual.tiles.identity != alone.tiles.identity
+    assert [one.notes["refine passes"] for one in made] == ["0", "2", "2"]
+    pieces = {tile.tobytes() for image in images for tile in cut_tiles(image.load(), 10)}
+    assert all(tile.tobytes() in pieces for tile in alone.tiles.tiles)  # Table IV keeps tiles as they are
+    (tmp_path / "file").touch()
+    with pytest.raises(SonarpostError, match="--out"):
+        run("--humminbird", tmp_path, "--out", tmp_path / "file" / "folder")
+
+
+def test_a_recording_and_an_image_of_it_give_the_same_lines(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    folders = [tmp_path / "son" / "deeper", tmp_path / "png"]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    for channel in ("B002", "B003"):
+        pings = [rng.integers(1, 256, rng.integers(20, 40), dtype=np.uint8) for _ in range(9)]
+        recording(folders[0], channel, pings)
+        image = read_channel(folders[0] / f"{channel}.SON")
+        assert [row[row > 0].tolist() for row in image] == [ping.tolist() for ping in pings]
+        write_png(folders[1] / f"some_{channel}_side.png", image)
+    from_recording, from_images = humminbird_lines(tmp_path / "son"), humminbird_lines(folders[1])
+    assert list(from_recording) == list(from_images) == ["humminbird B002", "humminbird B003"]
+    for name, values in from_recording.items():
+        assert np.array_equal(values, from_images[name], equal_nan=True)
+        assert np.isnan(values).any()
+
+
+def test_damaged_recordings_are_codebook_errors(tmp_path: Path) -> None:
+    ping = np.arange(1, 30, dtype=np.uint8)
+    recording(tmp_path, "B002", [ping] * 3)
+    son, idx = tmp_path / "B002.SON", tmp_path / "B002.IDX"
+    data, index = son.read_bytes(), idx.read_bytes()
+    for position in (0, 61, 62, 66):
+        son.write_bytes(data[:96] + data[96 : 96 + position] + b"\x77" + data[97 + position :])
+        with pytest.raises(CodebookError, match="ping 1"):
+            read_channel(son)
+    for length in range(len(data)):
+        son.write_bytes(data[:length])
+        with pytest.raises(CodebookError):
+            read_channel(son)
+    son.write_bytes(data)
+    for bad in (b"", index[:-1], struct.pack(">II", 0, 0xFFFFFFFF)):
+        idx.write_bytes(bad)
+        with pytest.raises(CodebookError):
+            read_channel(son)
+    idx.unlink()
+    with pytest.raises(CodebookError, match="IDX"):
+        read_channel(son)
+
+
+def test_a_missing_or_ambiguous_channel_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CodebookError, match="B002"):
+        humminbird_lines(tmp_path)
+    for name in ("a_B002.png", "b_B002.png"):
+        write_png(tmp_path / name, np.ones((4, 4), np.uint8))
+    with pytest.raises(CodebookError, match="b_B002"):
+        humminbird_lines(tmp_path)
+    (tmp_path / "a_B002.png").write_bytes(b"no image")
+    (tmp_path / "b_B002.png").unlink()
+    with pytest.raises(SonarpostError, match="a_B002"):
+        humminbird_lines(tmp_path)
+
+
+def test_a_nominal_codebook_is_the_same_bytes_in_any_order_of_its_images() -> None:
+    images = list(cut_line("x", line(), PatchPlan(copies=2)))
+    recipe = Recipe(10, 200, (Round(39.0, 400.0, 10), Round(100.0, 60.0)), 2)
+    one, other = build_nominal(recipe, images), build_nominal(recipe, images[::-1])
+    assert to_bytes(one) == to_bytes(other)
+    assert 100 < len(one.tiles) <= 200
+    assert one.notes["refine passes"] == "2"
+
+
+def test_the_recipes_fill_14_bit_codebooks_of_both_sizes() -> None:
+    assert [recipe.tile_px for recipe in RECIPES] == [10, 20]
+    assert all(recipe.max_tiles < 1 << 14 for recipe in RECIPES)
+    assert sum(recipe.max_tiles * recipe.tile_px**2 for recipe in RECIPES) <= 8_000_000
+
+
+@pytest.mark.realdata
+def test_the_real_recording_is_read_as_its_images_are() -> None:
+    if not (DATA / "surveys" / "humminbird").is_dir():
+        pytest.skip(f"no recording under {DATA} (SONARPOST_DATA names the folder)")
+    from_recording = humminbird_lines(DATA / "surveys" / "humminbird")
+    from_images = humminbird_lines(DATA / "surveys" / "derived")
+    for name, values in from_recording.items():
+        assert values.shape == (3453, 1550)
+        assert np.array_equal(values, from_images[name], equal_nan=True)
+
+
+@pytest.mark.realdata
+def test_the_real_recording_gives_windows_of_many_scales() -> None:
+    if not (DATA / "surveys" / "derived").is_dir():
+        pytest.skip(f"no recording under {DATA} (SONARPOST_DATA names the folder)")
+    images = humminbird_images(DATA / "surveys" / "derived")
+    assert len(images) > 2000
+    assert all(image.load().shape == (80, 80) for image in images[::100])
+
+
+@pytest.mark.parametrize("options", [(), ("--refine", -1)])
+def test_a_folder_without_a_recording_or_a_negative_number_is_refused(
+    tmp_path: Path, options: tuple[object, ...]
+) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SonarpostError):
+        run("--humminbird", tmp_path / "empty", "--out", tmp_path, *options)

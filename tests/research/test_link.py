@@ -1,0 +1,112 @@
+"""`python -m research.link`: the schemes over the same water, and its one JSON line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from research.link.__main__ import main
+from research.link.images import Codecs, LinkPicture
+from research.link.schemes import Setting, Water, run_bound, run_paper, run_sequential, run_v1
+from sonarpost.link.coding.channel_capacity import LossChannel
+
+
+@pytest.fixture(scope="module")
+def codecs() -> Codecs:
+    return Codecs.shipped()
+
+
+@pytest.fixture(scope="module")
+def pictures(codecs: Codecs) -> list[LinkPicture]:
+    rng = np.random.default_rng(0)
+    found = []
+    for number in range(6):
+        slope = np.add.outer(np.arange(32) * (number + 1), np.arange(48) * 2) % 200
+        found.append(codecs.code((slope + rng.integers(0, 40, slope.shape)).astype(np.uint8), number, 600))
+    return found
+
+
+def setting(loss: float, burst: float = 1.0) -> Setting:
+    return Setting(6, 64, LossChannel(loss, burst), group=24, depth=2, seed=3)
+
+
+def test_the_water_loses_what_it_says_in_bursts_as_long_as_it_says() -> None:
+    water = Water(LossChannel(0.3, 5.0), 0)
+    fates = np.array([water.passes() for _ in range(40_000)])
+    assert 1 - fates.mean() == pytest.approx(0.3, abs=0.02)
+    assert (~fates[:-1]).sum() / (~fates[:-1] & fates[1:]).sum() == pytest.approx(5.0, rel=0.1)
+
+
+def test_without_loss_everything_arrives(codecs: Codecs, pictures: list[LinkPicture]) -> None:
+    still = setting(0.0)
+    for outcome in (
+        run_paper(pictures, codecs, still),
+        run_sequential(pictures, codecs, still),
+        run_v1(pictures, codecs, still, feedback=False),
+        run_v1(pictures, codecs, still, feedback=True),
+    ):
+        assert all(d.has_preview and d.is_complete for d in outcome.delivered)
+        assert outcome.frames / len(pictures) == pytest.approx(6, abs=0.8)
+    ideal, plain = run_bound(pictures, codecs, still), run_sequential(pictures, codecs, still)
+    for best, found in zip(ideal.delivered, plain.delivered, strict=True):
+        assert best.quality.psnr >= found.quality.psnr - 0.2
+
+
+def test_the_bound_is_the_mean_over_what_may_arrive(codecs: Codecs, pictures: list[LinkPicture]) -> None:
+    two = Setting(2, 64, LossChannel(0.5), group=24, depth=2, seed=0)
+    (best, *_) = run_bound(pictures, codecs, two).delivered
+    qualities = [pictures[0].quality(codecs.emb, n).psnr for n in (0, 39, 103)]
+    assert best.quality.psnr == pytest.approx(0.25 * qualities[0] + 0.5 * qualities[1] + 0.25 * qualities[2])
+    assert best.payload_bytes == 64
+
+
+def test_with_feedback_all_is_complete_at_half_lost(codecs: Codecs, pictures: list[LinkPicture]) -> None:
+    outcome = run_v1(pictures, codecs, setting(0.5, 4.0), feedback=True)
+    assert all(d.is_complete for d in outcome.delivered)
+    assert outcome.reports > 0
+
+
+def test_the_command_prints_one_json_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(5)
+    for number in range(8):
+        pixels = np.add.outer(np.arange(32) * number, np.arange(32) * 3) % 180 + rng.integers(0, 60, (32, 32))
+        Image.fromarray(pixels.astype(np.uint8)).save(tmp_path / f"{number}.png")
+    command = ["--images", str(tmp_path), "--loss", "0.3", "--burst", "1,4", "--frames", "5", "--json"]
+    assert main(command) == 0
+    first = capsys.readouterr().out
+    read = json.loads(first.strip().splitlines()[-1])
+    assert read["images"] == 8
+    assert [(r["scheme"], r["burst"]) for r in read["results"]] == [
+        (scheme, burst)
+        for burst in (1.0, 4.0)
+        for scheme in ("paper", "sequential", "v1-broadcast", "v1-feedback", "bound")
+    ]
+    for row in read["results"]:
+        needed = {"loss", "bytes", "psnr", "ssim", "preview_rate", "complete_rate", "airtime_ratio"}
+        assert needed <= set(row)
+        assert row["airtime_ratio"] is None or row["airtime_ratio"] >= 1.0
+    by_scheme = {r["scheme"]: r for r in read["results"] if r["burst"] == 1.0}
+    assert by_scheme["paper"]["psnr"] < by_scheme["sequential"]["psnr"] < by_scheme["v1-broadcast"]["psnr"]
+    assert {by_scheme[s]["bytes"] for s in ("paper", "sequential", "v1-broadcast", "bound")} == {320}
+    assert main(command) == 0
+    assert capsys.readouterr().out == first
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--loss", "2"],
+        ["--loss", "x"],
+        ["--burst", "0"],
+        ["--frames", "1"],
+        ["--frame-bytes", "20"],
+        ["--images", "/nix"],
+    ],
+)
+def test_wrong_options_are_told(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*options]) == 2
+    assert capsys.readouterr().err.startswith("python -m research.link: ")

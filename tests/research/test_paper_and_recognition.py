@@ -1,0 +1,291 @@
+"""`python -m research.paper` and `python -m research.recognition`, in small."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from research.common.images import BenchPicture
+from research.common.statistics import auc
+from research.paper import __main__ as paper
+from research.paper.dimensions import RotatedTiles, sensitivity
+from research.paper.figures import FIG2, PIXELS, TABLE2, contact_pictures, reproduce
+from research.recognition import __main__ as recognition
+from research.recognition.classifier import FOLDS, Judge, features
+from sonarpost.codec.quality import psnr_db
+from sonarpost.codec.vq.tiles import cut_tiles
+from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.image_files import write_png
+from sonarpost.sonar.survey import Survey
+from sonarpost.sonar.xtf_writer import write_xtf
+
+
+def run(command: ModuleType, *arguments: object) -> int:
+    status: int = command.run(command.new_parser().parse_args([str(argument) for argument in arguments]))
+    return status
+
+
+def scene(seed: int, *, target: bool, side_px: int = 80) -> np.ndarray:
+    """Speckle, with a highlight and a shadow if there is a target."""
+    rng = np.random.default_rng(seed)
+    image = 45 * rng.rayleigh(1.0, (side_px, side_px))
+    if target:
+        row, column = (int(v) for v in rng.integers(side_px // 2 - 10, side_px // 2, 2))
+        image[row : row + 9, column : column + 9] *= 3.5
+        image[row : row + 9, column + 9 : column + 26] *= 0.1
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def labelled(count: int, first_seed: int = 0) -> list[BenchPicture]:
+    return [
+        BenchPicture(
+            str(i),
+            str(i),
+            scene(first_seed + i, target=i % 2 == 0),
+            f"{'t' if i % 2 == 0 else 'c'}{i % 20}",
+            i % 2 == 0,
+        )
+        for i in range(count)
+    ]
+
+
+@pytest.fixture(scope="module")
+def judge() -> Judge:
+    return Judge(labelled(120), [], [])
+
+
+def test_the_judge_tells_targets_from_clutter_and_noise_blinds_it(judge: Judge) -> None:
+    test = labelled(60, first_seed=1000)
+    is_target = np.array([bool(p.is_target) for p in test])
+    groups = [p.group for p in test]
+    areas = []
+    for sigma in (0, 60, 600):
+        rng = np.random.default_rng(sigma)
+        seen = [np.clip(p.pixels + rng.normal(0, sigma, p.pixels.shape), 0, 255).astype(np.uint8) for p in test]
+        areas.append(auc(judge.scores(seen, groups), is_target)[0])
+    assert areas[0] > 0.97
+    assert areas[0] >= areas[1] >= areas[2]
+    assert areas[2] < 0.8
+
+
+def test_the_judge_is_deterministic(judge: Judge) -> None:
+    again = Judge(labelled(120), [], [])
+    pictures = [p.pixels for p in labelled(10, 500)]
+    groups = [p.group for p in labelled(10, 500)]
+    assert np.array_equal(judge.scores(pictures, groups), again.scores(pictures, groups))
+
+
+def test_no_line_is_judged_by_a_judge_that_was_trained_on_it() -> None:
+    # In one line every label is the other way round. A judge that had learnt that line would know; one that had not
+    # gets it all wrong.
+    training = labelled(160)
+    odd = [
+        BenchPicture(f"odd {i}", f"odd {i}", scene(3000 + i, target=i % 2 == 0), "odd", i % 2 == 1) for i in range(40)
+    ]
+    judge = Judge([*training, *odd], [], [])
+    scores = judge.scores([p.pixels for p in odd], ["odd"] * len(odd))
+    assert auc(scores, np.array([bool(p.is_target) for p in odd]))[0] < 0.1
+
+
+def test_a_judge_needs_lines_of_both_kinds() -> None:
+    same_line = [BenchPicture(str(i), str(i), scene(i, target=i % 2 == 0), "one", i % 2 == 0) for i in range(10)]
+    with pytest.raises(ConfigError, match="two survey lines each"):
+        Judge(same_line, [], [])
+
+
+def test_simulated_pictures_change_what_is_learnt(judge: Judge) -> None:
+    simulated = [BenchPicture("s", "s", scene(9000 + i, target=i % 2 == 1), "sim", i % 2 == 0) for i in range(30)]
+    other = Judge(labelled(120), simulated, [])
+    pictures, groups = [p.pixels for p in labelled(10, 500)], [p.group for p in labelled(10, 500)]
+    assert not np.allclose(judge.scores(pictures, groups), other.scores(pictures, groups))
+
+
+def test_features_do_not_depend_on_brightness_and_need_room() -> None:
+    image = (scene(1, target=True) // 2).astype(np.uint8)
+    brighter = image + np.uint8(60)
+    assert np.allclose(features([image]), features([brighter]), atol=1e-9)
+    assert features([image, scene(2, target=False, side_px=50)]).shape[0] == 2
+    with pytest.raises(ConfigError, match="at least"):
+        features([np.zeros((35, 80), np.uint8)])
+
+
+@pytest.fixture
+def data_set(tmp_path: Path) -> Path:
+    """A data set of the SDVD's form: dated targets as PNG, numbered clutter as JPEG."""
+    rows = []
+    for split, count in (("train", 2 * FOLDS), ("test", 6)):
+        images = tmp_path / split / "images"
+        images.mkdir(parents=True)
+        for i in range(count):
+            tile = np.clip(45 * np.random.default_rng(i).rayleigh(1.0, (256, 256)), 0, 255)
+            if i % 2 == 0:
+                tile[110:132, 100:122] = 250
+                tile[110:132, 122:170] = 5
+                name, box = f"left_2024043005{i:02d}00L_tile_{i}.png", [100, 110, 170, 132]
+                write_png(images / name, tile.astype(np.uint8))
+            else:
+                name, box = f"{i}_{i}.jpg", ["", "", "", ""]
+                Image.fromarray(tile.astype(np.uint8)).save(images / name, quality=95)
+            rows.append([split, name, 256, 256, 9 if i % 2 == 0 else 0, *box])
+    with (tmp_path / "index.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["split", "image", "w", "h", "target_px", "x0", "y0", "x1", "y1"])
+        writer.writerows(rows)
+    return tmp_path
+
+
+def test_recognition_of_decoded_pictures(data_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--sdvd", data_set, "--codecs", "spiht,jpeg2000", "--budgets", "12,128", "--simulated", "0"]
+    assert run(recognition, *options, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert set(found) == {"images", "judge", "results"}
+    assert found["images"] == 12
+    assert found["judge"]["auc"] >= 0.93
+    rows = {(r["codec"], r["budget"]): r for r in found["results"]}
+    assert set(rows) == {("spiht", 12), ("spiht", 128), ("jpeg2000", 12), ("jpeg2000", 128)}
+    assert rows["jpeg2000", 12]["misses"] == 12
+    assert rows["jpeg2000", 12]["auc"] is None
+    assert rows["spiht", 128]["n"] == 12
+    low, high = rows["spiht", 128]["ci"]
+    assert 0 <= low <= rows["spiht", 128]["auc"] <= high <= 1
+    assert run(recognition, *options) == 0
+    assert "original" in capsys.readouterr().out
+
+
+def test_streams_with_grain_are_judged_within_the_same_budget(
+    data_set: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--sdvd", data_set, "--codecs", "emb", "--budgets", "64", "--simulated", "0", "--crop", "40"]
+    assert run(recognition, *options, "--grain-strength", "0,1", "--least-auc", "0", "--json") == 0
+    rows = json.loads(capsys.readouterr().out)["results"]
+    assert [row["grain"] for row in rows] == [None, 0.0, 1.0]
+    assert all(0 < row["bytes"] <= 64 for row in rows)
+    assert rows[1]["auc"] is not None
+    assert all(row["of_original_ci"][0] <= row["of_original"] <= row["of_original_ci"][1] for row in rows)
+
+
+def test_grain_is_added_at_the_strength_asked_for() -> None:
+    from research.recognition.speckle import grainy_twin, with_grain
+    from sonarpost.codec.baselines.spiht import SpihtCodec
+    from sonarpost.codec.emb.codec import EmbCodec
+
+    plain, twin = EmbCodec(), grainy_twin(EmbCodec())
+    assert isinstance(twin, EmbCodec)
+    assert twin.grain
+    assert grainy_twin(SpihtCodec()) is None
+    image = np.clip(45 * np.random.default_rng(0).rayleigh(1.0, (48, 48)), 0, 255).astype(np.uint8)
+    stream = twin.encode(image, 64)
+    picture = twin.decode(stream).image
+    views = [with_grain(twin, stream, picture, strength) for strength in (0.0, 0.5, 1.0)]
+    assert all(view is not None for view in views)
+    assert np.array_equal(views[0], picture)
+    assert np.array_equal(views[1], twin.decode_with_grain(stream))
+    spreads = [float(np.std(view)) for view in views]
+    assert spreads[0] < spreads[1] < spreads[2]
+    assert with_grain(plain, plain.encode(image, 64), picture) is None
+    assert with_grain(SpihtCodec(), stream, picture) is None
+
+
+def test_a_poor_judge_is_said_to_be_one(
+    data_set: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Judge, "scores", lambda _self, pictures, _groups: np.zeros(len(pictures)))
+    options = ["--sdvd", data_set, "--codecs", "spiht", "--budgets", "64", "--simulated", "0"]
+    assert run(recognition, *options) == 1
+    assert "says nothing about codecs" in capsys.readouterr().err
+
+
+def test_recognition_refuses_wrong_folders_and_thresholds(tmp_path: Path) -> None:
+    with pytest.raises(SurveyFileError, match=r"index\.csv"):
+        run(recognition, "--sdvd", tmp_path)
+    with pytest.raises(ConfigError, match="least-auc"):
+        run(recognition, "--sdvd", tmp_path, "--least-auc", "1.5")
+    for strength in ("-1", "2.5", "half", "0.5,", "nan"):
+        with pytest.raises(ConfigError, match="grain-strength"):
+            run(recognition, "--sdvd", tmp_path, f"--grain-strength={strength}")
+
+
+def test_the_papers_own_numbers() -> None:
+    assert {f.title: f.paper_bytes for f in TABLE2} == {"JPEG 2000": 586, "Huffman": 621, "VQ": 22, "SPIHT": 214}
+    assert [f.paper_psnr for f in FIG2] == [29.65, 21.72, 24.49, 21.96, 19.24, 18.19]
+    assert PIXELS == 5537
+
+
+def test_figures_without_their_codec_say_so() -> None:
+    (found, *_) = reproduce(FIG2, [], [np.zeros((49, 113), np.uint8)])
+    assert found.psnr is None
+    assert "not in this run" in found.reason
+
+
+@pytest.fixture(scope="module")
+def survey() -> Survey:
+    return simulate_survey(SurveySpec(seed=11, pings=200, samples=512, targets=3, clutter=0)).survey
+
+
+def test_contacts_are_cut_to_the_papers_size(survey: Survey) -> None:
+    pictures = contact_pictures(survey, 2)
+    assert 1 <= len(pictures) <= 2
+    assert all(p.shape == (49, 113) for p in pictures)
+    empty = simulate_survey(SurveySpec(seed=11, pings=20, samples=128, targets=0, clutter=0)).survey
+    with pytest.raises(SurveyFileError, match="a survey with a contact"):
+        contact_pictures(empty)
+
+
+def test_more_dimensions_cost_more_and_rebuild_better() -> None:
+    training = [scene(i, target=i % 2 == 0, side_px=100) for i in range(30)]
+    test = [scene(100 + i, target=True, side_px=100) for i in range(4)]
+    few, many = sensitivity(training, test, [5, 80])
+    assert few.rotation_bytes == 5 * 400 * 8
+    assert many.rotation_bytes == 80 * 400 * 8
+    assert many.tiles >= few.tiles > 0
+    assert few.database_bytes == few.tiles * (5 * 8 + 400)
+    assert many.database_bytes > few.database_bytes
+    assert many.psnr > few.psnr
+    assert few.build_s > 0
+    assert few.encode_ms > 0
+
+
+def test_the_rotated_search_finds_the_nearest_and_learns_it_once() -> None:
+    training = [scene(i, target=True, side_px=60) for i in range(6)]
+    every = np.concatenate([cut_tiles(p, 20) for p in training])
+    database = RotatedTiles(every, 40)
+    for picture in training:
+        database.learn(picture)
+    before = len(database)
+    rotated = database.rotate(every)
+    index, squared = database.nearest(rotated)
+    brute = np.square(rotated[:, None] - rotated[None]).sum(2)
+    assert (squared >= brute.min(axis=1) - 1e-6).all()
+    assert len(np.unique(index)) == before
+    for picture in training:
+        database.learn(picture)
+    assert len(database) == before
+    assert psnr_db(training[0], database.rebuild(training[0])) > 25
+
+
+def test_the_page_is_written_from_the_run(
+    survey: Survey, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib", reason="matplotlib is an optional extra")
+    monkeypatch.setattr("research.common.images._PINGS", 260)
+    write_xtf(survey, tmp_path / "line.xtf")
+    options = ["--out", tmp_path, "--training", "6", "--codecs", "vq,spiht", "--survey", tmp_path / "line.xtf"]
+    assert run(paper, *options) == 0
+    assert "reproduction.md" in capsys.readouterr().out
+    page = (tmp_path / "reproduction.md").read_text()
+    for part in ("## Table II", "## Fig. 2", "## Fig. 3", "| 100 |", "codec jpeg2000 is not in", "line.xtf"):
+        assert part in page
+    for name in ("fig2.png", "fig3.png"):
+        with Image.open(tmp_path / "reproduction" / name) as picture:
+            assert picture.width > 400
+    with pytest.raises(ConfigError, match="--training"):
+        run(paper, "--out", tmp_path, "--training", "1")
+    with pytest.raises(SurveyFileError):
+        run(paper, "--out", tmp_path, "--survey", tmp_path / "absent.xtf")

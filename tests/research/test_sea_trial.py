@@ -1,0 +1,133 @@
+"""`python -m research.sea_trial`: the rig delivers what the water lets through, and the command tells it right."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from research.common.images import simulated_pictures
+from research.sea_trial import __main__ as sea_trial
+from research.sea_trial.__main__ import SIZES_PX, Cell, claims, measure, table
+from research.sea_trial.rig import Delivered, Rig, Sample, cross
+from sonarpost.codec.vq.codebook import load_default
+from sonarpost.codec.vq.codec import IndexPacking, VqCodec
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.simulation.channel.channel_config import ChannelParameters
+from sonarpost.simulation.channel.channel_events import ArrivalEnded, ArrivalStarted, FrameOutcome
+from sonarpost.simulation.channel.channel_presets import build_parameters
+from sonarpost.simulation.channel.propagation import ChannelModel
+
+
+@pytest.fixture(scope="module")
+def samples() -> list[Sample]:
+    codec = VqCodec(load_default(20).tiles, IndexPacking.ASCII5)
+    pictures = simulated_pictures(6, 3, 140).pictures
+    return [
+        Sample(codec.encode(p.pixels[:80]), ContactSummary(lat_deg=44.0, lon_deg=-63.0, time_utc_s=1.4e9 + n))
+        for n, p in enumerate(pictures)
+    ]
+
+
+@pytest.mark.parametrize("rate", [1, 4])
+def test_in_still_water_everything_arrives(samples: list[Sample], rate: int) -> None:
+    found = cross(ChannelParameters(), 300.0, rate, samples)
+    frames = 12 * (3 if rate == 1 else 2)
+    assert found == Delivered(12, 12, 0, frames, frames, 6, 6, 0, 0)
+
+
+def test_beyond_hearing_nothing_arrives(samples: list[Sample]) -> None:
+    found = cross(build_parameters({"preset": "sea-trial"}, "test"), 300.0, 1, samples)
+    assert found == Delivered(12, 0, 0, 36, 0, 6, 0, 0, 0)
+
+
+def test_what_is_counted_is_what_the_water_let_through(samples: list[Sample], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The water's own account of every frame agrees with what came out at the far driver."""
+    resolved: list[ArrivalEnded] = []
+    inner = ChannelModel.poll
+
+    def poll(self: ChannelModel, now: float) -> list[ArrivalStarted | ArrivalEnded]:
+        happened = inner(self, now)
+        resolved.extend(event for event in happened if isinstance(event, ArrivalEnded))
+        return happened
+
+    monkeypatch.setattr(ChannelModel, "poll", poll)
+    found = cross(build_parameters({"frame_loss": 0.3, "packet_loss": 0.1, "seed": 4}, "test"), 50.0, 1, samples)
+    fates = [[frame.fate for frame in event.frames] for event in resolved if event.frames]
+    assert len(fates) == found.packets == 12
+    assert sum(fate is FrameOutcome.DELIVERED for packet in fates for fate in packet) == found.good_frames
+    assert sum(all(fate is FrameOutcome.DELIVERED for fate in packet) for packet in fates) == found.whole_packets
+    assert 0 < found.good_frames < found.frames == 36
+    pairs = zip(fates[::2], fates[1::2], strict=True)
+    lost = [FrameOutcome.LOST in second for first, second in pairs if FrameOutcome.LOST not in first]
+    assert sum(lost) == found.second_lost
+    assert found.whole_pictures + found.partial_pictures + found.contacts_only <= found.pictures == 6
+    assert found.partial_pictures > 0
+
+
+def test_a_packet_comes_out_as_it_went_in() -> None:
+    rig = Rig(ChannelParameters(), 100.0)
+    before = rig.now
+    heard = rig.send((b"one", b"two" * 20), 1)
+    assert [frame.data for frame in heard] == [b"one", b"two" * 20]
+    assert rig.now - before > 6.1
+
+
+def test_the_trial_turns_where_the_papers_did_and_can_be_repeated() -> None:
+    near, far = (60, 120), (160, 250)
+    cells = measure(12, 1, (*near, *far), SIZES_PX[:1])
+    assert cells == measure(12, 1, (*near, *far), SIZES_PX[:1])
+    rate1 = {cell.range_m: cell for cell in cells if cell.rate == 1}
+    assert min(rate1[range_m].packets for range_m in near) > 0.7
+    assert max(rate1[range_m].packets for range_m in far) < 0.3
+    assert {c.range_m: c.packets > 0.7 for c in cells if c.rate == 4} == {60: True, 120: False, 160: False, 250: False}
+    assert cells != measure(12, 2, (*near, *far), SIZES_PX[:1])
+
+
+def cell(range_m: int, delivered: Delivered, width_px: int = 140) -> Cell:
+    return Cell(1, width_px, 80, range_m, delivered)
+
+
+def test_the_papers_words_are_judged_by_what_was_measured() -> None:
+    whole = Delivered(4, 4, 0, 12, 12, 2, 2, 0, 0)
+    second = Delivered(4, 3, 1, 12, 11, 2, 1, 1, 0)
+    lost = Delivered(4, 0, 0, 12, 0, 2, 0, 0, 0)
+    as_told = claims([cell(60, whole), cell(60, second, 80), cell(130, lost), cell(200, lost)])
+    assert [(c["measured"], c["agrees"]) for c in as_told] == [(0.875, True), (1.0, True), (0.5, True), (1.0, True)]
+    at_every_size = claims([cell(60, second), cell(60, second, 80)])
+    assert [(c["measured"], c["agrees"]) for c in at_every_size] == [(0.75, True), (0.5, False), (0.5, False)]
+    otherwise = claims([cell(60, lost), cell(60, whole, 80), cell(200, whole)])
+    assert [(c["measured"], c["agrees"]) for c in otherwise] == [(0.5, False), (0.0, False), (0.0, False), (0.0, False)]
+    shown = table([cell(60, whole), replace(cell(60, lost), rate=4)])
+    assert "| 60 | 100 / 100 | most received |" in shown
+    assert "| 60 | 0 / 0 | not tried at sea |" in shown
+    assert "as in the paper" in shown
+
+
+def test_the_command_prints_and_draws(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(sea_trial, "RANGES_M", (60, 130, 200))
+    monkeypatch.setattr(sea_trial, "SIZES_PX", SIZES_PX[1:])
+    path = tmp_path / "plot.png"
+    assert sea_trial.main(["--pictures", "3", "--json", "--plot", str(path)]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["water"], told["seed"]) == ("sea-trial", 0)
+    assert [(row["rate"], row["width_px"], row["range_m"]) for row in told["results"]] == [
+        (rate, width, range_m) for width in (80, 40) for rate in (1, 4) for range_m in (60, 130, 200)
+    ]
+    assert all(row["pictures"] == 3 and row["packets"] == 6 for row in told["results"])
+    with Image.open(path) as drawn:
+        assert drawn.size[0] > 1000
+    assert sea_trial.main(["--pictures", "2"]) == 0
+    assert "| 130 | " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("wrong", [["--pictures", "0"], ["--pictures", "1001"], ["--seed", "-1"]])
+def test_wrong_options_are_refused(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert sea_trial.main([*wrong]) == 2
+    assert wrong[0] in capsys.readouterr().err

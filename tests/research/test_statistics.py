@@ -1,0 +1,226 @@
+"""BD-rate against analytic cases, bootstrap, AUC, MS-SSIM."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from research.codecs.rate_distortion import rate_difference
+from research.common.measurement import Point, Subject
+from research.common.statistics import (
+    auc,
+    bd_rate_percent,
+    bootstrap_weights,
+    interval,
+    mean_of_known,
+    overlap_db,
+    weighted_means,
+)
+from sonarpost.codec.quality import ms_ssim
+from sonarpost.errors import StreamError
+
+RATES = np.array([22.0, 44, 64, 128, 256, 512])
+
+
+def curve(rates: np.ndarray, db_per_octave: float = 1.5, offset_db: float = 15.0) -> np.ndarray:
+    return offset_db + db_per_octave * np.log2(rates)
+
+
+@pytest.mark.parametrize("factor", [0.25, 0.5, 0.9, 1.0, 1.7, 3.0])
+def test_a_codec_that_needs_a_constant_factor_of_the_rate(factor: float) -> None:
+    quality = curve(RATES)
+    found = bd_rate_percent(factor * RATES, quality, RATES, quality)
+    assert found == pytest.approx(100 * (factor - 1), abs=1e-9)
+
+
+def test_a_constant_gain_in_db_on_a_logarithmic_curve() -> None:
+    # At 1.5 dB an octave a gain of 1.5 dB is half the rate, wherever the points lie.
+    other_rates = np.array([30.0, 70, 150, 400, 900])
+    found = bd_rate_percent(RATES, curve(RATES) + 1.5, other_rates, curve(other_rates))
+    assert found == pytest.approx(-50.0, abs=1e-6)
+
+
+def test_the_mean_is_of_logarithms_over_the_common_range_only() -> None:
+    # First: log10 rate = q / 10; second: log10 rate = q / 5 - 2. Common range 20..30: the mean difference of the
+    # logarithms is mean(2 - q / 10) = -0.5.
+    q1, q2 = np.array([10.0, 18, 24, 30]), np.array([20.0, 26, 33, 40])
+    found = bd_rate_percent(10 ** (q1 / 10), q1, 10 ** (q2 / 5 - 2), q2)
+    assert found == pytest.approx(100 * (10**-0.5 - 1), abs=1e-9)
+    assert overlap_db(q1, q2) == (20.0, 30.0)
+
+
+def test_interpolation_does_not_overshoot() -> None:
+    # A step: a cubic through these would dip below 10 B between the first two points.
+    quality = np.array([20.0, 21.0, 21.1, 22.0])
+    rates = np.array([10.0, 10.5, 400, 420])
+    flat = np.array([20.0, 21.0])
+    found = bd_rate_percent(rates, quality, np.array([10.0, 10.0000001]), flat)
+    assert found is not None
+    assert 0.0 <= found <= 5.0
+
+
+def test_curves_that_cannot_be_compared() -> None:
+    quality = curve(RATES)
+    assert bd_rate_percent(RATES, quality, RATES, quality + 40) is None
+    assert overlap_db(quality, quality + 40) is None
+    assert bd_rate_percent(RATES[:1], quality[:1], RATES, quality) is None
+    assert bd_rate_percent(np.array([10.0, 20]), np.array([5.0, 5.0]), RATES, quality) is None
+
+
+def test_points_that_cost_more_without_being_better_do_not_count() -> None:
+    quality = curve(RATES)
+    rates = np.concatenate((RATES, RATES * 1.6, [600.0]))
+    worse = np.concatenate((quality, quality, [1.0]))
+    assert bd_rate_percent(rates, worse, RATES, quality) == pytest.approx(0.0, abs=1e-9)
+    assert bd_rate_percent(np.append(RATES, np.nan), np.append(quality, np.nan), RATES, quality) == pytest.approx(0.0)
+
+
+@given(
+    st.lists(st.floats(0.5, 2.0), min_size=6, max_size=6),
+    st.lists(st.floats(0.1, 2.0), min_size=6, max_size=6),
+)
+def test_swapping_the_codecs_inverts_the_factor(steps: list[float], others: list[float]) -> None:
+    first, second = 18 + np.cumsum(steps), 18 + np.cumsum(others)
+    one, two = bd_rate_percent(RATES, first, RATES, second), bd_rate_percent(RATES, second, RATES, first)
+    assert (one is None) == (two is None)
+    if one is not None and two is not None:
+        assert (1 + one / 100) * (1 + two / 100) == pytest.approx(1.0)
+
+
+def point(budget: int, sizes: list[float], psnr: list[float]) -> Point:
+    blank = np.full(len(sizes), np.nan)
+    codec = type("Named", (), {"name": "some"})()
+    return Point(Subject(codec), budget, np.array(sizes), np.array(psnr), blank, blank, blank, blank)
+
+
+def test_curves_rest_on_the_pictures_both_coded() -> None:
+    pictures = 20
+    base = np.linspace(18, 24, pictures)
+    easy = np.arange(pictures) < 19
+    one = [point(int(b), [b] * pictures, list(base + curve(np.array(b)))) for b in RATES]
+    # The other is the same codec at twice the bytes; it misses the best picture at one budget, and nearly all at
+    # another, which therefore does not count.
+    two = [point(int(b), [2 * b] * pictures, list(base + curve(np.array(b)))) for b in RATES]
+    for array in (two[2].stream_bytes, two[2].psnr):
+        array[~easy] = np.nan
+    for array in (two[0].stream_bytes, two[0].psnr):
+        array[3:] = np.nan
+    weights = bootstrap_weights([str(i) for i in range(pictures)], 50)
+    found = rate_difference(one, two, weights)
+    assert found.percent == pytest.approx(-50.0)
+    assert found.pictures == 19
+    assert found.ci is not None
+    assert found.ci == pytest.approx((-50.0, -50.0))
+    assert rate_difference(one, two[:1]).percent is None
+
+
+def test_bootstrap_draws_whole_sources_and_the_same_ones_for_all() -> None:
+    sources = ["a", "a", "b", "c", "c", "c"]
+    weights = bootstrap_weights(sources, 500, seed=4)
+    assert weights.shape == (500, 6)
+    assert np.array_equal(weights, bootstrap_weights(sources, 500, seed=4))
+    assert (weights[:, 0] == weights[:, 1]).all()
+    assert (weights[:, 3] == weights[:, 5]).all()
+    assert (weights[:, [0, 2, 3]].sum(axis=1) == 3).all()
+    assert not np.array_equal(weights, bootstrap_weights(sources, 500, seed=5))
+
+
+def test_the_interval_of_a_mean_agrees_with_theory() -> None:
+    values = np.random.default_rng(0).normal(20, 3, 400)
+    weights = bootstrap_weights([str(i) for i in range(400)])
+    found = interval(weighted_means(values, weights))
+    assert found is not None
+    half = 1.96 * values.std() / 20
+    assert found[0] == pytest.approx(values.mean() - half, abs=0.06)
+    assert found[1] == pytest.approx(values.mean() + half, abs=0.06)
+
+
+def test_what_is_unknown_stays_out_of_means_and_intervals() -> None:
+    values = np.array([1.0, np.nan, 3.0])
+    assert mean_of_known(values) == 2.0
+    assert np.isnan(mean_of_known(np.array([np.nan])))
+    weights = np.array([[1.0, 5.0, 3.0], [0.0, 3.0, 0.0]])
+    means = weighted_means(values, weights)
+    assert means[0] == pytest.approx(2.5)
+    assert np.isnan(means[1])
+    assert interval(np.full(100, np.nan)) is None
+
+
+def test_auc_by_hand() -> None:
+    scores = np.array([3.0, 1.0, 2.0, 2.0, 0.0])
+    is_target = np.array([True, True, False, True, False])
+    # Pairs (target, other): 3>2, 3>0, 1<2, 1>0, 2=2, 2>0: 4.5 of 6.
+    assert auc(scores, is_target) == pytest.approx([0.75])
+    # The second target twice, the first not at all: 1<2, 1>0, twice; 2=2, 2>0: 2 + 1.5 of 6.
+    weights = np.array([[0.0, 2, 1, 1, 1], [1, 1, 0, 1, 0]])
+    weighted = auc(scores, is_target, weights)
+    assert weighted[0] == pytest.approx(3.5 / 6)
+    assert np.isnan(weighted[1])
+
+
+def test_auc_of_chance_and_of_certainty() -> None:
+    rng = np.random.default_rng(1)
+    is_target = rng.random(2000) < 0.4
+    assert auc(rng.random(2000), is_target)[0] == pytest.approx(0.5, abs=0.05)
+    assert auc(is_target.astype(float), is_target)[0] == 1.0
+    assert auc(np.zeros(2000), is_target)[0] == 0.5
+
+
+def picture(seed: int, shape: tuple[int, int] = (80, 80)) -> np.ndarray:
+    return np.clip(60 * np.random.default_rng(seed).rayleigh(1.0, shape), 0, 255).astype(np.uint8)
+
+
+def test_ms_ssim_of_equal_and_of_damaged_pictures() -> None:
+    image = picture(0)
+    assert ms_ssim(image, image) == pytest.approx(1.0)
+    rng = np.random.default_rng(1)
+    values = []
+    for sigma in (2, 8, 30, 90):
+        noisy = np.clip(image + rng.normal(0, sigma, image.shape), 0, 255).astype(np.uint8)
+        values.append(ms_ssim(image, noisy))
+    assert values == sorted(values, reverse=True)
+    assert 0.0 <= values[-1] < values[0] < 1.0
+
+
+def test_ms_ssim_of_flat_pictures_is_their_luminance_term() -> None:
+    # Without any contrast all contrast-structure terms are 1; what is left is the coarsest scale's luminance.
+    a, b = np.full((32, 32), 100, np.uint8), np.full((32, 32), 140, np.uint8)
+    c1 = (0.01 * 255) ** 2
+    luminance = (2 * 100 * 140 + c1) / (100**2 + 140**2 + c1)
+    assert ms_ssim(a, b) == pytest.approx(luminance ** (0.3001 / (0.0448 + 0.2856 + 0.3001)))
+
+
+def test_ms_ssim_by_its_definition() -> None:
+    """Three scales written out with plain loops over a mirrored picture."""
+    a, b = picture(2, (17, 22)), picture(3, (17, 22))
+    axis = np.arange(-5, 6)
+    line = np.exp(-(axis**2) / (2 * 1.5**2))
+    window = np.outer(line, line) / line.sum() ** 2
+    c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+    x, y, result = a.astype(float), b.astype(float), 1.0
+    weights = np.array([0.0448, 0.2856, 0.3001])
+    for scale, weight in enumerate(weights / weights.sum()):
+        padded_x, padded_y = np.pad(x, 5, mode="symmetric"), np.pad(y, 5, mode="symmetric")
+        terms = []
+        for row in range(x.shape[0]):
+            for column in range(x.shape[1]):
+                u = padded_x[row : row + 11, column : column + 11]
+                v = padded_y[row : row + 11, column : column + 11]
+                mu, mv = (window * u).sum(), (window * v).sum()
+                var_u, var_v = (window * u * u).sum() - mu**2, (window * v * v).sum() - mv**2
+                cov = (window * u * v).sum() - mu * mv
+                term = (2 * cov + c2) / (var_u + var_v + c2)
+                terms.append(term * (2 * mu * mv + c1) / (mu**2 + mv**2 + c1) if scale == 2 else term)
+        result *= max(np.mean(terms), 1e-6) ** weight
+        rows, columns = x.shape[0] // 2 * 2, x.shape[1] // 2 * 2
+        x, y = (z[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2).mean((1, 3)) for z in (x, y))
+    assert ms_ssim(a, b) == pytest.approx(result, rel=1e-9)
+
+
+def test_ms_ssim_refuses_what_has_no_three_scales() -> None:
+    with pytest.raises(StreamError, match="at least 4 px"):
+        ms_ssim(picture(0, (3, 40)), picture(1, (3, 40)))
+    with pytest.raises(StreamError, match="shape"):
+        ms_ssim(picture(0), picture(1, (80, 79)))

@@ -1,0 +1,151 @@
+"""The recognition survey: blind, in each person's own order, answered once, counted with intervals."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+from starlette.testclient import TestClient
+
+from research.user_study.__main__ import main
+from research.user_study.server import Answers, Folders, PanelApp
+from research.user_study.trials import Decoded, trials_for
+from sonarpost.errors import ConfigError
+
+NAMES = [f"contact-{number}" for number in range(6)]
+
+
+@pytest.fixture
+def folders(tmp_path):
+    for folder in ("originals", "decoded/small", "decoded/large"):
+        path = tmp_path / folder
+        path.mkdir(parents=True)
+        for number, name in enumerate(NAMES):
+            remark = PngInfo()
+            remark.add_text("Title", name)
+            grey = np.full((20, 20), 10 * number + len(folder), np.uint8)
+            Image.fromarray(grey).save(path / f"{name}.png", pnginfo=remark)
+    return tmp_path / "originals", tmp_path / "decoded"
+
+
+@pytest.fixture
+def panel(folders, tmp_path):
+    answers = Answers(tmp_path / "state" / "panel.db")
+    app = PanelApp(Folders.read(*folders), answers, "Which?", choices=3, seed=1)
+    with TestClient(app.asgi, base_url="http://127.0.0.1", client=("127.0.0.1", 1)) as client:
+        yield client
+    answers.close()
+
+
+def grey_of(client, address) -> int:
+    return int(np.asarray(Image.open(io.BytesIO(client.get(address).content)))[0, 0])
+
+
+def right_choice(client, question) -> int:
+    """What somebody would choose who recognises everything; `small` is 13 long and `large` too, `originals` 9."""
+    shown = grey_of(client, question["shown"]) - len("decoded/small")
+    return [grey_of(client, address) - len("originals") for address in question["choices"]].index(shown)
+
+
+def test_from_the_first_question_to_the_table(panel, tmp_path, capsys):
+    assert panel.get("/api/panel").json() == {"title": "Which?", "trials": 12, "choices": 3}
+    assert panel.get("/api/panel/next").status_code == 401
+    headers = {"X-Panel": panel.post("/api/panel/start", json={"name": "Anna"}).json()["panel"]}
+    for number in range(1, 13):
+        question = panel.get("/api/panel/next", headers=headers).json()
+        assert (question["number"], question["of"], len(question["choices"])) == (number, 12, 3)
+        choice = right_choice(panel, question) if number <= 10 else -1
+        body = {"number": number, "choice": choice, "sure": 0.5, "seconds": float(number)}
+        answer = panel.post("/api/panel/answers", json=body, headers=headers)
+        assert (answer.status_code, answer.json()) == (201, {"answered": number})
+    assert panel.get("/api/panel/next", headers=headers).json() == {"done": True, "answered": 12}
+    assert panel.post("/api/panel/answers", json=body, headers=headers).status_code == 409
+    found = panel.get("/api/panel/results").json()
+    [anna] = found["people"]
+    assert (anna["name"], anna["right"], anna["answered"], anna["median_s"]) == ("Anna", 10, 12, 7.0)
+    assert anna["wilson"][0] < 10 / 12 < anna["wilson"][1]
+    assert set(found["by_group"]) == {"small", "large"}
+    assert found["chance"] == pytest.approx(1 / 3)
+    assert main(["--state", str(tmp_path / "state"), "--results"]) == 0
+    printed = capsys.readouterr().out
+    assert "Anna" in printed
+    assert "[large]" in printed
+    assert "by chance 0.33" in printed
+    assert main(["--state", str(tmp_path / "state"), "--results", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == found
+
+
+def test_nothing_gives_the_answer_away(panel):
+    headers = {"X-Panel": panel.post("/api/panel/start", json={"name": "Anna"}).json()["panel"]}
+    question = panel.get("/api/panel/next", headers=headers)
+    assert not any(name in question.text for name in (*NAMES, "small", "large"))
+    for address in (question.json()["shown"], *question.json()["choices"]):
+        data = panel.get(address).content
+        assert not any(name.encode() in data for name in NAMES)
+    assert panel.get("/api/panel/pictures/contact-1.png").status_code == 404
+    body = {"number": 1, "choice": 0, "sure": None, "seconds": 1.0}
+    assert set(panel.post("/api/panel/answers", json=body, headers=headers).json()) == {"answered"}
+
+
+def test_a_person_goes_on_where_they_were_and_another_has_another_order(panel):
+    start = panel.post("/api/panel/start", json={"name": "Anna"}).json()
+    headers = {"X-Panel": start["panel"]}
+    first = panel.get("/api/panel/next", headers=headers).json()
+    body = {"number": 1, "choice": 0, "sure": None, "seconds": 1.0}
+    panel.post("/api/panel/answers", json=body, headers=headers)
+    again = panel.post("/api/panel/start", json={"name": "Anna"}).json()
+    assert again == {**start, "answered": 1}
+    other = {"X-Panel": panel.post("/api/panel/start", json={"name": "Bo"}).json()["panel"]}
+    assert panel.get("/api/panel/next", headers=other).json()["shown"] != first["shown"]
+    orders = [[t.shown for t in trials_for(who, 1, NAMES, [Decoded("", n) for n in NAMES], 3)] for who in "ab"]
+    assert orders[0] != orders[1]
+    assert set(orders[0]) == set(orders[1])
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [({"choice": 3}, "choice"), ({"number": 2}, "number"), ({"seconds": -1.0}, "seconds"), ({"sure": 2}, "sure")],
+)
+def test_a_wrong_answer_form_is_named(panel, change, field):
+    headers = {"X-Panel": panel.post("/api/panel/start", json={"name": "Anna"}).json()["panel"]}
+    body = {"number": 1, "choice": 0, "sure": None, "seconds": 1.0, **change}
+    answer = panel.post("/api/panel/answers", json=body, headers=headers)
+    assert (answer.status_code, answer.json()["error"]["field"]) == (400, field)
+
+
+def test_the_right_one_is_anywhere_and_once():
+    decoded = [Decoded("", name) for name in NAMES]
+    places = [0, 0, 0]
+    for person in range(200):
+        for trial in trials_for(str(person), 1, NAMES, decoded, 3):
+            assert len(set(trial.choices)) == 3
+            places[trial.right] += 1
+    # 1200 in three places: each within five standard deviations of 400.
+    assert all(abs(number - 400) < 5 * 16.4 for number in places)
+
+
+def test_wrong_folders_and_numbers_are_named(folders, tmp_path, capsys):
+    originals, decoded = folders
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match="--originals"):
+        Folders.read(tmp_path / "empty", decoded)
+    (originals / "contact-1.png").unlink()
+    with pytest.raises(ConfigError, match="an original in"):
+        Folders.read(originals, decoded)
+    with pytest.raises(ConfigError, match="2 to 6"):
+        trials_for("a", 1, NAMES, [], 7)
+    assert main(["--state", str(tmp_path / "none"), "--results"]) == 2
+    assert main([]) == 2
+    assert "--originals DIR" in capsys.readouterr().err
+
+
+def test_results_are_for_this_host(folders, tmp_path):
+    answers = Answers(tmp_path / "panel.db")
+    app = PanelApp(Folders.read(*folders), answers, "Which?", choices=3, seed=1)
+    with TestClient(app.asgi, base_url="http://127.0.0.1", client=("10.0.0.7", 1)) as client:
+        assert client.get("/api/panel/results").status_code == 403
+    answers.close()
