@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.ready
 
-.PHONY: setup demo test test-long check fmt lock clean images test-compose screenshots
+.PHONY: setup demo test test-long check docs docs-serve fmt lock clean images test-compose screenshots
 
 setup: $(STAMP)
 
@@ -41,9 +41,18 @@ images:
 test-compose: setup
 	PYTHON=$(BIN)/python packaging/test-compose.sh $(ARGS)
 
-# The pictures of the console's page in docs/screenshots; needs Chromium.
+# The pictures of the console's page in docs/explanation/console; needs Chromium.
 screenshots: setup
 	$(BIN)/python packaging/screenshots.py
+
+# The documentation site, in build/site; a broken link or an undocumented name fails the build.
+docs: export NO_MKDOCS_2_WARNING = 1
+docs: setup
+	$(BIN)/mkdocs --quiet build --strict
+
+docs-serve: export NO_MKDOCS_2_WARNING = 1
+docs-serve: setup
+	$(BIN)/mkdocs serve $(ARGS)
 
 fmt: setup
 	$(BIN)/ruff format .
@@ -52,7 +61,7 @@ fmt: setup
 # Resolve the dependencies of pyproject.toml anew and write the exact versions down.
 lock:
 	rm -rf build/lock && $(PYTHON) -m venv build/lock
-	build/lock/bin/python -m pip install --quiet --disable-pip-version-check '.[dev]'
+	build/lock/bin/python -m pip install --quiet --disable-pip-version-check '.[dev,docs]'
 	build/lock/bin/python -m pip freeze --exclude sonarpost > requirements.lock
 
 clean:

@@ -1,4 +1,4 @@
-"""Makes the pictures of the console's page in docs/screenshots, with simulated contacts. Run by `make screenshots`.
+"""Makes the pictures of the console's page in docs/explanation/console, with simulated contacts. Run by `make screenshots`.
 
 Needs Debian's Chromium (apt-get install chromium), or another one that SONARPOST_CHROMIUM names.
 """
@@ -28,7 +28,7 @@ from sonarpost.services.console.store.users import Actor, Users
 from sonarpost.services.console.training.simulator import VESSEL, Training
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
-OUT = Path(__file__).resolve().parents[1] / "docs" / "screenshots"
+OUT = Path(__file__).resolve().parents[1] / "docs" / "explanation" / "console"
 SMALL, LARGE = (1366, 768), (1920, 1080)
 BOB = Actor("bob", "operator", "127.0.0.1")
 BEFORE, IN_ALL = 34, 60

@@ -1,4 +1,4 @@
-"""docs/wire-zenoh.md is true: its tables have every field, its bytes are the bytes, its programs run."""
+"""docs/specifications/zenoh.md is true: its tables have every field, its bytes are the bytes, its programs run."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from sonarpost.services.c2.service import ADVICE_PRIORITY, COMMAND_PRIORITY
 from sonarpost.services.relay.service import DECISION_PRIORITY, DETAIL_PRIORITY, PREVIEW_PRIORITY
 
 PlatformMaker = Callable[[str], PlatformConfig]
-TEXT = (REPOSITORY / "docs" / "wire-zenoh.md").read_text(encoding="utf-8")
+TEXT = (REPOSITORY / "docs" / "specifications" / "zenoh.md").read_text(encoding="utf-8")
 FIELDS = [(t, name) for t in RECORD_TYPES for name in t.model_fields]
 UNITS = {"mps": "m/s", "deg": "°", "db": "dB", "px": "px", "m": "m", "s": "s"}
 NAMED_OTHERWISE = {
@@ -213,7 +213,7 @@ def test_the_example_of_an_error_is_one() -> None:
 
 
 def blocks(language: str) -> dict[str, str]:
-    return dict(re.findall(rf"^```{language} (\w+)\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL))
+    return dict(re.findall(rf'^```{language} title="(\w+)"\n(.*?)^```$', TEXT, re.MULTILINE | re.DOTALL))
 
 
 def hex_block(name: str) -> bytes:

@@ -1,7 +1,7 @@
 """Everything that travels on Zenoh, as frozen records.
 
 A record is validated when it is made, so a record that exists is right. On the wire it is a plain msgpack map with
-two fields more, `type` and `v` (see `sonarpost.wire`); `docs/wire-zenoh.md` describes the same for other languages.
+two fields more, `type` and `v` (see `sonarpost.wire`); `docs/specifications/zenoh.md` describes the same for other languages.
 A value that is not known is None: nothing is ever guessed. Times are seconds since 1970-01-01 UTC.
 """
 

@@ -37,7 +37,9 @@ def new_parser() -> argparse.ArgumentParser:
         description="Measure the paper's Table II, Fig. 2 and Fig. 3 again and write them beside the paper's numbers: "
         "DIR/reproduction.md with its pictures in DIR/reproduction/ (needs matplotlib).",
     )
-    parser.add_argument("--out", type=Path, default=Path("docs"), metavar="DIR", help="where to write (docs)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("docs/research"), metavar="DIR", help="where to write (docs/research)"
+    )
     parser.add_argument(
         "--survey", type=Path, metavar="FILE.xtf", help="cut the pictures from this survey's contacts, not simulated"
     )

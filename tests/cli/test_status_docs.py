@@ -1,4 +1,4 @@
-"""docs/observability.md, the alert rules and the dashboard say what the code does."""
+"""docs/explanation/operations.md, the alert rules and the dashboard say what the code does."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from builders.fleet import FLEET, on_terminal
 
 from sonarpost.monitoring.metrics import FleetCollector
 
-DOCS = REPOSITORY / "docs"
-PAGE = (DOCS / "observability.md").read_text(encoding="utf-8")
+DOCS = REPOSITORY / "docs" / "explanation"
+PAGE = (DOCS / "operations.md").read_text(encoding="utf-8")
 
 
 def test_the_table_in_the_page_is_what_a_terminal_shows() -> None:
@@ -34,8 +34,8 @@ def test_rules_and_dashboard_ask_for_what_services_tell() -> None:
     pages = "".join(path.read_text(encoding="utf-8") for path in (REPOSITORY / "services").glob("*/README.md"))
     told = set(re.findall(r"`(\w+)`", pages))
     fixed = set(re.findall(r"`(sonarpost_\w+)`", PAGE))
-    rules = (DOCS / "observability" / "alerts.yml").read_text(encoding="utf-8")
-    dashboard = json.loads((DOCS / "observability" / "dashboard.json").read_text(encoding="utf-8"))
+    rules = (DOCS / "operations" / "alerts.yml").read_text(encoding="utf-8")
+    dashboard = json.loads((DOCS / "operations" / "dashboard.json").read_text(encoding="utf-8"))
     asked = set(re.findall(r"\bsonarpost_\w+", rules))
     for panel in dashboard["panels"]:
         asked |= {name for target in panel["targets"] for name in re.findall(r"\bsonarpost_\w+", target["expr"])}

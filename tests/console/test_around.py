@@ -169,7 +169,7 @@ def test_intervals_of_the_papers_share():
 
 
 def test_every_route_is_described(console):
-    told = (REPOSITORY / "docs" / "console-api.md").read_text(encoding="utf-8")
+    told = (REPOSITORY / "docs" / "specifications" / "console-api.md").read_text(encoding="utf-8")
     paths = [route.path for route in console.app.asgi._app.routes]
     assert len(paths) > 20
     for path in paths:
@@ -189,7 +189,7 @@ def test_every_field_of_a_contact_is_described(console):
     anna = console.browser("anna")
     console.decide(anna, ID)
     whole = anna.get(f"/api/contacts/{ID}").json()
-    told = (REPOSITORY / "docs" / "console-api.md").read_text(encoding="utf-8")
+    told = (REPOSITORY / "docs" / "specifications" / "console-api.md").read_text(encoding="utf-8")
     for part in (whole, whole["contact"], whole["versions"][0], whole["decisions"][0], whole["audit"][0]):
         for name in part:
             assert f'"{name}"' in told, name

@@ -1,4 +1,4 @@
-"""docs/exports.md says what the code does: properties, types, and a program that runs."""
+"""docs/reference/exports.md says what the code does: properties, types, and a program that runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from builders.exports import mission
 from sonarpost.export.cot import BOTTOM_RETURN, MINE_POSITIONS, SPOT
 from sonarpost.export.properties import COLUMNS
 
-PAGE = (REPOSITORY / "docs" / "exports.md").read_text(encoding="utf-8")
+PAGE = (REPOSITORY / "docs" / "reference" / "exports.md").read_text(encoding="utf-8")
 
 
 def section(title: str) -> str:

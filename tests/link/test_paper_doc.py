@@ -12,7 +12,7 @@ from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import HALF_PREFIX_SIZE, ContactFrame, HalfFrame, parse_frame
 from sonarpost.link.frames.paper.sender import body_capacity_bytes, plan_packets
 
-PAGE = (REPOSITORY / "docs" / "wire-acoustic.md").read_text(encoding="utf-8")
+PAGE = (REPOSITORY / "docs" / "specifications" / "acoustic-paper.md").read_text(encoding="utf-8")
 RATES = {0: (1, 32), 1: (3, 64), 2: (3, 64), 3: (2, 256), 4: (2, 256), 5: (8, 256), 6: (6, 32)}
 
 

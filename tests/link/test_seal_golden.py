@@ -83,7 +83,7 @@ def test_another_implementation_seals_the_same(case: dict[str, Any]) -> None:
 
 
 def test_the_page_has_the_numbers_of_the_code() -> None:
-    page = (REPOSITORY / "docs" / "wire-acoustic-v1.md").read_text(encoding="utf-8")
+    page = (REPOSITORY / "docs" / "specifications" / "acoustic-v1.md").read_text(encoding="utf-8")
     section = " ".join(page[page.index("## Authentication") : page.index("## What a receiver may show")].split())
     one, two = AuthenticationSettings(), AuthenticationSettings(2)
     assert f"{one.size} by default" in section

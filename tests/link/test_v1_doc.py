@@ -24,7 +24,7 @@ from sonarpost.link.frames.v1.frame import (
 from sonarpost.link.frames.v1.preview import Preview, entry_shape
 from sonarpost.link.sender_messages import MAX_MESSAGE_BYTES
 
-PAGE = (REPOSITORY / "docs" / "wire-acoustic-v1.md").read_text(encoding="utf-8")
+PAGE = (REPOSITORY / "docs" / "specifications" / "acoustic-v1.md").read_text(encoding="utf-8")
 
 
 def test_the_examples_parse_to_what_the_page_says() -> None:

@@ -1,4 +1,4 @@
-"""Revoking, as docs/security.md tells it: new list, router restarted, the old certificate is worth nothing."""
+"""Revoking, as docs/explanation/security.md tells it: new list, router restarted, the old certificate is worth nothing."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 A query and a reply cost far more than a small record. A consumer that takes several says so in its replies (`takes`);
 only then does a producer send them together, so that either end may be older than the other. Every record is answered
-for by itself. `docs/wire-zenoh.md` describes the same for other languages.
+for by itself. `docs/specifications/zenoh.md` describes the same for other languages.
 """
 
 from __future__ import annotations

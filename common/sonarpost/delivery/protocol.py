@@ -2,7 +2,7 @@
 
 The producer asks the consumer's queryable at `{key}/handoff/{consumer}`; the query's payload is a piece of the record
 of at most 32 kB, its attachment says which record and which piece; the reply, given after the consumer has committed,
-says what it has. `docs/wire-zenoh.md` describes the same for other languages.
+says what it has. `docs/specifications/zenoh.md` describes the same for other languages.
 """
 
 from __future__ import annotations

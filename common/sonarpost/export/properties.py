@@ -54,7 +54,7 @@ COLUMNS: Final[tuple[str, ...]] = (
     "picture_file",
     "notes",
 )
-"""Names of the properties in their order; `docs/exports.md` says what each means."""
+"""Names of the properties in their order; `docs/reference/exports.md` says what each means."""
 
 
 def properties(contact: AcceptedContact) -> dict[str, Value]:

@@ -1,4 +1,4 @@
-"""Health of a fleet as Prometheus metrics. `docs/observability.md` lists the names.
+"""Health of a fleet as Prometheus metrics. `docs/explanation/operations.md` lists the names.
 
 One exporter reads the health records of every platform that a router reaches: services need no listening port, a
 vehicle no Prometheus, and what is scraped is what the radio link carries anyway.

@@ -3,7 +3,7 @@
     python -m research.training.emb.structure \
         --model common/sonarpost/codec/emb/data/emb-2.model --out /tmp/emb/structure.model
 
-The scales were chosen on validation pictures; see docs/codec.md.
+The scales were chosen on validation pictures; see docs/explanation/codecs.md.
 """
 
 from __future__ import annotations

@@ -402,7 +402,7 @@ def test_every_key_is_in_the_documents(served):
     there = served.visit()
     there.press("?")
     there.wait("dialog .keys")
-    page = REPOSITORY / "docs" / "console.md"
+    page = REPOSITORY / "docs" / "explanation" / "console.md"
     section = page.read_text("utf-8").split("## Screens and keys")[1].split("\n## ")[0]
     keys = set(there.page.locator("dialog .keys kbd").all_inner_texts())
     assert len(keys) > 25

@@ -12,7 +12,7 @@ from sonarpost.sonar.options import SurveyOptions, load_options
 def add_option_flags(parser: argparse.ArgumentParser) -> None:
     """Add what says how a file is to be understood."""
     parser.add_argument(
-        "--options", type=Path, metavar="FILE.toml", help="mounting, errors, projection (docs/surveys.md)"
+        "--options", type=Path, metavar="FILE.toml", help="mounting, errors, projection (docs/explanation/surveys.md)"
     )
     parser.add_argument("--crs", metavar="EPSG:N", help="what positions in metres are in; goes before the options file")
 

@@ -103,7 +103,7 @@ class TileDatabase:
 
     @cached_property
     def identity(self) -> str:
-        """Hex sha256 over everything that decides a picture or an index (see docs/codebook.md)."""
+        """Hex sha256 over everything that decides a picture or an index (see docs/specifications/codebook-file.md)."""
         digest = hashlib.sha256(b"sonarpost tile database 1\n")
         digest.update(struct.pack(">HIH", self.tile_px, len(self), self.dims))
         digest.update(self.tiles.tobytes())

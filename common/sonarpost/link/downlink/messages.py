@@ -1,7 +1,7 @@
 """What commands, decisions, their confirmations and other traffic look like inside messages of the v1 link.
 
 A v1 message is bytes to the link; its first byte says what they are. Everything but free data fits the 27 bytes that a
-message has in a frame of 32. docs/wire-acoustic-v1.md, "Inside messages", gives the tables.
+message has in a frame of 32. docs/specifications/acoustic-v1.md, "Inside messages", gives the tables.
 
 An order (a command or a decision) has a token of 32 bits. The vehicle knows a repeated order by its token and content,
 and confirms every copy of it: the order or its confirmation may be lost, the outcome is the same.

@@ -1,4 +1,4 @@
-"""How the simulated water is set; docs/channel-model.md explains every parameter and names its source."""
+"""How the simulated water is set; docs/explanation/channel-model.md explains every parameter and names its source."""
 
 from __future__ import annotations
 

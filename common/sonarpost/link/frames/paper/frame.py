@@ -3,7 +3,7 @@
 After Fig. 6 and section III-D of the paper: a message starts with one character that says top or bottom half and
 four characters that identify the image. The paper's five bytes assume one half in one message; here an offset, the
 body's length and the stream header (six to eleven bytes more) let a half be spread over many frames, and let either
-half be placed when the other is lost. docs/wire-acoustic.md is the specification.
+half be placed when the other is lost. docs/specifications/acoustic-paper.md is the specification.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Objects of the v1 format: pieces of pictures and long messages.
 
 Every object carries its own check, so that no mixture of blocks and no damaged frame is taken for what was sent.
-docs/wire-acoustic-v1.md specifies the bytes.
+docs/specifications/acoustic-v1.md specifies the bytes.
 """
 
 from __future__ import annotations

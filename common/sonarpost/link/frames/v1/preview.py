@@ -1,7 +1,7 @@
 """Previews of the v1 format: a contact's record and the beginning of its picture.
 
 Every entry carries its own check, so that no mixture of blocks and no damaged frame is taken for a contact.
-docs/wire-acoustic-v1.md specifies the bytes.
+docs/specifications/acoustic-v1.md specifies the bytes.
 """
 
 from __future__ import annotations
