@@ -1,4 +1,4 @@
-"""Makes the pictures of the console's page in docs/explanation/console, with simulated contacts. Run by `make screenshots`.
+"""Write the screenshots of the console in docs/explanation/console, with simulated contacts (`make screenshots`).
 
 Needs Debian's Chromium (apt-get install chromium), or another one that SONARPOST_CHROMIUM names.
 """

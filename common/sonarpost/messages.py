@@ -1,8 +1,8 @@
-"""Everything that travels on Zenoh, as frozen records.
+"""The records that services exchange over Zenoh.
 
-A record is validated when it is made, so a record that exists is right. On the wire it is a plain msgpack map with
-two fields more, `type` and `v` (see `sonarpost.wire`); `docs/specifications/zenoh.md` describes the same for other languages.
-A value that is not known is None: nothing is ever guessed. Times are seconds since 1970-01-01 UTC.
+A record is validated when it is constructed. On the wire it is a plain msgpack map with two more fields, `type` and `v`
+(see `sonarpost.wire`). `docs/specifications/zenoh.md` specifies the same for other languages. A value that is not known
+is None. Times are seconds since 1970-01-01 UTC.
 """
 
 from __future__ import annotations
@@ -53,7 +53,16 @@ class Record(BaseModel):
 
 
 class Pixels(Record):
-    """A grey picture: rows along-track, columns across-track, row by row, little endian."""
+    """A grey image, row by row from the top, each row from its first column, without padding, 16 bits little endian.
+
+    The pixel in row r and column c (from 0) begins at byte (r * width_px + c) * bits / 8.
+
+    Attributes:
+        height_px: Rows, along-track.
+        width_px: Columns, across-track.
+        bits: Bits of a pixel, unsigned; 0 is black.
+        data: The pixels, height_px * width_px * bits / 8 bytes.
+    """
 
     TYPE: ClassVar[str] = "raster"
 
@@ -105,9 +114,35 @@ class Pixels(Record):
 
 
 class Contact(Record):
-    """What the detector knows of one object. `atd_confidence` is 0.0 to 2.0, as in the paper.
+    """An object on the seabed that the detector reports.
 
-    `height_m` is shadow x altitude / (slant range + shadow), on a flat bottom.
+    Attributes:
+        contact_id: Unique on the vehicle. On the vessel and at the shore site `{vehicle}/{image_id}`, because the
+            acoustic link does not carry the detector's identifier.
+        vehicle_id: Vehicle that recorded it.
+        sonar_id: Sonar, as the survey file names it. None if not known, as in all fields below.
+        line_name: Survey line.
+        ping_number: Ping at the middle of the object.
+        channel: Side of the sonar.
+        time_utc_s: Time of that ping.
+        lat_deg: Position of the object, north positive.
+        lon_deg: Position of the object, east positive.
+        position_sigma_m: Standard deviation of the position: root mean square distance of the true position from it.
+        depth_m: Depth of the vehicle below the surface.
+        altitude_m: Altitude of the vehicle above the seabed.
+        heading_deg: Heading of the vehicle, clockwise from true north.
+        speed_mps: Speed of the vehicle, forward positive.
+        slant_range_m: Distance from the sonar to the object.
+        ground_range_m: The same along a flat seabed.
+        atd_class: Class that the detector assigned.
+        atd_confidence: Confidence of the detector as in the paper, 2 is the highest.
+        length_m: Length along-track.
+        width_m: Width across-track.
+        shadow_m: Length of the shadow, up to the end of the recording.
+        height_m: Height above a flat seabed: shadow * altitude / (slant range + shadow). None if the recording ends
+            before the shadow does.
+        pixel_along_m: Size of a pixel of the image, along-track.
+        pixel_across_m: Size of a pixel of the image, across-track.
     """
 
     TYPE: ClassVar[str] = "contact"
@@ -139,11 +174,14 @@ class Contact(Record):
 
 
 class Snippet(Record):
-    """A contact and its picture (the paper's imgToCompress). The nadir is to the left where the sonar is known.
+    """A contact and its pixels, cut from a survey (the paper's imgToCompress).
 
     Attributes:
-        wide: More of the seabed around the contact: pixels of twice the size of those of `picture`, along and across.
-            It stays on the vehicle until the vessel asks for it; None where there is none.
+        contact: The contact.
+        picture: The pixels, nadir to the left if `channel` is known. The compressor accepts sides of 16 to 512 px.
+        source: Name of the file in which the contact was detected.
+        wide: More seabed around the same centre, in pixels of twice the size along and across, sides of 16 to 512 px.
+            It stays on the vehicle until a command of kind `wider` requests it. None if there is none.
     """
 
     TYPE: ClassVar[str] = "snippet"
@@ -155,7 +193,19 @@ class Snippet(Record):
 
 
 class EncodedImage(Record):
-    """A picture as a codec stream, ready for the acoustic link (imgToDecompress, UUV side)."""
+    """An image as a codec stream, ready for the acoustic link (the paper's imgToDecompress on the vehicle).
+
+    Attributes:
+        vehicle_id: Vehicle that encoded it.
+        image_id: Identifier of the image on the acoustic link; repeats after 1679616 images.
+        contact: The contact that the image shows.
+        codec: Name of the codec.
+        model: Identity of the codebook or model that the decoder needs; empty if it needs none.
+        height_px: Rows of the original.
+        width_px: Columns of the original.
+        stream: The codec's stream, header included.
+        original_sha256: Digest of the original's pixels (`data` of the snippet).
+    """
 
     TYPE: ClassVar[str] = "encoded_image"
 
@@ -171,7 +221,17 @@ class EncodedImage(Record):
 
 
 class LinkQuality(Record):
-    """What the receiving modem measured of one packet (from CACST)."""
+    """What the receiving modem measured of one packet (its CACST message). None: not reported.
+
+    Attributes:
+        snr_in_db: Signal-to-noise ratio at the equaliser's input.
+        snr_out_db: Signal-to-noise ratio at the equaliser's output.
+        spl_db: Sound pressure level re 1 µPa.
+        mse_db: Mean squared error of the equaliser.
+        doppler: Doppler, as the firmware reports it.
+        frames: Frames of the packet.
+        bad_frames: Frames that failed the modem's check.
+    """
 
     TYPE: ClassVar[str] = "link_quality"
 
@@ -185,7 +245,21 @@ class LinkQuality(Record):
 
 
 class AcousticFrame(Record):
-    """One frame that went into the water (`tx`) or came out of it (`rx`)."""
+    """One frame that a modem transmitted (`tx`) or received (`rx`).
+
+    Attributes:
+        direction: Transmitted or received.
+        platform_id: Platform of the modem.
+        time_utc_s: End of the packet by that platform's clock.
+        source: Address of the transmitting modem.
+        destination: Address that it was sent to; 127 is all modems.
+        rate: Micro-Modem rate number. None if the modem did not report it.
+        packet: Number of the packet on that platform.
+        frame_number: Number of the frame within its packet.
+        frame_count: Frames of the packet. None if the modem did not report it.
+        data: Content of the frame, padding included.
+        quality: Measurements of the packet. None if there are none.
+    """
 
     TYPE: ClassVar[str] = "acoustic_frame"
 
@@ -203,12 +277,32 @@ class AcousticFrame(Record):
 
 
 class ReconstructedImage(Record):
-    """A picture as the surface vessel rebuilt it (imgToDecompress, operator side, decoded).
+    """An image as the vessel decoded it (the paper's imgToDecompress on the operator's side).
+
+    Frames that arrive later lead to the same image again with a higher `version`.
 
     Attributes:
-        version: 1 for the first picture given out under this identifier; more when later frames added to it.
-        missing_mask: One bit a pixel, row by row, most significant first, 1 where nothing was received or what was
-            received cannot be right (those pixels are black); empty when nothing is missing.
+        vessel_id: Vessel that decoded it.
+        vehicle_id: Vehicle that sent it, identified by the address of its modem.
+        image_id: Identifier of the image on the acoustic link.
+        version: 1 for the first version of this image; counts up as more of it arrives.
+        contact: The contact as far as the acoustic link carries it. None if the contact frame has not arrived.
+        codec: Name of the codec; empty if only the contact frame arrived.
+        model: Identity of the codebook or model; empty if none was needed.
+        picture: The pixels; missing ones are black.
+        picture_sha256: Digest of the pixels (`data`): equal for the same image on every platform.
+        complete: The whole stream arrived.
+        missing_fraction: Fraction of the pixels that is missing.
+        missing_mask: One bit a pixel, row by row without padding, most significant bit first: pixel n is bit 7 - n mod
+            8 of byte n // 8. 1 where nothing was received or what was received cannot be right; empty if nothing is
+            missing.
+        missing_halves: Halves (in the sense of the paper) that did not arrive.
+        bytes_received: Bytes of the stream that arrived.
+        bytes_total: Length of the stream; 0 if not known.
+        frames_received: Acoustic frames used.
+        first_frame_utc_s: Arrival of the first frame, by the vessel's clock.
+        last_frame_utc_s: Arrival of the last frame.
+        notes: Remarks for the operator about this image.
     """
 
     TYPE: ClassVar[str] = "reconstructed_image"
@@ -261,14 +355,18 @@ class ReconstructedImage(Record):
 
 
 class OutgoingMessage(Record):
-    """Anything else a vehicle's program wants sent by sound: vehicle status, a position.
+    """Other data that a program of the vehicle sends over the acoustic link, for example vehicle status.
+
+    uuv_modem sends it with the `v1` wire format only.
 
     Attributes:
-        message_id: The same one given again is the same message and is sent once.
-        source: The program; programs of one priority share the water evenly.
-        priority: 1 first to 7 last. Up to 5 goes before pictures, below that into what frames leave free.
-        lifetime_s: For how long after `created_utc_s` it is worth sending.
-        data: Goes through the water as it is.
+        message_id: Identifier given by the source. A message whose identifier was used before is not sent again.
+        source: Program that sends it. Programs of one priority share the channel evenly.
+        priority: 1 is first, 7 last. 1 to 5 go before images; 6 and 7 fill free space in frames until they have waited
+            long.
+        lifetime_s: Time after `created_utc_s` after which the message is dropped.
+        created_utc_s: When it was created.
+        data: Content; transmitted unchanged.
     """
 
     TYPE: ClassVar[str] = "outgoing_message"
@@ -282,12 +380,14 @@ class OutgoingMessage(Record):
 
 
 class QueuedImage(Record):
-    """One picture in the acoustic queue.
+    """One image in the acoustic transmit queue.
 
     Attributes:
-        bytes_left: Of frames still to be sent for it, redundancy included, by the plan so far.
-        preview_utc_s: When its record and coarse picture are expected to have gone; None where they have.
-        expected_utc_s: When all of it that is planned is expected to have gone.
+        image_id: Identifier of the image on the acoustic link.
+        contact_id: Identifier of its contact.
+        bytes_left: Bytes of frames still to be sent, redundancy included, by the present plan.
+        preview_utc_s: When its contact record and preview are expected to be sent. None if they are.
+        expected_utc_s: When all that is planned is expected to be sent.
     """
 
     TYPE: ClassVar[str] = "queued_image"
@@ -300,13 +400,18 @@ class QueuedImage(Record):
 
 
 class QueueState(Record):
-    """What waits in a vehicle's acoustic queue, and when it is expected to have gone.
+    """The transmit queue of a vehicle, published at intervals.
 
     Attributes:
+        platform_id: The vehicle.
+        time_utc_s: Time of this state.
         rate: Micro-Modem rate in use.
-        frame_loss: Share of frames lost, as the receiver's reports tell; None while it is not known.
-        packet_interval_s: Time from one packet to the next, with what medium access costs.
-        images: Those that have not gone, the first to be finished first; at most 500.
+        frame_loss: Fraction of frames lost, from the receiver's feedback. None if not known.
+        packet_interval_s: Time from one packet to the next, medium access included.
+        messages_waiting: Messages not yet sent.
+        message_bytes: Bytes of these messages.
+        images_waiting: Images not yet sent.
+        images: These images, the first to be finished first; at most 500.
     """
 
     TYPE: ClassVar[str] = "queue_state"
@@ -323,10 +428,13 @@ class QueueState(Record):
 
 
 class ReceivedMessage(Record):
-    """A message of a vehicle, as it came out of the water.
+    """A message of a vehicle's program as received on the vessel.
 
     Attributes:
-        data: As its source on the vehicle gave it.
+        vessel_id: Vessel that received it.
+        vehicle_id: Vehicle that sent it, identified by the address of its modem.
+        received_utc_s: When it was received.
+        data: Content, as its source on the vehicle gave it.
     """
 
     TYPE: ClassVar[str] = "received_message"
@@ -338,14 +446,21 @@ class ReceivedMessage(Record):
 
 
 class DownlinkState(Record):
-    """How far a command or decision has come on its way to a vehicle.
+    """Progress of a command or decision on its way to a vehicle.
+
+    Published at every change, and after a restart of op_modem for those that are still open.
 
     Attributes:
+        vessel_id: Vessel that sends it.
+        vehicle_id: Vehicle that it is for.
+        kind: Kind of the command, or `decision`.
         record_id: Its `command_id` or `decision_id`.
-        state: asked: on the vessel's disk. sent: in the water, perhaps heard. confirmed: on the vehicle's disk.
-            refused: the vehicle cannot do it. expired: nobody has confirmed it in time.
-        times_sent: How often it has gone into the water.
-        reason: With `refused`: the vehicle's.
+        state: asked: stored on the vessel. sent: transmitted at least once. confirmed: stored on the vehicle. refused:
+            the vehicle cannot do it. expired: not confirmed in time.
+        times_sent: Number of transmissions.
+        expires_utc_s: Time after which it is not repeated.
+        changed_utc_s: Time of this change.
+        reason: With `refused`: the vehicle's reason.
     """
 
     TYPE: ClassVar[str] = "downlink_state"
@@ -362,7 +477,21 @@ class DownlinkState(Record):
 
 
 class Decision(Record):
-    """What an operator decided about one picture."""
+    """An operator's verdict on one image.
+
+    Attributes:
+        decision_id: Unique; a repeated decision is recognised by it.
+        vessel_id: Vessel of the operator; must be the vessel of the key.
+        vehicle_id: Vehicle of the image.
+        image_id: Identifier of the image.
+        image_version: Version that the operator saw.
+        verdict: The verdict.
+        confidence: The operator's confidence. None if not given.
+        mlo_class: Class of mine-like object. None if not classified.
+        remark: Free text.
+        operator: Name of the operator.
+        decided_utc_s: Time of the decision.
+    """
 
     TYPE: ClassVar[str] = "decision"
 
@@ -380,7 +509,19 @@ class Decision(Record):
 
 
 class Command(Record):
-    """What the vessel asks of a vehicle, carried by sound."""
+    """A request of the vessel, or of the shore site through it, to a vehicle.
+
+    Attributes:
+        command_id: Unique; a repeated command is recognised by it.
+        kind: refine: more detail. resend: the same again. wider: more seabed around the contact, as an image of its
+            own. revisit: survey a position again.
+        vehicle_id: Vehicle that receives it.
+        image_id: Image to refine, resend or show more around. None only for revisit.
+        lat_deg: Position to revisit. None for the other kinds.
+        lon_deg: Position to revisit. None for the other kinds.
+        issued_by: Name of the person.
+        issued_utc_s: Time of the command.
+    """
 
     TYPE: ClassVar[str] = "command"
 
@@ -410,7 +551,21 @@ class Command(Record):
 
 
 class Advice(Record):
-    """What an expert ashore thinks of one picture, for the operator on the vessel."""
+    """An expert's comment from the shore site on one image, for the operator on the vessel.
+
+    Attributes:
+        advice_id: Unique; repeated advice is recognised by it.
+        vessel_id: Vessel of the operator; must be the vessel of the key.
+        vehicle_id: Vehicle of the image.
+        image_id: Identifier of the image.
+        image_version: Version that the expert saw.
+        verdict: The verdict. None if none is given.
+        confidence: The expert's confidence. None if not given.
+        mlo_class: Class of mine-like object. None if not classified.
+        remark: Free text.
+        author: Name of the expert.
+        advised_utc_s: Time of the advice.
+    """
 
     TYPE: ClassVar[str] = "advice"
 
@@ -428,7 +583,16 @@ class Advice(Record):
 
 
 class TaskingState(Record):
-    """How far advice or a command from the shore has come; `delivered`: it is on the vessel's disk."""
+    """Progress of advice or a command from the shore site to a vessel. c2 publishes it at every change.
+
+    Attributes:
+        vessel_id: Vessel that it is for.
+        kind: Which record.
+        record_id: Its `advice_id` or `command_id`.
+        state: waiting: stored by c2. delivered: stored by the vessel's relay. refused: the relay does not accept it.
+        reason: With `refused`: the relay's reason.
+        changed_utc_s: Time of this change.
+    """
 
     TYPE: ClassVar[str] = "tasking_state"
 
@@ -441,7 +605,14 @@ class TaskingState(Record):
 
 
 class Relayed(Record):
-    """Envelope of what the vessel sends ashore: another record's key and payload, unchanged."""
+    """Envelope of a record that a vessel sends to a shore site.
+
+    Attributes:
+        vessel_id: Must be the vessel of the inner key and record.
+        key: Key of the inner record: this vessel's `image/reconstructed` or `contact/decision`.
+        payload: The inner record, unchanged, with its `type` and `v`.
+        relayed_utc_s: When the relay accepted it.
+    """
 
     TYPE: ClassVar[str] = "relayed"
 
@@ -452,7 +623,19 @@ class Relayed(Record):
 
 
 class Health(Record):
-    """A service's state, published at intervals."""
+    """A service's state, published every `health_interval_s` (5 s by default) and when the service stops.
+
+    Attributes:
+        platform_id: Platform of the service.
+        service: Name of the service.
+        time_utc_s: Time of this record.
+        started_utc_s: Start of the process.
+        state: degraded: the service runs, but something prevents part of its work.
+        detail: What is wrong; empty if nothing is.
+        counters: Events since the start, `records_handled` and `records_refused` among them.
+        gauges: Present values. `inbox`, `outbox` and `refused` are numbers of records in the service's store,
+            `disk_free_bytes` is the free space on its disk (absent if it cannot be read).
+    """
 
     TYPE: ClassVar[str] = "health"
 

@@ -1,4 +1,4 @@
-"""Revoking, as docs/explanation/security.md tells it: new list, router restarted, the old certificate is worth nothing."""
+"""A revoked certificate is refused once the router has restarted with the new list (docs/explanation/security.md)."""
 
 from __future__ import annotations
 

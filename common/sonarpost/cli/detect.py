@@ -55,7 +55,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--max-contacts", type=int, metavar="N", help="list no more than the N most confident of a file"
     )
-    parser.add_argument("--options", type=Path, metavar="FILE.toml", help="what the files do not say (docs/explanation/surveys.md)")
+    parser.add_argument(
+        "--options", type=Path, metavar="FILE.toml", help="what the files do not say (docs/explanation/surveys.md)"
+    )
     parser.add_argument("--vehicle", default="uuv", metavar="ID", help="vehicle_id of the records (default: uuv)")
     parser.set_defaults(run=run)
 

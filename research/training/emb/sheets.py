@@ -1,7 +1,8 @@
 """Draw the contact sheets of docs/explanation/codecs.md: originals above, decoded below.
 
     python -m research.training.emb.sheets --data ../shared/data --out docs/explanation/codecs 22 64 192
-    python -m research.training.emb.sheets --data ../shared/data --out docs/explanation/codecs --codecs emb emb-structure -- 64 128
+    python -m research.training.emb.sheets --data ../shared/data --out docs/explanation/codecs \
+        --codecs emb emb-structure -- 64 128
 
 Only pictures that anybody may show: the public-domain Humminbird recording (its last fifth) and the simulator.
 """

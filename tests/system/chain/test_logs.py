@@ -1,4 +1,4 @@
-"""One contact followed through the logs of the whole chain, in both formats, as docs/explanation/operations.md shows."""
+"""One contact followed through the logs of all services, as in docs/explanation/operations.md."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """What the decoder knows about sonar pictures that the bytes do not say: a small convolutional network.
 
 It estimates, from the decoded picture, the mean of the pictures that would have given these bytes, with a little more
-contrast than the mean has (see docs/explanation/codecs.md). It works at half resolution on blocks of 2 x 2 pixels, in integers, and
-changes no pixel by more than `LIMIT_GREY`.
+contrast than the mean has (see docs/explanation/codecs.md). It works at half resolution on blocks of 2 x 2 pixels, in
+integers, and changes no pixel by more than `LIMIT_GREY`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The coding loop: contexts, network, range coder; the same code writes, reads and lists training examples.
 
-Everything here is integer arithmetic on int32 and int64. See docs/explanation/codecs.md for the format in words. It is one long
-module because machine code that is kept on disk is compiled anew only when its own module changes (see `_jit`).
+Everything here is integer arithmetic on int32 and int64. See docs/explanation/codecs.md for the format in words. It is
+one long module because machine code that is kept on disk is compiled anew only when its own module changes (see
+`_jit`).
 """
 
 from __future__ import annotations

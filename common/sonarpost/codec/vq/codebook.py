@@ -1,4 +1,4 @@
-"""One file that holds a tile database (docs/specifications/codebook-file.md has the layout), and the codebooks shipped with the package.
+"""Codebook files and the shipped codebooks; docs/specifications/codebook-file.md specifies the file.
 
 Everything in the file is stored plainly, not compressed, so the same database and notes are the same bytes on every
 machine and with every version of every library.

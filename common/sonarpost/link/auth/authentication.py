@@ -1,8 +1,8 @@
 """Seals of acoustic frames: a short tag, a counter against replays, and encryption where it is wanted.
 
 AES-256-CCM (NIST SP 800-38C, RFC 3610). A sealed frame ends with the low bytes of its counter and the tag; the whole
-counter is the nonce, so that it is authenticated without being sent. docs/specifications/acoustic-v1.md specifies it and argues
-how safe it is. Pure: what must outlive a restart is handed out and taken back.
+counter is the nonce, so that it is authenticated without being sent. docs/specifications/acoustic-v1.md specifies it
+and argues how safe it is. Pure: what must outlive a restart is handed out and taken back.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 The record is small enough that, with a frame type, an image identifier and a checksum around it, it fills exactly
 the 32 bytes of a rate-0 frame. Every value that may be unknown has a code that says so; a value the field cannot
-hold is sent as unknown, never as the nearest one it can. docs/specifications/acoustic-paper.md gives the table bit by bit.
+hold is sent as unknown, never as the nearest one it can. docs/specifications/acoustic-paper.md gives the table bit by
+bit.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Range, travel time, signal-to-noise ratio and frame error rate in the simulated water.
 
 The sonar equation, with straight rays at one sound speed: SNR = SL - TL - NL - 10 log10(bandwidth), TL spreading and
-absorption. Multipath, Doppler and shadow zones are not modelled; docs/explanation/channel-model.md says what stands for them.
+absorption. Multipath, Doppler and shadow zones are not modelled; docs/explanation/channel-model.md says what stands for
+them.
 """
 
 from __future__ import annotations

@@ -17,7 +17,8 @@ Value = float | int | bool | str
 PRESETS: Mapping[str, Mapping[str, Value]] = MappingProxyType(
     {
         "still": MappingProxyType({}),
-        # The paper's trial in Bedford Basin: most packets below 130 m, most lost beyond. See docs/explanation/channel-model.md.
+        # The paper's trial in Bedford Basin: most packets below 130 m, most lost beyond. See
+        # docs/explanation/channel-model.md.
         "sea-trial": MappingProxyType(
             {
                 "range_loss": True,

@@ -1,7 +1,8 @@
 """The receiver of the `paper` wire format: pairs halves, gives out images, remembers the recent ones.
 
 Pure: bytes and `now` in, events out. `now` is in seconds on a clock that goes on over a restart (UTC), because the
-state can be saved and taken up by another process. docs/specifications/acoustic-paper.md gives the rules and their reasons.
+state can be saved and taken up by another process. docs/specifications/acoustic-paper.md gives the rules and their
+reasons.
 """
 
 from __future__ import annotations

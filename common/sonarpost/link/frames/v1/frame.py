@@ -1,7 +1,7 @@
 """Frames of the acoustic wire format v1: five bytes of header, then a symbol of a block or a list of segments.
 
-docs/specifications/acoustic-v1.md specifies this byte by byte. A frame stands by itself: the checksum covers it alone, the
-vehicle is known from the modem's source address, and padding that drivers add is recognised.
+docs/specifications/acoustic-v1.md specifies this byte by byte. A frame stands by itself: the checksum covers it alone,
+the vehicle is known from the modem's source address, and padding that drivers add is recognised.
 """
 
 from __future__ import annotations
