@@ -48,7 +48,7 @@ EXPECTED = {
     "sonarpost/v1/uuv-1/health/atd_stub": keys.health("uuv-1", "atd_stub"),
     "sonarpost/v1/uuv-1/health/*": keys.health_all("uuv-1"),
     "sonarpost/v1/uuv-1/alive/atd_stub": keys.alive("uuv-1", "atd_stub"),
-    "sonarpost/v1/shore/inbox/*/handoff/c2": keys.handoff(keys.shore_inbox_all(), "c2"),
+    "sonarpost/v1/shore/inbox/*/handoff/c2": keys.delivery_query(keys.shore_inbox_all(), "c2"),
 }
 
 OF_ONE_NAME: list[Callable[[str], str]] = [
@@ -90,7 +90,7 @@ OF_ONE_NAME: list[Callable[[str], str]] = [
     lambda name: keys.health("vessel-1", name),
     lambda name: keys.alive(name, "relay"),
     lambda name: keys.alive("vessel-1", name),
-    lambda name: keys.handoff("a/b", name),
+    lambda name: keys.delivery_query("a/b", name),
 ]
 
 
@@ -110,7 +110,7 @@ def test_no_two_kinds_of_records_meet_on_one_key() -> None:
     for key in written:
         assert [other for other in written if zenoh.KeyExpr(key).intersects(other)] == [key]
     assert zenoh.KeyExpr(keys.shore_inbox_all()).includes(keys.shore_inbox("vessel-1"))
-    assert not zenoh.KeyExpr(keys.shore_inbox_all()).intersects(keys.handoff(keys.shore_inbox("vessel-1"), "c2"))
+    assert not zenoh.KeyExpr(keys.shore_inbox_all()).intersects(keys.delivery_query(keys.shore_inbox("vessel-1"), "c2"))
 
 
 @pytest.mark.parametrize("make", OF_ONE_NAME)

@@ -16,9 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost import wire
-from sonarpost.delivery.batch_protocol import pack_replies, parse_query, unpack_replies
-from sonarpost.delivery.protocol import AckReply, attachment, parse_chunk
-from sonarpost.delivery.transaction import OutboxItem
+from sonarpost.delivery.protocol import AckReply, attachment, pack_replies, parse_query, unpack_replies
+from sonarpost.delivery.records import OutboxItem, ReceivedChunk
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Contact, Health, Pixels, Record
 
@@ -78,12 +77,13 @@ def test_old_handoff_messages_parse_for_ever_and_are_made_alike_today() -> None:
         payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
         reply = AckReply.unpack(payload, KEY)
         assert (reply.status, reply.next_offset, reply.reason) == (fields["status"], fields["next"], fields["reason"])
-        assert reply.takes == fields.get("takes", 0)
-        assert made["handoff-reply"][name] == payload == reply.pack(reply.takes)
+        assert reply.max_batch == fields.get("takes", 0)
+        assert made["handoff-reply"][name] == payload == reply.pack(reply.max_batch)
     for name, vector in vectors("handoff-attachment").items():
         payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
         size = min(32768, fields["size"] - fields["offset"])
-        chunk = parse_chunk(payload, bytes(size), KEY)
+        chunk = parse_query(payload, bytes(size), KEY)
+        assert isinstance(chunk, ReceivedChunk)
         assert plain({"origin": chunk.origin, "sha256": chunk.sha256}) == {
             "origin": fields["origin"],
             "sha256": fields["sha256"],
@@ -91,8 +91,8 @@ def test_old_handoff_messages_parse_for_ever_and_are_made_alike_today() -> None:
         assert (chunk.seq, chunk.size, chunk.offset) == (fields["seq"], fields["size"], fields["offset"])
         assert made["handoff-attachment"][name] == payload
         item = OutboxItem(fields["consumer"], chunk.seq, "k", "", 4, bytes(chunk.size), chunk.sha256)
-        assert chunk.settled == fields.get("settled", 0)
-        assert attachment(chunk.origin, item, chunk.offset, chunk.settled) == payload
+        assert chunk.done_up_to == fields.get("settled", 0)
+        assert attachment(chunk.origin, item, chunk.offset, chunk.done_up_to) == payload
 
 
 def test_old_queries_of_several_records_parse_for_ever_and_are_made_alike_today() -> None:
@@ -105,7 +105,7 @@ def test_old_queries_of_several_records_parse_for_ever_and_are_made_alike_today(
         assert isinstance(chunks, tuple)
         assert [[c.seq, c.size, {"$hex": c.sha256.hex()}] for c in chunks] == fields["records"]
         assert [c.data for c in chunks] == [bytes([number]) * size for number, size in enumerate(sizes)]
-        assert {c.settled for c in chunks} == {fields.get("settled", 0)}
+        assert {c.done_up_to for c in chunks} == {fields.get("settled", 0)}
         assert {c.origin.hex() for c in chunks} == {fields["origin"]["$hex"]}
         assert made["handoff-batch-attachment"][name] == payload
     for name, vector in vectors("handoff-batch-reply").items():

@@ -21,12 +21,10 @@ from builders.record_samples import RECORD_TYPES, SAMPLES
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.delivery import batch_protocol as handoff_batch
-from sonarpost.delivery import outbox, transaction
-from sonarpost.delivery import protocol as handoff
+from sonarpost.delivery import outbox, protocol, transaction
 from sonarpost.delivery import scheduler as schedule
 from sonarpost.delivery.protocol import AckReply, attachment
-from sonarpost.delivery.transaction import OutboxItem
+from sonarpost.delivery.records import OutboxItem
 from sonarpost.messages import Contact, Decision, Record, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.c2.service import ADVICE_PRIORITY, COMMAND_PRIORITY
@@ -159,24 +157,24 @@ def test_every_key_is_in_the_table() -> None:
             assert key in documented, name
             found.add(key)
     assert {key for key in documented if key.startswith("sonarpost/")} == found
-    assert keys.handoff("{key}", "c").replace("/c", "/{consumer}") in TEXT
+    assert keys.delivery_query("{key}", "c").replace("/c", "/{consumer}") in TEXT
 
 
 def test_numbers_in_the_text_are_those_of_the_code() -> None:
-    assert handoff.CHUNK_BYTES == 32768
+    assert protocol.CHUNK_BYTES == 32768
     assert TEXT.count("32768") > 4
-    assert f"A record is at most {handoff.MAX_RECORD_BYTES} bytes" in TEXT
+    assert f"A record is at most {protocol.MAX_RECORD_BYTES} bytes" in TEXT
     assert f"payloads up to {wire.MAX_PAYLOAD_BYTES}" in TEXT
-    assert table("The attachment")["size"]["range"] == f"0 to {handoff.MAX_RECORD_BYTES}"
+    assert table("The attachment")["size"]["range"] == f"0 to {protocol.MAX_RECORD_BYTES}"
     assert f"{outbox.REPLY_TIMEOUT_S:g} s in sonarpost" in TEXT
-    assert f"at most {handoff_batch.MAX_RECORDS}, and at most {handoff.CHUNK_BYTES} bytes together" in TEXT
-    assert f"sonarpost has {outbox.WINDOW} queries and {schedule.WINDOW_BYTES} bytes in flight" in TEXT
-    assert f"the first {outbox.PROBE_WINDOW} and no" in TEXT
+    assert f"at most {protocol.MAX_BATCH_RECORDS}, and at most {protocol.CHUNK_BYTES} bytes together" in TEXT
+    assert f"sonarpost has {schedule.WINDOW} queries and {schedule.WINDOW_BYTES} bytes in flight" in TEXT
+    assert f"the first {schedule.PROBE_WINDOW} and no" in TEXT
     assert f"up to {schedule.MAX_WINDOW_BYTES} bytes while answers come within {schedule.GROW_BELOW_S:g} s" in TEXT
     assert "half a second of it" in TEXT
-    assert schedule.PIECE_S == 0.5
+    assert schedule.CHUNK_S == 0.5
     assert f"Priorities 1 and\n   {schedule.URGENT_PRIORITY} wait" in TEXT
-    assert f"those of the {transaction.PARTIALS_KEPT} records touched last" in TEXT
+    assert f"those of the {transaction.MAX_PARTIAL_RECORDS} records touched last" in TEXT
     assert f"(sonarpost: {outbox.BACK_OFF_S[0]} s, rising to {outbox.BACK_OFF_S[-1]:g} s)" in TEXT
     told = f"{DECISION_PRIORITY} decisions, {PREVIEW_PRIORITY} first versions of a picture, {DETAIL_PRIORITY} later"
     assert told in TEXT
@@ -191,11 +189,11 @@ def test_numbers_in_the_text_are_those_of_the_code() -> None:
 
 def test_attachment_and_reply_have_the_documented_fields() -> None:
     item = OutboxItem("relay", 6, "k", "", 4, b"", bytes(32))
-    assert list(msgpack.unpackb(attachment(bytes(16), item, settled=5))) == list(table("The attachment"))
-    assert list(msgpack.unpackb(AckReply("stored").pack(takes=2))) == list(table("The reply"))
-    several = handoff_batch.attachment(bytes(16), [item], settled=5)
+    assert list(msgpack.unpackb(attachment(bytes(16), item, done_up_to=5))) == list(table("The attachment"))
+    assert list(msgpack.unpackb(AckReply("stored").pack(max_batch=2))) == list(table("The reply"))
+    several = protocol.batch_attachment(bytes(16), [item], done_up_to=5)
     assert list(msgpack.unpackb(several)) == list(table("Several records in one query"))
-    replies = handoff_batch.pack_replies([AckReply("stored")])
+    replies = protocol.pack_replies([AckReply("stored")])
     assert list(msgpack.unpackb(replies)) == list(table("Several records in one query", 1))
 
 
@@ -227,8 +225,8 @@ def test_the_hex_examples_are_the_bytes() -> None:
         "raster": wire.encode(SAMPLES["raster-16-bits"]),
         "decision": decision,
         "attachment": attachment(bytes(range(16)), item),
-        "reply": AckReply("stored").pack(handoff_batch.MAX_RECORDS),
-        "more": AckReply("more", 32768).pack(handoff_batch.MAX_RECORDS),
+        "reply": AckReply("stored").pack(protocol.MAX_BATCH_RECORDS),
+        "more": AckReply("more", 32768).pack(protocol.MAX_BATCH_RECORDS),
     }
     assert f"A decision, {len(decision)} bytes:" in TEXT
     assert f"with those {len(decision)} bytes" in TEXT
@@ -411,7 +409,7 @@ def test_a_watcher_sees_the_first_window_while_the_consumer_is_away_and_the_rest
     producer.start()
     taker = DecisionTaker(platform("vessel-1"))
     try:
-        eventually(lambda: len(seen) == outbox.PROBE_WINDOW)
+        eventually(lambda: len(seen) == schedule.PROBE_WINDOW)
         taker.start()
         eventually(lambda: len(seen) == 20)
         eventually(lambda: producer.store.outbox_depth() == 0)

@@ -1,25 +1,24 @@
-"""The one tree of errors that sonarpost raises.
+"""Exceptions of sonarpost.
 
-Whatever comes from outside (a file, a serial line, an acoustic frame, a Zenoh payload, a configuration) either
-parses or raises one of the errors below. The message always names where (file or key), which field, the value that
-was met and what was expected, so that a person can act on the log line alone.
+External input (a file, a serial line, an acoustic frame, a Zenoh payload, a configuration) either parses or raises one
+of these errors. The message has the form `where: field: got X, expected Y`: the log line alone shows what to correct.
 """
 
 from __future__ import annotations
 
 
 class SonarpostError(Exception):
-    """Base of every error that sonarpost raises on purpose."""
+    """Base class of all exceptions of sonarpost."""
 
 
 class BadInputError(SonarpostError):
-    """Something from outside does not parse.
+    """External input is invalid.
 
     Args:
-        where: The file, key expression, port or frame the input came from.
-        field: The part of it that is wrong, or an empty string when the whole is.
-        value: What was met there (shortened when long).
-        expected: What would have been accepted.
+        where: Source of the input: a file, key expression, port or frame.
+        field: Invalid part of it; empty if the input as a whole is invalid.
+        value: Value found there; the message shortens a long one.
+        expected: Description of a valid value.
     """
 
     def __init__(self, where: str, field: str, value: object, expected: str) -> None:
@@ -32,7 +31,7 @@ class BadInputError(SonarpostError):
     def __str__(self) -> str:
         shown = repr(self.value)
         if len(shown) > 80:
-            shown = f"{shown[:40]}...{shown[-37:]}"  # of a path, the end tells more than the beginning
+            shown = f"{shown[:40]}...{shown[-37:]}"  # the end of a path identifies it better than the start
         field = f"{self.field}: " if self.field else ""
         return f"{self.where}: {field}got {shown}, expected {self.expected}"
 
@@ -42,7 +41,7 @@ class SurveyFileError(BadInputError):
 
 
 class PayloadError(BadInputError):
-    """A Zenoh payload is not the record its key promises."""
+    """A Zenoh payload is not a valid record of its key."""
 
 
 class StreamError(BadInputError):
@@ -50,7 +49,7 @@ class StreamError(BadInputError):
 
 
 class FrameError(BadInputError):
-    """An acoustic frame is not of the wire format in use."""
+    """An acoustic frame does not match the wire format in use."""
 
 
 class SentenceError(BadInputError):
@@ -58,20 +57,24 @@ class SentenceError(BadInputError):
 
 
 class ConfigError(BadInputError):
-    """A configuration file or an environment override is wrong."""
+    """A configuration file or an environment override is invalid."""
 
 
 class CodebookError(BadInputError):
-    """A tile codebook cannot be read, or is not the one the other end used."""
+    """A tile codebook cannot be read, or differs from the one that the encoder used."""
 
 
 class StoredFileError(BadInputError):
-    """A record that c2 keeps as a file cannot be read back, or is not what its place promises."""
+    """A record file of c2 cannot be read, or does not match its name."""
 
 
 class PortError(SonarpostError):
-    """A serial port or socket cannot be opened, or went away."""
+    """A serial port or socket cannot be opened, or was lost."""
 
 
 class DeliveryError(SonarpostError):
-    """The durable store refused a record (full disk, damaged database)."""
+    """A record cannot be stored or delivered, for example because of a full disk or a damaged database."""
+
+
+class RetryLaterError(DeliveryError):
+    """A record cannot be accepted at present; its sender keeps it and retries, other records are not affected."""

@@ -211,12 +211,12 @@ def service_of(key: str) -> tuple[str, str]:
     return _name("platform", parts[0]), _name("service", parts[2])
 
 
-def handoff(key: str, consumer: str) -> str:
+def delivery_query(key: str, consumer: str) -> str:
     """Where the named consumer answers hand-over queries for the records of `key`."""
     return f"{key}/handoff/{_name('consumer', consumer)}"
 
 
-def handoff_any(key: str) -> str:
+def delivery_query_any(key: str) -> str:
     """Where any consumer answers hand-over queries for the records of `key`."""
     return f"{key}/handoff/*"
 

@@ -12,7 +12,7 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.unit_of_work import UnitOfWork
+from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.errors import DeliveryError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Health, QueueState, Snippet

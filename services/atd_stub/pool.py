@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 from sonarpost import wire
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.unit_of_work import UnitOfWork
+from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.messages import Snippet
 
 _PREFIX = "pool:"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from sonarpost import wire
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.unit_of_work import UnitOfWork
+from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.logs import kv
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub.seam import Seam, pack, unpack

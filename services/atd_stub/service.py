@@ -11,7 +11,8 @@ from pathlib import Path
 import msgpack
 
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.transaction import OutboxItem, Transaction
+from sonarpost.delivery.records import OutboxItem
+from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import DeliveryError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.logs import kv

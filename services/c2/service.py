@@ -14,7 +14,8 @@ from sonarpost import keys, wire
 from sonarpost.archive.shore_files import decision_file_name
 from sonarpost.bus import presence as hello
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction, queue_of
+from sonarpost.delivery.records import InboxItem, OutboxItem, queue_of
+from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import DeliveryError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
@@ -178,7 +179,7 @@ class C2Service(Service[C2Config]):
 
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Remember, with the acknowledgement itself, that a vessel has taken or refused a record."""
-        vessel = item.consumer.partition("@")[2]
+        vessel = item.queue.partition("@")[2]
         was = tasking.of_payload(vessel, item.key, item.payload)
         now = replace(
             was, state="delivered" if reason is None else "refused", reason=reason or "", changed_utc_s=time.time()
@@ -260,7 +261,7 @@ class C2Service(Service[C2Config]):
 
     def gauges(self) -> Mapping[str, float]:
         """Return how much is kept, and how much waits for vessels."""
-        waiting = [q for q in self.store.consumers() if q.startswith(CONSUMER)]
+        waiting = [q for q in self.store.queues() if q.startswith(CONSUMER)]
         return {
             "pictures_bytes": float(self._archive.pictures_bytes()),
             "waiting_for_vessels": float(sum(self.store.queue_depth(queue).records for queue in waiting)),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import msgpack
 
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.unit_of_work import UnitOfWork
+from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.errors import PayloadError
 
 _INDEX = "kept"

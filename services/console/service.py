@@ -13,7 +13,8 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.transaction import OutboxItem, Transaction
+from sonarpost.delivery.records import OutboxItem
+from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import (
@@ -164,7 +165,7 @@ class ConsoleService(Service[ConsoleConfig]):
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Remember that a consumer has taken a record or refused it; the board is told outside of this transaction."""
         table, record_id = _what(item)
-        tx.put_state(f"{_SETTLED}{table}/{item.consumer}/{record_id}", b"" if reason is None else reason.encode())
+        tx.put_state(f"{_SETTLED}{table}/{item.queue}/{record_id}", b"" if reason is None else reason.encode())
         self._wake.set()
 
     def _apply_settled(self) -> None:

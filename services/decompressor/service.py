@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from sonarpost import keys, wire
 from sonarpost.archive.image_files import write_image
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.transaction import InboxItem
+from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction

@@ -12,7 +12,7 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.transaction import InboxItem
+from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import DeliveryError, FrameError, PayloadError
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction

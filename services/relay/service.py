@@ -13,9 +13,9 @@ from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.bus.site_monitor import SiteConnectivity, SiteMonitor
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.disk_reserve import DiskReserve
-from sonarpost.delivery.queue_policy import QueuePolicy
-from sonarpost.delivery.transaction import InboxItem, Topic
+from sonarpost.delivery.outbox import QueuePolicy
+from sonarpost.delivery.records import InboxItem, Topic
+from sonarpost.delivery.store import DiskReserve
 from sonarpost.errors import PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
@@ -175,7 +175,7 @@ class RelayService(Service[RelayConfig]):
             upstream.stop()
 
     def _removed_queues(self) -> list[str]:
-        return [q for q in self.store.consumers() if is_upstream_queue(q) and q not in self._upstreams]
+        return [q for q in self.store.queues() if is_upstream_queue(q) and q not in self._upstreams]
 
     def degraded_reason(self) -> str:
         """Say that pictures wait with their senders for want of space, or that a site does not let this vessel in."""

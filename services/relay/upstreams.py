@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 import zenoh
 
 from sonarpost import keys
-from sonarpost.delivery.queue_policy import QueuePolicy
-from sonarpost.delivery.transaction import consumer_of, queue_of
+from sonarpost.delivery.outbox import QueuePolicy
+from sonarpost.delivery.records import consumer_of, queue_of
 from sonarpost.logs import kv
 from sonarpost.services.relay.config import UpstreamOptions
 

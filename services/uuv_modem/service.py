@@ -12,8 +12,8 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.inbox import RetryLaterError
-from sonarpost.delivery.transaction import InboxItem
+from sonarpost.delivery.records import InboxItem
+from sonarpost.errors import RetryLaterError
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.sender import Packet, plan_packets
 from sonarpost.logs import kv

@@ -15,9 +15,9 @@ import msgpack
 from builders.common import GOLDEN_FOLDER
 from builders.record_samples import SAMPLES
 from sonarpost import wire
-from sonarpost.delivery import batch_protocol as handoff_batch
+from sonarpost.delivery import protocol
 from sonarpost.delivery.protocol import AckReply, attachment
-from sonarpost.delivery.store import OutboxItem
+from sonarpost.delivery.records import OutboxItem
 
 BATCH = ((7, 1), (9, 0), (2**40, 300))
 FOLDER = GOLDEN_FOLDER / "zenoh"
@@ -49,7 +49,7 @@ def handoff_samples() -> dict[str, dict[str, bytes]]:
             "more": AckReply("more", next_offset=65536).pack(),
             "refused": AckReply("refused", reason="k: v: got 2, expected 1").pack(),
             "later": AckReply("later", reason="disk is full").pack(),
-            "stored-takes-several": AckReply("stored").pack(takes=128),
+            "stored-takes-several": AckReply("stored").pack(max_batch=128),
         },
     }
 
@@ -64,10 +64,10 @@ def batch_samples() -> dict[str, dict[str, bytes]]:
     ]
     return {
         "handoff-batch-attachment": {
-            "three-records": handoff_batch.attachment(bytes(range(16)), items),
-            "after-dropped-ones": handoff_batch.attachment(bytes(range(16)), items, 6),
+            "three-records": protocol.batch_attachment(bytes(range(16)), items),
+            "after-dropped-ones": protocol.batch_attachment(bytes(range(16)), items, 6),
         },
-        "handoff-batch-reply": {"one-of-each": handoff_batch.pack_replies(replies)},
+        "handoff-batch-reply": {"one-of-each": protocol.pack_replies(replies)},
     }
 
 

@@ -1,4 +1,4 @@
-"""What tests of the durable store do again and again."""
+"""Common steps of the tests of the durable store."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def send(store: Store, *payloads: bytes, consumer: str = "c", priority: int = 4)
 
 
 def fail_within(store: Store, write: Callable[[Transaction], object]) -> None:
-    """Write in a transaction that then meets an error which has nothing to do with the store."""
+    """Write in a transaction that is then ended by an exception."""
     with store.transaction() as tx:
         write(tx)
         raise ZeroDivisionError

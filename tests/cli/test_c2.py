@@ -222,7 +222,7 @@ def test_advice_is_on_c2s_disk_when_the_command_ends(capsys, c2, router, tmp_pat
     assert main([*arguments, "--router", router]) == 0
     assert "advice a-1 for vessel-1 accepted" in capsys.readouterr().out
     eventually(lambda: c2.gauges()["waiting_for_vessels"] == 1)
-    [item] = c2.store.owed("relay@vessel-1", 9)
+    [item] = c2.store.queued("relay@vessel-1", 9)
     advice = wire.decode(Advice, item.payload, item.key)
     assert item.key == keys.advice("vessel-1")
     assert (advice.image_id, advice.image_version, advice.verdict, advice.author) == ("AAAA", 2, "mine_like", "ann")
@@ -237,7 +237,7 @@ def test_a_command_is_owed_before_advice(capsys, c2, router):
     assert main(["c2", "advise", "uuv-1/AAAA", "--vessel", "vessel-1", "--router", router]) == 0
     assert main(["c2", "task", "uuv-1/AAAA", "--vessel", "vessel-1", "--kind", "refine", "--router", router]) == 0
     eventually(lambda: c2.gauges()["waiting_for_vessels"] == 2)
-    assert [item.key for item in c2.store.owed("relay@vessel-1", 9)] == [
+    assert [item.key for item in c2.store.queued("relay@vessel-1", 9)] == [
         keys.command("vessel-1", "refine"),
         keys.advice("vessel-1"),
     ]

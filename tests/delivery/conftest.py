@@ -1,4 +1,4 @@
-"""What tests of the runtime share: a store in a temporary folder."""
+"""Fixture: a store in a temporary folder."""
 
 from __future__ import annotations
 

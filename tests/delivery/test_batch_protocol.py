@@ -1,4 +1,4 @@
-"""Several records in one hand-over query: each is answered for by itself, and either side may be older."""
+"""Several records in one delivery query: each has its own reply, and either side can run an older version."""
 
 from __future__ import annotations
 
@@ -15,17 +15,23 @@ from hypothesis import strategies as st
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.delivery import protocol as handoff
-from sonarpost.delivery.batch_protocol import MAX_RECORDS, attachment, pack_replies, parse_query, unpack_replies
-from sonarpost.delivery.inbox import RetryLaterError
-from sonarpost.delivery.protocol import CHUNK_BYTES, AckReply
-from sonarpost.delivery.transaction import OutboxItem, ReceivedChunk
-from sonarpost.errors import PayloadError
+from sonarpost.delivery import protocol
+from sonarpost.delivery.protocol import (
+    CHUNK_BYTES,
+    MAX_BATCH_RECORDS,
+    AckReply,
+    batch_attachment,
+    pack_replies,
+    parse_query,
+    unpack_replies,
+)
+from sonarpost.delivery.records import OutboxItem, ReceivedChunk
+from sonarpost.errors import PayloadError, RetryLaterError
 from sonarpost.messages import Decision, Record
 from sonarpost.runtime.service import Service, UnitOfWork
 
 KEY = keys.contact_decision("vessel-1")
-WHERE = keys.handoff(KEY, "consumer")
+WHERE = keys.delivery_query(KEY, "consumer")
 ORIGIN = b"o" * 16
 PlatformMaker = Callable[[str], PlatformConfig]
 
@@ -52,11 +58,11 @@ def decision(number: int) -> bytes:
 # Bytes
 
 
-@given(st.dictionaries(st.integers(1, 2**63 - 1), st.binary(max_size=200), min_size=1, max_size=MAX_RECORDS))
-def test_what_was_packed_is_parsed(records: dict[int, bytes]) -> None:
+@given(st.dictionaries(st.integers(1, 2**63 - 1), st.binary(max_size=200), min_size=1, max_size=MAX_BATCH_RECORDS))
+def test_packed_batch_parses_unchanged(records: dict[int, bytes]) -> None:
     items = [item(seq, payload) for seq, payload in records.items()]
     settled = min(records) - 1
-    chunks = parse_query(attachment(ORIGIN, items, settled), b"".join(records.values()), WHERE)
+    chunks = parse_query(batch_attachment(ORIGIN, items, settled), b"".join(records.values()), WHERE)
     assert chunks == tuple(ReceivedChunk(ORIGIN, i.seq, len(i.payload), i.sha256, 0, i.payload, settled) for i in items)
 
 
@@ -73,7 +79,7 @@ SHA = bytes(32)
         ({"settled": 4}, b"ab", "settled"),
         ({"records": []}, b"", "records"),
         ({"records": None}, b"ab", "records"),
-        ({"records": [[n, 0, SHA] for n in range(1, MAX_RECORDS + 2)]}, b"", "records"),
+        ({"records": [[n, 0, SHA] for n in range(1, MAX_BATCH_RECORDS + 2)]}, b"", "records"),
         ({"records": [[4, 1, SHA], [4, 1, SHA]]}, b"ab", "records"),
         ({"records": [[4, 1, SHA], 5]}, b"ab", "records.1"),
         ({"records": [[4, 1, SHA], [5, 1]]}, b"ab", "records.1"),
@@ -89,15 +95,15 @@ SHA = bytes(32)
         ({}, bytes(CHUNK_BYTES + 1), "payload"),
     ],
 )
-def test_a_wrong_query_names_the_field(change: dict[str, object], data: bytes, field: str) -> None:
-    fields = msgpack.unpackb(attachment(ORIGIN, [item(4, b"a"), item(9, b"b")])) | change
+def test_query_error_names_the_field(change: dict[str, object], data: bytes, field: str) -> None:
+    fields = msgpack.unpackb(batch_attachment(ORIGIN, [item(4, b"a"), item(9, b"b")])) | change
     with pytest.raises(PayloadError, match="expected") as caught:
         parse_query(msgpack.packb(fields), data, WHERE)
     assert caught.value.field == field
 
 
 @given(st.binary(max_size=80), st.binary(max_size=8))
-def test_any_bytes_parse_or_are_refused_by_the_one_error(attached: bytes, data: bytes) -> None:
+def test_arbitrary_bytes_parse_or_raise_payload_error(attached: bytes, data: bytes) -> None:
     for parse in (lambda: parse_query(attached, data, WHERE), lambda: unpack_replies(attached, 2, WHERE)):
         with suppress(PayloadError):
             parse()
@@ -114,13 +120,13 @@ def test_any_bytes_parse_or_are_refused_by_the_one_error(attached: bytes, data: 
         (["stored", ["stored", ""]], "replies.0"),
     ],
 )
-def test_a_wrong_reply_names_the_field(replies: object, field: str) -> None:
+def test_reply_error_names_the_field(replies: object, field: str) -> None:
     with pytest.raises(PayloadError, match="expected") as caught:
         unpack_replies(msgpack.packb({"v": 2, "replies": replies}), 2, WHERE)
     assert caught.value.field == field
 
 
-def test_an_announcement_that_is_no_number_is_refused() -> None:
+def test_batch_announcement_must_be_a_number() -> None:
     fields = msgpack.unpackb(AckReply("stored").pack()) | {"takes": "many"}
     with pytest.raises(PayloadError, match="takes"):
         AckReply.unpack(msgpack.packb(fields), WHERE)
@@ -134,9 +140,9 @@ class Producer(Service[ServiceConfig]):
     PUBLISH = False
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        raise AssertionError("takes nothing")
+        raise AssertionError("consumes nothing")
 
-    def owe(self, *payloads: bytes) -> None:
+    def send(self, *payloads: bytes) -> None:
         effects = UnitOfWork()
         for payload in payloads:
             effects.send_payload(KEY, "consumer", payload, Decision)
@@ -144,7 +150,7 @@ class Producer(Service[ServiceConfig]):
 
 
 class Listener:
-    """A consumer made by hand: remembers what it was asked, and answers as a test wants."""
+    """Scripted consumer: stores the queries and replies as the test requires."""
 
     def __init__(
         self, session: zenoh.Session, answer: Callable[[tuple[ReceivedChunk, ...] | ReceivedChunk], bytes]
@@ -163,7 +169,7 @@ class Listener:
 
     @property
     def records(self) -> list[int]:
-        """The numbers of all that was asked for."""
+        """Sequence numbers of all queries."""
         return [c.seq for asked in self.asked for c in ([asked] if isinstance(asked, ReceivedChunk) else asked)]
 
 
@@ -189,25 +195,25 @@ def stored(asked: tuple[ReceivedChunk, ...] | ReceivedChunk, takes: int) -> byte
     return pack_replies([AckReply("stored")] * len(asked))
 
 
-@pytest.mark.parametrize(("takes", "most"), [(0, 1), (1, 1), (5, 5), (2**60, MAX_RECORDS)])
-def test_a_producer_sends_together_what_the_consumer_says_that_it_takes(
+@pytest.mark.parametrize(("takes", "most"), [(0, 1), (1, 1), (5, 5), (2**60, MAX_BATCH_RECORDS)])
+def test_producer_sends_batches_of_the_announced_size(
     takes: int, most: int, producer: Producer, client: zenoh.Session
 ) -> None:
     listener = Listener(client, lambda asked: stored(asked, takes))
-    producer.owe(*(decision(n) for n in range(300)))
+    producer.send(*(decision(n) for n in range(300)))
     with running(producer):
         eventually(lambda: producer.store.outbox_depth() == 0)
-    assert isinstance(listener.asked[0], ReceivedChunk), "it has not said anything yet"
+    assert isinstance(listener.asked[0], ReceivedChunk), "the consumer has not announced batches yet"
     assert listener.records == list(range(1, 301))
     longest = max(len(asked) for asked in listener.asked if not isinstance(asked, ReceivedChunk)) if most > 1 else 1
     assert longest == most
     assert all(isinstance(asked, ReceivedChunk) for asked in listener.asked) == (most == 1)
 
 
-def test_what_does_not_fit_together_goes_by_itself(producer: Producer, client: zenoh.Session) -> None:
-    listener = Listener(client, lambda asked: stored(asked, MAX_RECORDS))
+def test_records_that_do_not_fit_a_batch_are_sent_alone(producer: Producer, client: zenoh.Session) -> None:
+    listener = Listener(client, lambda asked: stored(asked, MAX_BATCH_RECORDS))
     sizes = [10, CHUNK_BYTES - 5, 10, 10, CHUNK_BYTES, 7]
-    producer.owe(*(bytes(size) for size in sizes))
+    producer.send(*(bytes(size) for size in sizes))
     with running(producer):
         eventually(lambda: producer.store.outbox_depth() == 0)
     assert listener.records == list(range(1, 7))
@@ -216,16 +222,16 @@ def test_what_does_not_fit_together_goes_by_itself(producer: Producer, client: z
             assert sum(chunk.size for chunk in asked) <= CHUNK_BYTES
 
 
-def test_a_consumer_that_takes_none_after_all_gets_each_by_itself(producer: Producer, client: zenoh.Session) -> None:
-    """As one does that knows version 1 only and came up in the place of another under the same name."""
+def test_single_records_are_sent_after_a_batch_was_refused(producer: Producer, client: zenoh.Session) -> None:
+    """A consumer that supports version 1 only replaces another one under the same name."""
 
     def answer(asked: tuple[ReceivedChunk, ...] | ReceivedChunk) -> bytes:
         if isinstance(asked, ReceivedChunk):
-            return AckReply("stored").pack(MAX_RECORDS)
+            return AckReply("stored").pack(MAX_BATCH_RECORDS)
         return AckReply("refused", reason="v: got 2, expected 1").pack()
 
     listener = Listener(client, answer)
-    producer.owe(*(decision(n) for n in range(30)))
+    producer.send(*(decision(n) for n in range(30)))
     with running(producer):
         eventually(lambda: producer.store.outbox_depth() == 0)
         assert producer.store.refused_count() == 0
@@ -234,12 +240,12 @@ def test_a_consumer_that_takes_none_after_all_gets_each_by_itself(producer: Prod
     assert sum(not isinstance(asked, ReceivedChunk) for asked in listener.asked) >= 1
 
 
-def test_each_record_of_a_query_has_an_answer_of_its_own(producer: Producer, client: zenoh.Session) -> None:
+def test_each_record_of_a_batch_has_its_own_reply(producer: Producer, client: zenoh.Session) -> None:
     waited: set[int] = set()
 
     def answer(asked: tuple[ReceivedChunk, ...] | ReceivedChunk) -> bytes:
         if isinstance(asked, ReceivedChunk):
-            return AckReply("stored").pack(MAX_RECORDS)
+            return AckReply("stored").pack(MAX_BATCH_RECORDS)
         replies = []
         for chunk in asked:
             if chunk.seq == 4:
@@ -252,7 +258,7 @@ def test_each_record_of_a_query_has_an_answer_of_its_own(producer: Producer, cli
         return pack_replies(replies)
 
     listener = Listener(client, answer)
-    producer.owe(*(decision(n) for n in range(1, 11)))
+    producer.send(*(decision(n) for n in range(1, 11)))
     with running(producer):
         eventually(lambda: producer.store.outbox_depth() == 0)
         assert producer.store._query("SELECT payload, reason FROM refused") == [(decision(4), "never")]
@@ -266,7 +272,7 @@ def test_each_record_of_a_query_has_an_answer_of_its_own(producer: Producer, cli
 
 
 class Consumer(Service[ServiceConfig]):
-    """Takes decisions; has no room for some as long as a test says so."""
+    """Consumes decisions; reports a full disk while `full` is set."""
 
     NAME = "consumer"
 
@@ -280,7 +286,7 @@ class Consumer(Service[ServiceConfig]):
 
     def check_capacity(self, key: str) -> None:
         if self.full:
-            raise RetryLaterError("no room")
+            raise RetryLaterError("disk full")
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         assert isinstance(record, Decision)
@@ -291,12 +297,12 @@ def ask(client: zenoh.Session, items: list[OutboxItem], data: bytes | None = Non
     querier = client.declare_querier(WHERE)
     eventually(lambda: querier.matching_status.matching)
     payload = b"".join(i.payload for i in items) if data is None else data
-    received = client.get(WHERE, payload=payload, attachment=attachment(ORIGIN, items), timeout=5).recv()
+    received = client.get(WHERE, payload=payload, attachment=batch_attachment(ORIGIN, items), timeout=5).recv()
     assert received.ok is not None
     return unpack_replies(received.ok.payload.to_bytes(), len(items), WHERE)
 
 
-def test_a_consumer_takes_the_good_refuses_the_bad_and_knows_both_again(
+def test_consumer_accepts_valid_refuses_invalid_and_recognises_both_again(
     platform: PlatformMaker, client: zenoh.Session
 ) -> None:
     consumer = Consumer(platform("vessel-1"), ServiceConfig())
@@ -322,29 +328,29 @@ def test_a_consumer_takes_the_good_refuses_the_bad_and_knows_both_again(
     assert consumer.got == []
 
 
-def test_a_query_that_cannot_be_read_is_refused_as_one(platform: PlatformMaker, client: zenoh.Session) -> None:
+def test_malformed_batch_gets_a_single_refusal(platform: PlatformMaker, client: zenoh.Session) -> None:
     consumer = Consumer(platform("vessel-1"), ServiceConfig())
     with running(consumer):
         reply = ask(client, [item(1, decision(1)), item(2, decision(2))], data=b"short")
         assert isinstance(reply, AckReply)
         assert reply.status == "refused"
-        assert consumer.store.refused_count() == 0, "nothing is known of any record"
+        assert consumer.store.refused_count() == 0, "no record could be identified"
         taken = ask(client, [item(1, decision(1)), item(2, decision(2))])
         assert taken == (AckReply("stored"), AckReply("stored"))
 
 
-def test_records_for_which_there_is_no_room_stay_with_their_producer(
+def test_producer_keeps_records_while_the_consumer_has_no_space(
     producer: Producer, platform: PlatformMaker, client: zenoh.Session
 ) -> None:
     consumer = Consumer(platform("vessel-1"), ServiceConfig())
     with running(consumer, producer):
-        producer.owe(decision(0))
+        producer.send(decision(0))
         eventually(lambda: consumer.got == ["d0"])
         consumer.full = True
         asked = ask(client, [item(1, decision(91)), item(2, decision(92))])
         assert isinstance(asked, tuple)
         assert [reply.status for reply in asked] == ["later", "later"]
-        producer.owe(*(decision(n) for n in range(1, 40)))
+        producer.send(*(decision(n) for n in range(1, 40)))
         eventually(lambda: not producer.is_responding("consumer"))
         assert producer.store.outbox_depth() == 39
         consumer.full = False
@@ -352,7 +358,7 @@ def test_records_for_which_there_is_no_room_stay_with_their_producer(
     assert sorted(consumer.got) == sorted(f"d{n}" for n in range(40))
 
 
-def test_a_store_that_cannot_be_written_answers_the_whole_query(platform: PlatformMaker, client: zenoh.Session) -> None:
+def test_store_write_error_rejects_the_whole_batch(platform: PlatformMaker, client: zenoh.Session) -> None:
     consumer = Consumer(platform("vessel-1"), ServiceConfig())
     items = [item(n, decision(n)) for n in range(1, 60)]
     with running(consumer):
@@ -367,18 +373,18 @@ def test_a_store_that_cannot_be_written_answers_the_whole_query(platform: Platfo
         eventually(lambda: len(consumer.got) == 59)
 
 
-def test_settled_in_a_query_of_several_closes_gaps(platform: PlatformMaker, client: zenoh.Session) -> None:
+def test_done_up_to_in_a_batch_closes_gaps(platform: PlatformMaker, client: zenoh.Session) -> None:
     consumer = Consumer(platform("vessel-1"), ServiceConfig())
     with running(consumer):
         querier = client.declare_querier(WHERE)
         eventually(lambda: querier.matching_status.matching)
         items = [item(8, decision(8)), item(9, decision(9))]
         payload = b"".join(i.payload for i in items)
-        client.get(WHERE, payload=payload, attachment=attachment(ORIGIN, items, settled=7), timeout=5).recv()
+        client.get(WHERE, payload=payload, attachment=batch_attachment(ORIGIN, items, done_up_to=7), timeout=5).recv()
         assert consumer.store._query("SELECT seq FROM seen_upto") == [(9,)]
-        single = handoff.attachment(ORIGIN, items[0])
+        single = protocol.attachment(ORIGIN, items[0])
         received = client.get(WHERE, payload=items[0].payload, attachment=single, timeout=5).recv()
         assert received.ok is not None
         reply = AckReply.unpack(received.ok.payload.to_bytes(), WHERE)
-        assert (reply.status, reply.takes) == ("stored", MAX_RECORDS)
+        assert (reply.status, reply.max_batch) == ("stored", MAX_BATCH_RECORDS)
         eventually(lambda: consumer.got == ["d8", "d9"])

@@ -1,4 +1,4 @@
-"""Room on the disk: a reserve, and what lies free inside a store's file."""
+"""Disk reserve, and free space inside the file of a store."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections import namedtuple
 
 import pytest
 
-from sonarpost.delivery.disk_reserve import DiskReserve
-from sonarpost.delivery.inbox import RetryLaterError
+from sonarpost.delivery.store import DiskReserve
+from sonarpost.errors import RetryLaterError
 
 DiskUsage = namedtuple("DiskUsage", "total used free")
 RECORD = bytes(100_000)
@@ -16,31 +16,31 @@ RECORD = bytes(100_000)
 @pytest.fixture
 def disk(monkeypatch):
     free = [0]
-    monkeypatch.setattr("sonarpost.delivery.disk_reserve.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
+    monkeypatch.setattr("sonarpost.delivery.store.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
     return free
 
 
-def test_below_the_reserve_records_are_not_admitted_and_it_is_said_until_there_is_room(store, disk):
-    room = DiskReserve(store, 1000, "records wait")
+def test_records_are_rejected_and_degraded_is_reported_below_the_reserve(store, disk):
+    reserve = DiskReserve(store, 1000, "records wait")
     disk[0] = 999
-    assert room.degraded_reason() == "", "nobody was turned away yet"
+    assert reserve.degraded_reason() == "", "no record was rejected yet"
     with pytest.raises(RetryLaterError, match="999 bytes free, below the reserve of 1000: records wait"):
-        room.require()
-    assert "records wait" in room.degraded_reason()
+        reserve.require()
+    assert "records wait" in reserve.degraded_reason()
     disk[0] = 1000
-    assert room.degraded_reason() == ""
-    room.require()
+    assert reserve.degraded_reason() == ""
+    reserve.require()
 
 
-def test_a_store_that_was_full_and_is_empty_takes_records_again(store, disk):
+def test_an_emptied_store_accepts_records_again(store, disk):
     with store.transaction() as tx:
         for _ in range(20):
             tx.accept("k", RECORD)
-    room = DiskReserve(store, 1_000_000, "records wait")
+    reserve = DiskReserve(store, 1_000_000, "records wait")
     with pytest.raises(RetryLaterError):
-        room.require()
+        reserve.require()
     with store.transaction() as tx:
-        for item in store.pending(20):
-            tx.done(item)
+        for item in store.inbox_items(20):
+            tx.remove_handled(item)
     assert store.reusable_bytes() >= 20 * len(RECORD)
-    room.require()
+    reserve.require()

@@ -1,4 +1,4 @@
-"""The durable hand-off between two services, over an in-process router."""
+"""Delivery between two services over an in-process router."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from builders.common import eventually
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.delivery import protocol as handoff
+from sonarpost.delivery import protocol
 from sonarpost.delivery.protocol import CHUNK_BYTES, AckReply
+from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import OutboxItem
 from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.messages import Decision, Record
 from sonarpost.runtime.service import Service, UnitOfWork
@@ -40,21 +40,21 @@ def decision(number: int, remark: str = "") -> Decision:
 
 
 class Producer(Service[ServiceConfig]):
-    """Owes what a test tells it to."""
+    """Sends the records of a test."""
 
     NAME = "producer"
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        raise AssertionError("takes nothing")
+        raise AssertionError("consumes nothing")
 
-    def owe(self, number: int, remark: str = "", priority: int = 4) -> None:
+    def send(self, number: int, remark: str = "", priority: int = 4) -> None:
         effects = UnitOfWork()
         effects.send(KEY, "consumer", decision(number, remark), priority=priority)
         self.commit(effects)
 
 
 class Consumer(Service[ServiceConfig]):
-    """Keeps the decisions it was handed in order."""
+    """Stores the received decisions in order."""
 
     NAME = "consumer"
 
@@ -89,28 +89,28 @@ def consumer(platform: PlatformMaker) -> Consumer:
     return Consumer(platform("vessel-1"), ServiceConfig())
 
 
-def test_records_owed_before_the_consumer_exists_arrive_once_and_in_order(
+def test_records_queued_before_the_consumer_exists_arrive_once_and_in_order(
     producer: Producer, consumer: Consumer
 ) -> None:
     for number in range(50):
-        producer.owe(number)
+        producer.send(number)
     producer.start()
     consumer.start()
     try:
         eventually(lambda: len(consumer.got) == 50)
         eventually(lambda: producer.store.outbox_depth() == 0)
         assert consumer.got == [f"d{n}" for n in range(50)]
-        # Counted when the handling is committed: the producer may have forgotten the last record before that.
+        # Counted at the commit, which can follow the producer's removal of the last record.
         eventually(lambda: consumer.health().counters["records_handled"] == 50)
     finally:
         producer.stop()
         consumer.stop()
 
 
-def test_the_urgent_goes_first(producer: Producer, consumer: Consumer) -> None:
+def test_urgent_record_is_sent_first(producer: Producer, consumer: Consumer) -> None:
     for number in range(20):
-        producer.owe(number, priority=6)
-    producer.owe(99, priority=1)
+        producer.send(number, priority=6)
+    producer.send(99, priority=1)
     producer.start()
     consumer.start()
     try:
@@ -121,7 +121,7 @@ def test_the_urgent_goes_first(producer: Producer, consumer: Consumer) -> None:
         consumer.stop()
 
 
-def test_a_watcher_sees_each_record_with_origin_and_sequence(
+def test_subscriber_receives_each_record_with_origin_and_sequence(
     producer: Producer, consumer: Consumer, client: zenoh.Session
 ) -> None:
     seen: list[tuple[bytes, dict[str, object]]] = []
@@ -131,8 +131,8 @@ def test_a_watcher_sees_each_record_with_origin_and_sequence(
     producer.start()
     consumer.start()
     try:
-        producer.owe(1)
-        producer.owe(2)
+        producer.send(1)
+        producer.send(2)
         eventually(lambda: len(seen) == 2)
         assert [msgpack.unpackb(p)["decision_id"] for p, _ in seen] == ["d1", "d2"]
         assert [a["seq"] for _, a in seen] == [1, 2]
@@ -143,7 +143,7 @@ def test_a_watcher_sees_each_record_with_origin_and_sequence(
         consumer.stop()
 
 
-def test_a_restarted_consumer_takes_a_repeated_record_only_once(
+def test_restarted_consumer_discards_a_repeated_record(
     producer: Producer, platform: PlatformMaker, client: zenoh.Session
 ) -> None:
     consumer = Consumer(platform("vessel-1"), ServiceConfig())
@@ -153,7 +153,10 @@ def test_a_restarted_consumer_takes_a_repeated_record_only_once(
 
     def ask() -> AckReply:
         replies = client.get(
-            keys.handoff(KEY, "consumer"), payload=payload, attachment=handoff.attachment(b"o" * 16, item), timeout=5
+            keys.delivery_query(KEY, "consumer"),
+            payload=payload,
+            attachment=protocol.attachment(b"o" * 16, item),
+            timeout=5,
         )
         return AckReply.unpack(replies.recv().ok.payload.to_bytes(), KEY)
 
@@ -164,29 +167,29 @@ def test_a_restarted_consumer_takes_a_repeated_record_only_once(
     consumer = Consumer(platform("vessel-1"), ServiceConfig())
     consumer.start()
     try:
-        # The acknowledgement was lost on the way, say: the producer asks again.
+        # As if the acknowledgement was lost: the producer repeats the query.
         assert ask().status == "stored"
         producer.start()
-        producer.owe(7)
+        producer.send(7)
         eventually(lambda: consumer.got == ["d7"])
     finally:
         consumer.stop()
         producer.stop()
 
 
-def test_a_record_in_many_pieces_resumes_after_a_restart(platform: PlatformMaker, client: zenoh.Session) -> None:
+def test_chunked_record_resumes_after_a_restart(platform: PlatformMaker, client: zenoh.Session) -> None:
     payload = wire.encode(decision(1, "x" * 2000)) + b""
-    # A large record made of small fields is not possible with text limits, so the pieces are made small by hand.
+    # Text fields are too short for a large record: use small chunks instead.
     sha = hashlib.sha256(payload).digest()
     item = OutboxItem("consumer", 1, KEY, "", 4, payload, sha)
 
     def ask(offset: int, end: int) -> AckReply:
-        querier = client.declare_querier(keys.handoff(KEY, "consumer"))
+        querier = client.declare_querier(keys.delivery_query(KEY, "consumer"))
         eventually(lambda: querier.matching_status.matching)
         replies = client.get(
-            keys.handoff(KEY, "consumer"),
+            keys.delivery_query(KEY, "consumer"),
             payload=payload[offset:end],
-            attachment=handoff.attachment(b"o" * 16, item, offset),
+            attachment=protocol.attachment(b"o" * 16, item, offset),
             timeout=5,
         )
         return AckReply.unpack(replies.recv().ok.payload.to_bytes(), KEY)
@@ -207,7 +210,7 @@ def test_a_record_in_many_pieces_resumes_after_a_restart(platform: PlatformMaker
 
 
 class Bulky(Decision):
-    """A decision with an attachment of any size, to make records of many pieces."""
+    """A decision with binary data of any size, for records of many chunks."""
 
     TYPE = "bulky"
     data: bytes
@@ -219,7 +222,7 @@ class BulkyConsumer(Consumer):
 
 
 @pytest.mark.parametrize("size", [CHUNK_BYTES - 300, CHUNK_BYTES, 3 * CHUNK_BYTES + 5, 40 * CHUNK_BYTES])
-def test_large_records_are_sent_in_pieces(size: int, producer: Producer, platform: PlatformMaker) -> None:
+def test_large_records_are_sent_in_chunks(size: int, producer: Producer, platform: PlatformMaker) -> None:
     consumer = BulkyConsumer(platform("vessel-1"), ServiceConfig())
     producer.start()
     consumer.start()
@@ -236,14 +239,14 @@ def test_large_records_are_sent_in_pieces(size: int, producer: Producer, platfor
         consumer.stop()
 
 
-def test_a_wrong_record_is_refused_and_kept_apart_on_both_sides(
+def test_invalid_record_is_refused_and_quarantined_on_both_sides(
     producer: Producer, platform: PlatformMaker, caplog: pytest.LogCaptureFixture
 ) -> None:
     consumer = BulkyConsumer(platform("vessel-1"), ServiceConfig())
     producer.start()
     consumer.start()
     try:
-        producer.owe(1)
+        producer.send(1)
         eventually(lambda: producer.store.refused_count() == 1)
         assert consumer.store.refused_count() == 1
         assert producer.store.outbox_depth() == 0
@@ -256,7 +259,7 @@ def test_a_wrong_record_is_refused_and_kept_apart_on_both_sides(
         consumer.stop()
 
 
-def test_a_plain_publication_of_a_third_party_is_taken(consumer: Consumer, client: zenoh.Session) -> None:
+def test_plain_publication_of_a_third_party_is_accepted(consumer: Consumer, client: zenoh.Session) -> None:
     consumer.start()
     try:
         publisher = client.declare_publisher(KEY)
@@ -270,7 +273,7 @@ def test_a_plain_publication_of_a_third_party_is_taken(consumer: Consumer, clien
         consumer.stop()
 
 
-def test_what_cannot_be_handled_now_is_tried_again_and_what_never_can_is_kept_apart(
+def test_temporary_errors_are_retried_and_permanent_ones_quarantined(
     producer: Producer, consumer: Consumer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.05)
@@ -283,7 +286,7 @@ def test_what_cannot_be_handled_now_is_tried_again_and_what_never_can_is_kept_ap
     consumer.start()
     try:
         for number in range(1, 5):
-            producer.owe(number)
+            producer.send(number)
         eventually(lambda: consumer.got == ["d1", "d4"])
         assert consumer.store.refused_count() == 2
         assert consumer.health().counters["records_failed"] == 1
@@ -293,15 +296,13 @@ def test_what_cannot_be_handled_now_is_tried_again_and_what_never_can_is_kept_ap
         consumer.stop()
 
 
-def test_a_full_disk_at_the_consumer_leaves_the_record_with_the_producer(
-    producer: Producer, consumer: Consumer
-) -> None:
+def test_producer_keeps_the_record_while_the_consumer_disk_is_full(producer: Producer, consumer: Consumer) -> None:
     producer.start()
     consumer.start()
     try:
         consumer.store._db.execute("PRAGMA max_page_count=1")
         for number in range(8):
-            producer.owe(number, "x" * 1900)
+            producer.send(number, "x" * 1900)
         eventually(lambda: consumer.health().state == "degraded")
         assert producer.store.outbox_depth() > 0
         consumer.store._db.execute("PRAGMA max_page_count=1000000")
@@ -313,7 +314,7 @@ def test_a_full_disk_at_the_consumer_leaves_the_record_with_the_producer(
         consumer.stop()
 
 
-def test_a_service_waits_for_its_router_and_can_be_stopped_meanwhile(tmp_path: Path) -> None:
+def test_service_can_be_stopped_while_it_waits_for_its_router(tmp_path: Path) -> None:
     lonely = PlatformConfig(id="vessel-1", router=("tcp/127.0.0.1:1",), state_dir=tmp_path)
     service = Producer(lonely, ServiceConfig())
     result: list[bool] = []
@@ -334,18 +335,19 @@ def test_a_service_waits_for_its_router_and_can_be_stopped_meanwhile(tmp_path: P
         ({"size": 1 << 40}, "size"),
         ({"sha256": "text"}, "sha256"),
         ({"offset": 10}, "payload"),
-        ({"v": 2}, "v"),
+        ({"v": 2}, "records"),
+        ({"v": 3}, "v"),
     ],
 )
-def test_a_wrong_query_names_the_field(change: dict[str, object], field: str) -> None:
+def test_query_error_names_the_field(change: dict[str, object], field: str) -> None:
     item = OutboxItem("c", 1, "k", "", 4, b"data", hashlib.sha256(b"data").digest())
-    fields = msgpack.unpackb(handoff.attachment(b"o" * 16, item)) | change
+    fields = msgpack.unpackb(protocol.attachment(b"o" * 16, item)) | change
     with pytest.raises(PayloadError, match="expected") as caught:
-        handoff.parse_chunk(msgpack.packb(fields), b"data", "k/handoff/c")
+        protocol.parse_query(msgpack.packb(fields), b"data", "k/handoff/c")
     assert caught.value.field == field
 
 
-def test_memory_of_accepted_numbers_stays_small(tmp_path: Path) -> None:
+def test_duplicate_window_stays_small(tmp_path: Path) -> None:
     store = Store(tmp_path / "s.db")
     order = [*range(2, 200), 1, *range(200, 400)]
     for seq in order:

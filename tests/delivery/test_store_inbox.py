@@ -1,4 +1,4 @@
-"""The durable store's inbox: each number of an origin once, waiting until it is done, no more than asked for."""
+"""Inbox of the durable store: deduplication, persistence until handled, limits of a read."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from hypothesis import strategies as st
 from sonarpost.delivery.store import Store
 
 
-def test_a_record_waits_until_it_is_done(tmp_path: Path) -> None:
+def test_record_stays_in_the_inbox_until_handled(tmp_path: Path) -> None:
     store = Store(tmp_path / "s.db")
     with store.transaction() as tx:
         assert tx.accept("k", b"1")
         assert tx.accept("k", b"2")
     store.close()
     store = Store(tmp_path / "s.db")
-    first, second = store.pending(9)
+    first, second = store.inbox_items(9)
     assert (first.payload, second.payload) == (b"1", b"2")
-    assert store.pending(9, after_id=first.id) == (second,)
+    assert store.inbox_items(9, after_id=first.id) == (second,)
     with store.transaction() as tx:
-        tx.done(first)
-    assert store.pending(9) == (second,)
+        tx.remove_handled(first)
+    assert store.inbox_items(9) == (second,)
     assert store.inbox_depth() == 1
     store.close()
 
 
 @given(st.lists(st.tuples(st.sampled_from([b"a" * 16, b"b" * 16]), st.integers(1, 30)), max_size=80))
 @settings(max_examples=30)
-def test_each_number_of_an_origin_is_accepted_once_in_any_order(
+def test_each_sequence_number_is_accepted_once_in_any_order(
     tmp_path_factory: pytest.TempPathFactory, arrivals: list[tuple[bytes, int]]
 ) -> None:
     store = Store(tmp_path_factory.mktemp("seen") / "s.db")
     accepted = set()
     for origin, seq in arrivals:
         with store.transaction() as tx:
-            assert tx.was_seen(origin, seq) == ((origin, seq) in accepted)
+            assert tx.was_received(origin, seq) == ((origin, seq) in accepted)
             assert tx.accept("k", b"x", origin, seq) == ((origin, seq) not in accepted)
         accepted.add((origin, seq))
     assert store.inbox_depth() == len(accepted)
-    # Memory of the past: only what lies above the first gap is kept one by one.
+    # Only numbers above the first gap are stored individually.
     kept = {(bytes(o), s) for o, s in store._query("SELECT origin, seq FROM seen")}  # type: ignore[arg-type]
     above_gap = set()
     for origin in (b"a" * 16, b"b" * 16):
@@ -55,7 +55,7 @@ def test_each_number_of_an_origin_is_accepted_once_in_any_order(
     store.close()
 
 
-def test_what_was_refused_is_not_accepted_and_stays_refused(store: Store) -> None:
+def test_refused_record_is_never_accepted(store: Store) -> None:
     with store.transaction() as tx:
         assert not tx.was_refused(ORIGIN, 1)
         tx.mark_refused(ORIGIN, 1)
@@ -66,9 +66,9 @@ def test_what_was_refused_is_not_accepted_and_stays_refused(store: Store) -> Non
 
 
 @pytest.mark.parametrize(("max_bytes", "count"), [(None, 4), (0, 1), (10, 1), (29, 2), (30, 3), (1000, 4)])
-def test_what_is_pending_is_given_up_to_so_many_bytes(store: Store, max_bytes: int | None, count: int) -> None:
+def test_inbox_read_is_limited_in_bytes(store: Store, max_bytes: int | None, count: int) -> None:
     with store.transaction() as tx:
         for _ in range(4):
             tx.accept("k", bytes(10))
-    assert len(store.pending(9, max_bytes=max_bytes)) == count
-    assert len(store.pending(1, max_bytes=max_bytes)) == 1
+    assert len(store.inbox_items(9, max_bytes=max_bytes)) == count
+    assert len(store.inbox_items(1, max_bytes=max_bytes)) == 1

@@ -1,4 +1,4 @@
-"""The durable store's outbox: numbers without gaps, the most urgent first, what was refused kept, listeners told."""
+"""Outbox of the durable store: consecutive numbers, priority order, quarantine, listeners."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from builders.store_steps import fail_within, send
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import OutboxItem
 
 
-def test_what_is_owed_is_as_it_was_given(store: Store) -> None:
+def test_queued_record_is_unchanged(store: Store) -> None:
     assert send(store, b"payload") == [1]
-    assert store.owed("c", 9) == (OutboxItem("c", 1, "k", "e", 4, b"payload", hashlib.sha256(b"payload").digest()),)
-    assert store.owed("other", 9) == ()
+    assert store.queued("c", 9) == (OutboxItem("c", 1, "k", "e", 4, b"payload", hashlib.sha256(b"payload").digest()),)
+    assert store.queued("other", 9) == ()
 
 
-def test_numbers_run_without_gaps_a_consumer_and_are_never_used_again(tmp_path: Path) -> None:
+def test_numbers_are_consecutive_in_a_queue_and_never_reused(tmp_path: Path) -> None:
     store = Store(tmp_path / "s.db")
     assert send(store, b"1", b"2") == [1, 2]
     assert send(store, b"1", consumer="d") == [1]
     with store.transaction() as tx:
-        tx.acknowledged("c", 1)
-        tx.acknowledged("c", 2)
+        tx.remove_acknowledged("c", (1,))
+        tx.remove_acknowledged("c", (2,))
     origin = store.origin
     store.close()
     store = Store(tmp_path / "s.db")
@@ -36,29 +36,27 @@ def test_numbers_run_without_gaps_a_consumer_and_are_never_used_again(tmp_path: 
     store.close()
 
 
-def test_a_transaction_that_failed_uses_no_number(store: Store) -> None:
+def test_failed_transaction_uses_no_number(store: Store) -> None:
     with pytest.raises(ZeroDivisionError):
         fail_within(store, lambda tx: tx.send("k", "c", b"lost", encoding="e"))
     assert send(store, b"1") == [1]
-    assert [item.payload for item in store.owed("c", 9)] == [b"1"]
+    assert [item.payload for item in store.queued("c", 9)] == [b"1"]
 
 
 @given(st.lists(st.integers(1, 7), max_size=12))
 @settings(max_examples=20)
-def test_the_most_urgent_is_owed_first_then_the_oldest(
-    tmp_path_factory: pytest.TempPathFactory, priorities: list[int]
-) -> None:
+def test_queue_order_is_priority_then_age(tmp_path_factory: pytest.TempPathFactory, priorities: list[int]) -> None:
     store = Store(tmp_path_factory.mktemp("order") / "s.db")
     for priority in priorities:
         send(store, b"x", priority=priority)
-    owed = [(item.priority, item.seq) for item in store.owed("c", 99)]
-    assert owed == sorted(owed)
-    assert len(owed) == len(priorities)
-    assert store.owed("c", 3) == store.owed("c", 99)[:3]
+    order = [(item.priority, item.seq) for item in store.queued("c", 99)]
+    assert order == sorted(order)
+    assert len(order) == len(priorities)
+    assert store.queued("c", 3) == store.queued("c", 99)[:3]
     store.close()
 
 
-def test_two_stores_have_two_origins(tmp_path: Path) -> None:
+def test_two_stores_have_different_origins(tmp_path: Path) -> None:
     a, b = Store(tmp_path / "a.db"), Store(tmp_path / "b.db")
     assert a.origin != b.origin
     assert len(a.origin) == len(b.origin) == 16
@@ -66,21 +64,19 @@ def test_two_stores_have_two_origins(tmp_path: Path) -> None:
     b.close()
 
 
-def test_what_was_refused_is_kept_with_its_reason(store: Store) -> None:
+def test_refused_record_is_quarantined_with_its_reason(store: Store) -> None:
     send(store, b"bad")
     with store.transaction() as tx:
-        tx.rejected(store.owed("c", 1)[0], "no such record")
+        tx.quarantine_refused(store.queued("c", 1)[0], "no such record")
     assert (store.outbox_depth(), store.refused_count()) == (0, 1)
     assert store._query("SELECT direction, key, payload, reason FROM refused") == [
         ("out", "k", b"bad", "no such record")
     ]
 
 
-def test_of_what_was_refused_the_latest_are_kept_and_the_beginning_of_each(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("sonarpost.delivery.transaction.REFUSED_KEPT", 5)
-    monkeypatch.setattr("sonarpost.delivery.transaction.REFUSED_BYTES", 3)
+def test_quarantine_keeps_the_latest_records_truncated(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sonarpost.delivery.transaction.MAX_QUARANTINED", 5)
+    monkeypatch.setattr("sonarpost.delivery.transaction.MAX_QUARANTINED_BYTES", 3)
     for number in range(12):
         with store.transaction() as tx:
             tx.quarantine("in", "k", b"%02d and more" % number, "no")
@@ -89,9 +85,9 @@ def test_of_what_was_refused_the_latest_are_kept_and_the_beginning_of_each(
     assert kept == [b"%02d " % number for number in range(7, 12)]
 
 
-def test_listeners_hear_of_commits_and_not_of_failures(store: Store) -> None:
+def test_listeners_are_notified_of_commits_only(store: Store) -> None:
     event = threading.Event()
-    store.listen_outbox(event)
+    store.add_outbox_listener(event)
     with pytest.raises(ZeroDivisionError):
         fail_within(store, lambda tx: (tx.send("k", "c", b"x", encoding="e"), tx.accept("k", b"x")))
     assert not event.is_set()
@@ -100,7 +96,7 @@ def test_listeners_hear_of_commits_and_not_of_failures(store: Store) -> None:
     assert event.is_set()
     assert not store.inbox_changed.is_set()
     event.clear()
-    store.unlisten_outbox(event)
+    store.remove_outbox_listener(event)
     with store.transaction() as tx:
         tx.send("k", "c", b"x", encoding="e")
         tx.accept("k", b"x")

@@ -16,9 +16,8 @@ from builders.store_steps import ORIGIN, fail_within, send
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.delivery import rows
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import Transaction
+from sonarpost.delivery.transaction import ROWS_PER_STATEMENT, Transaction, runs
 from sonarpost.errors import DeliveryError
 
 
@@ -51,49 +50,49 @@ for n in itertools.count(first):
     with store.transaction() as tx:
         for part in range(5):
             assert tx.accept("k", b"%d/%d" % (n, part), b"o" * 16, 5 * n + part - 4)
-        for item in store.pending(3):
-            tx.done(item)
+        for item in store.inbox_items(3):
+            tx.remove_handled(item)
             tx.send("k", "c", item.payload, encoding="e")
         tx.put_state("n", b"%d" % n)
     print(n, flush=True)
 """
 
 
-def check_whole(path: Path, told: int) -> None:
-    """Check that the transactions are there from the first to one not before `told`, each whole."""
+def check_complete(path: Path, reported: int) -> None:
+    """Check that all transactions up to `reported` or the next one are complete."""
     store = Store(path)
     assert store._query("PRAGMA integrity_check") == [("ok",)]
     done = int(store.get_state("n") or b"0")
-    assert done in (told, told + 1)  # the last may have been committed and not told
-    inbox = [item.payload for item in store.pending(10**6)]
-    owed = store.owed("c", 10**6)
-    # What was handled is owed and no longer in the inbox, in order, nothing twice and nothing missing.
-    assert [*(item.payload for item in owed), *inbox] == [
+    assert done in (reported, reported + 1)  # the last one can be committed and not yet reported
+    inbox = [item.payload for item in store.inbox_items(10**6)]
+    queued = store.queued("c", 10**6)
+    # Handled records are queued and no longer in the inbox, in order, without duplicates or gaps.
+    assert [*(item.payload for item in queued), *inbox] == [
         b"%d/%d" % (n, p) for n in range(1, done + 1) for p in range(5)
     ]
-    assert [item.seq for item in owed] == list(range(1, len(owed) + 1))
+    assert [item.seq for item in queued] == list(range(1, len(queued) + 1))
     assert store._query("SELECT seq FROM seen_upto") == [(5 * done,)]
     assert store._query("SELECT COUNT(*) FROM seen") == [(0,)]
     store.close()
 
 
-def test_a_killed_process_leaves_whole_transactions_only(tmp_path: Path) -> None:
+def test_killed_process_leaves_complete_transactions_only(tmp_path: Path) -> None:
     path, chance = tmp_path / "s.db", random.Random(7)
     for _ in range(6):
         writer = subprocess.Popen(
             [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         assert writer.stdout is not None
-        told = int(writer.stdout.readline())
+        reported = int(writer.stdout.readline())
         time.sleep(chance.uniform(0, 0.05))
         writer.send_signal(signal.SIGKILL)
         rest, complaints = writer.communicate()
         assert complaints == ""
-        whole_lines = [line for line in rest.split("\n")[:-1] if line]
-        check_whole(path, int(whole_lines[-1]) if whole_lines else told)
+        complete_lines = [line for line in rest.split("\n")[:-1] if line]
+        check_complete(path, int(complete_lines[-1]) if complete_lines else reported)
 
 
-def test_a_full_disk_keeps_nothing_of_the_transaction_and_the_rest_unharmed(store: Store) -> None:
+def test_full_disk_rolls_back_the_transaction_only(store: Store) -> None:
     send(store, b"before")
     pages = store._query("PRAGMA page_count")[0][0]
     store._query(f"PRAGMA max_page_count={pages}")
@@ -107,13 +106,13 @@ def test_a_full_disk_keeps_nothing_of_the_transaction_and_the_rest_unharmed(stor
         write()
     assert store.get_state("small") is None
     assert store.inbox_depth() == 0
-    assert [item.payload for item in store.owed("c", 9)] == [b"before"]
+    assert [item.payload for item in store.queued("c", 9)] == [b"before"]
     store._query("PRAGMA max_page_count=1000000")
     write()
     assert (store.get_state("small"), store.inbox_depth()) == (b"1", 1)
 
 
-def test_threads_take_turns(store: Store) -> None:
+def test_threads_write_one_at_a_time(store: Store) -> None:
     def count() -> None:
         for _ in range(25):
             with store.transaction() as tx:
@@ -126,49 +125,49 @@ def test_threads_take_turns(store: Store) -> None:
     for thread in threads:
         thread.join()
     assert store.get_state("n") == b"100"
-    assert [item.seq for item in store.owed("c", 999)] == list(range(1, 101))
+    assert [item.seq for item in store.queued("c", 999)] == list(range(1, 101))
 
 
-def test_a_transaction_that_reads_sees_what_it_wrote(store: Store) -> None:
+def test_transaction_reads_its_own_writes(store: Store) -> None:
     def write(tx: Transaction) -> None:
         tx.put_state("a", b"1")
         tx.accept("k", b"x", ORIGIN, 3)
         assert tx.get_state("a") == b"1"
-        assert tx.was_seen(ORIGIN, 3)
+        assert tx.was_received(ORIGIN, 3)
 
     with pytest.raises(ZeroDivisionError):
         fail_within(store, write)
     with store.transaction() as tx:
         assert tx.get_state("a") is None
-        assert not tx.was_seen(ORIGIN, 3)
+        assert not tx.was_received(ORIGIN, 3)
 
 
 @given(st.sets(st.integers(-50, 50)))
-def test_runs_are_the_numbers_and_nothing_between(numbers: set[int]) -> None:
-    found = list(rows.runs(numbers))
+def test_runs_cover_exactly_the_numbers(numbers: set[int]) -> None:
+    found = list(runs(numbers))
     assert [n for first, last in found for n in range(first, last + 1)] == sorted(numbers)
     assert all(last + 1 < first for (_, last), (first, _) in itertools.pairwise(found))
 
 
-def test_many_records_in_one_transaction_keep_their_order_and_numbers(store: Store) -> None:
-    payloads = [str(n).encode() for n in range(3 * rows.ROWS_AT_ONCE + 5)]
+def test_many_records_in_one_transaction_keep_order_and_numbers(store: Store) -> None:
+    payloads = [str(n).encode() for n in range(3 * ROWS_PER_STATEMENT + 5)]
     with store.transaction() as tx:
         numbers = [tx.send("k", "c", payload, encoding="") for payload in payloads]
         for payload in payloads:
             tx.accept("k", payload)
     assert numbers == list(range(1, len(payloads) + 1))
-    assert [item.payload for item in store.owed("c", 1000)] == payloads
-    assert [item.payload for item in store.pending(1000)] == payloads
+    assert [item.payload for item in store.queued("c", 1000)] == payloads
+    assert [item.payload for item in store.inbox_items(1000)] == payloads
     with store.transaction() as tx:
         assert tx.send("k", "c", b"x", encoding="") == len(payloads) + 1
-        tx.all_acknowledged("c", [*range(1, 50), 60, len(payloads) + 1])
-        for done in store.pending(40):
-            tx.done(done)
-    assert [item.seq for item in store.owed("c", 1000)] == [*range(50, 60), *range(61, len(payloads) + 1)]
-    assert [item.payload for item in store.pending(1000)] == payloads[40:]
+        tx.remove_acknowledged("c", [*range(1, 50), 60, len(payloads) + 1])
+        for done in store.inbox_items(40):
+            tx.remove_handled(done)
+    assert [item.seq for item in store.queued("c", 1000)] == [*range(50, 60), *range(61, len(payloads) + 1)]
+    assert [item.payload for item in store.inbox_items(1000)] == payloads[40:]
 
 
-def test_what_a_transaction_collected_is_gone_with_it(store: Store) -> None:
+def test_rollback_discards_collected_rows(store: Store) -> None:
     def fail() -> None:
         with store.transaction() as tx:
             tx.send("k", "c", b"x", encoding="")
@@ -180,4 +179,4 @@ def test_what_a_transaction_collected_is_gone_with_it(store: Store) -> None:
     assert store.outbox_depth() == store.inbox_depth() == 0
     with store.transaction() as tx:
         assert tx.send("k", "c", b"x", encoding="") == 1
-        assert not tx.was_seen(ORIGIN, 1)
+        assert not tx.was_received(ORIGIN, 1)

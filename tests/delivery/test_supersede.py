@@ -1,4 +1,4 @@
-"""Editions, quotas and queues in a store: what is dropped, what stays, and what a consumer makes of the gaps."""
+"""Editions, quotas and queues of a store, and gaps in the sequence numbers."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.delivery.protocol import attachment, parse_chunk
+from sonarpost.delivery.protocol import attachment, parse_query
+from sonarpost.delivery.records import OutboxItem, Topic, consumer_of, queue_of
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import OutboxItem, Topic, consumer_of, queue_of
 from sonarpost.errors import PayloadError
 
 
@@ -22,46 +22,46 @@ def send(store: Store, topic: str, edition: int, *, priority: int = 6, queue: st
         return tx.send("k", queue, payload, encoding="", priority=priority, topic=Topic(topic, edition))
 
 
-def owed(store: Store, queue: str = "c2") -> list[str]:
-    return [item.payload.decode().rstrip(".") for item in store.owed(queue, 99)]
+def queued(store: Store, queue: str = "c2") -> list[str]:
+    return [item.payload.decode().rstrip(".") for item in store.queued(queue, 99)]
 
 
-def test_a_newer_edition_takes_the_place_and_the_priority_of_older_ones(store: Store) -> None:
+def test_newer_edition_inherits_position_and_priority(store: Store) -> None:
     send(store, "a", 1, priority=5)
     send(store, "b", 1, priority=5)
     send(store, "c", 1, priority=6)
     assert send(store, "a", 2, priority=6) == 4
-    assert owed(store) == ["a2", "b1", "c1"]
-    assert [item.priority for item in store.owed("c2", 9)] == [5, 5, 6]
+    assert queued(store) == ["a2", "b1", "c1"]
+    assert [item.priority for item in store.queued("c2", 9)] == [5, 5, 6]
 
 
-def test_an_edition_on_its_way_stays_and_the_newest_always_does(store: Store) -> None:
+def test_edition_in_flight_and_newest_edition_are_kept(store: Store) -> None:
     send(store, "a", 1)
-    assert store.begin("c2", 1)
+    assert store.mark_in_flight("c2", (1,))
     send(store, "a", 2)
     send(store, "a", 3)
-    assert owed(store) == ["a1", "a3"]
-    store.end("c2", 1)
-    assert not store.begin("c2", 2), "it has been replaced, and must not be sent any more"
+    assert queued(store) == ["a1", "a3"]
+    store.clear_in_flight("c2", 1)
+    assert not store.mark_in_flight("c2", (2,)), "a replaced edition must not be sent"
 
 
-def test_an_older_edition_that_comes_late_is_not_queued(store: Store) -> None:
+def test_late_older_edition_is_not_queued(store: Store) -> None:
     send(store, "a", 3)
     assert send(store, "a", 2) == 0
-    assert owed(store) == ["a3"]
+    assert queued(store) == ["a3"]
 
 
-def test_queues_and_topics_know_nothing_of_each_other(store: Store) -> None:
+def test_queues_and_topics_are_independent(store: Store) -> None:
     send(store, "a", 1)
     send(store, "a", 2, queue="c2@shore-2")
     send(store, "b", 5)
-    assert (owed(store), owed(store, "c2@shore-2")) == (["a1", "b5"], ["a2"])
+    assert (queued(store), queued(store, "c2@shore-2")) == (["a1", "b5"], ["a2"])
     assert consumer_of(queue_of("c2", "shore-2")) == consumer_of("c2") == "c2"
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(1, 6), st.booleans()), max_size=25))
 @settings(max_examples=40)
-def test_whatever_comes_in_whatever_order_the_newest_edition_is_sent(
+def test_newest_edition_is_sent_for_any_order_of_arrival(
     tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int, bool]]
 ) -> None:
     store = Store(tmp_path_factory.mktemp("editions") / "s.db")
@@ -71,40 +71,40 @@ def test_whatever_comes_in_whatever_order_the_newest_edition_is_sent(
         send(store, topic, edition)
         newest[topic] = max(newest.get(topic, 0), edition)
         if take_one:
-            for item in store.owed("c2", 1):
-                assert store.begin("c2", item.seq)
+            for item in store.queued("c2", 1):
+                assert store.mark_in_flight("c2", (item.seq,))
                 name = item.payload.decode().rstrip(".")
                 sent.setdefault(name[0], set()).add(int(name[1:]))
                 with store.transaction() as tx:
-                    tx.acknowledged("c2", item.seq)
-                store.end("c2", item.seq)
-    for name in owed(store):
+                    tx.remove_acknowledged("c2", (item.seq,))
+                store.clear_in_flight("c2", item.seq)
+    for name in queued(store):
         sent.setdefault(name[0], set()).add(int(name[1:]))
     assert {topic: max(editions) for topic, editions in sent.items()} == newest
     store.close()
 
 
-def test_a_quota_drops_the_least_urgent_first_then_the_oldest_and_never_what_is_urgent(store: Store) -> None:
+def test_quota_drops_least_urgent_then_oldest_and_never_urgent_records(store: Store) -> None:
     for seq, (topic, priority) in enumerate([("a", 5), ("b", 6), ("c", 6), ("d", 2), ("e", 5)], 1):
         assert send(store, topic, 1, priority=priority, size=100) == seq
     with store.transaction() as tx:
         assert tx.drop_oldest("c2", 350, 2) == 2
-    assert owed(store) == ["d1", "a1", "e1"]
+    assert queued(store) == ["d1", "a1", "e1"]
     with store.transaction() as tx:
         assert tx.drop_oldest("c2", 0, 2) == 2
-    assert owed(store) == ["d1"]
+    assert queued(store) == ["d1"]
 
 
-def test_a_quota_leaves_what_is_on_its_way(store: Store) -> None:
+def test_quota_keeps_records_in_flight(store: Store) -> None:
     send(store, "a", 1, size=100)
     send(store, "b", 1, size=100)
-    assert store.begin("c2", 1)
+    assert store.mark_in_flight("c2", (1,))
     with store.transaction() as tx:
         assert tx.drop_oldest("c2", 0, 2) == 1
-    assert owed(store) == ["a1"]
+    assert queued(store) == ["a1"]
 
 
-def test_the_depth_of_a_queue(store: Store) -> None:
+def test_queue_depth_counts_records_and_bytes(store: Store) -> None:
     assert store.queue_depth("c2").oldest_utc_s is None
     send(store, "a", 1, size=70)
     send(store, "b", 1, size=30)
@@ -113,58 +113,58 @@ def test_the_depth_of_a_queue(store: Store) -> None:
     assert depth.oldest_utc_s is not None
 
 
-def test_every_queue_has_an_origin_of_its_own(store: Store) -> None:
-    """A site that is renamed has a queue whose numbers begin anew, and the same consumer behind it."""
+def test_every_queue_has_its_own_origin(store: Store) -> None:
+    """A renamed site has a new queue that numbers from 1, with the same consumer."""
     origins = {store.origin_of(queue) for queue in ("c2", "c2@a", "c2@b")}
     assert len(origins) == 3
     assert store.origin_of("c2") == store.origin
     assert {len(origin) for origin in origins} == {16}
 
 
-def test_what_a_producer_is_done_with_needs_no_memory(tmp_path: Path, store: Store) -> None:
+def test_numbers_below_done_up_to_are_not_stored(tmp_path: Path, store: Store) -> None:
     for edition in range(1, 8):
         send(store, "a", edition)
-    assert store.settled_upto("c2") == 6
+    assert store.done_up_to("c2") == 6
     consumer = Store(tmp_path / "consumer.db")
     with consumer.transaction() as tx:
         tx.mark_refused(b"o" * 16, 3)
-        tx.settle_upto(b"o" * 16, 6)
+        tx.mark_done_up_to(b"o" * 16, 6)
         assert tx.accept("k", b"x", b"o" * 16, 7)
         assert not tx.accept("k", b"x", b"o" * 16, 5)
-        tx.settle_upto(b"o" * 16, 2)
-        assert tx.was_seen(b"o" * 16, 7)
+        tx.mark_done_up_to(b"o" * 16, 2)
+        assert tx.was_received(b"o" * 16, 7)
     assert consumer._query("SELECT COUNT(*) FROM seen") == [(0,)]
     assert consumer._query("SELECT COUNT(*) FROM refused_before") == [(0,)]
     consumer.close()
     with store.transaction() as tx:
-        tx.acknowledged("c2", 7)
-    assert store.settled_upto("c2") == 7
+        tx.remove_acknowledged("c2", (7,))
+    assert store.done_up_to("c2") == 7
 
 
 @pytest.mark.parametrize("statement", [1, 2])
-def test_a_record_that_is_queued_meanwhile_is_not_told_to_be_done_with(store: Store, statement: int) -> None:
+def test_record_queued_during_the_read_is_not_reported_as_done(store: Store, statement: int) -> None:
     statements = 0
 
-    def queue_meanwhile(_: str) -> None:
+    def queue_during_read(_: str) -> None:
         nonlocal statements
         statements += 1
         if statements == statement:
             send(store, "a", 1)
 
-    store._reader.set_trace_callback(queue_meanwhile)
-    settled = store.settled_upto("c2")
+    store._reader.set_trace_callback(queue_during_read)
+    done_up_to = store.done_up_to("c2")
     store._reader.set_trace_callback(None)
-    assert all(settled < item.seq for item in store.owed("c2", 9))
+    assert all(done_up_to < item.seq for item in store.queued("c2", 9))
 
 
-def test_a_producer_cannot_settle_what_it_asks_for() -> None:
+def test_done_up_to_must_be_below_the_sequence_number() -> None:
     item = OutboxItem("c2", 5, "k", "", 4, b"data", hashlib.sha256(b"data").digest())
-    assert parse_chunk(attachment(b"o" * 16, item, settled=4), b"data", "k").settled == 4
+    assert parse_query(attachment(b"o" * 16, item, done_up_to=4), b"data", "k").done_up_to == 4
     with pytest.raises(PayloadError, match="settled: got 5, expected a number below seq"):
-        parse_chunk(attachment(b"o" * 16, item, settled=5), b"data", "k")
+        parse_query(attachment(b"o" * 16, item, done_up_to=5), b"data", "k")
 
 
-def test_a_store_of_version_1_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_store_of_version_1_is_migrated(tmp_path: Path) -> None:
     path = tmp_path / "s.db"
     old = sqlite3.connect(path)
     old.executescript(
@@ -188,9 +188,9 @@ def test_a_store_of_version_1_goes_on_where_it_was(tmp_path: Path) -> None:
     for _ in range(2):
         store = Store(path)
         assert store.origin == b"o" * 16
-        assert owed(store)[:3] == ["p1", "p2", "p3"]
+        assert queued(store)[:3] == ["p1", "p2", "p3"]
         store.close()
     store = Store(path)
     assert send(store, "a", 1) == 4
-    assert owed(store) == ["p1", "p2", "p3", "a1"]
+    assert queued(store) == ["p1", "p2", "p3", "a1"]
     store.close()

@@ -145,7 +145,7 @@ def test_a_signal_ends_a_service_whose_record_nobody_takes(start: Start, tmp_pat
             tx.send("sonarpost/v1/shore/inbox/vessel-1", "c2", b"x" * 100_000, encoding="e")
     store.close()
     process = start(configuration(tmp_path, router))
-    read_until(process, "A consumer does not answer, records wait")
+    read_until(process, "Consumer not responding; records queued")
     status, seconds, log = end(process, signal.SIGTERM)
     assert (status, "Traceback" in log) == (0, False)
     assert seconds < 3

@@ -144,7 +144,7 @@ def test_a_relay_with_a_session_of_its_own_reaches_the_shore(world, crew, tmp_pa
 
 def test_a_malformed_or_too_large_record_is_refused_by_c2_and_told(world, crew, tmp_path, caplog, aboard):
     c2 = crew(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
-    key = keys.handoff(keys.shore_inbox("vessel-1"), "c2")
+    key = keys.delivery_query(keys.shore_inbox("vessel-1"), "c2")
     replies: list[bytes] = []
 
     def refused_again() -> bool:

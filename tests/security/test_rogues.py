@@ -27,7 +27,7 @@ class Heard:
         self.queries: list[str] = []
         self.tokens: list[str] = []
         session.declare_subscriber("sonarpost/**", lambda sample: self.keys.append(str(sample.key_expr)))
-        session.declare_queryable(keys.handoff(keys.shore_inbox_all(), "c2"), self._answer)
+        session.declare_queryable(keys.delivery_query(keys.shore_inbox_all(), "c2"), self._answer)
         session.liveliness().declare_subscriber(
             "sonarpost/**", lambda sample: self.tokens.append(str(sample.key_expr)), history=True
         )
@@ -116,23 +116,25 @@ def test_it_is_no_use_to_come_as_a_peer_or_a_router(world, heard, mode):
 
 def test_a_vessel_hands_over_to_its_own_inbox_only(world, heard):
     with world.open("vessel-1") as rogue:
-        eventually(lambda: answers(rogue, keys.handoff(INBOX_1, "c2")) == [b"answer"], what="the own hand-over")
-        assert answers(rogue, keys.handoff(INBOX_2, "c2")) == []
-        assert answers(rogue, keys.handoff(keys.shore_inbox_all(), "c2")) == []
+        eventually(lambda: answers(rogue, keys.delivery_query(INBOX_1, "c2")) == [b"answer"], what="the own hand-over")
+        assert answers(rogue, keys.delivery_query(INBOX_2, "c2")) == []
+        assert answers(rogue, keys.delivery_query(keys.shore_inbox_all(), "c2")) == []
         assert answers(rogue, "sonarpost/**") == []
     assert {key for key in heard.queries if "vessel-1" not in key} == set()
-    world.shore.wait_for("Message denied", "peer=vessel-1", "message=Query", f"key={keys.handoff(INBOX_2, 'c2')}")
+    world.shore.wait_for(
+        "Message denied", "peer=vessel-1", "message=Query", f"key={keys.delivery_query(INBOX_2, 'c2')}"
+    )
 
 
 def test_a_vessel_answers_for_itself_only(world, ashore, heard):
     with world.open("vessel-1") as rogue:
         for vessel in ("vessel-1", "vessel-2"):
             rogue.declare_queryable(
-                keys.handoff(keys.advice(vessel), "relay"), lambda query: query.reply(query.key_expr, b"mine")
+                keys.delivery_query(keys.advice(vessel), "relay"), lambda query: query.reply(query.key_expr, b"mine")
             )
-        own = keys.handoff(keys.advice("vessel-1"), "relay")
+        own = keys.delivery_query(keys.advice("vessel-1"), "relay")
         eventually(lambda: answers(ashore, own) == [b"mine"], what="its own answer")
-        assert answers(ashore, keys.handoff(keys.advice("vessel-2"), "relay")) == []
+        assert answers(ashore, keys.delivery_query(keys.advice("vessel-2"), "relay")) == []
     world.shore.wait_for("Message denied", "peer=vessel-1", "Queryable", "vessel-2/advice/handoff/relay")
 
 
@@ -172,11 +174,11 @@ def test_a_revoked_certificate_gets_nothing_through_and_the_new_one_does(world, 
     with world.open("vessel-3") as rogue, world.open("vessel-3.g2") as honest:
         own_key_arrives(honest, heard, "vessel-3", "before")
         rogue.put("sonarpost/v1/vessel-3/acoustic/rx", b"stolen")
-        assert answers(rogue, keys.handoff(keys.shore_inbox("vessel-3"), "c2")) == []
+        assert answers(rogue, keys.delivery_query(keys.shore_inbox("vessel-3"), "c2")) == []
         rogue.liveliness().declare_token(keys.alive("vessel-3", "relay"))
         publisher = rogue.declare_publisher("sonarpost/v1/vessel-3/acoustic/rx")
         own_key_arrives(honest, heard, "vessel-3", "honest")
-        assert answers(honest, keys.handoff(keys.shore_inbox("vessel-3"), "c2")) == [b"answer"]
+        assert answers(honest, keys.delivery_query(keys.shore_inbox("vessel-3"), "c2")) == [b"answer"]
         assert not publisher.matching_status.matching
     assert "sonarpost/v1/vessel-3/acoustic/rx" not in heard.keys
     assert keys.alive("vessel-3", "relay") not in heard.tokens
@@ -195,7 +197,7 @@ def test_an_observer_sees_everything_and_changes_nothing(world, ashore, heard):
 
         eventually(put_and_seen, what="the picture")
         watcher.put(keys.advice("vessel-1"), b"false")
-        assert answers(watcher, keys.handoff(INBOX_1, "c2")) == []
+        assert answers(watcher, keys.delivery_query(INBOX_1, "c2")) == []
     world.shore.wait_for("Message denied", "peer=observer-1", "message=Put", f"key={keys.advice('vessel-1')}")
 
 
@@ -204,7 +206,7 @@ def test_a_vehicle_on_deck_shows_what_it_has_and_no_more(world, heard):
         own_key_arrives(vehicle, heard, "uuv-1", "before")
         vehicle.put("sonarpost/v1/vessel-1/image/reconstructed", b"false")
         own_key_arrives(vehicle, heard, "uuv-1", "deck")
-        assert answers(vehicle, keys.handoff(INBOX_1, "c2")) == []
+        assert answers(vehicle, keys.delivery_query(INBOX_1, "c2")) == []
     assert "sonarpost/v1/vessel-1/image/reconstructed" not in heard.keys
 
 

@@ -14,10 +14,10 @@ from sonarpost.security import tls_files
 from sonarpost.security.fleet import Fleet
 
 VESSEL = "vessel-1"
-DECISION = keys.handoff(keys.contact_decision(VESSEL), "relay")
-ADVICE = keys.handoff(keys.advice(VESSEL), "relay")
-COMMAND = keys.handoff(keys.command(VESSEL, "resend"), "relay")
-PICTURE = keys.handoff(keys.image_reconstructed(VESSEL), "relay")
+DECISION = keys.delivery_query(keys.contact_decision(VESSEL), "relay")
+ADVICE = keys.delivery_query(keys.advice(VESSEL), "relay")
+COMMAND = keys.delivery_query(keys.command(VESSEL, "resend"), "relay")
+PICTURE = keys.delivery_query(keys.image_reconstructed(VESSEL), "relay")
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def relay(aboard):
         keys.command_all(VESSEL),
         keys.image_reconstructed(VESSEL),
     ):
-        aboard.declare_queryable(keys.handoff(key, "relay"), answer)
+        aboard.declare_queryable(keys.delivery_query(key, "relay"), answer)
     aboard.declare_subscriber(keys.everything_of(VESSEL), lambda sample: asked.append(f"put {sample.key_expr}"))
     return asked
 
@@ -63,7 +63,7 @@ def test_the_shore_advises_and_commands_and_no_more(world, relay):
 
 
 def test_a_console_aboard_decides_and_commands_and_takes_advice(world, relay, aboard):
-    taken = keys.handoff(keys.advice(VESSEL), "console")
+    taken = keys.delivery_query(keys.advice(VESSEL), "console")
     with world.open("console-1", endpoint=world.vessel_tls) as console:
         eventually(lambda: answered(console, DECISION), what="the decision")
         assert answered(console, COMMAND)
@@ -75,17 +75,17 @@ def test_a_console_aboard_decides_and_commands_and_takes_advice(world, relay, ab
 
 
 def test_a_console_ashore_hands_in_advice_and_no_picture(world, ashore):
-    advice = keys.handoff(keys.tasking_advice(VESSEL), "c2")
+    advice = keys.delivery_query(keys.tasking_advice(VESSEL), "c2")
 
     def answer(query: zenoh.Query) -> None:
         with query:
             query.reply(query.key_expr, b"stored")
 
-    ashore.declare_queryable(keys.handoff(keys.tasking_advice_all(), "c2"), answer)
-    ashore.declare_queryable(keys.handoff(keys.shore_inbox_all(), "c2"), answer)
+    ashore.declare_queryable(keys.delivery_query(keys.tasking_advice_all(), "c2"), answer)
+    ashore.declare_queryable(keys.delivery_query(keys.shore_inbox_all(), "c2"), answer)
     with world.open("console-1") as console:
         eventually(lambda: answered(console, advice), what="the advice")
-        assert not answered(console, keys.handoff(keys.shore_inbox(VESSEL), "c2"))
+        assert not answered(console, keys.delivery_query(keys.shore_inbox(VESSEL), "c2"))
 
 
 def test_another_vessel_and_a_vehicle_get_nothing_at_a_vessels_door(world, relay):

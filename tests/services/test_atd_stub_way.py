@@ -14,7 +14,7 @@ from builders.common import REPOSITORY, eventually
 
 from sonarpost import keys, wire
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.unit_of_work import UnitOfWork
+from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.messages import Contact, Health, Pixels, QueuedImage, QueueState, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.pool import ContactPool

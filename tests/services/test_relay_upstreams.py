@@ -92,7 +92,7 @@ def test_a_site_with_a_router_of_its_own_is_reached_when_that_comes_up(begin, so
                 asked.append(msgpack.unpackb(query.payload.to_bytes())["key"])
                 query.reply(query.key_expr, msgpack.packb({"v": 1, "status": "stored", "next": 0, "reason": ""}))
 
-        far.declare_queryable(keys.handoff(keys.shore_inbox_all("far"), "c2"), answer)
+        far.declare_queryable(keys.delivery_query(keys.shore_inbox_all("far"), "c2"), answer)
         eventually(lambda: service.gauges()["waiting_for_far"] == 0)
         assert asked == [DECISIONS]
     finally:
@@ -173,7 +173,7 @@ def test_below_the_reserve_pictures_wait_with_their_senders_and_decisions_are_ta
     begin, c2, source, monkeypatch, refused
 ):
     free = [20_000_000]
-    monkeypatch.setattr("sonarpost.delivery.disk_reserve.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
+    monkeypatch.setattr("sonarpost.delivery.store.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
     shore = c2()
     service = begin(disk_reserve_bytes=50_000_000)
     source.send(IMAGES, "relay", image("AAAA"))
@@ -190,7 +190,7 @@ def test_below_the_reserve_pictures_wait_with_their_senders_and_decisions_are_ta
 def test_below_the_reserve_a_plain_publication_of_a_picture_is_refused_aloud(begin, c2, publish, monkeypatch):
     from sonarpost import wire
 
-    monkeypatch.setattr("sonarpost.delivery.disk_reserve.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, 20_000_000))
+    monkeypatch.setattr("sonarpost.delivery.store.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, 20_000_000))
     service = begin(disk_reserve_bytes=50_000_000)
     publish(IMAGES, wire.encode(image()))
     eventually(lambda: service.health().counters.get("records_refused") == 1)

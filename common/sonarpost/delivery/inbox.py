@@ -1,4 +1,4 @@
-"""The consumer's side of the durable hand-off: commit first, then acknowledge."""
+"""Consumer side of the delivery protocol: commit first, then acknowledge."""
 
 from __future__ import annotations
 
@@ -7,59 +7,60 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from dataclasses import dataclass
 
 import zenoh
 
 from sonarpost import keys
-from sonarpost.delivery.batch_protocol import MAX_RECORDS, pack_replies, parse_query
-from sonarpost.delivery.protocol import MAX_RECORD_BYTES, AckReply
+from sonarpost.delivery.protocol import MAX_BATCH_RECORDS, MAX_RECORD_BYTES, AckReply, pack_replies, parse_query
+from sonarpost.delivery.records import ReceivedChunk
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import ReceivedChunk, Transaction
-from sonarpost.errors import BadInputError, DeliveryError, PayloadError
+from sonarpost.delivery.transaction import Transaction
+from sonarpost.errors import BadInputError, DeliveryError, PayloadError, RetryLaterError
 from sonarpost.logs import kv, lazy_log_context
 from sonarpost.monitoring.log_context import context_of_payload
 
 log = logging.getLogger(__name__)
 
-BATCH = 64
-BATCH_ATTACHED = 65_536
-"""Most bytes of attachments in one batch, about 1400 small records: whoever waits for the store waits no longer."""
+COMMIT_MESSAGES = 64
+COMMIT_ATTACHMENT_BYTES = 65_536
+"""Maximum size of the attachments in one transaction (about 1400 small records); it bounds the duration."""
 QUEUE_LIMIT = 256
 RETRY_S = 0.5
 MAX_REASON = 200
 
 
 Replies = AckReply | list[AckReply]
-"""What is answered: to a query of several records, for each of them."""
-
-
-class RetryLaterError(DeliveryError):
-    """There is no room for this record at the moment; its sender keeps it, and other records may be taken."""
+"""Reply to a query; for a batch, one for each record."""
 
 
 @dataclass(frozen=True, slots=True)
-class _PendingAck:
-    """A hand-over query, or (query None) a plain publication by somebody without an outbox."""
+class _Message:
+    """A delivery query, or (query None) a plain publication of a program without an outbox."""
 
     key: str
     payload: bytes
-    attached: bytes
+    attachment: bytes
     query: zenoh.Query | None
 
 
 class Inbox:
-    """Takes records for one consumer: queries of the hand-off, and plain publications of third parties.
+    """Receives the records of one consumer: delivery queries, and plain publications of third-party programs.
 
-    A publication that carries a hand-off attachment is a copy for watchers and is left alone; the same record comes by
-    query. One without comes from a program that has no outbox (somebody's own detector): it is committed like any
-    other, but nobody is told, so a loss on the way to us is not repaired.
+    A publication with an attachment is a copy for subscribers and is ignored; its record arrives by query. One without
+    an attachment comes from a program that has no outbox (for example a custom detector). It is committed as well, but
+    its sender gets no reply: a publication that is lost before it arrives is not repeated.
 
     Args:
-        check: Called with (key, payload) before a record is stored; raises BadInputError to refuse it.
-        on_refused: Called with every error that made a record be refused.
+        session: Session on the platform's router.
+        store: Store for the accepted records.
+        consumer: Name of the consumer.
+        key_expressions: Keys of the records.
+        validate: Called with (key, payload) before a record is stored; raises BadInputError to refuse it.
+        on_refused: Called with each error that caused a record to be refused.
         check_capacity: Called with the key before a record is stored; raises RetryLaterError if there is no space.
-        delivery_only_keys: Key expressions on which plain publications are not for this consumer.
+        delivery_only_keys: Key expressions on which plain publications are ignored.
     """
 
     def __init__(
@@ -68,47 +69,49 @@ class Inbox:
         store: Store,
         consumer: str,
         key_expressions: tuple[str, ...],
-        check: Callable[[str, bytes], None],
+        validate: Callable[[str, bytes], None],
         on_refused: Callable[[BadInputError], None],
         *,
         check_capacity: Callable[[str], None] = lambda _: None,
         delivery_only_keys: Collection[str] = (),
     ) -> None:
         self._store = store
-        self._suffix = "/handoff/" + consumer
-        self._check = check
+        self._key_suffix = "/handoff/" + consumer
+        self._validate = validate
         self._on_refused = on_refused
         self._check_capacity = check_capacity
-        self._arrivals: queue.Queue[_PendingAck] = queue.Queue(QUEUE_LIMIT)
+        self._messages: queue.Queue[_Message] = queue.Queue(QUEUE_LIMIT)
         self._stop = threading.Event()
         self._storage_failing = False
-        self._kept: list[_PendingAck] = []
-        self._no_room: dict[str, str | None] = {}
+        self._retained: list[_Message] = []
+        self._no_capacity: dict[str, str | None] = {}
         self._thread = threading.Thread(target=self._run, name=f"inbox-{consumer}", daemon=True)
         self._thread.start()
         self._declared: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         for key in key_expressions:
-            self._declared.append(session.declare_queryable(keys.handoff(key, consumer), self._on_query))
+            self._declared.append(session.declare_queryable(keys.delivery_query(key, consumer), self._on_query))
             if key not in delivery_only_keys:
                 self._declared.append(session.declare_subscriber(key, self._on_sample))
 
     @property
     def storage_failing(self) -> bool:
-        """True while records cannot be stored (a full disk, for example)."""
+        """Whether records cannot be stored at present, for example because of a full disk."""
         return self._storage_failing
 
     def close(self) -> None:
-        """Stop taking records; what was not committed is not acknowledged and will be sent again."""
+        """Stop receiving; uncommitted records are not acknowledged, their producers send them again."""
         for declared in self._declared:
             declared.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
         self._stop.set()
         self._thread.join()
 
+    # Receive
+
     def _on_query(self, query: zenoh.Query) -> None:
-        key = str(query.key_expr).removesuffix(self._suffix)
+        key = str(query.key_expr).removesuffix(self._key_suffix)
         payload = query.payload.to_bytes() if query.payload is not None else b""
-        attached = query.attachment.to_bytes() if query.attachment is not None else b""
-        self._arrive(_PendingAck(key, payload, attached, query))
+        attachment = query.attachment.to_bytes() if query.attachment is not None else b""
+        self._put(_Message(key, payload, attachment, query))
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         if sample.attachment is not None or sample.kind != zenoh.SampleKind.PUT:
@@ -117,151 +120,148 @@ class Inbox:
         if size > MAX_RECORD_BYTES:
             self._on_refused(PayloadError(key, "payload", f"{size} bytes", f"at most {MAX_RECORD_BYTES} bytes"))
             return
-        self._arrive(_PendingAck(key, sample.payload.to_bytes(), b"", None))
+        self._put(_Message(key, sample.payload.to_bytes(), b"", None))
 
-    def _arrive(self, arrival: _PendingAck) -> None:
+    def _put(self, message: _Message) -> None:
         while not self._stop.is_set():
             try:
-                self._arrivals.put(arrival, timeout=0.2)
+                self._messages.put(message, timeout=0.2)
             except queue.Full:
                 continue
             return
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            batch = self._next_batch()
-            if batch:
-                self._answer(batch, self._commit(batch))
+            messages = self._next_messages()
+            if messages:
+                self._reply(messages, self._commit(messages))
 
-    def _next_batch(self) -> list[_PendingAck]:
-        if self._kept:
-            # What nobody sends again comes first, a moment after the trouble that kept it.
+    def _next_messages(self) -> list[_Message]:
+        if self._retained:
+            # Publications have no sender that repeats them: retry them first, after a pause.
             self._stop.wait(RETRY_S)
-            kept, self._kept = self._kept, []
-            return kept
-        try:
-            batch = [self._arrivals.get(timeout=0.2)]
-        except queue.Empty:
-            return []
-        while len(batch) < BATCH and sum(len(arrival.attached) for arrival in batch) < BATCH_ATTACHED:
-            try:
-                batch.append(self._arrivals.get_nowait())
-            except queue.Empty:
-                break
-        return batch
+            retained, self._retained = self._retained, []
+            return retained
+        messages: list[_Message] = []
+        with suppress(queue.Empty):
+            messages.append(self._messages.get(timeout=0.2))
+            while (
+                len(messages) < COMMIT_MESSAGES and sum(len(m.attachment) for m in messages) < COMMIT_ATTACHMENT_BYTES
+            ):
+                messages.append(self._messages.get_nowait())
+        return messages
 
-    def _commit(self, batch: list[_PendingAck]) -> list[Replies]:
-        """Store a batch in one transaction, so that many records share one write to the disk."""
-        self._no_room.clear()
+    def _commit(self, messages: list[_Message]) -> list[Replies]:
+        """Store several messages in one transaction, so that they share one write to the disk."""
+        self._no_capacity.clear()
         try:
             with self._store.transaction() as tx:
-                replies = [self._take(tx, arrival) for arrival in batch]
+                replies = [self._store_message(tx, message) for message in messages]
         except DeliveryError as error:
             if not self._storage_failing:
-                log.exception("Records cannot be stored, their senders keep them", extra=kv(error=str(error)))
+                log.exception("Records cannot be stored; senders keep them", extra=kv(error=str(error)))
             self._storage_failing = True
-            self._kept = [arrival for arrival in batch if arrival.query is None]
+            self._retained = [message for message in messages if message.query is None]
             later: Replies = AckReply("later", reason=str(error)[:MAX_REASON])
-            return [later] * len(batch)
+            return [later] * len(messages)
         if self._storage_failing:
             log.info("Records can be stored again")
         self._storage_failing = False
         return replies
 
-    def _take(self, tx: Transaction, arrival: _PendingAck) -> Replies:
-        if arrival.query is None:
-            return self._take_publication(tx, arrival)
-        try:
-            asked = parse_query(arrival.attached, arrival.payload, arrival.key + self._suffix)
-        except PayloadError as error:
-            self._on_refused(error)
-            return AckReply("refused", reason=str(error))
-        if isinstance(asked, ReceivedChunk):
-            return self._take_chunk(tx, arrival.key, asked)
-        return [self._take_chunk(tx, arrival.key, chunk) for chunk in asked]
+    # Store
 
-    def _take_chunk(self, tx: Transaction, key: str, chunk: ReceivedChunk) -> AckReply:
+    def _store_message(self, tx: Transaction, message: _Message) -> Replies:
+        if message.query is None:
+            return self._store_publication(tx, message)
         try:
-            return self._taken(tx, key, chunk)
+            received = parse_query(message.attachment, message.payload, message.key + self._key_suffix)
+        except PayloadError as error:
+            return self._refused(error)
+        if isinstance(received, ReceivedChunk):
+            return self._store_chunk(tx, message.key, received)
+        return [self._store_chunk(tx, message.key, chunk) for chunk in received]
+
+    def _store_publication(self, tx: Transaction, message: _Message) -> AckReply:
+        try:
+            self._require_capacity(message.key)
+        except RetryLaterError as error:
+            # The sender does not repeat it, and there is no space to retain it.
+            self._on_refused(PayloadError(message.key, "payload", "a publication that cannot be stored", str(error)))
+            return AckReply("later", reason=str(error)[:MAX_REASON])
+        return self._store_record(tx, message.key, message.payload, None)
+
+    def _store_chunk(self, tx: Transaction, key: str, chunk: ReceivedChunk) -> AckReply:
+        if chunk.done_up_to:
+            tx.mark_done_up_to(chunk.origin, chunk.done_up_to)
+        if tx.was_refused(chunk.origin, chunk.seq):
+            return AckReply("refused", reason="refused before; the reason is in the consumer's log and store")
+        if tx.was_received(chunk.origin, chunk.seq):
+            return AckReply("stored")
+        try:
+            self._require_capacity(key)
+            record = tx.add_chunk(chunk)
+            if isinstance(record, int):
+                return AckReply("more", next_offset=record)
+            if hashlib.sha256(record).digest() != chunk.sha256:
+                where = key + self._key_suffix
+                return self._refused(PayloadError(where, "sha256", chunk.sha256.hex(), "the digest of the record"))
+            return self._store_record(tx, key, record, chunk)
         except RetryLaterError as error:
             return AckReply("later", reason=str(error)[:MAX_REASON])
-        except PayloadError as error:
-            self._on_refused(error)
-            return AckReply("refused", reason=str(error))
 
-    def _need_room(self, key: str) -> None:
-        """Ask once a batch whether there is room for what comes on a key."""
-        if key not in self._no_room:
+    def _refused(self, error: PayloadError) -> AckReply:
+        self._on_refused(error)
+        return AckReply("refused", reason=str(error))
+
+    def _require_capacity(self, key: str) -> None:
+        """Check the capacity for a key, once in each transaction."""
+        if key not in self._no_capacity:
             try:
                 self._check_capacity(key)
             except RetryLaterError as error:
-                self._no_room[key] = str(error)
+                self._no_capacity[key] = str(error)
             else:
-                self._no_room[key] = None
-        reason = self._no_room[key]
+                self._no_capacity[key] = None
+        reason = self._no_capacity[key]
         if reason is not None:
             raise RetryLaterError(reason)
 
-    def _take_publication(self, tx: Transaction, arrival: _PendingAck) -> AckReply:
-        try:
-            self._need_room(arrival.key)
-        except RetryLaterError as error:
-            # Nobody sends it again, and to keep it would take the room that is not there.
-            self._on_refused(PayloadError(arrival.key, "payload", "a publication that cannot be stored", str(error)))
-            return AckReply("later", reason=str(error)[:MAX_REASON])
-        return self._take_checked(tx, arrival.key, arrival.payload, None)
-
-    def _taken(self, tx: Transaction, key: str, chunk: ReceivedChunk) -> AckReply:
-        if chunk.settled:
-            tx.settle_upto(chunk.origin, chunk.settled)
-        if tx.was_refused(chunk.origin, chunk.seq):
-            return AckReply("refused", reason="refused before; the reason is in the consumer's log and store")
-        if tx.was_seen(chunk.origin, chunk.seq):
-            return AckReply("stored")
-        self._need_room(key)
-        whole = tx.add_chunk(chunk)
-        if isinstance(whole, int):
-            return AckReply("more", next_offset=whole)
-        if hashlib.sha256(whole).digest() != chunk.sha256:
-            raise PayloadError(key + self._suffix, "sha256", chunk.sha256.hex(), "the digest of the record")
-        return self._take_checked(tx, key, whole, chunk)
-
-    def _take_checked(self, tx: Transaction, key: str, payload: bytes, chunk: ReceivedChunk | None) -> AckReply:
+    def _store_record(self, tx: Transaction, key: str, payload: bytes, chunk: ReceivedChunk | None) -> AckReply:
         with lazy_log_context(lambda: context_of_payload(payload, key)):
-            return self._checked(tx, key, payload, chunk)
-
-    def _checked(self, tx: Transaction, key: str, payload: bytes, chunk: ReceivedChunk | None) -> AckReply:
-        try:
-            self._check(key, payload)
-        except DeliveryError:
-            raise
-        except BadInputError as error:
-            self._on_refused(error)
-            return self._refuse(tx, key, payload, chunk, str(error))
-        except Exception as error:
-            # A defect of ours must not stop the records behind this one, and must not lose this one either.
-            log.exception("Record not checked, it is kept apart", extra=kv(key=key))
-            return self._refuse(tx, key, payload, chunk, f"{type(error).__name__}: {error}")
+            try:
+                self._validate(key, payload)
+            except DeliveryError:
+                raise
+            except BadInputError as error:
+                self._on_refused(error)
+                return self._quarantine(tx, key, payload, chunk, str(error))
+            except Exception as error:
+                # An unexpected exception must neither block later records nor lose this one.
+                log.exception("Record quarantined after an unexpected exception", extra=kv(key=key))
+                return self._quarantine(tx, key, payload, chunk, f"{type(error).__name__}: {error}")
         if chunk is None:
             tx.accept(key, payload)
         else:
             tx.accept(key, payload, chunk.origin, chunk.seq)
         return AckReply("stored")
 
-    def _refuse(self, tx: Transaction, key: str, payload: bytes, chunk: ReceivedChunk | None, reason: str) -> AckReply:
+    def _quarantine(
+        self, tx: Transaction, key: str, payload: bytes, chunk: ReceivedChunk | None, reason: str
+    ) -> AckReply:
         tx.quarantine("in", key, payload, reason)
         if chunk is not None:
             tx.mark_refused(chunk.origin, chunk.seq)
         return AckReply("refused", reason=reason)
 
-    def _answer(self, batch: list[_PendingAck], replies: list[Replies]) -> None:
-        for arrival, reply in zip(batch, replies, strict=True):
-            if arrival.query is None:
+    def _reply(self, messages: list[_Message], replies: list[Replies]) -> None:
+        for message, reply in zip(messages, replies, strict=True):
+            if message.query is None:
                 continue
-            packed = reply.pack(takes=MAX_RECORDS) if isinstance(reply, AckReply) else pack_replies(reply)
+            packed = reply.pack(MAX_BATCH_RECORDS) if isinstance(reply, AckReply) else pack_replies(reply)
             try:
-                with arrival.query as query:
+                with message.query as query:
                     query.reply(query.key_expr, packed)
             except zenoh.ZError as error:
-                # The asker is gone or the link is down: it asks again, and (origin, seq) is known here.
-                log.debug("A reply could not be sent", extra=kv(key=arrival.key, error=str(error)))
+                # The producer has left or the link is down: it repeats the query, which is then a duplicate.
+                log.debug("Reply not sent", extra=kv(key=message.key, error=str(error)))

@@ -1,33 +1,78 @@
-"""The producer's side of the durable hand-off: publish for watchers, then hand over until acknowledged."""
+"""Producer side of the delivery protocol: publish for subscribers, send to the consumer until it acknowledges."""
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import zenoh
 
-from sonarpost.delivery.queue_policy import PRIORITIES, REPLY_TIMEOUT_S, OnAcknowledged, QueuePolicy
-from sonarpost.delivery.scheduler import PROBE_WINDOW, WINDOW
-from sonarpost.delivery.sender import BACK_OFF_S, QueueSender
+from sonarpost import keys
+from sonarpost.delivery import protocol
+from sonarpost.delivery.protocol import AckReply
+from sonarpost.delivery.records import OutboxItem, consumer_of
+from sonarpost.delivery.scheduler import MAX_WINDOW_BYTES, WINDOW, Chunk, DeliveryScheduler, RecordTransfer
 from sonarpost.delivery.store import Store
-from sonarpost.errors import DeliveryError
+from sonarpost.delivery.transaction import Transaction
+from sonarpost.errors import DeliveryError, PayloadError
 from sonarpost.logs import kv
-
-__all__ = ["BACK_OFF_S", "PRIORITIES", "PROBE_WINDOW", "REPLY_TIMEOUT_S", "WINDOW", "Outbox", "QueuePolicy"]
+from sonarpost.monitoring.log_context import context_of_payload
 
 log = logging.getLogger(__name__)
 
+REPLY_TIMEOUT_S = 5.0
+BACK_OFF_S = (0.05, 0.1, 0.2, 0.5, 1.0)
+IDLE_S = 1.0
+POLL_S = (0.0005, 0.02)
+"""First and longest interval between checks for replies; they arrive in bursts, one for each commit."""
+REMOVE_AT = 512
+"""Number of acknowledged records that are removed from the store at once."""
+REMOVE_AFTER_S = 0.2
+LOADED_BYTES = 2 * MAX_WINDOW_BYTES
+"""Maximum size of the records in memory beyond the first 128."""
+PRIORITIES = {
+    1: zenoh.Priority.REAL_TIME,
+    2: zenoh.Priority.INTERACTIVE_HIGH,
+    3: zenoh.Priority.INTERACTIVE_LOW,
+    4: zenoh.Priority.DATA_HIGH,
+    5: zenoh.Priority.DATA,
+    6: zenoh.Priority.DATA_LOW,
+    7: zenoh.Priority.BACKGROUND,
+}
+
+OnAcknowledged = Callable[[Transaction, OutboxItem, str | None], None]
+"""Called in the transaction that removes a record, with the consumer's reason if it was refused."""
+
+
+@dataclass(frozen=True, slots=True)
+class QueuePolicy:
+    """Settings with which a queue is sent.
+
+    Attributes:
+        session: Returns the session to use, None while it is not open; by default the session of the outbox.
+        publish: Also publish each record on its key, once after a start, for subscribers.
+        bytes_per_s: Bandwidth limit, None for none.
+        held: Send nothing: the consumer is no longer configured.
+    """
+
+    session: Callable[[], zenoh.Session | None] | None = None
+    publish: bool = True
+    bytes_per_s: float | None = None
+    held: bool = False
+
 
 class Outbox:
-    """Hands every record of a store's outbox to its consumer, one thread a queue: none holds another back.
+    """Sends the outbox of a store to its consumers, with one thread for each queue.
 
     Args:
-        session: Of the platform's router.
-        store: Whose outbox this is.
-        queue_policy: Tells how a queue is sent; by default all are published and sent as fast as they are taken.
-        on_acknowledged: Called in the transaction that forgets a record its consumer has taken or refused.
+        session: Session on the platform's router.
+        store: Store with the outbox.
+        queue_policy: Returns the settings of a queue; by default records are published and sent without a limit.
+        on_acknowledged: Called in the transaction that removes an accepted or refused record.
     """
 
     def __init__(
@@ -46,20 +91,20 @@ class Outbox:
         self._wake = threading.Event()
         self._senders: dict[str, QueueSender] = {}
         self._held: set[str] = set()
-        store.listen_outbox(self._wake)
+        store.add_outbox_listener(self._wake)
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
-        """Start a sender for each queue as it first appears."""
+        """Start a sender for each queue when it first holds a record."""
         self._wake.set()
         while not self._stop.is_set():
             self._wake.wait()
             self._wake.clear()
             try:
-                queues = self._store.consumers()
+                queues = self._store.queues()
             except DeliveryError:
-                log.exception("The outbox cannot be read, trying again")
+                log.exception("Outbox cannot be read; retrying")
                 self._stop.wait(1.0)
                 self._wake.set()
                 continue
@@ -71,35 +116,335 @@ class Outbox:
         policy = self._queue_policy(queue)
         if policy.held:
             self._held.add(queue)
-            log.warning("Records wait for a consumer that is not configured", extra=kv(consumer=queue))
+            log.warning("Records held for a consumer that is not configured", extra=kv(consumer=queue))
             return
         self._senders[queue] = QueueSender(self._session, self._store, queue, policy, self._on_acknowledged)
 
     def is_responding(self, queue: str) -> bool:
-        """Tell whether a queue's consumer answered what it was asked last; False where nothing was asked yet."""
+        """Return whether a queue's consumer replied to the last query; False before the first one."""
         sender = self._senders.get(queue)
-        return sender is not None and sender.is_responding
-
-    @property
-    def rejected(self) -> int:
-        """How many records consumers have refused in this run."""
-        return sum(sender.rejected for sender in tuple(self._senders.values()))
-
-    @property
-    def delivered(self) -> int:
-        """How many records consumers have acknowledged in this run."""
-        return sum(sender.delivered for sender in tuple(self._senders.values()))
+        return sender is not None and sender.responding
 
     def acknowledged_count(self, queue: str) -> int:
-        """How many records one queue's consumer has acknowledged in this run."""
+        """Return the number of records that a queue's consumer has accepted since the start."""
         sender = self._senders.get(queue)
-        return 0 if sender is None else sender.delivered
+        return 0 if sender is None else sender.acknowledged_count
 
     def close(self) -> None:
-        """Stop handing over; what is not acknowledged stays in the store."""
+        """Stop sending; unacknowledged records stay in the store."""
         self._stop.set()
         self._wake.set()
         self._thread.join()
-        self._store.unlisten_outbox(self._wake)
+        self._store.remove_outbox_listener(self._wake)
         for sender in self._senders.values():
             sender.close()
+
+
+@dataclass(frozen=True, slots=True)
+class _Query:
+    chunks: Sequence[Chunk]
+    replies: zenoh.handlers.Handler[zenoh.Reply]
+
+
+class _NoReplyError(Exception):
+    """The consumer is absent, the link is down, or the consumer cannot store records."""
+
+
+class QueueSender:
+    """Sends one queue: several queries in flight, most urgent record first.
+
+    Attributes:
+        responding: Whether the consumer replied to the last query.
+        acknowledged_count: Number of records that the consumer has accepted since the start.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        store: Store,
+        queue: str,
+        policy: QueuePolicy,
+        on_acknowledged: OnAcknowledged | None,
+    ) -> None:
+        self.responding = False
+        self.acknowledged_count = 0
+        self._default_session = session
+        self._store = store
+        self._queue = queue
+        self._origin = store.origin_of(queue)
+        self._policy = policy
+        self._on_acknowledged = on_acknowledged
+        self._scheduler = DeliveryScheduler(policy.bytes_per_s, time.monotonic())
+        self._published: set[int] = set()
+        self._in_flight: deque[_Query] = deque()
+        self._acknowledged: dict[int, OutboxItem] = {}
+        self._first_acknowledged_s = 0.0
+        self._done_up_to = 0
+        self._failures = 0
+        self._max_batch = 0
+        self._batch_refused = False
+        self._stop = threading.Event()
+        self._wake = threading.Event()
+        self._wake.set()
+        store.add_outbox_listener(self._wake)
+        self._thread = threading.Thread(target=self._run, name=f"outbox-{queue}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop; a query without a reply ends when the session closes."""
+        self._stop.set()
+        self._wake.set()
+        self._thread.join(timeout=0.5)
+        self._store.remove_outbox_listener(self._wake)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self._step()
+            except (_NoReplyError, DeliveryError, zenoh.ZError) as error:
+                self._back_off(str(error))
+        try:
+            self._remove_acknowledged()
+        except DeliveryError as error:
+            log.debug("Acknowledged records not removed; the next start sends them again", extra=kv(error=str(error)))
+
+    def _step(self) -> None:
+        """Send the allowed queries and process the available replies; wait if there is nothing to do."""
+        self._load()
+        wait_s = self._send_queries()
+        if self._process_replies():
+            return
+        overdue = time.monotonic() - self._first_acknowledged_s > REMOVE_AFTER_S
+        if self._acknowledged and (overdue or not self._in_flight):
+            self._remove_acknowledged()
+        elif self._in_flight:
+            self._wait_for_reply(IDLE_S if wait_s is None else wait_s)
+        else:
+            self._wake.wait(IDLE_S if wait_s is None else wait_s)
+
+    # Load
+
+    def _load(self) -> None:
+        """Load the most urgent records if there are new ones or few remain."""
+        scheduler = self._scheduler
+        if not self._wake.is_set() and len(scheduler.active) > scheduler.lookahead // 2:
+            return
+        if len(self._acknowledged) >= REMOVE_AT:
+            self._remove_acknowledged()
+        self._wake.clear()
+        numbers = self._store.queued_numbers(self._queue, scheduler.lookahead + len(self._acknowledged))
+        unacknowledged = [seq for seq in numbers if seq not in self._acknowledged]
+        known, loaded = self._items(unacknowledged[: scheduler.lookahead])
+        scheduler.update([*known, *loaded])
+        self._done_up_to = self._store.done_up_to(self._queue)
+        session = self._session()
+        if session is not None:
+            for item in loaded:
+                self._publish(session, item)
+
+    def _items(self, numbers: Sequence[int]) -> tuple[list[OutboxItem], list[OutboxItem]]:
+        """Return records that are in memory and newly loaded ones; fewer of large records, to limit the memory."""
+        active = self._scheduler.active
+        known: list[OutboxItem] = []
+        loaded: list[OutboxItem] = []
+        for first in range(0, len(numbers), WINDOW):
+            part = numbers[first : first + WINDOW]
+            known += [active[seq].item for seq in part if seq in active]
+            loaded += self._store.queued_items(self._queue, [seq for seq in part if seq not in active])
+            if sum(len(item.payload) for items in (known, loaded) for item in items) > LOADED_BYTES:
+                break
+        return known, loaded
+
+    def _session(self) -> zenoh.Session | None:
+        return self._default_session if self._policy.session is None else self._policy.session()
+
+    # Send
+
+    def _send_queries(self) -> float | None:
+        """Send queries until the window is full; return the wait that the bandwidth limit requires."""
+        while not self._stop.is_set():
+            chunk, wait_s = self._scheduler.next_chunk(time.monotonic())
+            if chunk is None:
+                return wait_s
+            chunks = self._mark_in_flight(self._scheduler.batch_with(chunk))
+            if chunks:
+                self._send(chunks)
+        return None
+
+    def _mark_in_flight(self, chunks: Sequence[Chunk]) -> list[Chunk]:
+        """Protect the records from replacement; omit those that a newer edition has already replaced."""
+        new = [chunk.transfer.item.seq for chunk in chunks if not chunk.transfer.in_flight]
+        queued = self._store.mark_in_flight(self._queue, new) if new else ()
+        marked = []
+        for chunk in chunks:
+            if chunk.transfer.in_flight or chunk.transfer.item.seq in queued:
+                chunk.transfer.in_flight = True  # before the query is sent, so that a failure clears the mark
+                marked.append(chunk)
+            else:
+                self._scheduler.remove(chunk.transfer)
+        return marked
+
+    def _send(self, chunks: Sequence[Chunk]) -> None:
+        session = self._session()
+        if session is None:
+            raise _NoReplyError("router of the upstream not reached yet")
+        items = [chunk.transfer.item for chunk in chunks]
+        for item in items:
+            self._publish(session, item)
+        done_up_to = min(self._done_up_to, *(item.seq - 1 for item in items))
+        if len(chunks) == 1:
+            start, end = chunks[0].start, chunks[0].end
+            payload = items[0].payload[start:end]
+            attachment = protocol.attachment(self._origin, items[0], start, done_up_to)
+        else:
+            payload = b"".join(item.payload for item in items)
+            attachment = protocol.batch_attachment(self._origin, items, done_up_to)
+        replies = session.get(
+            keys.delivery_query(items[0].key, consumer_of(items[0].queue)),
+            timeout=REPLY_TIMEOUT_S,
+            priority=PRIORITIES[items[0].priority],
+            # Waits for the link: a dropped query would cost its whole time-out.
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            payload=payload,
+            attachment=attachment,
+        )
+        self._scheduler.query_sent(chunks[0], time.monotonic(), *chunks[1:])
+        self._in_flight.append(_Query(chunks, replies))
+
+    def _publish(self, session: zenoh.Session, item: OutboxItem) -> None:
+        """Publish a copy for subscribers, which identify a repeated one by (origin, seq)."""
+        if not self._policy.publish or item.seq in self._published:
+            return
+        self._published.add(item.seq)
+        session.put(
+            item.key,
+            item.payload,
+            encoding=item.encoding,
+            priority=PRIORITIES[item.priority],
+            attachment=protocol.attachment(self._origin, item),
+        )
+
+    # Replies
+
+    def _process_replies(self) -> bool:
+        """Process the available replies, oldest query first; return whether there was one."""
+        found = False
+        while self._in_flight:
+            query = self._in_flight[0]
+            try:
+                received = query.replies.try_recv()
+            except zenoh.ZError as error:
+                raise _NoReplyError("no reply") from error
+            if received is None:
+                break
+            self._in_flight.popleft()
+            self._scheduler.query_ended(query.chunks[0], time.monotonic())
+            self._process(query.chunks, received)
+            found = True
+        return found
+
+    def _wait_for_reply(self, timeout_s: float) -> None:
+        """Wait for the oldest query's reply, a new record, or the end of the bandwidth limit's wait."""
+        ends_s = time.monotonic() + timeout_s
+        poll_s = POLL_S[0]
+        while not self._wake.is_set() and not self._stop.is_set():
+            if self._process_replies() or time.monotonic() >= ends_s:
+                return
+            self._wake.wait(min(poll_s, max(ends_s - time.monotonic(), 0.0)))
+            poll_s = min(2 * poll_s, POLL_S[1])
+
+    def _process(self, chunks: Sequence[Chunk], received: zenoh.Reply) -> None:
+        if received.ok is None:
+            raise _NoReplyError("no reply before the time-out")
+        replies = self._unpack(chunks, received.ok.payload.to_bytes())
+        for chunk, reply in zip(chunks, replies, strict=True):
+            if reply.status != "later":
+                self._apply(chunk, reply)
+        for reply in replies:
+            if reply.status == "later":
+                raise _NoReplyError(f"the consumer cannot store records: {reply.reason}")
+
+    def _unpack(self, chunks: Sequence[Chunk], payload: bytes) -> Sequence[AckReply]:
+        where = chunks[0].transfer.item.key
+        try:
+            if len(chunks) == 1:
+                reply = AckReply.unpack(payload, where)
+                self._max_batch = reply.max_batch
+                return [reply]
+            replies = protocol.unpack_replies(payload, len(chunks), where)
+        except PayloadError as error:
+            raise _NoReplyError(str(error)) from error
+        if isinstance(replies, AckReply):
+            if replies.status != "later":
+                # An older consumer replaced the one that announced batches: send single records from now on.
+                self._batch_refused = True
+            raise _NoReplyError(f"batch not accepted: {replies.status} {replies.reason}")
+        return replies
+
+    def _apply(self, chunk: Chunk, reply: AckReply) -> None:
+        transfer = chunk.transfer
+        self._failures = 0
+        self.responding = True
+        self._scheduler.probing = False
+        self._scheduler.max_batch = 0 if self._batch_refused else self._max_batch
+        if transfer.item.seq not in self._scheduler.active:
+            return
+        if reply.status == "stored":
+            if not self._acknowledged:
+                self._first_acknowledged_s = time.monotonic()
+            self._acknowledged[transfer.item.seq] = transfer.item
+            self._scheduler.remove(transfer)
+            self.acknowledged_count += 1
+        elif reply.status == "refused":
+            self._quarantine(transfer, reply.reason)
+        elif reply.next_offset >= len(transfer.item.payload):
+            size = len(transfer.item.payload)
+            raise _NoReplyError(f"invalid reply: next offset {reply.next_offset} of {size} bytes")
+        else:
+            self._scheduler.confirm(chunk, reply.next_offset)
+
+    def _quarantine(self, transfer: RecordTransfer, reason: str) -> None:
+        item = transfer.item
+        with self._store.transaction() as tx:
+            tx.quarantine_refused(item, reason)
+            if self._on_acknowledged is not None:
+                self._on_acknowledged(tx, item, reason)
+        context = context_of_payload(item.payload, item.key)
+        log.error(
+            "Record refused by its consumer and quarantined",
+            extra=kv(**context, consumer=self._queue, key=item.key, reason=reason),
+        )
+        self._scheduler.remove(transfer)
+        self._clear(item.seq)
+
+    def _remove_acknowledged(self) -> None:
+        """Remove acknowledged records in one transaction; if repeated, the consumer discards them as duplicates."""
+        if not self._acknowledged:
+            return
+        with self._store.transaction() as tx:
+            tx.remove_acknowledged(self._queue, self._acknowledged)
+            if self._on_acknowledged is not None:
+                for item in self._acknowledged.values():
+                    self._on_acknowledged(tx, item, None)
+        self._clear(*self._acknowledged)
+        self._acknowledged.clear()
+
+    def _clear(self, *numbers: int) -> None:
+        self._published.difference_update(numbers)
+        self._store.clear_in_flight(self._queue, *numbers)
+
+    def _back_off(self, reason: str) -> None:
+        """Discard the queries in flight and wait; all unconfirmed chunks are sent again."""
+        self.responding = False
+        self._in_flight.clear()
+        self._scheduler.restart()
+        for transfer in self._scheduler.active.values():
+            if transfer.in_flight and transfer.received == 0:
+                # The consumer has confirmed no part of it: a newer edition may replace it again.
+                transfer.in_flight = False
+                self._store.clear_in_flight(self._queue, transfer.item.seq)
+        if self._failures == len(BACK_OFF_S):
+            log.warning("Consumer not responding; records queued", extra=kv(consumer=self._queue, reason=reason))
+        wait_s = BACK_OFF_S[min(self._failures, len(BACK_OFF_S) - 1)]
+        self._failures += 1
+        self._stop.wait(wait_s)

@@ -1,8 +1,8 @@
-"""Which piece of which record goes next to one consumer: pure, with the time as an argument.
+"""Order and timing of the chunks that are sent to one consumer. Pure: the time is an argument.
 
-The most urgent record's pieces go first, then the oldest's. Urgent records (commands, decisions, advice) wait neither
-for the bandwidth limit nor behind a full window, only for the piece that is on its way. Pieces are as small as the
-limit makes necessary, so that this is short.
+The most urgent record is sent first, then the oldest. Urgent records (commands, decisions, advice) wait neither for the
+bandwidth limit nor for a full window, only for the chunk in progress. A bandwidth limit makes chunks smaller, so that
+this wait is short.
 """
 
 from __future__ import annotations
@@ -12,66 +12,75 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import islice
 
-from sonarpost.delivery.batch_protocol import MAX_RECORDS, RECORD_OVERHEAD_BYTES
-from sonarpost.delivery.items import OutboxItem
-from sonarpost.delivery.protocol import CHUNK_BYTES
-from sonarpost.delivery.token_bucket import TokenBucket
+from sonarpost.delivery.protocol import BATCH_RECORD_OVERHEAD_BYTES, CHUNK_BYTES, MAX_BATCH_RECORDS
+from sonarpost.delivery.records import OutboxItem
 
 WINDOW = 128
-"""Most queries in flight: twice what a consumer commits with one write, so that it never waits for the next."""
+"""Maximum number of queries in flight: twice what a consumer commits at once, so that it never waits for the next."""
 WINDOW_BYTES = 8 * CHUNK_BYTES
-"""Most bytes in flight at first: on a link of 125 kB/s these take two seconds of a query's five."""
+"""Initial limit of the bytes in flight: 2 s on a link of 125 kB/s, out of the 5 s time-out of a query."""
 MAX_WINDOW_BYTES = 64 * CHUNK_BYTES
-"""Most bytes in flight on a fast link, so that the consumer has the next records while it writes the last."""
+"""Maximum bytes in flight on a fast link, so that the consumer has records to write at any time."""
 GROW_BELOW_S, SHRINK_ABOVE_S = 0.25, 1.0
-"""Answers that come sooner let the bytes in flight grow, later ones halve them."""
-LOOKS_AT = 512
-"""Most records looked at with a consumer that takes several with one query."""
+"""Reply times below the first limit increase the bytes in flight; times above the second halve them."""
+LOOKAHEAD = 512
+"""Number of records considered if the consumer accepts several in one query."""
 PROBE_WINDOW = 8
-"""Most records looked at while nobody has answered yet."""
-KEPT_FOR_URGENT = 4
+"""Number of records considered until the consumer has replied."""
+URGENT_RESERVE = 4
+"""Queries of the window that are reserved for urgent records."""
 URGENT_PRIORITY = 2
-PIECE_S = 0.5
-"""With a bandwidth limit, a piece takes this long."""
-MIN_PIECE_BYTES = 256
-OVERHEAD_BYTES = 320
-"""A query's attachment, key, headers of Zenoh, TCP and IP, and its reply, charged with every piece."""
+CHUNK_S = 0.5
+"""Transmission time of a chunk at the bandwidth limit."""
+MIN_CHUNK_BYTES = 256
+QUERY_OVERHEAD_BYTES = 320
+"""Attachment, key, reply, and headers of Zenoh, TCP and IP; charged to the bandwidth limit for each query."""
+MIN_WAIT_S = 1e-6
+"""Shorter waits are rounding errors and count as zero."""
 
 
 @dataclass(slots=True, eq=False)
 class RecordTransfer:
-    """One record on its way: how much was asked, how much the consumer has, how often it was begun anew."""
+    """Transfer of one record.
+
+    Attributes:
+        item: The record.
+        sent: Offset up to which chunks were sent; 1 for an empty record.
+        received: Offset up to which the consumer has confirmed the record.
+        in_flight: Whether the record was sent at least once, so that no newer edition may replace it.
+        attempt: Number of restarts of the transfer.
+    """
 
     item: OutboxItem
-    asked: int = 0
-    has: int = 0
-    begun: bool = False
+    sent: int = 0
+    received: int = 0
+    in_flight: bool = False
     attempt: int = 0
 
     @property
     def order(self) -> tuple[int, int, int]:
-        """What is lower goes first."""
-        return (self.item.priority, self.item.place, self.item.seq)
+        """Sort key; the lowest is sent first."""
+        return (self.item.priority, self.item.position, self.item.seq)
 
     @property
     def urgent(self) -> bool:
-        """Whether it waits for nothing but the piece that is on its way."""
+        """Whether it is exempt from bandwidth limit and window."""
         return self.item.priority <= URGENT_PRIORITY
 
     @property
-    def fresh(self) -> bool:
-        """Whether nothing of it has been asked yet."""
-        return self.asked == 0 and self.has == 0
+    def untouched(self) -> bool:
+        """Whether no part of it was sent yet."""
+        return self.sent == 0 and self.received == 0
 
     @property
-    def wants_sending(self) -> bool:
-        """Whether a piece of it is to be asked."""
-        return self.asked < len(self.item.payload) or self.asked == 0
+    def has_unsent(self) -> bool:
+        """Whether a chunk of it remains to be sent."""
+        return self.sent < len(self.item.payload) or self.sent == 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chunk:
-    """Bytes `start` to `end` of a record, to be asked with one query."""
+    """Bytes `start` to `end` of a record, sent with one query."""
 
     transfer: RecordTransfer
     start: int
@@ -80,171 +89,213 @@ class Chunk:
 
     @property
     def size(self) -> int:
-        """Bytes of the record in it."""
+        """Number of bytes."""
         return self.end - self.start
 
 
-def piece_bytes_for(bytes_per_s: float | None) -> int:
-    """Return how long pieces are at most: half a second of the limit, 256 B to 32 kB."""
+def chunk_bytes_for(bytes_per_s: float | None) -> int:
+    """Return the maximum chunk size: half a second at the bandwidth limit, 256 B to 32 KiB."""
     if bytes_per_s is None:
         return CHUNK_BYTES
-    return int(min(max(bytes_per_s * PIECE_S, MIN_PIECE_BYTES), CHUNK_BYTES))
+    return int(min(max(bytes_per_s * CHUNK_S, MIN_CHUNK_BYTES), CHUNK_BYTES))
+
+
+class TokenBucket:
+    """Bandwidth limit. Pure: the time is an argument, from any monotonic clock.
+
+    The bucket fills at `rate_bytes_per_s` up to `burst_bytes`. Urgent data is sent at once and charged as well. The
+    level then becomes negative, and other data waits until it has recovered, which keeps the mean rate.
+
+    Args:
+        rate_bytes_per_s: Mean rate, above 0.
+        burst_bytes: Maximum amount after a pause, above 0.
+        now_s: Start time; the bucket starts full.
+    """
+
+    def __init__(self, rate_bytes_per_s: float, burst_bytes: float, now_s: float) -> None:
+        self._rate_bytes_per_s = rate_bytes_per_s
+        self._burst_bytes = burst_bytes
+        self._level_bytes = burst_bytes
+        self._at_s = now_s
+
+    def wait_s(self, size_bytes: int, now_s: float) -> float:
+        """Return for how many seconds `size_bytes` have to wait.
+
+        More than the burst may be sent when the bucket is full; otherwise it could never be sent.
+        """
+        self._fill(now_s)
+        required = min(float(size_bytes), self._burst_bytes)
+        wait_s = (required - self._level_bytes) / self._rate_bytes_per_s
+        return wait_s if wait_s > MIN_WAIT_S else 0.0
+
+    def take(self, size_bytes: int, now_s: float) -> None:
+        """Charge `size_bytes`, also beyond the level."""
+        self._fill(now_s)
+        self._level_bytes -= size_bytes
+
+    def _fill(self, now_s: float) -> None:
+        gained = max(0.0, now_s - self._at_s) * self._rate_bytes_per_s
+        self._level_bytes = min(self._burst_bytes, self._level_bytes + gained)
+        self._at_s = max(self._at_s, now_s)
 
 
 class DeliveryScheduler:
-    """The transfers to one consumer.
+    """Transfers to one consumer.
 
     Args:
         bytes_per_s: Bandwidth limit, None for none.
-        now_s: Any clock that does not go back, the one later calls use.
+        now_s: Start time, from the monotonic clock that all calls use.
+
+    Attributes:
+        chunk_bytes: Maximum chunk size.
+        active: Transfers by sequence number.
+        probing: Whether the consumer has not replied yet; only one query is then in flight.
+        max_batch: Number of records that the consumer accepts in one query.
     """
 
     def __init__(self, bytes_per_s: float | None, now_s: float) -> None:
-        self.piece_bytes = piece_bytes_for(bytes_per_s)
+        self.chunk_bytes = chunk_bytes_for(bytes_per_s)
         self.active: dict[int, RecordTransfer] = {}
         self.probing = True
-        self.takes = 0
-        """How many records the consumer takes with one query."""
+        self.max_batch = 0
         self._order: deque[RecordTransfer] = deque()
         self._order_stale = False
-        self._in_flight = 0
         self._bytes_in_flight = 0
+        self._queries: dict[Chunk, tuple[float, int]] = {}
         self._bucket: TokenBucket | None = None
-        self._asked: dict[Chunk, tuple[float, int]] = {}
         self._window_bytes = WINDOW_BYTES
         if bytes_per_s is not None:
-            self._bucket = TokenBucket(bytes_per_s, self.piece_bytes + OVERHEAD_BYTES, now_s)
-            # What lies in the queues of a thin link must be through before a query's time is up.
-            self._window_bytes = int(min(WINDOW_BYTES, max(2 * bytes_per_s, 2 * self.piece_bytes)))
-        self._first_window_bytes = self._window_bytes
+            self._bucket = TokenBucket(bytes_per_s, self.chunk_bytes + QUERY_OVERHEAD_BYTES, now_s)
+            # All data in flight must get through a thin link before the time-out of a query.
+            self._window_bytes = int(min(WINDOW_BYTES, max(2 * bytes_per_s, 2 * self.chunk_bytes)))
+        self._initial_window_bytes = self._window_bytes
 
     @property
-    def looks_at(self) -> int:
-        """Of how many records the schedule wants to know."""
+    def lookahead(self) -> int:
+        """Number of records that the scheduler considers."""
         if self.probing:
             return PROBE_WINDOW
-        return LOOKS_AT if self.takes > 1 else WINDOW
+        return LOOKAHEAD if self.max_batch > 1 else WINDOW
 
-    def put(self, items: Iterable[OutboxItem]) -> None:
-        """Take what is owed most urgently; what has not begun and is not among them makes room."""
-        wanted = {item.seq: item for item in items}
-        for seq in [seq for seq, t in self.active.items() if not t.begun and seq not in wanted]:
+    def update(self, items: Iterable[OutboxItem]) -> None:
+        """Set the most urgent queued records; transfers that are not in flight and not among them are removed."""
+        items_by_seq = {item.seq: item for item in items}
+        for seq in [seq for seq, t in self.active.items() if not t.in_flight and seq not in items_by_seq]:
             del self.active[seq]
-        for seq, item in wanted.items():
+        for seq, item in items_by_seq.items():
             if seq not in self.active:
                 self.active[seq] = RecordTransfer(item)
         self._order_stale = True
 
     def _first_waiting(self) -> RecordTransfer | None:
         if self._order_stale:
-            waiting = (transfer for transfer in self.active.values() if transfer.wants_sending)
+            waiting = (transfer for transfer in self.active.values() if transfer.has_unsent)
             self._order = deque(sorted(waiting, key=lambda transfer: transfer.order))
             self._order_stale = False
         while self._order:
             transfer = self._order[0]
-            if transfer.wants_sending and self.active.get(transfer.item.seq) is transfer:
+            if self._is_waiting(transfer):
                 return transfer
             self._order.popleft()
         return None
 
-    def next_piece(self, now_s: float) -> tuple[Chunk | None, float | None]:
-        """Return the piece to ask now, or None and for how many seconds to wait (None: until something happens)."""
+    def _is_waiting(self, transfer: RecordTransfer) -> bool:
+        return transfer.has_unsent and self.active.get(transfer.item.seq) is transfer
+
+    def next_chunk(self, now_s: float) -> tuple[Chunk | None, float | None]:
+        """Return the chunk to send now, or (None, seconds to wait); None seconds: until a reply or a new record."""
         transfer = self._first_waiting()
         if transfer is None:
             return None, None
-        start = transfer.asked
-        end = min(start + self.piece_bytes, len(transfer.item.payload))
-        piece = Chunk(transfer, start, end, transfer.attempt)
-        if not self._has_room(piece):
+        end = min(transfer.sent + self.chunk_bytes, len(transfer.item.payload))
+        chunk = Chunk(transfer, transfer.sent, end, transfer.attempt)
+        if not self._fits_window(chunk):
             return None, None
         if self._bucket is not None and not transfer.urgent:
-            wait_s = self._bucket.wait_s(piece.size + OVERHEAD_BYTES, now_s)
+            wait_s = self._bucket.wait_s(chunk.size + QUERY_OVERHEAD_BYTES, now_s)
             if wait_s > 0:
                 return None, wait_s
-        return piece, 0.0
+        return chunk, 0.0
 
-    def _has_room(self, piece: Chunk) -> bool:
+    def _fits_window(self, chunk: Chunk) -> bool:
+        in_flight = len(self._queries)
         if self.probing:
-            # One query at a time until the consumer has answered: of a whole window, one that comes up in the middle
-            # of it would take the last and not the first.
-            return self._in_flight == 0
-        if piece.transfer.urgent:
-            return self._in_flight < WINDOW
-        fits = self._in_flight == 0 or self._bytes_in_flight + piece.size <= self._window_bytes
-        return fits and self._in_flight < WINDOW - KEPT_FOR_URGENT
+            # One query at a time: a consumer that starts during a full window would receive the last records first.
+            return in_flight == 0
+        if chunk.transfer.urgent:
+            return in_flight < WINDOW
+        fits = in_flight == 0 or self._bytes_in_flight + chunk.size <= self._window_bytes
+        return fits and in_flight < WINDOW - URGENT_RESERVE
 
-    def together_with(self, piece: Chunk) -> list[Chunk]:
-        """Return what goes with the same query as the piece that is next: whole small records behind it, in order.
+    def batch_with(self, chunk: Chunk) -> list[Chunk]:
+        """Return the chunks of the next query: `chunk`, and complete small records that follow it in order.
 
-        All are of its key and priority, have not begun, and fit with it into one piece.
+        All have its key and priority, are untouched, and fit with it into one chunk size.
         """
-        first = piece.transfer
-        pieces = [piece]
-        if min(self.takes, MAX_RECORDS) < 2 or self.probing or piece.size < len(first.item.payload) or not first.fresh:
-            return pieces
-        room = self.piece_bytes - piece.size
+        first = chunk.transfer
+        chunks = [chunk]
+        max_records = min(self.max_batch, MAX_BATCH_RECORDS)
+        if max_records < 2 or self.probing or chunk.size < len(first.item.payload) or not first.untouched:
+            return chunks
+        free_bytes = self.chunk_bytes - chunk.size
         for transfer in islice(self._order, 1, None):
-            item = transfer.item
-            if not transfer.wants_sending or self.active.get(item.seq) is not transfer:
+            if not self._is_waiting(transfer):
                 continue
-            room -= len(item.payload) + (0 if self._bucket is None else RECORD_OVERHEAD_BYTES)
-            alike = item.key == first.item.key and item.priority == first.item.priority and transfer.fresh
-            if room < 0 or not alike:
+            item = transfer.item
+            free_bytes -= len(item.payload) + (0 if self._bucket is None else BATCH_RECORD_OVERHEAD_BYTES)
+            alike = item.key == first.item.key and item.priority == first.item.priority and transfer.untouched
+            if free_bytes < 0 or not alike:
                 break
-            pieces.append(Chunk(transfer, 0, len(item.payload), transfer.attempt))
-            if len(pieces) == min(self.takes, MAX_RECORDS):
+            chunks.append(Chunk(transfer, 0, len(item.payload), transfer.attempt))
+            if len(chunks) == max_records:
                 break
-        return pieces
+        return chunks
 
-    def asked(self, piece: Chunk, now_s: float, *more: Chunk) -> None:
-        """Note that a piece was sent, or that several records were, with one query."""
-        size = piece.size
-        for sent in (piece, *more):
-            sent.transfer.begun = True
-            sent.transfer.asked = max(sent.end, 1)
+    def query_sent(self, chunk: Chunk, now_s: float, *more: Chunk) -> None:
+        """Record that a query with these chunks was sent."""
+        size = chunk.size
+        for sent in (chunk, *more):
+            sent.transfer.in_flight = True
+            sent.transfer.sent = max(sent.end, 1)
         size += sum(sent.size for sent in more)
-        self._in_flight += 1
         self._bytes_in_flight += size
-        self._asked[piece] = (now_s, size)
+        self._queries[chunk] = (now_s, size)
         if self._bucket is not None:
-            self._bucket.take(size + OVERHEAD_BYTES + len(more) * RECORD_OVERHEAD_BYTES, now_s)
+            self._bucket.take(size + QUERY_OVERHEAD_BYTES + len(more) * BATCH_RECORD_OVERHEAD_BYTES, now_s)
 
-    def answered(self, piece: Chunk, now_s: float) -> None:
-        """Note that a query has ended, however it ended; `piece` is the first that was in it."""
-        asked_s, size = self._asked.pop(piece)
-        self._in_flight -= 1
+    def query_ended(self, chunk: Chunk, now_s: float) -> None:
+        """Record that a query has ended, with any result; `chunk` is the first one of the query."""
+        sent_s, size = self._queries.pop(chunk)
         self._bytes_in_flight -= size
-        took_s = now_s - asked_s
         if self._bucket is not None:
             return
-        if took_s < GROW_BELOW_S:
+        if now_s - sent_s < GROW_BELOW_S:
             self._window_bytes = min(MAX_WINDOW_BYTES, self._window_bytes + size)
-        elif took_s > SHRINK_ABOVE_S:
-            self._window_bytes = max(self.piece_bytes, self._window_bytes // 2)
+        elif now_s - sent_s > SHRINK_ABOVE_S:
+            self._window_bytes = max(self.chunk_bytes, self._window_bytes // 2)
 
-    def go_on_from(self, piece: Chunk, next_offset: int) -> None:
-        """Note what the consumer has of a record; where it did not take the piece, send on from there."""
-        transfer = piece.transfer
-        transfer.has = next_offset
-        # Pieces that were on their way behind one that was not taken are answered alike: one of the answers is enough.
-        if next_offset != piece.end and piece.attempt == transfer.attempt:
+    def confirm(self, chunk: Chunk, next_offset: int) -> None:
+        """Record how much of a record the consumer has; continue there if it did not accept the chunk."""
+        transfer = chunk.transfer
+        transfer.received = next_offset
+        # Chunks in flight behind a chunk that was not accepted get the same reply: only the first one rewinds.
+        if next_offset != chunk.end and chunk.attempt == transfer.attempt:
             transfer.attempt += 1
-            transfer.asked = next_offset
+            transfer.sent = next_offset
             self._order_stale = True
 
-    def settled(self, transfer: RecordTransfer) -> None:
-        """Forget a record that is done with."""
+    def remove(self, transfer: RecordTransfer) -> None:
+        """Remove a transfer that is complete, refused or superseded."""
         self.active.pop(transfer.item.seq, None)
 
-    def start_again(self) -> None:
-        """Nothing is in flight any more: ask again for everything that is not settled, one query at first."""
-        self._in_flight = 0
+    def restart(self) -> None:
+        """Discard all queries in flight; send again what the consumer has not confirmed, one query at first."""
         self._bytes_in_flight = 0
-        self._asked.clear()
+        self._queries.clear()
         self._order_stale = True
-        self.takes = 0
-        self._window_bytes = self._first_window_bytes
+        self.max_batch = 0
+        self._window_bytes = self._initial_window_bytes
         self.probing = True
         for transfer in self.active.values():
             transfer.attempt += 1
-            transfer.asked = transfer.has
+            transfer.sent = transfer.received

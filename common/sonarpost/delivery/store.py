@@ -1,8 +1,8 @@
-"""The durable store of one service: what it has accepted, what it owes, and what it must remember.
+"""Durable store of one service: accepted records, queued records and state in one SQLite file.
 
-One SQLite file a service (WAL, synchronous=FULL). A record from outside is committed to `inbox` before it is
-acknowledged. Handling a record removes it from the inbox, adds what it leads to in `outbox` and changes `state` in
-**one** transaction, so a process killed at any moment neither loses nor doubles anything.
+The file uses WAL and synchronous=FULL. A received record is committed to `inbox` before it is acknowledged. Handling a
+record removes it from the inbox, adds new records to `outbox` and changes `state` in **one** transaction. A process
+that is killed at any moment therefore loses and duplicates nothing.
 """
 
 from __future__ import annotations
@@ -10,33 +10,80 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import logging
+import shutil
 import sqlite3
 import threading
 import uuid
 from collections.abc import Iterator, Sequence, Set
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from sonarpost.delivery import rows, store_schema
-from sonarpost.delivery.store_schema import SCHEMA_VERSION
-from sonarpost.delivery.transaction import QUEUE_MARK, InboxItem, OutboxItem, Transaction
-from sonarpost.errors import DeliveryError
+from sonarpost.delivery.records import SITE_SEPARATOR, InboxItem, OutboxItem
+from sonarpost.delivery.transaction import Transaction, runs
+from sonarpost.errors import DeliveryError, RetryLaterError
+from sonarpost.logs import kv
 
 log = logging.getLogger(__name__)
 
 CACHE_KB = 8000
-"""Most memory for pages: what is on its way need not be read from the disk to be deleted."""
+"""Page cache: records in flight are deleted without reading them from the disk."""
+HANDLING_RESERVE_BYTES = 8_388_608
+"""Free space for handling the accepted records: deleting rows writes to the write-ahead log."""
+SCHEMA_VERSION = 2
+
+_TABLES = """
+CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS outbox (
+    consumer TEXT NOT NULL, seq INTEGER NOT NULL, key TEXT NOT NULL, encoding TEXT NOT NULL, priority INTEGER NOT NULL,
+    payload BLOB NOT NULL, sha256 BLOB NOT NULL, created_utc_s REAL NOT NULL,
+    topic TEXT NOT NULL DEFAULT '', edition INTEGER NOT NULL DEFAULT 0, place INTEGER NOT NULL DEFAULT 0,
+    PRIMARY KEY (consumer, seq));
+CREATE TABLE IF NOT EXISTS outbox_next (consumer TEXT PRIMARY KEY, seq INTEGER NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS inbox (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT NOT NULL, payload BLOB NOT NULL, origin BLOB, seq INTEGER,
+    received_utc_s REAL NOT NULL);
+CREATE TABLE IF NOT EXISTS seen (origin BLOB NOT NULL, seq INTEGER NOT NULL, PRIMARY KEY (origin, seq)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS seen_upto (origin BLOB PRIMARY KEY, seq INTEGER NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS refused_before (
+    origin BLOB NOT NULL, seq INTEGER NOT NULL, PRIMARY KEY (origin, seq)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS partial (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, origin BLOB NOT NULL, seq INTEGER NOT NULL, size INTEGER NOT NULL,
+    sha256 BLOB NOT NULL, has INTEGER NOT NULL, touched_ns INTEGER NOT NULL, UNIQUE (origin, seq));
+CREATE TABLE IF NOT EXISTS partial_piece (
+    partial INTEGER NOT NULL REFERENCES partial (id) ON DELETE CASCADE, start INTEGER NOT NULL, data BLOB NOT NULL,
+    PRIMARY KEY (partial, start));
+CREATE TABLE IF NOT EXISTS refused (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, direction TEXT NOT NULL, key TEXT NOT NULL, payload BLOB NOT NULL,
+    reason TEXT NOT NULL, at_utc_s REAL NOT NULL);
+CREATE TABLE IF NOT EXISTS state (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
+"""
+
+# Version 1 had no editions; queued records keep their order.
+_MIGRATE_FROM_VERSION_1 = """
+ALTER TABLE outbox ADD COLUMN topic TEXT NOT NULL DEFAULT '';
+ALTER TABLE outbox ADD COLUMN edition INTEGER NOT NULL DEFAULT 0;
+ALTER TABLE outbox ADD COLUMN place INTEGER NOT NULL DEFAULT 0;
+UPDATE outbox SET place = seq;
+DROP INDEX IF EXISTS outbox_order;
+UPDATE meta SET value = CAST('2' AS BLOB) WHERE name = 'version';
+"""
+_INDEXES = """
+CREATE INDEX IF NOT EXISTS outbox_place ON outbox (consumer, priority, place, seq);
+CREATE INDEX IF NOT EXISTS outbox_topic ON outbox (consumer, topic, edition) WHERE topic <> '';
+"""
 _ITEM = "consumer, seq, key, encoding, priority, payload, sha256, place, created_utc_s"
 
 
 @dataclass(frozen=True, slots=True)
 class QueueDepth:
-    """What waits in one queue of the outbox.
+    """Contents of one outbox queue.
 
     Attributes:
-        oldest_utc_s: When the oldest record was queued; None where nothing waits.
+        records: Number of queued records.
+        size_bytes: Sum of their payload sizes.
+        oldest_utc_s: When the oldest record was queued; None for an empty queue.
     """
 
     records: int
@@ -45,7 +92,12 @@ class QueueDepth:
 
 
 class Store:
-    """A service's durable store; safe to use from several threads (one writer at a time).
+    """Durable store of a service, safe for several threads (one writer at a time).
+
+    Attributes:
+        path: The SQLite file.
+        origin: Random identity of the store, 16 bytes.
+        inbox_changed: Set when a record was added to the inbox.
 
     Raises:
         DeliveryError: The file cannot be opened or is not a store of this version.
@@ -56,11 +108,11 @@ class Store:
         self._lock = threading.RLock()
         self._reader_lock = threading.Lock()
         self._outbox_listeners: list[threading.Event] = []
-        self._begun: set[tuple[str, int]] = set()
+        self._in_flight: set[tuple[str, int]] = set()
         self.inbox_changed = threading.Event()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock_file = _only_user(path)
+            self._lock_file = _lock_exclusively(path)
         except OSError as error:
             raise DeliveryError(f"{path}: cannot be opened as a sonarpost store: {error}") from error
         try:
@@ -75,18 +127,18 @@ class Store:
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=FULL")
             self._db.execute("PRAGMA foreign_keys=ON")
-            # Some builds of SQLite overwrite what is deleted: every record would be written to the disk once more.
+            # Some builds of SQLite overwrite deleted content, which writes every record to the disk a second time.
             self._db.execute("PRAGMA secure_delete=OFF")
             self._db.execute(f"PRAGMA cache_size={-CACHE_KB}")
-            self._db.executescript(store_schema.TABLES)
+            self._db.executescript(_TABLES)
             with self.transaction():
                 self.origin = self._meta("origin", uuid.uuid4().bytes)
                 version = self._meta("version", str(SCHEMA_VERSION).encode())
             if version == b"1":
-                self._db.executescript(f"BEGIN IMMEDIATE; {store_schema.FROM_VERSION_1} COMMIT;")
+                self._db.executescript(f"BEGIN IMMEDIATE; {_MIGRATE_FROM_VERSION_1} COMMIT;")
                 version = str(SCHEMA_VERSION).encode()
             if version == str(SCHEMA_VERSION).encode():
-                self._db.executescript(store_schema.INDEXES)
+                self._db.executescript(_INDEXES)
             self._reader = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
             self._reader.execute("PRAGMA query_only=ON")
         except sqlite3.Error as error:
@@ -103,13 +155,13 @@ class Store:
 
     @contextmanager
     def transaction(self) -> Iterator[Transaction]:
-        """Open a write transaction: committed (and on the disk) when the block ends, rolled back when it raises.
+        """Open a write transaction: committed to the disk when the block ends, rolled back when it raises.
 
         Raises:
-            DeliveryError: The database refused (a full disk, for example); nothing of the block was kept.
+            DeliveryError: The database reported an error, for example a full disk; nothing was written.
         """
         with self._lock:
-            tx = Transaction(self._db, self._begun)
+            tx = Transaction(self._db, self._in_flight)
             try:
                 self._db.execute("BEGIN IMMEDIATE")
                 yield tx
@@ -126,11 +178,11 @@ class Store:
         if tx.wrote_inbox:
             self.inbox_changed.set()
 
-    def listen_outbox(self, event: threading.Event) -> None:
-        """Set `event` whenever the outbox has grown."""
+    def add_outbox_listener(self, event: threading.Event) -> None:
+        """Set `event` after each transaction that added a record to the outbox."""
         self._outbox_listeners.append(event)
 
-    def unlisten_outbox(self, event: threading.Event) -> None:
+    def remove_outbox_listener(self, event: threading.Event) -> None:
         """Stop setting `event`."""
         self._outbox_listeners.remove(event)
 
@@ -139,44 +191,50 @@ class Store:
             if self._db.in_transaction:
                 self._db.execute("ROLLBACK")
         except sqlite3.ProgrammingError:
-            # The store is closed, and what was not committed is gone with it.
-            log.debug("Nothing to roll back: %s is closed", self.path)
+            log.debug("Store closed during a transaction; nothing to roll back", extra=kv(path=self.path))
 
     def _query(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[object, ...]]:
-        with self._lock:
-            try:
-                return self._db.execute(sql, args).fetchall()
-            except sqlite3.Error as error:
-                raise DeliveryError(f"{self.path}: {error}") from error
+        """Query the writing connection, after the transaction in progress."""
+        return self._fetch(self._db, self._lock, sql, args)
 
     def _read(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[object, ...]]:
-        """Query what is committed, without waiting for a transaction that waits for the disk."""
-        with self._reader_lock:
+        """Query committed data without waiting for a transaction in progress."""
+        return self._fetch(self._reader, self._reader_lock, sql, args)
+
+    def _fetch(
+        self, db: sqlite3.Connection, lock: AbstractContextManager[object], sql: str, args: tuple[object, ...]
+    ) -> list[tuple[object, ...]]:
+        with lock:
             try:
-                return self._reader.execute(sql, args).fetchall()
+                return db.execute(sql, args).fetchall()
             except sqlite3.Error as error:
                 raise DeliveryError(f"{self.path}: {error}") from error
 
-    def consumers(self) -> tuple[str, ...]:
-        """Return the consumers to whom something is owed."""
+    def _read_int(self, sql: str, args: tuple[object, ...] = ()) -> int:
+        return _int(self._read(sql, args)[0][0])
+
+    # Outbox
+
+    def queues(self) -> tuple[str, ...]:
+        """Return the names of the queues that hold records."""
         return tuple(str(row[0]) for row in self._read("SELECT DISTINCT consumer FROM outbox"))
 
-    def owed(self, consumer: str, limit: int) -> tuple[OutboxItem, ...]:
-        """Return what is owed to `consumer`, most urgent first, then oldest first."""
-        return self.owed_items(consumer, self.owed_numbers(consumer, limit))
+    def queued(self, queue: str, limit: int) -> tuple[OutboxItem, ...]:
+        """Return the first `limit` records of a queue: most urgent first, then oldest first."""
+        return self.queued_items(queue, self.queued_numbers(queue, limit))
 
-    def owed_numbers(self, queue: str, limit: int) -> tuple[int, ...]:
-        """Return the numbers of what is owed, most urgent first, then oldest first."""
+    def queued_numbers(self, queue: str, limit: int) -> tuple[int, ...]:
+        """Return the first `limit` sequence numbers of a queue: most urgent first, then oldest first."""
         found = self._read(
             "SELECT seq FROM outbox WHERE consumer = ? ORDER BY priority, place, seq LIMIT ?", (queue, limit)
         )
         return tuple(_int(row[0]) for row in found)
 
-    def owed_items(self, queue: str, numbers: Sequence[int]) -> tuple[OutboxItem, ...]:
-        """Return the records of these numbers that are still owed, in the order of the numbers."""
+    def queued_items(self, queue: str, numbers: Sequence[int]) -> tuple[OutboxItem, ...]:
+        """Return those of the numbered records that are still queued, in the order of `numbers`."""
         sql = f"SELECT {_ITEM} FROM outbox WHERE consumer = ? AND seq BETWEEN ? AND ?"  # noqa: S608 constants
         found = {}
-        for first, last in rows.runs(numbers):
+        for first, last in runs(numbers):
             for c, s, k, e, p, d, h, at, t in self._read(sql, (queue, first, last)):
                 seq = _int(s)
                 found[seq] = OutboxItem(
@@ -184,84 +242,80 @@ class Store:
                 )
         return tuple(found[number] for number in numbers if number in found)
 
-    def begin(self, queue: str, seq: int) -> bool:
-        """Say that a record is about to be sent, so that no newer edition replaces it; False when one already has."""
-        return bool(self.begin_all(queue, (seq,)))
-
-    def begin_all(self, queue: str, numbers: Sequence[int]) -> Set[int]:
-        """Say that records are about to be sent; return which of them are still owed."""
+    def mark_in_flight(self, queue: str, numbers: Sequence[int]) -> Set[int]:
+        """Protect records from replacement by newer editions; return the numbers that are still queued."""
         sql = "SELECT seq FROM outbox WHERE consumer = ? AND seq BETWEEN ? AND ?"
         with self._lock:
-            there = {_int(row[0]) for run in rows.runs(numbers) for row in self._query(sql, (queue, *run))}
-            self._begun.update((queue, seq) for seq in there)
-        return there
+            queued = {_int(row[0]) for run in runs(numbers) for row in self._query(sql, (queue, *run))}
+            self._in_flight.update((queue, seq) for seq in queued)
+        return queued
 
-    def end(self, queue: str, *numbers: int) -> None:
-        """Take back what `begin` said."""
-        # Without the lock, whose holder may wait for the disk: what a transaction still finds begun it leaves alone.
+    def clear_in_flight(self, queue: str, *numbers: int) -> None:
+        """Undo `mark_in_flight`."""
+        # Without the lock, whose holder can wait for the disk; a transaction in progress ignores marked records.
         for seq in numbers:
-            self._begun.discard((queue, seq))
+            self._in_flight.discard((queue, seq))
 
-    def settled_upto(self, queue: str) -> int:
-        """Return the highest number with which, and with all below it, the queue is done."""
-        # One statement: a record that is queued between two would be told to its consumer as done with.
-        found = self._read(
+    def done_up_to(self, queue: str) -> int:
+        """Return the highest number for which this and all lower numbers have left the queue."""
+        # One statement: a record queued between two statements would be reported to its consumer as done.
+        return self._read_int(
             "SELECT COALESCE((SELECT MIN(seq) - 1 FROM outbox WHERE consumer = ?1),"
             " (SELECT seq FROM outbox_next WHERE consumer = ?1), 0)",
             (queue,),
         )
-        return _int(found[0][0])
 
     def origin_of(self, queue: str) -> bytes:
-        """Return the 16 bytes by which a queue's consumer knows it.
+        """Return the identity of a queue, 16 bytes.
 
-        A plain consumer's is the store's own; every `queue_of` has another, as its numbers begin at 1 again and might
-        come to a consumer that knows them from elsewhere (a site that was renamed).
+        It is the store's own for a plain consumer name. Each `queue_of` has a different one: its numbers start at 1,
+        and its consumer can have received these numbers from another queue (a renamed site).
         """
-        if QUEUE_MARK not in queue:
+        if SITE_SEPARATOR not in queue:
             return self.origin
         return hashlib.sha256(self.origin + queue.encode()).digest()[:16]
 
-    def queue_depth(self, queue: str, most_priority: int = 7) -> QueueDepth:
-        """Return what waits in one queue, of priorities 1 to `most_priority`."""
+    def queue_depth(self, queue: str, max_priority: int = 7) -> QueueDepth:
+        """Return the contents of one queue, counting priorities 1 to `max_priority`."""
         records, size, oldest = self._read(
             "SELECT COUNT(*), COALESCE(SUM(LENGTH(payload)), 0), MIN(created_utc_s) FROM outbox"
             " WHERE consumer = ? AND priority <= ?",
-            (queue, most_priority),
+            (queue, max_priority),
         )[0]
-        return QueueDepth(int(str(records)), int(str(size)), None if oldest is None else float(str(oldest)))
+        return QueueDepth(_int(records), _int(size), None if oldest is None else float(str(oldest)))
 
     def outbox_depth(self) -> int:
-        """Return how many records are owed to all consumers."""
-        return int(str(self._read("SELECT COUNT(*) FROM outbox")[0][0]))
+        """Return the number of records in all queues."""
+        return self._read_int("SELECT COUNT(*) FROM outbox")
+
+    # Inbox, quarantine and state
 
     def inbox_depth(self) -> int:
-        """Return how many accepted records are not handled yet."""
-        return int(str(self._read("SELECT COUNT(*) FROM inbox")[0][0]))
+        """Return the number of accepted records that are not handled yet."""
+        return self._read_int("SELECT COUNT(*) FROM inbox")
 
     def refused_count(self) -> int:
-        """Return how many records lie in the refused table."""
-        return int(str(self._read("SELECT COUNT(*) FROM refused")[0][0]))
+        """Return the number of quarantined records."""
+        return self._read_int("SELECT COUNT(*) FROM refused")
 
     def reusable_bytes(self) -> int:
-        """Return how much lies free inside the file: it never becomes smaller."""
-        pages, size = self._read("PRAGMA freelist_count")[0][0], self._read("PRAGMA page_size")[0][0]
-        return int(str(pages)) * int(str(size))
+        """Return the free space inside the file in bytes; the file itself never shrinks."""
+        return self._read_int("PRAGMA freelist_count") * self._read_int("PRAGMA page_size")
 
-    def pending(self, limit: int = 1, after_id: int = 0, max_bytes: int | None = None) -> tuple[InboxItem, ...]:
-        """Return accepted records not handled yet, oldest first, with an id above `after_id`.
+    def inbox_items(self, limit: int = 1, after_id: int = 0, max_bytes: int | None = None) -> tuple[InboxItem, ...]:
+        """Return accepted records that are not handled yet, oldest first.
 
         Args:
-            limit: Most records.
-            after_id: Only later ones.
-            max_bytes: Most bytes of payload, but one record at least; no limit by default.
+            limit: Maximum number of records.
+            after_id: Only records with a higher identifier.
+            max_bytes: Maximum sum of the payload sizes, at least one record; None for no limit.
         """
         if max_bytes is not None:
-            limit = self._how_many_within(limit, after_id, max_bytes)
+            limit = self._count_within(limit, after_id, max_bytes)
         found = self._read("SELECT id, key, payload FROM inbox WHERE id > ? ORDER BY id LIMIT ?", (after_id, limit))
         return tuple(InboxItem(_int(i), str(k), _bytes(p)) for i, k, p in found)
 
-    def _how_many_within(self, limit: int, after_id: int, max_bytes: int) -> int:
+    def _count_within(self, limit: int, after_id: int, max_bytes: int) -> int:
         sizes = self._read("SELECT LENGTH(payload) FROM inbox WHERE id > ? ORDER BY id LIMIT ?", (after_id, limit))
         total = 0
         for count, (size,) in enumerate(sizes):
@@ -271,12 +325,12 @@ class Store:
         return limit
 
     def get_state(self, name: str) -> bytes | None:
-        """Return what is remembered under `name`, or None."""
+        """Return the value under `name`, or None."""
         found = self._query("SELECT value FROM state WHERE name = ?", (name,))
         return _bytes(found[0][0]) if found else None
 
     def state_names(self, prefix: str) -> tuple[str, ...]:
-        """Return the names that begin with `prefix` under which something is remembered."""
+        """Return the names of all values that start with `prefix`."""
         found = self._query("SELECT name FROM state WHERE name >= ? AND name < ?", (prefix, prefix + "\U0010ffff"))
         return tuple(str(row[0]) for row in found)
 
@@ -288,11 +342,59 @@ class Store:
             self._lock_file.close()
 
 
-def _only_user(path: Path) -> IO[bytes]:
-    """Lock the store for this process; the kernel lets go when it ends, however it ends.
+class DiskReserve:
+    """Minimum free disk space of a store; below it no records are accepted.
+
+    The file of a store never shrinks. Free space inside it counts as free, so that a store that was once full can
+    accept records again after it was emptied.
+
+    Args:
+        store: The store.
+        reserve_bytes: Space that has to stay free.
+        consequence: Effect of the reached reserve, for the health record.
+    """
+
+    def __init__(self, store: Store, reserve_bytes: int, consequence: str) -> None:
+        self._store = store
+        self._reserve_bytes = reserve_bytes
+        self._consequence = consequence
+        self._reached = False
+
+    def free_bytes(self) -> int:
+        """Return the usable space in bytes.
+
+        Raises:
+            DeliveryError: The store cannot be read.
+        """
+        return shutil.disk_usage(self._store.path.parent).free + self._store.reusable_bytes()
+
+    def require(self) -> None:
+        """Check the free space.
+
+        Raises:
+            RetryLaterError: It is below the reserve.
+        """
+        if reason := self._check():
+            raise RetryLaterError(reason)
+
+    def degraded_reason(self) -> str:
+        """Return why no records are accepted, empty if they are; checks again only after `require` has failed."""
+        return self._check() if self._reached else ""
+
+    def _check(self) -> str:
+        free_bytes = self.free_bytes()
+        self._reached = free_bytes < self._reserve_bytes
+        if not self._reached:
+            return ""
+        folder = self._store.path.parent
+        return f"{folder}: {free_bytes} bytes free, below the reserve of {self._reserve_bytes}: {self._consequence}"
+
+
+def _lock_exclusively(path: Path) -> IO[bytes]:
+    """Lock the store for this process; the kernel releases the lock when the process ends.
 
     Raises:
-        DeliveryError: Another process has it: two of them would handle every record twice.
+        DeliveryError: Another process holds the lock; two processes would handle every record twice.
     """
     file = path.with_name(f"{path.name}.lock").open("ab")
     try:

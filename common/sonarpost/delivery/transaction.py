@@ -1,106 +1,183 @@
-"""The writes of one transaction on a service's store, and the records that go in and out of it."""
+"""Writes to a service's store: one open transaction, and a unit of work that is committed later."""
 
 from __future__ import annotations
 
 import hashlib
 import sqlite3
 import time
-from collections.abc import Iterable, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from functools import cache
 
-from sonarpost.delivery import rows
+from sonarpost import wire
 from sonarpost.delivery.duplicate_window import DuplicateWindow
-from sonarpost.delivery.items import QUEUE_MARK, InboxItem, OutboxItem, ReceivedChunk, Topic, consumer_of, queue_of
+from sonarpost.delivery.records import InboxItem, OutboxItem, ReceivedChunk, Topic
+from sonarpost.messages import Record
 
-__all__ = ["QUEUE_MARK", "InboxItem", "OutboxItem", "ReceivedChunk", "Topic", "Transaction", "consumer_of", "queue_of"]
+# Limits on what a remote station can make a store keep; beyond them the oldest entries are deleted.
+MAX_QUARANTINED = 1000
+MAX_QUARANTINED_BYTES = 256 * 1024
+MAX_PARTIAL_RECORDS = 64
 
-# Bounds on what strangers can make a store keep: whatever is beyond them, the oldest goes.
-REFUSED_KEPT = 1000
-REFUSED_BYTES = 256 * 1024
-PARTIALS_KEPT = 64
+# Each statement releases the interpreter lock and waits to get it back: multi-row statements are much faster.
+ROWS_PER_STATEMENT = 32
 
 _OUTBOX = "consumer, seq, key, encoding, priority, payload, sha256, created_utc_s, topic, edition, place"
 _INBOX = "key, payload, origin, seq, received_utc_s"
 
 
-class Transaction:
-    """The writes of one transaction; made by `Store.transaction`, atomic with everything else in it.
+class UnitOfWork:
+    """Everything that handling one record leads to: records to send, state to change; committed all or nothing.
 
-    New records, and the ends of old ones, are collected and written together: before they matter to another statement,
-    or by `flush` at the end.
+    Attributes:
+        payload: Bytes of the handled record as received; empty if no record caused this unit of work.
     """
 
-    def __init__(self, connection: sqlite3.Connection, begun: Set[tuple[str, int]] = frozenset()) -> None:
+    def __init__(self, payload: bytes = b"") -> None:
+        self.payload = payload
+        self._sends: list[tuple[str, str, bytes, str, int, Topic | None]] = []
+        self._state: dict[str, bytes | None] = {}
+        self._quarantined: list[tuple[str, bytes, str]] = []
+        self._counts: dict[str, int] = {}
+
+    def send(self, key: str, queue: str, record: Record, *, priority: int = 4, topic: Topic | None = None) -> None:
+        """Queue a record; see `Transaction.send`."""
+        self.send_payload(key, queue, wire.encode(record), type(record), priority=priority, topic=topic)
+
+    def send_payload(
+        self,
+        key: str,
+        queue: str,
+        payload: bytes,
+        record_type: type[Record],
+        *,
+        priority: int = 4,
+        topic: Topic | None = None,
+    ) -> None:
+        """Queue an encoded record; fields that this version does not know are preserved."""
+        self._sends.append((key, queue, payload, wire.encoding_of(record_type), priority, topic))
+
+    def put_state(self, name: str, value: bytes) -> None:
+        """Store `value` under `name`."""
+        self._state[name] = value
+
+    def delete_state(self, name: str) -> None:
+        """Delete the value under `name`."""
+        self._state[name] = None
+
+    def quarantine(self, key: str, payload: bytes, reason: str) -> None:
+        """Store data that cannot be used, with the reason, in the store's `refused` table."""
+        self._quarantined.append((key, payload, reason))
+
+    def count(self, name: str, by: int = 1) -> None:
+        """Increase a health counter when the unit of work is committed."""
+        self._counts[name] = self._counts.get(name, 0) + by
+
+    def write(self, tx: Transaction) -> None:
+        """Write everything into an open transaction."""
+        for key, queue, payload, encoding, priority, topic in self._sends:
+            tx.send(key, queue, payload, encoding=encoding, priority=priority, topic=topic)
+        for name, value in self._state.items():
+            if value is None:
+                tx.delete_state(name)
+            else:
+                tx.put_state(name, value)
+        for key, payload, reason in self._quarantined:
+            tx.quarantine("in", key, payload, reason)
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Increments of the health counters."""
+        return self._counts
+
+
+class Transaction:
+    """Writes of one transaction, created by `Store.transaction`.
+
+    New outbox and inbox records and removals are collected and written in multi-row statements: before another
+    statement depends on them, or at the end by `flush`.
+
+    Attributes:
+        wrote_outbox: Whether a record was added to the outbox.
+        wrote_inbox: Whether a record was added to the inbox.
+        superseded: Number of queued records that newer editions replaced.
+    """
+
+    def __init__(self, connection: sqlite3.Connection, in_flight: Set[tuple[str, int]] = frozenset()) -> None:
         self._db = connection
-        self._begun = begun
+        self._in_flight = in_flight
         self.wrote_outbox = False
         self.wrote_inbox = False
         self.superseded = 0
-        self._seen: dict[bytes, DuplicateWindow] = {}
-        self._numbers: dict[str, int] = {}
+        self._windows: dict[bytes, DuplicateWindow] = {}
+        self._last_seq: dict[str, int] = {}
         self._new_outbox: list[tuple[object, ...]] = []
         self._new_topics: set[tuple[str, str]] = set()
         self._new_inbox: list[tuple[object, ...]] = []
-        self._done: list[int] = []
+        self._handled: list[int] = []
 
     def flush(self) -> None:
-        """Write what was collected; `Store.transaction` does before it commits."""
+        """Write the collected changes; `Store.transaction` calls it before the commit."""
         self._flush_outbox()
         if self._new_inbox:
-            rows.insert(self._db, "inbox", _INBOX, self._new_inbox)
+            _insert_rows(self._db, "inbox", _INBOX, self._new_inbox)
             self._new_inbox.clear()
-        for first, last in rows.runs(self._done):
+        for first, last in runs(self._handled):
             self._db.execute("DELETE FROM inbox WHERE id BETWEEN ? AND ?", (first, last))
-        self._done.clear()
-        for seen in self._seen.values():
-            seen.write()
+        self._handled.clear()
+        for window in self._windows.values():
+            window.write()
 
     def _flush_outbox(self) -> None:
         if self._new_outbox:
-            rows.insert(self._db, "outbox", _OUTBOX, self._new_outbox)
-            self._db.executemany("INSERT OR REPLACE INTO outbox_next VALUES (?, ?)", self._numbers.items())
+            _insert_rows(self._db, "outbox", _OUTBOX, self._new_outbox)
+            self._db.executemany("INSERT OR REPLACE INTO outbox_next VALUES (?, ?)", self._last_seq.items())
             self._new_outbox.clear()
             self._new_topics.clear()
 
+    # Outbox
+
     def send(
-        self, key: str, consumer: str, payload: bytes, *, encoding: str, priority: int = 4, topic: Topic | None = None
+        self, key: str, queue: str, payload: bytes, *, encoding: str, priority: int = 4, topic: Topic | None = None
     ) -> int:
-        """Owe `payload` to `consumer` under `key`; return its sequence number (from 1, one after the other, a queue).
+        """Queue a record.
 
         Args:
-            key: Key expression the record is published on.
-            consumer: Name of the service that acknowledges it, or of a queue for it (`queue_of`).
+            key: Key expression of the record.
+            queue: Name of the service that acknowledges it, or of a queue for it (`queue_of`).
             payload: The record's bytes.
             encoding: Zenoh encoding of the payload.
             priority: 1 (first) to 7 (last), as Zenoh's priorities.
-            topic: Older editions in the queue whose transfer has not begun are dropped, and their place and priority
-                are this one's; where the queue has a newer edition, nothing is queued and 0 is returned.
+            topic: Replaces older editions that are not in flight; the record inherits their position and priority.
+
+        Returns:
+            The sequence number, consecutive from 1 in each queue; 0 if the queue already holds a newer edition.
         """
-        place = None
+        position = None
         name, edition = ("", 0) if topic is None else (topic.name, topic.edition)
         if name:
-            others = self._editions(consumer, name)
-            if any(row[1] > edition for row in others):
+            editions = self._editions(queue, name)
+            if any(row[1] > edition for row in editions):
                 return 0
-            place, priority = self._supersede(consumer, [row for row in others if row[1] < edition], priority)
-        seq = self._next_number(consumer)
+            position, priority = self._supersede(queue, [row for row in editions if row[1] < edition], priority)
+        seq = self._next_seq(queue)
         digest = hashlib.sha256(payload).digest()
         self._new_outbox.append(
-            (consumer, seq, key, encoding, priority, payload, digest, time.time(), name, edition, place or seq)
+            (queue, seq, key, encoding, priority, payload, digest, time.time(), name, edition, position or seq)
         )
         if name:
-            self._new_topics.add((consumer, name))
+            self._new_topics.add((queue, name))
         self.wrote_outbox = True
         return seq
 
-    def _next_number(self, queue: str) -> int:
-        if queue not in self._numbers:
+    def _next_seq(self, queue: str) -> int:
+        if queue not in self._last_seq:
             row = self._db.execute("SELECT seq FROM outbox_next WHERE consumer = ?", (queue,)).fetchone()
-            self._numbers[queue] = int(row[0]) if row else 0
-        self._numbers[queue] += 1
-        return self._numbers[queue]
+            self._last_seq[queue] = int(row[0]) if row else 0
+        self._last_seq[queue] += 1
+        return self._last_seq[queue]
 
     def _editions(self, queue: str, topic: str) -> list[tuple[int, int, int, int]]:
-        """Return seq, edition, place and priority of what the queue has of a topic."""
+        """Return (seq, edition, position, priority) of a topic's records in a queue."""
         if (queue, topic) in self._new_topics:
             self._flush_outbox()
         return self._db.execute(
@@ -111,22 +188,25 @@ class Transaction:
     def _supersede(
         self, queue: str, older: Iterable[tuple[int, int, int, int]], priority: int
     ) -> tuple[int | None, int]:
-        """Drop older editions that have not begun; return the first place and the most urgent priority among them."""
-        place: int | None = None
-        for seq, _, its_place, its_priority in older:
-            # One on its way arrives: were it stopped for each newer one, nothing might ever arrive.
-            if (queue, seq) in self._begun:
+        """Delete older editions; return the first position and the most urgent priority among them."""
+        position: int | None = None
+        for seq, _, its_position, its_priority in older:
+            # An edition in flight is completed: otherwise frequent new editions could block delivery for ever.
+            if (queue, seq) in self._in_flight:
                 continue
-            self.acknowledged(queue, seq)
+            self.remove_acknowledged(queue, (seq,))
             self.superseded += 1
-            place = its_place if place is None else min(place, its_place)
+            position = its_position if position is None else min(position, its_position)
             priority = min(priority, its_priority)
-        return place, priority
+        return position, priority
 
-    def drop_oldest(self, queue: str, max_bytes: int, above_priority: int) -> int:
-        """Drop records until the queue holds `max_bytes`, the least urgent first, then the oldest; return how many.
+    def drop_oldest(self, queue: str, max_bytes: int, protected_priority: int) -> int:
+        """Drop records until the queue holds at most `max_bytes`: the least urgent first, then the oldest.
 
-        What is as urgent as `above_priority` or more stays, and so does what is on its way.
+        Records in flight stay, and so do records of `protected_priority` or more urgent.
+
+        Returns:
+            Number of dropped records.
         """
         self._flush_outbox()
         total = int(
@@ -135,117 +215,119 @@ class Transaction:
             ).fetchone()[0]
         )
         dropped = 0
-        found = self._db.execute(
+        candidates = self._db.execute(
             "SELECT seq, LENGTH(payload) FROM outbox WHERE consumer = ? AND priority > ? ORDER BY priority DESC, place",
-            (queue, above_priority),
+            (queue, protected_priority),
         ).fetchall()
-        for seq, size in found:
+        for seq, size in candidates:
             if total <= max_bytes:
                 break
-            if (queue, seq) not in self._begun:
-                self.acknowledged(queue, seq)
+            if (queue, seq) not in self._in_flight:
+                self.remove_acknowledged(queue, (seq,))
                 total -= size
                 dropped += 1
         return dropped
 
     def drop_queue(self, queue: str) -> int:
-        """Drop everything a queue holds; return how many records that were."""
+        """Drop all records of a queue; return their number."""
         self._flush_outbox()
         return self._db.execute("DELETE FROM outbox WHERE consumer = ?", (queue,)).rowcount
 
-    def acknowledged(self, consumer: str, seq: int) -> None:
-        """Forget what the consumer has committed."""
-        self.all_acknowledged(consumer, (seq,))
-
-    def all_acknowledged(self, consumer: str, numbers: Iterable[int]) -> None:
-        """Forget several records that the consumer has committed."""
+    def remove_acknowledged(self, queue: str, numbers: Iterable[int]) -> None:
+        """Remove records that the consumer has committed."""
         self._flush_outbox()
-        for first, last in rows.runs(numbers):
-            self._db.execute("DELETE FROM outbox WHERE consumer = ? AND seq BETWEEN ? AND ?", (consumer, first, last))
+        for first, last in runs(numbers):
+            self._db.execute("DELETE FROM outbox WHERE consumer = ? AND seq BETWEEN ? AND ?", (queue, first, last))
 
-    def rejected(self, item: OutboxItem, reason: str) -> None:
-        """Keep what the consumer refused apart, where a person can find it."""
+    def quarantine_refused(self, item: OutboxItem, reason: str) -> None:
+        """Move a record that the consumer refused from the outbox to the quarantine."""
         self.quarantine("out", item.key, item.payload, reason)
-        self.acknowledged(item.consumer, item.seq)
+        self.remove_acknowledged(item.queue, (item.seq,))
+
+    # Inbox
 
     def accept(self, key: str, payload: bytes, origin: bytes | None = None, seq: int | None = None) -> bool:
-        """Put a record into the inbox; False when (origin, seq) was accepted before."""
-        if origin is not None and seq is not None and not self._first_time(origin, seq):
+        """Add a record to the inbox; return False if (origin, seq) was received before."""
+        if origin is not None and seq is not None and not self._add_seq(origin, seq):
             return False
         self._new_inbox.append((key, payload, origin, seq, time.time()))
         self.wrote_inbox = True
         return True
 
-    def done(self, item: InboxItem) -> None:
+    def remove_handled(self, item: InboxItem) -> None:
         """Remove a handled record from the inbox."""
-        self._done.append(item.id)
+        self._handled.append(item.id)
 
     def quarantine(self, direction: str, key: str, payload: bytes, reason: str) -> None:
-        """Keep a record that cannot be handled, with the reason: the latest 1000, of each at most 256 kB."""
+        """Store a record that cannot be handled, with the reason: the latest 1000, at most 256 KiB each."""
         row = self._db.execute(
             "INSERT INTO refused (direction, key, payload, reason, at_utc_s) VALUES (?, ?, ?, ?, ?) RETURNING id",
-            (direction, key, payload[:REFUSED_BYTES], reason, time.time()),
+            (direction, key, payload[:MAX_QUARANTINED_BYTES], reason, time.time()),
         ).fetchone()
-        self._db.execute("DELETE FROM refused WHERE id <= ?", (int(row[0]) - REFUSED_KEPT,))
+        self._db.execute("DELETE FROM refused WHERE id <= ?", (int(row[0]) - MAX_QUARANTINED,))
 
     def mark_refused(self, origin: bytes, seq: int) -> None:
-        """Remember that (origin, seq) was refused, so that the same is answered when it is asked again."""
-        if self._first_time(origin, seq):
-            self._seen_of(origin).refuse(seq)
+        """Store that (origin, seq) was refused, so that a repeated query gets the same reply."""
+        if self._add_seq(origin, seq):
+            self._window(origin).mark_refused(seq)
 
     def was_refused(self, origin: bytes, seq: int) -> bool:
-        """Tell whether (origin, seq) was refused before."""
-        return self._seen_of(origin).was_refused(seq)
+        """Return whether (origin, seq) was refused before."""
+        return self._window(origin).was_refused(seq)
 
-    def was_seen(self, origin: bytes, seq: int) -> bool:
-        """Tell whether (origin, seq) was accepted before."""
-        return self._seen_of(origin).has(seq)
+    def was_received(self, origin: bytes, seq: int) -> bool:
+        """Return whether (origin, seq) was accepted or refused before."""
+        return seq in self._window(origin)
 
-    def settle_upto(self, origin: bytes, seq: int) -> None:
-        """Remember that the producer is done with all up to `seq`: what it dropped leaves gaps in its numbers."""
-        self._seen_of(origin).settle_upto(seq)
+    def mark_done_up_to(self, origin: bytes, seq: int) -> None:
+        """Store that the producer no longer holds any number up to `seq`; dropped records leave gaps."""
+        self._window(origin).advance(seq)
 
-    def _seen_of(self, origin: bytes) -> DuplicateWindow:
-        seen = self._seen.get(origin)
-        if seen is None:
-            seen = self._seen[origin] = DuplicateWindow(self._db, origin)
-        return seen
+    def _window(self, origin: bytes) -> DuplicateWindow:
+        window = self._windows.get(origin)
+        if window is None:
+            window = self._windows[origin] = DuplicateWindow(self._db, origin)
+        return window
 
-    def _first_time(self, origin: bytes, seq: int) -> bool:
-        seen = self._seen_of(origin)
-        if seen.has(seq):
+    def _add_seq(self, origin: bytes, seq: int) -> bool:
+        window = self._window(origin)
+        if seq in window:
             return False
-        seen.add(seq)
-        self._forget_pieces(origin, seq)
+        window.add(seq)
+        self._delete_chunks(origin, seq)
         return True
 
-    def add_chunk(self, chunk: ReceivedChunk) -> bytes | int:
-        """Add one chunk of a large record; return the whole record's bytes, or the offset wanted next.
+    # Chunks of large records
 
-        A chunk that does not continue what is there is not stored: the returned offset says where to go on, which
-        makes a transfer resumable over restarts of either side. Pieces that do not add up to their sha256 are
-        forgotten and wanted again from 0; a record in one piece is returned as it is, for the caller to check.
+    def add_chunk(self, chunk: ReceivedChunk) -> bytes | int:
+        """Add a chunk of a record.
+
+        A chunk that does not follow the stored ones is not stored. A transfer therefore resumes after a restart of
+        either side. If the complete record does not match its digest, its chunks are deleted.
+
+        Returns:
+            The complete record, or the next offset to send. A record in a single chunk is returned unchecked.
         """
         if chunk.offset == 0 and len(chunk.data) == chunk.size:
-            self._forget_pieces(chunk.origin, chunk.seq)
+            self._delete_chunks(chunk.origin, chunk.seq)
             return chunk.data
-        number, has = self._partial(chunk)
-        if chunk.offset != has:
-            return has
-        has += len(chunk.data)
-        if has < chunk.size:
-            self._db.execute("INSERT INTO partial_piece VALUES (?, ?, ?)", (number, chunk.offset, chunk.data))
-            self._db.execute("UPDATE partial SET has = ? WHERE id = ?", (has, number))
-            return has
-        pieces = self._db.execute(
-            "SELECT data FROM partial_piece WHERE partial = ? ORDER BY start", (number,)
+        partial_id, received = self._partial(chunk)
+        if chunk.offset != received:
+            return received
+        received += len(chunk.data)
+        if received < chunk.size:
+            self._db.execute("INSERT INTO partial_piece VALUES (?, ?, ?)", (partial_id, chunk.offset, chunk.data))
+            self._db.execute("UPDATE partial SET has = ? WHERE id = ?", (received, partial_id))
+            return received
+        chunks = self._db.execute(
+            "SELECT data FROM partial_piece WHERE partial = ? ORDER BY start", (partial_id,)
         ).fetchall()
-        self._forget_pieces(chunk.origin, chunk.seq)
-        whole = b"".join(bytes(row[0]) for row in pieces) + chunk.data
-        return whole if hashlib.sha256(whole).digest() == chunk.sha256 else 0
+        self._delete_chunks(chunk.origin, chunk.seq)
+        payload = b"".join(bytes(row[0]) for row in chunks) + chunk.data
+        return payload if hashlib.sha256(payload).digest() == chunk.sha256 else 0
 
     def _partial(self, chunk: ReceivedChunk) -> tuple[int, int]:
-        """Return number and length of what is there of a record, begun anew where it is of another content."""
+        """Return (id, received bytes) of an incomplete record; one with other content is replaced."""
         which = (chunk.origin, chunk.seq)
         row = self._db.execute(
             "SELECT id, has, size, sha256 FROM partial WHERE origin = ? AND seq = ?", which
@@ -253,31 +335,64 @@ class Transaction:
         if row is not None and (row[2], row[3]) == (chunk.size, chunk.sha256):
             self._db.execute("UPDATE partial SET touched_ns = ? WHERE id = ?", (time.time_ns(), row[0]))
             return int(row[0]), int(row[1])
-        self._forget_pieces(*which)
-        self._seen_of(chunk.origin).has_pieces = True
+        self._delete_chunks(*which)
+        self._window(chunk.origin).has_chunks = True
         inserted = self._db.execute(
             "INSERT INTO partial (origin, seq, size, sha256, has, touched_ns) VALUES (?, ?, ?, ?, 0, ?)",
             (*which, chunk.size, chunk.sha256, time.time_ns()),
         )
         self._db.execute(
             "DELETE FROM partial WHERE id NOT IN (SELECT id FROM partial ORDER BY touched_ns DESC, id DESC LIMIT ?)",
-            (PARTIALS_KEPT,),
+            (MAX_PARTIAL_RECORDS,),
         )
         return int(inserted.lastrowid or 0), 0
 
-    def _forget_pieces(self, origin: bytes, seq: int) -> None:
-        if self._seen_of(origin).has_pieces:
+    def _delete_chunks(self, origin: bytes, seq: int) -> None:
+        if self._window(origin).has_chunks:
             self._db.execute("DELETE FROM partial WHERE origin = ? AND seq = ?", (origin, seq))
 
+    # State
+
     def put_state(self, name: str, value: bytes) -> None:
-        """Remember `value` under `name`."""
+        """Store `value` under `name`."""
         self._db.execute("INSERT OR REPLACE INTO state VALUES (?, ?)", (name, value))
 
     def delete_state(self, name: str) -> None:
-        """Forget `name`."""
+        """Delete the value under `name`."""
         self._db.execute("DELETE FROM state WHERE name = ?", (name,))
 
     def get_state(self, name: str) -> bytes | None:
-        """Return what is remembered under `name`, or None."""
+        """Return the value under `name`, or None."""
         row = self._db.execute("SELECT value FROM state WHERE name = ?", (name,)).fetchone()
         return bytes(row[0]) if row else None
+
+
+@cache
+def _insert_statement(table: str, columns: str, values: int, rows: int) -> str:
+    row = "(" + ", ".join("?" * values) + ")"
+    return f"INSERT INTO {table} ({columns}) VALUES {', '.join([row] * rows)}"  # noqa: S608 constants
+
+
+def _insert_rows(db: sqlite3.Connection, table: str, columns: str, rows: Sequence[tuple[object, ...]]) -> None:
+    for first in range(0, len(rows), ROWS_PER_STATEMENT):
+        part = rows[first : first + ROWS_PER_STATEMENT]
+        if len(part) < ROWS_PER_STATEMENT:
+            db.executemany(_insert_statement(table, columns, len(part[0]), 1), part)
+        else:
+            statement = _insert_statement(table, columns, len(part[0]), len(part))
+            db.execute(statement, [value for row in part for value in row])
+
+
+def runs(numbers: Iterable[int]) -> Iterator[tuple[int, int]]:
+    """Yield the runs of consecutive numbers as (first, last), in ascending order."""
+    first: int | None = None
+    last = 0
+    for number in sorted(numbers):
+        if first is not None and number == last + 1:
+            last = number
+            continue
+        if first is not None:
+            yield first, last
+        first = last = number
+    if first is not None:
+        yield first, last

@@ -25,12 +25,11 @@ from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.bus.tls import TlsMonitor
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.delivery.disk_reserve import HANDLING_RESERVE_BYTES, DiskReserve
 from sonarpost.delivery.inbox import Inbox
 from sonarpost.delivery.outbox import Outbox, QueuePolicy
-from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import InboxItem, OutboxItem, Transaction
-from sonarpost.delivery.unit_of_work import UnitOfWork
+from sonarpost.delivery.records import InboxItem, OutboxItem
+from sonarpost.delivery.store import HANDLING_RESERVE_BYTES, DiskReserve, Store
+from sonarpost.delivery.transaction import Transaction, UnitOfWork
 from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.logs import kv, lazy_log_context
 from sonarpost.messages import Health, Record, ServiceState
@@ -275,7 +274,7 @@ class Service(ABC, Generic[C]):
         while not self.stopping.is_set():
             self.store.inbox_changed.clear()
             try:
-                items = self.store.pending(max(16, self.BATCH), max_bytes=self.BATCH_BYTES)
+                items = self.store.inbox_items(max(16, self.BATCH), max_bytes=self.BATCH_BYTES)
                 for first in range(0, len(items), self.BATCH):
                     if self.stopping.is_set():
                         return
@@ -343,7 +342,7 @@ class Service(ABC, Generic[C]):
     def _quarantine_record(self, item: InboxItem, reason: str) -> None:
         with self.store.transaction() as tx:
             tx.quarantine("in", item.key, item.payload, reason)
-            tx.done(item)
+            tx.remove_handled(item)
 
     def commit(self, effects: UnitOfWork, item: InboxItem | None = None) -> None:
         """Write the effects and remove the record that caused them, in one transaction."""
@@ -359,7 +358,7 @@ class Service(ABC, Generic[C]):
             for effects, item in handled:
                 effects.write(tx)
                 if item is not None:
-                    tx.done(item)
+                    tx.remove_handled(item)
         with self._counter_lock:
             for effects, _ in handled:
                 for name, by in effects.counts.items():

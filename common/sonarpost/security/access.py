@@ -118,7 +118,7 @@ def _shore_at_vessel(vessel: str, sites: Sequence[str]) -> list[Rule]:
 def _console_at_vessel(vessel: str) -> list[Rule]:
     """An operator's program aboard: it hands in decisions and commands, and takes advice."""
     handed_in = (keys.below(keys.contact_decision(vessel)), keys.below(keys.command_all(vessel)))
-    taken = (keys.handoff_any(keys.advice(vessel)),)
+    taken = (keys.delivery_query_any(keys.advice(vessel)),)
     return [
         *_observer(),
         *_handing_in(handed_in),
@@ -163,7 +163,7 @@ def _answers(sites: Sequence[str]) -> tuple[str, ...]:
     """Where a site answers vessels: as its services declare it, for all vessels at once."""
     expressions = []
     for site in sites:
-        expressions += [keys.handoff_any(keys.shore_inbox_all(site)), keys.below(keys.shore_inbox_all(site))]
+        expressions += [keys.delivery_query_any(keys.shore_inbox_all(site)), keys.below(keys.shore_inbox_all(site))]
     return tuple(expressions)
 
 
