@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from sonarpost.errors import BadInputError, StoredFileError
-from sonarpost.export.accepted import DECISIONS, SideCar
+from sonarpost.export.contacts import DECISIONS, SideCar
 from sonarpost.logs import kv
 from sonarpost.messages import Decision, Pixels, ReconstructedImage
 from sonarpost.sonar.image_files import read_image

@@ -1,4 +1,4 @@
-"""Writes missing golden files of the exports: `PYTHONPATH=tests python -m builders.export_vectors`."""
+"""Write missing golden files of the exports: `PYTHONPATH=tests python -m builders.export_vectors`."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ from pathlib import Path
 
 from builders.common import GOLDEN_FOLDER
 from builders.exports import golden_files, mission
-from sonarpost.export.accepted import load_accepted
+from sonarpost.export.contacts import load_contacts
 
 FOLDER = GOLDEN_FOLDER / "export"
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
-        for name, data in golden_files(load_accepted(mission(Path(folder)))).items():
+        for name, data in golden_files(load_contacts(mission(Path(folder)))).items():
             path = FOLDER / name
             if not path.exists():
                 path.write_bytes(data)
             elif path.read_bytes() != data:
-                sys.exit(
-                    f"{path} would come out otherwise: a golden file is never changed, give the new one a new name"
-                )
+                sys.exit(f"{path}: output differs; golden files never change, write the new output to a new name")

@@ -1,4 +1,4 @@
-"""Accepted records for the tests of exports, written as c2 writes them."""
+"""Records in the c2 service's folder, for the tests of exports."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ import numpy as np
 
 from sonarpost.archive.image_files import write_image
 from sonarpost.archive.shore_files import decision_file_name
-from sonarpost.export.accepted import Accepted
+from sonarpost.export.contacts import ContactSet
 from sonarpost.export.cot import cot_events
-from sonarpost.export.csv_table import csv_bytes
-from sonarpost.export.geojson import geojson_bytes
 from sonarpost.export.kml import kml_bytes
+from sonarpost.export.tables import csv_bytes, geojson_bytes
 from sonarpost.messages import Contact, Decision, Pixels, ReconstructedImage
 
 FIRST_UTC_S = 1476262801.25
@@ -77,8 +76,8 @@ def decision(image_id: str = "00A7", **changes: Any) -> Decision:
     return Decision(**(fields | changes))
 
 
-def keep(out_dir: Path, *records: ReconstructedImage | Decision) -> Path:
-    """Write records into c2's folder; `test_c2_writes_what_is_read` holds this to what c2 does."""
+def store(out_dir: Path, *records: ReconstructedImage | Decision) -> Path:
+    """Write records into a folder as c2 does; `test_c2_files_are_readable` compares both."""
     for record in records:
         folder = out_dir / record.vessel_id
         if isinstance(record, ReconstructedImage):
@@ -92,8 +91,8 @@ def keep(out_dir: Path, *records: ReconstructedImage | Decision) -> Path:
 
 
 def mission(out_dir: Path) -> Path:
-    """Write one of every kind of contact; what the golden files show."""
-    return keep(
+    """Write one contact of each kind; the golden files show them."""
+    return store(
         out_dir,
         image("0001"),
         image("0002", {"lat_deg": 41.5261}, version=2, notes=("a note",)),
@@ -108,11 +107,11 @@ def mission(out_dir: Path) -> Path:
     )
 
 
-def golden_files(accepted: Accepted) -> dict[str, bytes]:
-    """Return every export that is text, by the name of its golden file."""
+def golden_files(contacts: ContactSet) -> dict[str, bytes]:
+    """Return all text exports by the name of their golden file."""
     return {
-        "mission.geojson": geojson_bytes(accepted),
-        "mission.kml": kml_bytes(accepted),
-        "mission.csv": csv_bytes(accepted),
-        "mission.cot": b"\n".join(cot_events(accepted, FIRST_UTC_S + 3600)) + b"\n",
+        "mission.geojson": geojson_bytes(contacts),
+        "mission.kml": kml_bytes(contacts),
+        "mission.csv": csv_bytes(contacts),
+        "mission.cot": b"\n".join(cot_events(contacts, FIRST_UTC_S + 3600)) + b"\n",
     }

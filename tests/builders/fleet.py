@@ -10,8 +10,7 @@ import zenoh
 from rich.console import Console
 
 from sonarpost import keys, wire
-from sonarpost.cli.status import show
-from sonarpost.cli.status.rows import rows_of
+from sonarpost.cli import status
 from sonarpost.messages import Health
 from sonarpost.monitoring.fleet import FleetState, ServiceStatus
 
@@ -58,7 +57,7 @@ FLEET = FleetState(
 
 def on_terminal(state: FleetState, width: int = 80) -> list[str]:
     console = Console(file=io.StringIO(), force_terminal=True, width=width, height=40, color_system=None)
-    console.print(show.table(state, rows_of(state, 15.0), "tcp/127.0.0.1:7447"))
+    console.print(status.table(state, status.rows_of(state, 15.0), "tcp/127.0.0.1:7447"))
     assert isinstance(console.file, io.StringIO)
     return [line.rstrip() for line in console.file.getvalue().splitlines()]
 

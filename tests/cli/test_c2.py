@@ -1,4 +1,4 @@
-"""`sonarpost c2`: live lines, tables, files, exports, and what is handed in for a vessel."""
+"""`sonarpost c2`: live lines, tables, copies, exports, and commands and comments for a vessel."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from builders.records import picture_record
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import router_config
-from sonarpost.cli.c2.ls import join, select
-from sonarpost.cli.c2.options import printable, since_of
+from sonarpost.cli.c2.stored import join_decisions, select_images, since_of
 from sonarpost.cli.main import main
+from sonarpost.cli.shared import printable
 from sonarpost.errors import ConfigError
 from sonarpost.messages import Advice, Contact, Decision, Pixels, TaskingState
 from sonarpost.services.c2.archive import Archive
@@ -60,7 +60,7 @@ def decision(decision_id="d1", image_id="AAAA", decided_utc_s=FIRST_S + 60, verd
 
 @pytest.fixture
 def out(tmp_path):
-    """A folder as c2 keeps it: three pictures, one of them in two versions, and a decision."""
+    """Folder of c2: three images, one of them in two versions, and a decision."""
     folder = tmp_path / "out"
     archive = Archive(C2Config(out_dir=folder))
     for record in (
@@ -82,7 +82,7 @@ def ls(capsys, out, *options):
     return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
 
-def test_ls_shows_the_newest_version_of_each_picture_with_its_decision(capsys, out):
+def test_ls_lists_the_newest_version_with_its_decision(capsys, out):
     rows = ls(capsys, out)
     assert [(r["image_id"], r["version"], (r["decision"] or {}).get("verdict")) for r in rows] == [
         ("AAAA", 2, "mine_like"),
@@ -107,23 +107,23 @@ def test_ls_filters(options, expected, capsys, out):
     assert sorted(r["image_id"] for r in ls(capsys, out, *options)) == expected
 
 
-def test_ls_prints_a_table_for_people(capsys, out):
+def test_ls_prints_a_table(capsys, out):
     assert main(["c2", "ls", "--out-dir", str(out)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert "picture" in lines[0]
+    assert "image" in lines[0]
     [line] = [line for line in lines if "uuv-1/AAAA" in line]
     for part in ("vessel-1", "2023-11-14 22:13:20", "56.40000 -5.60000", "mine_like", "op", "0 %"):
         assert part in line
-    assert lines[-1] == "3 pictures"
+    assert lines[-1] == "3 images"
 
 
-def test_ls_without_an_index_says_which_file_it_wanted(capsys, tmp_path):
+def test_ls_without_an_index_names_the_missing_file(capsys, tmp_path):
     assert main(["c2", "ls", "--out-dir", str(tmp_path)]) == 2
     assert f"{tmp_path / 'index.db'}: got 'no such file', expected the index" in capsys.readouterr().err
 
 
-def test_a_decision_is_about_the_picture_that_had_begun_to_arrive(tmp_path):
-    """A wiped vehicle begins its identifiers anew."""
+def test_decision_matches_the_image_received_before_it(tmp_path):
+    """A vehicle with a new store uses the same image identifiers again."""
     archive = Archive(C2Config(out_dir=tmp_path))
     archive.keep_image(image("AAAA", first_frame_utc_s=1000.0), 5.0)
     archive.flush()
@@ -132,16 +132,16 @@ def test_a_decision_is_about_the_picture_that_had_begun_to_arrive(tmp_path):
     for record in (decision("d1", decided_utc_s=1500.0), decision("d2", decided_utc_s=2500.0, verdict="unsure")):
         archive.keep_decision(record)
         archive.flush()
-    rows = join(archive.index().pictures(), archive.index().decisions())
+    rows = join_decisions(archive.index().pictures(), archive.index().decisions())
     archive.close()
     assert [(r.picture.first_frame_utc_s, r.decision and r.decision.decision_id) for r in rows] == [
         (1000.0, "d1"),
         (2000.0, "d2"),
     ]
-    assert len(select(rows)) == 2
+    assert len(select_images(rows)) == 2
 
 
-def test_get_copies_the_files_of_the_newest_version(capsys, out, tmp_path):
+def test_get_copies_the_newest_version(capsys, out, tmp_path):
     assert main(["c2", "get", "uuv-1/AAAA", "--out-dir", str(out), "--to", str(tmp_path / "here")]) == 0
     names = sorted(p.name for p in (tmp_path / "here").iterdir())
     assert names == [f"uuv-1_20231114T221320Z_AAAA_v2.{kind}" for kind in ("json", "png", "tiff")]
@@ -151,14 +151,14 @@ def test_get_copies_the_files_of_the_newest_version(capsys, out, tmp_path):
     assert "a picture that `sonarpost c2 ls` shows" in capsys.readouterr().err
 
 
-def test_get_of_an_unreadable_file_copies_nothing(capsys, out, tmp_path):
+def test_get_copies_nothing_if_a_file_is_unreadable(capsys, out, tmp_path):
     next(out.glob("vessel-1/*AAAA_v2.png")).unlink()
     assert main(["c2", "get", "uuv-1/AAAA", "--out-dir", str(out), "--to", str(tmp_path / "here")]) == 2
-    assert "a file that c2 keeps" in capsys.readouterr().err
+    assert "a readable file of c2" in capsys.readouterr().err
     assert not (tmp_path / "here").exists()
 
 
-def test_export_writes_every_format_and_notes_what_was_exported(capsys, out, tmp_path):
+def test_export_writes_all_formats_and_marks_images_as_exported(capsys, out, tmp_path):
     files = {name: tmp_path / f"contacts.{name}" for name in ("geojson", "kml", "kmz", "csv")}
     options = [part for name, path in files.items() for part in (f"--{name}", str(path))]
     assert main(["c2", "export", "--out-dir", str(out), "--vessel", "vessel-1", *options]) == 0
@@ -173,39 +173,39 @@ def test_export_sends_cursor_on_target_events(capsys, out):
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(20)
         port = server.getsockname()[1]
-        heard = bytearray()
+        received = bytearray()
 
-        def listen():
+        def receive():
             connection, _ = server.accept()
             with connection:
-                while piece := connection.recv(4096):
-                    heard.extend(piece)
+                while data := connection.recv(4096):
+                    received.extend(data)
 
-        listener = threading.Thread(target=listen)
+        listener = threading.Thread(target=receive)
         listener.start()
         assert (
             main(["c2", "export", "--out-dir", str(out), "--vessel", "vessel-1", "--cot", f"tcp://127.0.0.1:{port}"])
             == 0
         )
         listener.join(20)
-    events = [ET.fromstring(text + "</event>") for text in heard.decode().split("</event>")[:-1]]
+    events = [ET.fromstring(text + "</event>") for text in received.decode().split("</event>")[:-1]]
     assert sorted(event.attrib["type"][:3] for event in events) == ["a-s", "b-m"]
     assert len({event.attrib["uid"] for event in events}) == 2
-    assert "2 events, 0 contacts without a position left out" in capsys.readouterr().out
+    assert "2 events, 0 contacts without a position omitted" in capsys.readouterr().out
 
 
-def test_export_to_an_endpoint_where_nobody_listens_is_an_error(capsys, out):
+def test_export_to_an_unreachable_endpoint_is_an_error(capsys, out):
     endpoint = f"tcp://127.0.0.1:{free_port()}"
     assert main(["c2", "export", "--out-dir", str(out), "--cot", endpoint, "--cot-wait", "0.5"]) == 2
     assert "tcp://127.0.0.1" in capsys.readouterr().err
 
 
-def test_export_of_nothing_is_an_error_and_of_something_broken_is_said(capsys, out, tmp_path):
+def test_export_needs_an_output_and_reports_rejected_files(capsys, out, tmp_path):
     assert main(["c2", "export", "--out-dir", str(out)]) == 2
     assert "at least one of --geojson" in capsys.readouterr().err
     (out / "vessel-1" / "broken.json").write_text("{")
     assert main(["c2", "export", "--out-dir", str(out), "--csv", str(tmp_path / "c.csv")]) == 1
-    assert "left out: " in capsys.readouterr().err
+    assert "rejected: " in capsys.readouterr().err
 
 
 @pytest.fixture
@@ -216,11 +216,11 @@ def c2(platform, tmp_path):
     service.stop()
 
 
-def test_advice_is_on_c2s_disk_when_the_command_ends(capsys, c2, router, tmp_path):
-    arguments = ["c2", "advise", "uuv-1/AAAA", "--vessel", "vessel-1", "--version", "2", "--verdict", "mine_like"]
+def test_comment_is_stored_by_c2_when_the_command_ends(capsys, c2, router, tmp_path):
+    arguments = ["c2", "comment", "uuv-1/AAAA", "--vessel", "vessel-1", "--version", "2", "--verdict", "mine_like"]
     arguments += ["--confidence", "0.5", "--class", "sphere", "--remark", "look", "--author", "ann", "--id", "a-1"]
     assert main([*arguments, "--router", router]) == 0
-    assert "advice a-1 for vessel-1 accepted" in capsys.readouterr().out
+    assert "comment a-1 for vessel-1 accepted" in capsys.readouterr().out
     eventually(lambda: c2.gauges()["waiting_for_vessels"] == 1)
     [item] = c2.store.queued("relay@vessel-1", 9)
     advice = wire.decode(Advice, item.payload, item.key)
@@ -228,14 +228,14 @@ def test_advice_is_on_c2s_disk_when_the_command_ends(capsys, c2, router, tmp_pat
     assert (advice.image_id, advice.image_version, advice.verdict, advice.author) == ("AAAA", 2, "mine_like", "ann")
     listing = ["c2", "ls", "--tasking", "--json", "--out-dir", str(tmp_path / "live")]
     eventually(lambda: main(listing) == 0 and '"state": "waiting"' in capsys.readouterr().out)
-    # Another one under the same name is refused, and the person is told.
+    # Another record with the same identifier is rejected.
     assert main([*arguments[:-4], "--author", "ann", "--remark", "other", "--id", "a-1", "--router", router]) == 2
     assert "an identifier that no other record for this vessel has" in capsys.readouterr().err
 
 
-def test_a_command_is_owed_before_advice(capsys, c2, router):
-    assert main(["c2", "advise", "uuv-1/AAAA", "--vessel", "vessel-1", "--router", router]) == 0
-    assert main(["c2", "task", "uuv-1/AAAA", "--vessel", "vessel-1", "--kind", "refine", "--router", router]) == 0
+def test_command_is_sent_before_a_comment(capsys, c2, router):
+    assert main(["c2", "comment", "uuv-1/AAAA", "--vessel", "vessel-1", "--router", router]) == 0
+    assert main(["c2", "command", "uuv-1/AAAA", "--vessel", "vessel-1", "--kind", "refine", "--router", router]) == 0
     eventually(lambda: c2.gauges()["waiting_for_vessels"] == 2)
     assert [item.key for item in c2.store.queued("relay@vessel-1", 9)] == [
         keys.command("vessel-1", "refine"),
@@ -244,22 +244,22 @@ def test_a_command_is_owed_before_advice(capsys, c2, router):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "text"),
     [
-        (["advise", "uuv-1", "--vessel", "vessel-1"], "image_id"),
-        (["advise", "uuv-1/aaaa", "--vessel", "vessel-1"], "image_id"),
-        (["advise", "uuv-1/AAAA", "--vessel", "vessel-1", "--confidence", "2"], "confidence"),
-        (["task", "uuv-1", "--vessel", "vessel-1", "--kind", "revisit"], "where to revisit"),
-        (["task", "uuv-1", "--vessel", "vessel-1", "--kind", "refine"], "the image to refine"),
+        (["comment", "uuv-1", "--vessel", "vessel-1"], "image_id"),
+        (["comment", "uuv-1/aaaa", "--vessel", "vessel-1"], "image_id"),
+        (["comment", "uuv-1/AAAA", "--vessel", "vessel-1", "--confidence", "2"], "confidence"),
+        (["command", "uuv-1", "--vessel", "vessel-1", "--kind", "revisit"], "where to revisit"),
+        (["command", "uuv-1", "--vessel", "vessel-1", "--kind", "refine"], "the image to refine"),
     ],
 )
-def test_what_is_no_record_is_refused_before_anything_is_sent(arguments, said, capsys):
+def test_invalid_record_is_rejected_before_sending(arguments, text, capsys):
     assert main(["c2", *arguments]) == 2
-    assert said in capsys.readouterr().err
+    assert text in capsys.readouterr().err
 
 
-def test_without_c2_or_a_router_the_command_says_so(capsys, router):
-    common = ["c2", "advise", "uuv-1/AAAA", "--vessel", "vessel-1", "--timeout", "0.5"]
+def test_unreachable_c2_or_router_is_an_error(capsys, router):
+    common = ["c2", "comment", "uuv-1/AAAA", "--vessel", "vessel-1", "--timeout", "0.5"]
     assert main([*common, "--router", router]) == 2
     assert "not handed over to c2 within 0.5 s: nobody answers" in capsys.readouterr().err
     assert main([*common, "--router", f"tcp/127.0.0.1:{free_port()}"]) == 2
@@ -268,7 +268,7 @@ def test_without_c2_or_a_router_the_command_says_so(capsys, router):
 
 @pytest.fixture
 def watching():
-    """Starts `sonarpost c2 watch` as a process; lines of both outputs come in as they are said."""
+    """Starts `sonarpost c2 watch` as a process and collects the lines of both outputs."""
     started = []
 
     def start(*options):
@@ -279,11 +279,11 @@ def watching():
             text=True,
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
         )
-        said, complaints = [], []
-        for stream, lines in ((process.stdout, said), (process.stderr, complaints)):
+        printed, errors = [], []
+        for stream, lines in ((process.stdout, printed), (process.stderr, errors)):
             threading.Thread(target=lambda s=stream, to=lines: to.extend(iter(s.readline, "")), daemon=True).start()
         started.append(process)
-        return process, said, complaints
+        return process, printed, errors
 
     yield start
     for process in started:
@@ -293,37 +293,37 @@ def watching():
         process.stderr.close()
 
 
-def shown(session, record, key):
+def publish(session, record, key):
     publish_once(session, key, wire.encode(record))
 
 
-def test_watch_prints_a_line_each_and_ends_with_ctrl_c_whatever_happens_to_the_router(watching):
+def test_watch_prints_lines_across_router_restarts_until_ctrl_c(watching):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     hub = zenoh.open(router_config([endpoint]))
-    process, said, complaints = watching("--router", endpoint)
+    process, printed, errors = watching("--router", endpoint)
     try:
-        eventually(lambda: any("watching shore" in line for line in complaints), timeout_s=30)
+        eventually(lambda: any("watching shore" in line for line in errors), timeout_s=30)
         publish_once(hub, keys.shore_image("vessel-1"), b"rubbish")
-        eventually(lambda: any("expected" in line for line in complaints))
-        shown(hub, image(), keys.shore_image("vessel-1"))
-        shown(hub, decision(remark="two\nlines \x1b[31m"), keys.shore_decision("vessel-1"))
+        eventually(lambda: any("expected" in line for line in errors))
+        publish(hub, image(), keys.shore_image("vessel-1"))
+        publish(hub, decision(remark="two\nlines \x1b[31m"), keys.shore_decision("vessel-1"))
         state = TaskingState(
             vessel_id="vessel-1", kind="advice", record_id="a", state="refused", reason="no", changed_utc_s=1
         )
-        shown(hub, state, keys.tasking_state("vessel-1"))
-        eventually(lambda: len(said) == 3)
-        assert "vessel-1  picture   uuv-1/AAAA v1  30 x 20 px, complete, at 56.40000 -5.60000" in "".join(said)
-        assert "decision  uuv-1/AAAA v1  mine_like two?lines ?[31m (op)\n" in "".join(said)
-        assert "advice    a  refused: no\n" in "".join(said)
+        publish(hub, state, keys.tasking_state("vessel-1"))
+        eventually(lambda: len(printed) == 3)
+        assert "vessel-1  image     uuv-1/AAAA v1  30 x 20 px, complete, at 56.40000 -5.60000" in "".join(printed)
+        assert "decision  uuv-1/AAAA v1  mine_like two?lines ?[31m (op)\n" in "".join(printed)
+        assert "comment   a  refused: no\n" in "".join(printed)
         hub.close()
-        eventually(lambda: any("router not reached" in line for line in complaints))
+        eventually(lambda: any("router not reached" in line for line in errors))
         hub = zenoh.open(router_config([endpoint]))
-        eventually(lambda: any("router back" in line for line in complaints), timeout_s=30)
-        shown(hub, image("ZZZZ"), keys.shore_image("vessel-1"))
-        eventually(lambda: len(said) > 3)
+        eventually(lambda: any("router reconnected" in line for line in errors), timeout_s=30)
+        publish(hub, image("ZZZZ"), keys.shore_image("vessel-1"))
+        eventually(lambda: len(printed) > 3)
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=10) == 0
-        assert not any("Traceback" in line for line in complaints)
+        assert not any("Traceback" in line for line in errors)
     finally:
         hub.close()
 
@@ -331,15 +331,30 @@ def test_watch_prints_a_line_each_and_ends_with_ctrl_c_whatever_happens_to_the_r
 @pytest.mark.parametrize(
     ("text", "expected"), [("90m", 1e6 - 5400), ("2h", 1e6 - 7200), ("1.5d", 1e6 - 129600), (None, 0)]
 )
-def test_since(text, expected):
+def test_since_forms(text, expected):
     assert since_of(text, 1e6) == expected
 
 
 @pytest.mark.parametrize("text", ["", "yesterday", "2h30m", "-1h", "12"])
-def test_since_that_is_no_time(text):
+def test_invalid_since_is_rejected(text):
     with pytest.raises(ConfigError, match="--since"):
         since_of(text)
 
 
-def test_what_a_terminal_would_act_on_is_not_printed():
+def test_control_characters_are_not_printed():
     assert printable("a\x1b[2Jb\n\u202ec") == "a?[2Jb??c"
+
+
+@pytest.mark.parametrize(("old", "new"), [("task", "command"), ("advise", "comment")])
+def test_former_action_name_is_refused_with_the_new_name(old, new, capsys):
+    assert main(["c2", old, "uuv-1/AAAA", "--vessel", "vessel-1", "--kind", "refine"]) == 2
+    assert capsys.readouterr().err == f"sonarpost: c2: got '{old}', expected `sonarpost c2 {new}`, its new name\n"
+    assert main(["c2", old]) == 2
+
+
+@pytest.mark.parametrize("kind", ["expand", "wider"])
+def test_expand_and_its_former_name_send_the_same_record(kind, capsys, c2, router):
+    arguments = ["c2", "command", "uuv-1/AAAA", "--vessel", "vessel-1", "--kind", kind, "--router", router]
+    assert main(arguments) == 0
+    eventually(lambda: c2.gauges()["waiting_for_vessels"] == 1)
+    assert [item.key for item in c2.store.owed("relay@vessel-1", 9)] == [keys.command("vessel-1", "wider")]

@@ -1,4 +1,4 @@
-"""`sonarpost status`: what a terminal of 80 columns shows, what other programs get, and that it ends cleanly."""
+"""`sonarpost status`: output on a terminal of 80 columns, for other programs, and a clean end."""
 
 from __future__ import annotations
 
@@ -25,15 +25,14 @@ from builders.fleet import BROKEN, FLEET, Platforms, health, on_terminal, seen
 
 from sonarpost.bus.session import router_config
 from sonarpost.cli.main import main
-from sonarpost.cli.status import show
-from sonarpost.cli.status.rows import age_text, bytes_text, is_well, rows_of
+from sonarpost.cli.status import age_text, bytes_text, is_ok, plain_text, rows_of
 from sonarpost.config import PlatformConfig
 from sonarpost.monitoring.fleet import FleetState, ServiceStatus
 
 NAMES = ("uuv_modem", "acoustic_channel", "op_modem", "decompressor")
 
 
-def test_eighty_columns_show_every_row_whole() -> None:
+def test_table_fits_eighty_columns() -> None:
     lines = on_terminal(FLEET)
     assert max(len(line) for line in lines) <= 80
     assert lines[0] == "tcp/127.0.0.1:7447: 5 of 7 services alive on 3 platforms, 2 records rejected"
@@ -45,13 +44,13 @@ def test_eighty_columns_show_every_row_whole() -> None:
         r"vessel-1 +decompressor +stale \(ok\) +3 min +0 +3 +- +12 GB", rows["vessel-1", "decompressor"]
     )
     assert re.fullmatch(r" +op_modem +ok +1 s +0 +3 +SNR 12 dB, loss 2 % +500 MB", rows["", "op_modem"])
-    assert re.fullmatch(r" +relay +not heard +- +- +- +- +-", rows["", "relay"])
+    assert re.fullmatch(r" +relay +no data +- +- +- +- +-", rows["", "relay"])
     assert re.fullmatch(r"vessel-2 +relay +stopped +1 d +0 +3 +- +12 GB", rows["vessel-2", "relay"])
     assert re.fullmatch(r" +router +gone +4 s +0 +3 +- +12 GB", rows["", "router"])
     assert lines[-1] == "! uuv-1/uuv_modem: /dev/ttyUSB0: not open yet"
 
 
-def test_long_names_are_folded_and_not_cut() -> None:
+def test_long_names_are_folded() -> None:
     long = health("a" * 32, "b" * 40, detail="c" * 200)
     lines = on_terminal(FleetState((seen(long),), connected=True, rejected=0))
     assert max(len(line) for line in lines) <= 80
@@ -59,34 +58,34 @@ def test_long_names_are_folded_and_not_cut() -> None:
     assert "".join(lines).count("c") >= 200
 
 
-def test_old_data_looks_old() -> None:
-    def mood(state: ServiceStatus, *, connected: bool = True) -> tuple[str, str]:
+def test_row_severity() -> None:
+    def severity(state: ServiceStatus, *, connected: bool = True) -> tuple[str, str]:
         (row,) = rows_of(FleetState((state,), connected, 0), 15.0)
-        return row.state, row.mood
+        return row.state, row.severity
 
-    assert mood(seen(health(), 14.9)) == ("ok", "good")
-    assert mood(seen(health(), 15.1)) == ("stale (ok)", "doubtful")
-    assert mood(seen(health(), 1.0, alive=None), connected=False) == ("ok?", "doubtful")
-    assert mood(seen(health(state="degraded"))) == ("degraded", "bad")
-    assert mood(seen(None)) == ("not heard", "doubtful")
-    assert mood(seen(health(), alive=False)) == ("gone", "gone")
+    assert severity(seen(health(), 14.9)) == ("ok", "ok")
+    assert severity(seen(health(), 15.1)) == ("stale (ok)", "stale")
+    assert severity(seen(health(), 1.0, alive=None), connected=False) == ("ok?", "stale")
+    assert severity(seen(health(state="degraded"))) == ("degraded", "error")
+    assert severity(seen(None)) == ("no data", "stale")
+    assert severity(seen(health(), alive=False)) == ("gone", "gone")
 
 
-def test_well_is_everybody_and_somebody() -> None:
-    def well(*services: ServiceStatus, connected: bool = True) -> bool:
+def test_fleet_is_ok_if_services_run_and_all_are_ok() -> None:
+    def ok(*services: ServiceStatus, connected: bool = True) -> bool:
         state = FleetState(services, connected, 0)
-        return is_well(rows_of(state, 15.0), state)
+        return is_ok(rows_of(state, 15.0), state)
 
-    assert well(seen(health()))
-    assert not well()
-    assert not well(seen(health()), connected=False)
-    assert not well(seen(health()), seen(BROKEN))
+    assert ok(seen(health()))
+    assert not ok()
+    assert not ok(seen(health()), connected=False)
+    assert not ok(seen(health()), seen(BROKEN))
 
 
-def test_plain_text_is_whole_and_has_no_control_characters() -> None:
+def test_plain_text_is_complete_and_has_no_control_characters() -> None:
     hostile = health("uuv-1", "uuv_modem", state="degraded", detail="\x1b[2J\r\nall is well")
     state = FleetState((seen(hostile), seen(health("a" * 32, "b" * 40))), connected=True, rejected=0)
-    text = show.plain(state, rows_of(state, 15.0), "tcp/127.0.0.1:7447")
+    text = plain_text(state, rows_of(state, 15.0), "tcp/127.0.0.1:7447")
     assert text.replace("\n", "").isprintable()
     assert len(text.splitlines()) == 5
     assert ("a" * 32 + "  " + "b" * 40) in text
@@ -96,14 +95,14 @@ def test_plain_text_is_whole_and_has_no_control_characters() -> None:
 @pytest.mark.parametrize(
     ("age_s", "text"), [(None, "-"), (0.0, "0 s"), (59.9, "59 s"), (60, "1 min"), (7199, "1 h"), (1e6, "11 d")]
 )
-def test_ages(age_s: float | None, text: str) -> None:
+def test_age_text(age_s: float | None, text: str) -> None:
     assert age_text(age_s) == text
 
 
 @pytest.mark.parametrize(
     ("size", "text"), [(None, "-"), (0, "0 B"), (999, "999 B"), (3400, "3.4 kB"), (1.2e10, "12 GB"), (9e15, "9000 TB")]
 )
-def test_sizes(size: float | None, text: str) -> None:
+def test_bytes_text(size: float | None, text: str) -> None:
     assert bytes_text(size) == text
 
 
@@ -114,31 +113,31 @@ def platforms(client: zenoh.Session) -> Any:
     platforms.close()
 
 
-def test_once_for_people_and_programs(router: str, platforms: Platforms, capsys: pytest.CaptureFixture[str]) -> None:
+def test_once_as_text_and_as_json(router: str, platforms: Platforms, capsys: pytest.CaptureFixture[str]) -> None:
     platforms.run(health())
     assert main(["status", "--once", "--router", router]) == 0
     out = capsys.readouterr().out
-    assert out.splitlines()[1].split() == ["PLATFORM", "SERVICE", "STATE", "HEARD", "IN", "OUT", "LINK", "DISK"]
+    assert out.splitlines()[1].split() == ["PLATFORM", "SERVICE", "STATE", "AGE", "IN", "OUT", "LINK", "DISK"]
     assert "\x1b" not in out
     platforms.run(BROKEN)
     assert main(["status", "--once", "--json", "--router", router]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert told["connected"] is True
-    services = {(s["platform"], s["service"]): s for s in told["services"]}
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["connected"] is True
+    services = {(s["platform"], s["service"]): s for s in printed["services"]}
     assert services["uuv-1", "uuv_modem"]["detail"] == BROKEN.detail
     assert services["vessel-1", "op_modem"]["gauges"] == health().gauges
     assert [s["well"] for s in services.values()] == [False, True]
 
 
-def test_once_ends_when_nobody_answers(capsys: pytest.CaptureFixture[str]) -> None:
+def test_once_ends_without_a_router(capsys: pytest.CaptureFixture[str]) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     started = time.monotonic()
     assert main(["status", "--once", "--wait", "0.3", "--router", endpoint]) == 1
     assert time.monotonic() - started < 10
-    assert capsys.readouterr().out.splitlines()[0] == f"{endpoint}: not reached yet"
+    assert capsys.readouterr().out.splitlines()[0] == f"{endpoint}: router not reached yet"
 
 
-def test_the_configuration_names_the_router(
+def test_router_from_the_configuration_file(
     tmp_path: Path, router: str, platforms: Platforms, capsys: pytest.CaptureFixture[str]
 ) -> None:
     platforms.run(health())
@@ -149,7 +148,7 @@ def test_the_configuration_names_the_router(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "text"),
     [
         (["--interval", "0"], "--interval"),
         (["--stale-after", "-1"], "--stale-after"),
@@ -157,10 +156,10 @@ def test_the_configuration_names_the_router(
         (["--config", "nowhere.toml"], "nowhere.toml"),
     ],
 )
-def test_wrong_options_are_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_option_gives_one_line(arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["status", "--once", *arguments]) == 2
     error = capsys.readouterr().err
-    assert said in error
+    assert text in error
     assert error.count("\n") == 1
 
 
@@ -186,12 +185,12 @@ class Terminal:
         while True:
             try:
                 data = os.read(self.master, 65536)
-            except OSError:  # the terminal's other end is closed: the process has ended
+            except OSError:  # The process has ended.
                 return
             self.text += data.decode(errors="replace")
 
     def screen(self) -> str:
-        """The last picture drawn: what follows the last jump home."""
+        """Return the last screen: the text after the last cursor-home sequence."""
         return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.text.rpartition("\x1b[H")[2])
 
     def wait(self) -> int:
@@ -203,15 +202,15 @@ class Terminal:
 
 def ended_cleanly(terminal: Terminal) -> None:
     assert "Traceback" not in terminal.text
-    # Back on the main screen, with a cursor.
+    # The main screen and the cursor are restored.
     assert terminal.text.rindex("\x1b[?1049l") > terminal.text.rindex("\x1b[?1049h")
     assert terminal.text.rindex("\x1b[?25h") > terminal.text.rindex("\x1b[?25l")
 
 
-def test_the_terminal_is_put_right_at_sigterm() -> None:
+def test_sigterm_restores_the_terminal() -> None:
     terminal = Terminal("--router", f"tcp/127.0.0.1:{free_port()}", "--interval", "0.1")
     try:
-        eventually(lambda: "not reached yet" in terminal.screen(), what="the first picture")
+        eventually(lambda: "not reached yet" in terminal.screen(), what="the first screen")
     finally:
         terminal.process.terminate()
         status = terminal.wait()
@@ -219,11 +218,11 @@ def test_the_terminal_is_put_right_at_sigterm() -> None:
     ended_cleanly(terminal)
 
 
-def test_the_live_table_follows_cuts_and_ends_at_ctrl_c() -> None:
+def test_live_table_shows_lost_and_restored_router_until_ctrl_c() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     terminal = Terminal("--router", endpoint, "--interval", "0.1", "--stale-after", "2")
     try:
-        eventually(lambda: "not reached yet" in terminal.screen(), what="the first picture")
+        eventually(lambda: "not reached yet" in terminal.screen(), what="the first screen")
         session = zenoh.open(router_config([endpoint]))
         platforms = Platforms(session)
         platforms.run(health())
@@ -233,7 +232,7 @@ def test_the_live_table_follows_cuts_and_ends_at_ctrl_c() -> None:
         eventually(lambda: re.search(r"uuv_modem +gone", terminal.screen()) is not None, what="the end of a service")
         platforms.close()
         session.close()
-        eventually(lambda: "what is below is old" in terminal.screen(), what="the end of the router")
+        eventually(lambda: "data below is old" in terminal.screen(), what="the end of the router")
         eventually(lambda: "stale (ok)" in terminal.screen(), what="stale health")
         session = zenoh.open(router_config([endpoint]))
         platforms = Platforms(session)
@@ -248,7 +247,7 @@ def test_the_live_table_follows_cuts_and_ends_at_ctrl_c() -> None:
     ended_cleanly(terminal)
 
 
-def test_a_pipe_gets_lines(router: str, platforms: Platforms, platform: Callable[[str], PlatformConfig]) -> None:
+def test_json_lines_on_a_pipe(router: str, platforms: Platforms, platform: Callable[[str], PlatformConfig]) -> None:
     platforms.run(health())
     command = [sys.executable, "-m", "sonarpost.cli.main", "status", "--router", router, "--json", "--interval", "0.1"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

@@ -1,4 +1,4 @@
-"""docs/explanation/operations.md, the alert rules and the dashboard say what the code does."""
+"""docs/explanation/operations.md, the alert rules and the dashboard agree with the code."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ DOCS = REPOSITORY / "docs" / "explanation"
 PAGE = (DOCS / "operations.md").read_text(encoding="utf-8")
 
 
-def test_the_table_in_the_page_is_what_a_terminal_shows() -> None:
-    (shown,) = re.findall(r"```text\n(tcp/.*?)```", PAGE, re.DOTALL)
-    assert shown.splitlines() == on_terminal(FLEET)
+def test_documented_table_equals_the_output() -> None:
+    (documented,) = re.findall(r"```text\n(tcp/.*?)```", PAGE, re.DOTALL)
+    assert documented.splitlines() == on_terminal(FLEET)
 
 
-def test_every_fixed_metric_is_in_the_page() -> None:
+def test_all_fixed_metrics_are_documented() -> None:
     named = {
         family.name + ("_total" if family.type == "counter" else "")
         for family in FleetCollector(lambda: FLEET).collect()
@@ -30,15 +30,15 @@ def test_every_fixed_metric_is_in_the_page() -> None:
     assert {name for name in named if f"`{name}`" not in PAGE} == set()
 
 
-def test_rules_and_dashboard_ask_for_what_services_tell() -> None:
+def test_alert_rules_and_dashboard_use_published_metrics() -> None:
     pages = "".join(path.read_text(encoding="utf-8") for path in (REPOSITORY / "services").glob("*/README.md"))
-    told = set(re.findall(r"`(\w+)`", pages))
+    published = set(re.findall(r"`(\w+)`", pages))
     fixed = set(re.findall(r"`(sonarpost_\w+)`", PAGE))
     rules = (DOCS / "operations" / "alerts.yml").read_text(encoding="utf-8")
     dashboard = json.loads((DOCS / "operations" / "dashboard.json").read_text(encoding="utf-8"))
-    asked = set(re.findall(r"\bsonarpost_\w+", rules))
+    used = set(re.findall(r"\bsonarpost_\w+", rules))
     for panel in dashboard["panels"]:
-        asked |= {name for target in panel["targets"] for name in re.findall(r"\bsonarpost_\w+", target["expr"])}
-    assert len(asked) > 10
-    unknown = {n for n in asked - fixed if n.removeprefix("sonarpost_").removesuffix("_total") not in told}
+        used |= {name for target in panel["targets"] for name in re.findall(r"\bsonarpost_\w+", target["expr"])}
+    assert len(used) > 10
+    unknown = {n for n in used - fixed if n.removeprefix("sonarpost_").removesuffix("_total") not in published}
     assert unknown == set()

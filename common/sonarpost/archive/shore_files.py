@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from sonarpost.archive.image_files import image_file_name
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex
 from sonarpost.errors import StoredFileError
-from sonarpost.export.accepted import DECISIONS, SideCar
+from sonarpost.export.contacts import DECISIONS, SideCar
 from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage
 

@@ -1,4 +1,4 @@
-"""`sonarpost console`: who may log in to the operator's page, and a page to learn on."""
+"""`sonarpost console`: manages the users of the console, and serves a training console."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import importlib
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
-    # Commands know services by name only: the service brings its own options.
+    # The import contract does not allow a static import of a service here.
     command = importlib.import_module("sonarpost.services.console.command")
-    summary = "the operator's page: users, and simulated contacts to learn on"
+    summary = "manage the users of the console; serve simulated contacts for training"
     parser = subparsers.add_parser("console", help=summary, description=__doc__)
     command.add_options(parser)
     parser.set_defaults(run=command.run)

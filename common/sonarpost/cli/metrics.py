@@ -1,4 +1,4 @@
-"""`sonarpost metrics`: the health of every platform on a router, for Prometheus to scrape."""
+"""`sonarpost metrics`: a Prometheus exporter of the health of all platforms at a router."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from types import FrameType
 from prometheus_client import start_http_server
 
 from sonarpost import logs
-from sonarpost.cli.fleet_options import add_router_options, router_of
+from sonarpost.cli.shared import add_router_options, router_of
 from sonarpost.errors import PortError
 from sonarpost.monitoring.fleet import FleetTracker, FleetWatcher
 from sonarpost.monitoring.metrics import FleetCollector, registry_of
@@ -25,21 +25,25 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the subcommand."""
     parser = subparsers.add_parser(
         "metrics",
-        help="serve the fleet's health to Prometheus",
-        description="Serve http://ADDRESS:PORT/metrics with the health of every service of every platform on a router.",
+        help="serve the health of all platforms to Prometheus",
+        description="Serve http://ADDRESS:PORT/metrics with the health of all services of all platforms at a router.",
     )
     add_router_options(parser)
     parser.add_argument("--address", default="127.0.0.1", help="address to listen on (default: %(default)s)")
     parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="port to listen on (default: %(default)s)")
     parser.add_argument(
-        "--stale-after", type=float, default=30.0, metavar="S", help="age at which values end (default: %(default)s)"
+        "--stale-after",
+        type=float,
+        default=30.0,
+        metavar="S",
+        help="age of a health record at which its values are removed (default: %(default)s)",
     )
     parser.add_argument(
         "--forget-after",
         type=float,
         default=3600.0,
         metavar="S",
-        help="age at which a service that is gone is forgotten, its sonarpost_up too (default: %(default)s)",
+        help="time after which all metrics of a stopped service are removed (default: %(default)s)",
     )
     parser.add_argument("--log-format", choices=("text", "json"), default="text")
     parser.set_defaults(run=run)
@@ -49,8 +53,8 @@ def run(parsed: argparse.Namespace) -> int:
     """Serve until SIGTERM or SIGINT.
 
     Raises:
-        ConfigError: The router's options are wrong.
-        PortError: The address cannot be listened on.
+        ConfigError: A router option is invalid.
+        PortError: The address cannot be bound.
     """
     endpoints, tls = router_of(parsed)
     logs.set_up("metrics", log_format=parsed.log_format)
@@ -70,7 +74,7 @@ def run(parsed: argparse.Namespace) -> int:
     try:
         with watcher:
             log.info(
-                "Serving metrics",
+                "Metrics served",
                 extra=logs.kv(address=parsed.address, port=server.server_port, router=", ".join(endpoints)),
             )
             stop.wait()

@@ -1,5 +1,5 @@
-"""What c2 has accepted, in the formats of other programs: GeoJSON, KML and KMZ, CSV, Cursor-on-Target.
+"""Export of contacts to GeoJSON, CSV, KML, KMZ and Cursor-on-Target.
 
-`accepted.load_accepted` reads the folder that c2 keeps; everything else takes what it returns.
+`contacts.load_contacts` reads the folder that the c2 service writes. The other modules convert its result.
 `docs/reference/exports.md` describes the formats.
 """

@@ -1,8 +1,8 @@
-"""Cursor-on-Target events (version 2.0 of the event schema) of accepted contacts.
+"""Cursor-on-Target events of contacts, version 2.0 of the event schema.
 
-A contact that nobody has decided about is a spot on the map (`b-m-p-s-m`) and nothing else: only an operator's decision
-makes it a mine or a bottom return. Types are CoT's spelling of the MIL-STD-2525 functions S*U-WM (sea mine) and S*U-NB
-(bottom return, non-mine bottom object).
+A contact without a decision is a spot on the map (`b-m-p-s-m`). Only an operator's decision makes it a mine or a bottom
+return. The types correspond to the MIL-STD-2525 functions S*U-WM (sea mine) and S*U-NB (bottom return, non-mine bottom
+object).
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from dataclasses import dataclass
 from typing import Final, Literal
 from xml.etree import ElementTree as ET
 
-from sonarpost.export.accepted import Accepted, AcceptedContact, ReviewState
-from sonarpost.export.properties import DEGREE_DECIMALS
+from sonarpost.export.contacts import ContactSet, ExportContact, ReviewState
+from sonarpost.export.tables import DEGREE_DECIMALS
 from sonarpost.export.text import utc_text, xml_text
 
 SPOT: Final = "b-m-p-s-m"
 SEA_MINE: Final = "U-W-M"
 BOTTOM_RETURN: Final = "a-u-U-N-B"
-MEASURED_IN_A_PICTURE: Final = "m-i"
-"""CoT's "machine, mensurated": the position was measured in imagery."""
+MEASURED_IN_IMAGE: Final = "m-i"
+"""CoT "machine, mensurated": the position was measured in imagery."""
 UNKNOWN: Final = "9999999.0"
-"""What CoT writes for a height or an error of which nothing is known."""
+"""CoT value of an unknown height or error."""
 
-# MIL-STD-2525B, subsurface, sea mine: G on the bottom, M moored, F floating, O in another position.
+# MIL-STD-2525B, subsurface, sea mine: G on the bottom, M moored, F floating.
 MINE_POSITIONS: Final[Mapping[str, str]] = {
     "bottom": "G",
     "bottom mine": "G",
@@ -37,7 +37,7 @@ MINE_POSITIONS: Final[Mapping[str, str]] = {
     "drifting": "F",
     "drifting mine": "F",
 }
-# Colours of the spots, as signed 32-bit ARGB: what clients of the format read.
+# Colours of the spots as signed 32-bit ARGB.
 _SPOT_COLOURS: Final[Mapping[ReviewState, int]] = {
     "unreviewed": 0xFFFFD400 - (1 << 32),
     "unsure": 0xFFFF8C00 - (1 << 32),
@@ -52,11 +52,11 @@ _TITLES: Final[Mapping[ReviewState, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class CotOptions:
-    """How events are made.
+    """Options of the events.
 
     Attributes:
-        stale_after_s: An event's life; contacts lie still, so it is long.
-        mine_affiliation: Of what an operator called mine-like: `u` unknown, `s` suspect, `h` hostile.
+        stale_after_s: Lifetime of an event in seconds. The default is long because contacts do not move.
+        mine_affiliation: Affiliation of mine-like contacts: `u` unknown, `s` suspect, `h` hostile.
 
     Raises:
         ValueError: `stale_after_s` is not above 0.
@@ -70,30 +70,30 @@ class CotOptions:
             raise ValueError(f"stale_after_s: got {self.stale_after_s}, expected above 0")
 
 
-def cot_type(contact: AcceptedContact, options: CotOptions | None = None) -> str:
-    """Return the event's type: b-m-p-s-m, a-s-U-W-M (with -G, -M or -F where the class says so) or a-u-U-N-B."""
+def cot_type(contact: ExportContact, options: CotOptions | None = None) -> str:
+    """Return the event type: b-m-p-s-m, a-s-U-W-M (with -G, -M or -F for known mine classes) or a-u-U-N-B."""
     decision = contact.decision
     if decision is None or decision.verdict == "unsure":
         return SPOT
     if decision.verdict == "not_mine_like":
         return BOTTOM_RETURN
     affiliation = (options or CotOptions()).mine_affiliation
-    words = " ".join((decision.mlo_class or "").casefold().replace("_", " ").replace("-", " ").split())
-    position = MINE_POSITIONS.get(words)
+    mlo_class = " ".join((decision.mlo_class or "").casefold().replace("_", " ").replace("-", " ").split())
+    position = MINE_POSITIONS.get(mlo_class)
     return f"a-{affiliation}-{SEA_MINE}" + (f"-{position}" if position else "")
 
 
-def cot_event(contact: AcceptedContact, now_utc_s: float, options: CotOptions | None = None) -> bytes:
-    """Return one event as XML, UTF-8, without a declaration, on one line.
+def cot_event(contact: ExportContact, now_utc_s: float, options: CotOptions | None = None) -> bytes:
+    """Return one event as a single line of XML, UTF-8, without XML declaration.
 
-    `time` and `start` are the moment of sending: by a vehicle's wrong clock a contact would not be shown, or be stale
-    before it came. When it was seen stands in the remarks and in `detail/sonarpost`. `ce` is `position_sigma_m`, as CoT
-    defines it (one standard deviation). The height is unknown: depth is against the surface, not the ellipsoid.
+    `time` and `start` are the time of sending, because the clock of the vehicle may be wrong. The time of detection is
+    in the remarks. `ce` is `position_sigma_m`, one standard deviation as CoT defines it. The height above the ellipsoid
+    is unknown, because depth is measured from the surface.
 
     Args:
-        contact: One with a position.
-        now_utc_s: Time of sending.
-        options: Life and affiliation.
+        contact: A contact with a position.
+        now_utc_s: Time of sending, UTC.
+        options: Lifetime and affiliation.
 
     Raises:
         ValueError: The contact has no position.
@@ -113,11 +113,11 @@ def cot_event(contact: AcceptedContact, now_utc_s: float, options: CotOptions | 
             "time": utc_text(now_utc_s),
             "start": utc_text(now_utc_s),
             "stale": utc_text(now_utc_s + options.stale_after_s),
-            "how": MEASURED_IN_A_PICTURE,
+            "how": MEASURED_IN_IMAGE,
         },
     )
     point = {
-        # Written out: the schema's decimals know no exponent.
+        # The decimal type of the schema has no exponent.
         "lat": f"{lat_deg:.{DEGREE_DECIMALS}f}",
         "lon": f"{lon_deg:.{DEGREE_DECIMALS}f}",
         "hae": UNKNOWN,
@@ -125,17 +125,17 @@ def cot_event(contact: AcceptedContact, now_utc_s: float, options: CotOptions | 
         "le": UNKNOWN,
     }
     ET.SubElement(event, "point", point)
-    _detail(event, contact)
-    text: bytes = ET.tostring(event, encoding="utf-8")
-    return text
+    _add_detail(event, contact)
+    xml: bytes = ET.tostring(event, encoding="utf-8")
+    return xml
 
 
-def cot_events(accepted: Accepted, now_utc_s: float, options: CotOptions | None = None) -> tuple[bytes, ...]:
-    """Return the events of all contacts with a position; `len(accepted.unlocated)` are left out."""
-    return tuple(cot_event(contact, now_utc_s, options) for contact in accepted.located)
+def cot_events(contacts: ContactSet, now_utc_s: float, options: CotOptions | None = None) -> tuple[bytes, ...]:
+    """Return the events of all contacts with a position. Contacts without a position are omitted."""
+    return tuple(cot_event(contact, now_utc_s, options) for contact in contacts.located)
 
 
-def _detail(event: ET.Element, contact: AcceptedContact) -> None:
+def _add_detail(event: ET.Element, contact: ExportContact) -> None:
     image, decision = contact.image, contact.decision
     detail = ET.SubElement(event, "detail")
     ET.SubElement(detail, "contact", {"callsign": contact.name})
@@ -158,8 +158,8 @@ def _detail(event: ET.Element, contact: AcceptedContact) -> None:
     remarks.text = xml_text(_remarks(contact))
 
 
-def _remarks(contact: AcceptedContact) -> str:
-    """What a person reads, in sentences; text of the operator last."""
+def _remarks(contact: ExportContact) -> str:
+    """Return the remarks for the operator of the receiving program, with the free text last."""
     image, record, decision = contact.image, contact.image.contact, contact.decision
     parts = [f"{_TITLES[contact.review]}."]
     if record is not None:
@@ -172,8 +172,8 @@ def _remarks(contact: AcceptedContact) -> str:
     if image.missing_fraction > 0:
         parts.append(f"{100 * image.missing_fraction:.0f} % of the picture is missing.")
     if decision is not None:
-        surely = "" if decision.confidence is None else f", confidence {decision.confidence:.2f}"
-        parts.append(f"Decided {utc_text(decision.decided_utc_s)} by {decision.operator}{surely}.")
+        confidence = "" if decision.confidence is None else f", confidence {decision.confidence:.2f}"
+        parts.append(f"Decided {utc_text(decision.decided_utc_s)} by {decision.operator}{confidence}.")
         if decision.image_version < image.version:
             parts.append(f"The picture has grown since: version {decision.image_version} was looked at.")
         parts += [f"Class: {text}." for text in (decision.mlo_class,) if text]

@@ -1,8 +1,8 @@
-"""Sends Cursor-on-Target events to a TAK endpoint: TCP or TLS (a stream of events) or UDP (one event a datagram).
+"""Sender of Cursor-on-Target events to a TAK endpoint: a stream over TCP or TLS, or one UDP datagram for each event.
 
-CoT has no acknowledgement. What can be known is done: a connection that its other end has closed is noticed before the
-next batch, a batch that was cut off is sent again from its first event (an event sent twice changes nothing, as the
-identifier is the same), and closing waits until the other end has read everything.
+CoT has no acknowledgement. Therefore the sender detects a connection closed by the peer before each batch, repeats an
+interrupted batch from its first event, and waits for the peer before it closes a connection. A repeated event has the
+same identifier and replaces the first one.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _EXPECTED: Final = "tcp://host:port, tls://host:port or udp://host:port"
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where events go; `scheme` is tcp, tls or udp."""
+    """Destination of events; `scheme` is tcp, tls or udp."""
 
     scheme: str
     host: str
@@ -41,10 +41,10 @@ class Endpoint:
 
 
 def parse_endpoint(text: str) -> Endpoint:
-    """Return the endpoint of `tcp://host:port`, `tls://…` (or `ssl://…`) or `udp://…`; a multicast address is one too.
+    """Parse `tcp://host:port`, `tls://…` (or `ssl://…`) or `udp://…`. UDP hosts may be multicast addresses.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: The text is not an endpoint.
     """
     try:
         parts = urlsplit(text)
@@ -63,9 +63,9 @@ class TlsFiles:
     """PEM files for `tls://`.
 
     Attributes:
-        ca: Certificates that the server's must come from; None trusts those of the system.
-        certificate: Our own certificate, where the server asks for one.
-        key: Its private key, without a passphrase.
+        ca: Trusted certificate authorities; None trusts those of the operating system.
+        certificate: Client certificate, if the server requires one.
+        key: Private key of the client certificate, without a passphrase.
     """
 
     ca: Path | None = None
@@ -73,17 +73,17 @@ class TlsFiles:
     key: Path | None = None
 
     def context(self) -> ssl.SSLContext:
-        """Return a context that checks the server's certificate and name.
+        """Return a TLS context that verifies the server's certificate and host name.
 
         Raises:
-            ConfigError: A file is absent or of another kind.
+            ConfigError: A file is missing or has another format.
         """
         try:
             context = ssl.create_default_context(cafile=self.ca)
             if self.certificate is not None:
-                # Without a callback an encrypted key would ask on the terminal.
+                # The callback prevents a passphrase prompt on the terminal.
                 context.load_cert_chain(self.certificate, self.key, password=lambda: b"")
-        except OSError as error:  # ssl.SSLError is one
+        except OSError as error:  # includes ssl.SSLError
             files = ", ".join(str(p) for p in (self.ca, self.certificate, self.key) if p is not None)
             raise ConfigError("CoT endpoint", "TLS", files, f"readable PEM files ({error})") from error
         context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -91,30 +91,30 @@ class TlsFiles:
 
 
 class Wait(Protocol):
-    """Waits for so many seconds; True when there is no sense in waiting longer (`threading.Event.wait` is one)."""
+    """Function that waits between attempts, for example `threading.Event.wait`."""
 
-    def __call__(self, timeout: float, /) -> bool:
-        """Wait."""
+    def __call__(self, timeout_s: float, /) -> bool:
+        """Wait for `timeout_s`; return True to stop trying."""
 
 
-def _sleep(timeout: float, /) -> bool:
-    time.sleep(timeout)
+def _sleep(timeout_s: float, /) -> bool:
+    time.sleep(timeout_s)
     return False
 
 
 class CotSender:
-    """Sends batches of events, connecting as needed.
+    """Sends batches of events, and connects when needed.
 
     Args:
-        endpoint: As `parse_endpoint` takes it.
-        tls: Files for `tls://`.
-        timeout_s: For connecting and for each write.
-        multicast_ttl: Hops of a multicast datagram; 1 stays on the network.
-        clock: Seconds, monotonic.
-        wait: Called between attempts; True from it ends the trying.
+        endpoint: Text for `parse_endpoint`.
+        tls: PEM files for `tls://`.
+        timeout_s: Time limit of a connection attempt and of each write.
+        multicast_ttl: Hop limit of multicast datagrams; 1 keeps them on the local network.
+        clock: Monotonic clock, seconds.
+        wait: Function that waits between attempts.
 
     Raises:
-        ConfigError: The endpoint or a file of `tls` is wrong.
+        ConfigError: The endpoint or a file of `tls` is invalid.
     """
 
     def __init__(
@@ -143,14 +143,14 @@ class CotSender:
         self.close()
 
     def send(self, events: Sequence[bytes], give_up_after_s: float = 60.0) -> None:
-        """Send a batch, connecting again and starting it anew as often as needed.
+        """Send a batch; after an error, reconnect and send it again from its first event.
 
         Args:
-            events: As `cot_event` makes them.
-            give_up_after_s: No new attempt is begun after this long.
+            events: Results of `cot_event`.
+            give_up_after_s: No attempt starts later than this.
 
         Raises:
-            PortError: It could not be sent in time; names the endpoint and the last reason.
+            PortError: All attempts failed. The text names the endpoint and the last reason.
         """
         started_s = self._clock()
         attempt = 0
@@ -167,13 +167,13 @@ class CotSender:
                 return
 
     def close(self) -> None:
-        """End the connection when the other end has read what was sent, or after 2 s."""
+        """Close the connection after the peer has read all data, or after 2 s."""
         if self._socket is None:
             return
         if self.endpoint.scheme != "udp":
-            # What fails here fails because the other end has gone already.
+            # An error here means that the peer has already closed the connection.
             with contextlib.suppress(OSError):
-                self._finish(self._socket)
+                self._shut_down(self._socket)
         self._drop()
 
     def _send_once(self, events: Sequence[bytes]) -> None:
@@ -193,7 +193,7 @@ class CotSender:
     def _connect(self) -> socket.socket:
         host, port = self.endpoint.host, self.endpoint.port
         if self.endpoint.scheme == "udp":
-            return self._datagrams(host, port)
+            return self._open_datagram_socket(host, port)
         plain = socket.create_connection((host, port), self._timeout_s)
         if self._tls is None:
             return plain
@@ -203,7 +203,7 @@ class CotSender:
             plain.close()
             raise
 
-    def _datagrams(self, host: str, port: int) -> socket.socket:
+    def _open_datagram_socket(self, host: str, port: int) -> socket.socket:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         datagrams = socket.socket(family, socket.SOCK_DGRAM)
         if ipaddress.ip_address(str(address[0]).partition("%")[0]).is_multicast:
@@ -221,10 +221,10 @@ class CotSender:
         return datagrams
 
     def _discard_input(self, connection: socket.socket) -> None:
-        """Read away what the server sends (everybody's events), and notice that it has closed.
+        """Discard data from the server (events of other clients), and detect a closed connection.
 
         Raises:
-            OSError: The connection is over.
+            OSError: The connection is closed.
         """
         connection.settimeout(0.0)
         try:
@@ -233,17 +233,17 @@ class CotSender:
         except (BlockingIOError, ssl.SSLWantReadError):
             connection.settimeout(self._timeout_s)
         else:
-            raise ConnectionResetError("closed by the other end")
+            raise ConnectionResetError("closed by the peer")
 
-    def _finish(self, connection: socket.socket) -> None:
-        """Say that nothing more comes, and read until the other end has said so too.
+    def _shut_down(self, connection: socket.socket) -> None:
+        """Shut down sending, and read until the peer closes.
 
-        Closing with something unread would reset the connection and take from the other end what it has not read yet.
+        Closing a socket with unread data resets the connection, and the peer loses data that it has not yet read.
         """
         if isinstance(connection, ssl.SSLSocket):
             connection.settimeout(0.0)
             with contextlib.suppress(ssl.SSLError):
-                # Tells the end of the TLS stream; its answer is read below, like everything else.
+                # Sends close_notify. The reply is read below.
                 connection.unwrap()
         connection.shutdown(socket.SHUT_WR)
         deadline_s = time.monotonic() + _LINGER_S

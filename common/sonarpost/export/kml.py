@@ -1,24 +1,31 @@
-"""KML 2.2 and KMZ: what Google Earth and most chart programs open.
+"""KML 2.2 and KMZ for Google Earth and chart programs.
 
-A contact is a placemark with a balloon (its facts, in a KMZ its picture) and a style by verdict. Where heading, side
-and pixel sizes are known, a KMZ also lays the picture on the map.
+Each contact is a placemark with a style by verdict and a balloon with its properties. A KMZ adds the image to the
+balloon, and lays it on the map if heading, side and both pixel sizes are known.
 """
 
 from __future__ import annotations
 
 import io
+import math
 import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree as ET
 
+import numpy as np
+import numpy.typing as npt
+from PIL import Image, ImageDraw
+
 from sonarpost.errors import BadInputError
-from sonarpost.export.accepted import Accepted, AcceptedContact, ReviewState
-from sonarpost.export.chips import Chip, chip_of, icon_png
-from sonarpost.export.properties import DEGREE_DECIMALS, Value, properties
+from sonarpost.export.contacts import ContactSet, ExportContact, ReviewState
+from sonarpost.export.tables import DEGREE_DECIMALS, Value, contact_properties
 from sonarpost.export.text import html_text, utc_text, xml_text
 from sonarpost.files import write_atomically
+from sonarpost.sonar.geometry import Position, offset_position
+from sonarpost.sonar.image_files import read_image
 
 NAMESPACE: Final = "http://www.opengis.net/kml/2.2"
 COLOURS: Final[Mapping[ReviewState, str]] = {
@@ -33,143 +40,175 @@ FOLDERS: Final[Mapping[ReviewState, str]] = {
     "unreviewed": "Not reviewed",
     "not_mine_like": "Not mine-like",
 }
+MAX_OVERLAY_M: Final = 1000.0
+ICON_PX: Final = 32
+_MAX_OVERLAY_LATITUDE_DEG: Final = 85.0
 _BALLOON_WIDTH_PX: Final = 300
 _ZIP_TIME: Final = (1980, 1, 1, 0, 0, 0)
-"""The earliest that ZIP can say: the same contacts give the same bytes."""
+"""Earliest time of the ZIP format. A constant time makes equal contacts give equal bytes."""
 
 
-def kml_bytes(accepted: Accepted) -> bytes:
-    """Return one KML document without pictures, UTF-8."""
-    return _document(accepted, {}, icons=False)
+@dataclass(frozen=True, slots=True)
+class _Overlay:
+    """Image on the map: a KML LatLonBox and its counter-clockwise rotation about the centre of the box.
+
+    Attributes:
+        png: Image whose top points along the vehicle's heading.
+    """
+
+    png: bytes
+    north_deg: float
+    south_deg: float
+    east_deg: float
+    west_deg: float
+    rotation_deg: float
 
 
-def kmz_bytes(accepted: Accepted) -> tuple[bytes, tuple[BadInputError, ...]]:
-    """Return a KMZ: `doc.kml`, the pictures and the icons; nothing in it is fetched from a network.
+@dataclass(frozen=True, slots=True)
+class _ContactImage:
+    """Image of a contact as 8-bit PNG, and its map overlay if its orientation is known."""
+
+    png: bytes
+    overlay: _Overlay | None
+
+
+def kml_bytes(contacts: ContactSet) -> bytes:
+    """Return a KML document without images, UTF-8."""
+    return _document(contacts, {}, icons=False)
+
+
+def kmz_bytes(contacts: ContactSet) -> tuple[bytes, tuple[BadInputError, ...]]:
+    """Return a KMZ archive with `doc.kml`, images and icons. It references no network resource.
 
     Returns:
-        The archive, and one error for each picture that could not be read (its contact is there without it).
+        The archive, and one error for each unreadable image. Its contact is exported without the image.
     """
-    chips: dict[str, Chip] = {}
+    images: dict[str, _ContactImage] = {}
     problems: list[BadInputError] = []
-    for contact in accepted.located:
+    for contact in contacts.located:
+        if contact.image_path is None:
+            continue
         try:
-            if (chip := chip_of(contact)) is not None:
-                chips[contact.uid] = chip
+            pixels = _eight_bits(read_image(contact.image_path))
         except BadInputError as error:
             problems.append(error)
+        else:
+            images[contact.uid] = _ContactImage(_png(Image.fromarray(pixels)), _overlay(contact, pixels))
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        _add(archive, "doc.kml", _document(accepted, chips, icons=True))
+        _add_file(archive, "doc.kml", _document(contacts, images, icons=True))
         for review, colour in COLOURS.items():
-            _add(archive, f"icons/{review}.png", icon_png(review, colour))
-        for uid, chip in chips.items():
-            _add(archive, f"pictures/{uid}.png", chip.png)
-            if chip.overlay is not None:
-                _add(archive, f"overlays/{uid}.png", chip.overlay.png)
+            _add_file(archive, f"icons/{review}.png", _icon_png(review, colour))
+        for uid, image in images.items():
+            _add_file(archive, f"pictures/{uid}.png", image.png)
+            if image.overlay is not None:
+                _add_file(archive, f"overlays/{uid}.png", image.overlay.png)
     return buffer.getvalue(), tuple(problems)
 
 
-def write_kml(path: Path, accepted: Accepted) -> None:
-    """Write a KML document to `path`, whole or not at all.
+def write_kml(path: Path, contacts: ContactSet) -> None:
+    """Write a KML document atomically.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
-    write_atomically(path, kml_bytes(accepted))
+    write_atomically(path, kml_bytes(contacts))
 
 
-def write_kmz(path: Path, accepted: Accepted) -> tuple[BadInputError, ...]:
-    """Write a KMZ to `path`, whole or not at all; return one error for each picture that could not be read.
+def write_kmz(path: Path, contacts: ContactSet) -> tuple[BadInputError, ...]:
+    """Write a KMZ archive atomically; return one error for each unreadable image.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
-    archive, problems = kmz_bytes(accepted)
+    archive, problems = kmz_bytes(contacts)
     write_atomically(path, archive)
     return problems
 
 
-def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
+def _add_file(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
     entry = zipfile.ZipInfo(name, _ZIP_TIME)
-    # Pictures are compressed already; the document is text.
+    # PNG files are already compressed.
     entry.compress_type = zipfile.ZIP_STORED if name.endswith(".png") else zipfile.ZIP_DEFLATED
     entry.external_attr = 0o644 << 16
     archive.writestr(entry, data)
 
 
-def _document(accepted: Accepted, chips: Mapping[str, Chip], *, icons: bool) -> bytes:
+# Document
+
+
+def _document(contacts: ContactSet, images: Mapping[str, _ContactImage], *, icons: bool) -> bytes:
     root = ET.Element("kml", {"xmlns": NAMESPACE})
     document = _child(root, "Document")
     _child(document, "name", "sonarpost contacts")
-    missing = len(accepted.unlocated)
-    _child(document, "description", f"{len(accepted.located)} contacts; {missing} more without a position")
+    unlocated = len(contacts.unlocated)
+    _child(document, "description", f"{len(contacts.located)} contacts; {unlocated} more without a position")
     for review, colour in COLOURS.items():
-        _style(document, review, colour, icons=icons)
+        _add_style(document, review, colour, icons=icons)
     for review, title in FOLDERS.items():
-        contacts = [contact for contact in accepted.located if contact.review == review]
-        if not contacts:
+        reviewed = [contact for contact in contacts.located if contact.review == review]
+        if not reviewed:
             continue
         folder = _child(document, "Folder")
-        _child(folder, "name", f"{title} ({len(contacts)})")
-        for contact in contacts:
-            _placemark(folder, contact, chips.get(contact.uid))
-    _overlays(document, accepted, chips)
+        _child(folder, "name", f"{title} ({len(reviewed)})")
+        for contact in reviewed:
+            _add_placemark(folder, contact, has_image=contact.uid in images)
+    _add_overlays(document, contacts, images)
     ET.indent(root, " ")
     text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
 
 
-def _style(document: ET.Element, review: ReviewState, colour: str, *, icons: bool) -> None:
+def _add_style(document: ET.Element, review: ReviewState, colour: str, *, icons: bool) -> None:
     style = _child(document, "Style", id=review)
     icon_style = _child(style, "IconStyle")
     if icons:
         _child(_child(icon_style, "Icon"), "href", f"icons/{review}.png")
     else:
-        # KML colours are aabbggrr; without an icon of our own the reader's pin is tinted.
+        # Tints the default icon of the reader. KML colours are aabbggrr.
         _child(icon_style, "color", f"ff{colour[5:7]}{colour[3:5]}{colour[1:3]}")
-    # Without this, readers add a link to a web service to every balloon.
+    # Without a BalloonStyle, readers add a link to a web service to every balloon.
     _child(_child(style, "BalloonStyle"), "text", "<h3>$[name]</h3>$[description]")
 
 
-def _placemark(folder: ET.Element, contact: AcceptedContact, chip: Chip | None) -> None:
+def _add_placemark(folder: ET.Element, contact: ExportContact, *, has_image: bool) -> None:
     assert contact.position is not None
     lat_deg, lon_deg = contact.position
-    values = properties(contact)
+    values = contact_properties(contact)
     placemark = _child(folder, "Placemark", id=contact.uid)
     _child(placemark, "name", contact.name)
-    _child(placemark, "description", _balloon(values, f"pictures/{contact.uid}.png" if chip else None))
+    _child(placemark, "description", _balloon_html(values, f"pictures/{contact.uid}.png" if has_image else None))
     _child(_child(placemark, "TimeStamp"), "when", str(values["seen_utc"] or values["first_frame_utc"]))
     _child(placemark, "styleUrl", f"#{contact.review}")
     extended = _child(placemark, "ExtendedData")
     for name, value in values.items():
         if value is not None:
-            _child(_child(extended, "Data", name=name), "value", _shown(value))
+            _child(_child(extended, "Data", name=name), "value", _value_text(value))
     _child(_child(placemark, "Point"), "coordinates", f"{lon_deg:.{DEGREE_DECIMALS}f},{lat_deg:.{DEGREE_DECIMALS}f}")
 
 
-def _balloon(values: Mapping[str, Value], picture: str | None) -> str:
-    """HTML of the balloon; everything a stranger wrote is escaped in it."""
-    image = f'<img src="{html_text(picture)}" width="{_BALLOON_WIDTH_PX}"/>' if picture else ""
+def _balloon_html(values: Mapping[str, Value], image_name: str | None) -> str:
+    image = f'<img src="{html_text(image_name)}" width="{_BALLOON_WIDTH_PX}"/>' if image_name else ""
     rows = "".join(
-        f"<tr><td>{html_text(name)}</td><td>{html_text(_shown(value))}</td></tr>"
+        f"<tr><td>{html_text(name)}</td><td>{html_text(_value_text(value))}</td></tr>"
         for name, value in values.items()
         if value is not None and value != ""
     )
     return f"{image}<table>{rows}</table>"
 
 
-def _overlays(document: ET.Element, accepted: Accepted, chips: Mapping[str, Chip]) -> None:
-    laid = [(c, chips[c.uid].overlay) for c in accepted.located if c.uid in chips]
-    if not any(overlay for _, overlay in laid):
+def _add_overlays(document: ET.Element, contacts: ContactSet, images: Mapping[str, _ContactImage]) -> None:
+    overlays = [(c, images[c.uid].overlay) for c in contacts.located if c.uid in images]
+    if not any(overlay for _, overlay in overlays):
         return
     folder = _child(document, "Folder")
-    _child(folder, "name", "Pictures on the seabed")
-    for contact, overlay in laid:
+    _child(folder, "name", "Images on the seabed")
+    for contact, overlay in overlays:
         if overlay is None:
             continue
         ground = _child(folder, "GroundOverlay")
         _child(ground, "name", contact.name)
-        # Off at first: a slant-range picture laid on a chart is good to a few metres, and hides what lies below.
+        # Initially hidden: a slant-range image is only accurate to a few metres and covers the chart.
         _child(ground, "visibility", "0")
         _child(_child(ground, "TimeStamp"), "when", utc_text(contact.image.first_frame_utc_s))
         _child(_child(ground, "Icon"), "href", f"overlays/{contact.uid}.png")
@@ -179,7 +218,7 @@ def _overlays(document: ET.Element, accepted: Accepted, chips: Mapping[str, Chip
         _child(box, "rotation", repr(round(overlay.rotation_deg, 2)))
 
 
-def _shown(value: Value) -> str:
+def _value_text(value: Value) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
@@ -188,3 +227,64 @@ def _child(parent: ET.Element, tag: str, text: str | None = None, /, **attribute
     if text is not None:
         element.text = xml_text(text)
     return element
+
+
+# Images
+
+
+def _eight_bits(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
+    """Scale 16-bit pixels to 8 bits by the brightest pixel; sonars rarely use the full range of 16 bits."""
+    if pixels.dtype == np.uint8:
+        return pixels.astype(np.uint8, copy=False)
+    brightest = max(1, int(pixels.max()))
+    return (pixels.astype(np.uint32) * 255 // brightest).astype(np.uint8)
+
+
+def _overlay(contact: ExportContact, pixels: npt.NDArray[np.uint8]) -> _Overlay | None:
+    """Return the overlay of an image centred on the contact's position; None if its orientation is unknown.
+
+    Row 0 is the first ping and column 0 is nearest the track. With the heading at the top, a starboard image is
+    therefore mirrored top to bottom, and a port image is rotated by 180 degrees.
+    """
+    record, position = contact.image.contact, contact.position
+    if record is None or position is None or abs(position[0]) > _MAX_OVERLAY_LATITUDE_DEG:
+        return None
+    along, across, heading = record.pixel_along_m, record.pixel_across_m, record.heading_deg
+    if along is None or across is None or heading is None or record.channel is None:
+        return None
+    height_m, width_m = along * pixels.shape[0], across * pixels.shape[1]
+    if max(height_m, width_m) > MAX_OVERLAY_M:
+        return None
+    rotated = pixels[::-1, :] if record.channel == "starboard" else pixels[::-1, ::-1]
+    centre = Position(*position)
+    north, south = (offset_position(centre, bearing, height_m / 2).lat_deg for bearing in (0.0, 180.0))
+    east, west = (offset_position(centre, bearing, width_m / 2).lon_deg for bearing in (90.0, 270.0))
+    if west > east:
+        return None  # Readers disagree about boxes across the date line.
+    # KML rotates counter-clockwise, and its range is -180 to 180 degrees.
+    rotation_deg = math.remainder(-heading, 360.0)
+    png = _png(Image.fromarray(np.ascontiguousarray(rotated)))
+    return _Overlay(png, north, south, east, west, rotation_deg)
+
+
+def _icon_png(review: ReviewState, colour: str) -> bytes:
+    """Return an icon of 32 x 32 px. Verdicts differ in shape and in colour."""
+    image = Image.new("RGBA", (ICON_PX, ICON_PX), (0, 0, 0, 0))
+    draw = ImageDraw.Draw(image)
+    low, middle, high = 3, ICON_PX // 2, ICON_PX - 4
+    match review:
+        case "mine_like":
+            draw.polygon([(middle, low), (high, middle), (middle, high), (low, middle)], colour, "black", 2)
+        case "not_mine_like":
+            draw.ellipse((low, low, high, high), colour, "black", 2)
+        case "unsure":
+            draw.polygon([(middle, low), (high, high), (low, high)], colour, "black", 2)
+        case "unreviewed":
+            draw.rectangle((low, low, high, high), colour, "black", 2)
+    return _png(image)
+
+
+def _png(image: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, format="PNG")
+    return buffer.getvalue()

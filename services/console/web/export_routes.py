@@ -18,11 +18,10 @@ from starlette.routing import Route
 
 from sonarpost import wire
 from sonarpost.archive.image_files import side_car
-from sonarpost.export.accepted import Accepted, AcceptedContact, SideCar
+from sonarpost.export.contacts import ContactSet, ExportContact, SideCar
 from sonarpost.export.cot import cot_events
-from sonarpost.export.csv_table import csv_bytes
-from sonarpost.export.geojson import geojson_bytes
 from sonarpost.export.kml import kmz_bytes
+from sonarpost.export.tables import csv_bytes, geojson_bytes
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review import rendering
 from sonarpost.services.console.state import Board
@@ -44,7 +43,7 @@ class ExportRoutes:
 
     def __init__(self, board: Board) -> None:
         self._board = board
-        self._makers: dict[str, tuple[Callable[[Accepted], bytes], str]] = {
+        self._makers: dict[str, tuple[Callable[[ContactSet], bytes], str]] = {
             "contacts.geojson": (geojson_bytes, "application/geo+json"),
             "contacts.csv": (csv_bytes, "text/csv; charset=utf-8"),
             "contacts.kmz": (lambda accepted: kmz_bytes(accepted)[0], "application/vnd.google-earth.kmz"),
@@ -70,8 +69,8 @@ class ExportRoutes:
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(data, media_type=media, headers=headers)
 
-    def _accepted(self, wanted: Filter, folder: Path, *, pictures: bool) -> Accepted:
-        found: list[AcceptedContact] = []
+    def _accepted(self, wanted: Filter, folder: Path, *, pictures: bool) -> ContactSet:
+        found: list[ExportContact] = []
         with self._board.database.reading() as db:
             for offset in range(0, MOST, _PAGE):
                 page = list_contacts(db, replace(wanted, offset=offset, limit=_PAGE))
@@ -81,7 +80,7 @@ class ExportRoutes:
                 if len(items) < _PAGE:
                     break
         found.sort(key=lambda contact: (contact.image.first_frame_utc_s, contact.uid))
-        return Accepted(tuple(found), (), ())
+        return ContactSet(tuple(found), (), ())
 
     def _report(self, call: Call) -> Response:
         contact_id = str(call.request.path_params["id"])
@@ -93,17 +92,17 @@ class ExportRoutes:
         return Response(report(whole, image, time.time()), media_type="text/html; charset=utf-8", headers=headers)
 
 
-def _cot(accepted: Accepted) -> bytes:
+def _cot(accepted: ContactSet) -> bytes:
     # An event is a document of its own: its declaration goes, as it may stand at the beginning only.
     events = [event.partition(b"?>")[2] if event.startswith(b"<?xml") else event for event in _events(accepted)]
     return b'<?xml version="1.0" encoding="UTF-8"?>\n<events>\n' + b"\n".join(events) + b"\n</events>\n"
 
 
-def _events(accepted: Accepted) -> tuple[bytes, ...]:
+def _events(accepted: ContactSet) -> tuple[bytes, ...]:
     return cot_events(accepted, time.time())
 
 
-def _contact(db: sqlite3.Connection, item: Json, folder: Path | None) -> AcceptedContact:
+def _contact(db: sqlite3.Connection, item: Json, folder: Path | None) -> ExportContact:
     row = db.execute(
         "SELECT * FROM version WHERE contact_id = ? AND version = ?", (item["id"], item["version"])
     ).fetchone()
@@ -116,7 +115,7 @@ def _contact(db: sqlite3.Connection, item: Json, folder: Path | None) -> Accepte
     if folder is not None and image.codec:
         path = folder / f"{item['id']}.png"
         path.write_bytes(rendering.png(rendering.eight_bits(image.picture.to_array())))
-    return AcceptedContact(SideCar.model_validate(side_car(image)), decided, path)
+    return ExportContact(SideCar.model_validate(side_car(image)), decided, path)
 
 
 def report(whole: Json, image: ReconstructedImage, now_utc_s: float) -> str:

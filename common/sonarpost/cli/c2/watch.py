@@ -1,4 +1,4 @@
-"""`sonarpost c2 watch`: a line for everything a site accepts, as it accepts it."""
+"""`sonarpost c2 watch`: prints a line for each record that a shore site accepts."""
 
 from __future__ import annotations
 
@@ -14,36 +14,38 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
-from sonarpost.cli.c2.options import add_site, printable, time_text
-from sonarpost.cli.fleet_options import add_router_options, router_of
+from sonarpost.cli.shared import add_router_options, add_site_option, printable, router_of, time_text
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Decision, ReconstructedImage, Record, TaskingState
 
-LOOK_S = 0.2
-GONE_AFTER_S = 1.0
-ReadLine = tuple[str, bytes]
+POLL_S = 0.2
+DISCONNECTED_AFTER_S = 1.0
 
 
-def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action."""
-    parser = actions.add_parser("watch", help="print a line for everything that is accepted, live; Ctrl-C ends it")
-    add_site(parser)
+def add_actions(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `watch`."""
+    parser = actions.add_parser("watch", help="print a line for each accepted record, live; Ctrl-C ends it")
+    add_site_option(parser)
     add_router_options(parser)
-    parser.add_argument("--vessel", metavar="NAME", help="of this vessel only")
-    parser.add_argument("--json", action="store_true", help="one JSON object a line")
+    parser.add_argument("--vessel", metavar="NAME", help="only this vessel")
+    parser.add_argument("--json", action="store_true", help="print one JSON object for each line")
     parser.add_argument("--count", type=int, metavar="N", help="end after N lines")
     parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Print until interrupted, or until `--count` lines were printed; return 0."""
+    """Print records until interrupted, or until `--count` lines were printed; return 0."""
     endpoints, tls = router_of(parsed)
     stop = threading.Event()
     session = open_with_retry(endpoints, stop, tls)
     assert session is not None
+
+    def show(record: Record) -> None:
+        print(json.dumps(_fields(record)) if parsed.json else printable(line_of(record)), flush=True)
+
     try:
-        _say(f"watching {parsed.site} at {', '.join(endpoints)}")
-        Watch(session, parsed.site, parsed.vessel).run(_printer(as_json=parsed.json), parsed.count, stop)
+        _log(f"watching {parsed.site} at {', '.join(endpoints)}")
+        Watch(session, parsed.site, parsed.vessel).run(show, parsed.count, stop)
     except KeyboardInterrupt:
         return 0
     finally:
@@ -53,86 +55,79 @@ def run(parsed: argparse.Namespace) -> int:
 
 
 class Watch:
-    """Subscribes to what a site shows; a session finds back to its router by itself, and says so here.
+    """Subscription to the records that a site publishes. Zenoh reconnects; this class logs it.
 
     Args:
-        session: Of the site's router.
-        site: The site.
-        vessel: Of this vessel only; None for all.
+        session: Session at the router of the site.
+        site: Name of the site.
+        vessel: Only records of this vessel; None for all.
     """
 
     def __init__(self, session: zenoh.Session, site: str, vessel: str | None) -> None:
         self._session = session
         self._vessel = vessel
-        self._site = site
-        self._samples: queue.Queue[ReadLine] = queue.Queue()
+        self._samples: queue.Queue[tuple[str, bytes]] = queue.Queue()
         for key in (keys.shore_contact_all(site), keys.tasking_state_all(site)):
             session.declare_subscriber(key, self._on_sample)
-        self._gone_since_s: float | None = None
-        self._told_gone = False
+        self._disconnected_since_s: float | None = None
+        self._disconnect_logged = False
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
             self._samples.put((str(sample.key_expr), sample.payload.to_bytes()))
 
     def run(self, show: Callable[[Record], None], count: int | None, stop: threading.Event) -> None:
-        """Show records until `stop` is set or `count` of them were shown."""
+        """Call `show` for each record until `stop` is set or `count` records were shown."""
         shown = 0
         while not stop.is_set() and (count is None or shown < count):
-            self._look_at_link()
+            self._check_connection()
             try:
-                key, payload = self._samples.get(timeout=LOOK_S)
+                key, payload = self._samples.get(timeout=POLL_S)
             except queue.Empty:
                 continue
-            record = self._read(key, payload)
+            record = _decode(key, payload)
             if record is not None and self._vessel in (None, record.vessel_id):
                 show(record)
                 shown += 1
 
-    def _read(self, key: str, payload: bytes) -> ReconstructedImage | Decision | TaskingState | None:
-        kinds: dict[str, type[ReconstructedImage] | type[Decision] | type[TaskingState]] = {
-            "image": ReconstructedImage,
-            "decision": Decision,
-            "state": TaskingState,
-        }
-        kind = kinds.get(key.rpartition("/")[2])
-        if kind is None:
-            return None
-        try:
-            return wire.decode(kind, payload, key)
-        except PayloadError as error:
-            _say(str(error))
-            return None
-
-    def _look_at_link(self) -> None:
-        """Say when the router is gone and when it is back; what was shown meanwhile is in `ls`."""
+    def _check_connection(self) -> None:
+        """Log when the connection to the router is lost and when it is restored."""
         if self._session.info.routers_zid():
-            if self._told_gone:
-                _say("router back; what was accepted meanwhile is in `sonarpost c2 ls`")
-            self._gone_since_s, self._told_gone = None, False
+            if self._disconnect_logged:
+                _log("router reconnected; `sonarpost c2 ls` lists the records accepted in between")
+            self._disconnected_since_s, self._disconnect_logged = None, False
             return
         now_s = time.monotonic()
-        if self._gone_since_s is None:
-            self._gone_since_s = now_s
-        elif not self._told_gone and now_s - self._gone_since_s > GONE_AFTER_S:
-            self._told_gone = True
-            _say("router not reached, trying again")
+        if self._disconnected_since_s is None:
+            self._disconnected_since_s = now_s
+        elif not self._disconnect_logged and now_s - self._disconnected_since_s > DISCONNECTED_AFTER_S:
+            self._disconnect_logged = True
+            _log("router not reached, trying again")
 
 
-def _printer(*, as_json: bool) -> Callable[[Record], None]:
-    def show(record: Record) -> None:
-        print(json.dumps(_fields(record)) if as_json else printable(line_of(record)), flush=True)
-
-    return show
+def _decode(key: str, payload: bytes) -> ReconstructedImage | Decision | TaskingState | None:
+    types: dict[str, type[ReconstructedImage] | type[Decision] | type[TaskingState]] = {
+        "image": ReconstructedImage,
+        "decision": Decision,
+        "state": TaskingState,
+    }
+    record_type = types.get(key.rpartition("/")[2])
+    if record_type is None:
+        return None
+    try:
+        return wire.decode(record_type, payload, key)
+    except PayloadError as error:
+        _log(str(error))
+        return None
 
 
 def _fields(record: Record) -> dict[str, object]:
-    without = {"picture", "missing_mask"} if isinstance(record, ReconstructedImage) else set[str]()
-    return {"type": record.TYPE, **record.model_dump(exclude=without)}
+    pixels = {"picture", "missing_mask"} if isinstance(record, ReconstructedImage) else set[str]()
+    return {"type": record.TYPE, **record.model_dump(exclude=pixels)}
 
 
 def line_of(record: Record) -> str:
-    """Return the line for people."""
+    """Return a record as one line of text."""
     if isinstance(record, ReconstructedImage):
         contact = record.contact
         parts = [f"{record.picture.width_px} x {record.picture.height_px} px"]
@@ -140,16 +135,17 @@ def line_of(record: Record) -> str:
         if contact is not None and contact.lat_deg is not None and contact.lon_deg is not None:
             parts.append(f"at {contact.lat_deg:.5f} {contact.lon_deg:.5f}")
         name = f"{record.vehicle_id}/{record.image_id} v{record.version}"
-        return f"{time_text(record.last_frame_utc_s)}  {record.vessel_id}  picture   {name}  {', '.join(parts)}"
+        return f"{time_text(record.last_frame_utc_s)}  {record.vessel_id}  image     {name}  {', '.join(parts)}"
     if isinstance(record, Decision):
         name = f"{record.vehicle_id}/{record.image_id} v{record.image_version}"
         words = " ".join(part for part in (record.verdict, record.mlo_class or "", record.remark) if part)
         return f"{time_text(record.decided_utc_s)}  {record.vessel_id}  decision  {name}  {words} ({record.operator})"
     assert isinstance(record, TaskingState)
+    kind = "comment" if record.kind == "advice" else record.kind
     reason = f": {record.reason}" if record.reason else ""
-    what = f"{record.kind:8}  {record.record_id}  {record.state}{reason}"
-    return f"{time_text(record.changed_utc_s)}  {record.vessel_id}  {what}"
+    state = f"{kind:8}  {record.record_id}  {record.state}{reason}"
+    return f"{time_text(record.changed_utc_s)}  {record.vessel_id}  {state}"
 
 
-def _say(text: str) -> None:
+def _log(text: str) -> None:
     print(f"sonarpost c2: {text}", file=sys.stderr, flush=True)

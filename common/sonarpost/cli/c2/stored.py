@@ -1,0 +1,335 @@
+"""`sonarpost c2 ls`, `get` and `export`: list, copy and export the records in the c2 service's folder."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from sonarpost.archive.shore_files import files_of, find_picture
+from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, TaskingRow
+from sonarpost.cli.shared import printable, time_text
+from sonarpost.errors import BadInputError, ConfigError, StoredFileError
+from sonarpost.export.contacts import ContactSet, ExportContact, load_contacts, match_start_time
+from sonarpost.export.cot import cot_events
+from sonarpost.export.cot_sender import CotSender, TlsFiles
+from sonarpost.export.kml import write_kml, write_kmz
+from sonarpost.export.tables import write_csv, write_geojson
+from sonarpost.files import write_atomically
+
+PIPED_WIDTH = 160
+FORMATS = ("geojson", "kml", "kmz", "csv")
+EXIT_INCOMPLETE = 1
+
+_AGO = re.compile(r"(\d+(?:\.\d+)?)([smhd])")
+_UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+
+
+@dataclass(frozen=True, slots=True)
+class ListedImage:
+    """An image and the latest decision about it."""
+
+    picture: ImageRow
+    decision: DecisionRow | None
+
+
+def add_actions(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the actions `ls`, `get` and `export`."""
+    ls = actions.add_parser("ls", help="list images with their decisions, or commands and comments")
+    _add_filters(ls)
+    ls.add_argument("--undecided", action="store_true", help="only images without a decision")
+    ls.add_argument("--all-versions", action="store_true", help="all versions of an image, not only the newest")
+    ls.add_argument("--tasking", action="store_true", help="commands and comments, with their delivery state")
+    ls.add_argument("--json", action="store_true", help="print one JSON object for each line")
+    ls.set_defaults(run=run_ls)
+
+    get = actions.add_parser("get", help="copy the TIFF, PNG and JSON files of one image")
+    get.add_argument("picture", metavar="VEHICLE/IMAGE", help="name from `ls`, or the name of the files")
+    get.add_argument("--vessel", metavar="NAME", help="vessel, if two vessels have an image of this name")
+    get.add_argument("--version", type=int, metavar="N", help="version (default: the newest)")
+    get.add_argument("--to", type=Path, default=Path(), metavar="DIR", help="destination (default: current folder)")
+    _add_out_dir(get)
+    get.set_defaults(run=run_get)
+
+    export = actions.add_parser("export", help="write GeoJSON, KML, KMZ or CSV, or send Cursor-on-Target events")
+    _add_filters(export)
+    for name in FORMATS:
+        export.add_argument(f"--{name}", type=Path, metavar="FILE", help=f"write {name} to FILE")
+    export.add_argument("--cot", metavar="URL", help="send events to tcp://host:port, tls://… or udp://…")
+    for name in ("ca", "certificate", "key"):
+        export.add_argument(f"--cot-{name}", type=Path, metavar="PEM", help=f"{name} for --cot tls://…")
+    export.add_argument(
+        "--cot-wait", type=float, default=10.0, metavar="SECONDS", help="time limit for reaching the endpoint (10)"
+    )
+    export.set_defaults(run=run_export)
+
+
+def _add_out_dir(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out-dir", type=Path, default=Path("out"), metavar="DIR", help="out_dir of c2 (default: out)")
+
+
+def _add_filters(parser: argparse.ArgumentParser) -> None:
+    _add_out_dir(parser)
+    parser.add_argument("--vessel", metavar="NAME", help="only this vessel")
+    parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle")
+    parser.add_argument("--since", metavar="TIME", help="first received since 90m, 2h or 3d ago, or since a UTC time")
+
+
+def since_of(text: str | None, now_utc_s: float | None = None) -> float:
+    """Return the value of --since as UTC seconds: 90m, 2h, 3d ago, or a time like 2026-11-21T08:30:00.
+
+    Raises:
+        ConfigError: The text has another form.
+    """
+    if text is None:
+        return 0.0
+    if ago := _AGO.fullmatch(text):
+        now = time.time() if now_utc_s is None else now_utc_s
+        return now - float(ago.group(1)) * _UNIT_S[ago.group(2)]
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise ConfigError("c2", "--since", text, "45s, 90m, 2h, 3d, or a time like 2026-11-21T08:30:00") from error
+    return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+
+
+# ls
+
+
+def run_ls(parsed: argparse.Namespace) -> int:
+    """Print the table of images, or of commands and comments; return 0.
+
+    Raises:
+        StoredFileError: The folder has no index.
+        ConfigError: `--since` is invalid.
+    """
+    since_utc_s = since_of(parsed.since)
+    index = ShoreIndex(parsed.out_dir, writable=False)
+    try:
+        if parsed.tasking:
+            _print_tasking(index.tasking(), parsed, since_utc_s)
+            return 0
+        images = join_decisions(index.pictures(), index.decisions())
+    finally:
+        index.close()
+    rows = select_images(
+        images,
+        vessel=parsed.vessel,
+        vehicle=parsed.vehicle,
+        since_utc_s=since_utc_s,
+        undecided=parsed.undecided,
+        all_versions=parsed.all_versions,
+    )
+    if parsed.json:
+        for row in rows:
+            decision = None if row.decision is None else asdict(row.decision)
+            print(json.dumps({**asdict(row.picture), "decision": decision}))
+    else:
+        _print_images(rows)
+    return 0
+
+
+def join_decisions(images: Sequence[ImageRow], decisions: Iterable[DecisionRow]) -> list[ListedImage]:
+    """Join every image with the latest decision about it; see `match_start_time` for repeated image identifiers."""
+    start_times: dict[tuple[str, str, str], list[float]] = {}
+    for row in images:
+        known = start_times.setdefault((row.vessel_id, row.vehicle_id, row.image_id), [])
+        if row.first_frame_utc_s not in known:
+            known.append(row.first_frame_utc_s)
+    latest: dict[tuple[str, str, str, float], DecisionRow] = {}
+    for decision in sorted(decisions, key=lambda d: (d.decided_utc_s, d.decision_id)):
+        name = (decision.vessel_id, decision.vehicle_id, decision.image_id)
+        start = match_start_time(start_times.get(name, ()), decision.decided_utc_s)
+        if start is not None:
+            latest[(*name, start)] = decision
+    return [ListedImage(row, latest.get(_image_key(row))) for row in images]
+
+
+def _image_key(row: ImageRow) -> tuple[str, str, str, float]:
+    """Return the key of an image, which is the same for all its versions."""
+    return row.vessel_id, row.vehicle_id, row.image_id, row.first_frame_utc_s
+
+
+def select_images(
+    images: Iterable[ListedImage],
+    *,
+    vessel: str | None = None,
+    vehicle: str | None = None,
+    since_utc_s: float = 0.0,
+    undecided: bool = False,
+    all_versions: bool = False,
+) -> list[ListedImage]:
+    """Return the images that match the options of `ls`, in the given order."""
+    rows = [
+        row
+        for row in images
+        if vessel in (None, row.picture.vessel_id)
+        and vehicle in (None, row.picture.vehicle_id)
+        and row.picture.first_frame_utc_s >= since_utc_s
+        and not (undecided and row.decision is not None)
+    ]
+    if all_versions:
+        return rows
+    newest: dict[tuple[str, str, str, float], ListedImage] = {}
+    for row in rows:
+        key = _image_key(row.picture)
+        if key not in newest or newest[key].picture.version < row.picture.version:
+            newest[key] = row
+    return list(newest.values())
+
+
+def _print_images(rows: Sequence[ListedImage]) -> None:
+    headings = ("vessel", "image", "v", "first received (UTC)", "missing", "position", "detector", "decision", "by")
+    cells = []
+    for row in rows:
+        image, decision = row.picture, row.decision
+        located = image.lat_deg is not None and image.lon_deg is not None
+        confidence = "" if image.atd_confidence is None else f"{image.atd_confidence:.2f}"
+        cells.append(
+            (
+                image.vessel_id,
+                f"{image.vehicle_id}/{image.image_id}",
+                str(image.version),
+                time_text(image.first_frame_utc_s),
+                f"{100 * image.missing_fraction:.0f} %",
+                f"{image.lat_deg:.5f} {image.lon_deg:.5f}" if located else "",
+                " ".join(part for part in (image.atd_class or "", confidence) if part),
+                "" if decision is None else " ".join(p for p in (decision.verdict, decision.mlo_class or "") if p),
+                "" if decision is None else decision.operator,
+            )
+        )
+    _print_table(headings, cells, "images")
+
+
+def _print_tasking(rows: Iterable[TaskingRow], parsed: argparse.Namespace, since_utc_s: float) -> None:
+    chosen = [
+        row
+        for row in rows
+        if parsed.vessel in (None, row.vessel_id)
+        and parsed.vehicle in (None, row.vehicle_id)
+        and row.issued_utc_s >= since_utc_s
+    ]
+    if parsed.json:
+        for row in chosen:
+            print(json.dumps(asdict(row)))
+        return
+    headings = ("vessel", "kind", "id", "image", "text", "by", "issued (UTC)", "state", "reason")
+    cells = []
+    for row in chosen:
+        image = row.vehicle_id if row.image_id is None else f"{row.vehicle_id}/{row.image_id}"
+        issued = time_text(row.issued_utc_s)
+        kind = "comment" if row.kind == "advice" else row.kind
+        names = (row.vessel_id, kind, row.record_id, image)
+        cells.append((*names, row.summary, row.author, issued, row.state, row.reason))
+    _print_table(headings, cells, "records")
+
+
+def _print_table(headings: Sequence[str], rows: Sequence[Sequence[str]], noun: str) -> None:
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for heading in headings:
+        table.add_column(heading, overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(printable(cell)) for cell in row))
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        # A fixed width prints one line for each row, as `grep` needs.
+        console = Console(highlight=False, width=PIPED_WIDTH)
+    console.print(table)
+    console.print(f"{len(rows)} {noun}")
+
+
+# get
+
+
+def run_get(parsed: argparse.Namespace) -> int:
+    """Copy the files of an image and print their paths; return 0.
+
+    Raises:
+        StoredFileError: No image or several images match, or a file cannot be read.
+        OSError: A copy cannot be written.
+    """
+    index = ShoreIndex(parsed.out_dir, writable=False)
+    try:
+        row = find_picture(index.pictures(), parsed.picture, parsed.vessel, parsed.version)
+    finally:
+        index.close()
+    copies = []
+    for path in files_of(parsed.out_dir, row):
+        try:
+            copies.append((parsed.to / path.name, path.read_bytes()))
+        except OSError as error:
+            raise StoredFileError(str(path), "", error.strerror or str(error), "a readable file of c2") from error
+    parsed.to.mkdir(parents=True, exist_ok=True)
+    for path, data in copies:
+        write_atomically(path, data)
+        print(path)
+    return 0
+
+
+# export
+
+
+def run_export(parsed: argparse.Namespace) -> int:
+    """Export contacts; return 0, or 1 if a stored file was rejected.
+
+    Raises:
+        ConfigError: No output is requested, or an option is invalid.
+        StoredFileError: The folder cannot be read.
+        OSError, PortError: A file cannot be written, or events cannot be sent.
+    """
+    if not any(getattr(parsed, name) for name in (*FORMATS, "cot")):
+        options = ", ".join(f"--{name}" for name in (*FORMATS, "cot"))
+        raise ConfigError("c2 export", "", "no output", f"at least one of {options}")
+    contacts = _filter_contacts(load_contacts(parsed.out_dir), parsed)
+    problems = list(contacts.problems)
+    for name, write in (("geojson", write_geojson), ("kml", write_kml), ("csv", write_csv), ("kmz", write_kmz)):
+        path: Path | None = getattr(parsed, name)
+        if path is not None:
+            problems += write(path, contacts) or ()
+            print(f"{path}: {len(contacts.contacts)} contacts, {len(contacts.unlocated)} of them without a position")
+    if parsed.cot is not None:
+        events = cot_events(contacts, time.time())
+        with CotSender(parsed.cot, TlsFiles(parsed.cot_ca, parsed.cot_certificate, parsed.cot_key)) as sender:
+            sender.send(events, parsed.cot_wait)
+        print(f"{parsed.cot}: {len(events)} events, {len(contacts.unlocated)} contacts without a position omitted")
+    _mark_exported(parsed.out_dir, contacts.contacts)
+    for problem in problems:
+        print(f"rejected: {problem}", file=sys.stderr)
+    return EXIT_INCOMPLETE if problems else 0
+
+
+def _filter_contacts(contacts: ContactSet, parsed: argparse.Namespace) -> ContactSet:
+    since_utc_s = since_of(parsed.since)
+    chosen = tuple(
+        contact
+        for contact in contacts.contacts
+        if parsed.vessel in (None, contact.image.vessel_id)
+        and parsed.vehicle in (None, contact.image.vehicle_id)
+        and contact.image.first_frame_utc_s >= since_utc_s
+    )
+    return ContactSet(chosen, contacts.unmatched, contacts.problems)
+
+
+def _mark_exported(out_dir: Path, contacts: Sequence[ExportContact]) -> None:
+    """Mark images as exported in the index; retention deletes exported images first."""
+    exported = {(c.image.vessel_id, c.image.vehicle_id, c.image.image_id, c.image.first_frame_utc_s) for c in contacts}
+    try:
+        index = ShoreIndex(out_dir)
+        try:
+            rows = [row for row in index.pictures() if _image_key(row) in exported]
+            index.mark("exported_utc_s", rows, time.time())
+        finally:
+            index.close()
+    except (OSError, BadInputError) as error:
+        print(f"not marked as exported: {error}", file=sys.stderr)

@@ -1,0 +1,321 @@
+"""`sonarpost status`: a live table of the services of all platforms."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import signal
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from types import FrameType
+from typing import Literal
+
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from sonarpost.cli.shared import add_router_options, printable, router_of
+from sonarpost.errors import ConfigError
+from sonarpost.monitoring.fleet import FleetState, FleetWatcher, ServiceStatus
+
+EXIT_NOT_OK = 1
+UNKNOWN = "-"
+HEADINGS = ("PLATFORM", "SERVICE", "STATE", "AGE", "IN", "OUT", "LINK", "DISK")
+
+_RIGHT_ALIGNED = ("AGE", "IN", "OUT", "DISK")
+_POLL_S = 0.05
+
+Severity = Literal["ok", "error", "stale", "gone"]
+_STYLES: dict[Severity, str] = {"ok": "", "error": "bold red", "stale": "yellow", "gone": "dim"}
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser(
+        "status",
+        help="show the services of all platforms, live",
+        description="Show the services of all platforms at a router: state, queues, link, disk. Ctrl-C ends it.",
+    )
+    add_router_options(parser)
+    parser.add_argument("--once", action="store_true", help="print once; exit status 0 if all services are ok, else 1")
+    parser.add_argument("--json", action="store_true", help="print JSON lines instead of the table")
+    parser.add_argument("--interval", type=float, default=1.0, metavar="S", help="time between updates (default: 1)")
+    parser.add_argument(
+        "--wait",
+        type=float,
+        default=6.0,
+        metavar="S",
+        help="with --once: time limit for health records (default: 6; services publish every 5 s)",
+    )
+    parser.add_argument(
+        "--stale-after", type=float, default=15.0, metavar="S", help="age at which health is stale (default: 15)"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(parsed: argparse.Namespace, console: Console | None = None) -> int:
+    """Show the state of the fleet; return 0, or with --once 1 if a service is not ok.
+
+    Args:
+        parsed: The command line.
+        console: Output; by default standard output.
+
+    Raises:
+        ConfigError: A router option or a time is invalid.
+    """
+    for name in ("interval", "wait", "stale_after"):
+        if not 0 < getattr(parsed, name) <= 86400:
+            raise ConfigError("status", f"--{name.replace('_', '-')}", getattr(parsed, name), "above 0, to 86400")
+    endpoints, tls = router_of(parsed)
+    router = ", ".join(endpoints)
+    console = console or Console(highlight=False)
+    with (
+        _logging_suppressed(),
+        _stop_on_signals() as stop,
+        FleetWatcher(endpoints, tls, poll_s=min(1.0, parsed.interval)) as watcher,
+    ):
+        if parsed.once:
+            state = _wait_for_health(watcher, stop, parsed.wait)
+            _print_state(console, state, router, parsed)
+            return 0 if is_ok(rows_of(state, parsed.stale_after), state) else EXIT_NOT_OK
+        if parsed.json or not console.is_terminal:
+            while not stop.wait(parsed.interval):
+                _print_state(console, watcher.state(), router, parsed)
+            return 0
+        with Live(console=console, auto_refresh=False, screen=True) as live:
+            while True:
+                state = watcher.state()
+                live.update(table(state, rows_of(state, parsed.stale_after), router), refresh=True)
+                if stop.wait(parsed.interval):
+                    return 0
+
+
+def _print_state(console: Console, state: FleetState, router: str, parsed: argparse.Namespace) -> None:
+    rows = rows_of(state, parsed.stale_after)
+    if console.is_terminal and not parsed.json:
+        console.print(table(state, rows, router))
+        return
+    now = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+    text = as_json(state, rows, now) if parsed.json else plain_text(state, rows, router)
+    # Written directly: the console's `print` would wrap and colour the text.
+    console.file.write(f"{text}\n")
+    console.file.flush()
+
+
+def _wait_for_health(watcher: FleetWatcher, stop: threading.Event, wait_s: float) -> FleetState:
+    """Return the state when all running services have published health, or after `wait_s`."""
+    deadline_s = time.monotonic() + wait_s
+    while True:
+        state = watcher.state()
+        complete = state.connected and state.services and all(s.health or not s.alive for s in state.services)
+        if complete or time.monotonic() > deadline_s or stop.wait(_POLL_S):
+            return state
+
+
+@contextmanager
+def _logging_suppressed() -> Iterator[None]:
+    """Suppress log lines, which would break the table."""
+    logger = logging.getLogger("sonarpost")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+@contextmanager
+def _stop_on_signals() -> Iterator[threading.Event]:
+    """Return an event that SIGINT and SIGTERM set, so that the terminal is restored before the process ends."""
+    stop = threading.Event()
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+# Rows
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One service as text.
+
+    Attributes:
+        cells: Text of the columns `HEADINGS`.
+        severity: Colour of the row: ok, error, stale data, or the service is not running.
+        detail: Problem reported by the service; empty if there is none.
+    """
+
+    cells: tuple[str, ...]
+    severity: Severity
+    detail: str
+
+    @property
+    def state(self) -> str:
+        """Text of the column STATE."""
+        return self.cells[2]
+
+
+def rows_of(state: FleetState, stale_after_s: float) -> tuple[Row, ...]:
+    """Return a row for each service."""
+    return tuple(_row(status, stale_after_s) for status in state.services)
+
+
+def is_ok(rows: Sequence[Row], state: FleetState) -> bool:
+    """Return whether the router is reached and at least one service runs, all without a problem."""
+    return state.connected and bool(rows) and all(row.severity == "ok" for row in rows)
+
+
+def _row(status: ServiceStatus, stale_after_s: float) -> Row:
+    health = status.health
+    state, severity = _state_text(status, stale_after_s)
+    gauges: Mapping[str, float] = health.gauges if health else {}
+    cells = (
+        status.platform,
+        status.service,
+        state,
+        age_text(status.age_s),
+        _count_text(gauges.get("inbox")),
+        _count_text(gauges.get("outbox")),
+        _link_text(health.counters, gauges) if health else UNKNOWN,
+        bytes_text(gauges.get("disk_free_bytes")),
+    )
+    return Row(cells, severity, health.detail if health else "")
+
+
+def _state_text(status: ServiceStatus, stale_after_s: float) -> tuple[str, Severity]:
+    health = status.health
+    if status.alive is False:
+        return ("stopped" if health is not None and health.state == "stopping" else "gone"), "gone"
+    if health is None or status.age_s is None:
+        return "no data", "stale"
+    if status.age_s > stale_after_s:
+        return f"stale ({health.state})", "stale"
+    if status.alive is None:
+        return f"{health.state}?", "stale"
+    return health.state, "ok" if health.state == "ok" else "error"
+
+
+def _link_text(counters: Mapping[str, int], gauges: Mapping[str, float]) -> str:
+    """Return the state of the acoustic link for a modem service, and the queues to the shore sites for a relay."""
+    parts: list[str] = []
+    if gauges.get("modem_ready") == 0.0:
+        parts.append("no modem")
+    if (snr_db := gauges.get("snr_in_db")) is not None:
+        parts.append(f"SNR {snr_db:.0f} dB")
+    good, bad = counters.get("frames_received", 0), counters.get("frames_bad", 0)
+    if good + bad:
+        parts.append(f"loss {100 * bad / (good + bad):.0f} %")
+    sent, failed = counters.get("packets_sent", 0), counters.get("packets_failed", 0)
+    if sent + failed:
+        parts.append(f"sent {sent}" + (f", failed {failed}" if failed else ""))
+    for name, waiting in gauges.items():
+        if name.startswith("waiting_for_") and waiting:
+            parts.append(f"{waiting:.0f} for {name.removeprefix('waiting_for_')}")
+    return ", ".join(parts) or UNKNOWN
+
+
+def _count_text(value: float | None) -> str:
+    return UNKNOWN if value is None else f"{value:.0f}"
+
+
+def age_text(age_s: float | None) -> str:
+    """Return 3 s, 4 min, 5 h or 6 d, rounded down; `-` for None."""
+    if age_s is None:
+        return UNKNOWN
+    for unit, unit_s in (("d", 86400), ("h", 3600), ("min", 60)):
+        if age_s >= unit_s:
+            return f"{int(age_s // unit_s)} {unit}"
+    return f"{int(age_s)} s"
+
+
+def bytes_text(size_bytes: float | None) -> str:
+    """Return 512 B, 3.4 kB, 12 MB, 120 GB, with at least two digits; `-` for None."""
+    if size_bytes is None:
+        return UNKNOWN
+    value, unit = size_bytes, "B"
+    for larger in ("kB", "MB", "GB", "TB"):
+        if value < 1000:
+            break
+        value, unit = value / 1000, larger
+    return f"{value:.1f} {unit}" if unit != "B" and value < 10 else f"{value:.0f} {unit}"
+
+
+# Output
+
+
+def table(state: FleetState, rows: Sequence[Row], router: str) -> RenderableType:
+    """Return the table for a terminal. It fits 80 columns; longer names are folded."""
+    whole = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, collapse_padding=True, show_edge=False)
+    for heading in HEADINGS:
+        whole.add_column(heading, justify="right" if heading in _RIGHT_ALIGNED else "left", overflow="fold")
+    previous = ""
+    for row in rows:
+        # The platform is shown once, in its first row.
+        platform, *others = row.cells
+        cells = ["" if platform == previous else platform, *others]
+        previous = platform
+        whole.add_row(*(Text(printable(cell)) for cell in cells), style=_STYLES[row.severity])
+    headline = Text(_headline(state, router), style="" if state.connected else "bold red")
+    return Group(headline, whole, *(Text(line, style="red", overflow="fold") for line in _details(rows)))
+
+
+def plain_text(state: FleetState, rows: Sequence[Row], router: str) -> str:
+    """Return the table as plain text, with columns aligned by spaces."""
+    lines = [HEADINGS, *(tuple(printable(cell) for cell in row.cells) for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(HEADINGS))]
+    out = [_headline(state, router)]
+    out += ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
+    return "\n".join([*out, *_details(rows)])
+
+
+def as_json(state: FleetState, rows: Sequence[Row], time_utc: str) -> str:
+    """Return the health records and the states of the table as one line of JSON."""
+    services = []
+    for status, row in zip(state.services, rows, strict=True):
+        health = status.health
+        services.append(
+            {
+                "platform": status.platform,
+                "service": status.service,
+                "alive": status.alive,
+                "status": row.state,
+                "well": row.severity == "ok",
+                "age_s": None if status.age_s is None else round(status.age_s, 1),
+                "state": health.state if health else None,
+                "detail": health.detail if health else None,
+                "started_utc_s": health.started_utc_s if health else None,
+                "time_utc_s": health.time_utc_s if health else None,
+                "counters": health.counters if health else {},
+                "gauges": health.gauges if health else {},
+            }
+        )
+    whole = {"time_utc": time_utc, "connected": state.connected, "rejected": state.rejected, "services": services}
+    return json.dumps(whole)
+
+
+def _headline(state: FleetState, router: str) -> str:
+    if not state.connected:
+        return f"{router}: router not reached" + (", the data below is old" if state.services else " yet")
+    alive = sum(status.alive is True for status in state.services)
+    platforms = len({status.platform for status in state.services})
+    rejected = f", {state.rejected} records rejected" if state.rejected else ""
+    return f"{router}: {alive} of {len(state.services)} services alive on {platforms} platforms{rejected}"
+
+
+def _details(rows: Sequence[Row]) -> list[str]:
+    return [f"! {row.cells[0]}/{row.cells[1]}: {printable(row.detail)}" for row in rows if row.detail]

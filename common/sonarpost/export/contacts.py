@@ -1,0 +1,291 @@
+"""Contacts with their images and decisions, read from the c2 service's folder (`out_dir/{vessel}`).
+
+A contact is identified by vessel, vehicle, image identifier and the second of its first frame. The image identifier
+alone is not unique: a vehicle whose store was deleted starts its numbering again. The highest image version and the
+latest decision count.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Final, Literal, TypeVar
+
+from pydantic import Field, ValidationError
+
+from sonarpost.errors import BadInputError, StoredFileError
+from sonarpost.messages import (
+    Contact,
+    Count,
+    Decision,
+    Fraction,
+    ImageId,
+    Ordinal,
+    PlatformId,
+    Record,
+    Sha256,
+    Text,
+    Time,
+    Verdict,
+)
+from sonarpost.wire import expected_text
+
+MAX_FILE_BYTES: Final = 1 << 20
+"""Larger JSON files are rejected. A side-car with 64 notes of 2000 characters is far smaller."""
+
+DECISIONS: Final = "decisions"
+
+ReviewState = Verdict | Literal["unreviewed"]
+R = TypeVar("R", bound=Record)
+Seconds = TypeVar("Seconds", int, float)
+
+
+class SideCar(Record):
+    """JSON file beside a stored image: the `reconstructed_image` record without its pixels."""
+
+    TYPE = "reconstructed_image"
+
+    type: Literal["reconstructed_image"]
+    v: Literal[1]
+    vessel_id: PlatformId
+    vehicle_id: PlatformId
+    image_id: ImageId
+    version: Ordinal
+    contact: Contact | None
+    codec: str
+    model: str = ""
+    picture_sha256: Sha256
+    complete: bool
+    missing_fraction: Fraction
+    missing_halves: tuple[Literal["top", "bottom"], ...]
+    missing_rows: tuple[Count, ...] = ()
+    bytes_received: Count
+    bytes_total: Count
+    frames_received: Count
+    first_frame_utc_s: Time
+    last_frame_utc_s: Time
+    notes: tuple[Text, ...] = ()
+    height_px: Annotated[int, Field(ge=1, le=4096)]
+    width_px: Annotated[int, Field(ge=1, le=4096)]
+
+
+@dataclass(frozen=True, slots=True)
+class ExportContact:
+    """One contact to export.
+
+    Attributes:
+        image: Side-car of the latest version of its image.
+        decisions: All decisions about it, oldest first.
+        image_path: PNG of that version; None if the file is missing or only the contact record was received.
+    """
+
+    image: SideCar
+    decisions: tuple[Decision, ...]
+    image_path: Path | None
+
+    @property
+    def uid(self) -> str:
+        """Permanent identifier, for example sonarpost.vessel-1.uuv-1.20161012T090001Z.00A7."""
+        first = datetime.fromtimestamp(int(self.image.first_frame_utc_s), UTC).strftime("%Y%m%dT%H%M%SZ")
+        return f"sonarpost.{self.image.vessel_id}.{self.image.vehicle_id}.{first}.{self.image.image_id}"
+
+    @property
+    def name(self) -> str:
+        """Short name for maps and tables, for example uuv-1/00A7."""
+        return f"{self.image.vehicle_id}/{self.image.image_id}"
+
+    @property
+    def decision(self) -> Decision | None:
+        """Latest decision; None before the first one."""
+        return self.decisions[-1] if self.decisions else None
+
+    @property
+    def review(self) -> ReviewState:
+        """Latest verdict, or `unreviewed`."""
+        return self.decision.verdict if self.decision else "unreviewed"
+
+    @property
+    def position(self) -> tuple[float, float] | None:
+        """(lat_deg, lon_deg), WGS 84; None if either is unknown."""
+        contact = self.image.contact
+        if contact is None or contact.lat_deg is None or contact.lon_deg is None:
+            return None
+        return contact.lat_deg, contact.lon_deg
+
+
+@dataclass(frozen=True, slots=True)
+class ContactSet:
+    """Contacts to export.
+
+    Attributes:
+        contacts: Ordered by first frame, vessel, vehicle and image identifier.
+        unmatched: Decisions without a stored image.
+        problems: One error for each rejected file.
+    """
+
+    contacts: tuple[ExportContact, ...]
+    unmatched: tuple[Decision, ...]
+    problems: tuple[BadInputError, ...]
+
+    @property
+    def located(self) -> tuple[ExportContact, ...]:
+        """Contacts with a position."""
+        return tuple(c for c in self.contacts if c.position is not None)
+
+    @property
+    def unlocated(self) -> tuple[ExportContact, ...]:
+        """Contacts without a position. Maps omit them and state their number."""
+        return tuple(c for c in self.contacts if c.position is None)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredRecords:
+    """Files of the c2 service's folder.
+
+    Attributes:
+        images: Side-car and path of every stored image version.
+        decisions: All stored decisions.
+        problems: One error for each rejected file.
+    """
+
+    images: tuple[tuple[SideCar, Path], ...]
+    decisions: tuple[Decision, ...]
+    problems: tuple[BadInputError, ...]
+
+
+def load_contacts(out_dir: Path) -> ContactSet:
+    """Read all contacts from the c2 service's folder.
+
+    A rejected file is listed in `problems`; the other files are read. c2 may write while this function reads: an
+    image's side-car is written after its other files.
+
+    Args:
+        out_dir: `out_dir` of the c2 service, with one folder for each vessel.
+
+    Raises:
+        StoredFileError: `out_dir` is not a readable folder.
+    """
+    stored = read_stored_records(out_dir)
+    latest: dict[tuple[_Name, int], tuple[SideCar, Path]] = {}
+    for image, path in stored.images:
+        key = (_name(image), int(image.first_frame_utc_s))
+        if key not in latest or latest[key][0].version < image.version:
+            latest[key] = (image, path)
+    start_times: defaultdict[_Name, list[int]] = defaultdict(list)
+    for name, first_s in latest:
+        start_times[name].append(first_s)
+    decisions: defaultdict[tuple[_Name, int], list[Decision]] = defaultdict(list)
+    unmatched: list[Decision] = []
+    for decision in sorted(stored.decisions, key=lambda d: (d.decided_utc_s, d.decision_id)):
+        name = _name(decision)
+        start = match_start_time(start_times.get(name, ()), decision.decided_utc_s)
+        if start is None:
+            unmatched.append(decision)
+        else:
+            decisions[name, start].append(decision)
+    contacts = [
+        ExportContact(image, tuple(decisions[key]), _png_path(image, path)) for key, (image, path) in latest.items()
+    ]
+    contacts.sort(key=lambda c: (c.image.first_frame_utc_s, c.uid))
+    return ContactSet(tuple(contacts), tuple(unmatched), stored.problems)
+
+
+def read_stored_records(out_dir: Path) -> StoredRecords:
+    """Read all side-cars and decisions from the c2 service's folder.
+
+    Raises:
+        StoredFileError: `out_dir` is not a readable folder.
+    """
+    problems: list[BadInputError] = []
+    images: list[tuple[SideCar, Path]] = []
+    decisions: list[Decision] = []
+    for folder in _vessel_folders(out_dir):
+        for path in _json_files(folder, problems):
+            image = _read(SideCar, path, problems)
+            if image is not None and _is_of_vessel(image, folder, path, problems):
+                images.append((image, path))
+        for path in _json_files(folder / DECISIONS, problems):
+            decision = _read(Decision, path, problems)
+            if decision is not None and _is_of_vessel(decision, folder, path, problems):
+                decisions.append(decision)
+    return StoredRecords(tuple(images), tuple(decisions), tuple(problems))
+
+
+def match_start_time(start_times: Sequence[Seconds], utc_s: float) -> Seconds | None:
+    """Return which of several images with one identifier a record refers to.
+
+    It is the last image whose first frame arrived before the record was made. A single candidate always matches,
+    because platform clocks differ.
+
+    Args:
+        start_times: UTC of the first frame of each image, in seconds.
+        utc_s: UTC of the record, in seconds.
+
+    Returns:
+        The start time of the image, or None if no image matches.
+    """
+    earlier = [start for start in start_times if start <= utc_s]
+    if earlier or len(start_times) == 1:
+        return max(earlier, default=start_times[0])
+    return None
+
+
+def _vessel_folders(out_dir: Path) -> list[Path]:
+    try:
+        return sorted(path for path in out_dir.iterdir() if path.is_dir())
+    except OSError as error:
+        raise StoredFileError(str(out_dir), "", error.strerror or str(error), "the out_dir of c2") from error
+
+
+def _json_files(folder: Path, problems: list[BadInputError]) -> list[Path]:
+    try:
+        # A hidden file is not yet completely written.
+        return sorted(p for p in folder.iterdir() if p.suffix == ".json" and not p.name.startswith("."))
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        problems.append(StoredFileError(str(folder), "", error.strerror or str(error), "a readable folder"))
+        return []
+
+
+def _read(model: type[R], path: Path, problems: list[BadInputError]) -> R | None:
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_FILE_BYTES + 1)
+        if len(text) <= MAX_FILE_BYTES:
+            return model.model_validate_json(text)
+        limit = f"{MAX_FILE_BYTES} bytes"
+        problems.append(StoredFileError(str(path), "size", f"more than {limit}", f"at most {limit}"))
+    except OSError as error:
+        problems.append(StoredFileError(str(path), "", error.strerror or str(error), f"a readable {model.TYPE}"))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        value = "nothing" if first["type"] == "missing" else first["input"]
+        field = ".".join(str(part) for part in first["loc"])
+        problems.append(StoredFileError(str(path), field, value, expected_text(first["type"], first["msg"])))
+    return None
+
+
+def _is_of_vessel(record: SideCar | Decision, folder: Path, path: Path, problems: list[BadInputError]) -> bool:
+    """Return whether a record names the vessel of its folder; otherwise report a problem."""
+    if record.vessel_id == folder.name:
+        return True
+    problems.append(StoredFileError(str(path), "vessel_id", record.vessel_id, folder.name))
+    return False
+
+
+_Name = tuple[str, str, str]
+
+
+def _name(record: SideCar | Decision) -> _Name:
+    return record.vessel_id, record.vehicle_id, record.image_id
+
+
+def _png_path(image: SideCar, side_car: Path) -> Path | None:
+    png = side_car.with_suffix(".png")
+    # Without a codec only the contact record was received; its PNG is black.
+    return png if image.codec and os.access(png, os.R_OK) else None

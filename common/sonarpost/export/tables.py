@@ -1,0 +1,156 @@
+"""Flat tables of contacts: CSV (RFC 4180) and GeoJSON (RFC 7946)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+from sonarpost.export.contacts import ContactSet, ExportContact
+from sonarpost.export.text import csv_text, utc_text, xml_text
+from sonarpost.files import write_atomically
+
+Value = str | int | float | bool | None
+
+DEGREE_DECIMALS: Final = 7
+"""One unit of the last digit is about 1 cm on the ground."""
+
+BYTE_ORDER_MARK: Final = b"\xef\xbb\xbf"
+
+
+def _degrees(contact: ExportContact, index: int) -> float | None:
+    return None if contact.position is None else round(contact.position[index], DEGREE_DECIMALS)
+
+
+def _utc(time_utc_s: float | None) -> str | None:
+    return None if time_utc_s is None else utc_text(time_utc_s)
+
+
+def _from_record(name: str) -> Callable[[ExportContact], Value]:
+    """Return a function that reads a field of the contact record; None if no contact record was received."""
+    return lambda contact: getattr(contact.image.contact, name, None)
+
+
+def _from_decision(name: str) -> Callable[[ExportContact], Value]:
+    """Return a function that reads a field of the latest decision; None if there is no decision."""
+    return lambda contact: getattr(contact.decision, name, None)
+
+
+_PROPERTIES: Final[Mapping[str, Callable[[ExportContact], Value]]] = {
+    "uid": lambda c: c.uid,
+    "name": lambda c: c.name,
+    "vessel_id": lambda c: c.image.vessel_id,
+    "vehicle_id": lambda c: c.image.vehicle_id,
+    "image_id": lambda c: c.image.image_id,
+    "version": lambda c: c.image.version,
+    "review": lambda c: c.review,
+    "mlo_class": _from_decision("mlo_class"),
+    "operator_confidence": _from_decision("confidence"),
+    "operator": _from_decision("operator"),
+    "decided_utc": lambda c: _utc(c.decision.decided_utc_s if c.decision else None),
+    "decided_version": _from_decision("image_version"),
+    "decisions": lambda c: len(c.decisions),
+    "remark": _from_decision("remark"),
+    "lat_deg": lambda c: _degrees(c, 0),
+    "lon_deg": lambda c: _degrees(c, 1),
+    "position_sigma_m": _from_record("position_sigma_m"),
+    "seen_utc": lambda c: _utc(c.image.contact.time_utc_s if c.image.contact else None),
+    "first_frame_utc": lambda c: utc_text(c.image.first_frame_utc_s),
+    "last_frame_utc": lambda c: utc_text(c.image.last_frame_utc_s),
+    "depth_m": _from_record("depth_m"),
+    "altitude_m": _from_record("altitude_m"),
+    "heading_deg": _from_record("heading_deg"),
+    "channel": _from_record("channel"),
+    "ground_range_m": _from_record("ground_range_m"),
+    "atd_class": _from_record("atd_class"),
+    "atd_confidence": _from_record("atd_confidence"),
+    "length_m": _from_record("length_m"),
+    "width_m": _from_record("width_m"),
+    "shadow_m": _from_record("shadow_m"),
+    "height_m": _from_record("height_m"),
+    "pixel_along_m": _from_record("pixel_along_m"),
+    "pixel_across_m": _from_record("pixel_across_m"),
+    "picture_height_px": lambda c: c.image.height_px,
+    "picture_width_px": lambda c: c.image.width_px,
+    "picture_complete": lambda c: c.image.complete,
+    "picture_missing_fraction": lambda c: c.image.missing_fraction,
+    "picture_sha256": lambda c: c.image.picture_sha256,
+    "picture_file": lambda c: f"{c.image.vessel_id}/{c.image_path.name}" if c.image_path else None,
+    "notes": lambda c: "; ".join(c.image.notes),
+}
+
+COLUMNS: Final = tuple(_PROPERTIES)
+"""Names of the properties in their order. `docs/reference/exports.md` describes them."""
+
+
+def contact_properties(contact: ExportContact) -> dict[str, Value]:
+    """Return the properties of a contact, one for each of `COLUMNS`; None means unknown."""
+    return {name: read(contact) for name, read in _PROPERTIES.items()}
+
+
+def csv_bytes(contacts: ContactSet) -> bytes:
+    """Return a CSV table with one row for each contact, including contacts without a position.
+
+    The text is UTF-8 with a byte order mark, which spreadsheet programs need to recognise the encoding. Lines end with
+    CR LF.
+    """
+    buffer = io.StringIO(newline="")
+    writer = csv.writer(buffer, lineterminator="\r\n")
+    writer.writerow(COLUMNS)
+    for contact in contacts.contacts:
+        writer.writerow([_cell(value) for value in contact_properties(contact).values()])
+    return BYTE_ORDER_MARK + buffer.getvalue().encode()
+
+
+def write_csv(path: Path, contacts: ContactSet) -> None:
+    """Write the CSV table atomically.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    write_atomically(path, csv_bytes(contacts))
+
+
+def geojson(contacts: ContactSet) -> dict[str, object]:
+    """Return a GeoJSON FeatureCollection of points, longitude first, WGS 84.
+
+    Contacts without a position are not features. Their properties are in the foreign member `unlocated`.
+    """
+    features: list[dict[str, object]] = []
+    for contact in contacts.located:
+        values = _without_control_characters(contact)
+        point = {"type": "Point", "coordinates": [values["lon_deg"], values["lat_deg"]]}
+        features.append({"type": "Feature", "id": contact.uid, "geometry": point, "properties": values})
+    unlocated = [_without_control_characters(contact) for contact in contacts.unlocated]
+    return {"type": "FeatureCollection", "features": features, "unlocated": unlocated}
+
+
+def geojson_bytes(contacts: ContactSet) -> bytes:
+    """Return the FeatureCollection as UTF-8 text. Equal contacts give equal bytes."""
+    return (json.dumps(geojson(contacts), ensure_ascii=False, allow_nan=False, indent=1) + "\n").encode()
+
+
+def write_geojson(path: Path, contacts: ContactSet) -> None:
+    """Write the FeatureCollection atomically.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    write_atomically(path, geojson_bytes(contacts))
+
+
+def _cell(value: Value) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    # Numbers are not escaped: their minus sign would be taken for a formula.
+    return csv_text(value) if isinstance(value, str) else repr(value)
+
+
+def _without_control_characters(contact: ExportContact) -> dict[str, Value]:
+    values = contact_properties(contact)
+    return {name: xml_text(value) if isinstance(value, str) else value for name, value in values.items()}
