@@ -62,7 +62,7 @@ class SideCar(Record):
     complete: bool
     missing_fraction: Fraction
     missing_halves: tuple[Literal["top", "bottom"], ...]
-    missing_rows: tuple[Count, ...] = ()
+    missing_rows: Annotated[tuple[Count, ...], Field(strict=False)] = ()
     bytes_received: Count
     bytes_total: Count
     frames_received: Count
