@@ -19,11 +19,11 @@ import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from sonarpost.cli.survey.waterfall_picture import draw_waterfall, reduce_survey
+from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.snippets import from_survey
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.sonar.readers.registry import open_survey
+from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
 HEADER_BYTES = 1024

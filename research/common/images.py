@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image as PillowImage
 
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX, Image, to_uint8
-from sonarpost.detection.snippet import to_grey
+from sonarpost.detection.snippets import to_grey
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind

@@ -18,9 +18,9 @@ import numpy.typing as npt
 from research.common.measurement import Subject, code
 from research.detection.simulated import JudgedFile
 from sonarpost.codec.interface import Image
-from sonarpost.detection.contacts import Detection, detect
+from sonarpost.detection.detector import Detection, detect
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.snippet import HIGH_PERCENTILE, LOW_PERCENTILE, SnippetCut, cut_snippet
+from sonarpost.detection.snippets import HIGH_PERCENTILE, LOW_PERCENTILE, SnippetCut, cut_snippet
 from sonarpost.sonar.survey import ChannelPing, Survey
 
 HEIGHT_PX: Final = 80

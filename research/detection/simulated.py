@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from research.detection.truth import Scale, object_at
-from sonarpost.detection.contacts import Detection, detect
+from sonarpost.detection.detector import Detection, detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind

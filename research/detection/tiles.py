@@ -14,8 +14,7 @@ from research.common.images import JPEG_SUFFIXES, read_jpeg
 from research.common.sdvd import survey_line
 from research.common.statistics import Interval, auc, bootstrap_weights, interval
 from sonarpost.codec.interface import to_uint8
-from sonarpost.detection.image_confidence import image_confidence
-from sonarpost.detection.image_detector import LevelImage
+from sonarpost.detection.image_detector import LevelImage, image_confidence
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.image_files import read_image
 

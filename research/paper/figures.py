@@ -12,12 +12,12 @@ import numpy as np
 from research.common.measurement import PSNR_LIMIT_DB, Coded, Subject, code
 from sonarpost.codec.interface import Image
 from sonarpost.codec.quality import psnr_db, ssim
-from sonarpost.detection.contacts import detect
-from sonarpost.detection.snippet import cut_snippet
+from sonarpost.detection.detector import detect
+from sonarpost.detection.snippets import cut_snippet
 from sonarpost.errors import SurveyFileError
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
-from sonarpost.sonar.readers.registry import read_survey
+from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Survey
 
 HEIGHT_PX: Final = 49

@@ -28,9 +28,8 @@ from scipy.optimize import minimize
 
 from research.detection.truth import Scale, object_at
 from sonarpost.detection.candidates import Candidate, candidates
-from sonarpost.detection.clutter import clutter_levels
-from sonarpost.detection.fusion import FILTERS, FusionModel, fused_confidences, log_scores, suppress
-from sonarpost.detection.preprocess import LevelGrid, preprocess
+from sonarpost.detection.fusion import FILTERS, FusionModel, clutter_levels, fused_confidences, log_scores, suppress
+from sonarpost.detection.normalisation import LevelGrid, preprocess
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.files import write_atomically
 from sonarpost.simulation.seabed.survey import SimulatedSurvey, SurveySpec, TruthObject, simulate_survey

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from sonarpost.codec.interface import MIN_SIDE_PX
-from sonarpost.detection.contacts import Detection
-from sonarpost.detection.ground_snippet import ground_projected_image
-from sonarpost.detection.snippet import cut_expanded, cut_snippet
+from sonarpost.detection.detector import Detection
+from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image
 from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.seam import Origin
-from sonarpost.sonar.georeference import georeference
+from sonarpost.sonar.geometry import georeference
 from sonarpost.sonar.survey import Survey
 
 

@@ -25,7 +25,7 @@ from sonarpost.services.atd_stub.outgoing import Outgoing
 from sonarpost.services.atd_stub.seam_store import SeamStore
 from sonarpost.services.atd_stub.survey_walk import Finding
 from sonarpost.services.atd_stub.text_file import write_snippet
-from sonarpost.sonar.readers.registry import SUPPORTED_SUFFIXES
+from sonarpost.sonar.readers import SUPPORTED_SUFFIXES
 
 log = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from sonarpost.services.atd_stub.seam import Origin, Seam
 from sonarpost.services.atd_stub.survey_walk import Finding, SurveyWalk
 from sonarpost.services.atd_stub.text_file import read_contact
 from sonarpost.sonar.image_files import read_image
-from sonarpost.sonar.readers.registry import open_survey
+from sonarpost.sonar.readers import open_survey
 
 
 def from_survey(

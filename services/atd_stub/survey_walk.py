@@ -9,7 +9,7 @@ from itertools import chain
 from typing import Final
 
 from sonarpost import wire
-from sonarpost.detection.contacts import Detection, detect
+from sonarpost.detection.detector import Detection, detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig

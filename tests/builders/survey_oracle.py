@@ -12,9 +12,9 @@ import numpy as np
 
 from builders.surveys import MAKERS
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.georeference import georeference
+from sonarpost.sonar.geometry import georeference
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.readers.registry import open_survey
+from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 FILES = (

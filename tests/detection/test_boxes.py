@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sonarpost.detection.integral_image import IntegralImage, in_noise_units
+from sonarpost.detection.matched_filter import IntegralImage, in_noise_units
 
 values = st.one_of(st.floats(-100, 100, width=32), st.just(float("nan")))
 

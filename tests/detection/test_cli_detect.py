@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from sonarpost.cli import detect as command
-from sonarpost.detection.plot import annotated_waterfall
+from sonarpost.cli.detect import annotated_waterfall
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.messages import Contact
 from sonarpost.sonar.survey import Side

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from pyproj import Geod
 
-from sonarpost.detection.contacts import MINE_LIKE, detect
+from sonarpost.detection.detector import MINE_LIKE, detect
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.snippet import cut_snippet
+from sonarpost.detection.snippets import cut_snippet
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.bottom_track import track_bottom
 from sonarpost.sonar.geometry import Position, offset_between_m
-from sonarpost.sonar.readers.registry import read_survey
+from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Ping, Side, Survey
 
 

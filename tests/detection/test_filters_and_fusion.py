@@ -7,16 +7,29 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.detection.candidates import Candidate, FilterScores, candidates, geometry_score
-from sonarpost.detection.clutter import clutter_levels
-from sonarpost.detection.contacts import CLUTTER, MINE_LIKE, classify, height_from_shadow_m
-from sonarpost.detection.fusion import FILTERS, FusionModel, fused_confidences, log_scores, shipped_model, suppress
-from sonarpost.detection.highlight_shadow import matched_response, peaks
-from sonarpost.detection.measure import Measured, measure
-from sonarpost.detection.preprocess import preprocess
+from sonarpost.detection.candidates import (
+    Candidate,
+    FilterScores,
+    Measured,
+    TextureMap,
+    candidates,
+    geometry_score,
+    measure,
+)
+from sonarpost.detection.detector import CLUTTER, MINE_LIKE, classify, height_from_shadow_m
+from sonarpost.detection.fusion import (
+    FILTERS,
+    FusionModel,
+    clutter_levels,
+    fused_confidences,
+    log_scores,
+    shipped_model,
+    suppress,
+)
+from sonarpost.detection.matched_filter import matched_response, peaks
+from sonarpost.detection.normalisation import preprocess
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.structures import structures
-from sonarpost.detection.texture import TextureMap
 from sonarpost.sonar.survey import Side
 
 SETTINGS = DetectorSettings()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sonarpost.detection.contacts import detect
+from sonarpost.detection.detector import detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.stream import StreamDetector, follows
 from sonarpost.sonar.survey import ChannelPing, Side

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from sonarpost.detection.association import UNKNOWN_ALONG_M, AssociationRule, DetectionPosition
-from sonarpost.detection.contacts import detect
+from sonarpost.detection.detector import detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import Side
 

@@ -3,10 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonarpost.detection.contacts import detect
-from sonarpost.detection.ground_snippet import cut_ground_snippet
-from sonarpost.detection.image_confidence import image_confidence
-from sonarpost.detection.image_detector import LevelImage, level_image
+from sonarpost.detection.detector import detect
+from sonarpost.detection.image_detector import LevelImage, image_confidence, level_image
+from sonarpost.detection.snippets import cut_ground_snippet
 from sonarpost.sonar.survey import Side
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.detection.preprocess import preprocess
+from sonarpost.detection.normalisation import preprocess
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.detection.contacts import detect
-from sonarpost.detection.snippet import cut_expanded, cut_snippet, to_grey
+from sonarpost.detection.detector import detect
+from sonarpost.detection.snippets import cut_expanded, cut_snippet, to_grey
 from sonarpost.sonar.survey import ChannelPing, Side
 
 

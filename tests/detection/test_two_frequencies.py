@@ -9,12 +9,11 @@ import pytest
 from builders.two_frequencies import read_both, with_second_frequency
 
 from research.detection.codec_effect import confidence_with
-from sonarpost.detection.contacts import detect
-from sonarpost.detection.ground_snippet import cut_ground_snippet, ground_projected_image
-from sonarpost.detection.plot import annotated_waterfall
-from sonarpost.detection.preprocess import preprocess
+from sonarpost.cli.detect import annotated_waterfall
+from sonarpost.detection.detector import detect
+from sonarpost.detection.normalisation import preprocess
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.snippet import cut_expanded, cut_snippet
+from sonarpost.detection.snippets import cut_expanded, cut_ground_snippet, cut_snippet, ground_projected_image
 from sonarpost.detection.stream import StreamDetector, follows
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind

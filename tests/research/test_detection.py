@@ -15,7 +15,7 @@ from research.detection.simulated import JudgedContact, JudgedFile, operating, p
 from research.detection.tiles import TileScore, tile_auc, tile_scores
 from research.detection.truth import Scale, object_at
 from sonarpost.codec.registry import default_registry
-from sonarpost.detection.contacts import detect
+from sonarpost.detection.detector import detect
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.simulation.seabed.survey import TruthObject
 from sonarpost.simulation.seabed.targets import ObjectKind

@@ -10,7 +10,7 @@ import pytest
 from builders.common import eventually
 
 from sonarpost import keys
-from sonarpost.detection.contacts import detect
+from sonarpost.detection.detector import detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub import service as atd_stub

@@ -13,8 +13,8 @@ from builders.record_samples import BARE_CONTACT, FULL_CONTACT
 
 from sonarpost import keys
 from sonarpost.config import load
-from sonarpost.detection.contacts import FilterScores, detect
-from sonarpost.detection.ground_snippet import ground_projected_image
+from sonarpost.detection.detector import FilterScores, detect
+from sonarpost.detection.snippets import ground_projected_image
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
@@ -28,7 +28,7 @@ from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.image_files import read_image, write_tiff
 from sonarpost.sonar.options import ErrorBudget, Mounting
-from sonarpost.sonar.readers.registry import open_survey
+from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import gather
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf

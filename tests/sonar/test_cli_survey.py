@@ -13,8 +13,7 @@ from builders.surveys import MAKERS, make_xtf
 from PIL import Image
 
 from sonarpost.cli.main import main
-from sonarpost.cli.survey.track_picture import thinned_track
-from sonarpost.cli.survey.waterfall_picture import SIDE_PX, evened, nice_step, reduce_survey
+from sonarpost.cli.survey.plot import SIDE_PX, evened, nice_step, reduce_survey, thinned_track
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.options import SurveyOptions

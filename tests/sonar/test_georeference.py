@@ -10,10 +10,9 @@ import pytest
 import pyxtf
 from pyproj import Geod
 
-from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
-from sonarpost.sonar.georeference import georeference
+from sonarpost.sonar.geometry import Position, georeference, offset_between_m, offset_position
 from sonarpost.sonar.options import ErrorBudget, Mounting, SurveyOptions
-from sonarpost.sonar.readers.registry import read_survey
+from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 
 NO_ERRORS = dict.fromkeys(ErrorBudget.model_fields, 0.0)

@@ -13,7 +13,7 @@ from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.bottom_track import altitudes_m
 from sonarpost.sonar.geometry import along_track_m
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.readers.registry import read_survey
+from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Side
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
 from sonarpost.sonar.options import Mounting, SurveyOptions
-from sonarpost.sonar.readers.registry import open_survey, read_survey
+from sonarpost.sonar.readers import open_survey, read_survey
 from sonarpost.sonar.survey import Side, Survey
 
 STORED = {

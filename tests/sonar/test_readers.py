@@ -10,9 +10,9 @@ import pytest
 from builders.surveys import make_xtf
 
 from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.sonar import readers
 from sonarpost.sonar.options import SurveyOptions, load_options
-from sonarpost.sonar.readers import registry as readers
-from sonarpost.sonar.readers.registry import open_survey, read_survey, supported_suffixes
+from sonarpost.sonar.readers import open_survey, read_survey, supported_suffixes
 from sonarpost.sonar.source import InMemorySource, blocks, gather
 
 

@@ -7,7 +7,7 @@ import pytest
 from builders.surveys import make_waterfall
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.readers.registry import open_survey, read_survey
+from sonarpost.sonar.readers import open_survey, read_survey
 from sonarpost.sonar.survey import Side
 
 

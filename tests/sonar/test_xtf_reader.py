@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.readers.registry import SUPPORTED_SUFFIXES, read_survey, register_reader, supported_suffixes
+from sonarpost.sonar.readers import SUPPORTED_SUFFIXES, read_survey, register_reader, supported_suffixes
 from sonarpost.sonar.readers.xtf import MAX_FILE_BYTES, read_xtf
 from sonarpost.sonar.survey import Side
 from sonarpost.sonar.xtf_writer import write_xtf

@@ -1,26 +1,37 @@
-"""`sonarpost detect FILE…`: the contacts of survey files, as a table, as JSON, or drawn into the waterfall."""
+"""`sonarpost detect FILE…`: the contacts of survey files, as a table, as JSON, or drawn into the waterfall.
+
+## sonarpost.cli.detect
+A contact of `sonarpost detect` as JSON: the fields of the contact record, and where it lies in the picture.
+
+## sonarpost.cli.detect
+A waterfall with its contacts drawn in, for people.
+"""
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import io
 import json
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 
-from PIL import Image
+import numpy as np
+from PIL import Image, ImageDraw
 
-from sonarpost.cli.detect_record import FoundIn, contact_json
-from sonarpost.detection.ground_snippet import cut_ground_snippet
-from sonarpost.detection.plot import annotated_waterfall
+from sonarpost.detection.detector import MINE_LIKE, Detection
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.snippet import cut_snippet
+from sonarpost.detection.snippets import cut_ground_snippet, cut_snippet, to_grey
 from sonarpost.detection.stream import StreamContact, StreamDetector
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
 from sonarpost.sonar.options import SurveyOptions, load_options
-from sonarpost.sonar.readers.registry import read_survey
+from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.survey import Side, Survey
 
 _HEADER = (
     "  n  conf  class      side       ping  sample  range_m  length_m  width_m  shadow_m  height_m  position"
@@ -162,3 +173,104 @@ def _write_png(path: Path, picture: Image.Image) -> None:
     buffer = io.BytesIO()
     picture.save(buffer, format="PNG")
     write_atomically(path, buffer.getvalue())
+
+
+@dataclass
+class FoundIn:
+    """A file, what was found in it, and the time that detecting took."""
+
+    survey: Survey
+    contacts: list[StreamContact]
+    seconds: float = 0.0
+
+
+def contact_json(survey: Survey, contact: StreamContact, vehicle_id: str) -> dict[str, object]:
+    """Return one contact as JSON types.
+
+    Args:
+        survey: The file that holds the contact's ping.
+        contact: The contact.
+        vehicle_id: Of the record.
+    """
+    d = contact.detection
+    line_name = survey.line_name.encode("utf-8", "backslashreplace").decode()
+    return {
+        "contact_id": f"{line_name[:60]}-{_content_hash(survey.path)[:8]}-{d.ping_number}-{d.side.value}-{d.sample}",
+        "vehicle_id": vehicle_id,
+        "sonar_id": survey.sonar_id,
+        "line_name": line_name,
+        "ping_number": d.ping_number,
+        "channel": d.side.value,
+        "ping": contact.ping,
+        "sample": d.sample,
+        "time_utc": datetime.fromtimestamp(d.time_utc_s, UTC).isoformat(timespec="milliseconds"),
+        "lat_deg": None if d.position is None else d.position.lat_deg,
+        "lon_deg": None if d.position is None else d.position.lon_deg,
+        "position_sigma_m": d.position_sigma_m,
+        "depth_m": d.depth_m,
+        "altitude_m": d.altitude_m,
+        "heading_deg": d.heading_deg,
+        "speed_mps": d.speed_mps,
+        "slant_range_m": d.slant_range_m,
+        "ground_range_m": d.ground_range_m,
+        "atd_class": d.atd_class,
+        "atd_confidence": d.confidence,
+        "length_m": d.length_m,
+        "width_m": d.width_m,
+        "shadow_m": d.shadow_m,
+        "shadow_is_cut": d.shadow_is_cut,
+        "height_m": d.height_m,
+        "pixel_along_m": d.pixel_along_m,
+        "pixel_across_m": d.pixel_across_m,
+        "scores": {
+            "matched": d.scores.matched,
+            "cfar": d.scores.cfar,
+            "shadow": d.scores.shadow,
+            "texture": d.scores.texture,
+            "geometry": d.scores.geometry,
+        },
+    }
+
+
+@cache
+def _content_hash(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+_COLOURS = {MINE_LIKE: (255, 80, 60)}
+_OTHER_COLOUR = (255, 210, 60)
+_MARGIN_PX = 6
+
+
+def annotated_waterfall(survey: Survey, detections: Sequence[Detection]) -> Image.Image:
+    """Draw a survey as an operator sees it: port to the left, the vehicle's track in the middle, first ping on top.
+
+    Each contact is framed from its highlight to its shadow's end, red when mine-like, yellow otherwise, with its place
+    in `detections` (from 1) and its confidence.
+
+    Returns:
+        RGB picture, one row a ping, one column a sample; 1 x 1 for a survey without samples.
+    """
+    halves = {side: _grey(survey, side) for side in survey.sides()}
+    if not halves or not survey.pings:
+        return Image.new("RGB", (1, 1))
+    track = halves[Side.PORT].shape[1] if Side.PORT in halves else 0
+    pieces = [image[:, ::-1] if side is Side.PORT else image for side, image in halves.items()]
+    picture = Image.fromarray(np.hstack(pieces)).convert("RGB")
+    draw = ImageDraw.Draw(picture)
+    for number, detection in enumerate(detections, start=1):
+        near = detection.highlight_samples[0] - _MARGIN_PX
+        far = detection.highlight_samples[1] + detection.shadow_samples + _MARGIN_PX
+        left, right = (track - far, track - near) if detection.side is Side.PORT else (track + near, track + far)
+        top, bottom = detection.highlight_pings[0] - _MARGIN_PX, detection.highlight_pings[1] + _MARGIN_PX
+        colour = _COLOURS.get(detection.atd_class, _OTHER_COLOUR)
+        draw.rectangle((left, top, right, bottom), outline=colour)
+        draw.text((left, bottom + 1), f"{number}: {detection.confidence:.2f}", fill=colour)
+    return picture
+
+
+def _grey(survey: Survey, side: Side) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    image = survey.waterfall(side)
+    known = np.isfinite(image)
+    return to_grey(np.where(known, image, 0.0).astype(np.uint32), known)

@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
-from sonarpost.detection.contacts import Detection
+from sonarpost.detection.detector import Detection
 from sonarpost.sonar.survey import Side
 
 UNKNOWN_ALONG_M: Final = 0.2

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from sonarpost.detection.association import AssociationRule, DetectionPosition
-from sonarpost.detection.contacts import Detection, detect
+from sonarpost.detection.detector import Detection, detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.geometry import ping_spacing_m
 from sonarpost.sonar.options import SurveyOptions

@@ -17,9 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from sonarpost.detection.candidates import Candidate, FilterScores
-from sonarpost.detection.measure import Measured
-from sonarpost.detection.preprocess import LevelGrid
+from sonarpost.detection.candidates import Candidate, FilterScores, Measured
+from sonarpost.detection.normalisation import LevelGrid
 
 _SMOOTH_M: Final = 0.4
 _DARK_LEVEL: Final = -1.3

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.navigation_check import NavigationStatistics, PositionJumpFilter, mounted
+from sonarpost.sonar.navigation import NavigationStatistics, PositionJumpFilter, mounted
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.survey import Ping, Side, Survey
 

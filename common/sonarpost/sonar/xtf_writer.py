@@ -14,7 +14,7 @@ from pyxtf import XTFFileHeader, XTFPingChanHeader, XTFPingHeader
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.files import write_atomically
-from sonarpost.sonar.readers.xtf_navigation import KNOT_MPS, NAV_UNITS_DEGREES
+from sonarpost.sonar.readers.xtf import KNOT_MPS, NAV_UNITS_DEGREES
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)

@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from sonarpost.detection.snippet import to_grey
+from sonarpost.detection.snippets import to_grey
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
-from sonarpost.sonar.readers.registry import read_survey
+from sonarpost.sonar.readers import read_survey
 
 Floats = npt.NDArray[np.float64]
 SEED = 20240611

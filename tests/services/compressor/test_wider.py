@@ -9,7 +9,7 @@ from builders.common import eventually
 from builders.records import command_record
 
 from sonarpost import keys
-from sonarpost.detection.contacts import detect
+from sonarpost.detection.detector import detect
 from sonarpost.link.downlink import messages as dl
 from sonarpost.messages import Contact, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig

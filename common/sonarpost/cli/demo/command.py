@@ -21,7 +21,7 @@ from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
-from sonarpost.sonar.readers.registry import SUPPORTED_SUFFIXES
+from sonarpost.sonar.readers import SUPPORTED_SUFFIXES
 from sonarpost.sonar.xtf_writer import write_xtf
 
 MARKER = ".sonarpost-demo"

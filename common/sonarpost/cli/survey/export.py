@@ -15,7 +15,7 @@ from typing import TextIO
 
 from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
 from sonarpost.files import sync_folder
-from sonarpost.sonar.readers.registry import open_survey
+from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import SurveySource
 from sonarpost.sonar.survey import Ping
 

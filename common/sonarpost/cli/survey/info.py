@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
 from sonarpost.sonar.geometry import Position, offset_between_m
-from sonarpost.sonar.readers.registry import open_survey
+from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import SurveySource
 from sonarpost.sonar.survey import Ping, Side
 

@@ -1,19 +1,34 @@
-"""`sonarpost survey plot FILE…`: the waterfall with a range scale and the track, as PNG."""
+"""`sonarpost survey plot FILE…`: the waterfall with a range scale and the track, as PNG.
+
+## sonarpost.cli.survey.plot
+A recording's track on the tangent plane, with a scale, north up.
+
+## sonarpost.cli.survey.plot
+A recording as an operator's waterfall with scales, however long it is: rows of pings are averaged to fit.
+"""
 
 from __future__ import annotations
 
 import argparse
 import io
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from PIL import Image
+import numpy as np
+import numpy.typing as npt
+from PIL import Image, ImageDraw
 
-from sonarpost.cli.survey.common import add_option_flags, options_of
-from sonarpost.cli.survey.track_picture import draw_track, thinned_track
-from sonarpost.cli.survey.waterfall_picture import MAX_ROWS, draw_waterfall, evened, reduce_survey
+from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
-from sonarpost.sonar.readers.registry import open_survey
+from sonarpost.sonar.bottom_track import altitudes_m
+from sonarpost.sonar.geometry import Position, offset_between_m
+from sonarpost.sonar.ground_range import beam_normalised, ground_range_image
+from sonarpost.sonar.readers import open_survey
+from sonarpost.sonar.source import SurveySource, blocks
+from sonarpost.sonar.survey import Ping, Side, Survey
 
 _MOST_ROWS = 20_000
 
@@ -71,3 +86,225 @@ def _png(picture: Image.Image) -> bytes:
     buffer = io.BytesIO()
     picture.save(buffer, format="PNG")
     return buffer.getvalue()
+
+
+_SIDE_PX, _MARGIN_PX = 800, 60
+_MAX_FIXES = 4096
+_INK, _PAPER, _LINE, _START, _END = (20, 20, 20), (245, 245, 245), (20, 70, 160), (0, 140, 60), (200, 30, 30)
+
+
+def thinned_track(pings: Iterable[Ping]) -> list[Position]:
+    """Return at most 4096 fixes, evenly spread over the recording; the last is always among them."""
+    kept: list[Position] = []
+    every, number = 1, 0
+    last: Position | None = None
+    for ping in pings:
+        if ping.lat_deg is None or ping.lon_deg is None:
+            continue
+        last = Position(ping.lat_deg, ping.lon_deg)
+        if number % every == 0:
+            kept.append(last)
+            if len(kept) >= _MAX_FIXES - 1:
+                kept, every = kept[::2], every * 2
+        number += 1
+    if last is not None and kept[-1] != last:
+        kept.append(last)
+    return kept
+
+
+def draw_track(track: list[Position], title: str) -> Image.Image:
+    """Draw a track: start green, end red, a scale bar, and the position of the start in words.
+
+    Returns:
+        RGB picture; one that says so for a recording without positions.
+    """
+    picture = Image.new("RGB", (_SIDE_PX, _SIDE_PX), _PAPER)
+    draw = ImageDraw.Draw(picture)
+    draw.text((6, 4), title, fill=_INK)
+    if not track:
+        draw.text((_SIDE_PX // 2, _SIDE_PX // 2), "no positions", fill=_INK, anchor="mm")
+        return picture
+    points_m = [offset_between_m(track[0], place) for place in track]
+    norths, easts = zip(*points_m, strict=True)
+    extent_m = max(max(norths) - min(norths), max(easts) - min(easts), 1.0)
+    metre_px = (_SIDE_PX - 2 * _MARGIN_PX) / extent_m
+    middle_n, middle_e = (max(norths) + min(norths)) / 2, (max(easts) + min(easts)) / 2
+    pixels = [
+        (_SIDE_PX / 2 + (east - middle_e) * metre_px, _SIDE_PX / 2 - (north - middle_n) * metre_px)
+        for north, east in points_m
+    ]
+    if len(pixels) > 1:
+        draw.line(pixels, fill=_LINE, width=2)
+    for (x, y), colour, name in ((pixels[0], _START, "start"), (pixels[-1], _END, "end")):
+        draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=colour)
+        draw.text((x + 8, y - 5), name, fill=colour)
+    step_m = nice_step(extent_m / 3)
+    left, y = _MARGIN_PX, _SIDE_PX - 28
+    draw.line((left, y, left + step_m * metre_px, y), fill=_INK, width=3)
+    draw.text((left, y + 6), f"{step_m:g} m", fill=_INK)
+    draw.text((_SIDE_PX - 20, 30), "N", fill=_INK, anchor="mm")
+    draw.line((_SIDE_PX - 20, 40, _SIDE_PX - 20, 70), fill=_INK, width=2)
+    start = track[0]
+    place = (
+        f"start {abs(start.lat_deg):.6f} {'NS'[start.lat_deg < 0]} {abs(start.lon_deg):.6f} {'EW'[start.lon_deg < 0]}"
+    )
+    draw.text((_SIDE_PX - 8, y + 6), f"{place}; {math.hypot(*points_m[-1]):.0f} m to the end", fill=_INK, anchor="ra")
+    return picture
+
+
+FloatArray = npt.NDArray[np.float64]
+
+SIDE_PX = 500
+"""Width of a side."""
+MAX_ROWS = 1500
+_LEFT_PX, _BOTTOM_PX, _TOP_PX, _RIGHT_PX = 150, 34, 22, 30
+_BLOCK_PINGS, _OVERLAP_PINGS = 1000, 50
+_INK, _PAPER, _BOTTOM_COLOUR = (20, 20, 20), (245, 245, 245), (255, 190, 0)
+
+
+@dataclass
+class Reduced:
+    """A recording averaged to a picture's size.
+
+    Attributes:
+        echo: Mean echo, shape (rows, 2 * SIDE_PX), port mirrored to the left; NaN where nothing was recorded.
+        altitude_m: Mean altitude of each row; NaN where neither file nor picture tells.
+        times_utc_s: Time of each row's first ping.
+        numbers: Number of each row's first ping.
+        reach_m: Range of the outer edges.
+    """
+
+    echo: FloatArray
+    altitude_m: FloatArray
+    times_utc_s: list[float]
+    numbers: list[int]
+    reach_m: float
+
+
+def reduce_survey(source: SurveySource, *, over_ground: bool, max_rows: int = MAX_ROWS) -> Reduced:
+    """Walk through a recording and average it into at most `max_rows` rows.
+
+    Args:
+        source: The recording.
+        over_ground: Columns are ground range, without the water column, in place of slant range.
+        max_rows: Rows of the picture, at least 1.
+
+    Raises:
+        SurveyFileError: The file can no longer be read.
+    """
+    reach_m = max(reach_m for ping in source.pings() if (reach_m := ping.reach_m()) is not None)
+    per_row = math.ceil(source.info.ping_count / max_rows)
+    rows = math.ceil(source.info.ping_count / per_row)
+    total, count = np.zeros((rows, 2 * SIDE_PX)), np.zeros((rows, 2 * SIDE_PX))
+    heights, known = np.zeros(rows), np.zeros(rows)
+    times: list[float] = []
+    numbers: list[int] = []
+    first = 0
+    for survey, altitude_m in _parts(source):
+        place = (first + np.arange(len(survey.pings))) // per_row
+        image = _both_sides(survey, altitude_m if over_ground else np.zeros_like(altitude_m), reach_m)
+        valid = np.isfinite(image)
+        np.add.at(total, place, np.where(valid, image, 0))
+        np.add.at(count, place, valid)
+        np.add.at(heights, place, np.nan_to_num(altitude_m))
+        np.add.at(known, place, np.isfinite(altitude_m))
+        for row, ping in zip(place.tolist(), survey.pings, strict=True):
+            if row == len(times):
+                times.append(ping.time_utc_s)
+                numbers.append(ping.number)
+        first += len(survey.pings)
+    echo = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return Reduced(echo, np.where(known > 0, heights / np.maximum(known, 1), np.nan), times, numbers, reach_m)
+
+
+def _parts(source: SurveySource) -> Iterator[tuple[Survey, FloatArray]]:
+    """Yield pieces of the recording with their altitudes, tracked with pings of the neighbours in sight."""
+    for lead, survey in blocks(source, _BLOCK_PINGS, _OVERLAP_PINGS):
+        end = min(lead + _BLOCK_PINGS, len(survey.pings))
+        altitude_m = altitudes_m(survey)[lead:end]
+        part = Survey(survey.path, survey.sonar_id, survey.line_name, survey.pings[lead:end])
+        yield part, altitude_m
+
+
+def _both_sides(survey: Survey, altitude_m: FloatArray, reach_m: float) -> FloatArray:
+    """Return both sides in SIDE_PX columns each; an altitude of 0 leaves slant range as it is."""
+    image = np.full((len(survey.pings), 2 * SIDE_PX), np.nan)
+    for side in survey.sides():
+        half = ground_range_image(survey, side, altitude_m, reach_m / SIDE_PX)[:, :SIDE_PX]
+        if side is Side.PORT:
+            image[:, SIDE_PX - half.shape[1] : SIDE_PX] = half[:, ::-1]
+        else:
+            image[:, SIDE_PX : SIDE_PX + half.shape[1]] = half
+    return image
+
+
+def evened(reduced: Reduced) -> Reduced:
+    """Return a recording over ground range with beam pattern and grazing angle evened out, each side by itself."""
+    spacing_m = reduced.reach_m / SIDE_PX
+    port = reduced.echo[:, :SIDE_PX][:, ::-1].astype(np.float32)
+    starboard = reduced.echo[:, SIDE_PX:].astype(np.float32)
+    halves = [beam_normalised(half, reduced.altitude_m, spacing_m) for half in (port, starboard)]
+    return replace(reduced, echo=np.hstack([halves[0][:, ::-1], halves[1]]).astype(np.float64))
+
+
+def draw_waterfall(reduced: Reduced, title: str, *, over_ground: bool) -> Image.Image:
+    """Draw a waterfall: first ping on top, port to the left, ranges below, times and pings at the left.
+
+    Returns:
+        RGB picture. In slant range the bottom's first return is drawn in yellow where the altitude is known.
+    """
+    rows = reduced.echo.shape[0]
+    picture = Image.new("RGB", (_LEFT_PX + 2 * SIDE_PX + _RIGHT_PX, _TOP_PX + rows + _BOTTOM_PX), _PAPER)
+    picture.paste(Image.fromarray(_grey(reduced.echo)), (_LEFT_PX, _TOP_PX))
+    draw = ImageDraw.Draw(picture)
+    what = "ground range, m" if over_ground else "slant range, m"
+    draw.text((6, 4), f"{title}   {what}", fill=_INK)
+    if not over_ground:
+        _draw_bottom(draw, reduced)
+    _draw_ranges(draw, reduced.reach_m, _TOP_PX + rows)
+    step = max(rows // 12, 24)
+    for row in range(0, rows, step):
+        y = _TOP_PX + row
+        draw.line((_LEFT_PX - 6, y, _LEFT_PX, y), fill=_INK)
+        clock = utc_text(reduced.times_utc_s[row])[11:21]
+        draw.text((6, y - 5), f"{clock}  {reduced.numbers[row]}", fill=_INK)
+    return picture
+
+
+def _grey(echo: FloatArray) -> npt.NDArray[np.uint8]:
+    """Return the echo's logarithm stretched between its percentiles; what was not recorded is dark blue's grey, 30."""
+    known = np.isfinite(echo)
+    if not known.any():
+        return np.full(echo.shape, 30, dtype=np.uint8)
+    positive = echo[known & (echo > 0)]
+    unit = float(np.median(positive)) if positive.size else 1.0
+    value = np.log1p(np.where(known, echo, 0) / unit * 4)
+    low, high = np.percentile(value[known], (1, 99.5))
+    grey = np.clip((value - low) / max(float(high - low), 1e-9), 0, 1) * 255
+    return np.where(known, grey, 30).astype(np.uint8)
+
+
+def _draw_bottom(draw: ImageDraw.ImageDraw, reduced: Reduced) -> None:
+    middle = _LEFT_PX + SIDE_PX
+    for row, altitude_m in enumerate(reduced.altitude_m.tolist()):
+        if math.isfinite(altitude_m) and altitude_m < reduced.reach_m:
+            x = round(altitude_m / reduced.reach_m * SIDE_PX)
+            draw.point([(middle - 1 - x, _TOP_PX + row), (middle + x, _TOP_PX + row)], fill=_BOTTOM_COLOUR)
+
+
+def _draw_ranges(draw: ImageDraw.ImageDraw, reach_m: float, y: int) -> None:
+    step_m = nice_step(reach_m / 5)
+    for number in range(int(reach_m / step_m) + 1):
+        x_m = number * step_m
+        for sign in (-1, 1) if number else (1,):
+            x = _LEFT_PX + SIDE_PX + sign * round(x_m / reach_m * SIDE_PX)
+            draw.line((x, y, x, y + 6), fill=_INK)
+            draw.text((x, y + 8), f"{x_m:g}", fill=_INK, anchor="mt")
+    for text, x in (("port", _LEFT_PX + SIDE_PX // 2), ("starboard", _LEFT_PX + SIDE_PX * 3 // 2)):
+        draw.text((x, y + 22), text, fill=_INK, anchor="mt")
+
+
+def nice_step(about: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not above `about` (which is above 0)."""
+    power = 10.0 ** math.floor(math.log10(about))
+    return max(factor * power for factor in (1, 2, 5) if factor * power <= about * (1 + 1e-9))

@@ -30,7 +30,7 @@ import numpy as np
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position
-from sonarpost.sonar.navigation_check import NavigationRows
+from sonarpost.sonar.navigation import NavigationRows
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers.open_file import CheckedFile, SequentialReader
 from sonarpost.sonar.source import StreamedSource

@@ -30,9 +30,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position
 from sonarpost.sonar.image_files import GreyImage, read_image
-from sonarpost.sonar.navigation_check import NavigationRows
+from sonarpost.sonar.navigation import NavigationRows, Projection
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.projection import Projection
 from sonarpost.sonar.readers.open_file import CheckedFile
 from sonarpost.sonar.source import StreamedSource
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Ping, Side

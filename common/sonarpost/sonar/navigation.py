@@ -1,11 +1,20 @@
-"""Checks on navigation that hold for every format: jumps, time that goes back, the sonar's place on its carrier."""
+"""Checks on navigation that hold for every format: jumps, time that goes back, the sonar's place on its carrier.
+
+## sonarpost.sonar.navigation
+Positions in projected metres, turned into WGS-84 degrees.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Final
 
+from pyproj import Transformer
+from pyproj.exceptions import ProjError
+
+from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
 from sonarpost.sonar.options import Mounting
 from sonarpost.sonar.survey import Ping
@@ -123,3 +132,41 @@ class NavigationStatistics:
             (self._unmounted, "position left out, no heading to apply the mounting with, in"),
         )
         return [f"{text} {rows.of(total)}" for rows, text in texts if rows.count]
+
+
+_WGS84 = "EPSG:4326"
+
+
+class Projection:
+    """A projected coordinate system, from metres to degrees.
+
+    Args:
+        crs: As pyproj takes it: `EPSG:32619`, a PROJ string, WKT.
+        path: The file whose positions are in it, for messages.
+
+    Raises:
+        SurveyFileError: Not a coordinate system, or not a projected one.
+    """
+
+    def __init__(self, crs: str, path: Path) -> None:
+        try:
+            self._transformer = Transformer.from_crs(crs, _WGS84, always_xy=True)
+            source = self._transformer.source_crs
+        except ProjError as error:
+            raise SurveyFileError(str(path), "projected_crs", crs, "a coordinate system pyproj knows") from error
+        if source is None or not source.is_projected:
+            raise SurveyFileError(str(path), "projected_crs", crs, "a projected coordinate system")
+        if any(axis.unit_conversion_factor != 1 for axis in source.axis_info):
+            raise SurveyFileError(str(path), "projected_crs", crs, "a coordinate system in metres")
+
+    def position(self, easting_m: float, northing_m: float) -> Position | None:
+        """Return the position, or None where there is none (not finite, 0/0, outside the projection)."""
+        if not (math.isfinite(easting_m) and math.isfinite(northing_m)) or (easting_m, northing_m) == (0.0, 0.0):
+            return None
+        try:
+            lon_deg, lat_deg = self._transformer.transform(easting_m, northing_m, errcheck=True)
+        except ProjError:
+            return None  # outside the projection: no position, counted by the reader as one without a fix
+        if not (math.isfinite(lon_deg) and math.isfinite(lat_deg) and abs(lat_deg) <= 90):
+            return None
+        return Position(float(lat_deg), (float(lon_deg) + 180) % 360 - 180)

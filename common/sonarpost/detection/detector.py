@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 from sonarpost.detection.candidates import Candidate, FilterScores, candidates
 from sonarpost.detection.fusion import fused_confidences, suppress
-from sonarpost.detection.preprocess import FloatVector, LevelGrid, preprocess
+from sonarpost.detection.normalisation import FloatVector, LevelGrid, preprocess
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.structures import is_within, structures
 from sonarpost.sonar.bottom_track import altitudes_m
-from sonarpost.sonar.geometry import Position, sample_slant_range_m, slant_to_ground_range_m
-from sonarpost.sonar.georeference import georeference
+from sonarpost.sonar.geometry import Position, georeference, sample_slant_range_m, slant_to_ground_range_m
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.survey import Side, Survey
 
