@@ -6,7 +6,7 @@ Three sets of real images are cut into pieces of 140 x 80 px that do not overlap
 a survey line of a river bed of 2009, and synthetic-aperture tiles. Both sides of a line are cut at the same pings and
 in their order, so what is held out, the last quarter, is the end of the line on either side. Each is adapted to from
 both codebooks; a row of the table in `docs/specifications/codebook-file.md` is printed for each. Times are processor
-time, which other users of the machine do not lengthen.
+time, which does not depend on the load of the machine.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--max-contacts", type=int, metavar="N", help="list no more than the N most confident of a file"
     )
     parser.add_argument(
-        "--options", type=Path, metavar="FILE.toml", help="what the files do not say (docs/explanation/surveys.md)"
+        "--options", type=Path, metavar="FILE.toml", help="what the files do not say (see the page Surveys)"
     )
     parser.add_argument("--vehicle", default="uuv", metavar="ID", help="vehicle_id of the records (default: uuv)")
     parser.set_defaults(run=run)

@@ -2,7 +2,7 @@
 
 A reader is a function from a path and options to an open `SurveySource`; it raises `SurveyFileError` and nothing else
 for a bad file. Packages of others add formats by entry points of the group `sonarpost.survey_readers`: the name is
-the suffix without its dot, the object the reader (docs/surveys.md shows one whole).
+the suffix without its dot, the object the reader (docs/explanation/surveys.md has an example).
 """
 
 from __future__ import annotations
