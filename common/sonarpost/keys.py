@@ -1,7 +1,8 @@
-"""Every Zenoh key expression of sonarpost. No other module spells one.
+"""All Zenoh key expressions of sonarpost.
 
-Grammar: `sonarpost/v1/{platform}/…`. One prefix a platform, so that access control is a rule on a prefix; identifiers
-of contacts and images stay in the payloads.
+Grammar: `sonarpost/v1/{platform}/…`. Each platform has one prefix, so that access control is a rule on a prefix.
+Identifiers of contacts and images are in the payloads. The paragraph `Record: … From: … To: … Delivery: …` of a
+docstring is a row of the generated table of keys.
 """
 
 from __future__ import annotations
@@ -28,62 +29,98 @@ def _of(platform: str, rest: str) -> str:
 
 
 def contact_detected(vehicle: str) -> str:
-    """Contact and snippet, atd_stub to compressor (the paper's imgToCompress)."""
+    """A contact and its snippet (the paper's imgToCompress).
+
+    Record: snippet. From: atd_stub. To: compressor. Delivery: durable, priority 4.
+    """
     return _of(vehicle, "contact/detected")
 
 
 def image_encoded(vehicle: str) -> str:
-    """Encoded image, compressor to uuv_modem (imgToDecompress, UUV side)."""
+    """An encoded image (the paper's imgToDecompress on the vehicle).
+
+    Record: encoded_image. From: compressor. To: uuv_modem. Delivery: durable, priority 4.
+    """
     return _of(vehicle, "image/encoded")
 
 
 def acoustic_tx(platform: str) -> str:
-    """Frames that left through this platform's modem."""
+    """A frame that this platform's modem transmitted.
+
+    Record: acoustic_frame. From: uuv_modem. To: watchers. Delivery: plain, priority 5.
+    """
     return _of(platform, "acoustic/tx")
 
 
 def acoustic_rx(platform: str) -> str:
-    """Frames that this platform's modem received, op_modem to decompressor."""
+    """A frame that this platform's modem received.
+
+    Record: acoustic_frame. From: op_modem. To: decompressor. Delivery: durable, priority 4.
+    """
     return _of(platform, "acoustic/rx")
 
 
 def acoustic_queue(platform: str) -> str:
-    """What waits to be sent through this platform's modem, and until when."""
+    """The state of the vehicle's acoustic transmit queue.
+
+    Record: queue_state. From: uuv_modem. To: watchers. Delivery: plain, priority 5.
+    """
     return _of(platform, "acoustic/queue")
 
 
 def acoustic_queue_everywhere() -> str:
-    """What waits at every modem that is reached."""
+    """The transmit queues of all vehicles."""
     return f"{ROOT}/*/acoustic/queue"
 
 
 def acoustic_downlink(vessel: str) -> str:
-    """How far commands and decisions have come on their way to the vehicles."""
+    """The progress of a command or decision on its way to a vehicle.
+
+    Record: downlink_state. From: op_modem. To: watchers. Delivery: plain, priority 5.
+    """
     return _of(vessel, "acoustic/downlink")
 
 
 def message_received(vessel: str) -> str:
-    """Messages of vehicles that came by sound, op_modem to the vessel's programs."""
+    """A message that a vehicle sent over the acoustic link.
+
+    Record: received_message. From: op_modem. To: the configured consumers of messages. Delivery: durable, priority 4.
+    """
     return _of(vessel, "message/received")
 
 
 def message_outgoing(vehicle: str) -> str:
-    """Other traffic for the acoustic queue, any program to uuv_modem."""
+    """Other data for the acoustic link.
+
+    Record: outgoing_message. From: any program of the vehicle. To: uuv_modem. Delivery: durable, priority 4.
+    """
     return _of(vehicle, "message/outgoing")
 
 
 def image_reconstructed(vessel: str) -> str:
-    """Rebuilt picture, decompressor to relay and console (imgToDecompress, operator side)."""
+    """A decoded image (the paper's imgToDecompress on the operator's side).
+
+    Record: reconstructed_image. From: decompressor. To: relay, console. Delivery: durable, priority 5.
+    """
     return _of(vessel, "image/reconstructed")
 
 
 def contact_decision(vessel: str) -> str:
-    """An operator's decision, to relay and op_modem."""
+    """An operator's decision.
+
+    Record: decision. From: console, another operator's program. To: relay, op_modem. Delivery: durable, priority 4.
+    """
     return _of(vessel, "contact/decision")
 
 
 def command(platform: str, kind: str) -> str:
-    """A command: asked on the vessel, carried by sound, published on the vehicle."""
+    """A command for a vehicle.
+
+    On the vessel it goes from the shore site to op_modem, on the vehicle from uuv_modem to the services.
+
+    Record: command. From: c2, console, relay, uuv_modem. To: relay, op_modem, compressor, the configured consumers of
+    commands. Delivery: durable, priority 1.
+    """
     return _of(platform, f"command/{_name('kind', kind)}")
 
 
@@ -93,57 +130,78 @@ def command_all(platform: str) -> str:
 
 
 def advice(vessel: str) -> str:
-    """An expert's advice: c2 to relay, relay to the consumers on the vessel."""
+    """An expert's comment from the shore site.
+
+    Record: advice. From: c2, relay. To: relay, console, the configured consumers of advice. Delivery: durable, priority
+    2.
+    """
     return _of(vessel, "advice")
 
 
 def shore_inbox(vessel: str, site: str = SHORE) -> str:
-    """Records relayed from one vessel to one site, relay to c2."""
+    """A vessel's record in its envelope.
+
+    Priority 2 for decisions, 5 for the first version of an image, 6 for later ones.
+
+    Record: relayed. From: relay. To: c2. Delivery: durable, priority 2, 5 or 6, not published for watchers.
+    """
     return _of(site, f"inbox/{_name('vessel', vessel)}")
 
 
 def shore_inbox_all(site: str = SHORE) -> str:
-    """Records relayed from every vessel to one site."""
+    """Envelopes of every vessel to one site."""
     return _of(site, "inbox/*")
 
 
 def shore_image(vessel: str, site: str = SHORE) -> str:
-    """What a site's c2 has accepted of one vessel's pictures, for every shore subscriber."""
+    """A vessel's image that the site's c2 has stored.
+
+    Record: reconstructed_image. From: c2. To: watchers. Delivery: plain, priority 5.
+    """
     return _of(site, f"contact/{_name('vessel', vessel)}/image")
 
 
 def shore_decision(vessel: str, site: str = SHORE) -> str:
-    """What a site's c2 has accepted of one vessel's decisions, for every shore subscriber."""
+    """A vessel's decision that the site's c2 has stored.
+
+    Record: decision. From: c2. To: watchers. Delivery: plain, priority 5.
+    """
     return _of(site, f"contact/{_name('vessel', vessel)}/decision")
 
 
 def shore_image_all(site: str = SHORE) -> str:
-    """What a site's c2 has accepted of every vessel's pictures."""
+    """Images of every vessel that a site's c2 has stored."""
     return _of(site, "contact/*/image")
 
 
 def shore_decision_all(site: str = SHORE) -> str:
-    """What a site's c2 has accepted of every vessel's decisions."""
+    """Decisions of every vessel that a site's c2 has stored."""
     return _of(site, "contact/*/decision")
 
 
 def shore_contact_all(site: str = SHORE) -> str:
-    """Everything a site's c2 has accepted, of every vessel."""
+    """All records of every vessel that a site's c2 has stored."""
     return _of(site, "contact/*/*")
 
 
 def tasking_advice(vessel: str, site: str = SHORE) -> str:
-    """Advice for one vessel, a console or command ashore to c2."""
+    """An expert's comment for one vessel.
+
+    Record: advice. From: console, `sonarpost c2 comment`. To: c2. Delivery: durable, priority 4.
+    """
     return _of(site, f"tasking/{_name('vessel', vessel)}/advice")
 
 
 def tasking_advice_all(site: str = SHORE) -> str:
-    """Advice for every vessel."""
+    """Comments for every vessel."""
     return _of(site, "tasking/*/advice")
 
 
 def tasking_command(vessel: str, site: str = SHORE) -> str:
-    """A command for a vehicle of one vessel, a console or command ashore to c2."""
+    """A command for a vehicle of one vessel.
+
+    Record: command. From: console, `sonarpost c2 command`. To: c2. Delivery: durable, priority 4.
+    """
     return _of(site, f"tasking/{_name('vessel', vessel)}/command")
 
 
@@ -165,22 +223,28 @@ def tasking_vessel(key: str) -> str:
 
 
 def tasking_state(vessel: str, site: str = SHORE) -> str:
-    """How far advice and commands for one vessel have come, for every shore subscriber."""
+    """The progress of a comment or command to one vessel.
+
+    Record: tasking_state. From: c2. To: watchers. Delivery: plain, priority 5.
+    """
     return _of(site, f"tasking/{_name('vessel', vessel)}/state")
 
 
 def tasking_state_all(site: str = SHORE) -> str:
-    """How far advice and commands for every vessel have come."""
+    """Progress of comments and commands to every vessel."""
     return _of(site, "tasking/*/state")
 
 
 def health(platform: str, service: str) -> str:
-    """A service's health record."""
+    """A service's health.
+
+    Record: health. From: every service. To: watchers. Delivery: plain, priority 5.
+    """
     return _of(platform, f"health/{_name('service', service)}")
 
 
 def health_all(platform: str) -> str:
-    """Health of every service of a platform."""
+    """Health of every service of one platform."""
     return _of(platform, "health/*")
 
 
@@ -190,7 +254,10 @@ def health_everywhere() -> str:
 
 
 def alive(platform: str, service: str) -> str:
-    """A service's liveliness token."""
+    """A service's liveliness token.
+
+    Record: none. From: every service. To: watchers. Delivery: liveliness token.
+    """
     return _of(platform, f"alive/{_name('service', service)}")
 
 
@@ -212,42 +279,45 @@ def service_of(key: str) -> tuple[str, str]:
 
 
 def delivery_query(key: str, consumer: str) -> str:
-    """Where the named consumer answers hand-over queries for the records of `key`."""
+    """Queries by which records of `key` are handed over to the named consumer."""
     return f"{key}/handoff/{_name('consumer', consumer)}"
 
 
 def delivery_query_any(key: str) -> str:
-    """Where any consumer answers hand-over queries for the records of `key`."""
+    """Hand-over queries for records of `key`, for every consumer."""
     return f"{key}/handoff/*"
 
 
 def hello(vessel: str, answerer: str, site: str = SHORE) -> str:
-    """Where one process of a site says to a vessel that it is there."""
+    """A query by which a relay finds out whether a process of the shore site answers.
+
+    Record: none. From: relay. To: c2, the router of the shore site. Delivery: query.
+    """
     return f"{shore_inbox(vessel, site)}/hello/{_name('answerer', answerer)}"
 
 
 def hello_from_anybody(vessel: str, site: str = SHORE) -> str:
-    """Where every process of a site that says so says to a vessel that it is there."""
+    """Presence queries of one vessel to every process of a site."""
     return f"{shore_inbox(vessel, site)}/hello/*"
 
 
 def hello_to_all(answerer: str, site: str = SHORE) -> str:
-    """Where one process of a site says to every vessel that it is there."""
+    """Presence queries of every vessel to one process of a site."""
     return f"{shore_inbox_all(site)}/hello/{_name('answerer', answerer)}"
 
 
 def below(key: str) -> str:
-    """A key and everything below it, for access control."""
+    """A key and all keys below it, for access control."""
     return f"{key}/**"
 
 
 def everything_of(platform: str) -> str:
-    """Whatever one platform says, for access control."""
+    """All keys of one platform, for access control."""
     return _of(platform, "**")
 
 
 def everything() -> str:
-    """Whatever anybody of sonarpost says, for access control."""
+    """All keys of sonarpost, for access control."""
     return f"{ROOT}/**"
 
 
