@@ -21,7 +21,7 @@ from pathlib import Path
 
 from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
 from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.snippets import from_survey
+from sonarpost.services.atd_stub.survey_detection import detect_in_survey
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.xtf_writer import write_xtf
@@ -55,7 +55,7 @@ def walk(path: Path, action: str) -> None:
     """Do one action on a file and print what it took."""
     began = time.perf_counter()
     if action == "detect":
-        count = from_survey(path, "0" * 64, "uuv-1", AtdStubConfig(max_contacts=20)).contacts
+        count = detect_in_survey(path, "0" * 64, "uuv-1", AtdStubConfig(max_contacts=20)).contact_count
     else:
         with open_survey(path) as source:
             if action == "read":

@@ -139,7 +139,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "preview_utc_s": NO_TIME,
         "expected_utc_s": NO_TIME,
     },
-    SAMPLES["queue-state"].__class__: {
+    SAMPLES["queue-state-counting"].__class__: {
         "platform_id": NO_NAME,
         "time_utc_s": NO_TIME,
         "rate": [-1, 7],
@@ -149,6 +149,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "message_bytes": NO_COUNT,
         "images_waiting": NO_COUNT,
         "images": [tuple(SAMPLES["queued-image"].model_dump() for _ in range(501))],
+        "images_accepted": NO_COUNT,
     },
     SAMPLES["decision-full"].__class__: {
         "decision_id": NO_ID,

@@ -412,6 +412,7 @@ class QueueState(Record):
         message_bytes: Bytes of these messages.
         images_waiting: Images not yet sent.
         images: These images, the first to be finished first; at most 500.
+        images_accepted: New images ever accepted from the compressor; None from programs that do not count them.
     """
 
     TYPE: ClassVar[str] = "queue_state"
@@ -425,6 +426,7 @@ class QueueState(Record):
     message_bytes: Count
     images_waiting: Count
     images: Annotated[tuple[QueuedImage, ...], Field(max_length=500)]
+    images_accepted: Count | None = None
 
 
 class ReceivedMessage(Record):

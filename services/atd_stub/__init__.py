@@ -1,1 +1,1 @@
-"""Survey files or snippets to contacts."""
+"""Target detection: survey files or snippet files to contacts, released in the order of confidence."""

@@ -8,7 +8,7 @@ from sonarpost.services.atd_stub.service import AtdStubService
 
 
 def run() -> int:
-    """Run the service until it is told to stop; return the exit status."""
+    """Run the service until it is stopped; return the exit status."""
     return main(AtdStubService, AtdStubConfig)
 
 

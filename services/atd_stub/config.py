@@ -13,33 +13,33 @@ SidePx = Annotated[int, Field(ge=MIN_SIDE_PX, le=MAX_SIDE_PX)]
 
 
 class AtdStubConfig(ServiceConfig):
-    """Where files come from and what becomes of them.
+    """Input files, detection, snippets and release.
 
     Attributes:
-        mode: "survey" looks for contacts in survey files; "snippets" sends the pictures of a folder as they are (the
-            paper's talker).
+        mode: "survey" detects contacts in survey files; "snippets" sends image files as snippets (the paper's talker).
         input_dir: Folder that is polled.
         quarantine_dir: Where bad files are moved, each with its reason; by default `quarantine` in `input_dir`.
-        poll_s: Time between two looks at the folder.
-        settle_s: A file counts when its size and date have not changed for this long; at once with `NAME.done` beside.
-        require_done_marker: A file counts only when `NAME.done` lies beside it.
-        confidence_threshold: Least ATD confidence (0 to 2) of a contact that is sent.
-        max_contacts: Most contacts a survey file may give, most confident first; 0 for no limit.
-        max_in_flight: Most pictures between this service and the water; what else was found waits here, and the most
-            confident goes first.
+        poll_s: Interval between two polls of the folder.
+        settle_s: A file is complete when its size and date have not changed for this long; at once with `NAME.done`
+            beside it.
+        require_done_marker: A file is complete only when `NAME.done` is beside it.
+        confidence_threshold: Minimum ATD confidence (0 to 2) of a contact that is sent.
+        max_contacts: Maximum number of contacts of one survey file, most confident first; 0 for no limit.
+        max_in_flight: Maximum number of contacts between this service and their transmission. The others wait here and
+            the most confident is released first. 0 for no limit, with a modem service that publishes no queue_state.
         join_overlap_pings: Last pings of a file that are searched again together with the continuation file; also
             the overlap between parts of a long file. Twice a snippet's height is enough.
-        join_timeout_s: How long a contact in the later half of these pings waits for the continuation file; 0 sends it
-            at once.
+        join_timeout_s: How long a contact in the later half of these pings waits for the continuation file; 0 releases
+            it at once.
         snippet_height_px: Rows (along-track) of a snippet.
         snippet_width_px: Columns (across-track) of a snippet.
         snippet_pixel_m: Side of a snippet's pixels on the ground; 0 for the sonar's own, ping by sample.
-        snippet_dir: Where every contact's picture is kept, with a text file beside it; by default nowhere.
+        snippet_dir: Where each contact's snippet is stored with a text file beside it; by default nowhere.
         projected_crs: Coordinate system of survey files in metres (`EPSG:32619`).
-        position_source: Which of a survey file's positions is taken, the sensor's or the ship's.
+        position_source: Which position of a survey file is used, the sensor's or the ship's.
         port_order: Order of the port samples in survey files.
-        mounting: Where the sonar is, seen from the position in the file: offsets, layback, heading.
-        errors: How good positions, headings and altitudes are, one standard deviation each.
+        mounting: Position of the sonar relative to the position in the file: offsets, layback, heading.
+        errors: Standard deviations of positions, headings and altitudes.
     """
 
     mode: Literal["survey", "snippets"] = "survey"
@@ -50,7 +50,7 @@ class AtdStubConfig(ServiceConfig):
     require_done_marker: bool = False
     confidence_threshold: Annotated[float, Field(ge=0, le=2)] = 1.0
     max_contacts: Annotated[int, Field(ge=0)] = 0
-    max_in_flight: Annotated[int, Field(ge=1, le=100_000)] = 32
+    max_in_flight: Annotated[int, Field(ge=0, le=100_000)] = 32
     join_overlap_pings: Annotated[int, Field(ge=0, le=900)] = 200
     join_timeout_s: Annotated[float, Field(ge=0, le=86400)] = 0.0
     snippet_height_px: SidePx = 80
@@ -64,7 +64,7 @@ class AtdStubConfig(ServiceConfig):
     errors: ErrorBudget = ErrorBudget()
 
     def survey_options(self) -> SurveyOptions:
-        """Return how survey files are to be understood."""
+        """Return the options of the survey readers."""
         return SurveyOptions(
             projected_crs=self.projected_crs,
             position_source=self.position_source,

@@ -1,4 +1,4 @@
-"""Polls a folder for files, finds what is worth sending in each, and lets it go as the water takes it."""
+"""The atd_stub service: polls a folder, detects contacts in its files, and releases the most confident first."""
 
 from __future__ import annotations
 
@@ -18,169 +18,175 @@ from sonarpost.files import write_atomically
 from sonarpost.logs import kv
 from sonarpost.messages import Record, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
-from sonarpost.services.atd_stub import snippets
 from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.folder import FileSeen, SettledFiles, content_hash, look_at, printable
-from sonarpost.services.atd_stub.outgoing import Outgoing
-from sonarpost.services.atd_stub.seam_store import SeamStore
-from sonarpost.services.atd_stub.survey_walk import Finding
-from sonarpost.services.atd_stub.text_file import write_snippet
+from sonarpost.services.atd_stub.file_boundary import FileEndStore
+from sonarpost.services.atd_stub.input_folder import (
+    InputFile,
+    StableFiles,
+    content_sha256,
+    list_input_files,
+    printable,
+)
+from sonarpost.services.atd_stub.release import ContactRelease
+from sonarpost.services.atd_stub.snippet_files import read_snippet, write_snippet
+from sonarpost.services.atd_stub.survey_detection import DetectionResult, detect_in_survey
 from sonarpost.sonar.readers import SUPPORTED_SUFFIXES
 
 log = logging.getLogger(__name__)
 
-PICTURE_SUFFIXES = (".tif", ".tiff", ".png")
+IMAGE_SUFFIXES = (".tif", ".tiff", ".png")
 
 
 class AtdStubService(Service[AtdStubConfig]):
-    """Processes every file once ever, known by its content, and sends the most confident contacts first.
+    """Processes each file once, identified by its content.
 
-    That a file was processed and the snippets found in it are committed together: a process killed while it works on
-    a file begins that file again and owes its snippets once. A snippet is in one place of the store at any time: held
-    at a seam, in the pool, or owed to the compressor.
+    The entry of a file and its snippets are committed together: a process that is killed during a file starts that
+    file again and sends its snippets once. A snippet is in one place of the store at any time: held at the end of a
+    file, waiting for release, or in the outbox.
     """
 
     NAME = "atd_stub"
 
     def __init__(self, platform: PlatformConfig, config: AtdStubConfig) -> None:
         super().__init__(platform, config)
-        self._suffixes = SUPPORTED_SUFFIXES if config.mode == "survey" else PICTURE_SUFFIXES
-        self._settled = SettledFiles(config.settle_s, require_done_marker=config.require_done_marker)
-        self._dealt_with: set[FileSeen] = set()
-        self._waiting = -1
-        self._outgoing = Outgoing(platform, self.store, config.max_in_flight, self.commit)
-        self._seams = SeamStore(self.store)
+        self._suffixes = SUPPORTED_SUFFIXES if config.mode == "survey" else IMAGE_SUFFIXES
+        self._stable_files = StableFiles(config.settle_s, require_done_marker=config.require_done_marker)
+        self._processed: set[InputFile] = set()
+        self._files_waiting = -1
+        self._release = ContactRelease(platform, self.store, config.max_in_flight, self.commit)
+        self._file_ends = FileEndStore(self.store)
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """Refuse: nothing is sent to this service."""
+        """Not called: this service consumes no records."""
         raise NotImplementedError("atd_stub consumes no records")
 
     def on_start(self) -> None:
-        """Watch what waits on the way to the water, and start to poll."""
-        self._outgoing.listen(self.session)
+        """Subscribe to the state of the transmit queue, and start to poll and to release."""
+        self._release.subscribe(self.session)
         self.start_thread(self._poll, "poll")
-        self.start_thread(lambda: self._outgoing.run(self.stopping), "release")
+        self.start_thread(lambda: self._release.run(self.stopping), "release")
 
     def on_stop(self) -> None:
-        """Let the threads look up."""
-        self._outgoing.wake()
+        """Wake the release thread, so that it ends."""
+        self._release.wake()
 
     def gauges(self) -> Mapping[str, float]:
-        """Return how many files (-1 before the first look) and contacts wait."""
+        """Return the numbers of files (-1 before the first poll) and contacts that wait."""
         return {
-            "files_waiting": float(self._waiting),
-            "contacts_waiting": float(self._outgoing.waiting + self._seams.held),
-            "contacts_on_the_way": float(self._outgoing.on_the_way),
+            "files_waiting": float(self._files_waiting),
+            "contacts_waiting": float(self._release.pending + self._file_ends.held_count),
+            "contacts_in_flight": float(self._release.in_flight),
         }
 
     def degraded_reason(self) -> str:
-        """Return what keeps contacts from being handed on."""
-        return self._outgoing.trouble
+        """Return why contacts cannot be released."""
+        return self._release.error
 
     def warning(self) -> str:
-        """Say that contacts wait for the water."""
-        waiting = self._outgoing.waiting
-        return f"{waiting} contacts wait for room on the way to the water" if waiting else ""
+        """Return how many contacts wait for release."""
+        return self._release.status
 
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
-        """Count what the compressor has taken."""
-        if reason is None:
-            self._outgoing.taken()
-        else:
-            self._outgoing.wake()
+        """Check for free credit after the compressor has accepted or refused a snippet."""
+        self._release.wake()
 
     def _poll(self) -> None:
         while not self.stopping.is_set():
             try:
-                self._end_seams()
-                self._look()
+                self._release_expired_contacts()
+                self._process_folder()
             except (OSError, DeliveryError) as error:
                 self.set_degraded(f"{type(error).__name__}: {error}")
             else:
                 self.set_degraded("")
             self.stopping.wait(self.config.poll_s)
 
-    def _look(self) -> None:
+    def _process_folder(self) -> None:
         self.config.input_dir.mkdir(parents=True, exist_ok=True)
-        here = look_at(self.config.input_dir, self._suffixes)
-        self._dealt_with &= set(here)
-        fresh = tuple(seen for seen in here if seen not in self._dealt_with)
-        ready = self._settled.look(fresh, time.monotonic())
-        self._waiting = len(fresh)
-        unreadable: OSError | None = None
-        for seen in ready:
+        files = list_input_files(self.config.input_dir, self._suffixes)
+        self._processed &= set(files)
+        new = tuple(file for file in files if file not in self._processed)
+        complete = self._stable_files.update(new, time.monotonic())
+        self._files_waiting = len(new)
+        first_error: OSError | None = None
+        for file in complete:
             if self.stopping.is_set():
                 return
             try:
-                finished = self._process(seen)
+                is_finished = self._process(file)
             except OSError as error:
-                # Told when the files behind it have had their turn; it is tried again at the next look.
-                unreadable = unreadable or error
+                # The files after it are processed first; it is tried again with the next poll.
+                first_error = first_error or error
                 continue
-            if finished:
-                self._dealt_with.add(seen)
-                self._waiting -= 1
-        if unreadable is not None:
-            raise unreadable
+            if is_finished:
+                self._processed.add(file)
+                self._files_waiting -= 1
+        if first_error is not None:
+            raise first_error
 
-    def _process(self, seen: FileSeen) -> bool:
-        """Deal with a file; False when it went away or changed meanwhile and is to be looked at again."""
+    def _process(self, file: InputFile) -> bool:
+        """Process a file; return False if it was removed or changed and has to be tried again."""
         try:
-            content = content_hash(seen.path)
+            content = content_sha256(file.path)
         except FileNotFoundError:
             return False
-        if (kept := self.store.get_state(_state_name(content))) is not None:
-            self._meet_again(seen.path, content, kept)
+        if (entry := self.store.get_state(_state_name(content))) is not None:
+            self._skip_known(file.path, content, entry)
             return True
-        return self._detect(seen.path, content)
+        return self._detect(file.path, content)
 
     def _detect(self, path: Path, content: str) -> bool:
         started = time.perf_counter()
         try:
-            found = self._snippets(path, content)
+            result = self._contacts_of(path, content)
         except SurveyFileError as error:
-            # A file that went away or changed while it was read says nothing about the content that was meant.
-            if not _is_still(path, content):
+            # If the file was removed or changed during the search, the error is not about this content.
+            if not _is_unchanged(path, content):
                 return False
             self._quarantine(path, content, str(error))
             return True
         except (OSError, DeliveryError):
             raise
         except Exception as error:
-            # A defect of ours must not stop the files behind this one.
+            # A defect of the detector must not block the files after this one.
             log.exception("File not processed", extra=kv(file=path.name))
             self._quarantine(path, content, f"{type(error).__name__}: {error}")
             return True
-        if not _is_still(path, content):
-            log.warning("File changed while it was read, looking again later", extra=kv(file=path.name))
+        if not _is_unchanged(path, content):
+            log.warning("File changed while it was read; trying again", extra=kv(file=path.name))
             return False
-        self._hand_on(path, content, found, round(time.perf_counter() - started, 2))
+        self._commit_result(path, content, result, round(time.perf_counter() - started, 2))
         return True
 
-    def _hand_on(self, path: Path, content: str, found: Finding, seconds: float) -> None:
+    def _contacts_of(self, path: Path, content: str) -> DetectionResult:
+        if self.config.mode == "snippets":
+            return DetectionResult((read_snippet(path, content, self.platform.id),), contact_count=1)
+        file_ends = self._file_ends.by_sonar()
+        return detect_in_survey(path, content, self.platform.id, self.config, file_ends, time.time())
+
+    def _commit_result(self, path: Path, content: str, result: DetectionResult, duration_s: float) -> None:
         effects = UnitOfWork()
-        effects.put_state(
-            _state_name(content), msgpack.packb({"file": printable(path.name), "contacts": found.contacts})
-        )
+        entry = {"file": printable(path.name), "contacts": result.contact_count}
+        effects.put_state(_state_name(content), msgpack.packb(entry))
         effects.count("files_processed")
-        effects.count("contacts_detected", found.contacts)
-        freed = self._seams.keep(effects, found.seam, joined=found.joined)
-        self._commit_contacts(effects, (*found.snippets, *freed))
+        effects.count("contacts_detected", result.contact_count)
+        no_continuation = self._file_ends.put(effects, result.file_end, joined=result.joined)
+        self._commit_contacts(effects, (*result.snippets, *no_continuation))
         log.info(
             "File processed",
-            extra=kv(file=path.name, contacts=found.contacts, joined=found.joined, seconds=seconds),
+            extra=kv(file=path.name, contacts=result.contact_count, joined=result.joined, duration_s=duration_s),
         )
-        for warning in found.warnings:
-            log.warning("Met in the survey", extra=kv(file=path.name, what=printable(warning)))
+        for warning in result.warnings:
+            log.warning("Survey reader warning", extra=kv(file=path.name, warning=printable(warning)))
 
-    def _commit_contacts(self, effects: UnitOfWork, ready: tuple[Snippet, ...]) -> None:
-        """Commit effects, and contacts that are ready to go, whose files are written before."""
+    def _commit_contacts(self, effects: UnitOfWork, snippets: tuple[Snippet, ...]) -> None:
+        """Commit `effects` and contacts that are ready for release; their files are written before."""
         if self.config.snippet_dir is not None:
-            for snippet in ready:
+            for snippet in snippets:
                 write_snippet(self.config.snippet_dir, snippet)
-        self._outgoing.add(effects, ready)
-        self._seams.committed()
-        for snippet in ready:
+        self._release.add(effects, snippets)
+        self._file_ends.committed()
+        for snippet in snippets:
             log.info(
                 "Contact detected",
                 extra=kv(
@@ -191,58 +197,60 @@ class AtdStubService(Service[AtdStubConfig]):
                 ),
             )
 
-    def _end_seams(self) -> None:
-        """Let go what waited long enough for a file that has not come."""
+    def _release_expired_contacts(self) -> None:
         effects = UnitOfWork()
-        freed = self._seams.end(effects, time.time(), self.config.join_timeout_s)
-        if freed:
-            log.info("No file goes on where the last one ended", extra=kv(contacts=len(freed)))
-            self._commit_contacts(effects, freed)
+        expired = self._file_ends.release_expired(effects, time.time(), self.config.join_timeout_s)
+        if expired:
+            log.info(
+                "No continuation file within join_timeout_s; releasing held contacts", extra=kv(contacts=len(expired))
+            )
+            self._commit_contacts(effects, expired)
 
-    def _snippets(self, path: Path, content: str) -> Finding:
-        if self.config.mode == "snippets":
-            return snippets.from_picture(path, content, self.platform.id)
-        seams = self._seams.all()
-        return snippets.from_survey(path, content, self.platform.id, self.config, seams, time.time())
-
-    def _meet_again(self, path: Path, content: str, kept: bytes) -> None:
-        """Leave a file that was processed; put one that was refused aside again, where it will be found."""
-        known = msgpack.unpackb(kept)
-        reason = known.get("refused")
-        log.info("File known already", extra=kv(file=path.name, processed_as=known.get("file"), refused=reason or "no"))
-        if reason is not None:
-            self._move_aside(path, content, reason)
+    def _skip_known(self, path: Path, content: str, entry: bytes) -> None:
+        """Skip a file that was processed before; move one that was refused to the quarantine again."""
+        known = msgpack.unpackb(entry)
+        refused_reason = known.get("refused")
+        log.info(
+            "File already processed",
+            extra=kv(file=path.name, processed_as=known.get("file"), refused=refused_reason or "no"),
+        )
+        if refused_reason is not None:
+            self._move_to_quarantine(path, content, refused_reason)
 
     def _quarantine(self, path: Path, content: str, reason: str) -> None:
-        """Remember a bad file, so that it is looked at once, and move it aside with its reason."""
+        """Store that a file is bad, so that it is read once only, and move it to the quarantine with the reason."""
         reason = printable(reason)
         log.error("File quarantined", extra=kv(file=path.name, reason=reason))
         effects = UnitOfWork()
         effects.put_state(_state_name(content), msgpack.packb({"file": printable(path.name), "refused": reason}))
         effects.count("files_quarantined")
         self.commit(effects)
-        self._move_aside(path, content, reason)
+        self._move_to_quarantine(path, content, reason)
 
-    def _move_aside(self, path: Path, content: str, reason: str) -> None:
+    def _move_to_quarantine(self, path: Path, content: str, reason: str) -> None:
         folder = self.config.quarantine_dir or self.config.input_dir / "quarantine"
         target = folder / path.name
         if target.exists():
-            # Another bad file of this name lies there, and stays.
+            # Another bad file of this name is there and must not be overwritten.
             target = folder / f"{path.stem}-{content[:8]}{path.suffix}"
         try:
             folder.mkdir(parents=True, exist_ok=True)
             write_atomically(target.with_name(f"{target.name}.reason.txt"), f"{reason}\n".encode())
-            # The quarantine may be on another disk, where a rename does not reach.
+            # Not a rename: the quarantine may be on another disk.
             shutil.move(path, target)
-        except OSError as trouble:
-            # A read-only folder: the file stays, and is known by its content.
-            log.warning("File cannot be moved", extra=kv(file=path.name, error=str(trouble)))
+        except OSError as error:
+            # In a read-only folder the file stays; its stored entry prevents that it is processed again.
+            log.warning("File cannot be moved to quarantine", extra=kv(file=path.name, error=str(error)))
 
 
-def _is_still(path: Path, content: str) -> bool:
-    """Return whether the file is there and its content is the one that was read; OSError when it cannot be told."""
+def _is_unchanged(path: Path, content: str) -> bool:
+    """Return whether the file exists and has the content that was read.
+
+    Raises:
+        OSError: It cannot be read.
+    """
     try:
-        return content_hash(path) == content
+        return content_sha256(path) == content
     except FileNotFoundError:
         return False
 

@@ -51,6 +51,7 @@ _CONFIRMATION_LIFETIME_S: Final = 900.0
 _OWN: Final = "uuv_modem"
 _QUEUE, _HEARD, _ORDERS, _PACKET, _SEAL = "queue/", "heard", "orders", "packet", "seal"
 _LIMIT: Final = "v1-seal-limit/"
+IMAGES_ACCEPTED: Final = "images_accepted"
 
 Summarise = Callable[[EncodedImage], ContactSummary]
 
@@ -95,6 +96,7 @@ class VehicleEndpoint:
         self._to_hand: list[CommandRecord] = []
         self._outcomes: list[tuple[int, CommandOutcome]] = []
         self._taken: list[str] = []
+        self.images_accepted = int(store.get_state(IMAGES_ACCEPTED) or b"0")
         self._begin_anew(platform.id)
 
     def _new_seal(self, platform: PlatformConfig) -> FrameAuthenticator | None:
@@ -176,6 +178,7 @@ class VehicleEndpoint:
             self._hand(tx)
             for name in self._taken:
                 tx.delete_state(name)
+            tx.put_state(IMAGES_ACCEPTED, str(self.images_accepted).encode())
             digests = self._parts.write(tx, self._export())
         self._parts.wrote(digests)
         self._to_hand.clear()
@@ -231,6 +234,8 @@ class VehicleEndpoint:
             )
             return
         number = number_of_image(record.image_id)
+        if number not in self.queue.sender.kept:
+            self.images_accepted += 1
         name_of_it = ImageName(record.image_id, record.contact.contact_id)
         self.queue.add_picture(number, name_of_it, self._summarise(record), record.stream, now)
 

@@ -32,6 +32,8 @@ log = logging.getLogger(__name__)
 
 LONGEST_WAIT_S: Final = 0.2
 _LEAST_WAIT_S: Final = 0.005
+STATE_INTERVAL_S: Final = 0.2
+"""Minimum time between two publications of the queue state when images are accepted or have gone."""
 TAKEN = (PacketSent, PacketFailed, FrameReceived, FrameDecoded, MiniPacketReceived)
 """Events of the modem that the link acts on."""
 
@@ -82,6 +84,7 @@ class LineRunner:
         self._ended_at: float | None = None
         self._packet_s: dict[int, float] = {}
         self._told_at: float | None = None
+        self._told_images: tuple[int, int] = (0, 0)
 
     def take(self, event: ModemEvent | None) -> None:
         """Give an event of the modem, or None where records were accepted; from any thread."""
@@ -172,8 +175,12 @@ class LineRunner:
             wait_s = self._send(now)
         if self._changed:
             self._save()
-        if self._told_at is None or not 0 <= now - self._told_at < self._config.queue_interval_s:
-            self._told_at = now
+        images = (self._line.images_accepted, len(self._line.queue.open_numbers()))
+        interval_s = self._config.queue_interval_s
+        if images != self._told_images:
+            interval_s = min(interval_s, STATE_INTERVAL_S)
+        if self._told_at is None or not 0 <= now - self._told_at < interval_s:
+            self._told_at, self._told_images = now, images
             self._tell(now)
         return wait_s
 

@@ -30,7 +30,7 @@ from sonarpost.modem.micromodem import RATES, ModemEvent, PacketFailed, PacketSe
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import ServiceStoppingError, UnitOfWork
 from sonarpost.services.uuv_modem.config import UuvModemConfig
-from sonarpost.services.uuv_modem.line import VehicleEndpoint
+from sonarpost.services.uuv_modem.line import IMAGES_ACCEPTED, VehicleEndpoint
 from sonarpost.services.uuv_modem.line_runner import TAKEN, LineRunner
 from sonarpost.sonar.survey import Side
 
@@ -108,6 +108,8 @@ class UuvModemService(ModemService[UuvModemConfig]):
         if self._line is not None and self._runner is not None:
             self._line.load(self.platform.id, time.time())
             self.start_thread(self._runner.run, "link")
+        else:
+            self.start_thread(self._publish_paper_queue, "queue state")
 
     def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """As the base does, and wake the link."""
@@ -153,6 +155,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
             if number + 1 < len(packets):
                 self._remember(record, number + 1)
         effects.delete_state(_PROGRESS)
+        effects.put_state(IMAGES_ACCEPTED, str(int(self.store.get_state(IMAGES_ACCEPTED) or b"0") + 1).encode())
         effects.count("images_sent")
         log.info("Image sent", extra=kv(image_id=record.image_id, contact_id=record.contact.contact_id))
 
@@ -261,7 +264,39 @@ class UuvModemService(ModemService[UuvModemConfig]):
             message_bytes=waiting.messages.waiting_bytes,
             images_waiting=len(expected),
             images=images,
+            images_accepted=self._line.images_accepted,
         )
+        self._publish_state(state)
+
+    def _publish_paper_queue(self) -> None:
+        """Publish how many images wait in the inbox, every 0.2 s while that changes."""
+        published: tuple[int, int] | None = None
+        published_s = 0.0
+        while not self.stopping.wait(0.2):
+            sent = self.store.get_state(IMAGES_ACCEPTED)
+            waiting = self.store.inbox_depth()
+            if sent != self.store.get_state(IMAGES_ACCEPTED):
+                continue  # an image has gone between the two reads
+            accepted = int(sent or b"0") + waiting
+            if (waiting, accepted) == published and time.monotonic() - published_s < self.config.queue_interval_s:
+                continue
+            published, published_s = (waiting, accepted), time.monotonic()
+            self._publish_state(
+                QueueState(
+                    platform_id=self.platform.id,
+                    time_utc_s=time.time(),
+                    rate=self.config.rate,
+                    frame_loss=None,
+                    packet_interval_s=RATES[self.config.rate].airtime_s,
+                    messages_waiting=0,
+                    message_bytes=0,
+                    images_waiting=waiting,
+                    images=(),
+                    images_accepted=accepted,
+                )
+            )
+
+    def _publish_state(self, state: QueueState) -> None:
         try:
             key = keys.acoustic_queue(self.platform.id)
             self.session.put(key, wire.encode(state), encoding=wire.encoding_of(QueueState))

@@ -1,4 +1,4 @@
-"""Recordings cut into files, for tests of the seam between them: a seabed with boxes, and what atd_stub makes of it."""
+"""Recordings split into files: a simulated seabed with boxes, and the contacts that atd_stub detects in it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost import wire
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.snippets import from_survey
+from sonarpost.services.atd_stub.survey_detection import detect_in_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -20,14 +19,14 @@ OBJECT_SAMPLE = 150
 
 @dataclass(frozen=True)
 class Box:
-    """A bright box of 8 pings and 10 samples, and its shadow, about a row."""
+    """A bright box of 8 pings and 10 samples with its shadow, centred on a row."""
 
     row: int
     side: Side = Side.PORT
 
 
 def survey_of(rows: int, *boxes: Box, seed: int = 5, first_row: int = 0) -> Survey:
-    """Return a seabed of speckle with boxes; row 0 of the whole is at START_S."""
+    """Return a seabed of speckle with boxes; row 0 is at START_S."""
     rng = np.random.default_rng(seed)
     images = {}
     for side in Side:
@@ -58,8 +57,8 @@ def survey_of(rows: int, *boxes: Box, seed: int = 5, first_row: int = 0) -> Surv
     return Survey(Path("made.xtf"), "made", "made", pings)
 
 
-def cut_into(folder: Path, survey: Survey, *spans: tuple[int, int], sonar: str = "") -> list[Path]:
-    """Write pieces of a survey as files of a recorder that begins a new one now and then."""
+def split(folder: Path, survey: Survey, *spans: tuple[int, int], sonar: str = "") -> list[Path]:
+    """Write parts of a survey as the consecutive files of a recorder."""
     paths = []
     for number, (first, end) in enumerate(spans):
         part = replace(survey, pings=survey.pings[first:end], sonar_id=sonar or survey.sonar_id)
@@ -68,24 +67,20 @@ def cut_into(folder: Path, survey: Survey, *spans: tuple[int, int], sonar: str =
     return paths
 
 
-def run(paths: list[Path], **changes) -> list[Snippet]:
-    """Return what files give that come one after the other, and what is still held when no other comes."""
+def detect_in_files(paths: list[Path], **changes) -> list[Snippet]:
+    """Return the contacts of consecutive files, with those held at the end of the last one."""
     config = AtdStubConfig(**changes)
-    seams, sent, total = {}, [], 0
+    file_ends, sent, total = {}, [], 0
     for path in paths:
-        found = from_survey(path, path.stem.ljust(64, "0"), "uuv-1", config, seams, 100.0)
-        if not found.joined:
-            sent += [payload for seam in seams.values() for payload in held_of(seam)]
-        sent += found.snippets
-        total += found.contacts
-        seams = {} if found.seam is None else {found.seam.sonar_id: found.seam}
-    sent += [snippet for seam in seams.values() for snippet in held_of(seam)]
+        result = detect_in_survey(path, path.stem.ljust(64, "0"), "uuv-1", config, file_ends, 100.0)
+        if not result.joined:
+            sent += [snippet for end in file_ends.values() for snippet in end.held_snippets()]
+        sent += result.snippets
+        total += result.contact_count
+        file_ends = {} if result.file_end is None else {result.file_end.sonar_id: result.file_end}
+    sent += [snippet for end in file_ends.values() for snippet in end.held_snippets()]
     assert len(sent) == total, "every contact is counted once"
     return sent
-
-
-def held_of(seam) -> list[Snippet]:
-    return [wire.decode(Snippet, payload, "held") for payload in seam.held]
 
 
 def near(sent: list[Snippet], row: int, side: Side = Side.PORT) -> list[Snippet]:

@@ -142,7 +142,7 @@ SAMPLES: dict[str, Record] = {
     ),
     "queued-image-nothing-gone": NOTHING_GONE,
     "queued-image": PREVIEW_GONE,
-    "queue-state": QueueState(
+    "queue-state-counting": QueueState(
         platform_id="uuv-1",
         time_utc_s=1476262801.0,
         rate=1,
@@ -152,8 +152,9 @@ SAMPLES: dict[str, Record] = {
         message_bytes=40,
         images_waiting=2,
         images=(PREVIEW_GONE, NOTHING_GONE),
+        images_accepted=725,
     ),
-    "queue-state-empty": QueueState(
+    "queue-state-uncounted": QueueState(
         platform_id="uuv-1",
         time_utc_s=1476262801.0,
         rate=4,

@@ -282,6 +282,7 @@ STRATEGIES[QueueState] = st.builds(
     message_bytes=_count,
     images_waiting=_count,
     images=st.lists(STRATEGIES[QueuedImage], max_size=3).map(tuple),
+    images_accepted=_maybe(_count),
 )
 
 any_record: st.SearchStrategy[Record] = st.one_of(*STRATEGIES.values())

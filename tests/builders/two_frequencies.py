@@ -1,4 +1,4 @@
-"""Surveys of sonars of two frequencies, for tests: a second channel on each side, which shows mere speckle."""
+"""Surveys of dual-frequency sonars: a second channel on each side that shows only speckle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FIRST_HZ, SECOND_HZ = 400e3, 900e3
 
 
 def with_second_frequency(survey: Survey, samples: int, range_m: float) -> Survey:
-    """Return the survey with another channel after each side's own, of so many samples over another range."""
+    """Return the survey with a second channel on each side, with its own number of samples and range."""
     rng = np.random.default_rng(9)
 
     def channels(ping: Ping) -> tuple[ChannelPing, ...]:
@@ -27,10 +27,7 @@ def with_second_frequency(survey: Survey, samples: int, range_m: float) -> Surve
 
 
 def files_of(survey: Survey, folder: Path, samples: int, range_m: float) -> tuple[Path, Path]:
-    """Write a survey as the file of its first frequency alone, and as that of both; return the files.
-
-    Both are called the same, each in a folder of its own.
-    """
+    """Write a survey with its first frequency alone, and with both; return the two files of the same name."""
     paths = (folder / "alone" / "line.xtf", folder / "both" / "line.xtf")
     both = with_second_frequency(survey, samples, range_m)
     alone = replace(survey, pings=tuple(replace(p, channels=p.channels[: len(p.channels) // 2]) for p in both.pings))
@@ -41,7 +38,7 @@ def files_of(survey: Survey, folder: Path, samples: int, range_m: float) -> tupl
 
 
 def read_both(survey: Survey, folder: Path, samples: int, range_m: float) -> tuple[Survey, Survey]:
-    """Return the survey as it is read from the file of its first frequency alone, and from that of both."""
+    """Return the survey read from the file of its first frequency alone, and from the file of both."""
     alone, both = (read_xtf(path) for path in files_of(survey, folder, samples, range_m))
     assert {len(p.channels) for p in both.pings} == {2 * len(p.channels) for p in alone.pings}
     return alone, both

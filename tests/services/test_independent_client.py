@@ -115,7 +115,7 @@ def test_a_subscriber_without_sonarpost_reads_what_a_service_publishes(
     incoming = tmp_path / "incoming"
     incoming.mkdir()
     service = AtdStubService(
-        platform("uuv-1"), AtdStubConfig(mode="snippets", input_dir=incoming, poll_s=0.05, settle_s=0)
+        platform("uuv-1"), AtdStubConfig(max_in_flight=0, mode="snippets", input_dir=incoming, poll_s=0.05, settle_s=0)
     )
     service.start()
     try:

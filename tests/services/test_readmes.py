@@ -212,7 +212,7 @@ def test_every_counter_and_gauge_is_there_and_no_other(name, page, made):
 @every_service
 def test_the_page_has_every_part(name, page):
     assert page.text.startswith(f"# {name}: ")
-    for heading in ("Zenoh keys", "Configuration", "When something fails", "What it stores", "Health"):
+    for heading in ("Zenoh keys", "Configuration", "When something fails", "(Storage|What it stores)", "Health"):
         assert re.search(rf"^## {heading}$", page.text, flags=re.MULTILINE), heading
     assert f"`{name}.db`" in page.text
     assert len(page.rows("When something fails")) >= 5

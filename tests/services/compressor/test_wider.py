@@ -13,8 +13,8 @@ from sonarpost.detection.detector import detect
 from sonarpost.link.downlink import messages as dl
 from sonarpost.messages import Contact, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.record import of_detection
-from sonarpost.services.atd_stub.seam import Origin
+from sonarpost.services.atd_stub.file_boundary import Origin
+from sonarpost.services.atd_stub.survey_detection import snippet_of
 from sonarpost.services.compressor.wide import wider
 from sonarpost.services.op_modem.station import order_of
 from sonarpost.services.uuv_modem.config import UuvModemConfig
@@ -73,7 +73,7 @@ def test_wider_of_a_real_detection_shows_twice_the_ground_from_the_vessels_order
     origin = Origin("ab" * 32, "line-7.xtf", "line-7")
     # Away from the recording's ends, where the wide picture would be shifted.
     found = next(each for each in detect(survey) if 80 <= each.ping_index < 320 and 150 <= each.sample < 850)
-    sent = of_detection(survey, found, origin, "uuv-1", config)
+    sent = snippet_of(survey, found, origin, "uuv-1", config)
     begin(codec="emb", budget_bytes=4000)
     atd.send(IN, "compressor", sent)
     eventually(lambda: len(modem.received) == 1)

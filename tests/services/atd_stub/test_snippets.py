@@ -1,4 +1,4 @@
-"""What atd_stub says of a contact: position with its error, heights only where measured, pictures, the text beside."""
+"""The records of atd_stub: position with its error, measured heights, images, and the text files beside them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ from sonarpost.detection.snippets import ground_projected_image
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.folder import FileSeen, SettledFiles, look_at
-from sonarpost.services.atd_stub.record import of_detection
-from sonarpost.services.atd_stub.seam import Origin
+from sonarpost.services.atd_stub.file_boundary import Origin
+from sonarpost.services.atd_stub.input_folder import InputFile, StableFiles, list_input_files
 from sonarpost.services.atd_stub.service import AtdStubService
-from sonarpost.services.atd_stub.snippets import from_picture
-from sonarpost.services.atd_stub.text_file import contact_text, read_contact, write_snippet
+from sonarpost.services.atd_stub.snippet_files import contact_text, read_contact, read_snippet, write_snippet
+from sonarpost.services.atd_stub.survey_detection import snippet_of
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.image_files import read_image, write_tiff
@@ -44,21 +43,21 @@ def line(tmp_path_factory) -> Path:
     return path
 
 
-def first_of(path: Path, config: AtdStubConfig, change=lambda ping: ping):
+def best_contact_of(path: Path, config: AtdStubConfig, change=lambda ping: ping):
     with open_survey(path, config.survey_options()) as source:
         survey = gather(source)
     survey = replace(survey, pings=tuple(change(ping) for ping in survey.pings))
     found = detect(survey)[0]
-    return survey, found, of_detection(survey, found, ORIGIN, "uuv-1", config).contact
+    return survey, found, snippet_of(survey, found, ORIGIN, "uuv-1", config).contact
 
 
 # The record
 
 
 def test_a_contact_has_every_field_of_the_record(line):
-    _, found, contact = first_of(line, AtdStubConfig())
+    _, found, contact = best_contact_of(line, AtdStubConfig())
     if found.shadow_is_cut:
-        pytest.fail("the survey of this test has a whole shadow for its best contact")
+        pytest.fail("the best contact of this survey must have a complete shadow")
     unknown = {name for name, value in contact.model_dump().items() if value is None}
     assert unknown == set()
     assert contact.contact_id == f"line-7-abababab-{found.ping_number}-{found.side.value}-{found.sample}"
@@ -67,43 +66,43 @@ def test_a_contact_has_every_field_of_the_record(line):
     )
 
 
-def test_the_position_comes_with_its_error_and_the_error_with_the_configuration(line):
-    _, _, usual = first_of(line, AtdStubConfig())
-    assert 5 * 2**0.5 < usual.position_sigma_m < 12
-    _, _, sure = first_of(line, AtdStubConfig(errors=ErrorBudget(position_m=0.5)))
-    assert sure.position_sigma_m < usual.position_sigma_m - 3
-    assert (sure.lat_deg, sure.lon_deg) == (usual.lat_deg, usual.lon_deg)
+def test_the_position_error_follows_from_the_configured_error_budget(line):
+    _, _, default = best_contact_of(line, AtdStubConfig())
+    assert 5 * 2**0.5 < default.position_sigma_m < 12
+    _, _, precise = best_contact_of(line, AtdStubConfig(errors=ErrorBudget(position_m=0.5)))
+    assert precise.position_sigma_m < default.position_sigma_m - 3
+    assert (precise.lat_deg, precise.lon_deg) == (default.lat_deg, default.lon_deg)
 
 
-def test_a_layback_moves_the_contact_back_along_the_track(line):
-    _, found, plain = first_of(line, AtdStubConfig())
-    _, _, towed = first_of(line, AtdStubConfig(mounting=Mounting(layback_m=30.0)))
+def test_layback_moves_the_contact_back_along_the_track(line):
+    _, found, plain = best_contact_of(line, AtdStubConfig())
+    _, _, towed = best_contact_of(line, AtdStubConfig(mounting=Mounting(layback_m=30.0)))
     north_m, east_m = offset_between_m(Position(plain.lat_deg, plain.lon_deg), Position(towed.lat_deg, towed.lon_deg))
     bearing_deg = np.degrees(np.arctan2(east_m, north_m)) % 360
     assert np.hypot(north_m, east_m) == pytest.approx(30.0, abs=0.01)
     assert (bearing_deg - found.heading_deg) % 360 == pytest.approx(180.0, abs=0.1)
-    assert towed.position_sigma_m > plain.position_sigma_m, "it is not known where a towed sonar is"
+    assert towed.position_sigma_m > plain.position_sigma_m, "the position of a towed sonar is uncertain"
 
 
-@pytest.mark.parametrize("lost", ["lat_deg", "heading_deg"])
-def test_without_fix_or_heading_there_is_no_position_and_no_error_of_one(lost, line):
+@pytest.mark.parametrize("missing", ["lat_deg", "heading_deg"])
+def test_without_fix_or_heading_there_is_no_position(missing, line):
     def without(ping):
-        return replace(ping, **({"lat_deg": None, "lon_deg": None} if lost == "lat_deg" else {lost: None}))
+        return replace(ping, **({"lat_deg": None, "lon_deg": None} if missing == "lat_deg" else {missing: None}))
 
-    _, _, contact = first_of(line, AtdStubConfig(), without)
+    _, _, contact = best_contact_of(line, AtdStubConfig(), without)
     assert (contact.lat_deg, contact.lon_deg, contact.position_sigma_m) == (None, None, None)
     assert contact.slant_range_m is not None
 
 
-def test_a_shadow_that_the_recording_cuts_gives_no_height(line):
-    survey, found, _ = first_of(line, AtdStubConfig())
+def test_a_truncated_shadow_gives_no_height(line):
+    survey, found, _ = best_contact_of(line, AtdStubConfig())
     cut = replace(found, shadow_is_cut=True)
-    contact = of_detection(survey, cut, ORIGIN, "uuv-1", AtdStubConfig()).contact
+    contact = snippet_of(survey, cut, ORIGIN, "uuv-1", AtdStubConfig()).contact
     assert contact.height_m is None
     assert contact.shadow_m == found.shadow_m
 
 
-def test_the_survey_keys_of_the_configuration_are_checked_and_named(tmp_path):
+def test_errors_name_invalid_survey_options_of_the_configuration(tmp_path):
     path = tmp_path / "uuv.toml"
     head = '[platform]\nid = "uuv-1"\n[atd_stub]\nport_order = "nearest_first"\nprojected_crs = "EPSG:32619"\n'
     path.write_text(head + "[atd_stub.mounting]\nlayback_m = 25\n[atd_stub.errors]\nposition_m = 1.5\n")
@@ -119,11 +118,11 @@ def test_the_survey_keys_of_the_configuration_are_checked_and_named(tmp_path):
             load(path, "atd_stub", AtdStubConfig, {})
 
 
-# Pictures in square pixels on the ground
+# Images with square pixels on the ground
 
 
 def flat_survey(rows=300, along_m=0.1, altitude_m=4.0, samples=400, range_m=20.0) -> Survey:
-    """Ground with a bright square metre at 12 m ground range, row 150, and nothing else."""
+    """Make a flat seabed with one bright square metre at 12 m ground range in row 150."""
     slant_m = (np.arange(samples) + 0.5) * range_m / samples
     ground_m = np.sqrt(np.maximum(slant_m**2 - altitude_m**2, 0.0))
     echo = np.full((rows, samples), 100, dtype=np.uint16)
@@ -147,7 +146,7 @@ def flat_survey(rows=300, along_m=0.1, altitude_m=4.0, samples=400, range_m=20.0
 
 @pytest.fixture(scope="module")
 def detection(line):
-    return first_of(line, AtdStubConfig())[1]
+    return best_contact_of(line, AtdStubConfig())[1]
 
 
 def contact_at(survey: Survey, row: int, ground_m: float, found):
@@ -170,12 +169,12 @@ def contact_at(survey: Survey, row: int, ground_m: float, found):
 
 @pytest.mark.parametrize("along_m", [0.04, 0.1, 0.4])
 @pytest.mark.parametrize("altitude_m", [2.0, 8.0])
-def test_a_square_metre_is_a_square_in_the_middle_whatever_speed_and_altitude(along_m, altitude_m, detection):
+def test_a_square_metre_is_a_centred_square_at_any_speed_and_altitude(along_m, altitude_m, detection):
     survey = flat_survey(along_m=along_m, altitude_m=altitude_m)
-    picture = ground_projected_image(survey, contact_at(survey, 150, 12.0, detection), 80, 60, 0.1)
-    bright = np.argwhere(picture > 128)
+    image = ground_projected_image(survey, contact_at(survey, 150, 12.0, detection), 80, 60, 0.1)
+    bright = np.argwhere(image > 128)
     low, high = bright.min(axis=0), bright.max(axis=0) + 1
-    assert picture.shape == (80, 60)
+    assert image.shape == (80, 60)
     height, width = high - low
     assert height == pytest.approx(10, abs=1 + along_m / 0.1)
     assert width == pytest.approx(10, abs=2)
@@ -183,34 +182,33 @@ def test_a_square_metre_is_a_square_in_the_middle_whatever_speed_and_altitude(al
 
 
 @pytest.mark.parametrize("pixel_m", [0.0, 0.1])
-def test_beside_its_picture_goes_a_wide_one_of_twice_the_ground(pixel_m, detection):
+def test_the_expanded_image_shows_twice_the_ground(pixel_m, detection):
     survey = flat_survey()
     config = AtdStubConfig(snippet_height_px=60, snippet_width_px=60, snippet_pixel_m=pixel_m)
-    record = of_detection(survey, contact_at(survey, 150, 12.0, detection), ORIGIN, "uuv-1", config)
+    record = snippet_of(survey, contact_at(survey, 150, 12.0, detection), ORIGIN, "uuv-1", config)
     sizes = []
     for raster in (record.picture, record.wide):
         bright = np.argwhere(raster.to_array() > 128)
         sizes.append(bright.max(axis=0) + 1 - bright.min(axis=0))
     assert (record.wide.height_px, record.wide.width_px) == (60, 60)
-    # The square metre has half as many pixels each way, and lies where it lay.
+    # The square metre has half as many pixels in each direction, at the same place.
     np.testing.assert_allclose(sizes[1], sizes[0] / 2, atol=1.5)
     np.testing.assert_allclose(np.mean(np.argwhere(record.wide.to_array() > 128), axis=0)[0], 30, atol=1.5)
     assert record.contact.pixel_across_m == (pixel_m or 20.0 / 400)
 
 
-def test_where_the_survey_has_no_more_ground_there_is_no_wide_picture(detection):
+def test_without_more_seabed_in_the_survey_there_is_no_expanded_image(detection):
     survey = flat_survey()
     config = AtdStubConfig(snippet_height_px=300, snippet_width_px=60)
-    assert of_detection(survey, contact_at(survey, 150, 12.0, detection), ORIGIN, "uuv-1", config).wide is None
+    assert snippet_of(survey, contact_at(survey, 150, 12.0, detection), ORIGIN, "uuv-1", config).wide is None
 
 
-def test_a_picture_of_snippets_mode_has_no_wide_one(tmp_path, texture):
+def test_snippets_mode_has_no_expanded_image(tmp_path, texture):
     write_tiff(tmp_path / "p.tiff", texture())
-    (record,) = from_picture(tmp_path / "p.tiff", "ab" * 32, "uuv-1").snippets
-    assert record.wide is None
+    assert read_snippet(tmp_path / "p.tiff", "ab" * 32, "uuv-1").wide is None
 
 
-def test_what_was_not_recorded_is_black(detection):
+def test_unrecorded_seabed_is_black(detection):
     survey = flat_survey()
     at_the_end = ground_projected_image(survey, contact_at(survey, 290, 12.0, detection), 80, 60, 0.1)
     assert (at_the_end[52:] == 0).all()
@@ -221,7 +219,7 @@ def test_what_was_not_recorded_is_black(detection):
     assert (far[:, -20:] == 0).all()
 
 
-def test_without_altitude_or_travel_or_with_tiny_pixels_there_is_none(detection):
+def test_no_ground_projection_without_altitude_or_travel_or_with_tiny_pixels(detection):
     survey = flat_survey()
     found = contact_at(survey, 150, 12.0, detection)
     assert ground_projected_image(survey, replace(found, altitude_m=None), 80, 60, 0.1) is None
@@ -229,10 +227,10 @@ def test_without_altitude_or_travel_or_with_tiny_pixels_there_is_none(detection)
     assert ground_projected_image(survey, found, 80, 60, 1e-5) is None
 
 
-def test_the_record_says_the_size_of_the_pixels_it_has(line):
-    survey, found, native = first_of(line, AtdStubConfig())
+def test_the_record_has_the_pixel_size_of_its_image(line):
+    survey, found, native = best_contact_of(line, AtdStubConfig())
     config = AtdStubConfig(snippet_pixel_m=0.05, snippet_height_px=64, snippet_width_px=96)
-    sent = of_detection(survey, found, ORIGIN, "uuv-1", config)
+    sent = snippet_of(survey, found, ORIGIN, "uuv-1", config)
     assert (sent.contact.pixel_along_m, sent.contact.pixel_across_m) == (0.05, 0.05)
     assert (sent.picture.height_px, sent.picture.width_px) == (64, 96)
     assert (native.pixel_along_m, native.pixel_across_m) == (found.pixel_along_m, found.pixel_across_m)
@@ -242,20 +240,20 @@ def test_the_record_says_the_size_of_the_pixels_it_has(line):
 
 
 @pytest.mark.parametrize("contact", [FULL_CONTACT, BARE_CONTACT])
-def test_a_text_file_is_read_as_it_was_written(contact, tmp_path):
+def test_a_written_text_file_reads_back_equal(contact, tmp_path):
     path = tmp_path / "c.txt"
     path.write_text(contact_text(contact))
     assert read_contact(path, "other", contact.vehicle_id) == contact
 
 
-def test_a_text_file_is_for_people():
+def test_a_text_file_is_readable():
     text = contact_text(FULL_CONTACT)
     assert "time_utc: 2016-10-12T09:00:00.250Z\n" in text
     assert "lat_deg: 41.5251\n" in text
     assert "None" not in contact_text(BARE_CONTACT)
 
 
-def test_a_text_file_by_hand_may_say_little(tmp_path):
+def test_a_handwritten_text_file_may_have_few_fields(tmp_path):
     path = tmp_path / "c.txt"
     path.write_text(
         "\ufeff lat_deg :41.5\nlon_deg: -70\n\nseen_by: diver\nvehicle_id: uuv-9\ntime_utc: 2016-10-12T09:20\n"
@@ -265,7 +263,7 @@ def test_a_text_file_by_hand_may_say_little(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("lat_deg: 91\n", "lat_deg: got 91, expected"),
         ("lat_deg: north\n", "lat_deg: got 'north', expected a number"),
@@ -278,40 +276,40 @@ def test_a_text_file_by_hand_may_say_little(tmp_path):
         (b"\xff\xfe\x00", "UTF-8"),
     ],
 )
-def test_a_text_file_that_is_none_is_refused_by_name(text, said, tmp_path):
+def test_errors_name_the_invalid_line_or_field_of_a_text_file(text, expected, tmp_path):
     path = tmp_path / "c.txt"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(SurveyFileError, match=r"c\.txt: ") as caught:
         read_contact(path, "c1", "uuv-1")
-    assert said in str(caught.value)
+    assert expected in str(caught.value)
 
 
-def test_a_snippet_on_the_disk_is_named_by_its_contact_and_stays_in_its_folder(tmp_path):
-    picture = np.arange(400, dtype=np.uint8).reshape(20, 20)
+def test_the_file_name_of_a_snippet_is_its_contact_id_without_path_separators(tmp_path):
+    image = np.arange(400, dtype=np.uint8).reshape(20, 20)
     contact = Contact(contact_id="../a b/ü", vehicle_id="uuv-1", lat_deg=1.0)
-    tiff = write_snippet(tmp_path / "new" / "out", Snippet(contact=contact, picture=Pixels.from_array(picture)))
+    tiff = write_snippet(tmp_path / "new" / "out", Snippet(contact=contact, picture=Pixels.from_array(image)))
     assert tiff.parent == tmp_path / "new" / "out"
-    np.testing.assert_array_equal(read_image(tiff), picture)
+    np.testing.assert_array_equal(read_image(tiff), image)
     assert read_contact(tiff.with_suffix(".txt"), "x", "uuv-1") == contact
 
 
-# In the service
+# The service
 
 
 @pytest.fixture
-def begin(runner, platform, tmp_path):
+def start_service(runner, platform, tmp_path):
     (tmp_path / "incoming").mkdir(exist_ok=True)
 
     def start(**changes):
-        given = {"input_dir": tmp_path / "incoming", "poll_s": 0.02, "settle_s": 0.0, **changes}
-        return runner.start(AtdStubService(platform("uuv-1"), AtdStubConfig(**given)))
+        settings = {"max_in_flight": 0, "input_dir": tmp_path / "incoming", "poll_s": 0.02, "settle_s": 0.0, **changes}
+        return runner.start(AtdStubService(platform("uuv-1"), AtdStubConfig(**settings)))
 
     return start
 
 
-def test_what_is_kept_on_the_vehicle_can_be_sent_again_with_its_position(begin, runner, tmp_path, line):
+def test_stored_snippets_can_be_sent_again_with_their_positions(start_service, runner, tmp_path, line):
     compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
-    service = begin(snippet_dir=tmp_path / "kept", confidence_threshold=0.3, max_contacts=2)
+    service = start_service(snippet_dir=tmp_path / "kept", confidence_threshold=0.3, max_contacts=2)
     os.link(line, tmp_path / "incoming" / "line-7.xtf")
     eventually(lambda: len(compressor.received) == 2)
     runner.stop(service)
@@ -319,7 +317,7 @@ def test_what_is_kept_on_the_vehicle_can_be_sent_again_with_its_position(begin, 
     assert sorted(p.name for p in (tmp_path / "kept").iterdir()) == sorted(
         f"{name}.{suffix}" for name in first for suffix in ("tiff", "txt")
     )
-    begin(mode="snippets", input_dir=tmp_path / "kept")
+    start_service(mode="snippets", input_dir=tmp_path / "kept")
     eventually(lambda: len(compressor.received) == 4)
     for again in compressor.received[2:]:
         before = first[again.contact.contact_id]
@@ -330,41 +328,43 @@ def test_what_is_kept_on_the_vehicle_can_be_sent_again_with_its_position(begin, 
         assert again.contact.time_utc_s == pytest.approx(before.contact.time_utc_s, abs=0.001)
 
 
-def test_a_picture_with_a_bad_text_goes_to_quarantine(begin, tmp_path, texture):
+def test_an_image_with_an_invalid_text_file_is_quarantined(start_service, tmp_path, texture):
     folder = tmp_path / "incoming"
     (folder / "p.txt").write_text("lat_deg: 123\n")
     write_tiff(folder / "p.tiff", texture())
-    begin(mode="snippets")
+    start_service(mode="snippets")
     reason = folder / "quarantine" / "p.tiff.reason.txt"
     eventually(lambda: reason.is_file() and not (folder / "p.tiff").exists())
     assert "lat_deg" in reason.read_text()
 
 
-def test_a_done_file_counts_at_once_and_where_it_is_needed_nothing_else_does(tmp_path):
+def test_a_done_marker_completes_a_file_and_can_be_required(tmp_path):
     (tmp_path / "a.xtf").write_bytes(b"x")
     (tmp_path / "b.xtf").write_bytes(b"x")
     (tmp_path / "a.xtf.done").write_bytes(b"")
-    here = look_at(tmp_path, (".xtf",))
-    assert {seen.path.name: seen.is_done for seen in here} == {"a.xtf": True, "b.xtf": False}
-    names = lambda found: [seen.path.name for seen in found]  # noqa: E731
-    assert names(SettledFiles(5.0).look(here, 0.0)) == ["a.xtf"]
-    patient = SettledFiles(5.0, require_done_marker=True)
-    assert names(patient.look(here, 0.0)) == ["a.xtf"]
-    assert names(patient.look(here, 100.0)) == ["a.xtf"]
-    done = tuple(replace(seen, is_done=True) for seen in here)
-    assert names(patient.look(done, 101.0)) == ["a.xtf", "b.xtf"]
-    assert FileSeen(Path("a"), 1, 2, is_done=True) == FileSeen(Path("a"), 1, 2), "what is dealt with stays so"
+    files = list_input_files(tmp_path, (".xtf",))
+    assert {file.path.name: file.is_done for file in files} == {"a.xtf": True, "b.xtf": False}
+    names = lambda found: [file.path.name for file in found]  # noqa: E731
+    assert names(StableFiles(5.0).update(files, 0.0)) == ["a.xtf"]
+    with_marker = StableFiles(5.0, require_done_marker=True)
+    assert names(with_marker.update(files, 0.0)) == ["a.xtf"]
+    assert names(with_marker.update(files, 100.0)) == ["a.xtf"]
+    done = tuple(replace(file, is_done=True) for file in files)
+    assert names(with_marker.update(done, 101.0)) == ["a.xtf", "b.xtf"]
+    assert InputFile(Path("a"), 1, 2, is_done=True) == InputFile(Path("a"), 1, 2), (
+        "the marker does not make it another file"
+    )
 
 
-def test_the_same_file_under_another_name_is_said(begin, runner, tmp_path, line, caplog):
+def test_a_copy_under_another_name_is_logged(start_service, runner, tmp_path, line, caplog):
     caplog.set_level("INFO")
     runner.peer("uuv-1", "compressor", {KEY: Snippet})
-    service = begin()
+    service = start_service()
     os.link(line, tmp_path / "incoming" / "line-7.xtf")
     eventually(lambda: service.health().counters.get("files_processed") == 1)
     (tmp_path / "incoming" / ".again.xtf").write_bytes(line.read_bytes())
     (tmp_path / "incoming" / ".again.xtf").rename(tmp_path / "incoming" / "again.xtf")
-    eventually(lambda: any(r.message == "File known already" for r in caplog.records))
-    (said,) = [r.fields for r in caplog.records if r.message == "File known already"]
-    assert (said["file"], said["processed_as"]) == ("again.xtf", "line-7.xtf")
+    eventually(lambda: any(r.message == "File already processed" for r in caplog.records))
+    (fields,) = [r.fields for r in caplog.records if r.message == "File already processed"]
+    assert (fields["file"], fields["processed_as"]) == ("again.xtf", "line-7.xtf")
     assert service.health().counters["files_processed"] == 1

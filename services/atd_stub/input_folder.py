@@ -1,0 +1,93 @@
+"""The polled input folder: which files are there, and which of them are complete."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+DONE_SUFFIX = ".done"
+
+
+@dataclass(frozen=True, slots=True)
+class InputFile:
+    """A file as one poll of the folder found it.
+
+    Attributes:
+        path: The file.
+        size_bytes: Its size.
+        modified_ns: Its modification time.
+        is_done: Whether its recorder has put `NAME.done` beside it. Not part of the comparison.
+    """
+
+    path: Path
+    size_bytes: int
+    modified_ns: int
+    is_done: bool = field(default=False, compare=False)
+
+
+class StableFiles:
+    """Decides which files are complete.
+
+    Args:
+        settle_s: A file is complete when its size and date have not changed for this long, or at once with `NAME.done`.
+        require_done_marker: A file without `NAME.done` is never complete.
+    """
+
+    def __init__(self, settle_s: float, *, require_done_marker: bool = False) -> None:
+        self._settle_s = settle_s
+        self._require_done_marker = require_done_marker
+        self._unchanged_since_s: dict[InputFile, float] = {}
+
+    def update(self, files: tuple[InputFile, ...], now_s: float) -> tuple[InputFile, ...]:
+        """Return the complete files, oldest first; files of one date are sorted by name.
+
+        Args:
+            files: All files of the folder now.
+            now_s: Monotonic time.
+        """
+        self._unchanged_since_s = {file: self._unchanged_since_s.get(file, now_s) for file in files}
+        is_done = {file.path: file.is_done for file in files}
+        complete = (
+            file
+            for file, since_s in self._unchanged_since_s.items()
+            if is_done[file.path] or (now_s - since_s >= self._settle_s and not self._require_done_marker)
+        )
+        return tuple(sorted(complete, key=lambda file: (file.modified_ns, file.path.name)))
+
+
+def list_input_files(folder: Path, suffixes: tuple[str, ...]) -> tuple[InputFile, ...]:
+    """Return the regular files with these suffixes. Names that begin with a dot are skipped (copy in progress).
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
+    paths = tuple(folder.iterdir())
+    names = {path.name for path in paths}
+    files = []
+    for path in paths:
+        if path.name.startswith(".") or path.suffix.lower() not in suffixes:
+            continue
+        if not path.is_file():
+            continue  # a folder, a pipe or a broken link
+        try:
+            status = path.stat()
+        except FileNotFoundError:
+            continue  # removed after the folder was listed
+        files.append(InputFile(path, status.st_size, status.st_mtime_ns, path.name + DONE_SUFFIX in names))
+    return tuple(files)
+
+
+def printable(text: str) -> str:
+    """Return `text` with undecodable bytes of a file name escaped, as records and logs require."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
+def content_sha256(path: Path) -> str:
+    """Return the hex SHA-256 of a file's content, its identity under any name.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

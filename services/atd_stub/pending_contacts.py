@@ -1,0 +1,54 @@
+"""Durable priority list of the snippets that wait for release, most confident first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sonarpost import wire
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import UnitOfWork
+from sonarpost.messages import Snippet
+
+_PREFIX = "pool:"
+_MAX_CONFIDENCE = 2.0
+_STEPS = 1_000_000
+
+
+class PendingContacts:
+    """Snippets in the service's store.
+
+    The name of a stored snippet sorts by confidence, then by age. A contact without confidence comes last. All
+    content is in the store: a unit of work that is not committed changes nothing. One thread adds, one thread removes.
+
+    Args:
+        store: The service's store.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._next_number = 1 + max((int(name.rpartition(":")[2]) for name in store.state_names(_PREFIX)), default=0)
+
+    def __len__(self) -> int:
+        return len(self._store.state_names(_PREFIX))
+
+    def add(self, effects: UnitOfWork, snippets: Sequence[Snippet]) -> None:
+        """Add snippets."""
+        for snippet in snippets:
+            confidence = snippet.contact.atd_confidence
+            rank = round((_MAX_CONFIDENCE - (confidence or 0.0)) * _STEPS) + (confidence is None)
+            effects.put_state(f"{_PREFIX}{rank:08d}:{self._next_number:015d}", wire.encode(snippet))
+            self._next_number += 1
+
+    def remove_first(self, effects: UnitOfWork, count: int | None) -> list[bytes]:
+        """Remove up to `count` (None for all) of the most confident snippets; return them encoded, in this order.
+
+        Raises:
+            DeliveryError: The store cannot be read.
+        """
+        payloads = []
+        for name in sorted(self._store.state_names(_PREFIX))[:count]:
+            payload = self._store.get_state(name)
+            assert payload is not None, f"{name} was removed by another writer"
+            effects.delete_state(name)
+            payloads.append(payload)
+        return payloads

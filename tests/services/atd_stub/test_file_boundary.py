@@ -1,0 +1,249 @@
+"""atd_stub at file boundaries: an object across two files is one contact, and no held contact is lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from builders.common import GOLDEN_FOLDER, eventually
+from builders.joined_surveys import RANGE_M, SAMPLES, START_S, Box, detect_in_files, near, split, survey_of
+from builders.two_frequencies import with_second_frequency
+
+from sonarpost import keys
+from sonarpost.messages import Snippet
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.file_boundary import BoundaryDetection, Origin, pack, stored_ping_count, unpack
+from sonarpost.services.atd_stub.service import AtdStubService
+from sonarpost.services.atd_stub.survey_detection import detect_in_survey
+from sonarpost.sonar.readers.xtf import read_xtf
+from sonarpost.sonar.survey import ChannelPing, Ping, Side
+from sonarpost.sonar.xtf_writer import write_xtf
+
+KEY = keys.contact_detected("uuv-1")
+GOLDEN = GOLDEN_FOLDER / "atd_stub" / "seam-format-1.hex"
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 30.0])
+@pytest.mark.parametrize("boundary", [100, 146, 149, 151, 155])
+def test_an_object_is_one_contact_at_any_file_boundary(boundary, wait_s, tmp_path):
+    survey = survey_of(300, Box(150))
+    sent = detect_in_files(split(tmp_path, survey, (0, boundary), (boundary, 300)), join_timeout_s=wait_s)
+    (snippet,) = near(sent, 150)
+    assert len({s.contact.contact_id for s in sent}) == len(sent)
+    if wait_s:
+        # It waited for the continuation file: the object is in the middle of a complete image.
+        assert snippet.picture.height_px == 80
+        bright = snippet.picture.to_array().astype(float)
+        rows = bright[:, max(0, 70 - 20) :].max(axis=1)
+        assert rows[36:44].mean() > 1.2 * np.r_[rows[:20], rows[-20:]].mean()
+    number = 0 if snippet.contact.ping_number < boundary else 1
+    assert snippet.contact.line_name == snippet.source.removesuffix(".xtf") == f"line-{number}"
+
+
+def test_contacts_far_from_the_boundary_are_not_held(tmp_path):
+    survey = survey_of(300, Box(100), Box(260, Side.STARBOARD))
+    (path,) = split(tmp_path, survey, (0, 300))
+    result = detect_in_survey(path, "0" * 64, "uuv-1", AtdStubConfig(join_timeout_s=30.0), {}, 100.0)
+    assert near(list(result.snippets), 100)
+    assert not near(list(result.snippets), 260, Side.STARBOARD)
+    assert near(result.file_end.held_snippets(), 260, Side.STARBOARD)
+    assert result.file_end.hold_until_utc_s == 130.0
+
+
+def test_short_files_are_joined(tmp_path):
+    survey = survey_of(250, Box(40), Box(100), Box(150, Side.STARBOARD), Box(199))
+    spans = list(pairwise(range(0, 251, 50)))
+    sent = detect_in_files(split(tmp_path, survey, *spans), join_timeout_s=30.0)
+    for row, side in ((40, Side.PORT), (100, Side.PORT), (150, Side.STARBOARD), (199, Side.PORT)):
+        assert len(near(sent, row, side)) == 1, row
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 30.0])
+def test_repeated_pings_are_searched_once(wait_s, tmp_path):
+    survey = survey_of(300, Box(130), Box(100, Side.STARBOARD))
+    sent = detect_in_files(split(tmp_path, survey, (0, 150), (90, 300)), join_timeout_s=wait_s)
+    assert len(near(sent, 130)) == len(near(sent, 100, Side.STARBOARD)) == 1
+
+
+def test_each_object_of_a_long_file_is_one_contact_in_any_strip(tmp_path):
+    rows = [200, 780, 800, 885, 899, 901, 915, 985, 1000, 1600]
+    sides = [Side.PORT, Side.STARBOARD]
+    boxes = [Box(row, sides[n % 2]) for n, row in enumerate(rows)]
+    (path,) = split(tmp_path, survey_of(1700, *boxes), (0, 1700))
+    sent = detect_in_files([path])
+    assert [len(near(sent, box.row, box.side)) for box in boxes] == [1] * len(boxes)
+
+
+@pytest.mark.parametrize("what", ["later", "elsewhere", "other sonar", "other range", "earlier", "one more channel"])
+def test_a_file_that_is_no_continuation_is_not_joined(what, tmp_path):
+    survey = survey_of(200, Box(97))
+    first, second = split(tmp_path, survey, (0, 100), (100, 200))
+    later = survey.pings[100:]
+    match what:
+        case "later":
+            later = tuple(replace(p, time_utc_s=p.time_utc_s + 5.0) for p in later)
+        case "elsewhere":
+            later = tuple(replace(p, lat_deg=p.lat_deg + 0.001) for p in later)
+        case "other range":
+            later = tuple(replace(p, channels=tuple(replace(c, slant_range_m=30.0) for c in p.channels)) for p in later)
+        case "earlier":
+            later = tuple(replace(p, time_utc_s=p.time_utc_s - 3600.0) for p in later)
+        case "one more channel":
+            later = with_second_frequency(replace(survey, pings=later), SAMPLES, RANGE_M).pings
+    write_xtf(replace(survey, pings=later, sonar_id="else" if what == "other sonar" else "made"), second)
+    config = AtdStubConfig(join_timeout_s=30.0)
+    file_end = detect_in_survey(first, "0" * 64, "uuv-1", config, {}, 100.0).file_end
+    assert near(file_end.held_snippets(), 97)
+    assert not detect_in_survey(second, "1" * 64, "uuv-1", config, {file_end.sonar_id: file_end}, 100.0).joined
+
+
+def test_a_stopped_clock_does_not_merge_contacts(tmp_path):
+    survey = survey_of(260, Box(60), Box(120), Box(200))
+    stopped = replace(survey, pings=tuple(replace(p, time_utc_s=START_S) for p in survey.pings))
+    sent = detect_in_files(split(tmp_path, stopped, (0, 260)))
+    assert [len(near(sent, row)) for row in (60, 120, 200)] == [1, 1, 1]
+
+
+def test_max_contacts_keeps_the_most_confident(tmp_path):
+    (path,) = split(tmp_path, survey_of(500, *(Box(row) for row in range(60, 460, 60))), (0, 500))
+    every_contact = sorted(detect_in_files([path]), key=lambda s: -s.contact.atd_confidence)
+    limited = detect_in_files([path], max_contacts=3)
+    assert [s.contact.contact_id for s in limited] == [s.contact.contact_id for s in every_contact[:3]]
+
+
+def test_a_file_end_is_restored_from_the_store(tmp_path):
+    (path,) = split(tmp_path, survey_of(150, Box(130)), (0, 150))
+    file_end = detect_in_survey(path, "0" * 64, "uuv-1", AtdStubConfig(join_timeout_s=30.0), {}, 100.0).file_end
+    restored = unpack(pack(file_end))
+    assert (restored.sonar_id, restored.origins, restored.detections, restored.hold_until_utc_s) == (
+        file_end.sonar_id,
+        file_end.origins,
+        file_end.detections,
+        file_end.hold_until_utc_s,
+    )
+    assert restored.held
+    for one, other in zip(file_end.pings, restored.pings, strict=True):
+        assert replace(one, channels=()) == replace(other, channels=())
+        for channel, restored_channel in zip(one.channels, other.channels, strict=True):
+            np.testing.assert_array_equal(channel.samples, restored_channel.samples)
+            assert (channel.side, channel.samples.dtype, channel.slant_range_m, channel.scale) == (
+                restored_channel.side,
+                restored_channel.samples.dtype,
+                restored_channel.slant_range_m,
+                restored_channel.scale,
+            )
+    with pytest.raises(ValueError, match="format: got 2, expected 1"):
+        unpack(pack(file_end).replace(b"\xa6format\x01", b"\xa6format\x02"))
+
+
+def test_a_stored_file_end_of_format_1_is_read_and_written_unchanged():
+    packed = bytes.fromhex(GOLDEN.read_text())
+    file_end = unpack(packed)
+    first, second = Origin("0a" * 32, "line-0.xtf", "line-0"), Origin("1b" * 32, "line-1.xtf", "line-1")
+    assert (file_end.sonar_id, file_end.hold_until_utc_s, file_end.origins) == (
+        "made",
+        1.0e9 + 30.0,
+        (first, first, second),
+    )
+    assert file_end.detections == (
+        BoundaryDetection(Side.PORT, -2, -5, 1, 11.25, 0.2),
+        BoundaryDetection(Side.STARBOARD, 1, 0, 3, 12.5, 0.125, b"\x81a snippet's payload"),
+    )
+    assert file_end.held == (b"\x81a snippet's payload",)
+    assert [ping.number for ping in file_end.pings] == [98, 99, 100]
+    assert (file_end.pings[0].pitch_deg, file_end.pings[0].roll_deg, file_end.pings[1].lat_deg) == (0.5, -0.25, None)
+    starboard = file_end.pings[2].channel(Side.STARBOARD)
+    assert (starboard.frequency_hz, starboard.scale, starboard.samples.dtype) == (600e3, 0.5, np.uint16)
+    np.testing.assert_array_equal(starboard.samples, [7, 8, 65535])
+    assert pack(file_end) == packed
+
+
+def test_detections_of_one_object_are_near_each_other():
+    detection = BoundaryDetection(Side.PORT, 50, 46, 54, 11.0, 0.1)
+    assert detection.is_same_object(detection)
+    assert detection.is_same_object(replace(detection, row=79, first_row=75, end_row=83))
+    assert not detection.is_same_object(replace(detection, row=81, first_row=77, end_row=85))
+    assert detection.is_same_object(replace(detection, row=90, first_row=53, end_row=127)), (
+        "one of them shows the whole object"
+    )
+    assert not detection.is_same_object(replace(detection, side=Side.STARBOARD))
+    assert not detection.is_same_object(replace(detection, slant_range_m=14.1))
+
+
+def test_a_file_end_holds_at_most_16_mib_of_samples():
+    ping = Ping(0, 0.0, (ChannelPing(Side.PORT, np.zeros(1 << 20, dtype=np.uint32), 10.0),))
+    assert stored_ping_count([ping] * 50, 200) == 4
+    assert stored_ping_count([ping] * 2, 200) == 2
+    assert stored_ping_count([], 200) == 0
+
+
+# The service
+
+
+@pytest.fixture
+def start_service(runner, platform, tmp_path):
+    (tmp_path / "incoming").mkdir(exist_ok=True)
+
+    def start(**changes):
+        config = AtdStubConfig(input_dir=tmp_path / "incoming", poll_s=0.02, settle_s=0.0, max_in_flight=0, **changes)
+        return runner.start(AtdStubService(platform("uuv-1"), config))
+
+    return start
+
+
+@pytest.fixture
+def halves(tmp_path):
+    """A line whose file boundary is at an object, delivered file by file."""
+    (tmp_path / "made").mkdir()
+    paths = split(tmp_path / "made", survey_of(240, Box(120)), (0, 119), (119, 240))
+
+    def deliver(number: int) -> None:
+        paths[number].rename(tmp_path / "incoming" / paths[number].name)
+
+    return deliver
+
+
+def files_processed(service):
+    return service.health().counters.get("files_processed", 0)
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_contact_at_the_boundary_waits_for_the_continuation_file_and_is_sent_once(
+    restarted, start_service, runner, halves
+):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    service = start_service(join_timeout_s=3600.0)
+    halves(0)
+    eventually(lambda: files_processed(service) == 1)
+    eventually(lambda: service.health().gauges["contacts_waiting"] >= 1)
+    assert near(compressor.received, 120) == []
+    if restarted:
+        runner.stop(service)
+        service = start_service(join_timeout_s=3600.0)
+        eventually(lambda service=service: service.health().gauges["contacts_waiting"] >= 1)
+    halves(1)
+    eventually(lambda: len(near(compressor.received, 120)) == 1)
+    assert near(compressor.received, 120)[0].picture.height_px == 80
+
+
+def test_a_held_contact_is_released_when_no_continuation_file_arrives(start_service, runner, halves):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    service = start_service(join_timeout_s=0.2)
+    halves(0)
+    eventually(lambda: len(near(compressor.received, 120)) == 1)
+    eventually(lambda: service.health().gauges["contacts_waiting"] == 0)
+    halves(1)
+    eventually(lambda: files_processed(service) == 2)
+    eventually(lambda: service.health().gauges["contacts_waiting"] == service.health().gauges["outbox"] == 0)
+    assert len(near(compressor.received, 120)) == 1, "the second search recognises it"
+
+
+def test_the_builders_write_the_pings_of_each_part(tmp_path):
+    """The builders of this file work: the written pings are read back."""
+    survey = survey_of(60, Box(30))
+    (path,) = split(tmp_path, survey, (10, 50))
+    read = read_xtf(path)
+    assert [p.number for p in read.pings] == list(range(10, 50))
+    np.testing.assert_array_equal(read.pings[0].channel(Side.PORT).samples, survey.pings[10].channel(Side.PORT).samples)

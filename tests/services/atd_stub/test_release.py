@@ -1,0 +1,418 @@
+"""atd_stub: release of contacts by the credit of the acoustic transmit queue."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import time
+
+import msgpack
+import numpy as np
+import pytest
+from builders.common import REPOSITORY, eventually
+
+from sonarpost import keys, wire
+from sonarpost.delivery.store import Store
+from sonarpost.delivery.transaction import UnitOfWork
+from sonarpost.errors import DeliveryError
+from sonarpost.messages import Contact, Pixels, QueuedImage, QueueState, Snippet
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.pending_contacts import PendingContacts
+from sonarpost.services.atd_stub.release import RELEASE_EXPIRY_S, ReleaseCredit
+from sonarpost.services.atd_stub.service import AtdStubService
+from sonarpost.sonar.image_files import write_tiff
+
+KEY = keys.contact_detected("uuv-1")
+
+
+def queue_state(waiting, accepted=None, bytes_left=()):
+    return QueueState(
+        platform_id="uuv-1",
+        time_utc_s=1.0,
+        rate=1,
+        frame_loss=None,
+        packet_interval_s=5.0,
+        messages_waiting=0,
+        message_bytes=0,
+        images_waiting=waiting,
+        images=tuple(
+            QueuedImage(image_id=f"{n:04d}", contact_id="c", bytes_left=left, preview_utc_s=None, expected_utc_s=1.0)
+            for n, left in enumerate(bytes_left)
+        ),
+        images_accepted=accepted,
+    )
+
+
+# Credit
+
+
+@pytest.fixture
+def credit():
+    return ReleaseCredit(8)
+
+
+def test_there_is_no_credit_before_the_first_queue_state(credit):
+    assert credit.available(0) == 0
+    credit.update(queue_state(0, 0), 1000.0)
+    assert credit.available(0) == 8
+
+
+def test_images_in_the_queue_and_released_contacts_use_credit(credit):
+    credit.update(queue_state(3, 10), 1000.0)
+    assert credit.available(0) == 5
+    credit.released(2, 1000.0)
+    assert (credit.available(0), credit.in_flight(0)) == (3, 5)
+    credit.update(queue_state(4, 11), 1001.0)
+    assert (credit.available(0), credit.in_flight(0)) == (3, 5)
+    credit.update(queue_state(5, 12), 1002.0)
+    assert credit.in_flight(0) == 5
+    credit.update(queue_state(4, 12), 1003.0)
+    assert credit.available(0) == 4
+    credit.update(queue_state(20, 12), 1003.0)
+    assert credit.available(0) == 0
+
+
+def test_contacts_that_the_compressor_has_not_accepted_use_credit_even_when_their_release_times_expire(credit):
+    credit.update(queue_state(0, 0), 1000.0)
+    credit.released(6, 1000.0)
+    credit.update(queue_state(0, 0), 1000.0 + RELEASE_EXPIRY_S + 1.0)
+    assert credit.available(6) == 2
+    assert credit.available(0) == 8
+
+
+def test_images_without_bytes_left_do_not_use_credit(credit):
+    credit.update(queue_state(3, 0, bytes_left=(64, 0, 1)), 1000.0)
+    assert credit.in_flight(0) == 2
+    credit.update(queue_state(503, 0, bytes_left=[1] * 500), 1001.0)
+    assert credit.in_flight(0) == 503
+
+
+def test_a_lost_contact_blocks_its_credit_for_ten_minutes(credit):
+    credit.update(queue_state(0, 0), 1000.0)
+    credit.released(8, 1000.0)
+    credit.update(queue_state(0, 7), 1001.0)
+    assert credit.available(0) == 7
+    credit.update(queue_state(0, 7), 1000.0 + RELEASE_EXPIRY_S)
+    assert credit.available(0) == 7
+    credit.update(queue_state(0, 7), 1000.5 + RELEASE_EXPIRY_S)
+    assert credit.available(0) == 8
+
+
+def test_released_contacts_do_not_expire_while_no_queue_state_arrives(credit):
+    credit.update(queue_state(0, 0), 1000.0)
+    credit.released(8, 1000.0)
+    assert credit.available(0) == 0, "the modem service is down; its contacts wait for it"
+
+
+def test_release_times_in_the_future_are_removed(credit):
+    credit.update(queue_state(0, 0), 90_000.0)
+    credit.released(8, 90_000.0)
+    credit.update(queue_state(0, 0), 1000.0)
+    assert credit.available(0) == 8
+
+
+def test_a_queue_state_without_a_count_keeps_release_times_until_they_expire(credit):
+    credit.update(queue_state(0), 1000.0)
+    credit.released(3, 1000.0)
+    credit.update(queue_state(3), 1010.0)
+    assert credit.available(0) == 2
+    credit.update(queue_state(0), 1000.5 + RELEASE_EXPIRY_S)
+    assert credit.available(0) == 8
+
+
+def test_a_replaced_store_resets_the_count(credit):
+    credit.update(queue_state(0, 700), 1000.0)
+    credit.released(5, 1000.0)
+    credit.update(queue_state(0, 0), 1001.0)
+    assert credit.available(0) == 3, "these five are still on the way to the new store"
+    credit.update(queue_state(5, 5), 1002.0)
+    assert credit.available(0) == 3
+    credit.update(queue_state(0, 5), 1003.0)
+    assert credit.available(0) == 8
+    credit.released(5, 1003.0)
+    credit.update(queue_state(2, 2), 1004.0)
+    assert credit.in_flight(0) == 5
+
+
+def test_the_credit_is_restored_from_what_the_last_release_stored(credit):
+    credit.update(queue_state(2, 40), 1000.0)
+    credit.released(5, 1000.0)
+    restored = ReleaseCredit(8)
+    restored.unpack(credit.pack())
+    assert restored.available(0) == 0
+    restored.update(queue_state(4, 43), 1005.0)
+    assert (restored.in_flight(0), restored.available(0)) == (6, 2)
+
+
+def test_limit_0_gives_unlimited_credit():
+    credit = ReleaseCredit(0)
+    assert credit.available(1000) is None
+    credit.released(5, 1000.0)
+    assert credit.in_flight(0) == 0
+
+
+# The list of pending contacts
+
+
+def snippet(name, confidence):
+    image = Pixels.from_array(np.full((16, 16), 7, np.uint8))
+    return Snippet(contact=Contact(contact_id=name, vehicle_id="uuv-1", atd_confidence=confidence), picture=image)
+
+
+def commit(store, effects):
+    with store.transaction() as tx:
+        effects.write(tx)
+
+
+BY_PRIORITY = [("c", 1.9), ("a", 1.5), ("d", 1.5), ("e", 1.25), ("b", 0.0), ("f", None), ("g", None)]
+
+
+def test_pending_contacts_are_removed_most_confident_first_also_after_a_restart(tmp_path):
+    store = Store(tmp_path / "pending.db")
+    pending = PendingContacts(store)
+    for name, confidence in sorted(BY_PRIORITY):
+        effects = UnitOfWork()
+        pending.add(effects, [snippet(name, confidence)])
+        commit(store, effects)
+    removed = []
+    for count in (1, 3, 2, 9):
+        effects = UnitOfWork()
+        payloads = pending.remove_first(effects, count)
+        assert len(payloads) == min(count, len(BY_PRIORITY) - len(removed))
+        removed += payloads
+        commit(store, effects)
+        pending = PendingContacts(store)
+        assert len(pending) == len(BY_PRIORITY) - len(removed)
+    names = [wire.decode(Snippet, each, "removed").contact.contact_id for each in removed]
+    assert names == [name for name, _ in BY_PRIORITY]
+    store.close()
+
+
+def test_nothing_changes_without_a_commit(tmp_path):
+    store = Store(tmp_path / "pending.db")
+    pending = PendingContacts(store)
+    pending.add(UnitOfWork(), [snippet("a", 1.0)])
+    assert len(pending) == 0
+    effects = UnitOfWork()
+    pending.add(effects, [snippet("b", 1.0), snippet("c", 1.5)])
+    commit(store, effects)
+    first = pending.remove_first(UnitOfWork(), 1)
+    assert pending.remove_first(UnitOfWork(), None)[:1] == first
+    assert len(pending) == 2
+    store.close()
+
+
+# The service
+
+
+@pytest.fixture
+def start_service(runner, platform, tmp_path):
+    def start(**changes):
+        config = AtdStubConfig(mode="snippets", input_dir=tmp_path / "incoming", poll_s=0.02, settle_s=0.0, **changes)
+        return runner.start(AtdStubService(platform("uuv-1"), config))
+
+    return start
+
+
+@pytest.fixture
+def put_images(tmp_path, texture):
+    """Image files whose text files have the confidence of the detector, in the order of their names."""
+    folder = tmp_path / "incoming"
+    folder.mkdir()
+
+    def put(confidences, first=0):
+        for number, confidence in enumerate(confidences, start=first):
+            (folder / f"p{number:03d}.txt").write_text(f"contact_id: p{number:03d}\natd_confidence: {confidence}\n")
+            hidden = folder / f".p{number:03d}.tiff"
+            write_tiff(hidden, texture(seed=number))
+            hidden.rename(folder / f"p{number:03d}.tiff")
+
+    return put
+
+
+@pytest.fixture
+def modem(client):
+    """A modem service of which only the queue states exist."""
+
+    class Modem:
+        waiting, accepted = 0, 0
+
+        def publish(self):
+            client.put(keys.acoustic_queue("uuv-1"), wire.encode(queue_state(self.waiting, self.accepted)))
+
+        def accept(self, count):
+            self.waiting += count
+            self.accepted += count
+            self.publish()
+
+        def transmit(self, count):
+            self.waiting -= count
+            self.publish()
+
+    return Modem()
+
+
+def gauge(service, name):
+    return service.health().gauges[name]
+
+
+def publish_until(modem, condition):
+    eventually(lambda: (modem.publish(), condition())[1])
+
+
+def test_the_most_confident_contacts_are_released_first_and_never_too_many(start_service, runner, put_images, modem):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    confidences = random.Random(3).sample([n / 10 for n in range(20)], 8)
+    put_images(confidences)
+    service = start_service(max_in_flight=2)
+    eventually(lambda: service.health().counters.get("contacts_detected") == 8)
+    assert gauge(service, "contacts_waiting") == 8
+    assert "8 contacts wait for the first queue_state of uuv_modem" in service.health().detail
+    publish_until(modem, lambda: len(compressor.received) == 2)
+    eventually(lambda: (gauge(service, "contacts_in_flight"), gauge(service, "contacts_waiting")) == (2, 6))
+    assert service.health().state == "ok"
+    assert "6 contacts wait for space in the acoustic transmit queue" in service.health().detail
+    for number in range(3, 9):
+        modem.accept(1)
+        time.sleep(0.05)
+        assert len(compressor.received) == number - 1, "the accepted image still waits in the transmit queue"
+        modem.transmit(1)
+        eventually(lambda number=number: len(compressor.received) == number)
+    assert [s.contact.atd_confidence for s in compressor.received] == sorted(confidences, reverse=True)
+
+
+def test_a_full_transmit_queue_holds_contacts_over_a_restart_of_this_service(start_service, runner, put_images, modem):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    put_images([1.0])
+    service = start_service(max_in_flight=3)
+    publish_until(modem, lambda: len(compressor.received) == 1)
+    modem.accept(1)
+    modem.waiting = 3
+    publish_until(modem, lambda: gauge(service, "contacts_in_flight") == 3)
+    put_images([0.5, 1.5], first=1)
+    eventually(lambda: gauge(service, "contacts_waiting") == 2)
+    runner.stop(service)
+    service = start_service(max_in_flight=3)
+    eventually(lambda: gauge(service, "files_waiting") == 0)
+    assert len(compressor.received) == 1, "no queue state has arrived"
+    publish_until(modem, lambda: gauge(service, "contacts_in_flight") == 3)
+    assert gauge(service, "contacts_waiting") == 2
+    modem.transmit(1)
+    eventually(lambda: len(compressor.received) == 2)
+    modem.accept(1)
+    modem.transmit(1)
+    eventually(lambda: len(compressor.received) == 3)
+    assert [s.contact.atd_confidence for s in compressor.received] == [1.0, 1.5, 0.5]
+
+
+def test_contacts_that_are_accepted_while_this_service_is_down_give_their_credit_back(
+    start_service, runner, put_images, modem
+):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    put_images([1.0, 1.0, 0.5, 0.4])
+    modem.accepted = 70
+    service = start_service(max_in_flight=2)
+    publish_until(modem, lambda: len(compressor.received) == 2)
+    eventually(lambda: gauge(service, "contacts_in_flight") == 2)
+    runner.stop(service)
+    modem.accepted += 2
+    service = start_service(max_in_flight=2)
+    publish_until(modem, lambda: len(compressor.received) == 4)
+
+
+def test_while_the_compressor_is_down_no_more_than_the_limit_is_released(start_service, put_images, modem):
+    put_images([1.0] * 5)
+    service = start_service(max_in_flight=2)
+    publish_until(modem, lambda: gauge(service, "outbox") == 2)
+    service._release._credit._release_times_utc_s.clear()
+    publish_until(modem, lambda: gauge(service, "contacts_waiting") == 3)
+    time.sleep(0.1)
+    assert gauge(service, "outbox") == 2
+
+
+def test_limit_0_releases_without_a_queue_state(start_service, runner, put_images):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    put_images([1.0] * 40)
+    start_service(max_in_flight=0)
+    eventually(lambda: len(compressor.received) == 40)
+
+
+def test_a_malformed_queue_state_is_ignored(start_service, runner, put_images, publish, modem, caplog):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    service = start_service()
+    publish(keys.acoustic_queue("uuv-1"), b"\xc1")
+    eventually(lambda: any(r.message == "Ignoring malformed queue state" for r in caplog.records))
+    put_images([1.0])
+    publish_until(modem, lambda: len(compressor.received) == 1)
+    assert not service.failed
+
+
+def test_a_release_that_cannot_be_stored_is_tried_again(start_service, runner, put_images, modem, monkeypatch):
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    put_images([1.0, 0.5])
+    service = start_service(max_in_flight=1)
+    eventually(lambda: gauge(service, "contacts_waiting") == 2)
+
+    def fail(effects):
+        raise DeliveryError("disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(service._release, "_commit", fail)
+        publish_until(modem, lambda: "disk is full" in service.health().detail)
+        assert (gauge(service, "contacts_in_flight"), gauge(service, "contacts_waiting")) == (0, 2)
+    eventually(lambda: len(compressor.received) == 1)
+    eventually(lambda: service.health().state == "ok")
+
+
+def test_a_store_of_version_0_1_is_continued(start_service, runner, platform, put_images, modem):
+    settings = platform("uuv-1")
+    settings.state_dir.mkdir(parents=True)
+    store = Store(settings.state_dir / "atd_stub.db")
+    with store.transaction() as tx:
+        for number, (name, confidence) in enumerate((("low", 0.5), ("high", 1.9)), start=1):
+            rank = round((2.0 - confidence) * 1e6)
+            tx.put_state(f"pool:{rank:08d}:{number:015d}", wire.encode(snippet(name, confidence)))
+        tx.put_state("released", b"1")
+    store.close()
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    service = start_service()
+    assert gauge(service, "contacts_waiting") == 2
+    put_images([1.0])
+    eventually(lambda: gauge(service, "contacts_waiting") == 3)
+    publish_until(modem, lambda: len(compressor.received) == 3)
+    assert [s.contact.contact_id for s in compressor.received] == ["high", "p000", "low"]
+    assert msgpack.unpackb(service.store.get_state("releases"))[0] == 0
+
+
+def test_a_process_that_is_killed_repeatedly_sends_each_contact_once(runner, router, tmp_path, put_images, modem):
+    images, kills = 40, 3
+    put_images([round(random.Random(n).uniform(0, 2), 3) for n in range(images)])
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    config = tmp_path / "uuv.toml"
+    config.write_text(
+        f'[platform]\nid = "uuv-1"\nrouter = ["{router}"]\nstate_dir = "{tmp_path / "vehicle"}"\n'
+        f'health_interval_s = 0.1\n[atd_stub]\nmode = "snippets"\ninput_dir = "{tmp_path / "incoming"}"\n'
+        "poll_s = 0.05\nsettle_s = 0.0\nmax_in_flight = 8\n"
+    )
+    rng = random.Random(5)
+    command = [sys.executable, "-m", "sonarpost.services.atd_stub", "--config", str(config)]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY / "common")}
+
+    def all_received(count):
+        modem.accepted = len(compressor.received)
+        modem.publish()
+        return len(compressor.received) >= count
+
+    for life in range(kills + 1):
+        process = subprocess.Popen(command, cwd=REPOSITORY, stderr=subprocess.DEVNULL, env=environment)
+        try:
+            # A little further each time, and then at a random point of what it does next.
+            count = images if life == kills else (life + 1) * images // (kills + 2)
+            eventually(lambda count=count: all_received(count))
+            time.sleep(rng.uniform(0, 0.02))
+        finally:
+            process.kill()
+            process.wait()
+    assert sorted(s.contact.contact_id for s in compressor.received) == [f"p{n:03d}" for n in range(images)]

@@ -1,0 +1,58 @@
+"""atd_stub with dual-frequency sonars: files are joined, and contacts equal those of the first frequency alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from builders.joined_surveys import RANGE_M, SAMPLES, Box, detect_in_files, near, split, survey_of
+from builders.two_frequencies import files_of, with_second_frequency
+
+from sonarpost.detection.stream import follows
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.file_boundary import pack, unpack
+from sonarpost.services.atd_stub.survey_detection import detect_in_survey
+from sonarpost.sonar.readers.xtf import read_xtf
+from sonarpost.sonar.survey import Side
+from sonarpost.sonar.xtf_writer import write_xtf
+
+SECOND = pytest.mark.parametrize(
+    ("samples", "range_m"), [(SAMPLES, RANGE_M), (SAMPLES // 2, RANGE_M), (320, 12.5), (1024, 60.0)]
+)
+
+
+@SECOND
+@pytest.mark.parametrize("ground", [False, True])
+def test_contacts_and_snippets_equal_those_of_the_first_frequency_alone(ground, samples, range_m, tmp_path):
+    survey = survey_of(300, Box(150), Box(210, Side.STARBOARD))
+    config = AtdStubConfig(snippet_pixel_m=0.1) if ground else AtdStubConfig()
+    alone, both = (
+        detect_in_survey(path, "0" * 64, "uuv-1", config).snippets
+        for path in files_of(survey, tmp_path, samples, range_m)
+    )
+    assert len(near(list(both), 150)) == len(near(list(both), 210, Side.STARBOARD)) == 1
+    assert both == alone
+
+
+@SECOND
+def test_dual_frequency_files_are_joined(samples, range_m, tmp_path):
+    survey = with_second_frequency(survey_of(300, Box(150)), samples, range_m)
+    paths = split(tmp_path, survey, (0, 149), (149, 300))
+    read = [read_xtf(path) for path in paths]
+    assert [len(ping.channels) for ping in (read[0].pings[-1], read[1].pings[0])] == [4, 4]
+    assert follows(*read), "the command line joins them too"
+    assert len(near(detect_in_files(paths, join_timeout_s=30.0), 150)) == 1
+    file_end = detect_in_survey(paths[0], "0" * 64, "uuv-1", AtdStubConfig(join_timeout_s=30.0), {}, 100.0).file_end
+    assert detect_in_survey(
+        paths[1], "1" * 64, "uuv-1", AtdStubConfig(), {file_end.sonar_id: unpack(pack(file_end))}, 100.0
+    ).joined
+
+
+def test_a_second_frequency_with_another_range_is_no_continuation(tmp_path):
+    survey = survey_of(200, Box(97))
+    before, after = (with_second_frequency(survey, 320, range_m) for range_m in (12.5, 10.0))
+    first, second = split(tmp_path, before, (0, 100), (100, 200))
+    write_xtf(replace(after, pings=after.pings[100:]), second)
+    assert not follows(read_xtf(first), read_xtf(second))
+    file_end = detect_in_survey(first, "0" * 64, "uuv-1", AtdStubConfig(), {}, 100.0).file_end
+    assert not detect_in_survey(second, "1" * 64, "uuv-1", AtdStubConfig(), {file_end.sonar_id: file_end}, 100.0).joined
