@@ -1,67 +1,419 @@
-"""MkDocs hooks: pages that are made from code, and pages that are files of the repository outside `docs`."""
+"""Tables of the reference pages, made from code: records, keys, configuration, command line and modem rates."""
 
 from __future__ import annotations
 
-import logging
+import argparse
+import importlib
+import inspect
+import json
 import re
-from collections.abc import Mapping
-from pathlib import Path
-from urllib.parse import urljoin
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
-from mkdocs.structure.pages import Page
-from mkdocs.utils import get_relative_url
+import griffe
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
 
-_log = logging.getLogger("mkdocs.hooks.reference")
+from sonarpost import keys, messages
+from sonarpost.cli.main import parser
+from sonarpost.config import SERVICES, PlatformConfig, ServiceConfig
+from sonarpost.messages import Record
+from sonarpost.modem.micromodem import RATES
 
-REPOSITORY = Path(__file__).resolve().parents[2]
-SERVICES = tuple(sorted(path.parent.name for path in (REPOSITORY / "services").glob("*/README.md")))
-
-# Files of the repository that are pages of the site, and where.
-REPOSITORY_PAGES: Mapping[str, str] = {
-    "README.md": "index.md",
-    "CONTRIBUTING.md": "contributing.md",
-    "CHANGELOG.md": "changelog.md",
-    "ARCHITECTURE.md": "explanation/architecture.md",
-    "examples/README.md": "how-to/subscriber.md",
-    "research/README.md": "research/index.md",
-    "research/training/emb/README.md": "research/training-emb.md",
-    **{f"services/{name}/README.md": f"reference/services/{name}.md" for name in SERVICES},
+UNITS = {
+    "airtime_s": "s",
+    "m_per_s": "m/s",
+    "mps": "m/s",
+    "bytes_per_s": "B/s",
+    "db_per_decade": "dB a decade",
+    "deg": "°",
+    "db": "dB",
+    "px": "px",
+    "hz": "Hz",
+    "psu": "psu",
+    "bytes": "B",
+    "days": "d",
+    "m": "m",
+    "c": "°C",
+    "s": "s",
 }
-_LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s#]*)(#[^)\s]*)?\)")
+# Quantities whose names do not end in their unit.
+NAMED_OTHERWISE = {
+    "bits": "bit",
+    "baud": "bit/s",
+    "serial_baud": "bit/s",
+    "bytes_received": "B",
+    "bytes_total": "B",
+    "bytes_left": "B",
+}
+_FLOW = re.compile(
+    r"Record: (?P<record>.*?)\. From: (?P<source>.*?)\. To: (?P<to>.*?)\. Delivery: (?P<delivery>.*?)\.$"
+)
+_PARAMETERS = ("platform", "vehicle", "vessel", "site", "kind", "service", "answerer")
 
 
-def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that are not in `docs`."""
-    for source, uri in REPOSITORY_PAGES.items():
-        if files.get_file_from_path(uri) is None:
-            files.append(File.generated(config, uri, content=(REPOSITORY / source).read_text(encoding="utf-8")))
-    return files
+@dataclass(frozen=True, slots=True)
+class KeyRow:
+    """One key expression: its function in `sonarpost.keys`, its placeholders in braces, and what its docstring says."""
+
+    name: str
+    key: str
+    summary: str
+    record: str
+    source: str
+    to: str
+    delivery: str
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn links to files of the repository into links to pages, or into plain text where the file is no page."""
-    uri = page.file.src_uri
-    source = next((s for s, u in REPOSITORY_PAGES.items() if u == uri and page.file.generated_by), f"docs/{uri}")
-    return _with_site_links(markdown, source, uri)
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One command of the command line, with its full name and its description."""
+
+    name: str
+    description: str
+    parser: argparse.ArgumentParser
 
 
-def _with_site_links(markdown: str, source: str, uri: str) -> str:
-    def replace(link: re.Match[str]) -> str:
-        image, text, target, fragment = link.groups()
-        if not target or re.match(r"[a-z]+:", target):
-            return link.group()
-        path = urljoin(f"/{source}", target).strip("/")
-        if not (REPOSITORY / path).exists() and not path.startswith("docs/"):
-            _log.warning("%s: link: got %s, expected a file of the repository", source, target)
-        if path in REPOSITORY_PAGES:
-            page = REPOSITORY_PAGES[path]
-        elif path.startswith("docs/"):
-            page = path.removeprefix("docs/")
+def generate(name: str, argument: str) -> str:
+    """Return the Markdown for one mark in a page.
+
+    Raises:
+        KeyError: There is no generator of this name.
+    """
+    return GENERATORS[name](argument)
+
+
+def records(_: str = "") -> str:
+    """Return a section for every record: its description and a table of its fields."""
+    sections = []
+    for record in record_types():
+        summary, fields = described(record)
+        schemas = record.model_json_schema()["properties"]
+        rows = [
+            (
+                f"`{field}`",
+                _type(schema := _without_null(schemas[field])),
+                unit(field),
+                _range(schema),
+                "yes" if "anyOf" in schemas[field] else "no",
+                _absent(record, field),
+                fields.get(field, ""),
+            )
+            for field in record.model_fields
+        ]
+        header = ("field", "type", "unit", "range", "nil", "if absent", "meaning")
+        sections.append(f"## {record.TYPE}\n\n{summary}\n\n{table(header, rows)}")
+    return "\n\n".join(sections)
+
+
+def record_types() -> list[type[Record]]:
+    """Return every record of `sonarpost.messages`, in the order of the module."""
+    return [t for t in vars(messages).values() if inspect.isclass(t) and issubclass(t, Record) and t.TYPE]
+
+
+def key_table(service: str = "") -> str:
+    """Return the table of keys, of all or of those that one service sends or receives."""
+    rows = [row for row in key_rows() if row.record]
+    if not service:
+        header = ("key", "record", "from", "to", "delivery", "meaning")
+        return table(header, [(f"`{r.key}`", _record(r), r.source, r.to, r.delivery, r.summary) for r in rows])
+    cells = []
+    for row in rows:
+        for direction, names in (("in", row.to), ("out", row.source)):
+            if {service, "every service"} & set(names.split(", ")):
+                other = f"to {row.to}" if direction == "out" else f"from {row.source}"
+                cells.append((direction, f"`{row.key}`", _record(row), f"{row.delivery}, {other}"))
+    return table(("direction", "key", "record", "delivery"), sorted(cells, key=lambda cell: cell[0]))
+
+
+def wildcard_table(_: str = "") -> str:
+    """Return the table of key expressions with wildcards and of those for access control."""
+    return table(("key expression", "meaning"), [(f"`{r.key}`", r.summary) for r in key_rows() if not r.record])
+
+
+def key_rows() -> list[KeyRow]:
+    """Return every key expression of `sonarpost.keys`, in the order of the module."""
+    rows = []
+    for name, function in vars(keys).items():
+        if name.startswith("_") or not inspect.isfunction(function):
+            continue
+        if "Raises:" in (function.__doc__ or ""):
+            continue  # parses a key
+        parameters = list(inspect.signature(function).parameters)
+        if "key" in parameters:
+            key = function("{key}", *["consumer"] * (len(parameters) - 1)).replace("/consumer", "/{consumer}")
         else:
-            return text if "`" in text else f"{text} (`{path}`)"
-        return f"{image}[{text}]({get_relative_url(page, uri)}{fragment or ''})"
+            key = function(**{parameter: f"x{parameter}" for parameter in parameters})
+            for parameter in _PARAMETERS:
+                key = re.sub(rf"\bx{parameter}\b", f"{{{parameter}}}", key)
+        summary, _, rest = inspect.cleandoc(function.__doc__ or "").partition("\n\n")
+        text, _, flow = rest.rpartition("\n\n") if "Record: " in rest else (rest, "", "")
+        found = _FLOW.fullmatch(" ".join(flow.split()))
+        parts = found.groupdict() if found else dict.fromkeys(("record", "source", "to", "delivery"), "")
+        rows.append(KeyRow(name, key, " ".join(f"{summary} {text}".split()), **parts))
+    return rows
 
-    parts = re.split(r"(^```.*?^```$|^    .*?$)", markdown, flags=re.MULTILINE | re.DOTALL)
-    return "".join(part if part.startswith(("```", "    ")) else _LINK.sub(replace, part) for part in parts)
+
+def configuration(service: str = "") -> str:
+    """Return the tables of the configuration of one service, of `platform`, or of all of them with headings."""
+    if service:
+        return _configuration_tables(configuration_type(service), service)
+    names = ("platform", *SERVICES)
+    return "\n\n".join(f"## [{name}]\n\n{_configuration_tables(configuration_type(name), name)}" for name in names)
+
+
+def configuration_type(service: str) -> type[ServiceConfig]:
+    """Return the model of a configuration table."""
+    if service == "platform":
+        return PlatformConfig
+    module = importlib.import_module(f"sonarpost.services.{service}.config")
+    name = "".join(part.capitalize() for part in service.split("_")) + "Config"
+    found: type[ServiceConfig] = getattr(module, name)
+    return found
+
+
+def commands(_: str = "") -> str:
+    """Return a section for every command of `sonarpost`."""
+    return "\n\n".join(_command_section(command) for command in command_list())
+
+
+def command_list() -> list[Command]:
+    """Return every command, parents before their subcommands."""
+    whole = parser()
+    return list(_walk(Command("sonarpost", whole.description or "", whole)))
+
+
+def rates(_: str = "") -> str:
+    """Return the table of Micro-Modem rates."""
+    rows = [
+        (
+            str(rate.number),
+            rate.modulation,
+            f"{rate.frames} x {rate.frame_bytes}",
+            str(rate.packet_bytes),
+            f"{rate.airtime_s:g}",
+            f"{rate.throughput_bps:.0f}",
+        )
+        for rate in RATES.values()
+    ]
+    header = ("rate", "modulation and code", "frames x B", "packet, B", "air time, s", "throughput, bit/s")
+    return table(header, rows)
+
+
+GENERATORS: Mapping[str, Callable[[str], str]] = {
+    "records": records,
+    "keys": key_table,
+    "wildcards": wildcard_table,
+    "configuration": configuration,
+    "commands": commands,
+    "rates": rates,
+}
+
+
+def described(model: type[BaseModel]) -> tuple[str, dict[str, str]]:
+    """Return a model's summary and the description of each field, those of its bases included."""
+    fields: dict[str, str] = {}
+    for base in reversed(model.__mro__):
+        if base.__doc__ and issubclass(base, BaseModel):
+            for section in griffe.Docstring(inspect.cleandoc(base.__doc__)).parse("google", warnings=False):
+                if isinstance(section, griffe.DocstringSectionAttributes):
+                    fields |= {item.name: " ".join(item.description.split()) for item in section.value}
+    text = inspect.cleandoc(model.__doc__ or "").partition("Attributes:")[0].strip()
+    return text, fields
+
+
+def unit(name: str) -> str:
+    """Return the unit of a quantity, from its name."""
+    if name in NAMED_OTHERWISE:
+        return NAMED_OTHERWISE[name]
+    return next((text for suffix, text in UNITS.items() if name.endswith(f"_{suffix}")), "")
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def _record(row: KeyRow) -> str:
+    return "-" if row.record == "none" else f"`{row.record}`"
+
+
+def _without_null(schema: Mapping[str, Any]) -> Mapping[str, Any]:
+    return next((option for option in schema.get("anyOf", []) if option.get("type") != "null"), schema)
+
+
+def _type(schema: Mapping[str, Any]) -> str:
+    """Return the name of a type of msgpack for the JSON schema of a field."""
+    if "$ref" in schema:
+        name = schema["$ref"].rpartition("/")[2]
+        return next((f"[{t.TYPE}](#{t.TYPE})" for t in record_types() if t.__name__ == name), name)
+    match schema.get("type"):
+        case "array":
+            return f"array of {_type(schema['items'])}"
+        case "object":
+            return f"map of str to {_type(schema['additionalProperties'])}"
+        case "string" if schema.get("format") == "binary":
+            return "bin"
+        case kind:
+            return {"string": "str", "integer": "int", "number": "float", "boolean": "bool"}[str(kind)]
+
+
+def _range(schema: Mapping[str, Any]) -> str:
+    """Return the range of values for the JSON schema of a field."""
+    if inner := schema.get("items") or schema.get("additionalProperties"):
+        text = _range(inner) if isinstance(inner, dict) else ""
+        count = f"at most {schema['maxItems']}" if "maxItems" in schema else ""
+        return ", ".join(part for part in (f"{text} each" if text else "", count) if part)
+    if "const" in schema or "enum" in schema:
+        return ", ".join(f"`{_toml(value)}`" for value in schema.get("enum", [schema.get("const")]))
+    if "pattern" in schema:
+        return f"`{schema['pattern']}`"
+    if "maxLength" in schema:
+        what = "bytes" if schema.get("format") == "binary" else "characters"
+        return f"{schema.get('minLength', 0)} to {schema['maxLength']} {what}"
+    low = f"above {schema['exclusiveMinimum']:g}" if "exclusiveMinimum" in schema else _number(schema.get("minimum"))
+    high = f"below {schema['exclusiveMaximum']:g}" if "exclusiveMaximum" in schema else _number(schema.get("maximum"))
+    if low and high:
+        return f"{low} to {high}"
+    return f"from {low}" if low else f"to {high}" if high else ""
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return ""
+    return "2^63-1" if value == 2**63 - 1 else f"{value:.12g}"
+
+
+def _absent(record: type[Record], field: str) -> str:
+    info = record.model_fields[field]
+    return "required" if info.is_required() else "nil" if info.default is None else "empty"
+
+
+def _configuration_tables(model: type[BaseModel], name: str) -> str:
+    """Return the table of one configuration table, followed by those of the tables inside it."""
+    _, fields = described(model)
+    schema = model.model_json_schema()
+    rows, inside = [], []
+    for field, info in model.model_fields.items():
+        inner = _without_null(schema["properties"][field])
+        target = inner.get("items", inner)
+        if "$ref" in target:
+            definition = schema["$defs"][target["$ref"].rpartition("/")[2]]
+            if "properties" in definition:
+                inside.append((field, _model_named(info.annotation, definition["title"]), "items" in inner))
+                inner = {"type": "array", "items": {"type": "object"}} if "items" in inner else {"type": "object"}
+            else:
+                inner = {"type": "array", "items": definition} if "items" in inner else definition
+        default = info.get_default(call_default_factory=True)
+        rows.append(
+            (
+                f"`{field}`",
+                _configuration_type_text(inner, info.annotation),
+                unit(field),
+                _range(inner) if "properties" not in inner else "",
+                "**required**" if default is PydanticUndefined else _default(default),
+                fields.get(field, ""),
+            )
+        )
+    text = table(("key", "type", "unit", "range", "default", "meaning"), rows)
+    for field, inner_model, many in inside:
+        brackets = f"[[{name}.{field}]]" if many else f"[{name}.{field}]"
+        text += f"\n\n`{brackets}`:\n\n{_configuration_tables(inner_model, f'{name}.{field}')}"
+    return text
+
+
+def _model_named(annotation: object, title: str) -> type[BaseModel]:
+    """Return the model inside an annotation such as `tuple[Model, ...]` or `Model | None`."""
+    if inspect.isclass(annotation) and issubclass(annotation, BaseModel) and annotation.__name__ == title:
+        return annotation
+    for argument in getattr(annotation, "__args__", ()):
+        try:
+            return _model_named(argument, title)
+        except LookupError:
+            continue
+    raise LookupError(title)
+
+
+def _configuration_type_text(schema: Mapping[str, Any], annotation: object) -> str:
+    match schema.get("type"):
+        case "array":
+            return f"list of {_configuration_type_text(schema['items'], None)}s"
+        case "object":
+            return "table"
+        case "string":
+            return "path" if schema.get("format") == "path" else "text"
+        case kind:
+            return {"integer": "integer", "number": "number", "boolean": "boolean"}.get(str(kind), "text")
+
+
+def _default(value: object) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, BaseModel) or (isinstance(value, tuple) and value and isinstance(value[0], BaseModel)):
+        return "below"
+    return f"`{_toml(value)}`"
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, (bool, int, float)):
+        return json.dumps(value)
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }" if value else "{}"
+    return json.dumps(str(value))
+
+
+def _walk(command: Command) -> Iterator[Command]:
+    yield command
+    for action in command.parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            # Names without a help line are refused names of version 0.1.
+            for choice in action._choices_actions:
+                below = action.choices[choice.dest]
+                yield from _walk(
+                    Command(f"{command.name} {choice.dest}", below.description or choice.help or "", below)
+                )
+
+
+def _command_section(command: Command) -> str:
+    usage = " ".join(command.parser.format_usage().removeprefix("usage: ").split())
+    heading = "#" * (len(command.name.split()) + 1)
+    text = f"{heading} {command.name}\n\n{command.description}\n\n```text\n{usage}\n```"
+    rows = []
+    for action in command.parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            rows += [(f"`{choice.dest}`", choice.help or "", "") for choice in action._choices_actions]
+        elif action.help != argparse.SUPPRESS and not isinstance(action, argparse._HelpAction):
+            meaning = argument_help(action, command.parser)
+            rows.append(
+                (f"`{argument_name(action)}`", meaning, "" if "default" in meaning else _argument_default(action))
+            )
+    return f"{text}\n\n{table(('argument', 'meaning', 'default'), rows)}" if rows else text
+
+
+def argument_name(action: argparse.Action) -> str:
+    """Return how an argument is written, with the name of its value."""
+    if not action.option_strings:
+        return str(action.metavar or action.dest)
+    names = ", ".join(action.option_strings)
+    return names if action.nargs == 0 else f"{names} {_metavar(action)}"
+
+
+def argument_help(action: argparse.Action, command: argparse.ArgumentParser) -> str:
+    """Return the help line of an argument."""
+    return " ".join(((action.help or "") % {**vars(action), "prog": command.prog}).split())
+
+
+def _argument_default(action: argparse.Action) -> str:
+    empty = action.nargs == 0 or action.default in (None, argparse.SUPPRESS, [], ())
+    return "" if empty else f"`{action.default}`"
+
+
+def _metavar(action: argparse.Action) -> str:
+    if action.choices is not None and action.metavar is None:
+        return "{" + ",".join(str(choice) for choice in action.choices) + "}"
+    name = action.metavar or action.dest.upper()
+    return " ".join(name) if isinstance(name, tuple) else name
