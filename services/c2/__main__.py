@@ -8,7 +8,7 @@ from sonarpost.services.c2.service import C2Service
 
 
 def run() -> int:
-    """Run the service until it is told to stop; return the exit status."""
+    """Run the service until it is stopped; return the exit status."""
     return main(C2Service, C2Config)
 
 

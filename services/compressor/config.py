@@ -9,17 +9,18 @@ from sonarpost.config import ServiceConfig
 
 
 class CompressorConfig(ServiceConfig):
-    """Which codec, with which model.
+    """Codec, stream lengths and cache.
 
     Attributes:
         codec: Name in the codec registry.
-        codebook: Tile codebook: nominal-10, nominal-20 or a file. The receiving end needs the same one.
-        packing: How the vq codec writes an index: 14bit, 2byte, 3byte, ascii5.
-        budget_bytes: Upper bound of a stream, header included; 0 for the codec's natural size.
-        refine_bytes: How far streams go on beyond the budget where the codec can go on, for the vessel to ask for; v1
-            sends `stream_bytes` of [uuv_modem] unasked. Not for the paper's link, which sends all of a stream.
-        cache_images: Most pictures kept to answer the vessel's commands from.
-        cache_s: How long they are kept.
+        codebook: Tile codebook: nominal-10, nominal-20 or a file. The vessel needs the same one.
+        packing: Index format of the vq codec: 14bit, 2byte, 3byte, ascii5.
+        budget_bytes: Maximum length of a stream, header included; 0 for the codec's natural length.
+        refine_bytes: Length up to which streams continue beyond the budget, for refine commands, with an extensible
+            codec. The v1 link sends `stream_bytes` of [uuv_modem] without a command. Not for the paper's link, which
+            sends complete streams.
+        cache_images: Maximum number of images in the cache that answers commands.
+        cache_s: Maximum age of an image in the cache.
     """
 
     codec: str = "vq"

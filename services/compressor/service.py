@@ -1,4 +1,4 @@
-"""Turns snippets into codec streams, each with the identifier it has on the acoustic link, and gives them again."""
+"""The compressor service: encodes snippets and answers refine, resend and expand commands."""
 
 from __future__ import annotations
 
@@ -18,66 +18,66 @@ from sonarpost.logs import kv
 from sonarpost.messages import Command, CommandKind, EncodedImage, Record, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.compressor.config import CompressorConfig
-from sonarpost.services.compressor.kept import CachedImage, EncodeCache
-from sonarpost.services.compressor.refine import encode, handed, refined
-from sonarpost.services.compressor.wide import wider
+from sonarpost.services.compressor.encode_cache import CachedImage, EncodeCache, entry_location
+from sonarpost.services.compressor.encoding import encode, expand, refine, transmit_part
 
 log = logging.getLogger(__name__)
 
 IMAGE_IDS = MAX_NUMBER
-"""Identifiers count from 0001 as contacts do on the v1 link, so that both ends call a picture the same."""
+"""Image identifiers are the image numbers of the v1 link, 1 to this."""
+_CONSUMER = "uuv_modem"
 _NEXT_IMAGE = "next_image"
-_ASKED_FOR = 3
-"""Priority of what the vessel has asked for."""
+_COMMAND_PRIORITY = 3
+"""Delivery priority of images that the vessel has requested."""
 
 
 class CompressorService(Service[CompressorConfig]):
-    """Encodes every snippet once.
+    """Encodes each snippet once and assigns its image identifier.
 
     Raises:
         CodebookError: The codebook cannot be read.
-        ConfigError: No such codec.
+        ConfigError: Unknown codec.
     """
 
     NAME = "compressor"
 
     def __init__(self, platform: PlatformConfig, config: CompressorConfig) -> None:
-        # Before the store is opened: what is wrong with the configuration leaves nothing open behind it.
+        # Before the store is opened, so that a configuration error leaves no open store.
         tiles = open_codebook(config.codebook).tiles
         self._codec: Codec = default_registry().create(config.codec, CodecResources(tiles, config.packing))
         super().__init__(platform, config)
-        self._kept = EncodeCache(self.store, config.cache_images, config.cache_s)
+        self._cache = EncodeCache(self.store, config.cache_images, config.cache_s)
         log.info("Codec ready", extra=kv(codec=self._codec.name, model=self._codec.model_hash[:16]))
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """Snippets of this vehicle, and what the vessel asks of pictures."""
+        """Return the keys of this vehicle's snippets, and of commands for its images."""
         commands = {keys.command(self.platform.id, kind): Command for kind in ("refine", "resend", "wider")}
         return {keys.contact_detected(self.platform.id): Snippet, **commands}
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """Encode a snippet, or a picture again, and owe the stream to uuv_modem."""
+        """Encode a snippet, or execute a command, and send the stream to uuv_modem."""
         if isinstance(record, Command):
-            self._answer(record, effects)
+            self._execute(record, effects)
             return
         assert isinstance(record, Snippet)
-        image_id, kept = self._encode(record, effects, effects.payload)
+        image_id, cached = self._encode(record, effects, effects.payload)
         if self.config.cache_images:
-            self._kept.keep(effects, {image_id: kept}, time.time())
+            self._cache.put(effects, {image_id: cached}, time.time())
 
     def _encode(
         self, snippet: Snippet, effects: UnitOfWork, payload: bytes, priority: int = 4
     ) -> tuple[str, CachedImage]:
-        """Owe uuv_modem the stream of a new picture; return its identifier and what may be kept of it.
+        """Encode a snippet as a new image and send it; return its identifier and cache entry.
 
         Args:
-            snippet: The picture.
-            effects: Takes what it leads to.
-            payload: The snippet, packed.
-            priority: Of the hand-over.
+            snippet: The snippet.
+            effects: Receives the record.
+            payload: The snippet, encoded.
+            priority: Delivery priority.
         """
         started = time.perf_counter()
-        whole = encode(self._codec, snippet.picture.to_array(), self.config.budget_bytes, self.config.refine_bytes)
-        stream = handed(self._codec, whole)
+        complete = encode(self._codec, snippet.picture.to_array(), self.config.budget_bytes, self.config.refine_bytes)
+        stream = transmit_part(self._codec, complete)
         number = self._next_number()
         effects.put_state(_NEXT_IMAGE, str(number % IMAGE_IDS + 1).encode())
         image = EncodedImage(
@@ -91,11 +91,11 @@ class CompressorService(Service[CompressorConfig]):
             stream=stream,
             original_sha256=snippet.picture.sha256,
         )
-        effects.send(keys.image_encoded(self.platform.id), "uuv_modem", image, priority=priority)
+        effects.send(keys.image_encoded(self.platform.id), _CONSUMER, image, priority=priority)
         effects.count("images_encoded")
         effects.count("bytes_encoded", len(stream))
         log.info(
-            "Picture encoded",
+            "Image encoded",
             extra=kv(
                 vehicle=image.vehicle_id,
                 contact_id=snippet.contact.contact_id,
@@ -105,67 +105,62 @@ class CompressorService(Service[CompressorConfig]):
                 encode_ms=round(1000 * (time.perf_counter() - started), 1),
             ),
         )
-        return image.image_id, CachedImage(wire.encode(image.model_copy(update={"stream": whole})), payload)
+        return image.image_id, CachedImage(wire.encode(image.model_copy(update={"stream": complete})), payload)
 
-    def _answer(self, command: Command, effects: UnitOfWork) -> None:
-        """Give a picture again, finer or wider where that was asked for."""
+    def _execute(self, command: Command, effects: UnitOfWork) -> None:
         image_id = command.image_id or ""
-        found = self._kept.find(image_id)
-        if found is None:
+        cached = self._cache.get(image_id)
+        if cached is None:
             effects.count("commands_unknown_image")
-            log.warning("Picture is not kept any more", extra=kv(image_id=image_id, kind=command.kind))
+            log.warning("Image of command not in cache", extra=kv(image_id=image_id, kind=command.kind))
         elif command.kind == "wider":
-            self._widen(image_id, found, effects)
+            self._expand(image_id, cached, effects)
         else:
-            self._give_again(command.kind, image_id, found, effects)
+            self._resend(command.kind, image_id, cached, effects)
 
-    def _widen(self, image_id: str, found: CachedImage, effects: UnitOfWork) -> None:
-        """Give more of the seabed around a contact as a picture of its own, the same one whenever it is asked for."""
-        before = self._kept.find(found.wider_id) if found.wider_id else None
-        if before is not None:
-            self._give_again("resend", found.wider_id, before, effects)
+    def _expand(self, image_id: str, cached: CachedImage, effects: UnitOfWork) -> None:
+        """Send more seabed around a contact as an image of its own; a repeated command sends the same image."""
+        expanded = self._cache.get(cached.expanded_id) if cached.expanded_id else None
+        if expanded is not None:
+            self._resend("resend", cached.expanded_id, expanded, effects)
             return
-        wide = wider(wire.decode(Snippet, found.snippet, _where(image_id)))
-        if wide is None:
-            effects.count("commands_nothing_wider")
-            log.warning("There is no wider picture", extra=kv(image_id=image_id))
+        snippet = expand(wire.decode(Snippet, cached.snippet, entry_location(image_id)))
+        if snippet is None:
+            effects.count("commands_without_expanded_image")
+            log.warning("Snippet has no expanded image", extra=kv(image_id=image_id))
             return
-        wider_id, kept = self._encode(wide, effects, wire.encode(wide), priority=_ASKED_FOR)
-        self._kept.keep(effects, {image_id: replace(found, wider_id=wider_id), wider_id: kept}, time.time())
-        effects.count("images_widened")
-        log.info("Wider picture given", extra=kv(image_id=image_id, wider_id=wider_id))
+        expanded_id, entry = self._encode(snippet, effects, wire.encode(snippet), priority=_COMMAND_PRIORITY)
+        self._cache.put(effects, {image_id: replace(cached, expanded_id=expanded_id), expanded_id: entry}, time.time())
+        effects.count("images_expanded")
+        log.info("Expanded image sent", extra=kv(image_id=image_id, expanded_id=expanded_id))
 
-    def _give_again(self, kind: CommandKind, image_id: str, found: CachedImage, effects: UnitOfWork) -> None:
-        """Give a picture again; finer where that was asked for and its stream can go on where it ended.
+    def _resend(self, kind: CommandKind, image_id: str, cached: CachedImage, effects: UnitOfWork) -> None:
+        """Send an image again, with a longer stream for a refine command if the codec can extend it.
 
-        What a stream has more than the link has sent of it, the link sends by itself: this is for what it has not.
+        The link itself sends the rest of a stream that it has; a command arrives here only when it has no more.
         """
-        image = wire.decode(EncodedImage, found.image, _where(image_id))
-        # A picture that was encoded before the codec was changed goes as it is.
-        is_ours = (image.codec, image.model) == (self._codec.name, self._codec.model_hash)
-        if kind == "refine" and is_ours:
-            snippet = wire.decode(Snippet, found.snippet, _where(image_id))
-            longer = refined(self._codec, image.stream, snippet.picture.to_array())
+        image = wire.decode(EncodedImage, cached.image, entry_location(image_id))
+        # An image that was encoded with another codec is sent unchanged.
+        same_codec = (image.codec, image.model) == (self._codec.name, self._codec.model_hash)
+        if kind == "refine" and same_codec:
+            snippet = wire.decode(Snippet, cached.snippet, entry_location(image_id))
+            longer = refine(self._codec, image.stream, snippet.picture.to_array())
             if longer != image.stream:
                 image = image.model_copy(update={"stream": longer})
-                self._kept.keep(effects, {image_id: replace(found, image=wire.encode(image))}, time.time())
+                self._cache.put(effects, {image_id: replace(cached, image=wire.encode(image))}, time.time())
                 effects.count("images_refined")
-        if is_ours:
-            image = image.model_copy(update={"stream": handed(self._codec, image.stream)})
-        effects.send(keys.image_encoded(self.platform.id), "uuv_modem", image, priority=_ASKED_FOR)
-        effects.count("images_given_again")
-        log.info("Picture given again", extra=kv(image_id=image_id, kind=kind, bytes=len(image.stream)))
+        if same_codec:
+            image = image.model_copy(update={"stream": transmit_part(self._codec, image.stream)})
+        effects.send(keys.image_encoded(self.platform.id), _CONSUMER, image, priority=_COMMAND_PRIORITY)
+        effects.count("images_resent")
+        log.info("Image sent again", extra=kv(image_id=image_id, kind=kind, bytes=len(image.stream)))
 
     def _next_number(self) -> int:
         """Return the next image number.
 
-        The first is drawn from the store's own identity, so that a vehicle whose disk was wiped does not begin with
-        the identifiers of its last mission, which the vessel still remembers.
+        The first is derived from the identity of the store. A vehicle with a new disk therefore does not begin with
+        the identifiers of its last mission, which the vessel may still have.
         """
-        kept = self.store.get_state(_NEXT_IMAGE)
-        first = int.from_bytes(self.store.origin[:4], "big") if kept is None else int(kept)
-        return (first - 1) % IMAGE_IDS + 1
-
-
-def _where(image_id: str) -> str:
-    return f"compressor.db: kept/{image_id}"
+        stored = self.store.get_state(_NEXT_IMAGE)
+        number = int.from_bytes(self.store.origin[:4], "big") if stored is None else int(stored)
+        return (number - 1) % IMAGE_IDS + 1

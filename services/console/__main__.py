@@ -8,7 +8,7 @@ from sonarpost.services.console.service import ConsoleService
 
 
 def run() -> int:
-    """Run the service until it is told to stop; return the exit status."""
+    """Run the service until it is stopped; return the exit status."""
     return main(ConsoleService, ConsoleConfig)
 
 

@@ -8,7 +8,7 @@ from sonarpost.services.decompressor.service import DecompressorService
 
 
 def run() -> int:
-    """Run the service until it is told to stop; return the exit status."""
+    """Run the service until it is stopped; return the exit status."""
     return main(DecompressorService, DecompressorConfig)
 
 

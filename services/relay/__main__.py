@@ -8,7 +8,7 @@ from sonarpost.services.relay.service import RelayService
 
 
 def run() -> int:
-    """Run the service until it is told to stop; return the exit status."""
+    """Run the service until it is stopped; return the exit status."""
     return main(RelayService, RelayConfig)
 
 

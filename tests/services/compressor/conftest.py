@@ -1,4 +1,4 @@
-"""What the tests of compressor share: it, what stands before and behind it, and codecs to compare with."""
+"""Fixtures of the compressor tests: the service, its neighbours in the chain, and codecs to compare with."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OUT = keys.image_encoded("uuv-1")
 
 
 @pytest.fixture
-def begin(runner, platform):
+def start_service(runner, platform):
     def start(**options):
         return runner.start(CompressorService(platform("uuv-1"), CompressorConfig(**options)))
 

@@ -1,4 +1,4 @@
-"""compressor: one stream a snippet, identifiers that are never given twice, bad pictures apart."""
+"""compressor: one stream a snippet, unique identifiers, bad snippets quarantined."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from sonarpost.services.compressor.service import IMAGE_IDS, CompressorService
 IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
 
 
-def test_a_snippet_becomes_a_stream_with_its_contact(begin, atd, modem, snippet, vq, check_monitoring, watch):
-    seen = watch(OUT)
-    service = begin()
+def test_a_snippet_is_encoded_with_its_contact(start_service, atd, modem, snippet, vq, check_monitoring, watch):
+    published = watch(OUT)
+    service = start_service()
     sent = snippet("c1")
     atd.send(IN, "compressor", sent)
     eventually(lambda: len(modem.received) == 1)
@@ -35,13 +35,13 @@ def test_a_snippet_becomes_a_stream_with_its_contact(begin, atd, modem, snippet,
     # The header, and 14 bits for each tile of 10 x 10 px.
     size = StreamHeader.unpack(image.stream).size + 4 * 6 * 14 // 8
     eventually(lambda: service.health().counters == {"records_handled": 1, "images_encoded": 1, "bytes_encoded": size})
-    eventually(lambda: len(seen) == 1, what="the copy for watchers")
-    assert msgpack.unpackb(seen[0].payload.to_bytes())["image_id"] == image.image_id
+    eventually(lambda: len(published) == 1, what="the copy for watchers")
+    assert msgpack.unpackb(published[0].payload.to_bytes())["image_id"] == image.image_id
     check_monitoring(service)
 
 
-def test_sixteen_bits_are_mapped_over_their_own_range(begin, atd, modem, snippet, vq):
-    begin()
+def test_16_bit_images_are_mapped_over_their_own_range(start_service, atd, modem, snippet, vq):
+    start_service()
     deep = snippet("deep", dtype=np.uint16)
     assert deep.picture.bits == 16
     atd.send(IN, "compressor", deep)
@@ -51,23 +51,25 @@ def test_sixteen_bits_are_mapped_over_their_own_range(begin, atd, modem, snippet
 
 
 @pytest.mark.parametrize(
-    ("height_px", "width_px", "said"),
+    ("height_px", "width_px", "expected"),
     [(15, 60, "height_px: got 15"), (60, 15, "width_px: got 15"), (513, 40, "height_px: got 513")],
 )
-def test_a_picture_of_the_wrong_size_is_kept_apart(height_px, width_px, said, begin, atd, modem, snippet, refused):
-    service = begin()
+def test_a_snippet_of_invalid_size_is_quarantined(
+    height_px, width_px, expected, start_service, atd, modem, snippet, refused
+):
+    service = start_service()
     atd.send(IN, "compressor", snippet("bad", height_px, width_px), snippet("good"))
     eventually(lambda: [i.contact.contact_id for i in modem.received] == ["good"])
     [(key, reason)] = refused(service)
     assert key == IN
-    assert said in reason
+    assert expected in reason
     assert "expected 16..512" in reason
     health = service.health()
     assert (health.state, health.counters["records_refused"], health.gauges["refused"]) == ("ok", 1, 1.0)
 
 
-def test_a_budget_that_cannot_be_met_is_said(begin, atd, modem, snippet, refused):
-    service = begin(budget_bytes=9)
+def test_a_budget_that_cannot_be_met_is_reported(start_service, atd, modem, snippet, refused):
+    service = start_service(budget_bytes=9)
     atd.send(IN, "compressor", snippet("large"))
     eventually(lambda: len(refused(service)) == 1)
     assert "budget" in refused(service)[0][1]
@@ -88,8 +90,8 @@ def test_a_budget_that_cannot_be_met_is_said(begin, atd, modem, snippet, refused
         lambda fields: msgpack.packb(fields | {"picture": fields["picture"] | {"height_px": -1}}),
     ],
 )
-def test_a_payload_that_is_no_snippet_is_refused_and_the_next_one_taken(spoil, begin, atd, modem, snippet, refused):
-    service = begin()
+def test_a_malformed_snippet_is_refused_and_the_next_one_is_encoded(spoil, start_service, atd, modem, snippet, refused):
+    service = start_service()
     atd.send_bytes(IN, "compressor", spoil(msgpack.unpackb(wire.encode(snippet("spoilt")))))
     atd.send(IN, "compressor", snippet("good"))
     eventually(lambda: [i.contact.contact_id for i in modem.received] == ["good"])
@@ -97,20 +99,20 @@ def test_a_payload_that_is_no_snippet_is_refused_and_the_next_one_taken(spoil, b
     assert key == IN
     assert IN in reason
     assert "expected" in reason
-    # The producer has it too, with what was said of it.
+    # The producer quarantines it too, with the same reason.
     eventually(lambda: refused(atd) == [(IN, reason)])
     assert service.health().counters["records_refused"] == 1
 
 
-def test_a_plain_publication_is_encoded_too(begin, modem, snippet, publish):
-    begin()
-    publish(IN, wire.encode(snippet("from somebody's own detector")))
+def test_a_plain_publication_is_encoded_too(start_service, modem, snippet, publish):
+    start_service()
+    publish(IN, wire.encode(snippet("from another detector")))
     eventually(lambda: len(modem.received) == 1)
 
 
-def test_identifiers_go_on_over_restarts(begin, runner, atd, modem, snippet):
+def test_identifiers_continue_after_restarts(start_service, runner, atd, modem, snippet):
     for turn in range(3):
-        service = begin()
+        service = start_service()
         atd.send(IN, "compressor", *(snippet(f"{turn}-{n}") for n in range(4)))
         eventually(lambda turn=turn: len(modem.received) == 4 * (turn + 1))
         runner.stop(service)
@@ -119,74 +121,74 @@ def test_identifiers_go_on_over_restarts(begin, runner, atd, modem, snippet):
     assert [i.contact.contact_id for i in modem.received] == [f"{t}-{n}" for t in range(3) for n in range(4)]
 
 
-def test_the_last_identifier_is_followed_by_the_first(begin, runner, platform, atd, modem, snippet):
-    service = begin()
+def test_identifiers_wrap_around(start_service, runner, platform, atd, modem, snippet):
+    service = start_service()
     with service.store.transaction() as tx:
         tx.put_state("next_image", str(IMAGE_IDS).encode())
     atd.send(IN, "compressor", snippet("a"), snippet("b"))
     eventually(lambda: [i.image_id for i in modem.received] == ["1EKF", "0001"])
 
 
-def test_a_wiped_vehicle_does_not_begin_where_its_last_mission_did(runner, platform, tmp_path):
+def test_a_new_store_begins_with_another_identifier(runner, platform, tmp_path):
     starts = set()
     for number in range(4):
-        wiped = platform("uuv-1").model_copy(update={"state_dir": tmp_path / str(number)})
-        service = CompressorService(wiped, CompressorConfig())
+        new_disk = platform("uuv-1").model_copy(update={"state_dir": tmp_path / str(number)})
+        service = CompressorService(new_disk, CompressorConfig())
         starts.add(service._next_number())
         service.store.close()
     assert len(starts) == 4
 
 
-def test_what_was_encoded_before_a_stop_is_sent_after_it(begin, runner, atd, snippet):
-    service = begin()
+def test_encoded_images_are_sent_after_a_restart(start_service, runner, atd, snippet):
+    service = start_service()
     atd.send(IN, "compressor", snippet("a"), snippet("b"))
     eventually(lambda: service.store.outbox_depth() == 2)
     runner.stop(service)
-    begin()
+    start_service()
     late = runner.peer("uuv-1", "uuv_modem", {OUT: EncodedImage})
     eventually(lambda: [i.contact.contact_id for i in late.received] == ["a", "b"])
 
 
-def test_what_was_accepted_before_a_stop_is_encoded_after_it(begin, platform, modem, snippet):
+def test_accepted_snippets_are_encoded_after_a_restart(start_service, platform, modem, snippet):
     idle = CompressorService(platform("uuv-1"), CompressorConfig())
     with idle.store.transaction() as tx:
         tx.accept(IN, wire.encode(snippet("waiting")))
     idle.store.close()
-    begin()
+    start_service()
     eventually(lambda: [i.contact.contact_id for i in modem.received] == ["waiting"])
 
 
 @pytest.mark.parametrize("packing", list(IndexPacking))
-def test_every_packing_is_what_the_configuration_says(packing, begin, atd, modem, snippet):
-    begin(packing=packing)
+def test_the_configured_packing_is_used(packing, start_service, atd, modem, snippet):
+    start_service(packing=packing)
     atd.send(IN, "compressor", snippet("c"))
     eventually(lambda: len(modem.received) == 1)
     assert modem.received[0].stream[0] == packing.codec_id
 
 
 @pytest.mark.parametrize(
-    ("options", "error", "said"),
+    ("options", "error", "expected"),
     [
         ({"codebook": "/nowhere/own.tiles"}, CodebookError, "/nowhere/own.tiles"),
         ({"codebook": "nominal-11"}, CodebookError, "nominal-11"),
         ({"codec": "jpeg-of-the-future"}, ConfigError, "one of"),
     ],
 )
-def test_a_wrong_configuration_is_said_before_anything_is_opened(options, error, said, platform):
-    with pytest.raises(error, match=said):
+def test_a_configuration_error_is_raised_before_the_store_is_opened(options, error, expected, platform):
+    with pytest.raises(error, match=expected):
         CompressorService(platform("uuv-1"), CompressorConfig(**options))
     assert not (platform("uuv-1").state_dir / "compressor.db").exists()
 
 
-def test_a_damaged_codebook_is_named(platform, tmp_path):
+def test_the_error_names_the_damaged_codebook(platform, tmp_path):
     path = tmp_path / "own.tiles"
     path.write_bytes(b"SPTILES\n" + bytes(100))
     with pytest.raises(CodebookError, match=r"own\.tiles"):
         CompressorService(platform("uuv-1"), CompressorConfig(codebook=str(path)))
 
 
-def test_a_full_disk_leaves_the_snippet_with_its_sender(begin, atd, modem, snippet):
-    service = begin()
+def test_the_sender_keeps_the_snippet_while_the_disk_is_full(start_service, atd, modem, snippet):
+    service = start_service()
     service.store._db.execute("PRAGMA max_page_count=1")
     atd.send(IN, "compressor", snippet("late", 200, 200))
     eventually(lambda: service.health().state == "degraded")
@@ -196,8 +198,8 @@ def test_a_full_disk_leaves_the_snippet_with_its_sender(begin, atd, modem, snipp
     eventually(lambda: service.health().state == "ok")
 
 
-def test_the_contact_arrives_as_it_was(begin, atd, modem, texture):
-    begin()
+def test_the_contact_is_sent_unchanged(start_service, atd, modem, texture):
+    start_service()
     contact = Contact(
         contact_id="full", vehicle_id="uuv-1", lat_deg=56.1, lon_deg=-5.2, atd_confidence=1.5, ping_number=7
     )

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.chain
 # What the log of each service says of one contact; the first two know it by `contact_id`, the others by `image_id`.
 STEPS = {
     "atd_stub": "Contact detected",
-    "compressor": "Picture encoded",
+    "compressor": "Image encoded",
     "uuv_modem": "Image sent",
     "op_modem": "Packet received",
     "decompressor": "Picture reconstructed",
