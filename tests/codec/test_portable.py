@@ -35,7 +35,8 @@ def test_embs_golden_streams_hold_with_machine_code_for_a_generic_processor(tmp_
         check=True,
     )
     assert told.stdout.strip() == "generic"
-    tests = [str(path) for path in sorted((ROOT / "tests" / "codec").glob("test_emb*.py"))]
+    tests = [str(path) for path in sorted((ROOT / "tests" / "codec" / "emb").glob("test_*.py"))]
+    assert tests
     options = ["--noconftest", "-p", "no:cacheprovider", "-q", "-o", "timeout=900", "-k", "golden_streams"]
     found = subprocess.run(
         [sys.executable, "-m", "pytest", *options, *tests],
