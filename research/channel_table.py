@@ -12,10 +12,9 @@ from pathlib import Path
 
 from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_events import AcousticPacket, ArrivalEnded, FrameOutcome, PacketKind
-from sonarpost.simulation.channel.channel_presets import PRESETS, build_parameters, read_parameters
-from sonarpost.simulation.channel.propagation import ChannelModel
+from sonarpost.simulation.channel.events import AcousticPacket, ArrivalEnded, FrameOutcome, PacketKind
+from sonarpost.simulation.channel.model import ChannelModel
+from sonarpost.simulation.channel.parameters import PRESETS, ChannelParameters, build_parameters, read_parameters
 
 RANGES_M = (2, 30, 60, 90, 110, 120, 130, 140, 160, 200, 250, 300)
 GAP_S = 10.0
@@ -41,7 +40,7 @@ def deliver(config: ChannelParameters, rate: int, range_m: float, packets: int) 
         water.transmit(1, AcousticPacket(PacketKind.DATA, 1, 2, rate, shape.airtime_s, frames), number * GAP_S)
         for event in water.poll((number + 1) * GAP_S):
             if isinstance(event, ArrivalEnded):
-                arrived = sum(frame.fate in {FrameOutcome.DELIVERED, FrameOutcome.DAMAGED} for frame in event.frames)
+                arrived = sum(frame.outcome in {FrameOutcome.DELIVERED, FrameOutcome.DAMAGED} for frame in event.frames)
                 good += arrived
                 whole += arrived == shape.frames
     return Delivery(range_m, water.snr_db(range_m), whole / packets, good / packets / shape.frames)

@@ -34,10 +34,10 @@ from sonarpost.modem.micromodem import (
     PacketSent,
 )
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_events import Transmission
-from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem
-from sonarpost.simulation.modem.config import EmulatedModemConfig
+from sonarpost.simulation.channel.events import Transmission
+from sonarpost.simulation.channel.parameters import ChannelParameters
+from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
+from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
 _VESSEL: Final = 1
 _VEHICLE: Final = 3

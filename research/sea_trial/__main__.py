@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +20,7 @@ from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.errors import ConfigError
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.simulation.channel.channel_presets import build_parameters
+from sonarpost.simulation.channel.parameters import build_parameters
 
 BOUNDARY_M: Final = 130
 """Where the paper's trial turns."""
@@ -125,7 +125,7 @@ def measure(pictures: int, seed: int, ranges_m: Sequence[int], sizes_px: Sequenc
         for rate in RATES_USED:
             say(f"{width_px} x {height_px} px at rate {rate}")
             for range_m in ranges_m:
-                own = replace(water, seed=_cell_seed(seed, rate, width_px, height_px, range_m))
+                own = water.model_copy(update={"seed": _cell_seed(seed, rate, width_px, height_px, range_m)})
                 cells.append(Cell(rate, width_px, height_px, range_m, cross(own, range_m, rate, samples)))
     return cells
 

@@ -24,9 +24,9 @@ from sonarpost.modem.micromodem import (
     PacketSent,
 )
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem
-from sonarpost.simulation.modem.config import EmulatedModemConfig
+from sonarpost.simulation.channel.parameters import ChannelParameters
+from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
+from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
 VESSEL: Final = 1
 VEHICLE: Final = 2

@@ -1,1 +1,1 @@
-"""Emulated modems in simulated water, for everything that has no sea at hand."""
+"""Channel emulator service: emulated modems and the acoustic channel between them, for development and tests."""

@@ -1,6 +1,6 @@
-"""Runs the emulated modems and their water beside the other services.
+"""Runs a `ChannelEmulator` beside the other services.
 
-The channel itself, `sonarpost.simulation.channel.emulator.AcousticChannel`, needs neither this process nor Zenoh.
+The emulator, `sonarpost.simulation.channel.emulator.ChannelEmulator`, needs neither this process nor Zenoh.
 """
 
 from __future__ import annotations
@@ -15,57 +15,55 @@ from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.simulation.channel.emulator import ChannelEmulator
 
-__all__ = ["AcousticChannelService", "ChannelEmulator"]
-
 log = logging.getLogger(__name__)
 
 WATCH_S = 0.2
 
 
 class AcousticChannelService(Service[AcousticChannelConfig]):
-    """Offers emulated Micro-Modems in one simulated water on pseudo-terminals or TCP ports.
+    """Provides emulated Micro-Modems on pseudo-terminals or TCP ports.
 
-    The ports are open from the moment the process starts, whether or not a router is there: modems need none.
+    The ports are open from the start of the process, also without a router, which the modems do not need.
     """
 
     NAME = "acoustic_channel"
 
     def __init__(self, platform: PlatformConfig, config: AcousticChannelConfig) -> None:
         super().__init__(platform, config)
-        self._channel = ChannelEmulator(config.channel())
+        self._emulator = ChannelEmulator(config.emulator_config())
         try:
-            self._channel.start()
+            self._emulator.start()
         except BaseException:
             self.store.close()
             raise
-        for device in self._channel.devices():
+        for device in self._emulator.devices():
             log.info("Modem ready", extra=kv(modem=device.modem, address=device.address, device=device.device))
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """Never called, as this service consumes no records."""
-        raise NotImplementedError(f"acoustic_channel consumes no records, and got one on {key}")
+        """Reject any record: this service consumes none."""
+        raise NotImplementedError(f"acoustic_channel consumes no records, got one on {key}")
 
     def on_start(self) -> None:
-        """Watch the channel: when it fails, so does the service."""
+        """Watch the emulator: the service fails when the emulator fails."""
         self.start_thread(self._watch, "watch")
 
     def gauges(self) -> Mapping[str, float]:
-        """Return what the water did so far, and how many modems have a host."""
-        totals = self._channel.totals()
+        """Return the counts of packets and frames, and the number of connected hosts."""
+        totals = self._emulator.totals()
         return {
-            "modems_connected": float(self._channel.connected()),
+            "modems_connected": float(self._emulator.connected()),
             "packets_transmitted": float(totals.transmitted),
-            "packets_heard": float(totals.heard),
-            "packets_not_heard": float(sum(totals.not_heard.values())),
-            **{f"frames_{fate}": float(count) for fate, count in totals.frames.items()},
+            "packets_heard": float(totals.reported),
+            "packets_not_heard": float(sum(totals.unreported.values())),
+            **{f"frames_{outcome}": float(count) for outcome, count in totals.frames.items()},
         }
 
     def stop(self) -> None:
-        """Stop the channel, which writes its totals, then the service."""
+        """Stop the service, then the emulator, which writes its totals."""
         super().stop()
-        self._channel.stop()
+        self._emulator.stop()
 
     def _watch(self) -> None:
         while not self.stopping.wait(WATCH_S):
-            if self._channel.failure is not None:
-                raise self._channel.failure
+            if self._emulator.failure is not None:
+                raise self._emulator.failure

@@ -6,10 +6,11 @@ from datetime import UTC, datetime
 
 from sonarpost.modem.micromodem import nmea
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_events import Transmission
-from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem
-from sonarpost.simulation.modem.config import EmulatedModemConfig, PacketReport
+from sonarpost.simulation.channel.events import Transmission
+from sonarpost.simulation.channel.parameters import ChannelParameters
+from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
+from sonarpost.simulation.modem.receiver import PacketReport
+from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
 START_UTC_S = datetime(2016, 10, 12, 9, 0, 0, tzinfo=UTC).timestamp()
 RANGE_M = 150.0
@@ -19,7 +20,7 @@ class Bench:
     """Modems 150 m apart in one water, with what each told its host."""
 
     def __init__(self, modems: int = 2, serial_baud: float | None = None, **config: object) -> None:
-        water = {name: config.pop(name) for name in list(config) if name in ChannelParameters.__dataclass_fields__}
+        water = {name: config.pop(name) for name in list(config) if name in ChannelParameters.model_fields}
         places = {
             n: PlacedModem(
                 EmulatedModemConfig(n, utc_at_zero_s=START_UTC_S, **config), LocalPosition(RANGE_M * (n - 1))

@@ -22,9 +22,8 @@ from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Contact, Health, Pixels, Record, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.parameters import ChannelParameters
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, ModemEvent, nmea
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem
-from sonarpost.simulation.modem.config import EmulatedModemConfig
+from sonarpost.simulation.channel.parameters import ChannelParameters
+from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
+from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
 Spoil = Callable[[bytes], bytes]
 

@@ -16,10 +16,9 @@ from research.sea_trial.rig import Delivered, Rig, Sample, cross
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_events import ArrivalEnded, ArrivalStarted, FrameOutcome
-from sonarpost.simulation.channel.channel_presets import build_parameters
-from sonarpost.simulation.channel.propagation import ChannelModel
+from sonarpost.simulation.channel.events import ArrivalEnded, ArrivalStarted, FrameOutcome
+from sonarpost.simulation.channel.model import ChannelModel
+from sonarpost.simulation.channel.parameters import ChannelParameters, build_parameters
 
 
 @pytest.fixture(scope="module")
@@ -56,12 +55,14 @@ def test_what_is_counted_is_what_the_water_let_through(samples: list[Sample], mo
 
     monkeypatch.setattr(ChannelModel, "poll", poll)
     found = cross(build_parameters({"frame_loss": 0.3, "packet_loss": 0.1, "seed": 4}, "test"), 50.0, 1, samples)
-    fates = [[frame.fate for frame in event.frames] for event in resolved if event.frames]
-    assert len(fates) == found.packets == 12
-    assert sum(fate is FrameOutcome.DELIVERED for packet in fates for fate in packet) == found.good_frames
-    assert sum(all(fate is FrameOutcome.DELIVERED for fate in packet) for packet in fates) == found.whole_packets
+    outcomes = [[frame.outcome for frame in event.frames] for event in resolved if event.frames]
+    assert len(outcomes) == found.packets == 12
+    assert sum(outcome is FrameOutcome.DELIVERED for packet in outcomes for outcome in packet) == found.good_frames
+    assert (
+        sum(all(outcome is FrameOutcome.DELIVERED for outcome in packet) for packet in outcomes) == found.whole_packets
+    )
     assert 0 < found.good_frames < found.frames == 36
-    pairs = zip(fates[::2], fates[1::2], strict=True)
+    pairs = zip(outcomes[::2], outcomes[1::2], strict=True)
     lost = [FrameOutcome.LOST in second for first, second in pairs if FrameOutcome.LOST not in first]
     assert sum(lost) == found.second_lost
     assert found.whole_pictures + found.partial_pictures + found.contacts_only <= found.pictures == 6

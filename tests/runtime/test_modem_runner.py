@@ -31,8 +31,7 @@ from sonarpost.modem.micromodem import (
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialLink
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
 
 CONFIG = MicroModemConfig(address=3, settings=())
 

@@ -25,8 +25,7 @@ from sonarpost.services.op_modem.service import OpModemService
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService, summary_of
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
 
 IN, TX, RX = keys.image_encoded("uuv-1"), keys.acoustic_tx("uuv-1"), keys.acoustic_rx("vessel-1")
 CONTACT = Contact(contact_id="c", vehicle_id="uuv-1", lat_deg=56.4, lon_deg=-5.6, atd_confidence=1.5, channel="port")

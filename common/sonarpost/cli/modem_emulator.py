@@ -1,4 +1,4 @@
-"""`sonarpost modem-emulator`: emulated Micro-Modems in one simulated water, without any configuration file."""
+"""`sonarpost modem-emulator`: emulated Micro-Modems and the channel between them, without a configuration file."""
 
 from __future__ import annotations
 
@@ -14,15 +14,13 @@ from types import FrameType
 from sonarpost.errors import ConfigError
 from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.channel_presets import PRESETS, build_parameters, read_parameters
-from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
-from sonarpost.simulation.modem.config import EmulatedModemConfig
+from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.parameters import PRESETS, ChannelParameters, build_parameters, read_parameters
+from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
 WATCH_S = 0.2
 EXIT_FAILED = 1
-MOST_MODEMS = 64
+MAX_MODEMS = 64
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -30,11 +28,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "modem-emulator",
         help="emulated acoustic modems on pseudo-terminals or TCP ports",
-        description="Emulates Micro-Modems in one water until SIGINT or SIGTERM. The first line of the output is a "
-        'JSON object, {"modems":[{"address":1,"device":"…"},…]}; open the devices with any serial program or, for '
-        "TCP, with a socket:// URL.",
+        description="Emulates Micro-Modems and the channel between them until SIGINT or SIGTERM. The first line of the "
+        'output is a JSON object, {"modems":[{"address":1,"device":"…"},…]}. Open the devices with any serial program '
+        "or, for TCP, with a socket:// URL.",
     )
-    parser.add_argument("--modems", type=int, default=2, metavar="N", help="how many, addresses from 1 (2)")
+    parser.add_argument("--modems", type=int, default=2, metavar="N", help="number of modems, addresses from 1 (2)")
     ports = parser.add_mutually_exclusive_group()
     ports.add_argument(
         "--pty", type=Path, nargs="?", const=Path("modems"), metavar="DIR", help="links modem-1, … in DIR (./modems)"
@@ -50,32 +48,31 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="LETTER=EAST,NORTH,DEPTH",
         help="a ranging transponder A to D, metres from modem 1",
     )
-    parser.add_argument("--spacing", type=float, default=100.0, metavar="M", help="metres from modem to modem (100)")
-    parser.add_argument("--preset", choices=list(PRESETS), help="a set of the water's parameters (still)")
+    parser.add_argument("--spacing", type=float, default=100.0, metavar="M", help="metres between the modems (100)")
+    parser.add_argument("--preset", choices=list(PRESETS), help="set of channel parameters (still)")
+    parser.add_argument("--channel", type=Path, metavar="FILE", help="TOML file of channel parameters, over the preset")
+    parser.add_argument("--water", dest="renamed_water", help=argparse.SUPPRESS)
     parser.add_argument(
-        "--water", type=Path, metavar="FILE", help="TOML file of the water's parameters, over the preset"
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="any channel parameter, over the file"
     )
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="any parameter of the water, over the file"
-    )
-    parser.add_argument("--loss", type=float, metavar="P", help="chance that a frame is lost (0)")
-    parser.add_argument("--packet-loss", type=float, metavar="P", help="chance for a whole packet (0)")
-    parser.add_argument("--tail-damage", type=float, metavar="P", help="chance of a damaged tail (0)")
+    parser.add_argument("--loss", type=float, metavar="P", help="probability that a frame is lost (0)")
+    parser.add_argument("--packet-loss", type=float, metavar="P", help="probability that a packet is lost (0)")
+    parser.add_argument("--tail-damage", type=float, metavar="P", help="probability of a damaged tail (0)")
     parser.add_argument("--range-loss", action="store_true", help="lose frames by signal-to-noise ratio too")
-    parser.add_argument("--snr-at-1m", type=float, metavar="DB", help="signal-to-noise at 1 m (60)")
-    parser.add_argument("--seed", type=int, metavar="N", help="seed of every draw (0)")
-    parser.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="simulated seconds a second (1)")
+    parser.add_argument("--snr-at-1m", type=float, metavar="DB", help="signal-to-noise ratio at 1 m (60)")
+    parser.add_argument("--seed", type=int, metavar="N", help="seed of every random draw (0)")
+    parser.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="simulated seconds per second (1)")
     parser.add_argument(
         "--airtime", action="append", default=[], metavar="RATE=S", help="air time of a rate, instead of the nominal"
     )
-    parser.add_argument("--baud", type=float, metavar="B", help="simulate the serial lines' speed, as 19200")
-    parser.add_argument("--log", type=Path, metavar="FILE", help="append what became of every packet, as JSON lines")
+    parser.add_argument("--baud", type=float, metavar="B", help="simulate the speed of the serial lines, as 19200")
+    parser.add_argument("--log", type=Path, metavar="FILE", help="append the outcome of every packet, as JSON lines")
     parser.add_argument("--json", action="store_true", help="print those JSON lines too, instead of text")
     parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Run the emulator until SIGINT or SIGTERM; return 0, or 1 when it failed by itself."""
+    """Run the emulator until SIGINT or SIGTERM; return 0, or 1 when it failed."""
     stopping = threading.Event()
 
     def on_signal(_number: int, _frame: FrameType | None) -> None:
@@ -90,59 +87,59 @@ def run(parsed: argparse.Namespace) -> int:
 
 
 def _serve(parsed: argparse.Namespace, stopping: threading.Event) -> int:
-    channel = ChannelEmulator(_config(parsed), echo=sys.stdout if parsed.json else None)
-    channel.open()
+    emulator = ChannelEmulator(_config(parsed), echo=sys.stdout if parsed.json else None)
+    emulator.open()
     try:
-        devices = channel.devices()
+        devices = emulator.devices()
         listed = [{"address": device.address, "device": device.device} for device in devices]
-        _show(json.dumps({"modems": listed}))
-        channel.start()
+        _print(json.dumps({"modems": listed}))
+        emulator.start()
         if not parsed.json:
             for device in devices:
-                _show(f"modem {device.modem}: address {device.address}, {device.device}")
+                _print(f"modem {device.modem}: address {device.address}, {device.device}")
         while not stopping.wait(WATCH_S):
-            if channel.failure is not None:
-                print(f"sonarpost: the emulator failed: {channel.failure}", file=sys.stderr)
+            if emulator.failure is not None:
+                print(f"sonarpost: the emulator failed: {emulator.failure}", file=sys.stderr)
                 return EXIT_FAILED
     finally:
-        channel.stop()
-        _drop_unread()
+        emulator.stop()
+        _discard_unread()
     return 0
 
 
-def _show(line: str) -> None:
+def _print(line: str) -> None:
     try:
         print(line, flush=True)
     except BrokenPipeError:
-        # The modems are there for their hosts, whether or not somebody still reads what is said here.
-        _drop_unread()
+        # The emulator continues without a reader of its output.
+        _discard_unread()
 
 
-def _drop_unread() -> None:
-    """Send what a reader who has left cannot take to nowhere, as Python would complain about it at its end."""
+def _discard_unread() -> None:
+    """Redirect output that has no reader any more, about which Python would report an error at exit."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
-        os.close(nowhere)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
 
 
 def _config(parsed: argparse.Namespace) -> EmulatorConfig:
-    """Turn the command line into a configuration.
+    """Return the configuration that the command line describes.
 
     Raises:
         ConfigError: A value out of its bounds, named as the library names it.
     """
-    if not 1 <= parsed.modems <= MOST_MODEMS:
-        raise ConfigError("command line", "--modems", parsed.modems, f"1..{MOST_MODEMS}")
+    if parsed.renamed_water is not None:
+        raise ConfigError("command line", "--water", parsed.renamed_water, "its new name, --channel")
+    if not 1 <= parsed.modems <= MAX_MODEMS:
+        raise ConfigError("command line", "--modems", parsed.modems, f"1..{MAX_MODEMS}")
     try:
-        water = _water(parsed)
-        sites = tuple(ModemSite(n + 1, LocalPosition(east_m=n * parsed.spacing)) for n in range(parsed.modems))
         airtimes_s = dict(_airtime(text) for text in parsed.airtime)
         return EmulatorConfig(
-            sites=sites,
-            water=water,
+            sites=tuple(ModemSite(n + 1, LocalPosition(east_m=n * parsed.spacing)) for n in range(parsed.modems)),
+            channel=_parameters(parsed),
             modem=EmulatedModemConfig(address=0, generation=parsed.mm, airtimes_s=airtimes_s),
             pty_dir=None if parsed.tcp is not None else parsed.pty or Path("modems"),
             tcp_ports=tuple(parsed.tcp or (0,) * parsed.modems) if parsed.tcp is not None else (),
@@ -156,8 +153,8 @@ def _config(parsed: argparse.Namespace) -> EmulatorConfig:
         raise ConfigError("command line", name, rest, "a value within its bounds") from error
 
 
-def _water(parsed: argparse.Namespace) -> ChannelParameters:
-    """Return the water of preset, file and options, the later over the earlier."""
+def _parameters(parsed: argparse.Namespace) -> ChannelParameters:
+    """Return the channel parameters: preset, file, options and `--set`, each overriding the one before."""
     options = {
         "preset": parsed.preset,
         "seed": parsed.seed,
@@ -168,7 +165,7 @@ def _water(parsed: argparse.Namespace) -> ChannelParameters:
         "range_loss": parsed.range_loss or None,
     }
     given = {name: value for name, value in options.items() if value is not None}
-    from_file = read_parameters(parsed.water) if parsed.water else {}
+    from_file = read_parameters(parsed.channel) if parsed.channel else {}
     return build_parameters(from_file | given | dict(_parameter(text) for text in parsed.set), "command line")
 
 

@@ -91,7 +91,7 @@ class ModemService(Service[M]):
                 log.warning("Modem did not confirm a setting", extra=kv(command=event.command))
             case ev.ModemError():
                 self.count("modem_errors")
-                log.warning("Modem reports an error", extra=kv(complaint=event.complaint))
+                log.warning("Modem reports an error", extra=kv(error=event.report))
             case ev.SentenceRejected():
                 self.count("sentences_rejected")
                 log.warning("Line from the modem rejected", extra=kv(reason=str(event.error)))

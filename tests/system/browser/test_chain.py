@@ -31,9 +31,8 @@ from sonarpost.services.relay.service import RelayService
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.channel_config import ChannelParameters
-from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.parameters import ChannelParameters
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 
 TIME_SCALE = 60.0

@@ -13,8 +13,6 @@ from sonarpost.modem.micromodem.events import (
     FrameAcknowledged,
     FrameDecoded,
     FrameReceived,
-    MiniPacketAnswered,
-    MiniPacketReceived,
     ModemError,
     ModemEvent,
     ModemMessageReceived,
@@ -24,8 +22,6 @@ from sonarpost.modem.micromodem.events import (
     PacketFailed,
     PacketReceived,
     PacketSent,
-    PingAnswered,
-    PingReceived,
     PollReceived,
     RequestDone,
     RequestFailed,
@@ -35,6 +31,12 @@ from sonarpost.modem.micromodem.events import (
     UnhandledSentence,
 )
 from sonarpost.modem.micromodem.rates import RATES, Rate
+from sonarpost.modem.micromodem.sentences import (
+    MiniPacketAnswered,
+    MiniPacketReceived,
+    PingAnswered,
+    PingReceived,
+)
 from sonarpost.modem.micromodem.statistics import LinkStatistics, TransmitStatistics
 
 __all__ = [

@@ -1,66 +1,132 @@
-"""The host side of a WHOI Micro-Modem: bytes and the time go in, events and bytes come out.
+"""Host side of a WHOI Micro-Modem: bytes and the time go in, events and bytes come out.
 
-The driver does no input or output and reads no clock. Its owner gives it what the port has read (`receive`), calls
+The driver does no input or output and reads no clock. Its owner passes the bytes read from the port to `receive`, calls
 `poll` at `next_wakeup` and writes `bytes_to_send` to the port. All times are seconds of one monotonic clock.
 
-Every wait has an end: a sentence that gets lost costs time, or at worst one packet, which is then reported as
-failed, and the modem is asked for its address before the next one goes.
+Every wait is limited. A lost sentence costs time, or at most one packet, which is reported as failed. After a failed
+packet the modem is queried before the next one is sent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
+from typing import ClassVar
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.micromodem.events import FailureReason, ModemEvent, PollReceived, SentenceRejected
-from sonarpost.modem.micromodem.machine import DriverStateMachine
-from sonarpost.modem.micromodem.requests import RequestKind, flexible_command, mini_command, ping_command, poll_command
-from sonarpost.modem.micromodem.supervisor import Phase
-from sonarpost.modem.micromodem.transmit import OutgoingPacket, check_packet
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.events import (
+    FailureReason,
+    FrameAcknowledged,
+    ModemError,
+    ModemEvent,
+    PacketFailed,
+    PollReceived,
+    RequestFailed,
+    SentenceRejected,
+    UnhandledSentence,
+)
+from sonarpost.modem.micromodem.nmea import FieldReader, LineAssembler, Sentence
+from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem.reception import ReceptionTracker
+from sonarpost.modem.micromodem.requests import (
+    ModemRequest,
+    RequestKind,
+    RequestTracker,
+    flexible_command,
+    mini_command,
+    ping_command,
+    poll_command,
+)
+from sonarpost.modem.micromodem.sentences import (
+    Acknowledgement,
+    Cycle,
+    DataAccepted,
+    DataRequest,
+    ErrorReport,
+    ModemMessage,
+    ReceivedData,
+    Revision,
+    TransmitMark,
+    transmit_data,
+)
+from sonarpost.modem.micromodem.statistics import TransmitStatistics
+from sonarpost.modem.micromodem.supervisor import ModemSupervisor, Phase
+from sonarpost.modem.micromodem.transmit_cycle import OutgoingPacket, TransmitCycle, check_packet
 
 
-class MicroModem(DriverStateMachine):
-    """Drives one modem: configures it, sends packets one at a time, hands over what arrives.
+class MicroModem:
+    """Drives one modem: configures it, sends packets and requests one at a time, returns what it receives.
 
     Args:
         config: Address, settings and time-outs.
         where: Names the port in errors.
     """
 
+    def __init__(self, config: MicroModemConfig, where: str = "modem port") -> None:
+        self.config = config
+        self._lines = LineAssembler(where, learn_checksums=True)
+        self._supervisor = ModemSupervisor(config, self._send)
+        self._reception = ReceptionTracker(config)
+        self._requests = RequestTracker(config, self._send)
+        self._cycle: TransmitCycle | None = None
+        self._queue: deque[OutgoingPacket | ModemRequest] = deque()
+        self._poll_handler: Callable[[PollReceived], Sequence[bytes]] | None = None
+        self._next_id = 1
+        self._out = bytearray()
+        self._events: list[ModemEvent] = []
+        self._events_since_s = 0.0
+        # End of a transmission that this driver did not start.
+        self._busy_until_s: float | None = None
+
+    @property
+    def phase(self) -> Phase:
+        """State towards the modem."""
+        return self._supervisor.phase
+
+    @property
+    def ready(self) -> bool:
+        """Whether the modem is configured and, as far as known, answers."""
+        return self.phase in {Phase.CHECKING, Phase.READY}
+
     @property
     def firmware(self) -> str | None:
-        """Version the modem has told, or None."""
+        """Firmware version reported by the modem, or None."""
         return self._supervisor.firmware
 
     @property
-    def queued(self) -> int:
-        """How many packets and requests wait or are on their way."""
-        return len(self._queue) + (not self._idle)
-
-    @property
     def generation(self) -> int | None:
-        """1 or 2, None while the modem has not told its version."""
+        """1 or 2, None until the modem has reported its version."""
         return self._supervisor.generation
 
     @property
+    def queued(self) -> int:
+        """Number of packets and requests that are queued or in progress."""
+        return len(self._queue) + (not self._idle)
+
+    @property
     def receiving(self) -> bool:
-        """Whether a packet is arriving, as far as the driver knows."""
-        return self._listener.reception is not None
+        """Whether a packet is being received, as far as known."""
+        return self._reception.reception is not None
+
+    @property
+    def _idle(self) -> bool:
+        return self._cycle is None and self._requests.exchange is None
 
     def start(self, now: float) -> None:
-        """Begin to configure the modem; the port is open."""
+        """Configure the modem; the same as `port_opened`."""
         self.port_opened(now)
 
     def port_opened(self, now: float) -> None:
-        """The port is open (again): whatever the modem knew is set anew."""
+        """Configure the modem: the port was opened, possibly again."""
         if self.phase is not Phase.CLOSED:
             self.port_lost(now)
         self._supervisor.open(now)
         self._advance(now)
 
     def port_lost(self, now: float) -> None:
-        """The port is gone: the packet on its way has failed, received frames are handed over, the others wait."""
+        """Fail the exchange in progress and return received frames; queued packets wait for the next port."""
         self._supervisor.close()
         self._abort(FailureReason.PORT_LOST)
         self._lines.reset()
@@ -70,13 +136,13 @@ class MicroModem(DriverStateMachine):
     def send_packet(
         self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False, now: float
     ) -> int:
-        """Queue a packet; its `PacketSent` or `PacketFailed` carries the number returned here.
+        """Queue a packet and return its number, which its `PacketSent` or `PacketFailed` carries.
 
         Args:
-            destination: Address meant, 0..127.
+            destination: Destination address, 0..127.
             rate: Rate number, 0..6.
             frames: At least one, at most as many and as long as the rate allows; an empty frame is allowed.
-            ack: Ask the far modem for acoustic acknowledgements, and wait for them.
+            ack: Request acoustic acknowledgements from the far modem, and wait for them.
             now: Time on the driver's clock.
 
         Raises:
@@ -88,7 +154,7 @@ class MicroModem(DriverStateMachine):
         return packet.packet_id
 
     def ping(self, destination: int, now: float) -> int:
-        """Queue a ping; its `PingAnswered` tells the travel time, its `RequestDone` or `RequestFailed` the end.
+        """Queue a ping; `PingAnswered` carries the travel time, `RequestDone` or `RequestFailed` the result.
 
         Raises:
             FrameError: An address outside 0..127.
@@ -96,7 +162,7 @@ class MicroModem(DriverStateMachine):
         return self._request(RequestKind.PING, destination, ping_command(self.config.address, destination), now)
 
     def send_mini(self, destination: int, bits: int, now: float) -> int:
-        """Queue a user mini-packet of 13 bits; its end is a `RequestDone` or `RequestFailed`.
+        """Queue a user mini-packet of 13 bits; `RequestDone` or `RequestFailed` carries the result.
 
         Raises:
             FrameError: An address outside 0..127, or more than 13 bits.
@@ -105,7 +171,7 @@ class MicroModem(DriverStateMachine):
         return self._request(RequestKind.MINI_PACKET, destination, command, now)
 
     def send_flexible(self, destination: int, rate: int, data: bytes, now: float) -> int:
-        """Queue a packet of the flexible data protocol (Micro-Modem 2); its end is a `RequestDone` or `RequestFailed`.
+        """Queue flexible data (Micro-Modem 2); `RequestDone` or `RequestFailed` carries the result.
 
         Raises:
             FrameError: An address outside 0..127, a rate other than 1, 3 or 5, no data or more than 2048 bytes.
@@ -116,36 +182,34 @@ class MicroModem(DriverStateMachine):
     def request_packet(
         self, source: int, rate: int, frames: int | None = None, *, ack: bool = False, now: float
     ) -> int:
-        """Queue a poll: another modem is asked to send a packet here.
-
-        What it sends comes as any packet does; the `RequestDone` follows it.
+        """Queue a poll: another modem is requested to send a packet. `RequestDone` follows the received packet.
 
         Args:
             source: The modem that shall send.
             rate: Rate number, 0..6.
-            frames: How many frames at most, None for all that the rate has.
-            ack: Let it ask for acknowledgements.
+            frames: Maximum number of frames, None for a full packet.
+            ack: Whether it shall request acknowledgements.
             now: Time on the driver's clock.
 
         Raises:
-            FrameError: An address outside 0..127, an unknown rate, or a number of frames it does not have.
+            FrameError: An address outside 0..127, an unknown rate, or more frames than the rate has.
         """
         command = poll_command(source, self.config.address, rate, frames, ack=ack)
         return self._request(RequestKind.POLL, source, command, now, rate)
 
-    def set_poll_handler(self, uplink: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
-        """Give the function that is asked for frames when another modem polls this one.
+    def set_poll_handler(self, handler: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
+        """Set the function that returns the frames when another modem polls this one.
 
-        It is called inside `receive` and must not call back. No frames are a right answer: the modem then has nothing
-        to send. Frames that do not fit what was asked for raise `FrameError` out of `receive`.
+        It is called inside `receive` and must not call the driver. It may return no frames. Frames that do not fit the
+        poll raise `FrameError` from `receive`.
         """
-        self._uplink = uplink
+        self._poll_handler = handler
 
     def set_clock(self, utc: datetime, now: float) -> bool:
-        """Set the modem's clock, if it is free at this moment; tell whether the command was sent.
+        """Set the modem's clock if the modem is free; return whether the command was sent.
 
-        The time must be right when this is called, so it is not kept for later: on False, ask again. The answer
-        is a `ClockConfirmed` or, without one, a `SettingRefused`.
+        The command is not queued, as its time must be correct when it is sent: on False, call again later. The result
+        is a `ClockConfirmed` or, without an answer, a `SettingUnconfirmed`.
         """
         if self.phase is not Phase.READY or self._cycle is not None:
             return False
@@ -153,14 +217,18 @@ class MicroModem(DriverStateMachine):
         return True
 
     def receive(self, data: bytes, now: float) -> list[ModemEvent]:
-        """Take bytes from the port, in pieces of any size; whatever they are, the answer is events."""
+        """Process bytes from the port, in parts of any size. Invalid bytes are reported as events."""
         if self.phase is Phase.CLOSED:
             return self._take_events()
         for item in self._lines.feed(data):
             if isinstance(item, SentenceError):
                 self._events.append(SentenceRejected(item))
                 continue
-            self._take(item, now)
+            self._supervisor.note_sentence(now)
+            try:
+                self._HANDLERS.get(item.kind, MicroModem._on_other)(self, item, now)
+            except SentenceError as error:
+                self._events.append(SentenceRejected(error))
             self._advance(now)
         return self._take_events()
 
@@ -170,18 +238,232 @@ class MicroModem(DriverStateMachine):
         return self._take_events()
 
     def next_wakeup(self) -> float | None:
-        """Return when `poll` has something to do, or None; a time in the past means at once."""
+        """Return when `poll` has something to do, or None; a time in the past means immediately."""
         times_s = [self._events_since_s if self._events else None]
         times_s += [packet.queued_s + self.config.max_defer_s for packet in self._queue]
         if self.phase is not Phase.CLOSED:
-            busy_s = self._requester.deadline_s if self._cycle is None else self._cycle.deadline_s
-            # In the middle of a cycle the modem is not asked whether it is there: the cycle will tell.
-            idle_s = None if not self._idle and self.phase is Phase.READY else self._supervisor.deadline_s
-            times_s += [busy_s, idle_s, self._listener.deadline_s, self._foreign_until_s]
+            exchange_s = self._requests.deadline_s if self._cycle is None else self._cycle.deadline_s
+            # The modem is not queried during an exchange, which shows by itself whether the modem answers.
+            check_s = None if not self._idle and self.phase is Phase.READY else self._supervisor.deadline_s
+            times_s += [exchange_s, check_s, self._reception.deadline_s, self._busy_until_s]
         return min((time_s for time_s in times_s if time_s is not None), default=None)
 
     def bytes_to_send(self) -> bytes:
-        """Return, once, what is to be written to the port."""
+        """Remove and return the bytes to be written to the port."""
         data = bytes(self._out)
         self._out.clear()
         return data
+
+    def _advance(self, now: float) -> None:
+        self._events_since_s = now
+        while self._queue and now >= self._queue[0].queued_s + self.config.max_defer_s:
+            self._events.append(self._queue.popleft().failed(FailureReason.DEFERRED_TOO_LONG))
+        if self.phase is Phase.CLOSED:
+            return
+        self._on_reception(self._reception.poll(now))
+        if self._busy_until_s is not None and now >= self._busy_until_s:
+            self._busy_until_s = None
+        self._advance_cycle(now)
+        self._advance_request(now)
+        self._events += self._supervisor.poll(now, may_check=self._idle)
+        self._start_next(now)
+
+    def _advance_cycle(self, now: float) -> None:
+        if self._cycle is None:
+            return
+        self._cycle.poll(now)
+        if self._cycle.result is not None:
+            self._events.append(self._cycle.result)
+            if isinstance(self._cycle.result, PacketFailed):
+                self._supervisor.check(now)
+            self._cycle = None
+
+    def _advance_request(self, now: float) -> None:
+        events = self._requests.poll(now)
+        self._events += events
+        # Without an echo the modem itself has failed, not the channel or the far modem.
+        if any(isinstance(event, RequestFailed) and event.reason is FailureReason.NO_ECHO for event in events):
+            self._supervisor.check(now)
+
+    def _start_next(self, now: float) -> None:
+        channel_free = self._reception.reception is None and self._busy_until_s is None
+        if not (self._queue and channel_free and self._idle and self.phase is Phase.READY):
+            return
+        item = self._queue.popleft()
+        if isinstance(item, OutgoingPacket):
+            self._cycle = TransmitCycle(item, self.config, self._send, now)
+        else:
+            self._requests.start(item, now)
+
+    def _request(self, kind: RequestKind, peer: int, command: Sentence, now: float, rate: int = 0) -> int:
+        request = ModemRequest(self._next_id, kind, peer, command, rate, now)
+        self._enqueue(request, now)
+        return request.request_id
+
+    def _enqueue(self, item: OutgoingPacket | ModemRequest, now: float) -> None:
+        self._next_id += 1
+        if len(self._queue) >= self.config.queued_packets:
+            self._events.append(item.failed(FailureReason.QUEUE_FULL))
+        else:
+            self._queue.append(item)
+        self._advance(now)
+
+    def _on_reception(self, events: list[ModemEvent]) -> None:
+        self._events += events
+        self._requests.on_reception(events)
+
+    def _abort(self, reason: FailureReason) -> None:
+        """Fail the exchange in progress and return the received frames: the modem has lost its state."""
+        if self._cycle is not None:
+            self._events.append(self._cycle.abort(reason))
+            self._cycle = None
+        self._events += self._requests.abort(reason)
+        self._events += self._reception.flush()
+        self._busy_until_s = None
+
+    def _send(self, sentence: Sentence) -> None:
+        self._out += sentence.encode()
+
+    def _take_events(self) -> list[ModemEvent]:
+        events, self._events = self._events, []
+        return events
+
+    # Handlers of the modem's sentences
+
+    def _on_other(self, sentence: Sentence, now: float) -> None:
+        self._events.append(UnhandledSentence(sentence))
+
+    def _on_revision(self, sentence: Sentence, now: float) -> None:
+        revision = Revision.parse(sentence)
+        if revision.rebooted:
+            self._abort(FailureReason.REBOOTED)
+        self._events += self._supervisor.on_revision(revision, now)
+
+    def _on_setting(self, sentence: Sentence, now: float) -> None:
+        was_ready = self.ready
+        self._events += self._supervisor.on_setting(sentence, now)
+        if was_ready and not self.ready:
+            self._abort(FailureReason.REBOOTED)
+
+    def _on_clock(self, sentence: Sentence, now: float) -> None:
+        self._events += self._supervisor.on_clock(sentence, now)
+
+    def _on_cycle(self, sentence: Sentence, now: float) -> None:
+        cycle = Cycle.parse(sentence)
+        if self._cycle is not None and self._cycle.owns(cycle):
+            self._cycle.on_echo(now)
+        elif self._requests.exchange is not None and self._requests.exchange.owns(cycle):
+            self._requests.exchange.on_echo("CYC", now)
+        elif cycle.src != self.config.address:
+            self._on_reception(self._reception.on_cycle(cycle, now))
+        elif not self._start_polled(cycle, now):
+            self._events.append(UnhandledSentence(sentence))
+
+    def _start_polled(self, cycle: Cycle, now: float) -> bool:
+        """Start the cycle that answers a poll; return whether the poll can be answered."""
+        if self._poll_handler is None or self._cycle is not None or cycle.rate not in RATES or cycle.nframes < 1:
+            return False
+        rate = RATES[cycle.rate]
+        poll = PollReceived(cycle.dest, cycle.rate, min(cycle.nframes, rate.frames), rate.frame_bytes, cycle.ack)
+        self._events.append(poll)
+        frames = tuple(bytes(frame) for frame in self._poll_handler(poll))
+        if not frames:
+            return True
+        check_packet(poll.dest, poll.rate, frames)
+        packet = OutgoingPacket(self._next_id, poll.dest, poll.rate, frames, poll.ack, now)
+        self._next_id += 1
+        self._cycle = TransmitCycle(packet, self.config, self._send, now, polled=cycle)
+        return True
+
+    def _on_request(self, sentence: Sentence, now: float) -> None:
+        request = DataRequest.parse(sentence)
+        if self._cycle is not None and request.dest == self._cycle.packet.dest:
+            self._cycle.on_request(request, now)
+        else:
+            # An ended cycle, or a poll without frames: the modem would wait for the data.
+            self._send(transmit_data(request.src, request.dest, b"", ack=request.ack))
+
+    def _on_data_accepted(self, sentence: Sentence, now: float) -> None:
+        accepted = DataAccepted.parse(sentence)
+        if self._cycle is not None:
+            self._cycle.on_data_accepted(accepted, now)
+
+    def _on_transmission(self, sentence: Sentence, now: float) -> None:
+        mark = TransmitMark.parse(sentence)
+        if self._cycle is not None:
+            self._cycle.on_transmission(mark, now)
+        elif self._requests.exchange is not None:
+            self._requests.exchange.on_transmission(ends=mark.ends, now=now)
+        else:
+            self._busy_until_s = None if mark.ends else now + self.config.on_air_limit_s(None)
+
+    def _on_transmit_statistics(self, sentence: Sentence, now: float) -> None:
+        statistics: TransmitStatistics | None = None
+        try:
+            statistics = TransmitStatistics.parse(sentence)
+        except SentenceError as error:
+            # Invalid statistics still mark the end of the transmission.
+            self._events.append(SentenceRejected(error))
+        if self._cycle is not None:
+            self._cycle.on_statistics(statistics, now)
+        elif self._requests.exchange is not None:
+            self._requests.exchange.on_transmit_statistics(now)
+        else:
+            self._events.append(UnhandledSentence(sentence))
+
+    def _on_reception_started(self, sentence: Sentence, now: float) -> None:
+        FieldReader(sentence).optional_integer(0, "type", 0, 255)
+        self._on_reception(self._reception.on_start(now))
+
+    def _on_frame(self, sentence: Sentence, now: float) -> None:
+        self._on_reception(self._reception.on_frame(ReceivedData.parse(sentence), now))
+
+    def _on_message(self, sentence: Sentence, now: float) -> None:
+        message = ModemMessage.parse(sentence)
+        self._on_reception(self._reception.on_message(message, now))
+        if message.text == "PACKET_TIMEOUT" and self._requests.exchange is not None:
+            self._requests.exchange.on_no_answer()
+
+    def _on_link_statistics(self, sentence: Sentence, now: float) -> None:
+        self._on_reception(self._reception.on_statistics(sentence, now))
+
+    def _on_request_sentence(self, sentence: Sentence, now: float) -> None:
+        self._events += self._requests.receive(sentence, now)
+
+    def _on_acknowledgement(self, sentence: Sentence, now: float) -> None:
+        acknowledgement = Acknowledgement.parse(sentence)
+        self._reception.on_acknowledgement(now)
+        if self._cycle is not None:
+            self._cycle.on_acknowledgement(acknowledgement, now)
+        if acknowledgement.good:
+            a = acknowledgement
+            self._events.append(FrameAcknowledged(a.src, a.dest, a.frame_number))
+
+    def _on_error(self, sentence: Sentence, now: float) -> None:
+        report = ErrorReport.parse(sentence)
+        self._events.append(ModemError(report))
+        if self._cycle is not None:
+            self._cycle.on_error(report)
+        elif self._requests.exchange is not None:
+            self._requests.exchange.on_error(report, now)
+
+    _HANDLERS: ClassVar[Mapping[str, Callable[[MicroModem, Sentence, float], None]]] = {
+        "CAREV": _on_revision,
+        "CACFG": _on_setting,
+        "CACLK": _on_clock,
+        "CATMS": _on_clock,
+        "CACYC": _on_cycle,
+        "CADRQ": _on_request,
+        "CATXD": _on_data_accepted,
+        "CATXP": _on_transmission,
+        "CATXF": _on_transmission,
+        "CAXST": _on_transmit_statistics,
+        "CARXP": _on_reception_started,
+        "CARXD": _on_frame,
+        "CARXA": _on_frame,
+        "CAMSG": _on_message,
+        "CACST": _on_link_statistics,
+        "CAACK": _on_acknowledgement,
+        "CAERR": _on_error,
+        **dict.fromkeys(RequestTracker.KINDS, _on_request_sentence),
+    }

@@ -1,4 +1,4 @@
-"""What the driver tells: frozen records, in the order in which things happened."""
+"""Events of the driver: frozen records, returned in order of time."""
 
 from __future__ import annotations
 
@@ -8,37 +8,43 @@ from enum import StrEnum
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.sentences import ModemMessage
-from sonarpost.modem.micromodem.settings import ErrorReport
-from sonarpost.modem.micromodem.short_sentences import ReceivedFlexibleData
+from sonarpost.modem.micromodem.sentences import (
+    ErrorReport,
+    MiniPacketAnswered,
+    MiniPacketReceived,
+    ModemMessage,
+    PingAnswered,
+    PingReceived,
+    ReceivedFlexibleData,
+)
 from sonarpost.modem.micromodem.statistics import LinkStatistics, TransmitStatistics
 
 
 class FailureReason(StrEnum):
-    """Why a packet did not go."""
+    """Why a packet or request failed."""
 
-    NO_ECHO = "no CACYC: the modem did not take the cycle command"
-    NO_DATA_REQUEST = "no CADRQ: the modem did not ask for a frame"
-    NO_DATA_ECHO = "no CATXD: the modem did not take a frame"
-    NO_TRANSMIT_START = "no CATXP: the modem did not start to transmit"
-    NO_TRANSMIT_END = "no CATXF: the modem did not end the transmission"
-    DATA_TIMEOUT = "the modem went on without the data of a frame"
-    FRAME_REFUSED = "the modem takes fewer bytes than the frame has"
-    REBOOTED = "the modem restarted in the middle of the cycle"
-    PORT_LOST = "the port to the modem went away"
-    QUEUE_FULL = "too many packets wait already"
-    NO_ANSWER = "the far side did not answer"
-    REFUSED = "the modem does not understand the command"
-    WAITED_TOO_LONG = "the modem or the water was not free in time"
+    NO_ECHO = "no echo of the command (CACYC)"
+    NO_DATA_REQUEST = "no data request for a frame (CADRQ)"
+    NO_DATA_ECHO = "no confirmation of a frame's data (CATXD)"
+    NO_TRANSMIT_START = "no start of the transmission (CATXP)"
+    NO_TRANSMIT_END = "no end of the transmission (CATXF)"
+    DATA_TIMEOUT = "the modem continued without the data of a frame"
+    FRAME_REFUSED = "the modem accepts fewer bytes than the frame has"
+    REBOOTED = "the modem restarted during the exchange"
+    PORT_LOST = "the port to the modem was lost"
+    QUEUE_FULL = "the driver's queue is full"
+    NO_ANSWER = "no answer from the far modem"
+    REFUSED = "the modem rejected the command"
+    DEFERRED_TOO_LONG = "the modem or the channel was busy for too long"
 
 
 @dataclass(frozen=True, slots=True)
 class ModemReady:
-    """The modem has its address and settings, and has confirmed them.
+    """The modem has confirmed its address and settings.
 
     Attributes:
         address: Its address.
-        firmware: Version it has told in a `CAREV`, or None.
+        firmware: Version from its last `CAREV`, or None.
     """
 
     address: int
@@ -47,10 +53,10 @@ class ModemReady:
 
 @dataclass(frozen=True, slots=True)
 class ModemUnresponsive:
-    """The modem did not answer; said once until the next `ModemReady`. The driver keeps trying.
+    """The modem does not answer. Reported once until the next `ModemReady`; the driver keeps trying.
 
     Attributes:
-        waiting_for: The command that has no right answer.
+        waiting_for: The command without a correct answer.
         attempts: How often it was sent.
         silent_s: Time since the last valid sentence, None when there was none yet.
     """
@@ -62,66 +68,66 @@ class ModemUnresponsive:
 
 @dataclass(frozen=True, slots=True)
 class ModemRebooted:
-    """The modem has restarted by itself; it is configured again."""
+    """The modem has restarted; the driver configures it again."""
 
     firmware: str
 
 
 @dataclass(frozen=True, slots=True)
 class SettingUnconfirmed:
-    """A setting the driver can do without was not confirmed; the driver goes on."""
+    """The modem did not confirm an optional setting or the clock; the driver continues without."""
 
     command: str
 
 
 @dataclass(frozen=True, slots=True)
 class ClockConfirmed:
-    """The modem has taken the time it was given."""
+    """The modem has confirmed the time that was set."""
 
     utc: datetime
 
 
 @dataclass(frozen=True, slots=True)
 class ModemError:
-    """The modem has reported an error of its own."""
+    """The modem has reported an error (`CAERR`)."""
 
-    complaint: ErrorReport
+    report: ErrorReport
 
 
 @dataclass(frozen=True, slots=True)
 class ModemMessageReceived:
-    """A `CAMSG` that is no news of a frame."""
+    """A `CAMSG` other than BAD_CRC."""
 
     message: ModemMessage
 
 
 @dataclass(frozen=True, slots=True)
 class SentenceRejected:
-    """Bytes that are no valid sentence, or a sentence whose fields are wrong."""
+    """Bytes that are not a valid sentence, or a sentence with a wrong field."""
 
     error: SentenceError
 
 
 @dataclass(frozen=True, slots=True)
 class UnhandledSentence:
-    """A valid sentence that the driver has no use for (a setting nobody asked for, ranging, debugging)."""
+    """A valid sentence that the driver does not use (an unrequested setting, ranging, debugging)."""
 
     sentence: Sentence
 
 
 @dataclass(frozen=True, slots=True)
 class PacketSent:
-    """A packet has gone into the water.
+    """A packet was transmitted.
 
     Attributes:
-        packet_id: What `send_packet` returned.
-        dest: Address meant.
+        packet_id: Number returned by `send_packet`.
+        dest: Destination address.
         rate: Rate number.
         frames: The frames, as given.
-        acknowledged: Numbers (from 1) of the frames the far side has acknowledged; empty without `ack`.
-        started_s: Clock of the driver when the cycle was started.
-        finished_s: And when it was over.
-        statistics: What the modem told about the transmission, or None.
+        acknowledged: Numbers (from 1) of the frames that the far modem has acknowledged; empty without `ack`.
+        started_s: Start of the cycle on the driver's clock.
+        finished_s: End of the cycle on the driver's clock.
+        statistics: Statistics of the transmission, or None.
     """
 
     packet_id: int
@@ -136,15 +142,15 @@ class PacketSent:
 
 @dataclass(frozen=True, slots=True)
 class PacketFailed:
-    """A packet did not go, or it is not known whether it went.
+    """A packet was not transmitted, or the driver cannot determine whether it was.
 
     Attributes:
-        packet_id: What `send_packet` returned.
-        dest: Address meant.
+        packet_id: Number returned by `send_packet`.
+        dest: Destination address.
         rate: Rate number.
         frames: The frames, as given.
-        reason: Why.
-        maybe_sent: Whether all or part of it may have gone into the water all the same.
+        reason: Why it failed.
+        maybe_sent: Whether all or part of it may have been transmitted.
     """
 
     packet_id: int
@@ -157,17 +163,17 @@ class PacketFailed:
 
 @dataclass(frozen=True, slots=True)
 class FrameReceived:
-    """One good frame. `data` is what the modem gave: a short frame may have been padded on its way.
+    """One good frame. A modem may have padded the data of a short frame.
 
     Attributes:
-        src: Address that sent.
-        dest: Address meant (which may be another modem).
-        ack: Whether an acknowledgement was asked for.
+        src: Source address.
+        dest: Destination address, possibly of another modem.
+        ack: Whether an acknowledgement was requested.
         frame_number: From 1.
         data: Its bytes.
-        received_s: Clock of the driver when it came.
-        rate: Rate number where known.
-        statistics: Of its packet, None when the modem did not give them.
+        received_s: Time of reception on the driver's clock.
+        rate: Rate number, where known.
+        statistics: Statistics of its packet, None when the modem did not report them.
     """
 
     src: int
@@ -182,9 +188,9 @@ class FrameReceived:
 
 @dataclass(frozen=True, slots=True)
 class FrameDecoded:
-    """A good frame has arrived, of a packet that may not be over: what must not be lost is kept now.
+    """A good frame of a packet that may not be complete yet, so that it can be stored at once.
 
-    The same frame comes again as `FrameReceived`, with its packet.
+    The same frame follows as `FrameReceived` at the end of its packet.
     """
 
     frame: FrameReceived
@@ -192,17 +198,17 @@ class FrameDecoded:
 
 @dataclass(frozen=True, slots=True)
 class PacketReceived:
-    """The end of a packet; its `FrameReceived` events came just before.
+    """The end of a received packet; its `FrameReceived` events come just before.
 
     Attributes:
         frames: The good frames.
-        bad_frames: How many the modem said were damaged.
-        nframes: How many the packet had, None when nobody told.
-        src: Address that sent, where known.
-        dest: Address meant, where known.
+        bad_frames: Number of frames that the modem reported as damaged.
+        nframes: Number of frames in the packet, None when unknown.
+        src: Source address, where known.
+        dest: Destination address, where known.
         rate: Rate number, where known.
-        statistics: None when the modem did not give them.
-        complete: Every announced frame is here and the modem said that the packet is over.
+        statistics: None when the modem did not report them.
+        complete: Whether all announced frames were received and the modem reported the end of the packet.
     """
 
     frames: tuple[FrameReceived, ...]
@@ -217,7 +223,7 @@ class PacketReceived:
 
 @dataclass(frozen=True, slots=True)
 class FrameAcknowledged:
-    """The far side `src` has acknowledged a frame."""
+    """The far modem `src` has acknowledged a frame."""
 
     src: int
     dest: int
@@ -226,68 +232,34 @@ class FrameAcknowledged:
 
 @dataclass(frozen=True, slots=True)
 class StatisticsReceived:
-    """Link quality from something other than a data packet (an acknowledgement, a ping, a cycle start)."""
+    """Link quality of an acknowledgement, a ping, a mini-packet or the header of a rate 0 packet."""
 
     statistics: LinkStatistics
 
 
 @dataclass(frozen=True, slots=True)
 class RequestDone:
-    """A ping or mini-packet was answered, flexible data has gone, or a polled modem has sent its packet.
+    """A ping or mini-packet was answered, flexible data was transmitted, or a polled modem has sent its packet.
 
     Attributes:
-        request_id: What `ping`, `send_mini`, `send_flexible` or `request_packet` returned.
+        request_id: Number returned by `ping`, `send_mini`, `send_flexible` or `request_packet`.
         kind: "ping", "mini-packet", "flexible data" or "poll".
-        far: The other modem's address.
+        peer: Address of the other modem.
     """
 
     request_id: int
     kind: str
-    far: int
+    peer: int
 
 
 @dataclass(frozen=True, slots=True)
 class RequestFailed:
-    """The same did not come to its end; it may have gone into the water all the same."""
+    """A request failed; it may have been transmitted."""
 
     request_id: int
     kind: str
-    far: int
+    peer: int
     reason: FailureReason
-
-
-@dataclass(frozen=True, slots=True)
-class PingReceived:
-    """Somebody pings `dest`; its modem answers by itself."""
-
-    src: int
-    dest: int
-
-
-@dataclass(frozen=True, slots=True)
-class PingAnswered:
-    """`src` has answered a ping; `travel_s` is the sound's time one way, None where the modem does not tell it."""
-
-    src: int
-    dest: int
-    travel_s: float | None
-
-
-@dataclass(frozen=True, slots=True)
-class MiniPacketReceived:
-    """A user mini-packet of 13 bits."""
-
-    src: int
-    dest: int
-    bits: int
-
-
-@dataclass(frozen=True, slots=True)
-class MiniPacketAnswered:
-    """`src` has a mini-packet."""
-
-    src: int
-    dest: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,8 +267,8 @@ class FlexibleDataReceived:
     """A packet of the flexible data protocol.
 
     Attributes:
-        packet: What came, frame by frame.
-        received_s: Clock of the driver when it came.
+        packet: The packet, frame by frame.
+        received_s: Time of reception on the driver's clock.
     """
 
     packet: ReceivedFlexibleData
@@ -305,14 +277,14 @@ class FlexibleDataReceived:
 
 @dataclass(frozen=True, slots=True)
 class PollReceived:
-    """Another modem asks this one for a packet; what it was given is told by `PacketSent` or `PacketFailed`.
+    """Another modem requests a packet; `PacketSent` or `PacketFailed` reports the result.
 
     Attributes:
-        dest: Where the packet shall go.
+        dest: Destination address of the packet.
         rate: Rate number.
-        frames: How many frames at most.
-        frame_bytes: How many bytes in each at most.
-        ack: Whether acknowledgements shall be asked for.
+        frames: Maximum number of frames.
+        frame_bytes: Maximum size of a frame.
+        ack: Whether acknowledgements are requested.
     """
 
     dest: int

@@ -1,8 +1,8 @@
-"""What a packet of each Micro-Modem rate holds and how long it occupies the water.
+"""Packet size and air time of every Micro-Modem rate.
 
-Source: the tables of open Micro-Modem drivers (Goby3, WHOI's ros_acomms); rates 0, 1, 4 and 5 are Table I
-of the paper this project re-creates (32, 192, 512 and 2048 bytes a packet). Air times are nominal: they
-vary with firmware, probe length and bandwidth, so the driver's configuration can replace them.
+Source: the tables of open Micro-Modem drivers (Goby3, WHOI's ros_acomms). Rates 0, 1, 4 and 5 agree with Table I of the
+paper that sonarpost re-creates (32, 192, 512 and 2048 bytes a packet). Air times are nominal: they vary with firmware,
+probe length and bandwidth, and `MicroModemConfig` can replace them.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ class Rate:
 
     Attributes:
         number: 0..6, as in `CCCYC`.
-        modulation: Modulation and code, for people.
+        modulation: Name of modulation and code.
         frames: Frames in a packet.
         frame_bytes: Bytes in a frame.
-        airtime_s: Nominal time a packet occupies the water, in seconds, however full its frames are.
+        airtime_s: Nominal duration of a packet on the channel, however full its frames are.
     """
 
     number: int
@@ -37,7 +37,7 @@ class Rate:
 
     @property
     def throughput_bps(self) -> float:
-        """Bits a second while a full packet is on the air."""
+        """Bits per second during a full packet."""
         return 8 * self.packet_bytes / self.airtime_s
 
 

@@ -1,32 +1,44 @@
-"""What a host asks of its modem besides data cycles: pings, mini-packets, flexible data, and polls of other modems.
+"""Requests other than data packets: pings, mini-packets, flexible data, and polls of other modems.
 
-A request goes through three waits: for the modem's echo, for the end of the transmission, and for what the far side
-answers. Each has its end, and a later sentence stands for the earlier ones that were lost.
+A request waits for the modem's echo, for the end of the transmission and for the answer of the far modem. Every wait is
+limited, and a later sentence implies the earlier ones that were lost.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum, auto
 
 from sonarpost.errors import FrameError
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import FailureReason, RequestDone, RequestFailed
-from sonarpost.modem.micromodem.fields import MAX_ADDRESS
-from sonarpost.modem.micromodem.nmea import Sentence
+from sonarpost.modem.micromodem.events import (
+    FailureReason,
+    FlexibleDataReceived,
+    ModemEvent,
+    PacketReceived,
+    RequestDone,
+    RequestFailed,
+)
+from sonarpost.modem.micromodem.nmea import MAX_ADDRESS, Sentence
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.modem.micromodem.sentences import Cycle
-from sonarpost.modem.micromodem.settings import ErrorReport
-from sonarpost.modem.micromodem.short_sentences import MAX_MINI_BITS, FlexibleData, MiniPacket, PingCommand
+from sonarpost.modem.micromodem.sentences import (
+    FLEXIBLE_RATES,
+    MAX_MINI_BITS,
+    Cycle,
+    ErrorReport,
+    MiniPacketAnswered,
+    MiniPacketReceived,
+    PingAnswered,
+    PingReceived,
+    ReceivedFlexibleData,
+)
 
-FLEXIBLE_RATES = (1, 3, 5)
-FLEXIBLE_BYTES = 2048
-_COMMAND_PARTS = ("NMEA",)
+MAX_FLEXIBLE_BYTES = 2048
 
 
 class RequestKind(Enum):
-    """What is asked for."""
+    """Kind of a request."""
 
     PING = "ping"
     MINI_PACKET = "mini-packet"
@@ -36,41 +48,41 @@ class RequestKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ModemRequest:
-    """A command to the modem that is no data cycle of its own.
+    """A queued request.
 
     Attributes:
         request_id: Number of the request.
-        kind: What it is.
-        far: The other modem's address.
-        command: What is sent to the modem.
+        kind: Kind.
+        peer: Address of the other modem.
+        command: Command for the modem.
         rate: Rate number; 0 for pings and mini-packets.
-        queued_s: When it was handed over.
+        queued_s: Time at which it was queued.
     """
 
     request_id: int
     kind: RequestKind
-    far: int
+    peer: int
     command: Sentence
     rate: int
     queued_s: float
 
     def failed(self, reason: FailureReason) -> RequestFailed:
-        """Return the event that says so."""
-        return RequestFailed(self.request_id, self.kind.value, self.far, reason)
+        """Return the event of a failed request."""
+        return RequestFailed(self.request_id, self.kind.value, self.peer, reason)
 
 
 def ping_command(src: int, dest: int) -> Sentence:
-    """Return the command.
+    """Return `CCMPC,src,dest`.
 
     Raises:
         FrameError: An address outside 0..127.
     """
     _check_address("ping", dest)
-    return PingCommand(src, dest).sentence()
+    return Sentence("CCMPC", (str(src), str(dest)))
 
 
 def mini_command(src: int, dest: int, bits: int) -> Sentence:
-    """Return the command.
+    """Return `CCMUC,src,dest,HHHH`.
 
     Raises:
         FrameError: An address outside 0..127, or more than 13 bits.
@@ -78,35 +90,35 @@ def mini_command(src: int, dest: int, bits: int) -> Sentence:
     _check_address("mini-packet", dest)
     if not 0 <= bits <= MAX_MINI_BITS:
         raise FrameError("mini-packet", "bits", bits, f"0..{MAX_MINI_BITS}")
-    return MiniPacket(src, dest, bits).sentence()
+    return Sentence("CCMUC", (str(src), str(dest), f"{bits:04X}"))
 
 
 def flexible_command(dest: int, rate: int, data: bytes) -> Sentence:
-    """Return the command.
+    """Return `CCTDP,dest,rate,ack,reserved,hex`, without acknowledgement.
 
     Raises:
-        FrameError: An address outside 0..127, a rate the protocol does not have, no data or too much.
+        FrameError: An address outside 0..127, a rate that the protocol does not support, no data or too much.
     """
     _check_address("flexible data", dest)
     if rate not in FLEXIBLE_RATES:
         raise FrameError("flexible data", "rate", rate, f"one of {FLEXIBLE_RATES}")
-    if not 1 <= len(data) <= FLEXIBLE_BYTES:
-        raise FrameError("flexible data", "length", len(data), f"1..{FLEXIBLE_BYTES} bytes")
-    return FlexibleData(dest, rate, data).sentence()
+    if not 1 <= len(data) <= MAX_FLEXIBLE_BYTES:
+        raise FrameError("flexible data", "length", len(data), f"1..{MAX_FLEXIBLE_BYTES} bytes")
+    return Sentence("CCTDP", (str(dest), str(rate), "0", "0", data.hex().upper()))
 
 
 def poll_command(src: int, dest: int, rate: int, frames: int | None, *, ack: bool) -> Sentence:
-    """Return the command.
+    """Return the `CCCYC` that polls another modem.
 
     Args:
-        src: The modem that shall send.
-        dest: The modem it shall send to, usually the own one.
+        src: The modem that shall transmit.
+        dest: Destination of its packet, usually this modem.
         rate: Rate number.
-        frames: How many frames it shall send, None for all of a packet.
-        ack: Whether it shall ask for acknowledgements.
+        frames: Number of frames, None for a full packet.
+        ack: Whether it shall request acknowledgements.
 
     Raises:
-        FrameError: An address outside 0..127, an unknown rate, or a number of frames it does not have.
+        FrameError: An address outside 0..127, an unknown rate, or more frames than the rate has.
     """
     _check_address("poll", src)
     _check_address("poll", dest)
@@ -133,7 +145,7 @@ class _Stage(Enum):
 
 
 class RequestExchange:
-    """Takes one request through the modem. When `result` is set it is over."""
+    """Runs one request. It is over when `result` is set."""
 
     def __init__(
         self, request: ModemRequest, config: MicroModemConfig, send: Callable[[Sentence], None], now: float
@@ -148,49 +160,43 @@ class RequestExchange:
         self.poll(now)
 
     def owns(self, cycle: Cycle) -> bool:
-        """Tell whether a `CACYC` is the echo of this poll."""
-        echo = cycle.sentence()
-        return self.request.kind is RequestKind.POLL and self._stage is _Stage.ECHO and echo == self.request.command
+        """Return whether a `CACYC` is the echo of this poll."""
+        is_poll = self.request.kind is RequestKind.POLL and self._stage is _Stage.ECHO
+        return is_poll and cycle.sentence() == self.request.command
 
     def on_echo(self, kind: str, now: float) -> None:
-        """The modem has echoed a command of the given type (the kind without CC or CA)."""
+        """Process the echo of a command, whose kind is given without CC or CA."""
         if self._stage is _Stage.ECHO and kind == self.request.command.kind[2:]:
-            self._on_air(now)
+            self._wait_on_air(now)
 
     def on_transmission(self, *, ends: bool, now: float) -> None:
-        """The modem starts or ends to transmit."""
+        """Process the start or the end of a transmission."""
         if self._stage is _Stage.ECHO and not ends:
-            self._on_air(now)
+            self._wait_on_air(now)
         elif self._stage in {_Stage.ECHO, _Stage.ON_AIR} and ends:
-            self._gone(now)
+            self._transmitted(now)
 
     def on_transmit_statistics(self, now: float) -> None:
-        """The modem tells what it has sent, which is the end of it too."""
+        """Process `CAXST`, which implies the end of the transmission."""
         if self._stage is _Stage.ON_AIR:
-            self._gone(now)
+            self._transmitted(now)
 
     def on_answer(self, kind: RequestKind, src: int | None) -> None:
-        """The far side has answered a ping or mini-packet, or sent the packet it was asked for."""
-        if kind is self.request.kind and src == self.request.far and self._stage is not _Stage.OVER:
+        """Process an answer of the far modem: to a ping or mini-packet, or the packet of a poll."""
+        if kind is self.request.kind and src == self.request.peer and self._stage is not _Stage.OVER:
             self._finish()
 
     def on_no_answer(self) -> None:
-        """The modem says that nothing came."""
+        """Process the modem's report that no packet followed the poll."""
         if self.request.kind is RequestKind.POLL and self._stage is _Stage.ANSWER:
             self._fail(FailureReason.NO_ANSWER)
 
-    def on_complaint(self, complaint: ErrorReport, now: float) -> None:
-        """The modem did not understand a sentence: the command, as long as its echo is not there."""
-        if complaint.module in _COMMAND_PARTS and self._stage is _Stage.ECHO:
+    def on_error(self, report: ErrorReport, now: float) -> None:
+        """Process an NMEA error before the echo: the modem rejects the command."""
+        if report.module == "NMEA" and self._stage is _Stage.ECHO:
             self.deadline_s = now
             if self._attempt >= self._config.tries:
                 self._fail(FailureReason.REFUSED)
-
-    def abort(self, reason: FailureReason) -> RequestFailed:
-        """End the exchange from outside."""
-        self._fail(reason)
-        assert isinstance(self.result, RequestFailed)
-        return self.result
 
     def poll(self, now: float) -> None:
         """Do what is due: send again, or end the exchange."""
@@ -203,17 +209,17 @@ class RequestExchange:
         elif self._stage is _Stage.ECHO:
             self._fail(FailureReason.NO_ECHO)
         elif self._stage is _Stage.ON_AIR:
-            # Its end may have been lost, or this modem tells none for short packets.
-            self._gone(now)
+            # CATXF may have been lost, or this modem sends none for short packets.
+            self._transmitted(now)
         else:
             self._fail(FailureReason.NO_ANSWER)
 
-    def _on_air(self, now: float) -> None:
+    def _wait_on_air(self, now: float) -> None:
         self._stage = _Stage.ON_AIR
         flexible = self.request.kind is RequestKind.FLEXIBLE_DATA
         self.deadline_s = now + self._config.on_air_limit_s(self.request.rate if flexible else 0)
 
-    def _gone(self, now: float) -> None:
+    def _transmitted(self, now: float) -> None:
         if self.request.kind is RequestKind.FLEXIBLE_DATA:
             self._finish()
             return
@@ -224,9 +230,86 @@ class RequestExchange:
         self.deadline_s = now + wait_s
 
     def _finish(self) -> None:
-        self.result = RequestDone(self.request.request_id, self.request.kind.value, self.request.far)
+        self.result = RequestDone(self.request.request_id, self.request.kind.value, self.request.peer)
         self._stage = _Stage.OVER
 
     def _fail(self, reason: FailureReason) -> None:
         self.result = self.request.failed(reason)
         self._stage = _Stage.OVER
+
+
+class RequestTracker:
+    """Follows the request in progress; reports received pings, mini-packets and flexible data.
+
+    Args:
+        config: Time-outs and tries.
+        send: Sends a sentence.
+    """
+
+    KINDS = ("CAMPC", "CAMPA", "CAMPR", "CAMUC", "CAMUA", "CAMUR", "CATDP", "CARDP")
+    """Kinds of sentences for `receive`."""
+
+    def __init__(self, config: MicroModemConfig, send: Callable[[Sentence], None]) -> None:
+        self._config = config
+        self._send = send
+        self.exchange: RequestExchange | None = None
+
+    @property
+    def deadline_s(self) -> float | None:
+        """When `poll` has something to do, or None."""
+        return None if self.exchange is None else self.exchange.deadline_s
+
+    def start(self, request: ModemRequest, now: float) -> None:
+        """Start a request; no other is in progress."""
+        self.exchange = RequestExchange(request, self._config, self._send, now)
+
+    def receive(self, sentence: Sentence, now: float) -> list[ModemEvent]:
+        """Process a sentence of the kinds in `KINDS`.
+
+        Raises:
+            SentenceError: A wrong field.
+        """
+        if self.exchange is not None:
+            self.exchange.on_echo(sentence.kind[2:], now)
+        match sentence.kind:
+            case "CAMPA":
+                return [PingReceived.parse(sentence)]
+            case "CAMPR":
+                ping_answer = PingAnswered.parse(sentence)
+                self._on_answer(RequestKind.PING, ping_answer.src)
+                return [ping_answer]
+            case "CAMUA":
+                return [MiniPacketReceived.parse(sentence)]
+            case "CAMUR":
+                mini_answer = MiniPacketAnswered.parse(sentence)
+                self._on_answer(RequestKind.MINI_PACKET, mini_answer.src)
+                return [mini_answer]
+            case "CARDP":
+                return [FlexibleDataReceived(ReceivedFlexibleData.parse(sentence), now)]
+        return []
+
+    def on_reception(self, events: Iterable[ModemEvent]) -> None:
+        """Process events of the reception: the packet of a polled modem answers the poll."""
+        for event in events:
+            if isinstance(event, PacketReceived):
+                self._on_answer(RequestKind.POLL, event.src)
+
+    def poll(self, now: float) -> list[ModemEvent]:
+        """Do what is due; return the result of the request, once."""
+        if self.exchange is None:
+            return []
+        self.exchange.poll(now)
+        result = self.exchange.result
+        if result is None:
+            return []
+        self.exchange = None
+        return [result]
+
+    def abort(self, reason: FailureReason) -> list[ModemEvent]:
+        """End the request (the modem restarted, the port was lost)."""
+        exchange, self.exchange = self.exchange, None
+        return [] if exchange is None else [exchange.request.failed(reason)]
+
+    def _on_answer(self, kind: RequestKind, src: int | None) -> None:
+        if self.exchange is not None:
+            self.exchange.on_answer(kind, src)

@@ -1,33 +1,44 @@
-"""The sentences of the data cycle and of the configuration, as typed records.
+"""Typed sentences of the Micro-Modem, except its statistics.
 
-Each record has `parse`, which reads a `Sentence` or raises `SentenceError` naming kind, field, value and
-what was expected, and `sentence`, which builds it. `CC` travels from host to modem, `CA` from modem to
-host. Addresses are 0..127, frame numbers start at 1, binary data travels as hex. The statistics are in
-`statistics`.
+`parse` reads a `Sentence` or raises `SentenceError` with kind, field, value and expectation. `CC` sentences go from
+host to modem, `CA` sentences from modem to host. Addresses are 0..127, frame numbers start at 1, binary data is hex.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
-from sonarpost.modem.micromodem.fields import FieldReader
-from sonarpost.modem.micromodem.nmea import Sentence
+from sonarpost.errors import SentenceError
+from sonarpost.modem.micromodem.nmea import FieldReader, Sentence
+
+MAX_MINI_BITS = 0x1FFF
+"""A user mini-packet carries 13 bits."""
+FLEXIBLE_RATES = (1, 3, 5)
+"""Rates of the flexible data protocol."""
+ISO_SECONDS = "%Y-%m-%dT%H:%M:%SZ"
+"""Format of the time in `CCTMS` and `CATMS`."""
 
 _MAX_FRAME_NUMBER = 255
 _MAX_BYTES = 65535
 _MAX_RATE = 255
+_MAX_SETTING = 2**31
+_MAX_TRAVEL_S = 3600.0
+_SETTING_INTEGER = re.compile(r"[+-]?[0-9]{1,10}")
+_MINI_BITS = re.compile(r"[0-9A-Fa-f]{1,4}")
 
 
 @dataclass(frozen=True, slots=True)
 class Cycle:
-    """`CCCYC,command,src,dest,rate,ack,nframes` and its echo `CACYC`, which the far modem gives too.
+    """`CCCYC,command,src,dest,rate,ack,nframes`, its echo `CACYC`, and the announcement `CACYC` at the far modem.
 
     Attributes:
-        src: Address that transmits.
-        dest: Address meant.
-        rate: Number in `rates.RATES` (a newer firmware may announce others).
-        ack: Whether an acoustic acknowledgement is asked for.
-        nframes: Frames announced.
+        src: Transmitting address.
+        dest: Destination address.
+        rate: Rate number (newer firmware may announce others than those in `RATES`).
+        ack: Whether an acoustic acknowledgement is requested.
+        nframes: Number of announced frames.
         command: First field, 0 for a data cycle.
     """
 
@@ -52,27 +63,26 @@ class Cycle:
         )
 
     def sentence(self, kind: str = "CCCYC") -> Sentence:
-        """Build the command, or with "CACYC" its echo."""
-        return _sentence(kind, self.command, self.src, self.dest, self.rate, int(self.ack), self.nframes)
+        """Return the command, or with "CACYC" its echo."""
+        fields = (self.command, self.src, self.dest, self.rate, int(self.ack), self.nframes)
+        return Sentence(kind, tuple(str(field) for field in fields))
 
 
 @dataclass(frozen=True, slots=True)
 class DataRequest:
-    """`CADRQ,hhmmss,src,dest,ack,maxbytes,frame`: the modem asks for a frame's bytes."""
+    """`CADRQ,hhmmss,src,dest,ack,maxbytes,frame`: the modem requests the data of a frame."""
 
     src: int
     dest: int
     ack: bool
     max_bytes: int
     frame_number: int
-    modem_time: str = ""
 
     @classmethod
     def parse(cls, sentence: Sentence) -> DataRequest:
         """Read `CADRQ`."""
         read = FieldReader(sentence, ("CADRQ",), 6)
         return cls(
-            modem_time=read.text(0),
             src=read.address(1, "src"),
             dest=read.address(2, "dest"),
             ack=read.flag(3, "ack"),
@@ -80,35 +90,15 @@ class DataRequest:
             frame_number=read.integer(5, "frame", 1, _MAX_FRAME_NUMBER),
         )
 
-    def sentence(self) -> Sentence:
-        """Build `CADRQ`."""
-        fields = (self.modem_time, self.src, self.dest, int(self.ack), self.max_bytes, self.frame_number)
-        return _sentence("CADRQ", *fields)
 
-
-@dataclass(frozen=True, slots=True)
-class TransmitData:
-    """`CCTXD,src,dest,ack,hex`: the answer to a request; empty data means no more."""
-
-    src: int
-    dest: int
-    ack: bool
-    data: bytes
-
-    @classmethod
-    def parse(cls, sentence: Sentence) -> TransmitData:
-        """Read `CCTXD`."""
-        read = FieldReader(sentence, ("CCTXD",), 3)
-        return cls(read.address(0, "src"), read.address(1, "dest"), read.flag(2, "ack"), read.data(3, "data"))
-
-    def sentence(self) -> Sentence:
-        """Build `CCTXD`, with an empty last field when there is no data."""
-        return _sentence("CCTXD", self.src, self.dest, int(self.ack), self.data.hex().upper())
+def transmit_data(src: int, dest: int, data: bytes, *, ack: bool) -> Sentence:
+    """Return `CCTXD,src,dest,ack,hex`, the answer to a `DataRequest`; empty data means that no more follows."""
+    return Sentence("CCTXD", (str(src), str(dest), str(int(ack)), data.hex().upper()))
 
 
 @dataclass(frozen=True, slots=True)
 class DataAccepted:
-    """`CATXD,src,dest,ack,nbytes`: the modem has taken a frame."""
+    """`CATXD,src,dest,ack,nbytes`: the modem has accepted `nbytes` of a frame."""
 
     src: int
     dest: int
@@ -122,14 +112,10 @@ class DataAccepted:
         nbytes = read.integer(3, "nbytes", 0, _MAX_BYTES)
         return cls(read.address(0, "src"), read.address(1, "dest"), read.flag(2, "ack"), nbytes)
 
-    def sentence(self) -> Sentence:
-        """Build `CATXD`."""
-        return _sentence("CATXD", self.src, self.dest, int(self.ack), self.nbytes)
-
 
 @dataclass(frozen=True, slots=True)
 class TransmitMark:
-    """`CATXP,nbytes` (the transmission starts) or `CATXF,nbytes` (it ends); the count may be absent."""
+    """`CATXP,nbytes` (a transmission starts) or `CATXF,nbytes` (it ends); the count may be absent."""
 
     ends: bool
     nbytes: int | None = None
@@ -137,35 +123,15 @@ class TransmitMark:
     @classmethod
     def parse(cls, sentence: Sentence) -> TransmitMark:
         """Read `CATXP` or `CATXF`."""
-        read = FieldReader(sentence, ("CATXP", "CATXF"), 0)
+        read = FieldReader(sentence, ("CATXP", "CATXF"))
         return cls(sentence.kind == "CATXF", read.optional_integer(0, "nbytes", 0, _MAX_BYTES))
-
-    def sentence(self) -> Sentence:
-        """Build `CATXP` or `CATXF`."""
-        return _sentence("CATXF" if self.ends else "CATXP", "" if self.nbytes is None else self.nbytes)
-
-
-@dataclass(frozen=True, slots=True)
-class ReceptionStarted:
-    """`CARXP,type`: a packet begins to arrive; 0 FSK, 1 PSK, None where the field is absent."""
-
-    packet_type: int | None = None
-
-    @classmethod
-    def parse(cls, sentence: Sentence) -> ReceptionStarted:
-        """Read `CARXP`."""
-        return cls(FieldReader(sentence, ("CARXP",), 0).optional_integer(0, "type", 0, 255))
-
-    def sentence(self) -> Sentence:
-        """Build `CARXP`."""
-        return _sentence("CARXP", "" if self.packet_type is None else self.packet_type)
 
 
 @dataclass(frozen=True, slots=True)
 class ReceivedData:
-    """`CARXD,src,dest,ack,frame,hex`: one good frame of the packet that arrives.
+    """`CARXD,src,dest,ack,frame,hex`: one good frame of a packet.
 
-    A frame that was given to the far modem as text comes as `CARXA`, with the text instead of the hex.
+    A frame that was given to the far modem as text comes as `CARXA`, with text instead of hex.
     """
 
     src: int
@@ -179,24 +145,15 @@ class ReceivedData:
         """Read `CARXD` or `CARXA`."""
         read = FieldReader(sentence, ("CARXA", "CARXD"), 4)
         is_text = sentence.kind == "CARXA"
-        # Text may hold commas, which no other field does.
+        # Text may contain commas.
         data = ",".join(sentence.fields[4:]).encode("ascii") if is_text else read.data(4, "data")
-        return cls(
-            read.address(0, "src"),
-            read.address(1, "dest"),
-            read.flag(2, "ack"),
-            read.integer(3, "frame", 1, _MAX_FRAME_NUMBER),
-            data,
-        )
-
-    def sentence(self) -> Sentence:
-        """Build `CARXD`."""
-        return _sentence("CARXD", self.src, self.dest, int(self.ack), self.frame_number, self.data.hex().upper())
+        frame_number = read.integer(3, "frame", 1, _MAX_FRAME_NUMBER)
+        return cls(read.address(0, "src"), read.address(1, "dest"), read.flag(2, "ack"), frame_number, data)
 
 
 @dataclass(frozen=True, slots=True)
 class Acknowledgement:
-    """`CAACK,src,dest,frame,1`: an acoustic acknowledgement; `src` is the side that acknowledges."""
+    """`CAACK,src,dest,frame,1`: an acoustic acknowledgement by the modem `src`; a missing flag means good."""
 
     src: int
     dest: int
@@ -205,20 +162,16 @@ class Acknowledgement:
 
     @classmethod
     def parse(cls, sentence: Sentence) -> Acknowledgement:
-        """Read `CAACK`; a missing flag means acknowledged."""
+        """Read `CAACK`."""
         read = FieldReader(sentence, ("CAACK",), 3)
         frame_number = read.integer(2, "frame", 1, _MAX_FRAME_NUMBER)
         good = read.optional_integer(3, "flag", 0, 1) != 0
         return cls(read.address(0, "src"), read.address(1, "dest"), frame_number, good)
 
-    def sentence(self) -> Sentence:
-        """Build `CAACK`."""
-        return _sentence("CAACK", self.src, self.dest, self.frame_number, int(self.good))
-
 
 @dataclass(frozen=True, slots=True)
 class ModemMessage:
-    """`CAMSG,text,…`: BAD_CRC for a damaged frame, PACKET_TIMEOUT for a packet that did not go on, and others."""
+    """`CAMSG,text,…`: BAD_CRC for a damaged frame, PACKET_TIMEOUT for an incomplete packet, and others."""
 
     text: str
     details: tuple[str, ...] = ()
@@ -228,10 +181,220 @@ class ModemMessage:
         """Read `CAMSG`."""
         return cls(FieldReader(sentence, ("CAMSG",), 1).name(0, "text"), sentence.fields[1:])
 
-    def sentence(self) -> Sentence:
-        """Build `CAMSG`."""
-        return _sentence("CAMSG", self.text, *self.details)
+
+@dataclass(frozen=True, slots=True)
+class ConfigurationSetting:
+    """`CACFG,name,value`: a setting; a Micro-Modem 2 has dotted names, and some values are not integers."""
+
+    name: str
+    value: str
+
+    @classmethod
+    def parse(cls, sentence: Sentence) -> ConfigurationSetting:
+        """Read `CACFG`."""
+        read = FieldReader(sentence, ("CACFG",), 2)
+        return cls(read.name(0, "name"), ",".join(sentence.fields[1:]).strip())
+
+    @property
+    def number(self) -> int | None:
+        """The value as an integer, or None; leading zeros are accepted."""
+        return int(self.value) if _SETTING_INTEGER.fullmatch(self.value) else None
 
 
-def _sentence(kind: str, *fields: str | int) -> Sentence:
-    return Sentence(kind, tuple(str(field) for field in fields))
+@dataclass(frozen=True, slots=True)
+class Revision:
+    """`CAREV,hhmmss,role,version`: sent periodically, and as INIT after a restart.
+
+    Attributes:
+        role: AUV, INIT, COPROC or a value of newer firmware.
+        version: Four parts on a Micro-Modem 1, three on a 2; empty where absent.
+    """
+
+    role: str
+    version: str = ""
+
+    @classmethod
+    def parse(cls, sentence: Sentence) -> Revision:
+        """Read `CAREV`."""
+        read = FieldReader(sentence, ("CAREV",), 2)
+        return cls(role=read.name(1, "role"), version=read.text(2))
+
+    @property
+    def rebooted(self) -> bool:
+        """Whether the modem has just started."""
+        return self.role == "INIT"
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorReport:
+    """`CAERR,hhmmss,module,errno,message`, or `CAERR,hhmmss,DATA_TIMEOUT,frame`.
+
+    Attributes:
+        module: Module of the modem that reports the error, or DATA_TIMEOUT.
+        number: Error number or, for DATA_TIMEOUT, the frame without data; None where it is not an integer.
+        message: The remaining fields, as text.
+        modem_time: hhmmss of the modem's clock.
+    """
+
+    module: str
+    number: int | None = None
+    message: str = ""
+    modem_time: str = ""
+
+    @classmethod
+    def parse(cls, sentence: Sentence) -> ErrorReport:
+        """Read `CAERR`; an invalid number becomes part of the message."""
+        read = FieldReader(sentence, ("CAERR",), 2)
+        module, rest = read.name(1, "module"), sentence.fields[2:]
+        try:
+            number = read.optional_integer(2, "errno", -_MAX_SETTING, _MAX_SETTING)
+        except SentenceError:
+            return cls(module, None, ",".join(rest), read.text(0))
+        return cls(module, number, ",".join(rest[1:]), read.text(0))
+
+    @property
+    def data_timeout(self) -> bool:
+        """Whether the modem has received no data for a frame in time."""
+        return self.module == "DATA_TIMEOUT"
+
+
+def parse_clock(sentence: Sentence) -> datetime:
+    """Return the UTC time of `CACLK,Y,M,D,h,m,s` or, from a Micro-Modem 2, `CATMS,timedout,ISO8601Z`.
+
+    Raises:
+        SentenceError: A wrong field.
+    """
+    if sentence.kind == "CATMS":
+        text = FieldReader(sentence, ("CATMS",), 2).text(1).strip()
+        try:
+            return datetime.strptime(text, ISO_SECONDS).replace(tzinfo=UTC)
+        except ValueError as error:
+            raise SentenceError(sentence.kind, "time", text, "YYYY-MM-DDThh:mm:ssZ") from error
+    read = FieldReader(sentence, ("CACLK",), 6)
+    limits = (
+        ("year", 1970, 9999), ("month", 1, 12), ("day", 1, 31), ("hour", 0, 23), ("minute", 0, 59), ("second", 0, 59)
+    )  # fmt: skip
+    year, month, day, hour, minute, second = (read.integer(i, *limit) for i, limit in enumerate(limits))
+    try:
+        return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
+    except ValueError as error:
+        raise SentenceError(sentence.kind, "day", day, "a day of that month") from error
+
+
+@dataclass(frozen=True, slots=True)
+class PingReceived:
+    """`CAMPA,src,dest`: a ping from `src` to `dest`, whose modem replies automatically."""
+
+    src: int
+    dest: int
+
+    @classmethod
+    def parse(cls, sentence: Sentence) -> PingReceived:
+        """Read `CAMPA`."""
+        read = FieldReader(sentence, ("CAMPA",), 2)
+        return cls(read.address(0, "src"), read.address(1, "dest"))
+
+
+@dataclass(frozen=True, slots=True)
+class PingAnswered:
+    """`CAMPR,src,dest,travel_s`: the reply of `src` to a ping, with the one-way travel time (None where absent)."""
+
+    src: int
+    dest: int
+    travel_s: float | None
+
+    @classmethod
+    def parse(cls, sentence: Sentence) -> PingAnswered:
+        """Read `CAMPR`."""
+        read = FieldReader(sentence, ("CAMPR",), 2)
+        travel_s = read.optional_real(2, "travel time")
+        if travel_s is not None and not 0.0 <= travel_s <= _MAX_TRAVEL_S:
+            raise SentenceError(sentence.kind, "travel time", travel_s, f"0..{_MAX_TRAVEL_S:g} seconds")
+        return cls(read.address(0, "src"), read.address(1, "dest"), travel_s)
+
+
+@dataclass(frozen=True, slots=True)
+class MiniPacketReceived:
+    """`CAMUA,src,dest,HHHH`: a user mini-packet; `bits` is 0..0x1FFF."""
+
+    src: int
+    dest: int
+    bits: int
+
+    @classmethod
+    def parse(cls, sentence: Sentence) -> MiniPacketReceived:
+        """Read `CAMUA`."""
+        read = FieldReader(sentence, ("CAMUA",), 3)
+        text = read.text(2).strip()
+        if not _MINI_BITS.fullmatch(text) or int(text, 16) > MAX_MINI_BITS:
+            raise SentenceError(sentence.kind, "bits", text, f"hex, at most {MAX_MINI_BITS:X}")
+        return cls(read.address(0, "src"), read.address(1, "dest"), int(text, 16))
+
+
+@dataclass(frozen=True, slots=True)
+class MiniPacketAnswered:
+    """`CAMUR,src,dest`: `src` has received the mini-packet."""
+
+    src: int
+    dest: int
+
+    @classmethod
+    def parse(cls, sentence: Sentence) -> MiniPacketAnswered:
+        """Read `CAMUR`."""
+        read = FieldReader(sentence, ("CAMUR",), 2)
+        return cls(read.address(0, "src"), read.address(1, "dest"))
+
+
+@dataclass(frozen=True, slots=True)
+class FlexiblePart:
+    """One frame of received flexible data: whether its CRC is good, its size, and its bytes."""
+
+    good: bool
+    nbytes: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedFlexibleData:
+    """`CARDP,src,dest,rate,ack,reserved,minis,datas`; each group holds `crc;nbytes;hex` any number of times.
+
+    Attributes:
+        src: Source address.
+        dest: Destination address.
+        rate: Rate number.
+        ack: Whether an acknowledgement is requested.
+        parts: Mini-frames first, then data frames.
+    """
+
+    src: int
+    dest: int
+    rate: int
+    ack: bool
+    parts: tuple[FlexiblePart, ...]
+
+    @classmethod
+    def parse(cls, sentence: Sentence) -> ReceivedFlexibleData:
+        """Read `CARDP`."""
+        read = FieldReader(sentence, ("CARDP",), 6)
+        texts = [text for index in (5, 6) if read.text(index) for text in read.text(index).split(";")]
+        if len(texts) % 3:
+            raise SentenceError(sentence.kind, "frames", ";".join(texts)[:60], "groups of crc;nbytes;hex")
+        parts = []
+        for at in range(0, len(texts), 3):
+            group = FieldReader(Sentence("CARDP", tuple(texts[at : at + 3])))
+            part = FlexiblePart(group.flag(0, "crc"), group.integer(1, "nbytes", 0, _MAX_BYTES), group.data(2, "data"))
+            if part.good and len(part.data) != part.nbytes:
+                raise SentenceError(sentence.kind, "nbytes", part.nbytes, f"the number of bytes, {len(part.data)}")
+            parts.append(part)
+        rate = read.integer(2, "rate", 0, _MAX_RATE)
+        return cls(read.address(0, "src"), read.address(1, "dest"), rate, read.flag(3, "ack"), tuple(parts))
+
+    @property
+    def complete(self) -> bool:
+        """Whether there is at least one frame and every frame is good."""
+        return bool(self.parts) and all(part.good for part in self.parts)
+
+    @property
+    def data(self) -> bytes:
+        """The bytes of all frames, or none when a frame is bad: the remaining bytes would be misplaced."""
+        return b"".join(part.data for part in self.parts) if self.complete else b""

@@ -1,4 +1,4 @@
-"""Knows how the modem is: configures it, asks now and then whether it is still there, and never gives up."""
+"""Supervision of the modem: configures it, checks that it answers, and recovers it after a restart or a failure."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections.abc import Callable
 from datetime import datetime
 from enum import Enum, auto
 
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.dialogue import (
+from sonarpost.modem.micromodem.command_queue import (
     CommandProgress,
     CommandQueue,
     ModemCommand,
@@ -15,6 +14,7 @@ from sonarpost.modem.micromodem.dialogue import (
     query_command,
     set_command,
 )
+from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.events import (
     ClockConfirmed,
     ModemEvent,
@@ -25,12 +25,11 @@ from sonarpost.modem.micromodem.events import (
     UnhandledSentence,
 )
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.settings import ClockSetting, ConfigurationSetting, Revision
-from sonarpost.modem.micromodem.short_sentences import TimeSetting
+from sonarpost.modem.micromodem.sentences import ConfigurationSetting, Revision, parse_clock
 
 
 class Phase(Enum):
-    """What the driver does with its modem."""
+    """State of the driver towards its modem."""
 
     CLOSED = auto()
     CONFIGURING = auto()
@@ -39,63 +38,63 @@ class Phase(Enum):
 
 
 class ModemSupervisor:
-    """Brings the modem to READY and back there, whatever it does.
+    """Brings the modem to READY, and back to READY after any failure.
 
     Args:
         config: Address, settings and time-outs.
-        send: Takes the sentences to send.
+        send: Sends a sentence.
     """
 
     def __init__(self, config: MicroModemConfig, send: Callable[[Sentence], None]) -> None:
         self.phase = Phase.CLOSED
         self.firmware: str | None = None
         self._config = config
-        self._dialogue = CommandQueue(config, send)
+        self._commands = CommandQueue(config, send)
         self._alive_s = 0.0
-        self._heard_s: float | None = None
+        self._last_sentence_s: float | None = None
         self._attempts = 0
         self._unresponsive = False
 
     @property
     def deadline_s(self) -> float | None:
-        """When the present command is due again, or the modem is to be asked whether it is there."""
+        """When the next command or the next check is due."""
         if self.phase is Phase.READY:
             return self._alive_s + self._config.keepalive_s
-        return self._dialogue.deadline_s
+        return self._commands.deadline_s
 
     @property
     def generation(self) -> int | None:
-        """1 or 2: the version of a Micro-Modem 1 has four parts, that of a 2 three; None while it is not known."""
+        """1 or 2, from the parts of the version (four or three); None while it is unknown."""
         parts = len(self.firmware.split(".")) if self.firmware else 0
         return {3: 2, 4: 1}.get(parts)
 
     def open(self, now: float) -> None:
-        """The port is open: whatever the modem knew is set anew."""
+        """Configure the modem: the port was opened."""
         self._alive_s = now
-        self._heard_s = None
+        self._last_sentence_s = None
         self._configure(now)
 
     def close(self) -> None:
-        """The port is gone."""
+        """Stop: the port was closed."""
         self.phase = Phase.CLOSED
-        self._dialogue.stop()
+        self._commands.stop()
 
-    def heard(self, now: float) -> None:
-        """A valid sentence has come."""
-        self._heard_s = self._alive_s = now
+    def note_sentence(self, now: float) -> None:
+        """Record that a valid sentence was received."""
+        self._last_sentence_s = self._alive_s = now
 
     def check(self, now: float, command: ModemCommand | None = None) -> None:
-        """Ask the modem something before anything else is done: a command, or its address."""
+        """Require the answer to a command, by default the query of the address, before anything else is sent."""
         self.phase = Phase.CHECKING
-        self._dialogue.begin([command or query_command("SRC", self._config.address)], now)
-        self._dialogue.poll(now)
+        self._commands.begin([command or query_command("SRC", self._config.address)], now)
+        self._commands.poll(now)
 
     def set_clock(self, utc: datetime, now: float) -> None:
         """Send the time."""
         self.check(now, clock_command(utc, self.generation))
 
     def on_revision(self, revision: Revision, now: float) -> list[ModemEvent]:
-        """The modem tells its firmware, and perhaps that it has restarted."""
+        """Store the firmware version; configure the modem if it has restarted."""
         self.firmware = revision.version or self.firmware
         if not revision.rebooted:
             return []
@@ -103,29 +102,28 @@ class ModemSupervisor:
         return [ModemRebooted(revision.version)]
 
     def on_setting(self, sentence: Sentence, now: float) -> list[ModemEvent]:
-        """A setting: the answer to a command, a line of a dump, or somebody else's doing.
+        """Process `CACFG`: the answer to a command, a line of a dump, or a change by another program.
 
         Raises:
-            SentenceError: It is no setting.
+            SentenceError: A wrong field.
         """
         setting = ConfigurationSetting.parse(sentence)
-        if self._dialogue.receive(sentence, now) or self.phase is Phase.CONFIGURING:
+        if self._commands.receive(sentence, now) or self.phase is Phase.CONFIGURING:
             return []
         if setting.name == "SRC" and setting.number != self._config.address:
-            # Another program has set it, or a restart went unnoticed.
+            # Another program has set it, or the sentence of a restart was lost.
             self._configure(now)
             return []
         return [UnhandledSentence(sentence)]
 
     def on_clock(self, sentence: Sentence, now: float) -> list[ModemEvent]:
-        """The modem echoes the time it was given.
+        """Process `CACLK` or `CATMS`, the echo of the time.
 
         Raises:
-            SentenceError: It is no time.
+            SentenceError: A wrong field.
         """
-        is_old = sentence.kind == "CACLK"
-        utc = ClockSetting.parse(sentence).utc if is_old else TimeSetting.parse(sentence).utc
-        if self._dialogue.receive(sentence, now):
+        utc = parse_clock(sentence)
+        if self._commands.receive(sentence, now):
             return [ClockConfirmed(utc)]
         return [UnhandledSentence(sentence)]
 
@@ -134,7 +132,7 @@ class ModemSupervisor:
 
         Args:
             now: Time on the driver's clock.
-            may_check: Whether the modem may be asked whether it is there (not in the middle of a cycle).
+            may_check: Whether the modem may be queried (no exchange is in progress).
         """
         if self.phase is Phase.CLOSED:
             return []
@@ -142,16 +140,16 @@ class ModemSupervisor:
             if may_check and now >= self._alive_s + self._config.keepalive_s:
                 self.check(now)
             return []
-        self._dialogue.poll(now)
-        events: list[ModemEvent] = [SettingUnconfirmed(command.text) for command in self._dialogue.take_refused()]
-        if self._dialogue.progress is CommandProgress.DONE:
-            return events + self._done(now)
-        if self._dialogue.progress is CommandProgress.FAILED:
-            return events + self._failed(now)
+        self._commands.poll(now)
+        events: list[ModemEvent] = [SettingUnconfirmed(command.text) for command in self._commands.take_unconfirmed()]
+        if self._commands.progress is CommandProgress.DONE:
+            events += self._done(now)
+        elif self._commands.progress is CommandProgress.FAILED:
+            events += self._failed(now)
         return events
 
     def _done(self, now: float) -> list[ModemEvent]:
-        self._dialogue.stop()
+        self._commands.stop()
         was_configuring, self.phase = self.phase is Phase.CONFIGURING, Phase.READY
         self._alive_s = now
         self._attempts = 0
@@ -165,10 +163,10 @@ class ModemSupervisor:
         self._attempts += self._config.tries
         if not self._unresponsive:
             self._unresponsive = True
-            silent_s = None if self._heard_s is None else now - self._heard_s
-            events.append(ModemUnresponsive(self._dialogue.current.text, self._attempts, silent_s))
+            silent_s = None if self._last_sentence_s is None else now - self._last_sentence_s
+            events.append(ModemUnresponsive(self._commands.current.text, self._attempts, silent_s))
         self._configure(now, self._attempts)
-        self._dialogue.poll(now)
+        self._commands.poll(now)
         return events
 
     def _configure(self, start_s: float, earlier_attempts: int = 0) -> None:
@@ -178,4 +176,4 @@ class ModemSupervisor:
         commands = [set_command("SRC", address), set_command("CST", 1)]
         commands += [set_command(name, value, required=False) for name, value in self._config.settings]
         commands += [query_command("SRC", address), query_command("CST", 1)]
-        self._dialogue.begin(commands, start_s, earlier_attempts)
+        self._commands.begin(commands, start_s, earlier_attempts)

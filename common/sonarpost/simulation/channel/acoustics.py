@@ -1,8 +1,7 @@
-"""Range, travel time, signal-to-noise ratio and frame error rate in the simulated water.
+"""Sonar equation: positions, sound absorption, ambient noise, transmission loss and frame error rate.
 
-The sonar equation, with straight rays at one sound speed: SNR = SL - TL - NL - 10 log10(bandwidth), TL spreading and
-absorption. Multipath, Doppler and shadow zones are not modelled; docs/explanation/channel-model.md says what stands for
-them.
+SNR = SL - TL - NL - 10 log10(bandwidth), with straight rays at one sound speed. TL holds spreading and absorption.
+Multipath, Doppler and shadow zones are not modelled; see docs/explanation/channel-model.md.
 """
 
 from __future__ import annotations
@@ -17,19 +16,19 @@ SPHERICAL_DB_PER_DECADE = 20.0
 
 _ERROR_RATES: Mapping[int, tuple[tuple[float, float], ...]] = MappingProxyType(
     {
-        # (SNR in dB, frame error rate): the points WHOI's open tables give for rates 1, 3 and 5.
+        # (SNR in dB, frame error rate) at rates 1, 3 and 5, from the tables of WHOI's ros_acomms.
         1: ((-7.96, 1.0), (-7.23, 0.73), (-6.85, 0.17), (-6.01, 0.0)),
         3: ((-2.92, 1.0), (-1.59, 0.57), (-0.83, 0.115), (0.0, 0.025), (1.0, 0.0)),
         5: ((3.10, 1.0), (4.44, 0.135), (6.02, 0.0)),
     }
 )
-# An assumption: a rate without a published table behaves as the published one nearest in throughput.
+# Assumption: a rate without a published table behaves as the published rate nearest in throughput.
 _TABLE_OF_RATE: Mapping[int, int] = MappingProxyType({0: 1, 1: 1, 2: 1, 3: 3, 4: 3, 5: 5, 6: 1})
 
 
 @dataclass(frozen=True, slots=True)
 class LocalPosition:
-    """Where a modem is, in metres: east, north, depth (down)."""
+    """Position in a local frame: metres east, north and down."""
 
     east_m: float = 0.0
     north_m: float = 0.0
@@ -49,8 +48,9 @@ def absorption_db_per_km(
 ) -> float:
     """Return the absorption of sound in sea water, dB/km.
 
-    Formula: Ainslie and McColm, "A simplified formula for viscous and chemical absorption in sea water", JASA 103
-    (1998): boric acid, magnesium sulphate and water, within 10 % of Francois and Garrison from 100 Hz to 1 MHz.
+    Source: Ainslie and McColm, "A simplified formula for viscous and chemical absorption in sea water", JASA 103
+    (1998). It sums boric acid, magnesium sulphate and pure water, within 10 % of Francois and Garrison (1982) from
+    100 Hz to 1 MHz.
     """
     f, z, t = frequency_hz / 1000.0, depth_m / 1000.0, temperature_c
     f1 = 0.78 * math.sqrt(salinity_psu / 35.0) * math.exp(t / 26.0)
@@ -61,15 +61,15 @@ def absorption_db_per_km(
 
 
 def noise_db_per_hz(frequency_hz: float, wind_m_per_s: float = 5.0, shipping: float = 0.5) -> float:
-    """Return the spectrum level of ambient noise, dB re 1 uPa^2/Hz: turbulence, ships, wind and thermal noise.
+    """Return the spectrum level of ambient noise, dB re 1 uPa^2/Hz: turbulence, shipping, wind and thermal noise.
 
-    Formula: Wenz's curves as Coates, "Underwater acoustic systems" (1990), and Stojanovic, "On the relationship between
-    capacity and distance in an underwater acoustic communication channel" (WUWNet 2006), give them.
+    Source: Wenz's curves as given by Coates, "Underwater acoustic systems" (1990), and Stojanovic, "On the
+    relationship between capacity and distance in an underwater acoustic communication channel" (WUWNet 2006).
 
     Args:
-        frequency_hz: Of the carrier.
-        wind_m_per_s: Speed of the wind.
-        shipping: 0 (none) to 1 (heavy).
+        frequency_hz: Carrier frequency.
+        wind_m_per_s: Wind speed.
+        shipping: Shipping activity, 0 (none) to 1 (heavy).
     """
     f = frequency_hz / 1000.0
     sources_db = (
@@ -86,22 +86,23 @@ def transmission_loss_db(
 ) -> float:
     """Return the loss from 1 m to `range_m`, dB; ranges below 1 m count as 1 m.
 
-    Formula: TL = k log10(r) + a r, with k 20 for spherical, 10 for cylindrical and 15 for practical spreading.
+    Source: TL = k log10(r) + a r (Urick, "Principles of underwater sound"), k being 20 for spherical, 15 for practical
+    and 10 for cylindrical spreading.
     """
     distance_m = max(1.0, range_m)
     return spreading_db_per_decade * math.log10(distance_m) + absorption_db_per_km * distance_m / 1000.0
 
 
-def frame_error_rate(rate: int, snr: float) -> float:
-    """Return the chance, 0..1, that a frame of `rate` at `snr` dB is lost: linear between the published points.
+def frame_error_rate(rate: int, snr_db: float) -> float:
+    """Return the probability, 0..1, that a frame of `rate` is lost: linear between the published points.
 
     Raises:
         KeyError: A rate outside 0..6.
     """
     table = _ERROR_RATES[_TABLE_OF_RATE[rate]]
-    if snr <= table[0][0]:
+    if snr_db <= table[0][0]:
         return table[0][1]
     for (low_db, low), (high_db, high) in pairwise(table):
-        if snr <= high_db:
-            return low + (high - low) * (snr - low_db) / (high_db - low_db)
+        if snr_db <= high_db:
+            return low + (high - low) * (snr_db - low_db) / (high_db - low_db)
     return table[-1][1]

@@ -1,7 +1,7 @@
-"""The emulated modems and their water as a running thing: ports, one thread, a clock and a log.
+"""The channel emulator: emulated modems on real ports, in real time.
 
-The thread does what `ChannelSimulator` cannot: it reads the clock, moves bytes between ports and world, and writes down
-what became of each packet. Everything else is decided in the pure parts.
+One thread reads the clock, moves bytes between the ports and a `ChannelSimulator`, and writes the log. All decisions
+are made in the simulator, which needs neither clock nor port.
 """
 
 from __future__ import annotations
@@ -13,36 +13,134 @@ import select
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
+from pathlib import Path
+from types import MappingProxyType
 from typing import IO
 
 from sonarpost.errors import PortError
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.channel_log import PacketLog, Totals
-from sonarpost.simulation.channel.channel_simulator import ChannelSimulator, PlacedModem
-from sonarpost.simulation.channel.emulator_config import Device, EmulatorConfig
-from sonarpost.simulation.modem.config import HostOutput, PacketReport
-from sonarpost.simulation.modem.host_ports import HostPort, PtyPort, TcpPort
-from sonarpost.simulation.time_scale import TimeScale
+from sonarpost.simulation.channel.host_ports import HostPort, PtyPort, TcpPort
+from sonarpost.simulation.channel.packet_log import PacketLog, PacketTotals
+from sonarpost.simulation.channel.parameters import ChannelParameters
+from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
+from sonarpost.simulation.modem.receiver import HostOutput, PacketReport
+from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
 log = logging.getLogger(__name__)
 
-ASK_PORTS_S = 0.02
-READS_A_STEP = 16
-LONGEST_WAIT_S = 0.5
-MOST_WAITING_BYTES = 1 << 20
-"""A host that does not read loses whole sentences beyond this."""
+PORT_POLL_S = 0.02
+MAX_WAIT_S = 0.5
+MAX_READS_PER_STEP = 16
+MAX_PENDING_BYTES = 1 << 20
+"""Beyond this, a host that does not read loses whole sentences."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimeScale:
+    """Maps a monotonic reading to simulated seconds: simulated = real x scale, from zero at `started_s`.
+
+    Attributes:
+        scale: Simulated seconds per real second, above zero and finite; 1 is real time.
+        started_s: The monotonic reading, in real seconds, at which simulated time is zero.
+
+    Raises:
+        ValueError: A scale that is not a positive finite number.
+    """
+
+    scale: float = 1.0
+    started_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(f"time scale: got {self.scale!r}, expected a finite number above zero")
+
+    def simulated_s(self, real_s: float) -> float:
+        """Return the simulated time at the monotonic reading `real_s`."""
+        return (real_s - self.started_s) * self.scale
+
+    def wait_s(self, simulated_s: float, real_s: float) -> float:
+        """Return the real seconds from the reading `real_s` until `simulated_s`, never below zero."""
+        return max(0.0, self.started_s + simulated_s / self.scale - real_s)
+
+
+@dataclass(frozen=True, slots=True)
+class ModemSite:
+    """Address and position of one modem."""
+
+    address: int
+    position: LocalPosition = field(default_factory=LocalPosition)
+
+
+@dataclass(frozen=True, slots=True)
+class EmulatorConfig:
+    """Configuration of a `ChannelEmulator`.
+
+    Attributes:
+        sites: The modems, at least one, with different addresses; numbered from 1 in this order.
+        channel: Parameters of the channel model.
+        modem: Configuration of every modem. The emulator sets address, clock and data timeout. The data timeout is two
+            seconds of real time at time scales above 1.
+        pty_dir: Folder for the links `modem-1`, `modem-2`, …; None for TCP.
+        tcp_ports: Ports to listen on, one for each modem (0 selects a free one), when `pty_dir` is None.
+        tcp_host: Address to listen on.
+        time_scale: Simulated seconds per real second, 0.01..10000.
+        serial_baud: Speed of the serial lines, or None for lines without delay.
+        log_path: File to append the log to, or None.
+        transponders: Positions of the ranging transponders, by their letters A to D.
+
+    Raises:
+        ValueError: A value outside its bounds.
+    """
+
+    sites: tuple[ModemSite, ...]
+    channel: ChannelParameters = field(default_factory=ChannelParameters)
+    modem: EmulatedModemConfig = field(default_factory=lambda: EmulatedModemConfig(address=0))
+    pty_dir: Path | None = None
+    tcp_ports: tuple[int, ...] = ()
+    tcp_host: str = "127.0.0.1"
+    time_scale: float = 1.0
+    serial_baud: float | None = None
+    log_path: Path | None = None
+    transponders: Mapping[str, LocalPosition] = field(default_factory=lambda: MappingProxyType({}))
+
+    def __post_init__(self) -> None:
+        addresses = [site.address for site in self.sites]
+        if not addresses or len(set(addresses)) != len(addresses):
+            raise ValueError(f"sites: got addresses {addresses}, expected at least one, and all different")
+        if not all(0 <= address <= 127 for address in addresses):
+            raise ValueError(f"sites: got addresses {addresses}, expected 0..127")
+        if self.pty_dir is None and len(self.tcp_ports) != len(self.sites):
+            raise ValueError(
+                f"tcp_ports: got {len(self.tcp_ports)}, expected one for each of {len(self.sites)} modems, or pty_dir"
+            )
+        if unknown := set(self.transponders) - set("ABCD"):
+            raise ValueError(f"transponders: got {sorted(unknown)}, expected letters A to D")
+        if not 0.01 <= self.time_scale <= 10_000:
+            raise ValueError(f"time_scale: got {self.time_scale!r}, expected 0.01..10000")
+        if self.serial_baud is not None and not 0 < self.serial_baud < math.inf:
+            raise ValueError(f"serial_baud: got {self.serial_baud!r}, expected bits a second above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """The device by which a host reaches a modem: a path or a pyserial URL."""
+
+    modem: int
+    address: int
+    device: str
 
 
 @dataclass(slots=True)
-class _Line:
-    """A port and what waits to be written to it."""
+class _HostLine:
+    """A port and its output that is not written yet."""
 
     port: HostPort
     was_connected: bool = False
-    waiting: deque[HostOutput] = field(default_factory=deque)
-    waiting_bytes: int = 0
+    pending: deque[HostOutput] = field(default_factory=deque)
+    pending_bytes: int = 0
     written_of_first: int = 0
 
 
@@ -54,11 +152,11 @@ class _State(Enum):
 
 
 class ChannelEmulator:
-    """Emulated modems on real ports.
+    """Emulated modems on pseudo-terminals or TCP ports, with the channel between them.
 
     Args:
-        config: What it is made of.
-        echo: A second place for every line of the log.
+        config: Configuration.
+        echo: A second output for every line of the log.
     """
 
     def __init__(self, config: EmulatorConfig, echo: IO[str] | None = None) -> None:
@@ -67,36 +165,36 @@ class ChannelEmulator:
         self._lock = threading.Lock()
         self._state = _State.NEW
         self._stopping = threading.Event()
-        self._lines: dict[int, _Line] = {}
+        self._lines: dict[int, _HostLine] = {}
         self._log = PacketLog(None)
         self._thread: threading.Thread
-        self._world: ChannelSimulator
+        self._simulator: ChannelSimulator
         self._clock: TimeScale
         self._wake_out = self._wake_in = -1
         self.failure: Exception | None = None
-        """Why the channel ended by itself; None while it runs or when it was stopped."""
+        """The error that ended the emulator; None while it runs and after `stop`."""
 
     def open(self) -> None:
-        """Open the ports and the log: hosts can connect, and nothing is answered yet.
+        """Open the ports and the log: hosts can connect, and get no answer yet.
 
         Raises:
-            PortError: A port or the log cannot be opened; nothing is left open then.
+            PortError: A port or the log cannot be opened; everything is closed again.
             RuntimeError: It was opened before.
         """
         if self._state is not _State.NEW:
-            raise RuntimeError("an ChannelEmulator is opened once")
+            raise RuntimeError("a ChannelEmulator can be opened only once")
         self._state = _State.OPEN
         try:
             self._log = PacketLog(self.config.log_path, self._echo)
             for number in range(1, len(self.config.sites) + 1):
-                self._lines[number] = _Line(self._open_port(number))
+                self._lines[number] = _HostLine(self._open_port(number))
         except PortError:
             self._state = _State.CLOSED
             self._close()
             raise
 
     def start(self) -> None:
-        """Begin, after `open` where that was not called.
+        """Start the thread, after `open` if that was not called.
 
         Raises:
             PortError: A port or the log cannot be opened.
@@ -105,14 +203,14 @@ class ChannelEmulator:
         if self._state is not _State.OPEN:
             self.open()
         self._state = _State.RUNNING
-        self._world = self._make_world()
+        self._simulator = self._make_simulator()
         self._clock = TimeScale(self.config.time_scale, time.monotonic())
         self._wake_out, self._wake_in = os.pipe()
         self._thread = threading.Thread(target=self._run, name="acoustic-channel", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop, write the totals and close everything; a channel that is not open is left alone."""
+        """Stop, write the totals and close everything; without effect on an emulator that is not open."""
         state, self._state = self._state, _State.CLOSED
         if state is _State.OPEN:
             self._close()
@@ -124,56 +222,55 @@ class ChannelEmulator:
             os.close(self._wake_out)
 
     def devices(self) -> list[Device]:
-        """Return what hosts open, by number of the modem."""
+        """Return the device of every modem, by modem number."""
         sites = self.config.sites
         return [Device(number, sites[number - 1].address, line.port.device) for number, line in self._lines.items()]
 
-    def totals(self) -> Totals:
+    def totals(self) -> PacketTotals:
         """Return the counts of packets and frames so far."""
         with self._lock:
             return self._log.totals()
 
     def connected(self) -> int:
-        """Return how many modems have a client."""
+        """Return the number of modems with a connected host."""
         with self._lock:
             return sum(line.port.connected for line in self._lines.values())
 
     def move(self, modem: int, position: LocalPosition) -> None:
-        """Put a modem elsewhere.
+        """Set a modem's position.
 
         Raises:
             KeyError: No modem of that number.
         """
         with self._lock:
-            self._world.water.move(modem, position)
+            self._simulator.channel.move(modem, position)
             self._write("move", modem=modem, position_m=asdict(position))
-
-    # Building
 
     def _open_port(self, number: int) -> HostPort:
         if self.config.pty_dir is not None:
             return PtyPort(self.config.pty_dir / f"modem-{number}")
         return TcpPort(self.config.tcp_host, self.config.tcp_ports[number - 1])
 
-    def _make_world(self) -> ChannelSimulator:
+    def _make_simulator(self) -> ChannelSimulator:
         timeout_s = math.ceil(max(2.0, 2.0 * self.config.time_scale))
         template = replace(self.config.modem, utc_at_zero_s=time.time(), data_timeout_s=timeout_s)
-        places = {
+        modems = {
             number: PlacedModem(replace(template, address=site.address), site.position)
             for number, site in enumerate(self.config.sites, start=1)
         }
-        return ChannelSimulator(self.config.water, places, self.config.serial_baud, self.config.transponders)
+        return ChannelSimulator(self.config.channel, modems, self.config.serial_baud, self.config.transponders)
 
     def _settings(self) -> dict[str, object]:
-        water = asdict(self.config.water) | {"tail_damage_kind": self.config.water.tail_damage_kind.value}
         modems = [
             {"modem": device.modem, "address": device.address, "device": device.device, "position_m": asdict(position)}
             for device, position in zip(self.devices(), (site.position for site in self.config.sites), strict=True)
         ]
-        baud = self.config.serial_baud
-        return {"time_scale": self.config.time_scale, "serial_baud": baud, "water": water, "modems": modems}
-
-    # The thread
+        return {
+            "time_scale": self.config.time_scale,
+            "serial_baud": self.config.serial_baud,
+            "water": self.config.channel.model_dump(mode="json"),
+            "modems": modems,
+        }
 
     def _run(self) -> None:
         failure: Exception | None = None
@@ -182,18 +279,18 @@ class ChannelEmulator:
             while not self._stopping.is_set():
                 with self._lock:
                     self._step()
-                    waiting = self._poll_set()
+                    poll = self._poll_set()
                     timeout_s = self._timeout_s()
-                # Rounded up: waking a moment late costs nothing, waking early would spin.
-                waiting.poll(math.ceil(timeout_s * 1000))
+                # Rounded up: waking a moment late has no effect, waking early would spin.
+                poll.poll(math.ceil(timeout_s * 1000))
             with self._lock:
                 self._finish()
         except Exception as error:
             failure = error
-            log.exception("Acoustic channel failed")
+            log.exception("Channel emulator failed")
         finally:
             self._close()
-            # Told last: who sees it may count on closed ports.
+            # Set last: the ports are closed once a failure is visible.
             self.failure = failure
 
     def _now_s(self) -> float:
@@ -202,88 +299,88 @@ class ChannelEmulator:
     def _step(self) -> None:
         for number, line in self._lines.items():
             self._read(number, line)
-            line.port.notice()
-            self._note_client(number, line)
-        for happened in self._world.advance(self._now_s()):
+            line.port.update_connection()
+            self._note_connection(number, line)
+        for happened in self._simulator.advance(self._now_s()):
             if isinstance(happened, PacketReport):
-                self._log.packet(happened, happened.untold, time.time())
+                self._log.packet(happened, happened.unreported_reason, time.time())
             else:
-                self._log.transmitted += 1
+                self._log.transmission()
         for number, line in self._lines.items():
-            for output in self._world.take_outputs(number):
-                self._put(line, output)
+            for output in self._simulator.take_outputs(number):
+                self._queue(line, output)
             self._flush(line)
-            self._note_client(number, line)
+            self._note_connection(number, line)
 
-    def _read(self, number: int, line: _Line) -> None:
-        for _ in range(READS_A_STEP):
+    def _read(self, number: int, line: _HostLine) -> None:
+        for _ in range(MAX_READS_PER_STEP):
             data = line.port.read()
             if not data:
                 return
-            self._world.receive(number, data, self._now_s())
+            self._simulator.receive(number, data, self._now_s())
 
-    def _note_client(self, number: int, line: _Line) -> None:
+    def _note_connection(self, number: int, line: _HostLine) -> None:
         if line.port.connected == line.was_connected:
             return
         line.was_connected = line.port.connected
         self._write("client", modem=number, connected=line.port.connected)
         if not line.port.connected:
-            self._world.forget_host(number)
-            self._drop(line, "client left")
+            self._simulator.host_disconnected(number)
+            self._drop_pending(line, "client left")
 
-    def _put(self, line: _Line, output: HostOutput) -> None:
+    def _queue(self, line: _HostLine, output: HostOutput) -> None:
         if not line.port.connected:
-            self._untold(output, "no client connected")
-        elif line.waiting_bytes + len(output.data) > MOST_WAITING_BYTES:
-            self._untold(output, "client does not read")
+            self._log_unreported(output, "no client connected")
+        elif line.pending_bytes + len(output.data) > MAX_PENDING_BYTES:
+            self._log_unreported(output, "client does not read")
         else:
-            line.waiting.append(output)
-            line.waiting_bytes += len(output.data)
+            line.pending.append(output)
+            line.pending_bytes += len(output.data)
 
-    def _flush(self, line: _Line) -> None:
-        while line.waiting and line.port.connected:
-            first = line.waiting[0]
+    def _flush(self, line: _HostLine) -> None:
+        while line.pending and line.port.connected:
+            first = line.pending[0]
             count = line.port.write(first.data[line.written_of_first :])
             if not count:
                 return
             line.written_of_first += count
-            line.waiting_bytes -= count
+            line.pending_bytes -= count
             if line.written_of_first == len(first.data):
-                line.waiting.popleft()
+                line.pending.popleft()
                 line.written_of_first = 0
                 if first.report is not None:
                     self._log.packet(first.report, None, time.time())
 
-    def _drop(self, line: _Line, reason: str) -> None:
-        while line.waiting:
-            self._untold(line.waiting.popleft(), reason)
-        line.waiting_bytes = line.written_of_first = 0
+    def _drop_pending(self, line: _HostLine, reason: str) -> None:
+        while line.pending:
+            self._log_unreported(line.pending.popleft(), reason)
+        line.pending_bytes = line.written_of_first = 0
 
-    def _untold(self, output: HostOutput, reason: str) -> None:
+    def _log_unreported(self, output: HostOutput, reason: str) -> None:
         if output.report is not None:
             self._log.packet(output.report, reason, time.time())
 
     def _poll_set(self) -> select.poll:
-        waiting = select.poll()
-        waiting.register(self._wake_out, select.POLLIN)
+        poll = select.poll()
+        poll.register(self._wake_out, select.POLLIN)
         for line in self._lines.values():
-            for descriptor, mask in line.port.interests(writing=bool(line.waiting)):
-                waiting.register(descriptor, mask)
-        return waiting
+            for descriptor, mask in line.port.poll_masks(writing=bool(line.pending)):
+                poll.register(descriptor, mask)
+        return poll
 
     def _timeout_s(self) -> float:
-        asked = any(line.port.must_be_asked for line in self._lines.values())
-        due_s = self._clock.wait_s(self._world.next_deadline_s(), time.monotonic())
-        return min(due_s, ASK_PORTS_S if asked else LONGEST_WAIT_S)
+        poll_ports = any(line.port.needs_polling for line in self._lines.values())
+        due_s = self._clock.wait_s(self._simulator.next_deadline_s(), time.monotonic())
+        return min(due_s, PORT_POLL_S if poll_ports else MAX_WAIT_S)
 
     def _finish(self) -> None:
         for line in self._lines.values():
-            self._drop(line, "emulator stopped")
+            self._drop_pending(line, "emulator stopped")
         for number in self._lines:
-            for output in self._world.abandon_outputs(number):
-                self._untold(output, "emulator stopped")
+            for output in self._simulator.discard_outputs(number):
+                self._log_unreported(output, "emulator stopped")
         self._write("stop")
-        self._write("totals", **asdict(self._log.totals()), in_flight=self._world.water.in_flight)
+        self._write("totals", **self._log.totals().to_json(), in_flight=self._simulator.channel.in_flight)
 
     def _write(self, event: str, **fields: object) -> None:
         self._log.write(event, self._now_s(), time.time(), **fields)

@@ -1,6 +1,6 @@
-"""What hosts say to the emulated modem, from sentences to typed commands.
+"""Commands of the hosts, read strictly: every function returns typed values or raises `SentenceError`.
 
-Every function takes a sentence and either returns a command or raises `SentenceError`.
+The layouts are written down here independently of the driver's, so that an error in one of them is found by the other.
 """
 
 from __future__ import annotations
@@ -11,44 +11,27 @@ from datetime import UTC, datetime, timedelta
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem import RATES
-from sonarpost.modem.micromodem.nmea import Sentence
+from sonarpost.modem.micromodem.nmea import FieldReader, Sentence
+from sonarpost.modem.micromodem.sentences import FLEXIBLE_RATES, ISO_SECONDS, MAX_MINI_BITS, Cycle
 
-MOST_ADDRESS = 127
-FLEXIBLE_RATES = (1, 3, 5)
 FLEXIBLE_MINI_BYTES = 90
-"""What the mini-frame of a flexible data packet holds; data frames of the rate's size hold the rest."""
+"""Capacity of the mini-frame of a flexible data packet; data frames of the rate's size hold the rest."""
 
-_INTEGER = re.compile(r"-?[0-9]{1,10}")
-_HEX = re.compile(r"(?:[0-9A-Fa-f]{2})*")
 _MINI = re.compile(r"[0-9A-Fa-f]{1,4}")
 
 
 @dataclass(frozen=True, slots=True)
-class StartCycle:
-    """`CCCYC`: ask for a packet of `frames` frames to be filled and sent."""
+class FrameData:
+    """`CCTXD` or `CCTXA`: the data of the requested frame, as hex or as text; none means that no more follows."""
 
-    command: int
-    source: int
-    destination: int
-    rate: int
-    ack_requested: bool
-    frames: int
-
-
-@dataclass(frozen=True, slots=True)
-class FillFrame:
-    """`CCTXD`: the data of the frame that was asked for; none means that there is no more."""
-
-    source: int
-    destination: int
     ack_requested: bool
     data: bytes
-    is_text: bool = False
+    is_text: bool
 
 
 @dataclass(frozen=True, slots=True)
-class Flexible:
-    """`CCTDP`: a packet of the flexible data protocol, data and all."""
+class FlexibleData:
+    """`CCTDP`: a packet of the flexible data protocol with its data."""
 
     destination: int
     rate: int
@@ -58,19 +41,19 @@ class Flexible:
 
 @dataclass(frozen=True, slots=True)
 class Ranging:
-    """`CCPDT` or `CCPNT`: ask transponders for their travel times.
+    """`CCPDT` or `CCPNT`: request of the travel times to transponders.
 
     Attributes:
-        timeout_s: How long answers are waited for.
-        beacons: Letters of the transponders that are asked.
+        timeout_s: Wait for the answers.
+        transponders: Letters of the interrogated transponders.
     """
 
     timeout_s: float
-    beacons: str
+    transponders: str
 
 
 @dataclass(frozen=True, slots=True)
-class Mini:
+class MiniPacket:
     """`CCMPC` or `CCMUC`: a ping, or a user mini-packet of 13 bits."""
 
     source: int
@@ -78,145 +61,84 @@ class Mini:
     bits: int = 0
 
 
-def integer(sentence: Sentence, index: int, name: str, low: int, high: int) -> int:
-    """Return field `index` (from 0, after the kind) as an integer within `low`..`high`.
-
-    Raises:
-        SentenceError: The field is absent, not an integer, or out of bounds.
-    """
-    text = field(sentence, index, name)
-    if not _INTEGER.fullmatch(text) or not low <= int(text) <= high:
-        raise SentenceError(sentence.kind, name, text, f"an integer {low}..{high}")
-    return int(text)
-
-
-def field(sentence: Sentence, index: int, name: str) -> str:
-    """Return field `index` as text.
-
-    Raises:
-        SentenceError: The sentence is too short.
-    """
-    if index >= len(sentence.fields):
-        raise SentenceError(sentence.kind, name, ",".join(sentence.fields), f"at least {index + 1} fields")
-    return sentence.fields[index]
-
-
-def start_cycle(sentence: Sentence) -> StartCycle:
-    """Read `$CCCYC,command,source,destination,rate,ack,frames`.
-
-    Raises:
-        SentenceError: A field that is absent or out of bounds, a rate without so many frames.
-    """
-    rate = integer(sentence, 3, "rate", 0, max(RATES))
-    return StartCycle(
-        integer(sentence, 0, "command", 0, 1),
-        integer(sentence, 1, "source", 0, MOST_ADDRESS),
-        integer(sentence, 2, "destination", 0, MOST_ADDRESS),
-        rate,
-        bool(integer(sentence, 4, "ack", 0, 1)),
-        integer(sentence, 5, "frames", 1, RATES[rate].frames),
+def start_cycle(sentence: Sentence) -> Cycle:
+    """Read `CCCYC,command,source,destination,rate,ack,frames`; the rate must have that many frames."""
+    read = FieldReader(sentence, strict=True)
+    rate = read.integer(3, "rate", 0, max(RATES))
+    return Cycle(
+        command=read.integer(0, "command", 0, 1),
+        src=read.address(1, "source"),
+        dest=read.address(2, "destination"),
+        rate=rate,
+        ack=read.flag(4, "ack"),
+        nframes=read.integer(5, "frames", 1, RATES[rate].frames),
     )
 
 
-def fill_frame(sentence: Sentence) -> FillFrame:
-    """Read `$CCTXD,source,destination,ack,hex` or `$CCTXA,source,destination,ack,text`.
-
-    Raises:
-        SentenceError: A field that is absent, out of bounds or not hex.
-    """
-    is_text = sentence.kind == "CCTXA"
-    # Text may hold commas, which no other field does.
-    field(sentence, 3, "data")
-    text = ",".join(sentence.fields[3:]).encode("ascii")
-    return FillFrame(
-        integer(sentence, 0, "source", 0, MOST_ADDRESS),
-        integer(sentence, 1, "destination", 0, MOST_ADDRESS),
-        bool(integer(sentence, 2, "ack", 0, 1)),
-        text if is_text else hexadecimal(sentence, 3, "data"),
-        is_text,
-    )
+def frame_data(sentence: Sentence) -> FrameData:
+    """Read `CCTXD,source,destination,ack,hex` or `CCTXA,source,destination,ack,text`."""
+    read = FieldReader(sentence, strict=True)
+    read.text(3, "data")
+    read.address(0, "source")
+    read.address(1, "destination")
+    ack_requested = read.flag(2, "ack")
+    if sentence.kind == "CCTXD":
+        return FrameData(ack_requested, read.data(3, "data"), is_text=False)
+    # Text may contain commas.
+    return FrameData(ack_requested, ",".join(sentence.fields[3:]).encode("ascii"), is_text=True)
 
 
-def flexible(sentence: Sentence) -> Flexible:
-    """Read `$CCTDP,destination,rate,ack,reserved,hex`.
-
-    Raises:
-        SentenceError: A field that is absent, out of bounds or not hex, no data, a rate the protocol does not have, or
-            more data than that holds.
-    """
-    rate = integer(sentence, 1, "rate", 0, max(RATES))
+def flexible_data(sentence: Sentence) -> FlexibleData:
+    """Read `CCTDP,destination,rate,ack,reserved,hex`, with at most the data that the rate can carry."""
+    read = FieldReader(sentence, strict=True)
+    rate = read.integer(1, "rate", 0, max(RATES))
     if rate not in FLEXIBLE_RATES:
         raise SentenceError(sentence.kind, "rate", rate, f"one of {FLEXIBLE_RATES}")
-    data = hexadecimal(sentence, 4, "data")
-    most = FLEXIBLE_MINI_BYTES + RATES[rate].packet_bytes
-    if not 1 <= len(data) <= most:
-        raise SentenceError(sentence.kind, "length", len(data), f"1..{most} bytes")
-    destination = integer(sentence, 0, "destination", 0, MOST_ADDRESS)
-    return Flexible(destination, rate, bool(integer(sentence, 2, "ack", 0, 1)), data)
+    data = read.data(4, "data")
+    capacity = FLEXIBLE_MINI_BYTES + RATES[rate].packet_bytes
+    if not 1 <= len(data) <= capacity:
+        raise SentenceError(sentence.kind, "length", len(data), f"1..{capacity} bytes")
+    return FlexibleData(read.address(0, "destination"), rate, read.flag(2, "ack"), data)
 
 
 def ranging(sentence: Sentence) -> Ranging:
-    """Read a request for travel times.
+    """Read a request of travel times.
 
-    `$CCPDT,group,channel,0,0,timeout_ms,A,B,C,D` asks the REMUS transponders whose flag is 1,
-    `$CCPNT,transmit_hz,transmit_ms,receive_ms,timeout_ms,A_hz,B_hz,C_hz,D_hz,flag` the narrow-band ones whose
-    frequency is not 0.
-
-    Raises:
-        SentenceError: A field that is absent or out of bounds.
+    `CCPDT,group,channel,0,0,timeout_ms,A,B,C,D` interrogates the REMUS transponders whose flag is 1.
+    `CCPNT,transmit_hz,transmit_ms,receive_ms,timeout_ms,A_hz,B_hz,C_hz,D_hz,flag` interrogates the narrow-band ones
+    whose frequency is not 0.
     """
+    read = FieldReader(sentence, strict=True)
     remus = sentence.kind == "CCPDT"
     if remus:
-        integer(sentence, 0, "group", 1, 1)
-        integer(sentence, 1, "channel", 1, 4)
+        read.integer(0, "group", 1, 1)
+        read.integer(1, "channel", 1, 4)
     else:
         for index, name in enumerate(("transmit frequency", "transmit length", "receive length")):
-            integer(sentence, index, name, 0, 100_000)
-    timeout_ms = integer(sentence, 4 if remus else 3, "timeout", 0, 60_000)
-    first, most = (5, 1) if remus else (4, 100_000)
-    asked = [integer(sentence, first + place, f"beacon {letter}", 0, most) for place, letter in enumerate("ABCD")]
-    return Ranging(timeout_ms / 1000, "".join(letter for letter, on in zip("ABCD", asked, strict=True) if on))
+            read.integer(index, name, 0, 100_000)
+    timeout_ms = read.integer(4 if remus else 3, "timeout", 0, 60_000)
+    first, highest = (5, 1) if remus else (4, 100_000)
+    enabled = [read.integer(first + place, f"beacon {letter}", 0, highest) for place, letter in enumerate("ABCD")]
+    return Ranging(timeout_ms / 1000, "".join(letter for letter, on in zip("ABCD", enabled, strict=True) if on))
 
 
-def hexadecimal(sentence: Sentence, index: int, name: str) -> bytes:
-    """Return field `index` as bytes.
-
-    Raises:
-        SentenceError: The field is absent or not pairs of hex digits.
-    """
-    text = field(sentence, index, name)
-    if not _HEX.fullmatch(text):
-        raise SentenceError(sentence.kind, name, text, "pairs of hex digits")
-    return bytes.fromhex(text)
-
-
-def mini(sentence: Sentence) -> Mini:
-    """Read `$CCMPC,source,destination` or `$CCMUC,source,destination,HHHH`.
-
-    Raises:
-        SentenceError: A field that is absent, out of bounds or more than 13 bits.
-    """
-    source = integer(sentence, 0, "source", 0, MOST_ADDRESS)
-    destination = integer(sentence, 1, "destination", 0, MOST_ADDRESS)
+def mini_packet(sentence: Sentence) -> MiniPacket:
+    """Read `CCMPC,source,destination` or `CCMUC,source,destination,HHHH` with at most 13 bits."""
+    read = FieldReader(sentence, strict=True)
+    source, destination = read.address(0, "source"), read.address(1, "destination")
     if sentence.kind == "CCMPC":
-        return Mini(source, destination)
-    text = field(sentence, 2, "bits")
-    if not _MINI.fullmatch(text) or int(text, 16) > 0x1FFF:
-        raise SentenceError(sentence.kind, "bits", text, "hex, at most 1FFF")
-    return Mini(source, destination, int(text, 16))
+        return MiniPacket(source, destination)
+    text = read.text(2, "bits")
+    if not _MINI.fullmatch(text) or int(text, 16) > MAX_MINI_BITS:
+        raise SentenceError(sentence.kind, "bits", text, f"hex, at most {MAX_MINI_BITS:X}")
+    return MiniPacket(source, destination, int(text, 16))
 
 
-def calendar_fields(sentence: Sentence) -> datetime:
-    """Read `$CCCLK,year,month,day,hour,minute,second` (UTC); a host that counts on from 59 may say second 60.
-
-    Raises:
-        SentenceError: A field that is absent, or no such date or time.
-    """
-    names = ("year", "month", "day", "hour", "minute", "second")
-    most = (9999, 12, 31, 23, 59, 60)
-    year, month, day, hour, minute, second = (
-        integer(sentence, i, name, 0, high) for i, (name, high) in enumerate(zip(names, most, strict=True))
-    )
+def calendar_time(sentence: Sentence) -> datetime:
+    """Read `CCCLK,year,month,day,hour,minute,second` (UTC); second 60 is accepted as the next minute's 0."""
+    read = FieldReader(sentence, strict=True)
+    limits = (("year", 9999), ("month", 12), ("day", 31), ("hour", 23), ("minute", 59), ("second", 60))
+    year, month, day, hour, minute, second = (read.integer(i, name, 0, high) for i, (name, high) in enumerate(limits))
     try:
         return datetime(year, month, day, hour, minute, tzinfo=UTC) + timedelta(seconds=second)
     except (ValueError, OverflowError) as error:
@@ -224,14 +146,11 @@ def calendar_fields(sentence: Sentence) -> datetime:
 
 
 def iso_time(sentence: Sentence) -> datetime:
-    """Read `$CCTMS,2019-12-02T03:02:59Z,mode` (UTC; the mode has to be 0, at once).
-
-    Raises:
-        SentenceError: A field that is absent, not such a time, or another mode.
-    """
-    text = field(sentence, 0, "time")
-    integer(sentence, 1, "mode", 0, 0)
+    """Read `CCTMS,2019-12-02T03:02:59Z,mode` (UTC); only mode 0 (immediately) is accepted."""
+    read = FieldReader(sentence, strict=True)
+    text = read.text(0, "time")
+    read.integer(1, "mode", 0, 0)
     try:
-        return datetime.strptime(text, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)
+        return datetime.strptime(text, ISO_SECONDS).replace(tzinfo=UTC)
     except ValueError as error:
         raise SentenceError(sentence.kind, "time", text, "YYYY-MM-DDThh:mm:ssZ") from error

@@ -1,15 +1,22 @@
-"""The emulated modem's stored settings and its clock."""
+"""Configuration, stored settings and clock of the emulated modem."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from types import MappingProxyType
 
 from sonarpost.errors import SentenceError
+from sonarpost.modem.micromodem import RATES
+
+FIRMWARE_VERSIONS: Mapping[int, str] = MappingProxyType({1: "0.93.0.09", 2: "2.0.27087"})
+"""Version in `CAREV` by generation: four parts for the first, three for the second."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.]{0,39}")
-_MOST_SETTINGS = 512
+_MAX_SETTINGS = 512
 _FACTORY = {
     "AGC": 0, "AGN": 250, "ASD": 0, "BBD": 0, "BND": 1, "BR1": 3, "BR2": 3, "BRN": 0, "BSP": 1, "BW0": 5000,
     "CPR": 1, "CRL": 50, "CST": 1, "CTO": 10, "DBG": 0, "DGM": 0, "DOP": 0, "DQF": 0, "DTH": 108, "DTO": 2,
@@ -19,7 +26,7 @@ _FACTORY = {
     "RXP": 1, "SCG": 0, "SGP": 0, "SHF": 0, "SNR": 0, "SNV": 0, "SRC": 0, "TAT": 50, "TOA": 0, "TXD": 0,
     "TXF": 1, "TXP": 1, "XST": 1,
 }  # fmt: skip
-# What the emulator acts on, with the values it accepts; every other name is stored and given back.
+# The settings that the emulator acts on, with their bounds. Every other name is stored and returned.
 _BOUNDS = {
     "SRC": (0, 127), "DTO": (1, 100_000), "CTO": (1, 100_000), "TAT": (0, 60_000), "CST": (0, 1), "XST": (0, 1),
     "RXP": (0, 1), "RXA": (0, 1), "RXD": (0, 1), "TXP": (0, 1), "TXF": (0, 1), "REV": (0, 1), "TOA": (0, 1),
@@ -27,11 +34,67 @@ _BOUNDS = {
 }  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True)
+class EmulatedModemConfig:
+    """Configuration of one emulated modem.
+
+    Attributes:
+        address: Initial `SRC`, 0..127.
+        generation: 1 or 2: version strings, and whether flexible data is supported.
+        statistics_version: Layout of `CACST`: 6, which every known host reads, or 8 of the newest firmware.
+        utc_at_zero_s: Reading of the modem's clock at simulated time zero, seconds since 1970 UTC.
+        airtimes_s: Air times by rate number, where they differ from the nominal ones.
+        data_timeout_s: Initial `DTO`, whole seconds.
+        revision_period_s: Idle time before and between `CAREV,…,AUV`.
+        reboot_s: Time from `CCMSC` to `CAREV,…,INIT`.
+        mini_airtime_s: Air time of an acknowledgement, a ping or a mini-packet.
+        turnaround_s: Time from the end of a packet to the automatic reply.
+        promiscuous: Whether the host receives data addressed to other modems.
+        broadcast_addresses: Destinations that address every modem.
+
+    Raises:
+        ValueError: A value outside its bounds.
+    """
+
+    address: int
+    generation: int = 2
+    statistics_version: int = 6
+    utc_at_zero_s: float = 0.0
+    airtimes_s: Mapping[int, float] = field(default_factory=lambda: MappingProxyType({}))
+    data_timeout_s: int = 2
+    revision_period_s: float = 10.0
+    reboot_s: float = 1.0
+    mini_airtime_s: float = 0.9
+    turnaround_s: float = 0.2
+    promiscuous: bool = True
+    broadcast_addresses: frozenset[int] = frozenset({0, 15, 127})
+
+    def __post_init__(self) -> None:
+        if self.generation not in FIRMWARE_VERSIONS:
+            raise ValueError(f"generation: got {self.generation!r}, expected 1 or 2")
+        if self.statistics_version not in {6, 8}:
+            raise ValueError(f"statistics_version: got {self.statistics_version!r}, expected 6 or 8")
+        times = {f"airtimes_s of rate {rate}": time_s for rate, time_s in self.airtimes_s.items()}
+        times |= {name: getattr(self, name) for name in ("revision_period_s", "mini_airtime_s")}
+        for name, time_s in times.items():
+            if not (math.isfinite(time_s) and time_s > 0):
+                raise ValueError(f"{name}: got {time_s!r}, expected seconds above 0")
+        if unknown := set(self.airtimes_s) - set(RATES):
+            raise ValueError(f"airtimes_s: got rates {sorted(unknown)}, expected {min(RATES)}..{max(RATES)}")
+        for name in ("reboot_s", "turnaround_s"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected seconds, 0 or more")
+
+    def airtime_s(self, rate: int) -> float:
+        """Return the air time of a data packet of `rate`."""
+        return self.airtimes_s.get(rate, RATES[rate].airtime_s)
+
+
 class ModemSettings:
-    """Named integers that survive a reboot; three-letter names are kept in capitals, as hosts write them.
+    """Named integers that survive a reboot. Names of three letters are stored in capitals, as hosts write them.
 
     Args:
-        address: Initial `SRC`. A reset returns to it (a real modem returns to 0 and has to be told again).
+        address: Initial `SRC`. A reset restores it, while a real modem returns to 0.
         data_timeout_s: Initial `DTO`.
     """
 
@@ -53,38 +116,38 @@ class ModemSettings:
         return sorted(self._values.items())
 
     def group(self, name: str) -> list[tuple[str, int]]:
-        """Return the settings with dotted names that begin with `name.`, in alphabetical order."""
+        """Return the settings whose dotted names begin with `name.`, in alphabetical order."""
         return [(stored, value) for stored, value in self.items() if stored.startswith(f"{name}.")]
 
     def query(self, name: str) -> tuple[str, int]:
-        """Return one name, as stored, and its value.
+        """Return the stored form of a name, and its value.
 
         Raises:
             SentenceError: No such setting.
         """
-        known = self._canonical(name)
-        if known not in self._values:
+        stored = self._canonical(name)
+        if stored not in self._values:
             raise SentenceError("CCCFQ", "name", name, "a setting that was stored")
-        return known, self._values[known]
+        return stored, self._values[stored]
 
     def store(self, name: str, value: int) -> None:
-        """Store one setting; `ALL` with 0 resets them all.
+        """Store one setting; `ALL` with 0 resets all of them.
 
         Raises:
-            SentenceError: A name no modem has, a value out of the setting's bounds, or too many names.
+            SentenceError: An invalid name, a value out of the setting's bounds, or too many names.
         """
         if not _NAME.fullmatch(name):
             raise SentenceError("CCCFG", "name", name, "letters, digits and dots")
-        known = self._canonical(name)
-        if known == "ALL":
+        stored = self._canonical(name)
+        if stored == "ALL":
             if value != 0:
                 raise SentenceError("CCCFG", "ALL", value, "0")
             self._values = dict(self._initial)
             return
-        self._check(known, value)
-        if known not in self._values and len(self._values) >= _MOST_SETTINGS:
-            raise SentenceError("CCCFG", "name", name, f"at most {_MOST_SETTINGS} settings")
-        self._values[known] = value
+        self._check(stored, value)
+        if stored not in self._values and len(self._values) >= _MAX_SETTINGS:
+            raise SentenceError("CCCFG", "name", name, f"at most {_MAX_SETTINGS} settings")
+        self._values[stored] = value
 
     @staticmethod
     def _canonical(name: str) -> str:
@@ -98,13 +161,13 @@ class ModemSettings:
 
 
 class ModemClock:
-    """The modem's calendar clock over simulated seconds, to the microsecond.
+    """Calendar clock of the modem over simulated seconds, to the microsecond.
 
-    The clock has a pulse at every true second. A host that sets it names the second to come, shortly after the one
-    before: the clock shows that second at once and runs from the next pulse on.
+    The clock has a pulse at every true second. A host sets it to the next second, shortly after the previous one. The
+    clock shows that second at once and runs from the next pulse on.
 
     Args:
-        utc_at_zero_s: Seconds since 1970 (UTC), on the true clock, when simulated time is zero.
+        utc_at_zero_s: True UTC at simulated time zero, seconds since 1970.
     """
 
     def __init__(self, utc_at_zero_s: float) -> None:
@@ -118,29 +181,29 @@ class ModemClock:
         return self._at_zero + timedelta(seconds=max(now, self._held_until_s))
 
     def set(self, date: datetime, now: float) -> None:
-        """Make the clock read `date` (UTC) from `now` to the next pulse, and run from there.
+        """Set the clock to `date` (UTC): it holds this value from `now` to the next pulse and then runs.
 
         Raises:
-            SentenceError: A year that leaves no room to count on.
+            SentenceError: A year outside 1970..2199.
         """
         if not 1970 <= date.year <= 2199:
             raise SentenceError("clock", "year", date.year, "1970..2199")
         true_s = self._true_at_zero_s + now
-        # A microsecond of grace: on the pulse is on the pulse, whatever the sum above was rounded to.
+        # One microsecond of tolerance for the rounding of the sum above.
         self._held_until_s = now + max(0.0, math.ceil(true_s - 1e-6) - true_s)
         self._at_zero = date - timedelta(seconds=self._held_until_s)
         self.was_set = True
 
     @property
     def source(self) -> str:
-        """Where the time comes from, as `CATMQ` and `CATMG` name it."""
+        """Source of the time as named in `CATMQ` and `CATMG`."""
         return "USER_CMD" if self.was_set else "RTC"
 
     def status(self, generation: int) -> str:
-        """Return the clock's status as statistics carry it.
+        """Return the clock status as statistics carry it.
 
-        On a Micro-Modem 2 bits 0-1 are the source of the time (1 own clock, 2 a host's command) and bits 2-4 that of
-        the pulse (1 own clock); on a 1, whether a host has set it.
+        On a Micro-Modem 2 bits 0-1 are the source of the time (1 own clock, 2 a host's command) and bits 2-4 the source
+        of the pulse (1 own clock). On a Micro-Modem 1 it is 1 when a host has set the clock.
         """
         if generation == 1:
             return str(int(self.was_set))

@@ -1,0 +1,259 @@
+"""One transmit cycle of the modem: command, data requests, data, transmission, statistics, acknowledgements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum, auto
+
+from sonarpost.errors import FrameError
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.events import FailureReason, PacketFailed, PacketSent
+from sonarpost.modem.micromodem.nmea import MAX_ADDRESS, Sentence
+from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem.reception import FSK_MINI_PACKET
+from sonarpost.modem.micromodem.sentences import (
+    Acknowledgement,
+    Cycle,
+    DataAccepted,
+    DataRequest,
+    ErrorReport,
+    TransmitMark,
+    transmit_data,
+)
+from sonarpost.modem.micromodem.statistics import TransmitStatistics
+
+
+@dataclass(frozen=True, slots=True)
+class OutgoingPacket:
+    """A queued packet.
+
+    Attributes:
+        packet_id: Number of the packet.
+        dest: Destination address.
+        rate: Rate number.
+        frames: Their bytes.
+        ack: Whether to request acknowledgements.
+        queued_s: Time at which it was queued.
+    """
+
+    packet_id: int
+    dest: int
+    rate: int
+    frames: tuple[bytes, ...]
+    ack: bool
+    queued_s: float
+
+    def failed(self, reason: FailureReason, *, maybe_sent: bool = False) -> PacketFailed:
+        """Return the event of a failed packet."""
+        return PacketFailed(self.packet_id, self.dest, self.rate, self.frames, reason, maybe_sent)
+
+
+def check_packet(destination: int, rate: int, frames: Sequence[bytes]) -> None:
+    """Reject a packet that the modem cannot send.
+
+    Raises:
+        FrameError: An address outside 0..127, an unknown rate, no frame, more frames or longer ones than the rate has.
+    """
+    where = "packet to send"
+    if not 0 <= destination <= MAX_ADDRESS:
+        raise FrameError(where, "destination", destination, f"0..{MAX_ADDRESS}")
+    if rate not in RATES:
+        raise FrameError(where, "rate", rate, f"one of {sorted(RATES)}")
+    limit = RATES[rate]
+    if not 1 <= len(frames) <= limit.frames:
+        raise FrameError(where, "frames", len(frames), f"1..{limit.frames} frames at rate {rate}")
+    for number, frame in enumerate(frames, start=1):
+        if len(frame) > limit.frame_bytes:
+            expected = f"at most {limit.frame_bytes} bytes at rate {rate}"
+            raise FrameError(where, f"length of frame {number}", len(frame), expected)
+
+
+class TransmitStage(Enum):
+    """What the cycle waits for."""
+
+    ECHO = auto()
+    REQUEST = auto()
+    DATA_ECHO = auto()
+    ON_AIR = auto()
+    STATISTICS = auto()
+    ACKNOWLEDGEMENT = auto()
+    OVER = auto()
+
+
+class TransmitCycle:
+    """Sends one packet through the modem. The cycle is over when `result` is set.
+
+    The host's own command starts it or, with `polled`, the command of another modem that requests data. A later
+    sentence implies the earlier ones that were lost. A command without an answer is sent again, a frame is sent again
+    when the modem requests it again, and every wait is limited.
+    """
+
+    def __init__(
+        self,
+        packet: OutgoingPacket,
+        config: MicroModemConfig,
+        send: Callable[[Sentence], None],
+        now: float,
+        polled: Cycle | None = None,
+    ) -> None:
+        self.packet = packet
+        self.result: PacketSent | PacketFailed | None = None
+        self.stage = TransmitStage.ECHO
+        self.deadline_s = now
+        self._config = config
+        self._send = send
+        self._cycle = polled or Cycle(config.address, packet.dest, packet.rate, packet.ack, len(packet.frames))
+        self._started_s = now
+        self._attempt = 0
+        self._frame_number = 0
+        self._frames_given: set[int] = set()
+        self._acknowledged: set[int] = set()
+        self._on_air = False
+        self._statistics: TransmitStatistics | None = None
+        if polled is None:
+            self.poll(now)
+        else:
+            self._wait(TransmitStage.REQUEST, now, config.request_timeout_s)
+
+    def owns(self, cycle: Cycle) -> bool:
+        """Return whether a `CACYC` is the echo of this cycle's command."""
+        return cycle == self._cycle
+
+    def on_echo(self, now: float) -> None:
+        """Process `CACYC`, the echo of the command."""
+        if self.stage is TransmitStage.ECHO:
+            # At rate 0 a header is transmitted before the first data request.
+            header_s = self._config.on_air_limit_s(0) if self.packet.rate == 0 else 0.0
+            self._wait(TransmitStage.REQUEST, now, self._config.request_timeout_s + header_s)
+
+    def on_request(self, request: DataRequest, now: float) -> None:
+        """Process `CADRQ`: send the data of a frame, again if it is requested again."""
+        # A modem polled for more frames than there are continues to request after the last one.
+        before_air = self.stage is TransmitStage.ON_AIR and not self._on_air
+        if not before_air and self.stage not in {TransmitStage.ECHO, TransmitStage.REQUEST, TransmitStage.DATA_ECHO}:
+            return
+        number = request.frame_number
+        frame = self._frame(number)
+        if len(frame) > request.max_bytes:
+            self._send_data(b"")
+            self.abort(FailureReason.FRAME_REFUSED)
+            return
+        self._frame_number = number
+        self._frames_given.add(number)
+        self._send_data(frame)
+        self._wait(TransmitStage.DATA_ECHO, now, self._config.reply_timeout_s)
+
+    def on_data_accepted(self, accepted: DataAccepted, now: float) -> None:
+        """Process `CATXD`: the modem has accepted all or part of a frame."""
+        if self.stage is not TransmitStage.DATA_ECHO:
+            return
+        if accepted.nbytes != len(self._frame(self._frame_number)):
+            self.abort(FailureReason.FRAME_REFUSED)
+        elif self._missing():
+            self._wait(TransmitStage.REQUEST, now, self._config.request_timeout_s)
+        else:
+            # Long enough for the end of the transmission, as the sentence of its start may be lost.
+            wait_s = self._config.start_timeout_s + self._config.on_air_limit_s(self.packet.rate)
+            self._wait(TransmitStage.ON_AIR, now, wait_s)
+
+    def on_transmission(self, mark: TransmitMark, now: float) -> None:
+        """Process the start or end of a transmission: of the packet, or of the header of rate 0."""
+        if self._frames_given and mark.nbytes == 0 and any(self.packet.frames):
+            return  # an automatic reply of the modem
+        if not self._frames_given:
+            on_air_s = self._config.on_air_limit_s(self.packet.rate)
+            self.deadline_s = max(self.deadline_s, now + self._config.request_timeout_s + on_air_s)
+        elif self.stage in {TransmitStage.REQUEST, TransmitStage.DATA_ECHO, TransmitStage.ON_AIR}:
+            self._on_air = True
+            if mark.ends:
+                self._wait(TransmitStage.STATISTICS, now, self._config.statistics_timeout_s)
+            else:
+                self._wait(TransmitStage.ON_AIR, now, self._config.on_air_limit_s(self.packet.rate))
+
+    def on_statistics(self, statistics: TransmitStatistics | None, now: float) -> None:
+        """Process `CAXST`, None for an invalid one; those of a rate 0 header are ignored."""
+        header = statistics is not None and statistics.packet_type == FSK_MINI_PACKET
+        if header or not self._frames_given:
+            return
+        if self.stage in {TransmitStage.DATA_ECHO, TransmitStage.ON_AIR, TransmitStage.STATISTICS}:
+            self._on_air = True
+            self._statistics = statistics
+            self._transmitted(now)
+
+    def on_acknowledgement(self, acknowledgement: Acknowledgement, now: float) -> None:
+        """Process `CAACK`."""
+        number = acknowledgement.frame_number
+        if acknowledgement.src != self.packet.dest or not self._on_air or not acknowledgement.good:
+            return
+        if 1 <= number <= len(self.packet.frames):
+            self._acknowledged.add(number)
+        if self.stage is TransmitStage.ACKNOWLEDGEMENT and len(self._acknowledged) == len(self.packet.frames):
+            self._finish(now)
+
+    def on_error(self, report: ErrorReport) -> None:
+        """Process a data timeout of the modem."""
+        if report.data_timeout and self.stage in {TransmitStage.REQUEST, TransmitStage.DATA_ECHO}:
+            self.abort(FailureReason.DATA_TIMEOUT)
+
+    def abort(self, reason: FailureReason) -> PacketFailed:
+        """End the cycle as failed and return the event."""
+        # After an interrupted exchange, a modem that has a frame may transmit it.
+        failed = self.packet.failed(reason, maybe_sent=bool(self._frames_given))
+        self.result = failed
+        self.stage = TransmitStage.OVER
+        return failed
+
+    def poll(self, now: float) -> None:
+        """Do what is due: send again, or end the cycle."""
+        if self.result is not None or now < self.deadline_s:
+            return
+        match self.stage:
+            case TransmitStage.ECHO if self._attempt < self._config.tries:
+                self._attempt += 1
+                self._send(self._cycle.sentence())
+                self._wait(TransmitStage.ECHO, now, self._config.reply_timeout_s)
+            case TransmitStage.ECHO:
+                self.abort(FailureReason.NO_ECHO)
+            case TransmitStage.REQUEST:
+                self.abort(FailureReason.NO_DATA_REQUEST)
+            case TransmitStage.DATA_ECHO:
+                # The data is not repeated: a modem whose echo is late would take it for the next frame.
+                self.abort(FailureReason.NO_DATA_ECHO)
+            case TransmitStage.ON_AIR:
+                self.abort(FailureReason.NO_TRANSMIT_END if self._on_air else FailureReason.NO_TRANSMIT_START)
+            case TransmitStage.STATISTICS:
+                self._transmitted(now)
+            case TransmitStage.ACKNOWLEDGEMENT:
+                self._finish(now)
+
+    def _transmitted(self, now: float) -> None:
+        """Wait for the requested acknowledgements, or finish."""
+        if self._missing():
+            self.abort(FailureReason.DATA_TIMEOUT)
+        elif self.packet.ack and len(self._acknowledged) < len(self.packet.frames):
+            self._wait(TransmitStage.ACKNOWLEDGEMENT, now, self._config.ack_wait_s)
+        else:
+            self._finish(now)
+
+    def _finish(self, now: float) -> None:
+        p = self.packet
+        acknowledged = tuple(sorted(self._acknowledged))
+        self.result = PacketSent(
+            p.packet_id, p.dest, p.rate, p.frames, acknowledged, self._started_s, now, self._statistics
+        )
+        self.stage = TransmitStage.OVER
+
+    def _wait(self, stage: TransmitStage, now: float, wait_s: float) -> None:
+        self.stage = stage
+        self.deadline_s = now + wait_s
+
+    def _missing(self) -> bool:
+        """Return whether the modem has not received the data of every frame."""
+        return any(number not in self._frames_given for number in range(1, len(self.packet.frames) + 1))
+
+    def _frame(self, number: int) -> bytes:
+        return self.packet.frames[number - 1] if number <= len(self.packet.frames) else b""
+
+    def _send_data(self, data: bytes) -> None:
+        self._send(transmit_data(self._cycle.src, self._cycle.dest, data, ack=self._cycle.ack))

@@ -1,0 +1,294 @@
+import itertools
+from datetime import UTC, datetime
+
+import pytest
+from builders.fake_modem import FakeModem, nth_of
+
+from sonarpost.errors import ConfigError
+from sonarpost.modem.micromodem import (
+    ClockConfirmed,
+    FailureReason,
+    MicroModem,
+    MicroModemConfig,
+    ModemReady,
+    ModemRebooted,
+    ModemUnresponsive,
+    PacketFailed,
+    PacketSent,
+    SentenceRejected,
+    SettingUnconfirmed,
+    UnhandledSentence,
+)
+from sonarpost.modem.micromodem.supervisor import Phase
+
+CONFIG = MicroModemConfig(address=3)
+
+
+def started(config: MicroModemConfig = CONFIG, **options) -> FakeModem:
+    modem = FakeModem(MicroModem(config), **options)
+    modem.driver.start(0.0)
+    return modem
+
+
+def test_first_bytes_on_the_wire() -> None:
+    driver = MicroModem(MicroModemConfig(address=1))
+    assert driver.next_wakeup() is None
+    driver.start(10.0)
+    assert driver.bytes_to_send() == b"$CCCFG,SRC,1*31\r\n"
+    assert driver.next_wakeup() == 15.0
+    driver.receive(b"$CACFG,SRC,1*33\r\n", 10.1)
+    assert driver.bytes_to_send() == b"$CCCFG,CST,1*37\r\n"
+    assert not driver.ready
+
+
+def test_sets_address_and_statistics_and_asks_for_them() -> None:
+    modem = started()
+    modem.run(5.0)
+    assert modem.events == [ModemReady(address=3, firmware=None)]
+    assert modem.settings == {"SRC": "3", "CST": "1", "RXP": "1"}
+    assert modem.commands("CCCFQ") == [("SRC",), ("CST",)]
+    assert modem.driver.ready
+
+
+def test_more_settings_are_sent_and_one_without_answer_is_done_without() -> None:
+    config = MicroModemConfig(address=3, settings=(("RXP", 1), ("gain.x", 7)))
+    modem = started(config, loses=lambda sentence, _: sentence.fields[:1] == ("gain.x",))
+    modem.run(30.0)
+    assert modem.events == [SettingUnconfirmed("CCCFG,gain.x,7"), ModemReady(3, None)]
+
+
+@pytest.mark.parametrize("kind", ["CCCFG", "CACFG", "CCCFQ"])
+@pytest.mark.parametrize("nth", [1, 2, 3, 4, 5])
+def test_any_lost_sentence_only_delays(kind: str, nth: int) -> None:
+    modem = started(loses=nth_of(kind, nth))
+    modem.run(CONFIG.reply_timeout_s + 2.0)
+    assert modem.events == [ModemReady(3, None)]
+
+
+def test_echo_of_leading_zeros_and_more_fields_counts() -> None:
+    driver = MicroModem(CONFIG)
+    driver.start(0.0)
+    driver.bytes_to_send()
+    driver.receive(b"$CACFG,SRC,003,extra\r\n", 0.1)
+    assert driver.bytes_to_send() == b"$CCCFG,CST,1*37\r\n"
+
+
+def test_wrong_echo_is_no_answer() -> None:
+    driver = MicroModem(CONFIG)
+    driver.start(0.0)
+    driver.bytes_to_send()
+    for wrong in (b"$CACFG,SRC,4\r\n", b"$CACFG,CST,3\r\n", b"$CACFG,SRC\r\n", b"$CACLK,2016,1,1,0,0,0\r\n"):
+        driver.receive(wrong, 0.1)
+        assert driver.bytes_to_send() == b""
+
+
+def test_configuration_dump_and_revisions_in_between() -> None:
+    """A dump of 200 settings, one of them our own with its old value, begins before the echo comes."""
+    modem = started(loses=nth_of("CACFG", 1))
+    for number in range(200):
+        modem.later(0.02 + number * 0.05, lambda n=number: modem.say("CACFG", f"X{n}", n))
+    modem.later(0.5, lambda: modem.say("CACFG", "SRC", 0))
+    modem.later(1.0, lambda: modem.say("CAREV", "181807", "AUV", "2.0.27087"))
+    modem.loses = lambda sentence, _: sentence.fields == ("SRC", "3") and modem.now < 9.0
+    modem.run(25.0)
+    assert modem.events == [ModemReady(3, "2.0.27087")]
+    assert len([c for c in modem.commands("CCCFG") if c[0] == "SRC"]) <= 2, "asking more often would only prolong it"
+
+
+def test_dump_without_end_does_not_wait_for_ever() -> None:
+    modem = started(loses=lambda sentence, _: sentence.kind == "CCCFG")
+
+    def dump() -> None:
+        modem.say("CACFG", "X", 1)
+        modem.later(0.5, dump)
+
+    modem.later(0.5, dump)
+    modem.run(CONFIG.dump_limit_s + 1.0)
+    assert len(modem.heard) == 0
+    assert modem._seen["CCCFG"] == 2
+
+
+def test_silent_modem_is_reported_once_and_asked_for_ever() -> None:
+    modem = started()
+    modem.dead = True
+    modem.run(3600.0)
+    assert modem.events == [ModemUnresponsive("CCCFG,SRC,3", attempts=3, silent_s=None)]
+    tries = modem._seen["CCCFG"]
+    assert 3600 / CONFIG.retry_cap_s - 2 < tries < 3600 / CONFIG.retry_cap_s + 10, "waits grow, up to the cap"
+    modem.dead = False
+    modem.run(3600.0 + 2 * CONFIG.retry_cap_s)
+    assert modem.events[1:] == [ModemReady(3, None)]
+
+
+def test_waits_double_up_to_the_cap() -> None:
+    driver = MicroModem(MicroModemConfig(address=3, reply_timeout_s=1.0, retry_cap_s=10.0))
+    driver.start(0.0)
+    sent_s, now = [], 0.0
+    for _ in range(8):
+        assert driver.bytes_to_send() == b"$CCCFG,SRC,3*33\r\n"
+        sent_s.append(now)
+        while driver._out == b"":
+            now = driver.next_wakeup()
+            driver.poll(now)
+    gaps = [b - a for a, b in itertools.pairwise(sent_s)]
+    assert gaps == [1.0, 2.0, 4.0, 8.0, 10.0, 10.0, 10.0]
+
+
+def test_modem_that_dies_while_idle_is_noticed_and_set_up_again() -> None:
+    modem = started()
+    modem.run(10.0)
+    modem.dead = True
+    modem.settings["SRC"] = "0"
+    modem.run(150.0)
+    unresponsive = modem.events[1]
+    assert isinstance(unresponsive, ModemUnresponsive)
+    assert unresponsive.waiting_for == "CCCFQ,SRC"
+    assert unresponsive.silent_s > CONFIG.keepalive_s
+    assert not modem.driver.ready
+    modem.dead = False
+    modem.run(300.0)
+    assert modem.events[2:] == [ModemReady(3, None)]
+    assert modem.settings["SRC"] == "3"
+
+
+def test_idle_modem_is_asked_only_when_it_says_nothing() -> None:
+    modem = started()
+    modem.run(5.0)
+    for second in range(600):
+        modem.later(float(second), lambda: modem.say("CAREV", "000000", "AUV", "0.93.0.09"))
+    before = len(modem.heard)
+    modem.run(600.0)
+    assert len(modem.heard) == before
+    modem.run(700.0)
+    assert modem.commands("CCCFQ")[2:] == [("SRC",)] * 3
+    assert modem.events == [ModemReady(3, None)]
+
+
+def test_another_address_than_ours_is_put_right() -> None:
+    modem = started()
+    modem.run(5.0)
+    modem.settings["SRC"] = "9"
+    modem.run(60.0)
+    assert modem.settings["SRC"] == "3"
+    assert modem.events == [ModemReady(3, None)] * 2
+
+
+def test_restart_of_an_idle_modem() -> None:
+    modem = started()
+    modem.run(5.0)
+    modem.settings = {}
+    modem.say("CAREV", "000001", "INIT", "0.93.0.09")
+    assert not modem.driver.ready
+    sent = len(modem.heard)
+    modem.run(5.0 + 0.9 * CONFIG.init_pause_s)
+    assert len(modem.heard) == sent, "a modem that starts is left alone for a moment"
+    modem.run(20.0)
+    assert modem.events[1:] == [ModemRebooted("0.93.0.09"), ModemReady(3, "0.93.0.09")]
+    assert modem.settings == {"SRC": "3", "CST": "1", "RXP": "1"}
+
+
+def test_packets_wait_for_the_modem_and_fail_when_it_takes_too_long() -> None:
+    modem = started()
+    modem.dead = True
+    packet_id = modem.driver.send_packet(1, 4, [b"x"], now=0.0)
+    modem.run(CONFIG.max_defer_s + 1.0)
+    (failed,) = modem.of(PacketFailed)
+    assert (failed.packet_id, failed.reason) == (packet_id, FailureReason.DEFERRED_TOO_LONG)
+    assert not failed.maybe_sent
+    modem.driver.send_packet(1, 4, [b"y"], now=modem.now)
+    modem.dead = False
+    modem.run(modem.now + 100.0)
+    assert [event.frames for event in modem.of(PacketSent)] == [(b"y",)]
+
+
+def test_clock_is_set_once_and_confirmed() -> None:
+    modem = started()
+    utc = datetime(2016, 10, 12, 9, 0, 5, tzinfo=UTC)
+    assert not modem.driver.set_clock(utc, modem.now), "not before the modem is ready"
+    modem.run(5.0)
+    assert modem.driver.set_clock(utc, modem.now)
+    modem.run(6.0)
+    assert modem.commands("CCCLK") == [("2016", "10", "12", "9", "0", "5")]
+    assert modem.events[1:] == [ClockConfirmed(utc)]
+    modem.loses = lambda sentence, _: sentence.kind == "CACLK"
+    assert modem.driver.set_clock(utc, modem.now)
+    modem.run(40.0)
+    assert len(modem.commands("CCCLK")) == 2, "an old time is not sent again"
+    assert modem.events[2:] == [SettingUnconfirmed("CCCLK,2016,10,12,9,0,5")]
+    assert modem.driver.phase is Phase.READY
+
+
+def test_what_the_driver_does_not_know_is_passed_on() -> None:
+    modem = started()
+    modem.run(5.0)
+    modem.say("CATOA", "120000.1234", 1)
+    modem.say("CACFG", "BW", 2)
+    modem.raw(b"$CATXF,28*00\r\nnoise\r\n")
+    modem.say("CAREV", "000000")
+    assert [event.sentence.kind for event in modem.of(UnhandledSentence)] == ["CATOA", "CACFG"]
+    assert [event.error.field for event in modem.of(SentenceRejected)] == ["checksum", "", "fields"]
+
+
+def test_nothing_happens_while_the_port_is_closed() -> None:
+    driver = MicroModem(CONFIG)
+    assert driver.receive(b"$CAREV,000001,INIT,1\r\n", 0.0) == []
+    assert driver.poll(100.0) == []
+    driver.start(100.0)
+    driver.port_lost(101.0)
+    assert driver.bytes_to_send() == b""
+    assert driver.next_wakeup() is None
+    assert driver.phase is Phase.CLOSED
+
+
+def test_half_a_line_of_before_does_not_meet_the_new_port() -> None:
+    driver = MicroModem(CONFIG)
+    driver.start(0.0)
+    driver.receive(b"$CACFG,SRC", 0.1)
+    driver.port_lost(1.0)
+    driver.port_opened(2.0)
+    driver.bytes_to_send()
+    assert driver.receive(b"$CACFG,SRC,3\r\n", 2.1) == []
+    assert driver.bytes_to_send() == b"$CCCFG,CST,1*37\r\n"
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong"),
+    [
+        ("address", -1),
+        ("address", 128),
+        ("tries", 0),
+        ("queued_packets", 0),
+        ("airtime_margin", 0.5),
+        ("reply_timeout_s", 0.0),
+        ("max_defer_s", float("inf")),
+        ("keepalive_s", float("nan")),
+        ("airtimes_s", {9: 1.0}),
+        ("airtimes_s", {1: 0.0}),
+    ],
+)
+def test_wrong_configuration_names_the_field(field: str, wrong: object) -> None:
+    with pytest.raises(ConfigError) as caught:
+        MicroModemConfig(**{"address": 1, field: wrong})
+    assert caught.value.field.startswith(field)
+
+
+def test_scaled_configuration_changes_times_only() -> None:
+    config = MicroModemConfig(address=1, airtimes_s={1: 3.1})
+    assert (config.airtime_s(1), config.airtime_s(5), config.airtime_s(None), config.airtime_s(77)) == (
+        3.1,
+        3.1,
+        3.4,
+        3.4,
+    )
+
+
+def test_every_outage_is_reported() -> None:
+    modem = started()
+    for outage in range(3):
+        modem.run(modem.now + 10.0)
+        modem.dead = True
+        modem.run(modem.now + 200.0)
+        assert len(modem.of(ModemUnresponsive)) == outage + 1
+        modem.dead = False
+        modem.run(modem.now + 100.0)
+        assert modem.driver.ready

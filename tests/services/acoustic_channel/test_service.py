@@ -1,0 +1,492 @@
+"""The emulated modems on real pseudo-terminals and TCP ports: what hosts read is what the log says."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import serial
+import zenoh
+from builders.common import eventually, free_port
+from pydantic import ValidationError
+
+from sonarpost import keys, wire
+from sonarpost.cli import modem_emulator
+from sonarpost.config import PlatformConfig
+from sonarpost.errors import ConfigError, PortError
+from sonarpost.messages import Health
+from sonarpost.modem.micromodem import nmea
+from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
+from sonarpost.services.acoustic_channel.service import AcousticChannelService
+from sonarpost.simulation.channel.acoustics import LocalPosition
+from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.parameters import ChannelParameters
+from sonarpost.simulation.modem.settings import EmulatedModemConfig
+
+SITES = (ModemSite(1), ModemSite(2, LocalPosition(150.0)))
+SCALE = 100.0
+
+
+class Host:
+    """A client of one modem that fills cycles and collects what it is told."""
+
+    def __init__(self, device: str) -> None:
+        self._port = serial.serial_for_url(device, timeout=0)
+        self._lines = nmea.LineAssembler(device)
+        self.told: list[nmea.Sentence] = []
+        self._query_until_answered()
+
+    def _query_until_answered(self) -> None:
+        def answered() -> bool:
+            self.say("CCCFQ", "SRC")
+            self.wait(0.02)
+            return any(sentence.kind == "CACFG" for sentence in self.told)
+
+        eventually(answered, what="answer to CCCFQ")
+
+    def say(self, kind: str, *fields: str | int) -> None:
+        self._port.write(nmea.format(kind, *fields))
+
+    def write(self, data: bytes) -> None:
+        self._port.write(data)
+
+    def read(self) -> None:
+        for item in self._lines.feed(self._port.read(65536)):
+            assert isinstance(item, nmea.Sentence), item
+            self.told.append(item)
+
+    def wait(self, wait_s: float) -> None:
+        select.select([self._port], [], [], wait_s)
+        self.read()
+
+    def count(self, kind: str) -> int:
+        return sum(sentence.kind == kind for sentence in self.told)
+
+    def expect(self, kind: str, number: int = 1) -> None:
+        def come() -> bool:
+            self.wait(0.02)
+            return self.count(kind) >= number
+
+        eventually(come, what=f"{number} x {kind}")
+
+    def send(self, destination: int, rate: int, frames: list[bytes], source: int = 1) -> None:
+        """Run a whole cycle, to the end of the transmission."""
+        sent, asked = self.count("CAXST"), self.count("CADRQ")
+        self.say("CCCYC", 0, source, destination, rate, 0, len(frames))
+        for number, frame in enumerate(frames, start=1):
+            self.expect("CADRQ", asked + number)
+            self.say("CCTXD", source, destination, 0, frame.hex())
+        self.expect("CAXST", sent + 1)
+
+    def received(self) -> list[tuple[int, bytes]]:
+        """Frame number and bytes of every `CARXD`."""
+        return [(int(s.fields[3]), bytes.fromhex(s.fields[4])) for s in self.told if s.kind == "CARXD"]
+
+    def close(self) -> None:
+        self._port.close()
+
+
+Make = Callable[..., ChannelEmulator]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Iterator[Make]:
+    """Starts channels, with ptys and a log in a temporary folder unless told otherwise, and stops them."""
+    running: list[ChannelEmulator] = []
+
+    def start(**config: object) -> ChannelEmulator:
+        defaults: dict[str, object] = {"sites": SITES, "time_scale": SCALE, "log_path": tmp_path / "water.jsonl"}
+        if "tcp_ports" not in config:
+            defaults["pty_dir"] = tmp_path / "ports"
+        channel = ChannelEmulator(EmulatorConfig(**(defaults | config)))  # type: ignore[arg-type]
+        running.append(channel)
+        channel.start()
+        return channel
+
+    yield start
+    for channel in running:
+        channel.stop()
+        assert channel.failure is None
+
+
+def log_of(path: Path, event: str | None = None) -> list[dict[str, object]]:
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return [line for line in lines if event is None or line["event"] == event]
+
+
+def hosts_of(channel: ChannelEmulator) -> list[Host]:
+    return [Host(device.device) for device in channel.devices()]
+
+
+@pytest.mark.parametrize("tcp", [False, True])
+def test_the_log_is_what_the_receiver_read(make: Make, tmp_path: Path, tcp: bool):
+    water = ChannelParameters(seed=3, frame_loss=0.3, tail_damage=0.4)
+    channel = make(channel=water, **({"tcp_ports": (0, 0)} if tcp else {}))
+    sender, receiver = hosts_of(channel)
+    for n in range(12):
+        sender.send(2, 5, [bytes([n, k]) * 20 for k in range(3)] + [b""])
+        receiver.expect("CACST", n + 1)
+    sender.close()
+    receiver.close()
+    channel.stop()
+
+    packets = log_of(tmp_path / "water.jsonl", "packet")
+    assert [p["packet"] for p in packets] == list(range(1, 13))
+    assert all(
+        p["heard"] and (p["source"], p["destination"], p["receiver"], p["rate"]) == (1, 2, 2, 5) for p in packets
+    )
+    frames = [frame for p in packets for frame in p["frames"]]
+    told = [(f["number"], bytes.fromhex(f["hex"])) for f in frames if f["fate"] in {"delivered", "damaged"}]
+    assert told == receiver.received()
+    assert {f["fate"] for f in frames} == {"delivered", "lost", "damaged", "empty"}
+    for frame in frames:
+        data = bytes.fromhex(frame["hex"])
+        assert (len(data), hashlib.sha256(data).hexdigest()) == (frame["bytes"], frame["sha256"])
+        assert ("sent_hex" in frame) == (frame["fate"] == "damaged")
+    lost = sum(f["fate"] == "lost" for f in frames)
+    assert receiver.count("CAMSG") == lost
+
+    start, *_, stop, totals = log_of(tmp_path / "water.jsonl")
+    assert (start["event"], stop["event"], totals["event"]) == ("start", "stop", "totals")
+    assert start["water"]["seed"] == 3
+    assert (totals["transmitted"], totals["heard"], totals["not_heard"], totals["in_flight"]) == (12, 12, {}, 0)
+    assert totals["frames"] == {fate: sum(f["fate"] == fate for f in frames) for fate in totals["frames"]}
+
+
+def test_two_runs_of_one_seed_have_one_outcome(make: Make, tmp_path: Path):
+    seen = []
+    for run in ("a", "b"):
+        channel = make(
+            channel=ChannelParameters(seed=8, frame_loss=0.5, tail_damage=0.5),
+            pty_dir=tmp_path / run,
+            log_path=tmp_path / f"{run}.jsonl",
+        )
+        sender, receiver = hosts_of(channel)
+        for _ in range(5):
+            sender.send(2, 1, [b"abcdefgh", b"ijklmnop", b"qrstuvwx"])
+        receiver.expect("CACST", 5)
+        channel.stop()
+        seen.append([p["frames"] for p in log_of(tmp_path / f"{run}.jsonl", "packet")])
+    assert seen[0] == seen[1]
+
+
+def test_what_no_client_reads_is_delivered_and_not_heard(make: Make, tmp_path: Path):
+    channel = make()
+    sender = Host(channel.devices()[0].device)
+    sender.send(2, 1, [b"abc"])
+    eventually(lambda: channel.totals().unreported == {"no client connected": 1}, what="packet in the totals")
+    channel.stop()
+    (packet,) = log_of(tmp_path / "water.jsonl", "packet")
+    assert (packet["heard"], packet["not_heard_because"]) == (False, "no client connected")
+    assert packet["frames"][0]["fate"] == "delivered"
+
+
+@pytest.mark.parametrize("tcp", [False, True])
+def test_a_client_can_leave_and_return_and_finds_nothing_stale(make: Make, tcp: bool):
+    channel = make(**({"tcp_ports": (0, 0)} if tcp else {}))
+    sender, receiver = hosts_of(channel)
+    for n in range(3):
+        # The receiver leaves with the packet unread in its port.
+        sender.send(2, 1, [b"unread"])
+        eventually(lambda n=n: channel.totals().reported == n + 1, what="packet written to the port")
+        receiver.close()
+        eventually(lambda: channel.connected() == 1, what="client seen to have left")
+        receiver = Host(channel.devices()[1].device)
+        assert receiver.count("CARXD") == 0
+    sender.send(2, 1, [b"fresh"])
+    receiver.expect("CACST")
+    assert receiver.received() == [(1, b"fresh")]
+
+
+def test_a_restarted_emulator_has_the_same_paths(make: Make, tmp_path: Path):
+    first = make()
+    devices = [device.device for device in first.devices()]
+    assert devices == [str(tmp_path / "ports" / f"modem-{n}") for n in (1, 2)]
+    Host(devices[0]).close()
+    first.stop()
+    assert not any(Path(device).is_symlink() for device in devices)
+    second = make()
+    assert [device.device for device in second.devices()] == devices
+    Host(devices[0]).close()
+    # One that takes the paths over while the other still runs keeps them when the other ends.
+    third = make()
+    second.stop()
+    Host(third.devices()[0].device).close()
+
+
+def test_a_short_lived_client_is_understood(make: Make):
+    channel = make()
+    device = Path(channel.devices()[0].device)
+    with device.open("wb", buffering=0) as port:
+        port.write(nmea.format("CCCFG", "SRC", 42))
+    host = Host(str(device))
+    assert {sentence.fields for sentence in host.told if sentence.kind == "CACFG"} == {("SRC", "42")}
+
+
+def test_a_new_tcp_client_takes_the_place_of_a_dead_one(make: Make):
+    channel = make(tcp_ports=(0, 0))
+    first = Host(channel.devices()[0].device)
+    second = Host(channel.devices()[0].device)
+    second.say("CCCFQ", "CST")
+    second.expect("CACFG", 2)
+    with pytest.raises(serial.SerialException):
+        eventually(lambda: first.wait(0.05) is not None, timeout_s=5.0)
+
+
+def test_garbage_is_answered_with_errors_and_does_no_harm(make: Make):
+    channel = make(tcp_ports=(0, 0))
+    host = Host(channel.devices()[0].device)
+    host.write(random.Random(5).randbytes(20_000) + b"\r\n$CCCYC,0,1,2,1,0,1*00\r\n")
+    host.expect("CAERR")
+    host.say("CCCFQ", "XST")
+    eventually(lambda: host.wait(0.02) or ("XST", "1") in [s.fields for s in host.told], what="answer after garbage")
+
+
+def test_a_host_that_never_answers_is_given_up_after_two_real_seconds(make: Make):
+    channel = make(time_scale=1000.0)
+    host = Host(channel.devices()[0].device)
+    began_s = time.monotonic()
+    host.say("CCCYC", 0, 1, 2, 1, 0, 1)
+    host.expect("CAERR")
+    assert 1.9 < time.monotonic() - began_s < 6.0
+    timeout = next(sentence for sentence in host.told if sentence.kind == "CAERR")
+    assert timeout.fields[1:] == ("DATA_TIMEOUT", "1")
+    assert channel.totals().transmitted == 0
+
+
+def test_a_client_that_does_not_read_loses_whole_sentences_only(make: Make):
+    channel = make(tcp_ports=(0, 0))
+    device = channel.devices()[0].device
+    with socket.create_connection(("127.0.0.1", int(device.rsplit(":", 1)[1]))) as idle:
+        query = nmea.format("CCCFQ", "ALL") * 50
+        idle.settimeout(10.0)
+        for _ in range(200):  # some 10 MB of answers
+            idle.sendall(query)
+        eventually(lambda: channel.connected() == 1, what="client seen")
+        assembler = nmea.LineAssembler()
+        seen = 0
+        try:
+            while data := idle.recv(1 << 20):
+                idle.settimeout(0.5)
+                for item in assembler.feed(data):
+                    assert isinstance(item, nmea.Sentence)
+                    seen += 1
+                if seen > 20_000:
+                    break
+        except TimeoutError:
+            pass
+        assert seen > 1000
+    other = Host(channel.devices()[1].device)
+    other.close()
+
+
+def test_air_time_runs_at_the_time_scale(make: Make):
+    channel = make(time_scale=10.0, modem=EmulatedModemConfig(address=0, airtimes_s={1: 5.0}))
+    host = Host(channel.devices()[0].device)
+    host.say("CCCYC", 0, 1, 2, 1, 0, 1)
+    host.expect("CADRQ")
+    began_s = time.monotonic()
+    host.say("CCTXD", 1, 2, 0, "AA")
+    host.expect("CATXF")
+    assert 0.5 <= time.monotonic() - began_s < 2.0
+
+
+def test_a_moved_modem_is_elsewhere(make: Make, tmp_path: Path):
+    channel = make()
+    sender, receiver = hosts_of(channel)
+    channel.move(2, LocalPosition(300.0))
+    sender.send(2, 1, [b"abc"])
+    receiver.expect("CACST")
+    channel.stop()
+    assert log_of(tmp_path / "water.jsonl", "packet")[0]["range_m"] == 300.0
+    assert log_of(tmp_path / "water.jsonl", "move")[0]["modem"] == 2
+
+
+def test_ports_that_cannot_be_had_are_named(make: Make, tmp_path: Path):
+    (tmp_path / "ports").mkdir()
+    (tmp_path / "ports" / "modem-2").write_text("not a link")
+    with pytest.raises(PortError, match="modem-2"):
+        make()
+    assert not (tmp_path / "ports" / "modem-1").is_symlink()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(PortError, match=str(port)):
+            make(tcp_ports=(0, port))
+    with pytest.raises(PortError, match="log"):
+        make(log_path=tmp_path, tcp_ports=(0, 0))
+
+
+def test_a_log_that_cannot_be_written_ends_the_channel(tmp_path: Path):
+    config = EmulatorConfig(sites=SITES, pty_dir=tmp_path / "ports", log_path=Path("/dev/full"))
+    channel = ChannelEmulator(config)
+    channel.start()
+    eventually(lambda: channel.failure is not None, what="failure")
+    assert isinstance(channel.failure, PortError)
+    assert list((tmp_path / "ports").iterdir()) == []
+    channel.stop()
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"sites": ()},
+        {"sites": (ModemSite(1), ModemSite(1))},
+        {"sites": (ModemSite(200),)},
+        {"tcp_ports": (1,)},
+        {"time_scale": 0.0},
+        {"time_scale": float("nan")},
+        {"serial_baud": -1.0},
+    ],
+)
+def test_configurations_that_make_no_sense_are_refused(config: dict[str, object], tmp_path: Path):
+    complete = {"sites": SITES} | ({} if "tcp_ports" in config else {"pty_dir": tmp_path}) | config
+    with pytest.raises(ValueError, match=next(iter(config))):
+        EmulatorConfig(**complete)  # type: ignore[arg-type]
+
+
+# The command
+
+
+def run_command(*arguments: str) -> subprocess.Popen[str]:
+    code = (
+        "import argparse, sys; from sonarpost.cli import modem_emulator as m; p = argparse.ArgumentParser();"
+        "m.add_parser(p.add_subparsers()); a = p.parse_args(sys.argv[1:]); sys.exit(a.run(a))"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", code, "modem-emulator", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
+def test_the_command_lists_its_devices_first_and_ends_cleanly(tmp_path: Path, ending: signal.Signals):
+    log, ports = tmp_path / "log.jsonl", tmp_path / "ports"
+    with run_command(
+        "--modems", "3", "--pty", str(ports), "--log", str(log), "--time-scale", "100", "--json"
+    ) as process:
+        assert process.stdout is not None
+        listed = json.loads(process.stdout.readline())
+        assert listed == {"modems": [{"address": n, "device": str(ports / f"modem-{n}")} for n in (1, 2, 3)]}
+        host = Host(listed["modems"][0]["device"])
+        host.send(2, 1, [b"abc"])
+        host.close()
+        process.send_signal(ending)
+        # Not communicate(): it would miss what readline has already taken into its buffer.
+        rest = process.stdout.read()
+        assert process.stderr is not None
+        assert (process.wait(timeout=10), process.stderr.read()) == (0, "")
+    assert rest == log.read_text(encoding="utf-8")
+    assert log_of(log)[-1]["event"] == "totals"
+    assert list(ports.iterdir()) == []
+
+
+def test_the_command_offers_tcp_ports():
+    ports = [free_port(), free_port()]
+    with run_command("--tcp", *map(str, ports)) as process:
+        assert process.stdout is not None
+        listed = json.loads(process.stdout.readline())
+        assert [m["device"] for m in listed["modems"]] == [f"socket://127.0.0.1:{port}" for port in ports]
+        Host(listed["modems"][1]["device"]).close()
+        process.terminate()
+        assert process.wait(timeout=10) == 0
+
+
+@pytest.mark.parametrize("arguments", [(), ("--json",)])
+def test_the_command_goes_on_when_nobody_reads_its_output(arguments: tuple[str, ...]):
+    with run_command("--tcp", "--mm", "1", "--time-scale", "100", *arguments) as process:
+        assert process.stdout is not None
+        listed = json.loads(process.stdout.readline())
+        process.stdout.close()
+        host = Host(listed["modems"][0]["device"])
+        host.send(2, 1, [b"abc"])
+        eventually(lambda: (host.wait(0.05), any(s.kind == "CATXF" for s in host.told))[1], what="end of the packet")
+        eventually(lambda: (host.wait(0.05), "0.93.0.09" in str(host.told))[1], what="a Micro-Modem 1")
+        host.close()
+        assert process.poll() is None
+        process.terminate()
+        assert process.stderr is not None
+        assert (process.wait(timeout=10), process.stderr.read()) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("--modems", "0"), "--modems"),
+        (("--set", "snr_spread_db=-1"), "snr_spread_db"),
+        (("--set", "colour=blue"), "colour"),
+        (("--transponder", "A=far"), "--transponder"),
+        (("--transponder", "E=1"), "transponders"),
+        (("--loss", "1.5"), "frame_loss"),
+        (("--time-scale", "0"), "time_scale"),
+        (("--modems", "3", "--tcp", "1", "2"), "tcp_ports"),
+        (("--airtime", "fast"), "--airtime"),
+        (("--airtime", "9=1"), "airtimes_s"),
+        (("--spacing", "nan"), "position"),
+    ],
+)
+def test_the_command_refuses_values_out_of_bounds(arguments: tuple[str, ...], named: str):
+    import argparse
+
+    parser = argparse.ArgumentParser()
+    modem_emulator.add_parser(parser.add_subparsers())
+    parsed = parser.parse_args(["modem-emulator", *arguments])
+    with pytest.raises(ConfigError, match=named):
+        parsed.run(parsed)
+
+
+# The service
+
+
+def test_the_service_offers_modems_and_reports_what_the_water_did(
+    platform: Callable[[str], PlatformConfig], client: zenoh.Session, tmp_path: Path
+):
+    config = AcousticChannelConfig(
+        pty_dir=tmp_path / "ports", log=tmp_path / "water.jsonl", time_scale=SCALE, airtime_s={"1": 2.0}
+    )
+    service = AcousticChannelService(platform("sea"), config)
+    reports: list[Health] = []
+    key = keys.health("sea", "acoustic_channel")
+    subscriber = client.declare_subscriber(
+        key, lambda sample: reports.append(wire.decode(Health, sample.payload.to_bytes(), key))
+    )
+    try:
+        assert service.start()
+        sender, receiver = (Host(str(tmp_path / "ports" / f"modem-{n}")) for n in (1, 2))
+        sender.send(2, 1, [b"abc"])
+        receiver.expect("CACST")
+
+        def reported() -> bool:
+            return any(r.gauges.get("frames_delivered") == 1 and r.gauges["modems_connected"] == 2 for r in reports)
+
+        eventually(reported, what="health with one delivered frame")
+        sender.close()
+        receiver.close()
+    finally:
+        service.stop()
+        subscriber.undeclare()
+    assert log_of(tmp_path / "water.jsonl")[-1]["frames"]["delivered"] == 1
+    assert log_of(tmp_path / "water.jsonl", "packet")[0]["airtime_s"] == 2.0
+
+
+def test_the_service_table_refuses_what_does_not_go_together():
+    for wrong in (
+        {"modem": [{"address": 1}, {"address": 1}]},
+        {"tcp_ports": [1, 2, 3]},
+        {"frame_loss": 1.5},
+        {"airtime_s": {"9": 1.0}},
+        {"unknown": 1},
+    ):
+        with pytest.raises(ValidationError):
+            AcousticChannelConfig.model_validate(wrong)

@@ -1,0 +1,94 @@
+"""The project's own driver on the emulated Micro-Modem: packets, reboots, lost frames and collisions."""
+
+from __future__ import annotations
+
+import pytest
+from builders.emulator_bench import Bench
+
+from sonarpost.modem.micromodem import (
+    RATES,
+    MicroModem,
+    MicroModemConfig,
+    ModemError,
+    ModemEvent,
+    ModemRebooted,
+    ModemUnresponsive,
+    PacketFailed,
+    PacketReceived,
+    PacketSent,
+    SentenceRejected,
+)
+
+
+def drive(bench: Bench, drivers: dict[int, MicroModem], until_s: float) -> dict[int, list[ModemEvent]]:
+    """Run the project's own drivers on the emulated modems, without any real time."""
+    events: dict[int, list[ModemEvent]] = {n: [] for n in drivers}
+    while bench.now < until_s:
+        for n, driver in drivers.items():
+            told, bench.told[n] = bench.told[n], b""
+            events[n] += driver.receive(told, bench.now) + driver.poll(bench.now)
+            bench.world.receive(n, driver.bytes_to_send(), bench.now)
+        bench.advance(round(bench.now + 0.05, 6))
+    return events
+
+
+@pytest.mark.parametrize("rate", sorted(RATES))
+@pytest.mark.parametrize("ack", [False, True])
+def test_the_driver_gets_along_with_the_emulator(rate: int, ack: bool):
+    bench = Bench()
+    drivers = {n: MicroModem(MicroModemConfig(n)) for n in (1, 2)}
+    for driver in drivers.values():
+        driver.start(bench.now)
+    drive(bench, drivers, 10.0)
+    assert all(driver.ready for driver in drivers.values())
+    shape = RATES[rate]
+    frames = [bytes([n + 1]) * (shape.frame_bytes - n) for n in range(shape.frames)]
+    for n in range(2):
+        drivers[1].send_packet(2, rate, frames, ack=ack, now=bench.now + n / 1000)
+    events = drive(bench, drivers, 70.0)
+
+    sent = [event for event in events[1] if isinstance(event, PacketSent)]
+    assert [event.acknowledged for event in sent] == [tuple(range(1, shape.frames + 1)) if ack else ()] * 2
+    assert all(event.statistics is not None and event.statistics.nbytes == sum(map(len, frames)) for event in sent)
+    got = [event for event in events[2] if isinstance(event, PacketReceived)]
+    assert [[frame.data for frame in packet.frames] for packet in got] == [frames] * 2
+    assert all(packet.complete and packet.rate == rate and packet.statistics is not None for packet in got)
+    unwanted = (PacketFailed, ModemError, SentenceRejected, ModemRebooted, ModemUnresponsive)
+    assert not [event for n in events for event in events[n] if isinstance(event, unwanted)]
+
+
+def test_the_driver_recovers_from_a_reboot_of_the_emulator():
+    bench = Bench()
+    driver = MicroModem(MicroModemConfig(1))
+    driver.start(bench.now)
+    drive(bench, {1: driver}, 10.0)
+    bench.say(1, ("CCMSC", 1, 1, 0))
+    events = drive(bench, {1: driver}, 30.0)[1]
+    assert sum(isinstance(event, ModemRebooted) for event in events) == 1
+    assert driver.ready
+    driver.send_packet(2, 1, [b"after"], now=bench.now)
+    drive(bench, {1: driver}, 45.0)
+    assert "CARXD,1,2,0,1,6166746572" in bench.lines(2)
+
+
+def test_the_driver_sees_lost_frames_and_collisions():
+    bench = Bench(modems=3, frame_loss=0.4, seed=2)
+    drivers = {n: MicroModem(MicroModemConfig(n)) for n in (1, 2, 3)}
+    for driver in drivers.values():
+        driver.start(bench.now)
+    drive(bench, drivers, 10.0)
+    frames = [bytes([n]) * 8 for n in range(1, 9)]
+    drivers[1].send_packet(2, 5, frames, now=bench.now)
+    events = drive(bench, drivers, 20.0)
+    (packet,) = (event for event in events[2] if isinstance(event, PacketReceived))
+    told = next(r for r in bench.reports if r.arrival.receiver == 2)
+    good = [frame.received for frame in told.arrival.frames if frame.outcome.value == "delivered"]
+    assert [frame.data for frame in packet.frames] == good
+    assert packet.bad_frames == 8 - len(good) > 0
+    assert not packet.complete
+    for n in (1, 3):
+        drivers[n].send_packet(2, 1, [b"clash"], now=bench.now)
+    events = drive(bench, drivers, 40.0)
+    assert not [event for event in events[2] if isinstance(event, PacketReceived) and event.frames]
+    assert not drivers[2].receiving
+    assert all(driver.ready for driver in drivers.values())

@@ -1,0 +1,113 @@
+"""The emulated Micro-Modem's serial line: errors are answered, no bytes break it, and it takes its time."""
+
+from __future__ import annotations
+
+import pytest
+from builders.emulator_bench import START_UTC_S, Bench
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonarpost.modem.micromodem import nmea
+from sonarpost.simulation.channel.events import Transmission
+from sonarpost.simulation.channel.simulator import SerialLine
+from sonarpost.simulation.modem.emulator import EmulatedMicroModem
+from sonarpost.simulation.modem.settings import EmulatedModemConfig
+
+
+@pytest.mark.parametrize(
+    ("line", "answer"),
+    [
+        (b"$CCCFQ,SRC*00\r\n", "NMEA,1,bad checksum"),
+        (b"hello\r\n", "NMEA,1,bad sentence"),
+        (b"$CCXYZ,1*00\r\n", "NMEA,1,bad checksum"),
+        (b"$CCXYZ,1\r\n", "NMEA,2,unknown CCXYZ"),
+        (b"$CCCYC,0,1,2,9,0,1\r\n", "NMEA,3,CCCYC bad rate"),
+        (b"$CCCYC,0,1,2,1,0,4\r\n", "NMEA,3,CCCYC bad frames"),
+        (b"$CCCYC,0,1,2,1,0,0\r\n", "NMEA,3,CCCYC bad frames"),
+        (b"$CCMPC,5,2\r\n", "NMEA,3,CCMPC bad source"),
+        (b"$CCCYC,0,1,128,1,0,1\r\n", "NMEA,3,CCCYC bad destination"),
+        (b"$CCCYC\r\n", "NMEA,3,CCCYC bad rate"),
+        (b"$CCCFG,SRC,128\r\n", "NMEA,3,CCCFG bad SRC"),
+        (b"$CCCFG,SRC,x\r\n", "NMEA,3,CCCFG bad value"),
+        (b"$CCCFG,,1\r\n", "NMEA,3,CCCFG bad name"),
+        (b"$CCCFG,ALL,1\r\n", "NMEA,3,CCCFG bad ALL"),
+        (b"$CCMSC,1,1,5\r\n", "NMEA,3,CCMSC bad minutes"),
+        (b"$CCMUC,1,2,2000\r\n", "NMEA,3,CCMUC bad bits"),
+        (b"$CCTXD,1,2,0,ABC\r\n", "NMEA,3,CCTXD bad data"),
+    ],
+)
+def test_what_does_not_parse_is_answered_with_an_error(line: bytes, answer: str):
+    modem = EmulatedMicroModem(EmulatedModemConfig(1, utc_at_zero_s=START_UTC_S))
+    modem.bytes_to_send()
+    modem.receive(line, 2.0)
+    assert modem.bytes_to_send() == nmea.format("CAERR", "090002", *answer.split(","))
+    assert modem.packets_to_transmit() == []
+
+
+KINDS = ["CCCFG", "CCCFQ", "CCMSC", "CCCLK", "CCCLQ", "CCTMS", "CCTMQ", "CCCYC",
+         "CCTXD", "CCTXA", "CCMPC", "CCMUC", "CCTDP", "CCPDT", "CCPNT", "CCALQ"]  # fmt: skip
+
+SENTENCES = st.tuples(
+    st.sampled_from(KINDS),
+    st.lists(
+        st.one_of(st.integers(-2, 130).map(str), st.sampled_from(["", "SRC", "ALL", "DTO", "AABB", "1e5", "٣"[:0]])),
+        max_size=8,
+    ),
+).map(lambda s: nmea.format(s[0], *s[1]))
+
+
+@given(st.lists(st.tuples(st.sampled_from([1, 2]), st.one_of(st.binary(max_size=80), SENTENCES), st.floats(0, 5))))
+def test_no_bytes_break_it(steps: list[tuple[int, bytes, float]]):
+    bench = Bench(frame_loss=0.2, tail_damage=0.2)
+    for modem, data, pause_s in steps:
+        bench.world.receive(modem, data, bench.now)
+        bench.advance(bench.now + pause_s)
+    bench.advance(bench.now + 400.0)
+    for modem in (1, 2):
+        assembler = nmea.LineAssembler()
+        items = assembler.feed(bench.told[modem])
+        assert all(isinstance(item, nmea.Sentence) for item in items)
+        assert assembler.pending_bytes == 0
+    # Whatever was sent, the modem still lives: a reboot has ended and a query has an answer.
+    bench.clear()
+    bench.world.receive(1, b"\r\n" + nmea.format("CCCFQ", "SRC"), bench.now)
+    bench.advance(bench.now)
+    assert bench.lines(1)[-1].startswith("CACFG,SRC,")
+
+
+@given(st.integers(1, 7), st.integers(0, 2**32))
+def test_lateness_of_the_driver_changes_nothing(steps: int, seed: int):
+    def run(advances: int) -> tuple[dict[int, bytes], list[Transmission]]:
+        bench = Bench(frame_loss=0.3, seed=seed)
+        bench.say(1, ("CCCYC", 0, 1, 2, 5, 1, 3), *(("CCTXD", 1, 2, 1, f"{n:02X}" * 20) for n in range(3)))
+        for n in range(1, advances + 1):
+            bench.advance(1.0 + 24.0 * n / advances)
+        return bench.told, bench.transmissions
+
+    assert run(steps) == run(1)
+
+
+def test_the_serial_line_takes_its_time():
+    bench = Bench(serial_baud=19200)
+    query = nmea.format("CCCFQ", "SRC")
+    bench.world.receive(1, query, 1.0)
+    answer = b"$CACFG,SRC,1*33\r\n"
+    arrives_s = 1.0 + (len(query) + len(answer)) * 10 / 19200
+    bench.advance(arrives_s - 0.0001)
+    assert bench.told[1] == b""
+    bench.advance(arrives_s + 0.0001)
+    assert bench.told[1] == answer
+
+
+def test_what_is_on_a_serial_line_comes_out_in_order_or_is_dropped():
+    line: SerialLine[str] = SerialLine(100)
+    line.put("a", 10, 0.0)
+    line.put("b", 10, 0.0)
+    line.put("c", 10, 5.0)
+    assert line.next_s() == 1.0
+    assert line.take(1.99) == ["a"]
+    assert line.take(5.5) == ["b"]
+    assert line.discard() == ["c"]
+    assert line.next_s() is None
+    with pytest.raises(ValueError, match="baud"):
+        SerialLine(0)
