@@ -26,7 +26,7 @@ test: setup
 test-long: setup
 	$(BIN)/python -m pytest -m long -o faulthandler_timeout=1800 $(ARGS)
 
-check: setup
+check: setup docs
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy

@@ -112,6 +112,8 @@ class PlatformConfig(ServiceConfig):
         acoustic_key_file: Key that vehicles and vessel have in common; with it, only frames sealed with it are sent and
             taken on the `v1` acoustic link.
         health_interval_s: How often a service publishes its health.
+        log_level: Least severity of log lines: debug, info, warning or error.
+        log_format: Log lines as text or as JSON objects.
     """
 
     id: PlatformId

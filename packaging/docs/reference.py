@@ -20,6 +20,8 @@ from sonarpost.cli.main import parser
 from sonarpost.config import SERVICES, PlatformConfig, ServiceConfig
 from sonarpost.messages import Record
 from sonarpost.modem.micromodem import RATES
+from sonarpost.monitoring.fleet import FleetState
+from sonarpost.monitoring.metrics import FleetCollector
 
 UNITS = {
     "airtime_s": "s",
@@ -201,6 +203,16 @@ def rates(_: str = "") -> str:
     return table(header, rows)
 
 
+def metrics(_: str = "") -> str:
+    """Return the table of the metrics that do not depend on a service's counters and gauges."""
+    rows = []
+    for family in FleetCollector(lambda: FleetState(services=(), connected=True, rejected=0)).collect():
+        name = family.name + ("_total" if family.type == "counter" else "")
+        labels = ", ".join(getattr(family, "_labelnames", ()))
+        rows.append((f"`{name}`", family.type, labels, family.documentation))
+    return table(("metric", "type", "labels", "meaning"), rows)
+
+
 GENERATORS: Mapping[str, Callable[[str], str]] = {
     "records": records,
     "keys": key_table,
@@ -208,6 +220,7 @@ GENERATORS: Mapping[str, Callable[[str], str]] = {
     "configuration": configuration,
     "commands": commands,
     "rates": rates,
+    "metrics": metrics,
 }
 
 
@@ -215,12 +228,12 @@ def described(model: type[BaseModel]) -> tuple[str, dict[str, str]]:
     """Return a model's summary and the description of each field, those of its bases included."""
     fields: dict[str, str] = {}
     for base in reversed(model.__mro__):
-        if base.__doc__ and issubclass(base, BaseModel):
+        if base.__doc__ and issubclass(base, BaseModel) and base is not BaseModel:
             for section in griffe.Docstring(inspect.cleandoc(base.__doc__)).parse("google", warnings=False):
                 if isinstance(section, griffe.DocstringSectionAttributes):
                     fields |= {item.name: " ".join(item.description.split()) for item in section.value}
     text = inspect.cleandoc(model.__doc__ or "").partition("Attributes:")[0].strip()
-    return text, fields
+    return text, {name: fields[name] for name in model.model_fields if name in fields}
 
 
 def unit(name: str) -> str:

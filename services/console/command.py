@@ -45,9 +45,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         ("rm", "remove"),
     ):
         action = what.add_parser(name, help=summary)
-        action.add_argument("name", metavar="NAME")
+        action.add_argument("name", metavar="NAME", help="name of the user")
         if name == "add":
-            action.add_argument("--role", choices=ROLES, default="observer")
+            action.add_argument("--role", choices=ROLES, default="observer", help="what the user may do")
         if name != "rm":
             action.add_argument("--password-stdin", action="store_true", help="read the password from standard input")
         _add_state(action)

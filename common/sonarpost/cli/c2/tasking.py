@@ -43,10 +43,10 @@ def add_actions(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     comment = actions.add_parser("comment", help="send an expert's comment on an image to the operator of a vessel")
     _add_common_options(comment)
     comment.add_argument("--version", type=int, default=1, metavar="N", help="version of the image (default: 1)")
-    comment.add_argument("--verdict", choices=get_args(Verdict))
+    comment.add_argument("--verdict", choices=get_args(Verdict), help="verdict of the expert")
     comment.add_argument("--confidence", type=float, metavar="P", help="0 to 1")
     comment.add_argument("--class", dest="mlo_class", metavar="TEXT", help="class of mine-like object")
-    comment.add_argument("--remark", default="", metavar="TEXT")
+    comment.add_argument("--remark", default="", metavar="TEXT", help="free text")
     comment.set_defaults(run=run_comment)
     for name in RENAMED_ACTIONS:
         # No argument can start with this prefix: every former option is accepted, and the action is refused.

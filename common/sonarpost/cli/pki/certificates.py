@@ -28,14 +28,14 @@ def add_actions(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     renew = actions.add_parser(
         "renew", allow_abbrev=False, help="issue a new key and certificate under the platform's present name"
     )
-    renew.add_argument("platform")
+    renew.add_argument("platform", help="name of the platform")
     _add_making(renew)
     renew.set_defaults(run=run_renew)
 
     revoke = actions.add_parser(
         "revoke", allow_abbrev=False, help="take a platform's name off the routers' lists for good"
     )
-    revoke.add_argument("platform")
+    revoke.add_argument("platform", help="name of the platform")
     revoke.add_argument("--reason", default="", help="for the list")
     common.add_folder(revoke)
     revoke.set_defaults(run=run_revoke)

@@ -17,7 +17,9 @@ from mkdocs.utils import get_relative_url
 sys.path.insert(0, str(Path(__file__).parent))
 import reference
 
-_log = logging.getLogger("mkdocs.hooks.site")
+from sonarpost.config import SERVICES
+
+_log = logging.getLogger("mkdocs.hooks.pages")
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -30,7 +32,7 @@ REPOSITORY_PAGES: Mapping[str, str] = {
     "examples/README.md": "how-to/subscriber.md",
     "research/README.md": "research/index.md",
     "research/training/emb/README.md": "research/training-emb.md",
-    **{f"services/{name}/README.md": f"reference/services/{name}.md" for name in reference.SERVICES},
+    **{f"services/{name}/README.md": f"reference/services/{name}.md" for name in SERVICES},
 }
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s#]*)(#[^)\s]*)?\)")
 _CODE = re.compile(r"(^```.*?^```$|^    .*?$)", re.MULTILINE | re.DOTALL)

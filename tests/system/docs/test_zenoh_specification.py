@@ -1,0 +1,326 @@
+"""The examples of docs/specifications/zenoh.md: bytes, programs and observable delivery."""
+
+from __future__ import annotations
+
+import hashlib
+import queue
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import zenoh
+from builders.common import REPOSITORY, eventually
+from builders.record_samples import SAMPLES
+
+from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.delivery import protocol
+from sonarpost.delivery import scheduler as schedule
+from sonarpost.delivery.protocol import AckReply, attachment
+from sonarpost.delivery.records import OutboxItem
+from sonarpost.messages import Contact, Decision, Record, Snippet
+from sonarpost.runtime.service import Service, UnitOfWork
+
+PlatformMaker = Callable[[str], PlatformConfig]
+TEXT = (REPOSITORY / "docs" / "specifications" / "zenoh.md").read_text(encoding="utf-8")
+
+
+def test_limits_of_the_wire_format() -> None:
+    assert protocol.CHUNK_BYTES == 32_768
+    assert protocol.MAX_RECORD_BYTES == 8_388_608
+    assert protocol.MAX_BATCH_RECORDS == 128
+    assert wire.MAX_PAYLOAD_BYTES == 41_943_040
+
+
+def test_example_of_an_error_message() -> None:
+    snippet = SAMPLES["snippet-without-wide"].model_dump()
+    snippet["contact"]["lat_deg"] = 91.0
+    with pytest.raises(wire.PayloadError) as caught:
+        wire.decode(
+            Snippet, msgpack.packb({"type": "snippet", "v": 1} | snippet), "sonarpost/v1/uuv-1/contact/detected"
+        )
+    assert f"    {caught.value}\n" in TEXT
+
+
+def blocks(language: str) -> dict[str, str]:
+    return dict(re.findall(rf'^```{language} title="(\w+)"\n(.*?)^```$', TEXT, re.MULTILINE | re.DOTALL))
+
+
+def hex_block(name: str) -> bytes:
+    return bytes.fromhex("".join(line.split("#")[0] for line in blocks("hex")[name].splitlines()))
+
+
+def test_hex_examples_equal_the_encoded_records() -> None:
+    decision = wire.encode(SAMPLES["decision-bare"])
+    item = OutboxItem("relay", 1, "k", "", 4, decision, hashlib.sha256(decision).digest())
+    assert {name: hex_block(name) for name in blocks("hex")} == {
+        "raster": wire.encode(SAMPLES["raster-16-bits"]),
+        "decision": decision,
+        "attachment": attachment(bytes(range(16)), item),
+        "reply": AckReply("stored").pack(protocol.MAX_BATCH_RECORDS),
+        "more": AckReply("more", 32768).pack(protocol.MAX_BATCH_RECORDS),
+    }
+    assert f"A decision, {len(decision)} bytes:" in TEXT
+    assert f"with those {len(decision)} bytes" in TEXT
+
+
+@pytest.mark.parametrize("name", blocks("hex"))
+def test_comments_of_hex_examples_equal_the_decoded_fields(name: str) -> None:
+    """Every line after the first has one field, and its name and value as a comment."""
+    first, *lines = blocks("hex")[name].splitlines()
+    assert first.endswith(f"# map of {len(lines)}")
+    for line in lines:
+        comment = line.split("# ")[1]
+        (field, value), *_ = msgpack.unpackb(b"\x81" + bytes.fromhex(line.split("#")[0])).items()
+        if isinstance(value, bytes):
+            assert comment == f"{field}: {len(value)} bytes"
+        else:
+            shown = "nil" if value is None else f'"{value}"' if isinstance(value, str) else str(value)
+            assert comment == f"{field}: {shown}"
+
+
+class RecordingConsumer(Service[ServiceConfig]):
+    """Stores every record that it consumes."""
+
+    key = keys.contact_detected("uuv-1")
+    record_type: type[Record] = Snippet
+    NAME = "compressor"
+
+    def __init__(self, platform: PlatformConfig) -> None:
+        super().__init__(platform, ServiceConfig())
+        self.received: list[Any] = []
+
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
+        return {self.key: self.record_type}
+
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+        self.received.append(record)
+
+
+class DecisionConsumer(RecordingConsumer):
+    key = keys.contact_decision("vessel-1")
+    record_type = Decision
+    NAME = "relay"
+
+
+class Program:
+    """A program of the page, run as a process that cannot import sonarpost."""
+
+    def __init__(self, tmp_path: Path, name: str, *arguments: str) -> None:
+        path = tmp_path / f"{name}.py"
+        path.write_text("import sys\nsys.modules['sonarpost'] = None\n" + blocks("python")[name], encoding="utf-8")
+        self.process = subprocess.Popen(
+            [sys.executable, str(path), *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        self.lines: queue.Queue[str] = queue.Queue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.put(line.strip())
+
+    def wait(self) -> None:
+        assert self.process.wait(timeout=20) == 0, self.process.stderr and self.process.stderr.read()
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        for stream in (self.process.stdout, self.process.stderr):
+            assert stream is not None
+            stream.close()
+
+
+Run = Callable[..., Program]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[Run]:
+    programs: list[Program] = []
+
+    def start(name: str, *arguments: str) -> Program:
+        programs.append(Program(tmp_path, name, *arguments))
+        return programs[-1]
+
+    yield start
+    for program in programs:
+        program.close()
+
+
+def test_published_contact_reaches_consumer_and_watcher(run: Run, router: str, platform: PlatformMaker) -> None:
+    consumer = RecordingConsumer(platform("uuv-1"))
+    consumer.start()
+    try:
+        watching = run("watch", router)
+        while not watching.lines.get(timeout=15).startswith("sonarpost/v1/uuv-1/health/compressor health"):
+            pass
+        run("publish", router).wait()
+        eventually(lambda: len(consumer.received) == 1)
+        line = ""
+        while not line.startswith(keys.contact_detected("uuv-1")):
+            line = watching.lines.get(timeout=15)
+        assert line.split() == [keys.contact_detected("uuv-1"), "snippet"]
+    finally:
+        consumer.stop()
+    snippet = consumer.received[0]
+    assert snippet.contact == Contact(
+        contact_id="my-detector-1",
+        vehicle_id="uuv-1",
+        time_utc_s=snippet.contact.time_utc_s,
+        lat_deg=41.5251,
+        lon_deg=-70.6712,
+        atd_confidence=1.5,
+    )
+    assert snippet.picture.to_array()[5].tolist() == list(range(0, 192, 2))
+
+
+def test_delivery_program_waits_for_its_consumer(
+    run: Run, router: str, platform: PlatformMaker, tmp_path: Path
+) -> None:
+    (tmp_path / "record").write_bytes(hex_block("decision"))
+    program = run("handover", router, DecisionConsumer.key, "relay", str(tmp_path / "record"))
+    with pytest.raises(queue.Empty):
+        program.lines.get(timeout=0.5)
+    consumer = DecisionConsumer(platform("vessel-1"))
+    consumer.start()
+    try:
+        program.wait()
+        assert program.lines.get(timeout=5) == "stored"
+        eventually(lambda: consumer.received == [SAMPLES["decision-bare"]])
+    finally:
+        consumer.stop()
+
+
+def test_delivery_program_sends_pieces_and_reports_a_refusal(
+    run: Run, router: str, platform: PlatformMaker, tmp_path: Path
+) -> None:
+    """100 kB that are not a snippet: the consumer refuses them after the last piece."""
+    (tmp_path / "record").write_bytes(msgpack.packb({"type": "snippet", "v": 1, "filler": b"x" * 100_000}))
+    consumer = RecordingConsumer(platform("uuv-1"))
+    consumer.start()
+    try:
+        program = run("handover", router, RecordingConsumer.key, "compressor", str(tmp_path / "record"))
+        program.wait()
+        assert (
+            program.lines.get(timeout=5) == f"refused {RecordingConsumer.key}: contact: got 'nothing', expected a value"
+        )
+        assert consumer.store.refused_count() == 1
+    finally:
+        consumer.stop()
+    assert consumer.received == []
+
+
+class Producer(Service[ServiceConfig]):
+    NAME = "decider"
+
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+        raise AssertionError("consumes nothing")
+
+
+def queue_decision(producer: Producer, consumer: str, number: int) -> None:
+    effects = UnitOfWork()
+    fields = SAMPLES["decision-bare"].model_dump() | {"decision_id": f"d{number}"}
+    effects.send(DecisionConsumer.key, consumer, Decision(**fields))
+    producer.commit(effects)
+
+
+def test_watcher_receives_the_probe_window_until_the_consumer_answers(
+    client: zenoh.Session, platform: PlatformMaker
+) -> None:
+    seen: list[dict[str, Any]] = []
+    client.declare_subscriber(DecisionConsumer.key, lambda s: seen.append(msgpack.unpackb(s.attachment.to_bytes())))
+    producer = Producer(platform("vessel-1"), ServiceConfig())
+    for number in range(20):
+        queue_decision(producer, "relay", number)
+    producer.start()
+    consumer = DecisionConsumer(platform("vessel-1"))
+    try:
+        eventually(lambda: len(seen) == schedule.PROBE_WINDOW)
+        consumer.start()
+        eventually(lambda: len(seen) == 20)
+        eventually(lambda: producer.store.outbox_depth() == 0)
+        assert sorted(fields["seq"] for fields in seen) == list(range(1, 21))
+    finally:
+        producer.stop()
+        consumer.stop()
+
+
+def test_record_for_two_consumers_is_published_with_both_sequence_numbers(
+    client: zenoh.Session, platform: PlatformMaker
+) -> None:
+    seen: list[tuple[str, int, str]] = []
+
+    def show(sample: zenoh.Sample) -> None:
+        fields = msgpack.unpackb(sample.attachment.to_bytes())  # type: ignore[union-attr]
+        seen.append((fields["consumer"], fields["seq"], msgpack.unpackb(sample.payload.to_bytes())["decision_id"]))
+
+    client.declare_subscriber(DecisionConsumer.key, show)
+    producer = Producer(platform("vessel-1"), ServiceConfig())
+    queue_decision(producer, "op_modem", 1)
+    queue_decision(producer, "relay", 2)
+    queue_decision(producer, "op_modem", 2)
+    producer.start()
+    try:
+        eventually(lambda: len(seen) == 3)
+        assert sorted(seen) == [("op_modem", 1, "d1"), ("op_modem", 2, "d2"), ("relay", 1, "d2")]
+    finally:
+        producer.stop()
+
+
+def test_consumer_ignores_publications_with_an_attachment(client: zenoh.Session, platform: PlatformMaker) -> None:
+    consumer = DecisionConsumer(platform("vessel-1"))
+    consumer.start()
+    try:
+        publisher = client.declare_publisher(DecisionConsumer.key)
+        eventually(lambda: publisher.matching_status.matching)
+        publisher.put(b"rubbish", attachment=b"anything")
+        publisher.put(hex_block("decision"), attachment=hex_block("attachment"))
+        publisher.delete()
+        publisher.put(hex_block("decision"))
+        eventually(lambda: len(consumer.received) == 1)
+        assert consumer.store.refused_count() == 0
+    finally:
+        consumer.stop()
+
+
+def test_service_answers_the_example_query_with_the_example_reply(
+    client: zenoh.Session, platform: PlatformMaker
+) -> None:
+    consumer = DecisionConsumer(platform("vessel-1"))
+    consumer.start()
+    selector = "sonarpost/v1/vessel-1/contact/decision/handoff/relay"
+
+    def ask(payload: bytes, attached: bytes | None) -> bytes:
+        replies = client.get(selector, payload=payload, attachment=attached, timeout=5)
+        received = replies.recv()
+        assert received.ok is not None
+        assert str(received.ok.key_expr) == selector
+        return received.ok.payload.to_bytes()
+
+    try:
+        querier = client.declare_querier(selector)
+        eventually(lambda: querier.matching_status.matching)
+        assert ask(hex_block("decision"), hex_block("attachment")) == hex_block("reply")
+        assert ask(hex_block("decision"), hex_block("attachment")) == hex_block("reply")
+        eventually(lambda: len(consumer.received) == 1)
+        # Refused for its content: a repeated query does not refuse it a second time.
+        bad = msgpack.packb({"type": "decision", "v": 9})
+        item = OutboxItem("relay", 2, "k", "", 4, bad, hashlib.sha256(bad).digest())
+        first, again = (AckReply.unpack(ask(bad, attachment(bytes(range(16)), item)), "k") for _ in range(2))
+        assert first == AckReply("refused", reason=f"{DecisionConsumer.key}: v: got 9, expected 1")
+        assert again.status == "refused"
+        assert "refused before" in again.reason
+        assert consumer.store.refused_count() == 1
+        # Refused for its attachment: without origin and number it is not stored.
+        refused = AckReply.unpack(ask(hex_block("decision"), None), "k")
+        assert refused.status == "refused"
+        assert f"{selector}: payload: got b''" in refused.reason
+        assert consumer.store.refused_count() == 1
+    finally:
+        consumer.stop()
