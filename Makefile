@@ -2,20 +2,27 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+RUN_TIME := $(VENV)/.run-time
 STAMP := $(VENV)/.ready
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .PHONY: setup demo test test-long check docs docs-serve fmt lock clean images test-compose screenshots
 
 setup: $(STAMP)
 
-# Exactly the locked versions, then the project itself, editable, without asking any index again.
-$(STAMP): requirements.lock pyproject.toml
+# The locked versions of what sonarpost needs at run time, then sonarpost itself, editable. `make demo` needs no more.
+$(RUN_TIME): requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	$(PIP) install -r requirements.lock
+	$(PIP) install --no-deps --no-build-isolation -e .
 	touch $@
 
-demo: setup
+# The tools for tests, checks and documentation.
+$(STAMP): $(RUN_TIME) requirements-dev.lock
+	$(PIP) install -r requirements.lock -r requirements-dev.lock
+	touch $@
+
+demo: $(RUN_TIME)
 	$(BIN)/sonarpost demo $(ARGS)
 
 # Two at a time, a file's tests together and those of real processes one after the other (tests/conftest.py).
@@ -58,11 +65,14 @@ fmt: setup
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-# Resolve the dependencies of pyproject.toml anew and write the exact versions down.
+# Resolve the dependencies of pyproject.toml again and write down the exact versions: those of the run time with the
+# build tools of an editable installation, then those that tests, checks and documentation need besides.
 lock:
 	rm -rf build/lock && $(PYTHON) -m venv build/lock
-	build/lock/bin/python -m pip install --quiet --disable-pip-version-check '.[dev,docs]'
+	build/lock/bin/python -m pip install --quiet --disable-pip-version-check . build editables hatchling
 	build/lock/bin/python -m pip freeze --exclude sonarpost > requirements.lock
+	build/lock/bin/python -m pip install --quiet --disable-pip-version-check -c requirements.lock '.[dev,docs]'
+	build/lock/bin/python -m pip freeze --exclude sonarpost | grep -vxFf requirements.lock > requirements-dev.lock
 
 clean:
 	rm -rf $(VENV) build dist demo-out .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

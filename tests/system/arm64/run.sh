@@ -41,19 +41,19 @@ fi
 # What the tests of codecs import: the locked versions.
 names='numpy|scipy|numba|llvmlite|pillow|pillow-jxl-plugin|pydantic|pydantic_core|annotated-types|typing-inspection'
 names+='|typing_extensions|msgpack|tifffile|pytest|pytest-timeout|iniconfig|pluggy|packaging|pygments|hypothesis|sortedcontainers'
-if ! grep -iE "^($names)==" requirements.lock | cmp -s - "$work/site/.wanted"; then
+if ! grep -ihE "^($names)==" requirements.lock requirements-dev.lock | cmp -s - "$work/site/.wanted"; then
     rm -rf "$work/site"
     platforms=()
     for glibc in 2_36 2_34 2_31 2_28 2_27 2_26 2_24 2_17; do
         platforms+=(--platform "manylinux_${glibc}_aarch64")
     done
-    grep -iE "^($names)==" requirements.lock > "$work/wanted"
+    grep -ihE "^($names)==" requirements.lock requirements-dev.lock > "$work/wanted"
     "${pip[@]}" install --quiet --disable-pip-version-check --target "$work/site" --no-deps --only-binary=:all: \
         "${platforms[@]}" --platform manylinux2014_aarch64 --implementation cp --python-version "$version" -r "$work/wanted"
     mv "$work/wanted" "$work/site/.wanted"
 fi
 
-export PYTHONPATH=$work/site:$PWD/common NUMBA_CACHE_DIR=$work/numba PYTHONDONTWRITEBYTECODE=1
+export PYTHONPATH=$work/site:$PWD/common:$PWD/tests NUMBA_CACHE_DIR=$work/numba PYTHONDONTWRITEBYTECODE=1
 export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 python=("$qemu" -L "$work/root" "$work/root/usr/bin/$python_package")
 "${python[@]}" -c 'import platform, sys; print(platform.machine(), sys.version); sys.exit(platform.machine() != "aarch64")'
