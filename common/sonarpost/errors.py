@@ -72,6 +72,10 @@ class PortError(SonarpostError):
     """A serial port or socket cannot be opened, or was lost."""
 
 
+class TransmissionError(SonarpostError):
+    """A modem did not transmit a packet."""
+
+
 class DeliveryError(SonarpostError):
     """A record cannot be stored or delivered, for example because of a full disk or a damaged database."""
 

@@ -29,7 +29,7 @@ from sonarpost.modem.micromodem import (
     nmea,
 )
 from sonarpost.runtime.modem_runner import ModemRunner
-from sonarpost.runtime.serial_port import SerialLink
+from sonarpost.runtime.serial_port import SerialPort
 from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
 
@@ -37,11 +37,11 @@ CONFIG = MicroModemConfig(address=3, settings=())
 
 
 class PtyModem:
-    """A modem on a pseudo-terminal that answers at once; the water takes no time."""
+    """A modem on a pseudo-terminal that replies at once and transmits in no time."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.answers = True
+        self.replies = True
         self.commands: list[nmea.Sentence] = []
         self.plug()
 
@@ -61,7 +61,7 @@ class PtyModem:
             os.close(self.master)
             self._thread.join(5.0)
 
-    def say(self, kind: str, *fields: str | int) -> None:
+    def write(self, kind: str, *fields: str | int) -> None:
         os.write(self.master, nmea.format(kind, *fields))
 
     def _serve(self, master: int) -> None:
@@ -74,39 +74,39 @@ class PtyModem:
                 time.sleep(0.002)
                 continue
             except OSError:
-                # Nobody has the other side open, or the cable is out.
+                # The other side is not open, or unplugged.
                 time.sleep(0.002)
                 continue
             for sentence in items:
                 assert isinstance(sentence, nmea.Sentence)
                 self.commands.append(sentence)
-                if self.answers:
-                    self._answer(*([sentence.kind, *sentence.fields]))
+                if self.replies:
+                    self._reply(*([sentence.kind, *sentence.fields]))
 
-    def _answer(self, kind: str, *fields: str) -> None:
+    def _reply(self, kind: str, *fields: str) -> None:
         if kind == "CCCFG":
-            self.say("CACFG", *fields)
+            self.write("CACFG", *fields)
         elif kind == "CCCFQ":
-            self.say("CACFG", fields[0], {"SRC": 3, "CST": 1}[fields[0]])
+            self.write("CACFG", fields[0], {"SRC": 3, "CST": 1}[fields[0]])
         elif kind == "CCCLK":
-            self.say("CACLK", *fields)
+            self.write("CACLK", *fields)
         elif kind == "CCCYC":
-            self.say("CACYC", *fields)
-            self.say("CADRQ", "000000", *fields[1:3], fields[4], 256, 1)
+            self.write("CACYC", *fields)
+            self.write("CADRQ", "000000", *fields[1:3], fields[4], 256, 1)
         elif kind == "CCTXD":
             size = len(fields[3]) // 2
-            self.say("CATXD", *fields[:3], size)
-            self.say("CATXP", size)
-            self.say("CATXF", size)
-            self.say("CAXST", 7, "20250606", "230117.336548")
+            self.write("CATXD", *fields[:3], size)
+            self.write("CATXP", size)
+            self.write("CATXF", size)
+            self.write("CAXST", 7, "20250606", "230117.336548")
 
 
 class Rig:
     def __init__(self, modem: PtyModem) -> None:
         self.modem = modem
         self.events: list[ModemEvent] = []
-        self.link = SerialLink(str(modem.path), first_retry_s=0.02, longest_retry_s=0.1)
-        self.runner = ModemRunner(MicroModem(CONFIG), self.link, self.events.append)
+        self.port = SerialPort(str(modem.path), first_retry_s=0.02, max_retry_s=0.1)
+        self.runner = ModemRunner(MicroModem(CONFIG), self.port, self.events.append)
 
     def of(self, *kinds: type) -> list[ModemEvent]:
         return [event for event in self.events if isinstance(event, kinds)]
@@ -115,7 +115,7 @@ class Rig:
 def eventually(condition: Callable[[], object], timeout_s: float = 10.0) -> None:
     end_s = time.monotonic() + timeout_s
     while not condition():
-        assert time.monotonic() < end_s, "did not come true in time"
+        assert time.monotonic() < end_s, "condition not met in time"
         time.sleep(0.005)
 
 
@@ -129,7 +129,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     modem.unplug()
 
 
-def test_configures_sends_and_receives(rig: Rig) -> None:
+def test_the_runner_configures_sends_and_receives(rig: Rig) -> None:
     eventually(lambda: rig.runner.ready)
     assert rig.events == [ModemReady(3, None)]
     packet_id = rig.runner.send_packet(1, 4, [b"snippet"])
@@ -138,26 +138,26 @@ def test_configures_sends_and_receives(rig: Rig) -> None:
     assert (sent.packet_id, sent.frames) == (packet_id, (b"snippet",))
     assert rig.modem.commands[-1].fields == ("3", "1", "0", b"snippet".hex().upper())
     assert rig.runner.queued == 0
-    rig.modem.say("CARXP", 1)
-    rig.modem.say("CARXD", 1, 3, 0, 1, "00FF")
-    rig.modem.say("CACST", 8, 0)
+    rig.modem.write("CARXP", 1)
+    rig.modem.write("CARXD", 1, 3, 0, 1, "00FF")
+    rig.modem.write("CACST", 8, 0)
     eventually(lambda: rig.of(PacketReceived))
     assert [event.data for event in rig.of(FrameReceived)] == [b"\x00\xff"]
 
 
-def test_clock_is_set_through_the_runner(rig: Rig) -> None:
+def test_the_clock_is_set_through_the_runner(rig: Rig) -> None:
     eventually(lambda: rig.runner.ready)
     utc = datetime(2016, 10, 12, 9, 0, 5, tzinfo=UTC)
     assert rig.runner.set_clock(utc)
     eventually(lambda: rig.of(ClockConfirmed))
 
 
-def test_wrong_packet_is_refused_in_the_caller(rig: Rig) -> None:
+def test_an_invalid_packet_raises_in_the_caller(rig: Rig) -> None:
     with pytest.raises(FrameError):
         rig.runner.send_packet(1, 9, [b"x"])
 
 
-def test_packets_from_many_threads_all_go(rig: Rig) -> None:
+def test_packets_of_several_threads_are_all_sent(rig: Rig) -> None:
     eventually(lambda: rig.runner.ready)
     ids: list[int] = []
 
@@ -177,9 +177,9 @@ def test_packets_from_many_threads_all_go(rig: Rig) -> None:
     assert len(set(ids)) == 16
 
 
-def test_unplugged_in_the_middle_of_a_cycle_and_plugged_in_again(rig: Rig) -> None:
+def test_a_port_lost_during_a_cycle_is_opened_again(rig: Rig) -> None:
     eventually(lambda: rig.runner.ready)
-    rig.modem.answers = False
+    rig.modem.replies = False
     first, second = rig.runner.send_packet(1, 4, [b"first"]), rig.runner.send_packet(1, 4, [b"second"])
     eventually(lambda: any(s.kind == "CCCYC" for s in rig.modem.commands))
     rig.modem.unplug()
@@ -187,19 +187,19 @@ def test_unplugged_in_the_middle_of_a_cycle_and_plugged_in_again(rig: Rig) -> No
     (failed,) = rig.of(PacketFailed)
     assert (failed.packet_id, failed.reason) == (first, FailureReason.PORT_LOST)
     assert not rig.runner.ready
-    rig.modem.answers = True
+    rig.modem.replies = True
     rig.modem.plug()
     eventually(lambda: rig.of(PacketSent))
     assert [event.packet_id for event in rig.of(PacketSent)] == [second]
     assert len(rig.of(ModemReady)) == 2
 
 
-def test_callback_may_send_and_may_fail(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_callback_may_send_and_may_raise(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     modem = PtyModem(tmp_path / "ttyMODEM")
     sent: list[int] = []
 
     def fail() -> None:
-        raise RuntimeError("a careless consumer")
+        raise RuntimeError("defect of a consumer")
 
     def on_event(event: ModemEvent) -> None:
         if isinstance(event, ModemReady):
@@ -208,29 +208,29 @@ def test_callback_may_send_and_may_fail(tmp_path: Path, caplog: pytest.LogCaptur
         if isinstance(event, PacketSent):
             sent.append(event.packet_id)
 
-    runner = ModemRunner(MicroModem(CONFIG), SerialLink(str(modem.path)), on_event)
+    runner = ModemRunner(MicroModem(CONFIG), SerialPort(str(modem.path)), on_event)
     with caplog.at_level(logging.ERROR):
         runner.start()
         eventually(lambda: sent)
     runner.stop()
     modem.unplug()
     (record,) = caplog.records
-    assert "ModemReady was not handled" in record.getMessage()
+    assert (record.getMessage(), record.fields["event"]) == ("Modem event not handled", "ModemReady")
 
 
-def test_stop_is_quick_and_tells_what_did_not_go(tmp_path: Path) -> None:
+def test_stop_returns_at_once_and_reports_the_packet_that_failed(tmp_path: Path) -> None:
     modem = PtyModem(tmp_path / "ttyMODEM")
     rig = Rig(modem)
     rig.runner.start()
     with pytest.raises(PortError, match="already started"):
         rig.runner.start()
     eventually(lambda: rig.runner.ready)
-    modem.answers = False
+    modem.replies = False
     packet_id = rig.runner.send_packet(1, 4, [b"x"])
     eventually(lambda: any(s.kind == "CCCYC" for s in modem.commands))
-    begun_s = time.monotonic()
+    start_s = time.monotonic()
     rig.runner.stop()
-    assert time.monotonic() - begun_s < 2.0
+    assert time.monotonic() - start_s < 2.0
     assert [(event.packet_id, event.reason) for event in rig.of(PacketFailed)] == [(packet_id, FailureReason.PORT_LOST)]
     assert not any(thread.name.endswith("ttyMODEM") for thread in threading.enumerate())
     rig.runner.stop()
@@ -238,16 +238,16 @@ def test_stop_is_quick_and_tells_what_did_not_go(tmp_path: Path) -> None:
 
 
 def test_timers_run_without_a_byte_from_the_port(tmp_path: Path) -> None:
-    """A clock that runs fifty times faster: the silent modem is asked again and again."""
+    """With a clock fifty times faster, a command without a reply is repeated."""
     modem = PtyModem(tmp_path / "ttyMODEM")
-    modem.answers = False
+    modem.replies = False
     events: list[ModemEvent] = []
     runner = ModemRunner(
         MicroModem(CONFIG),
-        SerialLink(str(modem.path)),
+        SerialPort(str(modem.path)),
         events.append,
         clock=lambda: 50.0 * time.monotonic(),
-        longest_wait_s=0.02,
+        max_wait_s=0.02,
     )
     runner.start()
     eventually(lambda: events)
@@ -257,14 +257,14 @@ def test_timers_run_without_a_byte_from_the_port(tmp_path: Path) -> None:
     assert events[0].attempts == 3
 
 
-def test_two_runners_ping_poll_and_exchange_small_things(tmp_path: Path) -> None:
+def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path: Path) -> None:
     sites = (ModemSite(1), ModemSite(2, LocalPosition(150.0)))
     channel = ChannelEmulator(EmulatorConfig(sites, pty_dir=tmp_path / "modems", time_scale=50.0))
     channel.start()
     events: dict[int, list[ModemEvent]] = {1: [], 2: []}
     runners = {
         device.address: ModemRunner(
-            MicroModem(MicroModemConfig(device.address)), SerialLink(device.device), events[device.address].append
+            MicroModem(MicroModemConfig(device.address)), SerialPort(device.device), events[device.address].append
         )
         for device in channel.devices()
     }
@@ -273,14 +273,14 @@ def test_two_runners_ping_poll_and_exchange_small_things(tmp_path: Path) -> None
             runner.start()
         runners[2].set_poll_handler(lambda polled: [b"polled"])
         eventually(lambda: all(runner.ready for runner in runners.values()))
-        asked = [
+        requests = [
             runners[1].ping(2),
             runners[1].send_mini(2, 0x123),
             runners[1].send_flexible(2, 1, b"flexible"),
             runners[1].request_packet(2, 1),
         ]
-        eventually(lambda: len([e for e in events[1] if isinstance(e, RequestDone)]) == len(asked), 20.0)
-        assert [e.request_id for e in events[1] if isinstance(e, RequestDone)] == asked
+        eventually(lambda: len([e for e in events[1] if isinstance(e, RequestDone)]) == len(requests), 20.0)
+        assert [e.request_id for e in events[1] if isinstance(e, RequestDone)] == requests
         assert [e.travel_s for e in events[1] if isinstance(e, PingAnswered)] == [0.1]
         assert [e.data for e in events[1] if isinstance(e, FrameReceived)] == [b"polled"]
         assert [e.bits for e in events[2] if isinstance(e, MiniPacketReceived)] == [0x123]

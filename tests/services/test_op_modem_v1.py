@@ -24,7 +24,7 @@ from sonarpost.link.sender import LinkSender
 from sonarpost.messages import AcousticFrame, Command, Decision, DownlinkState, ReceivedMessage
 from sonarpost.modem.micromodem import FrameReceived, MicroModem, MicroModemConfig, PacketReceived
 from sonarpost.runtime.modem_runner import ModemRunner
-from sonarpost.runtime.serial_port import SerialLink
+from sonarpost.runtime.serial_port import SerialPort
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService
@@ -108,7 +108,7 @@ class Vehicle:
             seal.grant(10_000)
         self.receiver = LinkReceiver(seal=seal)
         self.sender = LinkSender(SenderConfig(frame_bytes=64, channels=(LossChannel(0.1),), feedback=True), seal=seal)
-        link = SerialLink(port, 19200)
+        link = SerialPort(port, 19200)
         self.modem = ModemRunner(MicroModem(MicroModemConfig(3), port), link, self.on_event)
 
     def on_event(self, event):

@@ -1,4 +1,4 @@
-"""Joins the pure driver, the port and the clock: one thread in which everything that concerns the modem happens."""
+"""Thread that connects the sans-I/O modem driver with its serial port and a clock."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from collections.abc import Callable, Sequence
 from datetime import datetime
 
 from sonarpost.errors import PortError
+from sonarpost.logs import kv
 from sonarpost.modem.micromodem import MicroModem, ModemEvent, PollReceived
-from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialLink
+from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialPort
 
 log = logging.getLogger(__name__)
 
@@ -19,31 +20,31 @@ _STOP_S = 1.0
 
 
 class ModemRunner:
-    """Feeds bytes to the driver, polls its timers and writes what it wants to send.
+    """Passes received bytes to the driver, polls its timers and writes its output to the port.
 
     Args:
-        driver: Used by nobody else from now on.
-        link: Not started yet.
-        on_event: Called with each event, in order, in the runner's thread and without a lock: it may call
-            `send_packet`. An exception from it is logged and costs that event only.
-        clock: Seconds, monotonic.
-        longest_wait_s: The timers are looked at this often even if none is due, for clocks that run fast.
+        driver: The driver; used only by this runner from now on.
+        port: The port, not started.
+        on_event: Called with each event, in order, in the runner's thread and without a lock, so it may call
+            `send_packet`. An exception from it is logged and loses that event only.
+        clock: Monotonic time in seconds.
+        max_wait_s: Maximum time between two polls of the timers, for clocks that run fast.
     """
 
     def __init__(
         self,
         driver: MicroModem,
-        link: SerialLink,
+        port: SerialPort,
         on_event: Callable[[ModemEvent], None],
         clock: Callable[[], float] = time.monotonic,
         *,
-        longest_wait_s: float = 0.25,
+        max_wait_s: float = 0.25,
     ) -> None:
         self._driver = driver
-        self._link = link
+        self._port = port
         self._on_event = on_event
         self._clock = clock
-        self._longest_wait_s = longest_wait_s
+        self._max_wait_s = max_wait_s
         self._lock = threading.Lock()
         self._inputs: queue.SimpleQueue[PortEvent | None] = queue.SimpleQueue()
         self._stopping = threading.Event()
@@ -57,35 +58,36 @@ class ModemRunner:
 
     @property
     def queued(self) -> int:
-        """How many packets wait or are on their way."""
+        """Number of packets that wait or are being transmitted."""
         with self._lock:
             return self._driver.queued
 
     @property
     def receiving(self) -> bool:
-        """Whether a packet is arriving, as far as the driver knows."""
+        """Whether a packet is being received."""
         with self._lock:
             return self._driver.receiving
 
     def start(self) -> None:
-        """Open the port and begin; returns at once.
+        """Start the thread and open the port; returns at once.
 
         Raises:
-            PortError: Started already.
+            PortError: Already started.
         """
         if self._thread is not None:
-            raise PortError(f"{self._link.url}: the runner is already started")
+            raise PortError(f"{self._port.url}: the runner is already started")
         self._stopping.clear()
-        self._thread = threading.Thread(target=self._run, name=f"modem {self._link.url}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"modem {self._port.url}", daemon=True)
         self._thread.start()
-        self._link.start(self._inputs.put)
+        self._port.start(self._inputs.put)
 
     def stop(self) -> None:
         """Close the port and end the thread.
 
-        A packet on its way is reported as failed before this returns; those that wait go after the next `start`.
+        A packet that is being transmitted is reported as failed before this returns. Packets that wait are sent after
+        the next `start`.
         """
-        self._link.close()
+        self._port.close()
         self._stopping.set()
         self._inputs.put(None)
         thread, self._thread = self._thread, None
@@ -98,7 +100,7 @@ class ModemRunner:
         Raises:
             FrameError: An address, a rate or frames that the modem cannot send.
         """
-        return self._ask(lambda now: self._driver.send_packet(destination, rate, frames, ack=ack, now=now))
+        return self._call(lambda now: self._driver.send_packet(destination, rate, frames, ack=ack, now=now))
 
     def ping(self, destination: int) -> int:
         """Queue a ping, from any thread; see `MicroModem.ping`.
@@ -106,7 +108,7 @@ class ModemRunner:
         Raises:
             FrameError: An address outside 0..127.
         """
-        return self._ask(lambda now: self._driver.ping(destination, now))
+        return self._call(lambda now: self._driver.ping(destination, now))
 
     def send_mini(self, destination: int, bits: int) -> int:
         """Queue a user mini-packet, from any thread; see `MicroModem.send_mini`.
@@ -114,42 +116,42 @@ class ModemRunner:
         Raises:
             FrameError: An address outside 0..127, or more than 13 bits.
         """
-        return self._ask(lambda now: self._driver.send_mini(destination, bits, now))
+        return self._call(lambda now: self._driver.send_mini(destination, bits, now))
 
     def send_flexible(self, destination: int, rate: int, data: bytes) -> int:
         """Queue flexible data, from any thread; see `MicroModem.send_flexible`.
 
         Raises:
-            FrameError: What the modem cannot send.
+            FrameError: Data, an address or a rate that the modem cannot send.
         """
-        return self._ask(lambda now: self._driver.send_flexible(destination, rate, data, now))
+        return self._call(lambda now: self._driver.send_flexible(destination, rate, data, now))
 
     def request_packet(self, source: int, rate: int, frames: int | None = None, *, ack: bool = False) -> int:
         """Queue a poll of another modem, from any thread; see `MicroModem.request_packet`.
 
         Raises:
-            FrameError: What the modem cannot ask for.
+            FrameError: An address, a rate or a number of frames that the modem cannot request.
         """
-        return self._ask(lambda now: self._driver.request_packet(source, rate, frames, ack=ack, now=now))
+        return self._call(lambda now: self._driver.request_packet(source, rate, frames, ack=ack, now=now))
 
     def set_poll_handler(self, uplink: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
-        """Give the function that is asked for frames when another modem polls; see `MicroModem.set_poll_handler`.
+        """Set the function that returns frames when another modem polls; see `MicroModem.set_poll_handler`.
 
-        It is called in the runner's thread and must neither wait nor call the runner.
+        It is called in the runner's thread. It must not block or call the runner.
         """
         with self._lock:
             self._driver.set_poll_handler(uplink)
 
     def set_clock(self, utc: datetime) -> bool:
-        """Set the modem's clock if it is free at this moment, from any thread; see `MicroModem.set_clock`."""
+        """Set the modem's clock if the modem is idle, from any thread; see `MicroModem.set_clock`."""
         with self._lock:
             sent = self._driver.set_clock(utc, self._clock())
         self._inputs.put(None)
         return sent
 
-    def _ask(self, queue_it: Callable[[float], int]) -> int:
+    def _call(self, request: Callable[[float], int]) -> int:
         with self._lock:
-            number = queue_it(self._clock())
+            number = request(self._clock())
         self._inputs.put(None)
         return number
 
@@ -164,7 +166,7 @@ class ModemRunner:
     def _wait(self) -> PortEvent | None:
         with self._lock:
             wakeup_s = self._driver.next_wakeup()
-        wait_s = self._longest_wait_s
+        wait_s = self._max_wait_s
         if wakeup_s is not None:
             wait_s = min(max(0.0, wakeup_s - self._clock()), wait_s)
         try:
@@ -175,14 +177,14 @@ class ModemRunner:
     def _step(self, item: PortEvent | None) -> None:
         with self._lock:
             now = self._clock()
-            events = self._take(item, now)
+            events = self._apply(item, now)
             events += self._driver.poll(now)
             data = self._driver.bytes_to_send()
         if data:
             self._write(data)
         self._deliver(events)
 
-    def _take(self, item: PortEvent | None, now: float) -> list[ModemEvent]:
+    def _apply(self, item: PortEvent | None, now: float) -> list[ModemEvent]:
         if isinstance(item, bytes):
             return self._driver.receive(item, now)
         if isinstance(item, PortOpened):
@@ -193,14 +195,14 @@ class ModemRunner:
 
     def _write(self, data: bytes) -> None:
         try:
-            self._link.write(data)
+            self._port.write(data)
         except PortError as error:
-            # The link tells the loss itself, and the driver's time-outs cover what was not written.
-            log.debug("%s", error)
+            # The port reports the loss as an event, and the driver's time-outs cover the data that was not written.
+            log.debug("Write failed", extra=kv(error=str(error)))
 
     def _deliver(self, events: list[ModemEvent]) -> None:
         for event in events:
             try:
                 self._on_event(event)
             except Exception:
-                log.exception("%s: %s was not handled", self._link.url, type(event).__name__)
+                log.exception("Modem event not handled", extra=kv(port=self._port.url, event=type(event).__name__))

@@ -1,4 +1,4 @@
-"""What the services on both ends of the acoustic link share: a modem on a port, its troubles told in health and log."""
+"""Base class of the services that drive a modem: the port, the driver, and their state in health and log."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from sonarpost.logs import kv
 from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, ModemEvent
 from sonarpost.modem.micromodem import events as ev
 from sonarpost.runtime.modem_runner import ModemRunner
-from sonarpost.runtime.serial_port import SerialLink
+from sonarpost.runtime.serial_port import SerialPort
 from sonarpost.runtime.service import Service
 
 log = logging.getLogger(__name__)
 
 
 class ModemServiceConfig(ServiceConfig):
-    """What every service with a modem configures.
+    """Configuration of a service with a modem.
 
     Attributes:
         port: Any pyserial URL: /dev/ttyUSB0, socket://host:port, rfc2217://host:port.
-        baud: Speed of the serial line.
+        baud: Bit rate of the serial line.
         address: The modem's own address, set at start-up.
-        reply_timeout_s: Wait for the modem's answer to a command before it is sent again.
+        reply_timeout_s: Time to wait for the modem's reply before a command is sent again.
     """
 
     port: Annotated[str, Field(min_length=1)]
@@ -40,23 +40,23 @@ M = TypeVar("M", bound=ModemServiceConfig)
 
 
 class ModemService(Service[M]):
-    """A service that drives a Micro-Modem. Subclasses act on events in `on_modem_event`.
+    """A service that drives a Micro-Modem. Subclasses handle events in `on_modem_event`.
 
     Raises:
-        ConfigError: The port's URL is of no known kind.
+        ConfigError: Unsupported kind of URL.
     """
 
     def __init__(self, platform: PlatformConfig, config: M) -> None:
-        # Before the store is opened: what is wrong with the configuration leaves nothing open behind it.
-        self._link = SerialLink(config.port, config.baud)
+        # Before the store is opened, so that a configuration error leaves no open store.
+        self._port = SerialPort(config.port, config.baud)
         super().__init__(platform, config)
         driver = MicroModem(MicroModemConfig(config.address, reply_timeout_s=config.reply_timeout_s), config.port)
-        self.modem = ModemRunner(driver, self._link, self._on_event)
-        self._modem_problem = f"{config.port}: the modem has not answered yet"
+        self.modem = ModemRunner(driver, self._port, self._on_event)
+        self._modem_error = f"{config.port}: no reply from the modem yet"
 
     @abstractmethod
     def on_modem_event(self, event: ModemEvent) -> None:
-        """Act on an event of the driver; called in the modem's thread."""
+        """Handle an event of the driver; called in the modem's thread."""
 
     def on_start(self) -> None:
         """Open the port."""
@@ -71,19 +71,19 @@ class ModemService(Service[M]):
         return {"modem_ready": float(self.modem.ready)}
 
     def degraded_reason(self) -> str:
-        """Return what is wrong with the port or the modem."""
-        if not self._link.is_open:
-            return f"{self.config.port}: {self._link.problem or 'not open yet'}"
-        return "" if self.modem.ready else self._modem_problem
+        """Return why the port or the modem does not work."""
+        if not self._port.is_open:
+            return f"{self.config.port}: {self._port.error or 'not open yet'}"
+        return "" if self.modem.ready else self._modem_error
 
     def _on_event(self, event: ModemEvent) -> None:
         match event:
             case ev.ModemReady():
                 log.info("Modem ready", extra=kv(port=self.config.port, address=event.address, firmware=event.firmware))
             case ev.ModemUnresponsive():
-                self._modem_problem = f"{self.config.port}: no right answer to {event.waiting_for}"
+                self._modem_error = f"{self.config.port}: no valid reply to {event.waiting_for}"
                 self.count("modem_unresponsive")
-                log.error("Modem does not answer", extra=kv(port=self.config.port, waiting_for=event.waiting_for))
+                log.error("Modem does not reply", extra=kv(port=self.config.port, waiting_for=event.waiting_for))
             case ev.ModemRebooted():
                 self.count("modem_restarts")
                 log.warning("Modem restarted", extra=kv(firmware=event.firmware))

@@ -1,7 +1,7 @@
-"""The only place that touches the modem's port: any pyserial URL, opened again whenever it goes away.
+"""A serial port that is opened again when it is lost; any pyserial URL.
 
-A thread opens the port, reads it and notices when it is gone (an unplugged adapter, a closed pseudo-terminal, a
-TCP connection that ended). What it reads and each change of state is handed to a callback in that thread.
+A thread opens the port, reads it and detects its loss: an unplugged adapter, a closed pseudo-terminal, a closed TCP
+connection. It calls back with the bytes it reads and with each change of state.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import serial
 
 from sonarpost.errors import ConfigError, PortError
+from sonarpost.logs import kv
 
 log = logging.getLogger(__name__)
 
@@ -35,27 +36,27 @@ class PortOpened:
 
 @dataclass(frozen=True, slots=True)
 class PortLost:
-    """The port was open and is gone; it is being opened again."""
+    """The port was open and is lost; it is opened again."""
 
     reason: str
 
 
 PortEvent = PortOpened | PortLost | bytes
-"""What the callback is given: a change of state, or bytes as they came."""
+"""Argument of the callback: a change of state, or received bytes."""
 
 
-class SerialLink:
-    """A serial port, or something that pyserial treats as one, that is opened again and again.
+class SerialPort:
+    """A serial port, or another pyserial URL, that reconnects.
 
     Args:
         url: `/dev/ttyUSB0`, `/dev/pts/3`, `socket://host:port`, `rfc2217://host:port`, `loop://`.
         baud: Bits a second; 8N1 without flow control, as the Micro-Modem is set.
-        first_retry_s: Wait after the first failed attempt to open; it doubles
-        longest_retry_s: up to this.
-        write_timeout_s: A write that the port does not take within this counts as a lost port.
+        first_retry_s: Delay after the first failed attempt to open. It doubles with each attempt.
+        max_retry_s: Maximum delay between attempts.
+        write_timeout_s: A write that takes longer counts as a lost port.
 
     Raises:
-        ConfigError: pyserial does not know this kind of URL.
+        ConfigError: pyserial does not support this kind of URL.
     """
 
     def __init__(
@@ -64,77 +65,77 @@ class SerialLink:
         baud: int = 19200,
         *,
         first_retry_s: float = 0.2,
-        longest_retry_s: float = 5.0,
+        max_retry_s: float = 5.0,
         write_timeout_s: float = 5.0,
     ) -> None:
         self.url = url
         self.baud = baud
         self._first_retry_s = first_retry_s
-        self._longest_retry_s = longest_retry_s
+        self._max_retry_s = max_retry_s
         self._write_timeout_s = write_timeout_s
-        # Held while writing and while closing: a descriptor closed under a writer may be somebody else's next moment.
+        # Held while writing and while closing: a closed descriptor may be reused by another file at once.
         self._in_use = threading.Lock()
         self._port: serial.Serial | None = None
         self._thread: threading.Thread | None = None
         self._closing = threading.Event()
-        self._problem: str | None = None
+        self._error: str | None = None
         self._make_port()
 
     @property
     def is_open(self) -> bool:
-        """Whether the port is open, as far as is known."""
+        """Whether the port is open."""
         return self._port is not None
 
     @property
-    def problem(self) -> str | None:
-        """Why the port is not open, for the health report; None while it is, and before the first attempt."""
-        return self._problem
+    def error(self) -> str | None:
+        """Why the port is not open; None while it is open, and before the first attempt."""
+        return self._error
 
     def start(self, on_event: Callable[[PortEvent], None]) -> None:
-        """Begin to open and read the port; returns at once.
+        """Start to open and read the port; returns at once.
 
         Args:
             on_event: Called from the reading thread, in order.
 
         Raises:
-            PortError: Started already.
+            PortError: Already started.
         """
         if self._thread is not None:
             raise PortError(f"{self.url}: already started")
-        # Each run has its own: a thread that is slow to end must not take a new start for its own.
+        # One event a run: a thread that ends slowly must not react to the event of the next run.
         self._closing = threading.Event()
         arguments = (on_event, self._closing)
         self._thread = threading.Thread(target=self._run, args=arguments, name=f"port {self.url}", daemon=True)
         self._thread.start()
 
     def write(self, data: bytes) -> None:
-        """Write all of `data`; blocks until the port has taken it.
+        """Write all of `data`; blocks until it is written.
 
         Raises:
-            PortError: The port is not open, or is lost over this.
+            PortError: The port is not open, or is lost during the write.
         """
         with self._in_use:
             port = self._port
             if port is None:
-                raise PortError(f"{self.url}: not open ({self._problem or 'not opened yet'})")
+                raise PortError(f"{self.url}: not open ({self._error or 'not opened yet'})")
             try:
                 port.write(data)
             except (serial.SerialException, OSError) as error:
-                # The reading thread sees that the port is no longer the present one, and closes it.
-                self._port, self._problem = None, _why(error)
-                raise PortError(f"{self.url}: cannot be written: {_why(error)}") from error
+                # The reading thread detects the change and closes the port.
+                self._port, self._error = None, _reason(error)
+                raise PortError(f"{self.url}: cannot be written: {_reason(error)}") from error
 
     def close(self) -> None:
         """Close the port and end the thread; returns within a second.
 
-        A thread that hangs in the driver of a broken adapter, or in a connection attempt, ends when that lets it.
+        A thread that is blocked in an adapter's driver or in a connection attempt ends later by itself.
         """
         self._closing.set()
         thread, self._thread = self._thread, None
         if thread is not None and thread is not threading.current_thread():
             thread.join(_CLOSE_S)
             if thread.is_alive():
-                log.warning("%s: port still busy; it closes by itself", self.url)
+                log.warning("Port still busy; it closes later", extra=kv(port=self.url))
 
     def _run(self, on_event: Callable[[PortEvent], None], closing: threading.Event) -> None:
         wait_s = self._first_retry_s
@@ -145,57 +146,57 @@ class SerialLink:
             opened_s = time.monotonic()
             on_event(PortOpened())
             reason = self._read(port, on_event, closing)
-            self._drop(port, reason)
+            self._discard(port, reason)
             if not closing.is_set():
-                log.warning("%s: port lost: %s", self.url, self._problem)
-                on_event(PortLost(self._problem or reason))
-            # A port that opens and is lost at once (a server that is full) is not hammered.
-            lasted = time.monotonic() - opened_s > self._longest_retry_s
-            wait_s = self._first_retry_s if lasted else min(2.0 * wait_s, self._longest_retry_s)
+                log.warning("Port lost", extra=kv(port=self.url, reason=self._error))
+                on_event(PortLost(self._error or reason))
+            # A port that is lost at once after opening (a server without free connections) is retried more slowly.
+            was_stable = time.monotonic() - opened_s > self._max_retry_s
+            wait_s = self._first_retry_s if was_stable else min(2.0 * wait_s, self._max_retry_s)
             closing.wait(wait_s)
 
     def _open(self, closing: threading.Event) -> serial.Serial | None:
-        """Try until the port is open; None when the link is closed before that."""
-        wait_s, told = self._first_retry_s, False
+        """Retry until the port is open; return None if it is closed before."""
+        wait_s, is_logged = self._first_retry_s, False
         while not closing.is_set():
             port = self._make_port()
             try:
                 port.open()
                 if self.url.startswith("socket://"):
-                    _watch_connection(port.fileno())
+                    _enable_keepalive(port.fileno())
             except (serial.SerialException, OSError, ValueError, termios.error) as error:
                 _close_port(port)
-                self._problem = _why(error)
-                if not told:
-                    log.warning("%s: port cannot be opened: %s; trying again", self.url, self._problem)
-                    told = True
+                self._error = _reason(error)
+                if not is_logged:
+                    log.warning("Port cannot be opened; retrying", extra=kv(port=self.url, reason=self._error))
+                    is_logged = True
                 closing.wait(wait_s)
-                wait_s = min(2.0 * wait_s, self._longest_retry_s)
+                wait_s = min(2.0 * wait_s, self._max_retry_s)
                 continue
-            self._port, self._problem = port, None
-            log.info("%s: port open", self.url)
+            self._port, self._error = port, None
+            log.info("Port open", extra=kv(port=self.url))
             return port
         return None
 
     def _read(self, port: serial.Serial, on_event: Callable[[PortEvent], None], closing: threading.Event) -> str:
-        """Hand over bytes until the port is gone; return why."""
+        """Call back with received bytes until the port is lost; return the reason."""
         try:
             descriptor: int | None = port.fileno()
         except (io.UnsupportedOperation, AttributeError):
-            descriptor = None  # loop:// and rfc2217:// have none: pyserial itself waits for their bytes
+            descriptor = None  # loop:// and rfc2217:// have none; pyserial waits for their bytes
         while not closing.is_set() and self._port is port:
             try:
                 data = _read_object(port) if descriptor is None else _read_descriptor(descriptor)
             except (serial.SerialException, OSError, TypeError, ValueError) as error:
-                return _why(error)
+                return _reason(error)
             if data:
                 on_event(data)
         return "closed"
 
-    def _drop(self, port: serial.Serial, reason: str) -> None:
-        """Forget and close the port; the first reason is the one that counts."""
+    def _discard(self, port: serial.Serial, reason: str) -> None:
+        """Close the port and store why; an earlier reason is kept."""
         if self._port is port:
-            self._port, self._problem = None, reason
+            self._port, self._error = None, reason
         cancel_write = getattr(port, "cancel_write", None)
         if cancel_write is not None:
             cancel_write()
@@ -213,18 +214,18 @@ class SerialLink:
 
 
 def _close_port(port: serial.Serial) -> None:
-    # pyserial 3.5 forgets, without closing it, a socket whose shutdown fails because the other end has reset it.
+    # pyserial 3.5 does not close a socket whose shutdown fails because the peer has reset it.
     connection = getattr(port, "_socket", None)
     try:
         port.close()
     except (serial.SerialException, OSError) as error:
-        log.debug("%s: while closing: %s", port.port, error)
+        log.debug("Error while closing", extra=kv(port=port.port, error=str(error)))
     if isinstance(connection, socket.socket):
         connection.close()
 
 
-def _watch_connection(descriptor: int) -> None:
-    """Let the kernel notice a terminal server that has lost its power, which otherwise takes many minutes."""
+def _enable_keepalive(descriptor: int) -> None:
+    """Enable TCP keepalive: without it, the loss of a terminal server is detected only after many minutes."""
     with socket.socket(fileno=os.dup(descriptor)) as connection:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_USER_TIMEOUT", 20_000)):
@@ -233,7 +234,11 @@ def _watch_connection(descriptor: int) -> None:
 
 
 def _read_descriptor(descriptor: int) -> bytes:
-    """Wait a moment for bytes; nothing readable is b"", the end of the stream an OSError."""
+    """Return received bytes, b"" if none arrive within the poll interval.
+
+    Raises:
+        OSError: End of the stream.
+    """
     readable, _, _ = select.select([descriptor], [], [], _POLL_S)
     if not readable:
         return b""
@@ -242,16 +247,16 @@ def _read_descriptor(descriptor: int) -> bytes:
     except BlockingIOError:
         return b""
     if not data:
-        raise OSError("the other end has closed")
+        raise OSError("closed by the other end")
     return data
 
 
 def _read_object(port: serial.Serial) -> bytes:
-    """Wait a moment for a byte, then take what else is there."""
+    """Return received bytes, b"" if none arrive within the poll interval."""
     data = port.read(1)
     waiting = port.in_waiting if data else 0
     return bytes(data + port.read(min(waiting, _READ_BYTES))) if waiting else bytes(data)
 
 
-def _why(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     return str(error) or type(error).__name__
