@@ -63,7 +63,7 @@ def acoustic_rx(platform: str) -> str:
 def acoustic_queue(platform: str) -> str:
     """The state of the vehicle's acoustic transmit queue.
 
-    Record: queue_state. From: uuv_modem. To: watchers. Delivery: plain, priority 5.
+    Record: queue_state. From: uuv_modem. To: atd_stub, watchers. Delivery: plain, priority 5.
     """
     return _of(platform, "acoustic/queue")
 

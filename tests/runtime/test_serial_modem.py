@@ -14,8 +14,7 @@ from sonarpost.errors import ConfigError, FrameError, PortError, TransmissionErr
 from sonarpost.runtime import serial_modem
 from sonarpost.runtime.serial_modem import SerialModem
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.channel.emulator_config import EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
 
 
 @pytest.fixture

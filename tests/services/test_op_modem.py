@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
+
 import pytest
 from builders.common import eventually
 from hypothesis import given, settings
@@ -13,6 +15,7 @@ from sonarpost.modem.micromodem import FrameReceived, LinkStatistics, PacketRece
 from sonarpost.services.op_modem import service as op_modem
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService, quality_of
+from sonarpost.simulation.modem.statistics import PacketType, ReceivedPacket, ReceiveMode, receive_statistics
 
 RX = keys.acoustic_rx("vessel-1")
 
@@ -40,11 +43,21 @@ def packet(*frames, bad=0, nframes=None, rate=1, statistics=None):
 
 
 def sentences(number, data, src=3, dest=1):
-    """A packet of one frame as a modem tells it."""
-    measured = LinkStatistics(mode=0, rate=1, src=src, dest=dest, packet_type=3, nframes=1, nbad=0, snr_in_db=12.5)
-    statistics = measured.sentence()
-    carxd = nmea.format("CARXD", src, dest, 0, number, data.hex().upper())
-    return carxd + nmea.format(statistics.kind, *statistics.fields)
+    """The sentences of a received packet of one frame."""
+    statistics = ReceivedPacket(
+        mode=ReceiveMode.GOOD,
+        arrived=datetime(2016, 10, 12, tzinfo=UTC),
+        clock="0",
+        rate=1,
+        source=src,
+        destination=dest,
+        packet_type=PacketType.PSK,
+        frames=1,
+        bad_frames=0,
+        snr_db=12.5,
+        range_m=150.0,
+    )
+    return nmea.format("CARXD", src, dest, 0, number, data.hex().upper()) + receive_statistics(statistics, 6)
 
 
 def test_packets_are_handed_on_with_their_numbers(modem_pair, begin, decompressor, check_monitoring):

@@ -230,7 +230,7 @@ def test_a_modem_that_says_nothing_is_named(begin, serial_cable):
     eventually(lambda: service.health().counters.get("modem_unresponsive", 0) >= 1)
     health = service.health()
     assert health.state == "degraded"
-    assert health.detail.startswith(f"{line.port}: no right answer to ")
+    assert health.detail.startswith(f"{line.port}: no valid reply to ")
 
 
 @pytest.mark.parametrize(
