@@ -288,22 +288,22 @@ def delivery_query_any(key: str) -> str:
     return f"{key}/handoff/*"
 
 
-def hello(vessel: str, answerer: str, site: str = SHORE) -> str:
-    """A query by which a relay finds out whether a process of the shore site answers.
+def presence(vessel: str, service: str, site: str = SHORE) -> str:
+    """Presence query of a vessel to a service of the shore site, and its reply.
 
     Record: none. From: relay. To: c2, the router of the shore site. Delivery: query.
     """
-    return f"{shore_inbox(vessel, site)}/hello/{_name('answerer', answerer)}"
+    return f"{shore_inbox(vessel, site)}/hello/{_name('service', service)}"
 
 
-def hello_from_anybody(vessel: str, site: str = SHORE) -> str:
+def presence_any(vessel: str, site: str = SHORE) -> str:
     """Presence queries of one vessel to every process of a site."""
     return f"{shore_inbox(vessel, site)}/hello/*"
 
 
-def hello_to_all(answerer: str, site: str = SHORE) -> str:
+def presence_all_vessels(service: str, site: str = SHORE) -> str:
     """Presence queries of every vessel to one process of a site."""
-    return f"{shore_inbox_all(site)}/hello/{_name('answerer', answerer)}"
+    return f"{shore_inbox_all(site)}/hello/{_name('service', service)}"
 
 
 def below(key: str) -> str:

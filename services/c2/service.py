@@ -12,7 +12,7 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.archive.shore_files import decision_file_name
-from sonarpost.bus import presence as hello
+from sonarpost.bus.connectivity import declare_presence
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem, OutboxItem, queue_of
 from sonarpost.delivery.transaction import Transaction
@@ -230,7 +230,7 @@ class C2Service(Service[C2Config]):
         """Begin to remove what is too old, and to show how far advice and commands have come."""
         self.start_thread(self._retain, "retention")
         self.start_thread(self._show_states, "tasking")
-        hello.declare_presence(self.session, self.platform.id, self.NAME, self.config.site)
+        declare_presence(self.session, self.platform.id, self.NAME, self.config.site)
 
     def on_stop(self) -> None:
         """Wake what waits."""

@@ -10,8 +10,8 @@ from collections.abc import Collection, Mapping, Sequence
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.bus.connectivity import MonitoredSite, SiteMonitor
 from sonarpost.bus.session import open_with_retry
-from sonarpost.bus.site_monitor import SiteConnectivity, SiteMonitor
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.outbox import QueuePolicy
 from sonarpost.delivery.records import InboxItem, Topic
@@ -52,11 +52,11 @@ class RelayService(Service[RelayConfig]):
         self._watch = SiteMonitor(platform.id, [self._site(u) for u in self._upstreams.values()], platform.tls)
         self._picture_room = DiskReserve(self.store, config.disk_reserve_bytes, "pictures wait with their senders")
 
-    def _site(self, upstream: Upstream) -> SiteConnectivity:
+    def _site(self, upstream: Upstream) -> MonitoredSite:
         """Return how a site is asked whether it is reached: on the session that leads to it."""
         if upstream.own_router:
-            return SiteConnectivity(upstream.site, lambda: upstream.session, upstream.own_router)
-        return SiteConnectivity(upstream.site, lambda: self.session, self.platform.upstream)
+            return MonitoredSite(upstream.site, lambda: upstream.session, upstream.own_router)
+        return MonitoredSite(upstream.site, lambda: self.session, self.platform.upstream)
 
     def _open_session(self, endpoints: Sequence[str], stop: threading.Event) -> zenoh.Session | None:
         return open_with_retry(endpoints, stop, self.platform.tls)

@@ -1,4 +1,4 @@
-"""A fleet's health records as `sonarpost status` shows them, and platforms that publish health."""
+"""Health records of a fleet as `sonarpost status` shows them, and platforms that publish health."""
 
 from __future__ import annotations
 
@@ -63,14 +63,14 @@ def on_terminal(state: FleetState, width: int = 80) -> list[str]:
 
 
 class Platforms:
-    """Tells health and holds tokens as services do."""
+    """Publishes health and holds liveliness tokens like services."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._records: list[Health] = []
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._tell, daemon=True)
+        self._thread = threading.Thread(target=self._publish, daemon=True)
         self._thread.start()
 
     def run(self, record: Health) -> None:
@@ -82,7 +82,7 @@ class Platforms:
         self._records.remove(record)
         self._tokens.pop(keys.alive(record.platform_id, record.service)).undeclare()
 
-    def _tell(self) -> None:
+    def _publish(self) -> None:
         while not self._stop.wait(0.05):
             for record in tuple(self._records):
                 self._session.put(keys.health(record.platform_id, record.service), wire.encode(record))

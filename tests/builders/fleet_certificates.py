@@ -1,9 +1,10 @@
-"""A fleet with certificates and real routers in processes, whose logs tests read."""
+"""A fleet with certificates, and router processes whose logs tests read."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -23,6 +24,13 @@ from sonarpost.security.fleet import Fleet
 from sonarpost.security.router_config import Wanted, router_json5
 
 DAY_S = 86400.0
+TRACED = "warn,zenoh::net::routing::interceptor=trace"
+"""Filter of Zenoh's log that shows every decision of access control."""
+_DECISION = re.compile(
+    r".*ThreadId\((?P<thread>\d+)\).*: (?:Using cached result: )?(?P<zid>[0-9a-f]+) .*is (?P<no>un)?authorized to "
+    r"(?P<message>.+?) \((?P<flow>ingress|egress)\) on (?P<key>.*)"
+)
+_INTERCEPTED = re.compile(r".*ThreadId\((?P<thread>\d+)\).*: Msg intercepted!")
 
 
 def tls_of(folder: Path) -> TlsConfig:
@@ -30,15 +38,16 @@ def tls_of(folder: Path) -> TlsConfig:
 
 
 class Router:
-    """A router process, and what it has logged."""
+    """A router process and its log lines."""
 
-    def __init__(self, config: Path) -> None:
+    def __init__(self, config: Path, zenoh_log: str | None = TRACED) -> None:
+        environment = {name: value for name, value in os.environ.items() if name != "RUST_LOG"}
         self.process = subprocess.Popen(
             [sys.executable, "-m", "sonarpost.bus.router", "--config", str(config)],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
-            env={name: value for name, value in os.environ.items() if name != "RUST_LOG"},
+            env=environment if zenoh_log is None else {**environment, "RUST_LOG": zenoh_log},
         )
         self.lines: list[str] = []
         self._thread = threading.Thread(target=self._read, daemon=True)
@@ -49,15 +58,40 @@ class Router:
         for line in self.process.stderr:
             self.lines.append(line)
 
-    def said(self, *words: str) -> bool:
+    def logged(self, *words: str) -> bool:
         return any(all(word in line for word in words) for line in list(self.lines))
 
     def wait_for(self, *words: str) -> None:
         deadline = time.monotonic() + 20
-        while not self.said(*words):
+        while not self.logged(*words):
             if time.monotonic() > deadline or (self.process.poll() is not None and not self._thread.is_alive()):
-                pytest.fail(f"the router did not say {words}:\n{''.join(self.lines)}")
+                pytest.fail(f"the router did not log {words}:\n{''.join(self.lines)}")
             time.sleep(0.01)
+
+    def denied(self) -> list[tuple[str, str, str]]:
+        """Return (peer, message, key) of every denied incoming message; all empty for an oversized one.
+
+        Zenoh logs a decision for each message, some ahead of time, and then that a message was intercepted.
+        """
+        names: dict[str, str] = {}
+        last: dict[str, tuple[str, str, str]] = {}
+        found = []
+        for line in list(self.lines):
+            if match := _DECISION.match(line):
+                if name := re.search(r"CertCommonName\(([^()]*)\)", line):
+                    names[match["zid"]] = name[1]
+                outgoing = match["no"] and match["flow"] == "egress"
+                denial = (names.get(match["zid"], ""), match["message"], match["key"]) if match["no"] else ("", "", "")
+                last[match["thread"]] = ("", "outgoing", "") if outgoing else denial
+            elif match := _INTERCEPTED.match(line):
+                found.append(last.pop(match["thread"], ("", "", "")))
+        return [denial for denial in found if denial[1] != "outgoing"]
+
+    def wait_for_denial(self, peer: str, message: str, key: str) -> None:
+        def denied() -> bool:
+            return any(p == peer and message in m and key in k for p, m, k in self.denied())
+
+        eventually(denied, timeout_s=20, what=f"denial of {message} {key} from {peer}")
 
     def stop(self) -> None:
         if self.process.poll() is None:
@@ -74,7 +108,7 @@ class Router:
 
 @dataclass
 class World:
-    """A shore's router and a vessel's, linked by TLS, and certificates of all kinds."""
+    """Routers of a shore and a vessel, linked by TLS, and certificates of all kinds."""
 
     folder: Path
     fleet: Fleet
@@ -85,10 +119,10 @@ class World:
     folders: dict[str, Path]
     routers: dict[str, Router] = field(default_factory=dict)
 
-    def start(self, platform: str, wanted: Wanted) -> Router:
+    def start(self, platform: str, wanted: Wanted, zenoh_log: str | None = TRACED) -> Router:
         path = self.folder / f"{platform}-{len(self.routers)}.json5"
         path.write_text(router_json5(self.fleet.index(), wanted, time.time()), encoding="utf-8")
-        router = Router(path)
+        router = Router(path, zenoh_log)
         self.routers[path.stem] = router
         router.wait_for("Router started")
         return router
@@ -108,7 +142,7 @@ class World:
         return tls_of(self.folders[name])
 
     def open(self, name: str, mode: str = "client", endpoint: str = "") -> zenoh.Session:
-        """A session at the shore's outer door with somebody's certificate."""
+        """Open a session at the shore's TLS endpoint with the certificate of `name`."""
         config = client_config([endpoint or self.shore_tls], self.tls(name))
         config.insert_json5("mode", json.dumps(mode))
         return zenoh.open(config)
@@ -130,7 +164,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
         "uuv-1": fleet.issue("uuv-1", "uuv").folder,
         "console-1": fleet.issue("console-1", "console").folder,
         "observer-1": fleet.issue("observer-1", "observer").folder,
-        # Made forty days ago for ten days; the authority of then is the one of now.
+        # Issued 40 days ago for 10 days by the same authority.
         "expired": Fleet(fleet.folder, lambda: b"", shifted(-40)).issue("vessel-4", "vessel", days=10).folder,
         "nameless": fleet.issue("shore-2", "shore", ["elsewhere.example"]).folder,
     }
@@ -167,16 +201,16 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
 
 
 @pytest.fixture
-def ashore(world: World) -> Iterator[zenoh.Session]:
-    """A service's session at the shore's router."""
+def shore_session(world: World) -> Iterator[zenoh.Session]:
+    """Session of a service at the shore's router."""
     session = zenoh.open(client_config([world.shore_local]))
     yield session
     session.close()
 
 
 @pytest.fixture
-def aboard(world: World) -> Iterator[zenoh.Session]:
-    """A service's session at the vessel's router, linked to the shore's."""
+def vessel_session(world: World) -> Iterator[zenoh.Session]:
+    """Session of a service at the vessel's router, which is linked to the shore's."""
     world.shore.wait_for("Peer connected", "peer=vessel-1")
     session = zenoh.open(client_config([world.vessel_local]))
     yield session
@@ -184,7 +218,7 @@ def aboard(world: World) -> Iterator[zenoh.Session]:
 
 
 def matching(session: zenoh.Session, key: str) -> zenoh.Publisher:
-    """A publisher that somebody listens to."""
+    """Declare a publisher and wait for a subscriber."""
     publisher = session.declare_publisher(key)
     eventually(lambda: bool(publisher.matching_status.matching), what=f"a subscriber of {key}")
     return publisher

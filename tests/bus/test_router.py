@@ -1,4 +1,4 @@
-"""The embedded router takes zenohd's configuration files and options, and says what is wrong with them in one line."""
+"""The embedded router accepts zenohd's configuration files and options and reports errors in one line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from builders.common import REPOSITORY, eventually, free_port
 
 from sonarpost.bus import router
 from sonarpost.bus.session import client_config
-from sonarpost.errors import ConfigError
+from sonarpost.errors import BadInputError, ConfigError
 
 Start = Callable[..., subprocess.Popen[str]]
 
@@ -34,7 +34,7 @@ CONFIG = """{
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Starts a router process; all are ended with the test."""
+    """Starts router processes and stops them after the test."""
     started: list[subprocess.Popen[str]] = []
 
     def start_one(*arguments: str) -> subprocess.Popen[str]:
@@ -78,19 +78,19 @@ def write_config(tmp_path: Path, text: str, name: str = "router.json5") -> Path:
     return path
 
 
-def test_two_routers_with_files_carry_a_record_from_one_to_the_other(start: Start, tmp_path: Path) -> None:
+def test_linked_routers_with_files_forward_a_record(start: Start, tmp_path: Path) -> None:
     shore, vessel = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
     processes = [
         start("--config", str(write_config(tmp_path, CONFIG % shore, "shore.json5"))),
         start("-c", str(write_config(tmp_path, CONFIG % vessel, "vessel.json5")), "-e", shore),
     ]
     with reach(shore) as ashore, reach(vessel) as aboard:
-        came = threading.Event()
-        subscriber = ashore.declare_subscriber("sonarpost/test", lambda _sample: came.set())
+        received = threading.Event()
+        subscriber = ashore.declare_subscriber("sonarpost/test", lambda _sample: received.set())
         publisher = aboard.declare_publisher("sonarpost/test")
-        eventually(lambda: bool(publisher.matching_status.matching), 20, "the subscriber known on the vessel")
+        eventually(lambda: bool(publisher.matching_status.matching), 20, "the subscriber at the vessel's router")
         publisher.put(b"here")
-        assert came.wait(10)
+        assert received.wait(10)
         subscriber.undeclare()
     for process in processes:
         process.send_signal(signal.SIGTERM)
@@ -100,7 +100,7 @@ def test_two_routers_with_files_carry_a_record_from_one_to_the_other(start: Star
         assert "Router stopped" in output
 
 
-def test_endpoints_on_the_command_line_stand_instead_of_the_files(tmp_path: Path) -> None:
+def test_command_line_endpoints_replace_those_of_the_file(tmp_path: Path) -> None:
     path = write_config(tmp_path, CONFIG % "tcp/127.0.0.1:1")
     config = router.load(path, ["tcp/127.0.0.1:7001", "tcp/127.0.0.1:7002"], ["tcp/shore:7448"], [])
     assert json.loads(config.get_json("listen/endpoints")) == ["tcp/127.0.0.1:7001", "tcp/127.0.0.1:7002"]
@@ -109,19 +109,19 @@ def test_endpoints_on_the_command_line_stand_instead_of_the_files(tmp_path: Path
     assert json.loads(kept.get_json("listen/endpoints")) == ["tcp/127.0.0.1:1"]
 
 
-def test_a_file_without_a_mode_is_a_routers(tmp_path: Path) -> None:
+def test_default_mode_of_a_file_is_router(tmp_path: Path) -> None:
     config = router.load(write_config(tmp_path, "{}"), [], [], [])
     assert json.loads(config.get_json("mode")) == "router"
 
 
-def test_single_keys_are_set_last(tmp_path: Path) -> None:
+def test_settings_are_applied_last(tmp_path: Path) -> None:
     path = write_config(tmp_path, CONFIG % "tcp/127.0.0.1:1")
     config = router.load(path, [], [], ["transport/link/tx/lease:1234", "metadata:{name:'a'}"])
     assert json.loads(config.get_json("transport/link/tx/lease")) == 1234
     assert json.loads(config.get_json("metadata")) == {"name": "a"}
 
 
-def test_without_a_file_the_router_listens_on_loopback_only() -> None:
+def test_router_without_a_file_listens_on_loopback_only() -> None:
     config = router.load(None, [], [], [])
     assert json.loads(config.get_json("listen/endpoints")) == ["tcp/127.0.0.1:7447"]
     assert json.loads(config.get_json("scouting/multicast/enabled")) is False
@@ -140,7 +140,7 @@ def test_without_a_file_the_router_listens_on_loopback_only() -> None:
         ("{}", {"settings": ["no/such/key:1"]}, ("--cfg", "no/such/key")),
     ],
 )
-def test_what_is_wrong_is_named(
+def test_error_names_the_invalid_setting(
     tmp_path: Path, text: str | None, arguments: dict[str, list[str]], words: tuple[str, ...]
 ) -> None:
     path = tmp_path / "router.json5"
@@ -153,12 +153,12 @@ def test_what_is_wrong_is_named(
         assert word in str(caught.value)
 
 
-def test_wrong_endpoints_without_a_file_are_named() -> None:
+def test_error_names_invalid_endpoints_without_a_file() -> None:
     with pytest.raises(ConfigError, match="Zenoh endpoints"):
         router.load(None, ["nowhere"], [], [])
 
 
-def test_a_wrong_file_ends_the_process_with_one_line(start: Start, tmp_path: Path) -> None:
+def test_invalid_file_ends_the_process_with_one_line(start: Start, tmp_path: Path) -> None:
     process = start("--config", str(write_config(tmp_path, "{mode: 'router', lisen: {}}")))
     output = process.communicate(timeout=20)[0]
     assert process.returncode == router.EXIT_CANNOT_START
@@ -168,7 +168,7 @@ def test_a_wrong_file_ends_the_process_with_one_line(start: Start, tmp_path: Pat
 
 
 @pytest.mark.parametrize("path", sorted(REPOSITORY.glob("config/router-*.json5")), ids=lambda path: path.name)
-def test_the_projects_router_files_are_a_routers_and_discover_nobody(path: Path) -> None:
+def test_router_files_of_the_project_disable_discovery(path: Path) -> None:
     config = router.load(path, [], [], [])
     assert json.loads(config.get_json("scouting/multicast/enabled")) is False
     assert json.loads(config.get_json("scouting/gossip/enabled")) is False
@@ -176,3 +176,25 @@ def test_the_projects_router_files_are_a_routers_and_discover_nobody(path: Path)
     assert json.loads(config.get_json("transport/link/tx/lease")) == 3000
     wait = "transport/link/tx/queue/congestion_control/block/wait_before_close"
     assert json.loads(config.get_json(wait)) == 60_000_000
+
+
+@pytest.mark.parametrize(
+    ("metadata", "expected"),
+    [
+        ("null", (None, ())),
+        ("'a name'", (None, ())),
+        ("{name: 'a'}", (None, ())),
+        ("{platform: 'vessel-1'}", ("vessel-1", ())),
+        ("{platform: 'shore-1', sites: ['shore', 'north']}", ("shore-1", ("shore", "north"))),
+    ],
+)
+def test_configuration_names_the_platform_and_its_sites(
+    metadata: str, expected: tuple[str | None, tuple[str, ...]]
+) -> None:
+    assert router.platform_and_sites(zenoh.Config.from_json5(f"{{metadata: {metadata}}}")) == expected
+
+
+@pytest.mark.parametrize("metadata", ["{platform: 7}", "{platform: 'No Name'}", "{platform: 'a', sites: 'shore'}"])
+def test_invalid_metadata_is_rejected(metadata: str) -> None:
+    with pytest.raises(BadInputError):
+        router.platform_and_sites(zenoh.Config.from_json5(f"{{metadata: {metadata}}}"))

@@ -1,4 +1,4 @@
-"""Sessions: configurations that join nobody uninvited, and opening until it works or is stopped."""
+"""Sessions: configuration without discovery, and opening with retries until success or stop."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def setting(config: zenoh.Config, path: str) -> object:
 @pytest.mark.parametrize(
     "config", [client_config(["tcp/127.0.0.1:1"]), router_config(["tcp/127.0.0.1:1"], ["tcp/h:2"])]
 )
-def test_nothing_is_discovered_and_no_memory_is_shared(config: zenoh.Config) -> None:
+def test_discovery_and_shared_memory_are_off(config: zenoh.Config) -> None:
     assert setting(config, "scouting/multicast/enabled") is False
     assert setting(config, "scouting/gossip/enabled") is False
     assert setting(config, "transport/shared_memory/enabled") is False
@@ -38,14 +38,14 @@ def test_services_are_clients_and_hubs_are_routers() -> None:
     assert setting(router, "connect/endpoints") == ["tcp/d:4"]
 
 
-def test_a_router_that_is_there_is_joined_at_once(router: str) -> None:
+def test_available_router_is_joined_at_once(router: str) -> None:
     opened = open_with_retry([router], threading.Event())
     assert opened is not None
     assert len(opened.info.routers_zid()) == 1
     opened.close()
 
 
-def test_the_second_endpoint_serves_when_the_first_is_dead(router: str) -> None:
+def test_second_endpoint_is_used_if_the_first_is_unreachable(router: str) -> None:
     stop = threading.Event()
     end = threading.Timer(3.0, stop.set)
     end.start()
@@ -55,9 +55,7 @@ def test_the_second_endpoint_serves_when_the_first_is_dead(router: str) -> None:
     opened.close()
 
 
-def test_a_router_that_comes_later_is_joined_then(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_router_that_starts_later_is_joined(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "RETRY_S", (0.02,))
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     opened: list[zenoh.Session | None] = []
@@ -66,7 +64,7 @@ def test_a_router_that_comes_later_is_joined_then(
     waiting = threading.Thread(target=lambda: opened.append(open_with_retry([endpoint], stop)))
     waiting.start()
     try:
-        eventually(lambda: "Zenoh router not reached, trying again" in caplog.text)
+        eventually(lambda: "Zenoh router not reached; retrying" in caplog.text)
         assert opened == []
         late = zenoh.open(router_config([endpoint]))
         eventually(lambda: len(opened) == 1)
@@ -76,13 +74,13 @@ def test_a_router_that_comes_later_is_joined_then(
     assert opened[0] is not None
     opened[0].close()
     late.close()
-    # However often it tried, it said so once, and where.
+    # One warning for all attempts, with the endpoint.
     warnings = [r for r in caplog.records if r.message.startswith("Zenoh router not reached")]
     assert len(warnings) == 1
     assert vars(warnings[0])["fields"]["router"] == endpoint
 
 
-def test_waiting_ends_soon_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_ends_the_wait_between_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "RETRY_S", (60.0,))
     stop = threading.Event()
     opened: list[zenoh.Session | None] = []
@@ -97,7 +95,7 @@ def test_waiting_ends_soon_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None
     assert time.monotonic() - began < 3
 
 
-def test_nothing_is_tried_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_attempt_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     def no_open(_: zenoh.Config) -> zenoh.Session:
         raise AssertionError("tried")
 
@@ -107,7 +105,7 @@ def test_nothing_is_tried_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     assert open_with_retry(["tcp/127.0.0.1:1"], stop) is None
 
 
-def test_two_routers_carry_what_one_is_told(router: str) -> None:
+def test_linked_routers_forward_publications(router: str) -> None:
     far_endpoint = f"tcp/127.0.0.1:{free_port()}"
     far = zenoh.open(router_config([far_endpoint], [router]))
     here, there = zenoh.open(client_config([router])), zenoh.open(client_config([far_endpoint]))

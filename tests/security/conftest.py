@@ -1,7 +1,7 @@
-"""Fixtures of these tests; `builders.fleet_certificates` makes them."""
+"""Fixtures, defined in `builders.fleet_certificates`."""
 
 from __future__ import annotations
 
-from builders.fleet_certificates import aboard, ashore, world
+from builders.fleet_certificates import shore_session, vessel_session, world
 
-__all__ = ["aboard", "ashore", "world"]
+__all__ = ["shore_session", "vessel_session", "world"]

@@ -1,4 +1,4 @@
-"""The authority: names, files, modes, and what it refuses."""
+"""Certificate authority: names, files, file modes, rejected requests, and the pki commands."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def mode(path: Path) -> int:
 
 
 @pytest.mark.parametrize("umask", [0o000, 0o022, 0o777])
-def test_files_have_their_modes_whatever_the_umask(tmp_path, umask):
+def test_file_modes_are_independent_of_the_umask(tmp_path, umask):
     before = os.umask(umask)
     try:
         fleet = Fleet.init(tmp_path / "pki", "test")
@@ -46,7 +46,7 @@ def test_files_have_their_modes_whatever_the_umask(tmp_path, umask):
     assert mode(fleet.folder / ".lock") & 0o077 == 0
 
 
-def test_a_certificate_is_for_client_and_server_and_for_its_hosts(fleet):
+def test_certificate_holds_hosts_and_usage(fleet):
     folder = fleet.issue("shore-1", "shore", ["shore.example", "192.0.2.7", "2001:db8::7"], days=10).folder
     own = x509.load_pem_x509_certificate((folder / "certificate.pem").read_bytes())
     authority = x509.load_pem_x509_certificate((fleet.folder / "ca.pem").read_bytes())
@@ -59,7 +59,7 @@ def test_a_certificate_is_for_client_and_server_and_for_its_hosts(fleet):
     assert (constraints.ca, constraints.path_length) == (True, 0)
 
 
-def test_a_revoked_name_never_comes_back(fleet):
+def test_revoked_name_is_never_reused(fleet):
     assert fleet.issue("vessel-1", "vessel").entry.common_name == "vessel-1"
     fleet.renew("vessel-1")
     fleet.revoke("vessel-1", "lost")
@@ -72,7 +72,7 @@ def test_a_revoked_name_never_comes_back(fleet):
     assert [e.common_name for e in fleet.index().allowed("vessel")] == ["vessel-1.g3"]
 
 
-def test_a_renewal_keeps_the_name_and_has_another_key(fleet):
+def test_renewal_keeps_the_name_with_a_new_key(fleet):
     first, second = fleet.issue("vessel-1", "vessel", ["v.example"]), fleet.renew("vessel-1", days=3)
     assert (second.entry.common_name, second.entry.hosts) == ("vessel-1", ("v.example",))
     assert second.entry.serial != first.entry.serial
@@ -80,7 +80,7 @@ def test_a_renewal_keeps_the_name_and_has_another_key(fleet):
     assert fleet.renew("vessel-1").folder != second.folder
 
 
-def test_nothing_is_written_over(fleet, tmp_path):
+def test_existing_files_are_not_overwritten(fleet, tmp_path):
     with pytest.raises(PkiError, match="not there yet"):
         Fleet.init(fleet.folder, "again")
     fleet.issue("vessel-1", "vessel")
@@ -94,7 +94,7 @@ def test_nothing_is_written_over(fleet, tmp_path):
     assert fleet.index() == before
 
 
-def test_a_certificate_that_cannot_be_written_is_not_in_the_index(fleet, tmp_path):
+def test_certificate_that_cannot_be_written_is_not_indexed(fleet, tmp_path):
     (tmp_path / "file").write_text("")
     before = fleet.index()
     with pytest.raises(OSError, match="file"):
@@ -104,31 +104,31 @@ def test_a_certificate_that_cannot_be_written_is_not_in_the_index(fleet, tmp_pat
 
 
 @pytest.mark.parametrize("name", ["shore", "", "Vessel", "vessel.g2", "a" * 33, "-a", "a/b", "../a", "a\n"])
-def test_a_name_that_is_no_platform_is_refused(fleet, name):
+def test_invalid_platform_name_is_rejected(fleet, name):
     with pytest.raises(BadInputError, match="platform"):
         fleet.issue(name, "vessel")
 
 
 @pytest.mark.parametrize("host", ["a b", "", "-a", "a..b", "1.2.3", "a" * 64, "*.example", "ex_ample", "300.1.1.1"])
-def test_a_host_that_is_none_is_refused(fleet, host):
+def test_invalid_host_is_rejected(fleet, host):
     with pytest.raises(BadInputError, match="host"):
         fleet.issue("vessel-1", "vessel", [host])
     assert fleet.index().certificates == ()
 
 
 @pytest.mark.parametrize("name", ["vessel-1", "vessel-1.g2", "v.g999999"])
-def test_names_and_generations(name):
+def test_common_names_hold_the_generation(name):
     platform, generation = names.platform_of(name)
     assert names.common_name(platform, generation) == name
 
 
 @pytest.mark.parametrize("name", ["vessel-1.g1", "vessel-1.g0", "vessel-1.g02", "vessel-1.2", "x.g2.g3", ""])
-def test_other_names_are_none_of_ours(name):
+def test_other_common_names_are_rejected(name):
     with pytest.raises(BadInputError):
         names.platform_of(name)
 
 
-def test_the_key_may_have_a_passphrase(tmp_path):
+def test_key_can_have_a_passphrase(tmp_path):
     made = Fleet.init(tmp_path / "pki", "test", b"correct horse")
     assert b"ENCRYPTED" in (made.folder / "ca.key").read_bytes()
     assert made.issue("vessel-1", "vessel").entry.common_name == "vessel-1"
@@ -140,13 +140,13 @@ def test_the_key_may_have_a_passphrase(tmp_path):
     assert "short" not in str(caught.value)
 
 
-def test_an_authority_whose_key_others_can_read_signs_nothing(fleet):
+def test_authority_with_a_readable_key_signs_nothing(fleet):
     (fleet.folder / "ca.key").chmod(0o640)
     with pytest.raises(PkiError, match="0640"):
         fleet.issue("vessel-1", "vessel")
 
 
-def test_an_authority_that_has_ended_signs_nothing_and_no_certificate_outlives_it(tmp_path):
+def test_authority_signs_only_within_its_validity(tmp_path):
     old = Fleet.init(tmp_path / "pki", "test", days=20, now_utc_s=lambda: time.time() - 10 * DAY_S)
     entry = Fleet(old.folder, lambda: b"").issue("vessel-1", "vessel", days=365).entry
     assert 9 < entry.days_left(time.time()) <= 10
@@ -157,13 +157,13 @@ def test_an_authority_that_has_ended_signs_nothing_and_no_certificate_outlives_i
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", '{"v": 2, "fleet": "x"}', '{"v": 1, "fleet": "x", "certificates": [{"serial": "zz"}]}']
 )
-def test_a_damaged_index_is_named(fleet, text):
+def test_error_names_the_damaged_index(fleet, text):
     (fleet.folder / "index.json").write_text(text)
     with pytest.raises(PkiError, match=r"index\.json"):
         FleetIndex.read(fleet.folder)
 
 
-def test_two_at_once_give_no_name_twice(fleet):
+def test_concurrent_issues_never_reuse_a_name(fleet):
     def issue() -> str:
         try:
             return Fleet(fleet.folder, lambda: b"").issue("vessel-1", "vessel").entry.common_name
@@ -171,16 +171,16 @@ def test_two_at_once_give_no_name_twice(fleet):
             return str(error)
 
     with ThreadPoolExecutor(4) as pool:
-        said = [task.result() for task in [pool.submit(issue) for _ in range(4)]]
-    assert said.count("vessel-1") == 1
-    assert sum("renew" in text for text in said) == 3
+        results = [task.result() for task in [pool.submit(issue) for _ in range(4)]]
+    assert results.count("vessel-1") == 1
+    assert sum("renew" in text for text in results) == 3
     assert len(fleet.index().certificates) == 1
 
 
-# The commands
+# Commands
 
 
-def test_the_commands_end_to_end(tmp_path, capsys):
+def test_commands_end_to_end(tmp_path, capsys):
     folder, secret = tmp_path / "pki", tmp_path / "secret"
     secret.write_text("correct horse\n")
     secret.chmod(0o600)
@@ -214,14 +214,14 @@ def test_the_commands_end_to_end(tmp_path, capsys):
     assert main([*wanted, "--out", str(out), "--replace"]) == 0
 
 
-def test_the_passphrase_comes_from_a_private_file_or_a_terminal_only(tmp_path, capsys):
+def test_passphrase_is_read_from_a_private_file_or_a_terminal_only(tmp_path, capsys):
     secret = tmp_path / "secret"
     secret.write_text("correct horse\n")
     secret.chmod(0o644)
     assert main(["pki", "init", "--dir", str(tmp_path / "a"), "--passphrase-file", str(secret)]) == 2
-    said = capsys.readouterr().err
-    assert "0644" in said
-    assert "horse" not in said
+    output = capsys.readouterr().err
+    assert "0644" in output
+    assert "horse" not in output
     with pytest.raises(SystemExit):
         main(["pki", "init", "--dir", str(tmp_path / "a"), "--passphrase", "correct horse"])
     assert not (tmp_path / "a").exists()
@@ -238,7 +238,7 @@ def test_the_passphrase_comes_from_a_private_file_or_a_terminal_only(tmp_path, c
         (["--platform", "shore-1", "--connect", "tcp/shore:7448"], "tls/HOST:PORT"),
     ],
 )
-def test_a_router_configuration_that_makes_no_sense_is_refused(fleet, capsys, options, words):
+def test_invalid_router_options_are_rejected(fleet, capsys, options, words):
     fleet.issue("shore-1", "shore")
     fleet.issue("uuv-1", "uuv")
     assert main(["pki", "router-config", "--dir", str(fleet.folder), *options]) == 2

@@ -1,4 +1,4 @@
-"""What a vessel and its shore need of each other passes their routers, and what is in the way is named."""
+"""Authorised traffic between a vessel and its shore passes their routers; obstacles are reported."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from sonarpost.services.relay.service import RelayService
 
 
 class Producer(Service[ServiceConfig]):
-    """Owes records to somebody."""
+    """Sends records."""
 
     NAME = "producer"
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        raise AssertionError("it consumes nothing")
+        raise AssertionError("consumes nothing")
 
-    def owe(self, key: str, consumer: str, record: Record) -> None:
+    def send(self, key: str, consumer: str, record: Record) -> None:
         effects = UnitOfWork()
         effects.send(key, consumer, record)
         self.commit(effects)
 
 
 class Console(Service[ServiceConfig]):
-    """Takes advice and commands aboard."""
+    """Consumes advice and commands on the vessel."""
 
     NAME = "console"
 
@@ -52,7 +52,7 @@ class Console(Service[ServiceConfig]):
 
 
 @pytest.fixture
-def crew(world, tmp_path):
+def start_service(world, tmp_path):
     started = []
 
     def start(service_type, platform_id, router, config=None, **platform):
@@ -82,10 +82,10 @@ def decision(number: int) -> Decision:
     )
 
 
-def test_records_go_up_and_advice_and_commands_come_down(world, crew, tmp_path):
+def test_records_advice_and_commands_pass_the_routers(world, start_service, tmp_path):
     got: list[str] = []
-    c2 = crew(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
-    relay = crew(
+    c2 = start_service(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
+    relay = start_service(
         RelayService,
         "vessel-1",
         world.vessel_local,
@@ -93,13 +93,13 @@ def test_records_go_up_and_advice_and_commands_come_down(world, crew, tmp_path):
         upstream=(world.shore_tls,),
         tls=world.tls("vessel-1"),
     )
-    console = crew(Console, "vessel-1", world.vessel_local)
-    operator = crew(Producer, "vessel-1", world.vessel_local)
-    expert = crew(Producer, "shore-1", world.shore_local)
+    console = start_service(Console, "vessel-1", world.vessel_local)
+    operator = start_service(Producer, "vessel-1", world.vessel_local)
+    expert = start_service(Producer, "shore-1", world.shore_local)
     c2.session.declare_subscriber("sonarpost/v1/**", lambda sample: got.append(str(sample.key_expr)))
 
-    operator.owe(keys.contact_decision("vessel-1"), "relay", decision(1))
-    eventually(lambda: c2.health().counters.get("decisions_stored") == 1, what="the decision ashore")
+    operator.send(keys.contact_decision("vessel-1"), "relay", decision(1))
+    eventually(lambda: c2.health().counters.get("decisions_stored") == 1, what="the decision at the shore")
 
     advice = Advice(
         advice_id="a-1",
@@ -111,65 +111,67 @@ def test_records_go_up_and_advice_and_commands_come_down(world, crew, tmp_path):
         verdict="unsure",
         advised_utc_s=2.0,
     )
-    expert.owe(keys.tasking_advice("vessel-1"), "c2", advice)
-    eventually(lambda: advice in console.got, what="the advice aboard")
+    expert.send(keys.tasking_advice("vessel-1"), "c2", advice)
+    eventually(lambda: advice in console.got, what="the advice at the vessel")
 
-    # Watchers ashore see the vessel's health and liveliness; the relay sees that the shore is reached.
-    eventually(lambda: keys.health("vessel-1", "relay") in got, what="the relay's health ashore")
+    # Subscribers at the shore see the vessel's health and liveliness; the relay reports the shore as reached.
+    eventually(lambda: keys.health("vessel-1", "relay") in got, what="the relay's health at the shore")
     alive = keys.alive("vessel-1", "relay")
     eventually(
         lambda: [str(r.ok.key_expr) for r in c2.session.liveliness().get(alive) if r.ok] == [alive], what="its token"
     )
-    eventually(lambda: relay.health().gauges.get("reached_shore") == 1.0, what="the self-test")
+    eventually(lambda: relay.health().gauges.get("reached_shore") == 1.0, what="the connectivity check")
     assert relay.health().state == "ok"
     assert relay.health().gauges["certificate_days_left"] > 300
-    # Nothing that one vessel and its shore need was refused on the way.
-    assert not [line for line in world.vessel.lines if "Message denied" in line]
+    # No message that the vessel and its shore require was denied.
+    assert world.vessel.denied() == []
 
 
-def test_a_relay_with_a_session_of_its_own_reaches_the_shore(world, crew, tmp_path):
-    c2 = crew(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
-    relay = crew(
+def test_relay_with_its_own_session_reaches_the_shore(world, start_service, tmp_path):
+    c2 = start_service(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
+    relay = start_service(
         RelayService,
         "vessel-1",
         world.vessel_local,
         RelayConfig(upstreams=(UpstreamOptions(router=(world.shore_tls,)),)),
         tls=world.tls("vessel-1"),
     )
-    operator = crew(Producer, "vessel-1", world.vessel_local)
-    operator.owe(keys.contact_decision("vessel-1"), "relay", decision(2))
-    eventually(lambda: c2.health().counters.get("decisions_stored") == 1, what="the decision ashore")
-    eventually(lambda: relay.health().gauges.get("reached_shore") == 1.0, what="the self-test")
+    operator = start_service(Producer, "vessel-1", world.vessel_local)
+    operator.send(keys.contact_decision("vessel-1"), "relay", decision(2))
+    eventually(lambda: c2.health().counters.get("decisions_stored") == 1, what="the decision at the shore")
+    eventually(lambda: relay.health().gauges.get("reached_shore") == 1.0, what="the connectivity check")
 
 
-def test_a_malformed_or_too_large_record_is_refused_by_c2_and_told(world, crew, tmp_path, caplog, aboard):
-    c2 = crew(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
+def test_malformed_record_is_refused_by_c2_and_logged(world, start_service, tmp_path, caplog, vessel_session):
+    c2 = start_service(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
     key = keys.delivery_query(keys.shore_inbox("vessel-1"), "c2")
     replies: list[bytes] = []
 
-    def refused_again() -> bool:
-        found = [r.ok.payload.to_bytes() for r in aboard.get(key, payload=b"x" * 40000, attachment=b"junk") if r.ok]
+    def refused_repeatedly() -> bool:
+        found = [
+            r.ok.payload.to_bytes() for r in vessel_session.get(key, payload=b"x" * 40000, attachment=b"junk") if r.ok
+        ]
         replies.extend(found)
         return bool(found)
 
-    eventually(refused_again, what="c2's answer")
+    eventually(refused_repeatedly, what="c2's reply")
     assert wire.unpack_map(replies[0], key)["status"] == "refused"
     assert c2.health().counters["records_refused"] >= 1
     assert "Record refused" in caplog.text
 
 
-def test_the_self_test_tells_what_is_in_the_way(world, crew, aboard, tmp_path):
+def test_connectivity_check_names_the_obstacle(world, start_service, vessel_session, tmp_path):
     endpoints = (world.shore_tls,)
     tls = world.tls("vessel-1")
 
     def reached(vessel: str) -> ConnectivityState:
-        return diagnose_no_reply(query_presence(aboard, vessel), endpoints, tls).reach
+        return diagnose_no_reply(query_presence(vessel_session, vessel), endpoints, tls).state
 
-    # The shore's router answers; c2 does not run.
-    eventually(lambda: reached("vessel-1") is ConnectivityState.NOBODY_THERE, what="the router's answer")
-    crew(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
+    # The router of the shore replies; c2 does not run.
+    eventually(lambda: reached("vessel-1") is ConnectivityState.NO_C2, what="the router's reply")
+    start_service(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
     eventually(lambda: reached("vessel-1") is ConnectivityState.REACHED, what="c2's answer")
-    # A vessel whose `id` is not the certificate's name: TLS lets it in, the list does not.
+    # The `id` of the vessel differs from the certificate name: TLS accepts it, access control does not.
     assert reached("vessel-2") is ConnectivityState.DENIED
 
 
@@ -178,39 +180,41 @@ def test_the_self_test_tells_what_is_in_the_way(world, crew, aboard, tmp_path):
     [
         ("stranger", "certificate verify failed"),
         ("expired", "certificate expired"),
-        ("nobody", "[platform] has no tls"),
+        ("no tls", "[platform] has no tls"),
     ],
 )
-def test_a_refused_certificate_is_named_as_such(world, who, words):
-    tls = None if who == "nobody" else world.tls(who)
+def test_refused_certificate_is_reported_with_its_reason(world, who, words):
+    tls = None if who == "no tls" else world.tls(who)
     if who == "stranger":
         tls = tls.model_copy(update={"ca": world.fleet.folder / "ca.pem"})
         words = "unknown ca"
     outcome = probe_endpoint(world.shore_tls, tls)
-    assert outcome.reach is ConnectivityState.TLS_REFUSED
+    assert outcome.state is ConnectivityState.TLS_REFUSED
     assert words in outcome.detail
     assert outcome.detail.startswith(world.shore_tls)
 
 
-def test_an_endpoint_where_nobody_listens_is_no_connection():
+def test_unreachable_endpoint_is_no_connection():
     endpoint = f"tls/localhost:{free_port()}"
-    assert probe_endpoint(endpoint, None).reach is ConnectivityState.NO_CONNECTION
-    assert probe_endpoint("tls/no-such-host.invalid:1", None).reach is ConnectivityState.NO_CONNECTION
-    assert probe_endpoint("somewhere", None).reach is ConnectivityState.UNKNOWN
+    assert probe_endpoint(endpoint, None).state is ConnectivityState.NO_CONNECTION
+    assert probe_endpoint("tls/no-such-host.invalid:1", None).state is ConnectivityState.NO_CONNECTION
+    assert probe_endpoint("somewhere", None).state is ConnectivityState.NO_REPLY
 
 
-def test_a_revoked_vessel_is_told_that_it_is_denied(world, crew, caplog):
+def test_revoked_vessel_reports_that_it_is_denied(world, start_service, caplog):
     local = f"tcp/127.0.0.1:{free_port()}"
-    # The thief's router runs with the configuration of before the revocation.
+    # The stolen router runs with the configuration from before the revocation.
     before = world.fleet.index()
     entries = tuple(e.model_copy(update={"revoked_utc_s": None}) for e in before.certificates)
-    thief = type(world)(
+    stolen = type(world)(
         **{**vars(world), "fleet": _Unrevoked(before.model_copy(update={"certificates": entries[:-1]}))}
     )
     wanted = Wanted("vessel-3", local=[local], connect=[world.shore_tls], files=world.folders["vessel-3"])
-    thief.start("vessel-3", wanted)
-    relay = crew(RelayService, "vessel-3", local, RelayConfig(), upstream=(world.shore_tls,), tls=world.tls("vessel-3"))
-    eventually(lambda: "denied by access control" in relay.health().detail, what="the self-test")
+    stolen.start("vessel-3", wanted)
+    relay = start_service(
+        RelayService, "vessel-3", local, RelayConfig(), upstream=(world.shore_tls,), tls=world.tls("vessel-3")
+    )
+    eventually(lambda: "denied by access control" in relay.health().detail, what="the connectivity check")
     assert relay.health().state == "degraded"
     assert "Shore not reached" in caplog.text
 
@@ -223,7 +227,7 @@ class _Unrevoked:
         return self._index
 
 
-def test_a_service_that_cannot_connect_for_its_certificate_says_so(world, caplog):
+def test_service_logs_that_its_certificate_is_refused(world, caplog):
     stop = threading.Event()
     waiting = threading.Thread(target=lambda: open_with_retry([world.shore_tls], stop, world.tls("expired")))
     waiting.start()
@@ -234,15 +238,15 @@ def test_a_service_that_cannot_connect_for_its_certificate_says_so(world, caplog
     assert "certificate expired" in vars(record)["fields"]["error"]
 
 
-def test_no_part_of_a_key_is_in_logs_health_or_the_process_list(world, crew, caplog):
-    relay = crew(RelayService, "vessel-1", world.vessel_local, RelayConfig(), tls=world.tls("vessel-1"))
+def test_no_part_of_a_key_appears_in_logs_health_or_process_list(world, start_service, caplog):
+    relay = start_service(RelayService, "vessel-1", world.vessel_local, RelayConfig(), tls=world.tls("vessel-1"))
     keys_of_hosts = [path.read_text() for path in world.folder.rglob("key.pem")]
     secrets = [line for text in keys_of_hosts for line in text.splitlines() if not line.startswith("-----")]
     assert len(secrets) > 20
-    said = [caplog.text, relay.health().model_dump_json()]
+    texts = [caplog.text, relay.health().model_dump_json()]
     for router in world.routers.values():
-        said += router.lines
-        said.append(Path(f"/proc/{router.process.pid}/cmdline").read_text(errors="replace"))
-    written = "\n".join(said)
+        texts += router.lines
+        texts.append(Path(f"/proc/{router.process.pid}/cmdline").read_text(errors="replace"))
+    written = "\n".join(texts)
     assert "router" in written
     assert not [secret for secret in secrets if secret in written]

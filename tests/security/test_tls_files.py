@@ -1,4 +1,4 @@
-"""A host's TLS files: what is wrong with them is said at the start, and never what is in them."""
+"""TLS files of a host: errors are reported at the start, without the content of the files."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ def check(folder: Path, now_utc_s: float | None = None) -> tls_files.OwnCertific
     return tls_files.check(tls.ca, tls.certificate, tls.key, time.time() if now_utc_s is None else now_utc_s)
 
 
-def test_good_files_say_whose_they_are(folder):
+def test_valid_files_return_the_certificate(folder):
     own = check(folder)
     assert own.common_name.startswith("vessel-")
     assert 364 < own.days_left(time.time()) <= 365
-    assert own.remarks == ()
+    assert own.warnings == ()
 
 
 def missing(folder):
@@ -96,7 +96,7 @@ def locked_key(folder):
         (locked_key, "key", "passphrase"),
     ],
 )
-def test_what_is_wrong_is_named_and_nothing_of_a_key_is_shown(folder, spoil, where, words):
+def test_error_names_the_file_and_shows_no_part_of_a_key(folder, spoil, where, words):
     secret = (folder / "key.pem").read_text().splitlines()[1]
     spoil(folder)
     with pytest.raises(ConfigError, match=words) as caught:
@@ -107,30 +107,30 @@ def test_what_is_wrong_is_named_and_nothing_of_a_key_is_shown(folder, spoil, whe
     assert secret not in repr(caught.value)
 
 
-def test_validity_counts(folder):
+def test_expired_and_future_certificates_are_rejected(folder):
     with pytest.raises(ConfigError, match="expired"):
         check(folder, time.time() + 366 * DAY_S)
     with pytest.raises(ConfigError, match="valid from"):
         check(folder, time.time() - DAY_S)
 
 
-def test_a_key_its_group_may_read_is_remarked_on(folder):
+def test_group_readable_key_gives_a_warning(folder):
     (folder / "key.pem").chmod(0o640)
-    assert "0640" in check(folder).remarks[0]
+    assert "0640" in check(folder).warnings[0]
 
 
-def test_a_key_written_where_its_path_belongs_is_not_repeated(folder):
+def test_key_given_instead_of_its_path_is_not_shown(folder):
     secret = (folder / "key.pem").read_text()
     with pytest.raises(ConfigError) as caught:
         tls_files.check(folder / "ca.pem", folder / "certificate.pem", Path(secret), time.time())
     assert secret.splitlines()[1] not in str(caught.value)
 
 
-def test_health_warns_before_the_end_and_says_when_it_has_come(fleet, tmp_path, caplog):
+def test_health_reports_soon_expiry_and_expiry(fleet, tmp_path, caplog):
     caplog.set_level(logging.WARNING)
     folder = fleet.issue("vessel-90", "vessel", days=10, out=tmp_path / "tls").folder
     own, now_utc_s = TlsMonitor(tls_of(folder)), time.time()
-    assert "The certificate ends soon" in caplog.text
+    assert "Certificate expires soon" in caplog.text
     assert "ends in 10.0 days" in own.warning(now_utc_s)
     assert own.degraded_reason(now_utc_s) == ""
     assert own.warning(now_utc_s + 11 * DAY_S) == ""
@@ -142,7 +142,7 @@ def test_health_warns_before_the_end_and_says_when_it_has_come(fleet, tmp_path, 
     assert (nothing.warning(now_utc_s), nothing.degraded_reason(now_utc_s), nothing.gauges(now_utc_s)) == ("", "", {})
 
 
-# In the configuration
+# Configuration
 
 
 def load(tmp_path: Path, text: str, **environment: str):
@@ -154,7 +154,7 @@ def load(tmp_path: Path, text: str, **environment: str):
 FILES = 'tls = { ca = "a.pem", certificate = "b.pem", key = "c.pem" }'
 
 
-def test_the_files_are_named_in_the_platform_table(tmp_path):
+def test_platform_table_names_the_files(tmp_path):
     platform = load(tmp_path, f'[platform]\nid = "vessel-1"\nupstream = ["tls/shore:7448"]\n{FILES}\n')
     assert platform.tls is not None
     assert [str(p) for p in (platform.tls.ca, platform.tls.certificate, platform.tls.key)] == [
@@ -166,14 +166,14 @@ def test_the_files_are_named_in_the_platform_table(tmp_path):
     assert load(tmp_path, '[platform]\nid = "vessel-1"\n').tls is None
 
 
-def test_the_environment_sets_them_one_by_one_or_whole(tmp_path):
+def test_environment_overrides_single_files_or_the_table(tmp_path):
     one = load(tmp_path, f'[platform]\nid = "vessel-1"\n{FILES}\n', SONARPOST_PLATFORM__TLS__KEY="/run/key")
     assert one.tls is not None
     assert (str(one.tls.key), str(one.tls.ca)) == ("/run/key", "a.pem")
     three = {f"SONARPOST_PLATFORM__TLS__{name}": f"/{name}" for name in ("CA", "CERTIFICATE", "KEY")}
-    all_of_them = load(tmp_path, '[platform]\nid = "vessel-1"\n', **three)
-    assert all_of_them.tls is not None
-    assert str(all_of_them.tls.certificate) == "/CERTIFICATE"
+    separate = load(tmp_path, '[platform]\nid = "vessel-1"\n', **three)
+    assert separate.tls is not None
+    assert str(separate.tls.certificate) == "/CERTIFICATE"
     whole = load(
         tmp_path,
         f'[platform]\nid = "vessel-1"\n{FILES}\n',
@@ -193,13 +193,13 @@ def test_the_environment_sets_them_one_by_one_or_whole(tmp_path):
         (FILES, {"SONARPOST_PLATFORM__TLS": "x"}, "SONARPOST_PLATFORM__TLS"),
     ],
 )
-def test_a_wrong_key_is_named(tmp_path, text, environment, field):
+def test_error_names_the_configuration_key(tmp_path, text, environment, field):
     with pytest.raises(ConfigError) as caught:
         load(tmp_path, f'[platform]\nid = "vessel-1"\n{text}\n', **environment)
     assert caught.value.field == field
 
 
-def test_a_service_with_wrong_files_ends_with_one_line(tmp_path, folder):
+def test_service_with_invalid_files_exits_with_one_line(tmp_path, folder):
     (folder / "key.pem").chmod(0o644)
     path = tmp_path / "vessel.toml"
     names = {"ca": "ca.pem", "certificate": "certificate.pem", "key": "key.pem"}

@@ -1,4 +1,4 @@
-"""At a vessel's router: a shore that has fallen into wrong hands can advise and command and nothing else; consoles."""
+"""Rights at a vessel's router: a compromised shore can send advice and commands only; consoles."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ VESSEL = "vessel-1"
 DECISION = keys.delivery_query(keys.contact_decision(VESSEL), "relay")
 ADVICE = keys.delivery_query(keys.advice(VESSEL), "relay")
 COMMAND = keys.delivery_query(keys.command(VESSEL, "resend"), "relay")
-PICTURE = keys.delivery_query(keys.image_reconstructed(VESSEL), "relay")
+IMAGE = keys.delivery_query(keys.image_reconstructed(VESSEL), "relay")
 
 
 @pytest.fixture
-def relay(aboard):
-    """A relay aboard, as far as its hand-overs go."""
+def relay(vessel_session):
+    """Keys of the delivery queries and publications that reach the vessel's relay."""
     asked: list[str] = []
 
     def answer(query: zenoh.Query) -> None:
@@ -36,8 +36,8 @@ def relay(aboard):
         keys.command_all(VESSEL),
         keys.image_reconstructed(VESSEL),
     ):
-        aboard.declare_queryable(keys.delivery_query(key, "relay"), answer)
-    aboard.declare_subscriber(keys.everything_of(VESSEL), lambda sample: asked.append(f"put {sample.key_expr}"))
+        vessel_session.declare_queryable(keys.delivery_query(key, "relay"), answer)
+    vessel_session.declare_subscriber(keys.everything_of(VESSEL), lambda sample: asked.append(f"put {sample.key_expr}"))
     return asked
 
 
@@ -45,58 +45,58 @@ def answered(session: zenoh.Session, key: str) -> bool:
     return [reply.ok.payload.to_bytes() for reply in session.get(key, timeout=3) if reply.ok] == [b"stored"]
 
 
-def test_the_shore_advises_and_commands_and_no_more(world, relay):
+def test_shore_sends_advice_and_commands_only(world, relay):
     with world.open("shore-1", endpoint=world.vessel_tls) as shore:
         eventually(lambda: answered(shore, ADVICE), what="advice")
         assert answered(shore, COMMAND)
         assert not answered(shore, DECISION)
-        assert not answered(shore, PICTURE)
+        assert not answered(shore, IMAGE)
         shore.put(keys.image_reconstructed(VESSEL), b"false")
         shore.put(keys.contact_decision(VESSEL), b"false")
         shore.put(keys.advice(VESSEL), b"true")
         eventually(lambda: f"put {keys.advice(VESSEL)}" in relay, what="the advice as a publication")
-    assert not {DECISION, PICTURE} & set(relay)
+    assert not {DECISION, IMAGE} & set(relay)
     assert f"put {keys.image_reconstructed(VESSEL)}" not in relay
     assert f"put {keys.contact_decision(VESSEL)}" not in relay
-    world.vessel.wait_for("Message denied", "peer=shore-1", "message=Query", f"key={DECISION}")
-    world.vessel.wait_for("Message denied", "peer=shore-1", "message=Put", f"key={keys.image_reconstructed(VESSEL)}")
+    world.vessel.wait_for_denial("shore-1", "Query", DECISION)
+    world.vessel.wait_for_denial("shore-1", "Put", keys.image_reconstructed(VESSEL))
 
 
-def test_a_console_aboard_decides_and_commands_and_takes_advice(world, relay, aboard):
+def test_vessel_console_sends_decisions_and_commands_and_receives_advice(world, relay, vessel_session):
     taken = keys.delivery_query(keys.advice(VESSEL), "console")
     with world.open("console-1", endpoint=world.vessel_tls) as console:
         eventually(lambda: answered(console, DECISION), what="the decision")
         assert answered(console, COMMAND)
-        assert not answered(console, PICTURE)
+        assert not answered(console, IMAGE)
         console.declare_queryable(taken, lambda query: query.reply(query.key_expr, b"stored"))
-        eventually(lambda: answered(aboard, taken), what="advice for the console")
-    assert PICTURE not in relay
-    world.vessel.wait_for("Message denied", "peer=console-1", "message=Query", f"key={PICTURE}")
+        eventually(lambda: answered(vessel_session, taken), what="advice for the console")
+    assert IMAGE not in relay
+    world.vessel.wait_for_denial("console-1", "Query", IMAGE)
 
 
-def test_a_console_ashore_hands_in_advice_and_no_picture(world, ashore):
+def test_shore_console_sends_advice_and_no_image(world, shore_session):
     advice = keys.delivery_query(keys.tasking_advice(VESSEL), "c2")
 
     def answer(query: zenoh.Query) -> None:
         with query:
             query.reply(query.key_expr, b"stored")
 
-    ashore.declare_queryable(keys.delivery_query(keys.tasking_advice_all(), "c2"), answer)
-    ashore.declare_queryable(keys.delivery_query(keys.shore_inbox_all(), "c2"), answer)
+    shore_session.declare_queryable(keys.delivery_query(keys.tasking_advice_all(), "c2"), answer)
+    shore_session.declare_queryable(keys.delivery_query(keys.shore_inbox_all(), "c2"), answer)
     with world.open("console-1") as console:
         eventually(lambda: answered(console, advice), what="the advice")
         assert not answered(console, keys.delivery_query(keys.shore_inbox(VESSEL), "c2"))
 
 
-def test_another_vessel_and_a_vehicle_get_nothing_at_a_vessels_door(world, relay):
+def test_other_vessels_and_vehicles_are_denied(world, relay):
     for name in ("vessel-2", "uuv-1"):
         with world.open(name, endpoint=world.vessel_tls) as stranger:
-            assert not any(answered(stranger, key) for key in (ADVICE, COMMAND, DECISION, PICTURE))
-        world.vessel.wait_for("A peer is on no list", f"peer={name}")
+            assert not any(answered(stranger, key) for key in (ADVICE, COMMAND, DECISION, IMAGE))
+        world.vessel.wait_for("Peer denied by access control", f"peer={name}")
     assert relay == []
 
 
-def test_two_authorities_stand_in_one_file_while_a_fleet_changes(world, tmp_path):
+def test_ca_file_can_hold_two_authorities_during_a_change(world, tmp_path):
     young = Fleet.init(tmp_path / "young", "young")
     folder = young.issue("vessel-9", "vessel").folder
     (folder / "ca.pem").write_bytes((world.fleet.folder / "ca.pem").read_bytes() + (folder / "ca.pem").read_bytes())

@@ -1,4 +1,4 @@
-"""`sonarpost status` through TLS and access control: an observer ashore sees the shore and the vessels linked to it."""
+"""`sonarpost status` with TLS and access control: an observer sees the shore and the vessels linked to it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from sonarpost.cli.main import main
 
 
 @pytest.fixture
-def told(aboard: zenoh.Session, ashore: zenoh.Session) -> Iterator[None]:
-    """A service on either side of the radio link tells its health."""
-    platforms = Platforms(aboard), Platforms(ashore)
+def publishing(vessel_session: zenoh.Session, shore_session: zenoh.Session) -> Iterator[None]:
+    """A service on each side of the radio link publishes its health."""
+    platforms = Platforms(vessel_session), Platforms(shore_session)
     platforms[0].run(health("vessel-1", "relay"))
     platforms[1].run(health("shore-1", "c2"))
     yield
@@ -25,19 +25,19 @@ def told(aboard: zenoh.Session, ashore: zenoh.Session) -> Iterator[None]:
         each.close()
 
 
-@pytest.mark.usefixtures("told")
-def test_an_observer_sees_both_sides_of_the_radio_link(world: Any, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.usefixtures("publishing")
+def test_observer_sees_both_sides_of_the_radio_link(world: Any, capsys: pytest.CaptureFixture[str]) -> None:
     tls = world.tls("observer-1")
     command = ["status", "--once", "--json", "--router", world.shore_tls]
     command += ["--tls-ca", str(tls.ca), "--tls-certificate", str(tls.certificate), "--tls-key", str(tls.key)]
 
-    def sees_both() -> bool:
+    def shows_both() -> bool:
         main(command)
         services = json.loads(capsys.readouterr().out)["services"]
-        # The routers tell their health, too.
+        # The routers publish their health as well.
         return {
             ("vessel-1", "relay", "ok"),
             ("shore-1", "c2", "ok"),
         } <= {(s["platform"], s["service"], s["status"]) for s in services}
 
-    eventually(sees_both, timeout_s=30.0, what="both sides")
+    eventually(shows_both, timeout_s=30.0, what="both sides")

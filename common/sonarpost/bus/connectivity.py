@@ -1,150 +1,302 @@
-"""Why the other side is not reached: Zenoh says "timeout" or nothing, so this tries one thing after the other.
+"""Connectivity of a vessel to its shore sites, with the reason when a site is not reached.
 
-An endpoint is tried with TCP and TLS alone, as Zenoh would; a shore by asking its processes whether they are there.
-What the two say together is a `ConnectivityState`.
+Zenoh reports a refused connection as a time-out, and a message denied by access control not at all. This module
+therefore queries the processes of a site for their presence and, without a reply, probes the routers on the way with
+plain TCP and TLS.
 """
 
 from __future__ import annotations
 
+import logging
 import re
 import socket
 import ssl
+import threading
 import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+import msgpack
 import zenoh
 
-from sonarpost import keys
-from sonarpost.bus import presence as hello
+from sonarpost import keys, wire
 from sonarpost.config import TlsConfig
-from sonarpost.errors import PayloadError
+from sonarpost.errors import BadInputError, PayloadError
+from sonarpost.logs import kv
 
-_ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?P<host>\[[^]]+\]|[^:\[\]]+):(?P<port>[0-9]{1,5})(?P<options>[?#;].*)?")
+log = logging.getLogger(__name__)
+
 TIMEOUT_S = 3.0
-# A server refuses a client's certificate after the handshake is over on the client's side (TLS 1.3).
-REFUSAL_S = 0.7
+# With TLS 1.3, a server refuses the client's certificate after the handshake has ended on the client's side.
+TLS_REFUSAL_S = 0.7
+# A presence query costs some hundred bytes of the radio link.
+PROBE_INTERVAL_REACHED_S = 120.0
+PROBE_INTERVAL_NOT_REACHED_S = (2.0, 5.0, 15.0, 30.0)
+PRESENCE_VERSION = 1
+_ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?P<host>\[[^]]+\]|[^:\[\]]+):(?P<port>[0-9]{1,5})(?P<options>[?#;].*)?")
 
 
 class ConnectivityState(Enum):
-    """How far something gets towards the other side."""
+    """Result of an attempt to reach a site or an endpoint."""
 
     REACHED = "reached"
-    NOBODY_THERE = "nobody there"
+    NO_C2 = "c2 not running"
     DENIED = "denied by access control"
     TLS_REFUSED = "TLS refused"
     NO_CONNECTION = "no connection"
-    UNKNOWN = "no answer"
+    NO_REPLY = "no reply"
+
+
+# Faults that need a person: a wrong certificate or access control list.
+FAULTS = (ConnectivityState.TLS_REFUSED, ConnectivityState.DENIED)
 
 
 @dataclass(frozen=True, slots=True)
 class ConnectivityResult:
-    """What an attempt came to.
+    """Result of an attempt, with details for people."""
 
-    Attributes:
-        reach: How far it got.
-        detail: What was met, for people.
-    """
-
-    reach: ConnectivityState
+    state: ConnectivityState
     detail: str = ""
 
     @property
     def text(self) -> str:
-        """Both in one line."""
-        return f"{self.reach.value}: {self.detail}" if self.detail else self.reach.value
+        """State and detail in one line."""
+        return f"{self.state.value}: {self.detail}" if self.detail else self.state.value
 
 
-def probe_endpoint(endpoint: str, tls: TlsConfig | None, timeout_s: float = TIMEOUT_S) -> ConnectivityResult:
-    """Connect to an endpoint by TCP and, for `tls/…`, shake hands with the host's own certificate.
+# Presence
 
-    Returns:
-        REACHED (something listens and has not refused us), TLS_REFUSED (by us or by it, with the reason), or
-        NO_CONNECTION. It takes up to `timeout_s`, and for `tls/…` at least a moment.
+
+@dataclass(frozen=True, slots=True)
+class PresenceReply:
+    """Reply to a presence query: a running process of a platform."""
+
+    platform: str
+    service: str
+
+    def pack(self) -> bytes:
+        """Return the reply as msgpack."""
+        packed: bytes = msgpack.packb({"v": PRESENCE_VERSION, "platform": self.platform, "service": self.service})
+        return packed
+
+    @classmethod
+    def unpack(cls, payload: bytes, where: str) -> PresenceReply:
+        """Parse a reply.
+
+        Raises:
+            PayloadError: It is not a presence reply; names the field.
+        """
+        fields = wire.unpack_map(payload, where)
+        if fields.get("v") != PRESENCE_VERSION:
+            raise PayloadError(where, "v", fields.get("v"), str(PRESENCE_VERSION))
+        names = []
+        for field in ("platform", "service"):
+            value = fields.get(field)
+            if not isinstance(value, str) or not 1 <= len(value) <= 40:
+                raise PayloadError(where, field, value, "1 to 40 characters")
+            names.append(value)
+        return cls(*names)
+
+
+def declare_presence(
+    session: zenoh.Session, platform: str, service: str, site: str = keys.SHORE
+) -> zenoh.Queryable[None]:
+    """Reply to presence queries of every vessel until the session closes or the queryable is undeclared.
+
+    A vessel queries a key below its own prefix, which access control treats as it treats the vessel's records. A reply
+    therefore shows that routers, certificates and access control let the records pass.
     """
-    match = _ENDPOINT.fullmatch(endpoint)
-    if match is None:
-        return ConnectivityResult(ConnectivityState.UNKNOWN, f"{endpoint} is not tcp/HOST:PORT or tls/HOST:PORT")
-    host, port = match["host"].strip("[]"), int(match["port"])
-    try:
-        with socket.create_connection((host, port), timeout_s) as connection:
-            if match["protocol"] == "tcp":
-                return ConnectivityResult(ConnectivityState.REACHED, endpoint)
-            return _shake_hands(connection, host, endpoint, tls)
-    except (OSError, OverflowError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        return ConnectivityResult(ConnectivityState.NO_CONNECTION, f"{endpoint}: {reason}")
+    payload = PresenceReply(platform, service).pack()
 
+    def on_query(query: zenoh.Query) -> None:
+        # The key is `.../inbox/{vessel}/hello/{service or *}`.
+        vessel = str(query.key_expr).split("/")[-3]
+        try:
+            with query:
+                query.reply(keys.presence(vessel, service, site), payload)
+        except (zenoh.ZError, BadInputError) as error:
+            log.debug("Presence reply not sent", extra=kv(key=str(query.key_expr), error=str(error)))
 
-def _shake_hands(connection: socket.socket, host: str, endpoint: str, tls: TlsConfig | None) -> ConnectivityResult:
-    if tls is None:
-        return ConnectivityResult(
-            ConnectivityState.TLS_REFUSED, f"{endpoint}: [platform] has no tls, so there is no certificate to show"
-        )
-    try:
-        context = ssl.create_default_context(cafile=str(tls.ca))
-        context.load_cert_chain(str(tls.certificate), str(tls.key))
-        with context.wrap_socket(connection, server_hostname=host) as wrapped:
-            wrapped.settimeout(REFUSAL_S)
-            try:
-                ended = wrapped.recv(1) == b""
-            except TimeoutError:
-                # Zenoh waits for our first message: nobody has refused us.
-                return ConnectivityResult(ConnectivityState.REACHED, endpoint)
-            detail = "closed after the handshake" if ended else "speaks before it is spoken to, no Zenoh router"
-            return ConnectivityResult(ConnectivityState.TLS_REFUSED, f"{endpoint}: {detail}")
-    except ssl.SSLCertVerificationError as error:
-        return ConnectivityResult(
-            ConnectivityState.TLS_REFUSED, f"{endpoint}: its certificate is not accepted here: {error.verify_message}"
-        )
-    except ssl.SSLError as error:
-        return ConnectivityResult(ConnectivityState.TLS_REFUSED, f"{endpoint}: {_ssl_reason(error)}")
-
-
-def _ssl_reason(error: ssl.SSLError) -> str:
-    reason = (error.reason or str(error)).replace("_", " ").lower()
-    if "alert" in reason:
-        return f"it does not accept our certificate ({reason.partition('alert ')[2] or reason})"
-    return reason
+    return session.declare_queryable(keys.presence_all_vessels(service, site), on_query)
 
 
 def query_presence(
     session: zenoh.Session, vessel: str, site: str = keys.SHORE, timeout_s: float = TIMEOUT_S
 ) -> ConnectivityResult:
-    """Ask a site's processes, through the routers between, whether they are there for this vessel.
+    """Query the processes of a site through the routers between.
 
     Returns:
-        REACHED (c2 answers), NOBODY_THERE (the shore's router answers, c2 does not) or UNKNOWN (nobody answers).
+        REACHED (c2 replies), NO_C2 (the router of the shore replies, c2 does not) or NO_REPLY.
     """
-    began = time.monotonic()
-    answers: dict[str, str] = {}
-    for reply in session.get(keys.hello_from_anybody(vessel, site), target=zenoh.QueryTarget.ALL, timeout=timeout_s):
+    began_s = time.monotonic()
+    platforms: dict[str, str] = {}
+    for reply in session.get(keys.presence_any(vessel, site), target=zenoh.QueryTarget.ALL, timeout=timeout_s):
         if reply.ok is None:
             continue
         try:
-            answer = hello.parse(reply.ok.payload.to_bytes(), str(reply.ok.key_expr))
+            presence = PresenceReply.unpack(reply.ok.payload.to_bytes(), str(reply.ok.key_expr))
         except PayloadError as error:
-            return ConnectivityResult(ConnectivityState.UNKNOWN, str(error))
-        answers[answer.service] = answer.platform
-    if "c2" in answers:
-        return ConnectivityResult(ConnectivityState.REACHED, f"{answers['c2']} in {time.monotonic() - began:.3f} s")
-    if answers:
-        service, platform = next(iter(answers.items()))
-        return ConnectivityResult(ConnectivityState.NOBODY_THERE, f"{service} of {platform} answers, c2 does not")
-    return ConnectivityResult(ConnectivityState.UNKNOWN, f"nobody answers for {site}")
+            return ConnectivityResult(ConnectivityState.NO_REPLY, str(error))
+        platforms[presence.service] = presence.platform
+    if "c2" in platforms:
+        took_s = time.monotonic() - began_s
+        return ConnectivityResult(ConnectivityState.REACHED, f"{platforms['c2']} in {took_s:.3f} s")
+    if platforms:
+        service, platform = next(iter(platforms.items()))
+        return ConnectivityResult(ConnectivityState.NO_C2, f"{service} of {platform} replies, c2 does not")
+    return ConnectivityResult(ConnectivityState.NO_REPLY, f"no reply from {site}")
+
+
+# Endpoints
+
+
+def probe_endpoint(endpoint: str, tls: TlsConfig | None, timeout_s: float = TIMEOUT_S) -> ConnectivityResult:
+    """Connect to an endpoint by TCP and, for `tls/...`, with the host's own certificate.
+
+    Returns:
+        REACHED (a listener has accepted the connection), TLS_REFUSED (by either side, with the reason), NO_CONNECTION,
+        or NO_REPLY for an unsupported endpoint. Takes at most about `timeout_s`.
+    """
+    match = _ENDPOINT.fullmatch(endpoint)
+    if match is None:
+        return ConnectivityResult(ConnectivityState.NO_REPLY, f"{endpoint} is not tcp/HOST:PORT or tls/HOST:PORT")
+    host, port = match["host"].strip("[]"), int(match["port"])
+    try:
+        with socket.create_connection((host, port), timeout_s) as connection:
+            refused = _probe_tls(connection, host, tls) if match["protocol"] == "tls" else ""
+    except (OSError, OverflowError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        return ConnectivityResult(ConnectivityState.NO_CONNECTION, f"{endpoint}: {reason}")
+    if refused:
+        return ConnectivityResult(ConnectivityState.TLS_REFUSED, f"{endpoint}: {refused}")
+    return ConnectivityResult(ConnectivityState.REACHED, endpoint)
+
+
+def _probe_tls(connection: socket.socket, host: str, tls: TlsConfig | None) -> str:
+    """Return why TLS is refused, empty if it is not."""
+    if tls is None:
+        return "[platform] has no tls, so there is no certificate to present"
+    try:
+        context = ssl.create_default_context(cafile=str(tls.ca))
+        context.load_cert_chain(str(tls.certificate), str(tls.key))
+        with context.wrap_socket(connection, server_hostname=host) as wrapped:
+            wrapped.settimeout(TLS_REFUSAL_S)
+            try:
+                closed = wrapped.recv(1) == b""
+            except TimeoutError:
+                return ""  # Zenoh waits for the first message of the client: the certificate was accepted.
+            return "closed after the handshake" if closed else "sends data first, so it is not a Zenoh router"
+    except ssl.SSLCertVerificationError as error:
+        return f"its certificate is not accepted here: {error.verify_message}"
+    except ssl.SSLError as error:
+        reason = (error.reason or str(error)).replace("_", " ").lower()
+        if "alert" in reason:
+            return f"it does not accept our certificate ({reason.partition('alert ')[2] or reason})"
+        return reason
 
 
 def diagnose_no_reply(
-    asked: ConnectivityResult, endpoints: tuple[str, ...], tls: TlsConfig | None
+    result: ConnectivityResult, endpoints: Sequence[str], tls: TlsConfig | None
 ) -> ConnectivityResult:
-    """Return what an unanswered question is due to, after trying the endpoints of the routers in between."""
-    if asked.reach is not ConnectivityState.UNKNOWN or not endpoints:
-        return asked
-    tried = [probe_endpoint(endpoint, tls) for endpoint in endpoints]
-    refused = [outcome for outcome in tried if outcome.reach is ConnectivityState.TLS_REFUSED]
-    reached = [outcome for outcome in tried if outcome.reach is ConnectivityState.REACHED]
-    if reached:
-        # sonarpost's own router answers every vessel that it lets in; zenohd does not, and then c2 may be away as well.
-        detail = f"{reached[0].detail} takes our certificate and nothing comes back (with zenohd: or c2 is not there)"
-        return ConnectivityResult(ConnectivityState.DENIED, detail)
-    return (refused or tried)[0]
+    """Return the cause of a missing reply by probing the routers on the way; other results are returned unchanged."""
+    if result.state is not ConnectivityState.NO_REPLY or not endpoints:
+        return result
+    probes = [probe_endpoint(endpoint, tls) for endpoint in endpoints]
+    for probe in probes:
+        if probe.state is ConnectivityState.REACHED:
+            # The embedded router replies to every vessel that it admits; zenohd does not, so c2 can be down as well.
+            detail = f"{probe.detail} accepts our certificate, but no reply arrives (with zenohd: or c2 is not running)"
+            return ConnectivityResult(ConnectivityState.DENIED, detail)
+    return next((probe for probe in probes if probe.state is ConnectivityState.TLS_REFUSED), probes[0])
+
+
+# Monitor
+
+
+@dataclass(frozen=True, slots=True)
+class MonitoredSite:
+    """A site whose connectivity is monitored.
+
+    Attributes:
+        name: Name of the site in keys.
+        session: Returns the session that leads to it, None while it is not open.
+        endpoints: Routers on the way that this host or its router connects to; probed when no reply arrives.
+    """
+
+    name: str
+    session: Callable[[], zenoh.Session | None]
+    endpoints: tuple[str, ...] = ()
+
+
+class SiteMonitor:
+    """Checks the connectivity to every site periodically and reports changes in log and health.
+
+    Args:
+        vessel: The platform that queries.
+        sites: The sites.
+        tls: The host's own certificate.
+    """
+
+    def __init__(self, vessel: str, sites: Sequence[MonitoredSite], tls: TlsConfig | None) -> None:
+        self._vessel = vessel
+        self._sites = sites
+        self._tls = tls
+        self._lock = threading.Lock()
+        self._results: dict[str, ConnectivityResult] = {}
+
+    def run(self, stop: threading.Event) -> None:
+        """Check all sites repeatedly until `stop` is set."""
+        failures = 0
+        while not stop.is_set():
+            for site in self._sites:
+                if stop.is_set():
+                    return
+                self.update(site.name, self.check(site))
+            if not self._texts(lambda state: state is not ConnectivityState.REACHED):
+                failures = 0
+                stop.wait(PROBE_INTERVAL_REACHED_S)
+            else:
+                stop.wait(PROBE_INTERVAL_NOT_REACHED_S[min(failures, len(PROBE_INTERVAL_NOT_REACHED_S) - 1)])
+                failures += 1
+
+    def check(self, site: MonitoredSite) -> ConnectivityResult:
+        """Check one site: query its presence and, without a reply, probe the routers on the way."""
+        session = site.session()
+        if session is None:
+            result = ConnectivityResult(ConnectivityState.NO_REPLY, "router of the site not reached")
+        else:
+            try:
+                result = query_presence(session, self._vessel, site.name)
+            except zenoh.ZError as error:
+                result = ConnectivityResult(ConnectivityState.NO_REPLY, str(error)[:200])
+        return diagnose_no_reply(result, site.endpoints, self._tls)
+
+    def update(self, name: str, result: ConnectivityResult) -> None:
+        """Store a site's result; log it if the state has changed."""
+        with self._lock:
+            before = self._results.get(name)
+            self._results[name] = result
+        if before is not None and before.state is result.state:
+            return
+        if result.state is ConnectivityState.REACHED:
+            log.info("Shore reached", extra=kv(site=name, by=result.detail))
+        else:
+            log.warning("Shore not reached", extra=kv(site=name, reason=result.state.value, detail=result.detail))
+
+    def degraded_reason(self) -> str:
+        """Return the faults that a person has to correct, empty for none."""
+        return self._texts(lambda state: state in FAULTS)
+
+    def warning(self) -> str:
+        """Return the sites that are not reached for another reason, empty for none."""
+        return self._texts(lambda state: state not in FAULTS and state is not ConnectivityState.REACHED)
+
+    def gauges(self) -> Mapping[str, float]:
+        """Return for each checked site whether it was reached: 1 or 0."""
+        with self._lock:
+            return {f"reached_{n}": float(r.state is ConnectivityState.REACHED) for n, r in self._results.items()}
+
+    def _texts(self, selected: Callable[[ConnectivityState], bool]) -> str:
+        with self._lock:
+            return "; ".join(f"{n}: {r.text}" for n, r in self._results.items() if selected(r.state))

@@ -1,4 +1,4 @@
-"""Zenoh sessions as sonarpost uses them: services are clients, hubs are routers, nothing is discovered by itself."""
+"""Zenoh sessions: services are clients, hubs are routers, discovery is off."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ def client_config(endpoints: Sequence[str], tls: TlsConfig | None = None) -> zen
 
     Args:
         endpoints: The router's endpoints.
-        tls: The host's own certificate, for `tls/…` endpoints: both sides show one.
+        tls: The host's own certificate for `tls/...` endpoints, where both sides present one.
     """
     return _config("client", listen=(), connect=endpoints, tls=tls)
 
 
 def router_config(listen: Sequence[str], connect: Sequence[str] = (), tls: TlsConfig | None = None) -> zenoh.Config:
-    """Return the configuration of an embedded router, linked to the routers it connects to.
+    """Return the configuration of an embedded router that links to the routers in `connect`.
 
-    It has no access control: whoever has a certificate of the fleet may do everything. `sonarpost pki router-config`
-    writes configurations with it.
+    It has no access control: every certificate of the fleet has all rights. `sonarpost pki router-config` writes
+    configurations with access control.
     """
     return _config("router", listen=listen, connect=connect, tls=tls)
 
 
 def _config(mode: str, listen: Sequence[str], connect: Sequence[str], tls: TlsConfig | None) -> zenoh.Config:
-    # Pictures are shown in bursts: one that finds the queue full waits for a moment before it is dropped.
+    # Images are published in bursts: with a full queue, a publication waits briefly before it is dropped.
     drop = {"wait_before_drop": WAIT_BEFORE_DROP_US, "max_wait_before_drop_fragments": 2 * WAIT_BEFORE_DROP_US}
     link: dict[str, object] = {"tx": {"lease": 3000, "queue": {"congestion_control": {"drop": drop}}}}
     if tls is not None:
@@ -49,9 +49,9 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str], tls: TlsCo
         "mode": mode,
         "listen": {"endpoints": list(listen)},
         "connect": {"endpoints": list(connect), "timeout_ms": OPEN_TIMEOUT_MS},
-        # Endpoints are written down: discovery would join strangers, and its delay would slow every start.
+        # Endpoints are configured: discovery could join foreign networks, and its delay would slow every start.
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        # Shared memory would bypass the network link on one host and hide its behaviour.
+        # On one host, shared memory would bypass the network link and hide its behaviour.
         "transport": {"shared_memory": {"enabled": False}, "link": link},
     }
     if mode == "router":
@@ -66,7 +66,7 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str], tls: TlsCo
 
 
 def tls_settings(tls: TlsConfig) -> dict[str, object]:
-    """Return Zenoh's `transport/link/tls` section: paths of files, never what is in them."""
+    """Return Zenoh's `transport/link/tls` section, which holds file paths only."""
     settings: dict[str, object] = {
         "enable_mtls": True,
         "verify_name_on_connect": True,
@@ -82,10 +82,13 @@ def tls_settings(tls: TlsConfig) -> dict[str, object]:
 def open_with_retry(
     endpoints: Sequence[str], stop: threading.Event, tls: TlsConfig | None = None
 ) -> zenoh.Session | None:
-    """Open a client session, trying each endpoint in turn until one opens or `stop` is set (then None).
+    """Open a client session, trying each endpoint in turn until one opens.
 
-    The library's own endless retry cannot be interrupted by a signal and stays with the first endpoint, so the loop is
-    here. Once open, the session finds back to its endpoint by itself.
+    Zenoh's own endless retry cannot be interrupted by a signal and only tries the first endpoint. An open session
+    reconnects to its endpoint by itself.
+
+    Returns:
+        The session, or None if `stop` was set first.
     """
     attempt = 0
     while not stop.is_set():
@@ -94,9 +97,9 @@ def open_with_retry(
             return zenoh.open(client_config([endpoint], tls))
         except zenoh.ZError as error:
             if attempt == 0:
-                # Zenoh says "timeout" for a refused certificate, too.
+                # Zenoh reports a refused certificate as a time-out.
                 reason = probe_endpoint(endpoint, tls).text if endpoint.startswith("tls/") else str(error)[:200]
-                log.warning("Zenoh router not reached, trying again", extra=kv(router=endpoint, error=reason))
+                log.warning("Zenoh router not reached; retrying", extra=kv(router=endpoint, error=reason))
             attempt += 1
             stop.wait(RETRY_S[min(attempt // len(endpoints), len(RETRY_S) - 1)])
     return None

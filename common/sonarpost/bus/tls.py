@@ -1,4 +1,4 @@
-"""A process's own certificate: checked when it starts, watched while it runs."""
+"""Monitor of a process's own TLS certificate: validity at the start, expiry while it runs."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ log = logging.getLogger(__name__)
 
 
 class TlsMonitor:
-    """The `[platform] tls` of a process, or none.
+    """Monitor of the `[platform] tls` files of a process; without them it reports nothing.
 
     Raises:
-        ConfigError: The files are missing, unreadable, do not fit together, have expired, or the key is not private;
-            names the setting and the file, never what is in it.
+        ConfigError: The files are missing, unreadable, do not match, have expired, or the key is not private. The error
+            names the setting and the file, never its content.
     """
 
     def __init__(self, tls: TlsConfig | None) -> None:
@@ -28,22 +28,22 @@ class TlsMonitor:
             return
         now_utc_s = time.time()
         self._own = tls_files.check(tls.ca, tls.certificate, tls.key, now_utc_s)
-        for remark in self._own.remarks:
-            log.warning("TLS files", extra=kv(remark=remark))
+        for detail in self._own.warnings:
+            log.warning("TLS key readable by its group", extra=kv(detail=detail))
         if warning := self.warning(now_utc_s):
-            log.warning("The certificate ends soon", extra=kv(remark=warning))
+            log.warning("Certificate expires soon", extra=kv(detail=warning))
 
     def warning(self, now_utc_s: float) -> str:
-        """Return what health says of the certificate's end, empty while it is far away or past."""
+        """Return that the certificate expires soon; empty if it does not or has expired."""
         return "" if self._own is None or self.degraded_reason(now_utc_s) else self._warning(now_utc_s)
 
     def degraded_reason(self, now_utc_s: float) -> str:
-        """Return that the certificate has expired, empty while it has not: no new connection comes about then."""
+        """Return that the certificate has expired, which prevents new connections; empty if it has not."""
         expired = self._own is not None and self._own.days_left(now_utc_s) <= 0
         return self._warning(now_utc_s) if expired else ""
 
     def gauges(self, now_utc_s: float) -> Mapping[str, float]:
-        """Return `certificate_days_left`, or nothing without a certificate."""
+        """Return `certificate_days_left`; empty without a certificate."""
         return {} if self._own is None else {"certificate_days_left": self._own.days_left(now_utc_s)}
 
     def _warning(self, now_utc_s: float) -> str:

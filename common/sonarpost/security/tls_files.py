@@ -25,13 +25,13 @@ class OwnCertificate:
         common_name: The name that other routers know the host by.
         serial: Serial number, hexadecimal.
         not_after: End of validity.
-        remarks: What is not wrong but should be put right, for the log.
+        warnings: Deficiencies that do not prevent operation, for the log.
     """
 
     common_name: str
     serial: str
     not_after: datetime
-    remarks: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def days_left(self, now_utc_s: float) -> float:
         """Return how many days it is still valid, negative when it has expired."""
@@ -46,7 +46,7 @@ def check(ca: Path, certificate: Path, key: Path, now_utc_s: float) -> OwnCertif
     """
     authorities = _certificates(ca, "ca")
     own = _certificates(certificate, "certificate")[0]
-    remarks = _check_key(key, own)
+    warnings = _check_key(key, own)
     signers = [authority for authority in authorities if x509_files.signed_by(own, authority)]
     if not signers:
         issuer = own.issuer.rfc4514_string()
@@ -55,7 +55,7 @@ def check(ca: Path, certificate: Path, key: Path, now_utc_s: float) -> OwnCertif
     # While a fleet changes to a new authority, the file holds the old one as well, and that may end.
     _check_validity("ca", ca, max(signers, key=lambda signer: signer.not_valid_after_utc), now_utc_s)
     return OwnCertificate(
-        x509_files.common_name_of(own), f"{own.serial_number:x}", own.not_valid_after_utc, tuple(remarks)
+        x509_files.common_name_of(own), f"{own.serial_number:x}", own.not_valid_after_utc, tuple(warnings)
     )
 
 
