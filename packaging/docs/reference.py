@@ -52,7 +52,7 @@ NAMED_OTHERWISE = {
 _FLOW = re.compile(
     r"Record: (?P<record>.*?)\. From: (?P<source>.*?)\. To: (?P<to>.*?)\. Delivery: (?P<delivery>.*?)\.$"
 )
-_PARAMETERS = ("platform", "vehicle", "vessel", "site", "kind", "service", "answerer")
+_PARAMETERS = ("platform", "vehicle", "vessel", "site", "kind", "service")
 
 
 @dataclass(frozen=True, slots=True)
