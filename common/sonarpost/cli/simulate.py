@@ -1,4 +1,4 @@
-"""`sonarpost simulate`: write a simulated survey, and what is truly in it."""
+"""`sonarpost simulate`: write a simulated survey and its ground truth."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Write a simulated side-scan survey as XTF. The same options give the same file.",
     )
     parser.add_argument("out", type=Path, metavar="OUT.xtf", help="the file to create or replace")
-    parser.add_argument("--seed", type=int, default=default.seed, help="source of every chance (%(default)s)")
+    parser.add_argument("--seed", type=int, default=default.seed, help="seed of every random draw (%(default)s)")
     parser.add_argument(
         "--seabed",
         choices=[kind.value for kind in SeabedKind],
         default=default.seabed.value,
-        help="what lies on the bottom (%(default)s)",
+        help="type of seabed (%(default)s)",
     )
-    parser.add_argument("--pings", type=int, default=default.pings, help="length of the line (%(default)s)")
-    parser.add_argument("--samples", type=int, default=default.samples, help="samples a side (%(default)s)")
+    parser.add_argument("--pings", type=int, default=default.pings, help="number of pings (%(default)s)")
+    parser.add_argument("--samples", type=int, default=default.samples, help="samples per side (%(default)s)")
     parser.add_argument(
-        "--range-m", type=float, default=default.range_m, help="slant range a side in metres (%(default)s)"
+        "--range-m", type=float, default=default.range_m, help="slant range per side in metres (%(default)s)"
     )
+    parser.add_argument("--altitude-m", type=float, default=default.altitude_m, help="altitude in metres (%(default)s)")
+    parser.add_argument("--bits", type=int, choices=(8, 16), default=default.bits, help="bits per sample (%(default)s)")
     parser.add_argument(
-        "--altitude-m", type=float, default=default.altitude_m, help="height over the bottom (%(default)s)"
+        "--targets", type=int, default=default.targets, help="number of mine-like objects (%(default)s)"
     )
-    parser.add_argument("--bits", type=int, choices=(8, 16), default=default.bits, help="a sample (%(default)s)")
-    parser.add_argument("--targets", type=int, default=default.targets, help="mine-like objects (%(default)s)")
-    parser.add_argument("--clutter", type=int, default=default.clutter, help="other objects (%(default)s)")
-    parser.add_argument("--truth", type=Path, metavar="FILE.json", help="write what is truly there, as JSON")
+    parser.add_argument("--clutter", type=int, default=default.clutter, help="number of other objects (%(default)s)")
+    parser.add_argument("--truth", type=Path, metavar="FILE.json", help="write the ground truth as JSON")
     parser.set_defaults(run=run_simulate)
 
 
 def run_simulate(args: argparse.Namespace) -> int:
-    """Simulate, write and say what was written.
+    """Simulate and write a survey; print its summary.
 
     Raises:
         ConfigError: An option out of range.
@@ -68,12 +68,12 @@ def run_simulate(args: argparse.Namespace) -> int:
     write_xtf(simulated.survey, args.out)
     if args.truth is not None:
         write_atomically(args.truth, truth_json(simulated, args.out.name).encode())
-    mines = sum(thing.is_mine_like for thing in simulated.truth)
+    mines = sum(item.is_mine_like for item in simulated.truth)
     print(f"{args.out}: {spec.pings} pings, {mines} mine-like objects, {len(simulated.truth) - mines} others")
     return 0
 
 
 def truth_json(simulated: SimulatedSurvey, survey_name: str) -> str:
-    """Return the truth of a simulated survey as a JSON document, one object for each thing on the bottom."""
-    objects = [asdict(thing) for thing in simulated.truth]
+    """Return the ground truth of a survey as a JSON document, one entry for each object on the seabed."""
+    objects = [asdict(item) for item in simulated.truth]
     return json.dumps({"schema": TRUTH_SCHEMA, "survey": survey_name, "objects": objects}, indent=2) + "\n"

@@ -1,1 +1,1 @@
-"""Simulation: Micro-Modems, the acoustic channel, the seabed with its survey, and missions."""
+"""Simulation of what sonarpost needs at sea: modems, the acoustic channel, and side-scan surveys of the seabed."""

@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter
 
 from sonarpost.cli.simulate import add_parser
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.seabed.echo import SonarSettings, Track, echo_intensity, received
+from sonarpost.simulation.seabed.echo import SonarSettings, Track, echo_intensity, received_amplitude
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.targets import MINE_LIKE_KINDS, ObjectKind, SeabedObject, place_object
 from sonarpost.simulation.seabed.terrain import Seabed, SeabedKind
@@ -101,7 +101,7 @@ def test_the_beam_widens_with_range():
 def test_speckle_is_that_of_real_recordings():
     rng = np.random.default_rng(0)
     flat = np.full((300, 1024), 1.0, np.float32)
-    amplitude = received(flat, np.full(300, ALTITUDE_M), SETTINGS, rng)[:, 300:700]
+    amplitude = received_amplitude(flat, np.full(300, ALTITUDE_M), SETTINGS, rng)[:, 300:700]
     rows = amplitude / amplitude.mean(axis=1, keepdims=True)
     assert 0.3 < rows.std() < 0.45
     off = rows - rows.mean()
@@ -184,7 +184,7 @@ def test_sixteen_bits_use_the_range_of_recorders():
 
 
 def test_on_rails_without_wobble():
-    survey = simulate_survey(dataclasses.replace(SMALL, wobble=0.0, seabed=SeabedKind.MUD)).survey
+    survey = simulate_survey(dataclasses.replace(SMALL, motion=0.0, seabed=SeabedKind.MUD)).survey
     assert {p.heading_deg for p in survey} == {40.0}
     assert {p.roll_deg for p in survey} == {0.0}
 

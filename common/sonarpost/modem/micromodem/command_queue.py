@@ -172,9 +172,9 @@ def _answers(sentence: Sentence, expected: Sentence) -> bool:
     """Return whether a sentence is the expected answer; leading zeros and additional fields are accepted."""
     if sentence.kind != expected.kind or len(sentence.fields) < len(expected.fields):
         return False
-    return all(_normalized(a) == _normalized(b) for a, b in zip(expected.fields, sentence.fields, strict=False))
+    return all(_normalised(a) == _normalised(b) for a, b in zip(expected.fields, sentence.fields, strict=False))
 
 
-def _normalized(text: str) -> str:
+def _normalised(text: str) -> str:
     text = text.strip()
     return (text.lstrip("0") or "0") if text.isdigit() else text

@@ -1,1 +1,1 @@
-"""An emulated WHOI Micro-Modem and the ports on which hosts reach it."""
+"""Emulated Micro-Modem."""

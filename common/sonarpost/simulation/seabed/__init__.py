@@ -1,1 +1,1 @@
-"""Simulated seabeds with objects, and side-scan surveys of them with known truth."""
+"""Simulated side-scan surveys of a seabed with known objects."""

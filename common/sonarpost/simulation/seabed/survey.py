@@ -1,4 +1,4 @@
-"""A simulated side-scan survey with known truth: what lies where, in pings and samples and on the chart."""
+"""Simulated side-scan survey with ground truth: every object in pings and samples and in geographic coordinates."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.seabed.echo import FloatImage, SonarSettings, Track, echo_intensity, received
+from sonarpost.simulation.seabed.echo import FloatImage, SonarSettings, Track, echo_intensity, received_amplitude
 from sonarpost.simulation.seabed.targets import (
     CLUTTER_KINDS,
     MINE_LIKE_KINDS,
@@ -30,35 +30,35 @@ FloatArray = npt.NDArray[np.float64]
 SONAR_NAME: Final = "simulated SSS"
 _SIGN: Final = {Side.PORT: -1, Side.STARBOARD: 1}
 _SAND_LEVEL: Final = 0.26
-"""Part of full scale that flat sand at half range comes to."""
+"""Level of flat sand at half range, as a fraction of full scale."""
 _MARGIN_M: Final = 2.0
-_APART_M: Final = 5.0
-_PLACING_TRIES: Final = 400
+_MIN_DISTANCE_M: Final = 5.0
+_PLACEMENT_TRIES: Final = 400
 
 
 @dataclass(frozen=True, slots=True)
 class SurveySpec:
-    """What to simulate. The same values give the same survey, sample for sample.
+    """Specification of a survey. The same values give the same survey, sample for sample.
 
     Attributes:
-        seed: Source of every chance.
+        seed: Seed of every random draw.
         pings: 1 to 10,000.
-        samples: Samples a side, 64 to 8192.
-        range_m: Slant range a side.
-        altitude_m: Mean height over the bottom; at most half the range.
+        samples: Samples per side, 64 to 8192.
+        range_m: Slant range per side.
+        altitude_m: Mean altitude; at most half the range.
         speed_mps: Speed over ground.
-        ping_rate_hz: Pings a second; sound must be back before the next one.
+        ping_rate_hz: Pings per second; the echo must return before the next ping.
         heading_deg: Mean course, true.
-        start_lat_deg: Where the first ping is.
-        start_lon_deg: Where the first ping is.
-        start_time_utc_s: When the first ping is.
-        seabed: What lies on the bottom.
-        targets: Mine-like objects: how many, or which.
-        clutter: Other objects: how many, or which.
-        bits: 8 or 16 bits a sample.
-        wobble: How unsteadily the vehicle goes: 0 on rails, 1 as usual.
-        water_depth_m: Mean depth of the bottom; more than the altitude.
-        frequency_hz: Of the sonar, for the record.
+        start_lat_deg: Latitude of the first ping.
+        start_lon_deg: Longitude of the first ping.
+        start_time_utc_s: Time of the first ping.
+        seabed: Type of seabed.
+        targets: Number or kinds of the mine-like objects.
+        clutter: Number or kinds of the other objects.
+        bits: 8 or 16 bits per sample.
+        motion: Scale of the vehicle's yaw, roll and altitude variations: 0 none, 1 typical.
+        water_depth_m: Mean depth of the seabed; at least the altitude.
+        frequency_hz: Sonar frequency, recorded in the survey.
 
     Raises:
         ConfigError: A value outside these limits.
@@ -79,7 +79,7 @@ class SurveySpec:
     targets: int | tuple[ObjectKind, ...] = 4
     clutter: int | tuple[ObjectKind, ...] = 6
     bits: int = 8
-    wobble: float = 1.0
+    motion: float = 1.0
     water_depth_m: float = 20.0
     frequency_hz: float = 600_000.0
 
@@ -96,7 +96,7 @@ class SurveySpec:
             "start_lat_deg": (self.start_lat_deg, -85, 85),
             "start_lon_deg": (self.start_lon_deg, -180, 180),
             "start_time_utc_s": (self.start_time_utc_s, 0, 2**33),
-            "wobble": (self.wobble, 0, 5),
+            "motion": (self.motion, 0, 5),
             "water_depth_m": (self.water_depth_m, self.altitude_m, 6000),
             "frequency_hz": (self.frequency_hz, 20_000, 5_000_000),
             "targets": (_count(self.targets), 0, 1000),
@@ -116,21 +116,21 @@ class SurveySpec:
 
 @dataclass(frozen=True, slots=True)
 class TruthObject:
-    """An object of a simulated survey, where it is on the bottom and in the picture.
+    """Position of an object on the seabed and in the recording.
 
     Attributes:
-        kind: Its shape.
-        is_mine_like: Whether it should be called a mine.
-        side: The channel that sees it.
-        ping: Row of the survey in which it is abeam.
-        sample_index: Sample of its middle at half its height; 0 is nearest the vehicle.
-        lat_deg: Of its middle.
-        lon_deg: Of its middle.
-        ground_range_m: From the track to its middle.
+        kind: Shape.
+        is_mine_like: Whether it has the shape and size of a sea mine.
+        side: Channel that records it.
+        ping: Index of the ping in which it is abeam.
+        sample_index: Sample of its centre at half its height; 0 is nearest the vehicle.
+        lat_deg: Latitude of its centre.
+        lon_deg: Longitude of its centre.
+        ground_range_m: From the track to its centre.
         length_m: Along its long axis.
-        width_m: Across it.
-        height_m: Above the bottom.
-        orientation_deg: Of its long axis, clockwise from the course.
+        width_m: Across its long axis.
+        height_m: Above the seabed.
+        orientation_deg: Long axis, clockwise from the course.
     """
 
     kind: ObjectKind
@@ -149,7 +149,7 @@ class TruthObject:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedSurvey:
-    """A survey and what is truly there."""
+    """A survey and its ground truth."""
 
     survey: Survey
     truth: tuple[TruthObject, ...]
@@ -159,15 +159,15 @@ def simulate_survey(spec: SurveySpec) -> SimulatedSurvey:
     """Simulate a survey line.
 
     Args:
-        spec: What to simulate.
+        spec: Specification.
 
     Returns:
-        The survey, its path naming the seed since there is no file, and the truth in order of pings.
+        The survey, whose path contains the seed as there is no file, and the truth in order of pings.
 
     Raises:
-        ConfigError: More objects than find room with a few metres between them.
+        ConfigError: More objects than fit with the minimum distance between them.
     """
-    # Separate sources: another number of targets leaves seabed, track and noise as they were.
+    # Separate generators: another number of targets does not change seabed, track and noise.
     seabed_rng, object_rng, track_rng, noise_rng = (
         np.random.default_rng(s) for s in np.random.SeedSequence(spec.seed).spawn(4)
     )
@@ -180,18 +180,19 @@ def simulate_survey(spec: SurveySpec) -> SimulatedSurvey:
         cell_m=min(max(spec.range_m / 600, 0.025), 0.15),
         rng=seabed_rng,
     )
-    things = _lay_out(spec, length_m, object_rng)
-    grounds_m = [place_object(seabed, thing) for thing in things]
-    track, altitude_m = _drive(spec, seabed, track_rng)
+    objects = _random_objects(spec, length_m, object_rng)
+    grounds_m = [place_object(seabed, item) for item in objects]
+    track, altitude_m = _simulate_track(spec, seabed, track_rng)
     settings = SonarSettings(spec.samples, spec.range_m, spec.ping_spacing_m)
     sides = {
         side: _quantised(
-            received(echo_intensity(seabed, track, settings, sign), altitude_m, settings, noise_rng), spec.bits
+            received_amplitude(echo_intensity(seabed, track, settings, sign), altitude_m, settings, noise_rng),
+            spec.bits,
         )
         for side, sign in _SIGN.items()
     }
-    truth = [_truth(spec, track, *pair) for pair in zip(things, grounds_m, strict=True)]
-    truth.sort(key=lambda thing: thing.ping)
+    truth = [_truth(spec, track, *pair) for pair in zip(objects, grounds_m, strict=True)]
+    truth.sort(key=lambda item: item.ping)
     return SimulatedSurvey(_survey(spec, track, altitude_m, sides), tuple(truth))
 
 
@@ -202,64 +203,65 @@ def _count(objects: int | tuple[ObjectKind, ...]) -> int:
 def _kinds(
     objects: int | tuple[ObjectKind, ...], choice: tuple[ObjectKind, ...], rng: np.random.Generator
 ) -> list[ObjectKind]:
-    """Return the kinds asked for; a mere number takes each kind in turn from a chance beginning."""
+    """Return the kinds; for a number, each kind in turn, starting with a random one."""
     if not isinstance(objects, int):
         return list(objects)
     first = int(rng.integers(len(choice)))
     return [choice[(first + i) % len(choice)] for i in range(objects)]
 
 
-def _lay_out(spec: SurveySpec, length_m: float, rng: np.random.Generator) -> list[SeabedObject]:
-    """Scatter the objects over both sides, clear of nadir, of the far edge and of one another."""
+def _random_objects(spec: SurveySpec, length_m: float, rng: np.random.Generator) -> list[SeabedObject]:
+    """Place objects on both sides at random, away from nadir, from the far edge and from each other."""
     kinds = _kinds(spec.targets, MINE_LIKE_KINDS, rng) + _kinds(spec.clutter, CLUTTER_KINDS, rng)
     inset_m = min(4.0, length_m / 4)
-    things: list[SeabedObject] = []
+    objects: list[SeabedObject] = []
     for kind in kinds:
-        for _ in range(_PLACING_TRIES):
+        for _ in range(_PLACEMENT_TRIES):
             along_m = float(rng.uniform(inset_m, length_m - inset_m))
             ground_m = float(rng.uniform(1.1 * spec.altitude_m, 0.8 * spec.range_m))
             across_m = ground_m if rng.random() < 0.5 else -ground_m
-            if all(math.hypot(along_m - t.along_m, across_m - t.across_m) > _APART_M for t in things):
-                things.append(random_object(kind, along_m, across_m, rng))
+            if all(math.hypot(along_m - t.along_m, across_m - t.across_m) > _MIN_DISTANCE_M for t in objects):
+                objects.append(random_object(kind, along_m, across_m, rng))
                 break
         else:
-            expected = f"objects that find room on {length_m:.0f} m of track"
+            expected = f"objects that fit on {length_m:.0f} m of track"
             raise ConfigError("survey simulator", "targets and clutter", len(kinds), expected)
-    return things
+    return objects
 
 
-def _wander(count: int, scale_pings: float, rng: np.random.Generator) -> FloatArray:
-    """Return smooth chance of about unit spread that changes over `scale_pings`."""
+def _smooth_noise(count: int, scale_pings: float, rng: np.random.Generator) -> FloatArray:
+    """Return noise of approximately unit variance, smoothed over `scale_pings`."""
     white = rng.standard_normal(count)
     smooth = gaussian_filter1d(white, scale_pings, mode="reflect")
     return np.asarray(smooth * math.sqrt(2 * math.sqrt(math.pi) * scale_pings), dtype=np.float64)
 
 
-def _drive(spec: SurveySpec, seabed: Seabed, rng: np.random.Generator) -> tuple[Track, FloatArray]:
-    """Drive the line: return the track and the altitude over the bottom right below, both per ping."""
+def _simulate_track(spec: SurveySpec, seabed: Seabed, rng: np.random.Generator) -> tuple[Track, FloatArray]:
+    """Return the track and the altitude above the seabed, both per ping."""
     slow, swell = 12.0 * spec.ping_rate_hz, 1.6 * spec.ping_rate_hz
-    yaw_deg = spec.wobble * (1.2 * _wander(spec.pings, slow, rng) + 0.12 * _wander(spec.pings, swell, rng))
-    roll_deg = spec.wobble * (0.8 * _wander(spec.pings, slow, rng) + 0.4 * _wander(spec.pings, swell, rng))
+    yaw_deg = spec.motion * (1.2 * _smooth_noise(spec.pings, slow, rng) + 0.12 * _smooth_noise(spec.pings, swell, rng))
+    roll_deg = spec.motion * (0.8 * _smooth_noise(spec.pings, slow, rng) + 0.4 * _smooth_noise(spec.pings, swell, rng))
     along_m = np.arange(spec.pings, dtype=np.float64) * spec.ping_spacing_m
-    slide = np.sin(np.radians(yaw_deg)) * spec.ping_spacing_m
-    across_m = np.cumsum(slide - slide.mean())
+    drift_m = np.sin(np.radians(yaw_deg)) * spec.ping_spacing_m
+    across_m = np.cumsum(drift_m - drift_m.mean())
     bottom_m = np.asarray(seabed.sampled(along_m, across_m)[0], dtype=np.float64)
-    # The vehicle holds its altitude over the bottom as its altimeter shows it, some seconds late and not quite.
-    held = gaussian_filter1d(bottom_m, 3.0 * spec.ping_rate_hz, mode="nearest")
-    drift = 1 + spec.wobble * (0.08 * _wander(spec.pings, slow, rng) + 0.006 * _wander(spec.pings, swell, rng))
-    height_m = held + spec.altitude_m * np.clip(drift, 0.5, 1.5)
+    # The vehicle follows the seabed with a delay of some seconds and a slowly varying error.
+    followed_m = gaussian_filter1d(bottom_m, 3.0 * spec.ping_rate_hz, mode="nearest")
+    slow_error, fast_error = _smooth_noise(spec.pings, slow, rng), _smooth_noise(spec.pings, swell, rng)
+    altitude_factor = 1 + spec.motion * (0.08 * slow_error + 0.006 * fast_error)
+    height_m = followed_m + spec.altitude_m * np.clip(altitude_factor, 0.5, 1.5)
     track = Track(along_m, across_m, height_m, np.radians(yaw_deg), np.radians(roll_deg))
     return track, height_m - bottom_m
 
 
 def _quantised(amplitude: FloatImage, bits: int) -> Samples:
-    full = 255 if bits == 8 else 32767  # recorders of 16 bits leave the highest one free
+    full = 255 if bits == 8 else 32767  # recorders of 16 bits do not use the highest bit
     counts = np.clip(np.rint(amplitude * (_SAND_LEVEL * full)), 0, full)
     samples: Samples = counts.astype(np.uint8) if bits == 8 else counts.astype(np.uint16)
     return samples
 
 
-def _chart_position(spec: SurveySpec, along_m: float, across_m: float) -> Position:
+def _geographic_position(spec: SurveySpec, along_m: float, across_m: float) -> Position:
     bearing_deg = spec.heading_deg + math.degrees(math.atan2(across_m, along_m))
     start = Position(spec.start_lat_deg, spec.start_lon_deg)
     return offset_position(start, bearing_deg, math.hypot(along_m, across_m))
@@ -268,7 +270,7 @@ def _chart_position(spec: SurveySpec, along_m: float, across_m: float) -> Positi
 def _survey(spec: SurveySpec, track: Track, altitude_m: FloatArray, sides: dict[Side, Samples]) -> Survey:
     pings = []
     for row in range(spec.pings):
-        place = _chart_position(spec, float(track.along_m[row]), float(track.across_m[row]))
+        position = _geographic_position(spec, float(track.along_m[row]), float(track.across_m[row]))
         channels = tuple(
             ChannelPing(side, samples[row], spec.range_m, spec.frequency_hz) for side, samples in sides.items()
         )
@@ -277,8 +279,8 @@ def _survey(spec: SurveySpec, track: Track, altitude_m: FloatArray, sides: dict[
                 number=row + 1,
                 time_utc_s=spec.start_time_utc_s + row / spec.ping_rate_hz,
                 channels=channels,
-                lat_deg=place.lat_deg,
-                lon_deg=place.lon_deg,
+                lat_deg=position.lat_deg,
+                lon_deg=position.lon_deg,
                 heading_deg=(spec.heading_deg + math.degrees(track.yaw_rad[row])) % 360,
                 altitude_m=float(altitude_m[row]),
                 depth_m=spec.water_depth_m - float(track.height_m[row]),
@@ -291,27 +293,27 @@ def _survey(spec: SurveySpec, track: Track, altitude_m: FloatArray, sides: dict[
     return Survey(Path(name), SONAR_NAME, name, tuple(pings))
 
 
-def _truth(spec: SurveySpec, track: Track, thing: SeabedObject, ground_m: float) -> TruthObject:
-    """Find the ping an object is abeam of, and the sample its middle falls into."""
-    along = thing.along_m - track.along_m
-    across = thing.across_m - track.across_m
+def _truth(spec: SurveySpec, track: Track, item: SeabedObject, ground_m: float) -> TruthObject:
+    """Return the ping in which an object is abeam, and the sample of its centre."""
+    along = item.along_m - track.along_m
+    across = item.across_m - track.across_m
     ahead = along * np.cos(track.yaw_rad) + across * np.sin(track.yaw_rad)
     row = int(np.argmin(np.abs(ahead)))
     abeam_m = float(across[row] * math.cos(track.yaw_rad[row]) - along[row] * math.sin(track.yaw_rad[row]))
-    drop_m = float(track.height_m[row]) - ground_m - thing.height_m / 2
+    drop_m = float(track.height_m[row]) - ground_m - item.height_m / 2
     slant_m = math.hypot(abeam_m, drop_m)
-    place = _chart_position(spec, thing.along_m, thing.across_m)
+    position = _geographic_position(spec, item.along_m, item.across_m)
     return TruthObject(
-        kind=thing.kind,
-        is_mine_like=thing.is_mine_like,
+        kind=item.kind,
+        is_mine_like=item.is_mine_like,
         side=Side.STARBOARD if abeam_m > 0 else Side.PORT,
         ping=row,
         sample_index=min(int(slant_m / spec.range_m * spec.samples), spec.samples - 1),
-        lat_deg=place.lat_deg,
-        lon_deg=place.lon_deg,
+        lat_deg=position.lat_deg,
+        lon_deg=position.lon_deg,
         ground_range_m=abs(abeam_m),
-        length_m=thing.length_m,
-        width_m=thing.width_m,
-        height_m=thing.height_m,
-        orientation_deg=thing.orientation_deg,
+        length_m=item.length_m,
+        width_m=item.width_m,
+        height_m=item.height_m,
+        orientation_deg=item.orientation_deg,
     )

@@ -1,9 +1,9 @@
-"""Seabeds to survey: a height map and a backscatter map, seeded.
+"""Simulated seabeds: seeded maps of height and backscatter.
 
-A seabed is a pair of maps over the surveyed strip, along the track and across it. Heights are metres about a mean of
-zero; backscatter is the Lambert coefficient, linear in intensity (mud about 0.1, sand 0.3, gravel 0.6, rock 0.8 at
-the some hundred kilohertz of a side-scan sonar). The shapes follow what such sonars show: power-law relief, sharp
-crested ripples that meander and fork, patches with soft borders, outcrops that break through sand.
+Both maps cover the surveyed strip, along and across the track. Heights are metres about a mean of zero. Backscatter is
+the Lambert coefficient, linear in intensity: mud about 0.1, sand 0.3, gravel 0.6, rock 0.8 at the some hundred
+kilohertz of a side-scan sonar. The shapes follow recordings: power-law relief, ripples with sharp crests that meander
+and fork, patches with soft borders, rock outcrops in sand.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SAND_BACKSCATTER: Final = 0.3
 
 
 class SeabedKind(StrEnum):
-    """What lies on the bottom."""
+    """Type of seabed."""
 
     SAND = "sand"
     RIPPLES = "ripples"
@@ -36,12 +36,12 @@ class SeabedKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Seabed:
-    """A strip of bottom. The arrays are the strip's own: objects are placed by changing them.
+    """A strip of seabed. Placing an object changes its arrays.
 
     Attributes:
         height_m: Shape (along, across), float32, metres.
         backscatter: Same shape, float32, linear.
-        cell_m: Side of a cell.
+        cell_m: Size of a cell.
         along_start_m: Along-track coordinate of row 0.
         across_start_m: Across-track coordinate of column 0; starboard is positive.
     """
@@ -53,10 +53,10 @@ class Seabed:
     across_start_m: float
 
     def sampled(self, along_m: npt.NDArray[np.float64], across_m: npt.NDArray[np.float64]) -> tuple[FloatMap, FloatMap]:
-        """Return height and backscatter at places, interpolated linearly, held constant beyond the strip's edge."""
-        where = np.stack([(along_m - self.along_start_m) / self.cell_m, (across_m - self.across_start_m) / self.cell_m])
-        height = map_coordinates(self.height_m, where, order=1, mode="nearest")
-        backscatter = map_coordinates(self.backscatter, where, order=1, mode="nearest")
+        """Return height and backscatter at positions, linearly interpolated; beyond the edge they are constant."""
+        cells = np.stack([(along_m - self.along_start_m) / self.cell_m, (across_m - self.across_start_m) / self.cell_m])
+        height = map_coordinates(self.height_m, cells, order=1, mode="nearest")
+        backscatter = map_coordinates(self.backscatter, cells, order=1, mode="nearest")
         return height, backscatter
 
 
@@ -66,8 +66,8 @@ class _Patch:
     backscatter: FloatMap
 
 
-class _Maker:
-    """Draws textures of one shape from one generator."""
+class _TextureGenerator:
+    """Generates textures of one size from one random generator."""
 
     def __init__(self, shape: tuple[int, int], cell_m: float, rng: np.random.Generator) -> None:
         self._shape = shape
@@ -78,7 +78,7 @@ class _Maker:
         self._wavenumber = np.hypot(along[:, None], across[None, :])
 
     def fractal(self, exponent: float, longest_m: float, shortest_m: float) -> FloatMap:
-        """Return unit-variance noise whose power falls as wavenumber**-exponent between two wavelengths."""
+        """Return unit-variance noise with power proportional to wavenumber**-exponent between two wavelengths."""
         k = self._wavenumber
         with np.errstate(divide="ignore"):
             amplitude = np.where(k > 0, k ** np.float32(-exponent / 2), np.float32(0))
@@ -86,7 +86,7 @@ class _Maker:
         white = self._rng.standard_normal(self._shape, dtype=np.float32)
         noise = scipy.fft.irfft2(scipy.fft.rfft2(white) * amplitude, s=self._shape)
         spread = float(noise.std())
-        # A strip smaller than the longest wavelength can be left with nothing: flat, then.
+        # Without a component in the band, as in a very small strip, the texture is flat.
         return np.asarray(noise / spread if spread > 0 else noise, dtype=np.float32)
 
     def sand(self) -> _Patch:
@@ -100,14 +100,14 @@ class _Maker:
         along = np.arange(self._shape[0], dtype=np.float32)[:, None] * self._cell_m
         across = np.arange(self._shape[1], dtype=np.float32)[None, :] * self._cell_m
         carrier = (along * math.cos(direction) + across * math.sin(direction)) / wavelength_m
-        # Strong, slow changes of phase make the crests meander and, where they cannot keep up, fork and end.
+        # Strong, slow phase variations make the crests meander, fork and end.
         phase = 2 * math.pi * carrier + 2.2 * self.fractal(3.5, 16.0, 2.0) + 0.35 * self.fractal(2.0, 2.5, 0.4)
-        # Waves leave sharp crests and round troughs.
+        # Wave ripples have sharp crests and round troughs.
         profile = np.exp(1.1 * np.sin(phase)) - 1.26
         strength = np.clip(0.75 + 0.35 * self.fractal(3.0, 20.0, 3.0), 0.15, 1.3)
         relief = np.asarray(wavelength_m / 38 * strength * profile, dtype=np.float32)
         bed = self.sand()
-        # Coarser grains and shell gather in the troughs.
+        # Coarse grains and shells collect in the troughs.
         coarse = np.asarray(1.15 - 0.12 * np.clip(profile, -1, 1), dtype=np.float32)
         return _Patch(relief + np.float32(0.6) * bed.height_m, bed.backscatter * coarse)
 
@@ -125,7 +125,7 @@ class _Maker:
         along = np.arange(self._shape[0], dtype=np.float32)[:, None] * self._cell_m
         across = np.arange(self._shape[1], dtype=np.float32)[None, :] * self._cell_m
         for _ in range(int(self._rng.integers(0, 3))):
-            # The furrow of a trawl door or an anchor: a groove with spoil on one side.
+            # Furrow of a trawl door or an anchor: a groove with spoil on one side.
             direction = self._rng.uniform(0, math.pi)
             through = (self._rng.uniform(0, self._shape[0]), self._rng.uniform(0, self._shape[1]))
             off = (along - through[0] * self._cell_m) * math.sin(direction)
@@ -148,18 +148,18 @@ class _Maker:
         )
 
     def mixed(self) -> _Patch:
-        """Sand with fields of three other bottoms, their borders as ragged as tides leave them."""
+        """Return sand with patches of three other types with irregular borders."""
         patches = [self.sand(), self.ripples(), self.mud() if self._rng.random() < 0.5 else self.gravel(), self.rock()]
-        favour = [0.35, 0.25, 0.0, -0.35]
-        scores = np.stack([bias + self.fractal(3.0, 45.0, 0.8) for bias in favour])
+        biases = [0.35, 0.25, 0.0, -0.35]
+        scores = np.stack([bias + self.fractal(3.0, 45.0, 0.8) for bias in biases])
         weights = np.exp(9 * (scores - scores.max(axis=0)))
         weights /= weights.sum(axis=0)
         height = sum(w * p.height_m for w, p in zip(weights, patches, strict=True))
         backscatter = sum(w * p.backscatter for w, p in zip(weights, patches, strict=True))
         return _Patch(np.asarray(height, dtype=np.float32), np.asarray(backscatter, dtype=np.float32))
 
-    def make(self, kind: SeabedKind) -> _Patch:
-        draw = {
+    def generate(self, kind: SeabedKind) -> _Patch:
+        generators = {
             SeabedKind.SAND: self.sand,
             SeabedKind.RIPPLES: self.ripples,
             SeabedKind.GRAVEL: self.gravel,
@@ -167,7 +167,7 @@ class _Maker:
             SeabedKind.ROCK: self.rock,
             SeabedKind.MIXED: self.mixed,
         }
-        return draw[kind]()
+        return generators[kind]()
 
 
 def make_seabed(
@@ -178,31 +178,31 @@ def make_seabed(
     cell_m: float,
     rng: np.random.Generator,
 ) -> Seabed:
-    """Draw a seabed.
+    """Generate a seabed.
 
     Args:
-        kind: What lies there; `MIXED` is sand with patches of the others.
+        kind: Type; `MIXED` is sand with patches of other types.
         along_m: First and last along-track coordinate to cover.
         across_m: First and last across-track coordinate to cover, starboard positive.
-        cell_m: Side of a cell.
-        rng: Source of chance; the same state gives the same seabed.
+        cell_m: Size of a cell.
+        rng: Random generator; the same state gives the same seabed.
 
     Raises:
         ValueError: An empty strip, or one of more than 200 million cells.
     """
     if not cell_m > 0 or not along_m[1] > along_m[0] or not across_m[1] > across_m[0]:
-        raise ValueError(f"no strip: {along_m} by {across_m} m in cells of {cell_m} m")
-    wanted = [math.ceil((high - low) / cell_m) + 1 for low, high in (along_m, across_m)]
-    if wanted[0] * wanted[1] > 200_000_000:
-        raise ValueError(f"{wanted[0]} x {wanted[1]} cells are more than memory should be asked for")
-    # Lengths of small prime factors keep the Fourier transforms fast.
-    rows, columns = (scipy.fft.next_fast_len(n, real=True) for n in wanted)
-    patch = _Maker((rows, columns), cell_m, rng).make(kind)
-    # Nothing on the bottom is sharper than a few centimetres.
+        raise ValueError(f"strip: got {along_m} by {across_m} m in cells of {cell_m} m, expected a positive area")
+    size = [math.ceil((high - low) / cell_m) + 1 for low, high in (along_m, across_m)]
+    if size[0] * size[1] > 200_000_000:
+        raise ValueError(f"strip: got {size[0]} x {size[1]} cells, expected at most 200 million (memory)")
+    # Lengths with small prime factors make the Fourier transforms fast.
+    rows, columns = (scipy.fft.next_fast_len(n, real=True) for n in size)
+    patch = _TextureGenerator((rows, columns), cell_m, rng).generate(kind)
+    # Relief is smooth below a few centimetres.
     height = gaussian_filter(patch.height_m, 0.02 / cell_m)
     return Seabed(
-        height_m=np.ascontiguousarray(height[: wanted[0], : wanted[1]], dtype=np.float32),
-        backscatter=np.ascontiguousarray(patch.backscatter[: wanted[0], : wanted[1]], dtype=np.float32),
+        height_m=np.ascontiguousarray(height[: size[0], : size[1]], dtype=np.float32),
+        backscatter=np.ascontiguousarray(patch.backscatter[: size[0], : size[1]], dtype=np.float32),
         cell_m=cell_m,
         along_start_m=along_m[0],
         across_start_m=across_m[0],
