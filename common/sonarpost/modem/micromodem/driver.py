@@ -18,10 +18,12 @@ from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.events import (
     FailureReason,
+    FlexibleDataReceived,
     FrameAcknowledged,
     ModemError,
     ModemEvent,
     PacketFailed,
+    PacketReceived,
     PollReceived,
     RequestFailed,
     SentenceRejected,
@@ -32,8 +34,8 @@ from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.modem.micromodem.reception import ReceptionTracker
 from sonarpost.modem.micromodem.requests import (
     ModemRequest,
+    RequestExchange,
     RequestKind,
-    RequestTracker,
     flexible_command,
     mini_command,
     ping_command,
@@ -45,8 +47,13 @@ from sonarpost.modem.micromodem.sentences import (
     DataAccepted,
     DataRequest,
     ErrorReport,
+    MiniPacketAnswered,
+    MiniPacketReceived,
     ModemMessage,
+    PingAnswered,
+    PingReceived,
     ReceivedData,
+    ReceivedFlexibleData,
     Revision,
     TransmitMark,
     transmit_data,
@@ -69,8 +76,8 @@ class MicroModem:
         self._lines = LineAssembler(where, learn_checksums=True)
         self._supervisor = ModemSupervisor(config, self._send)
         self._reception = ReceptionTracker(config)
-        self._requests = RequestTracker(config, self._send)
         self._cycle: TransmitCycle | None = None
+        self._request: RequestExchange | None = None
         self._queue: deque[OutgoingPacket | ModemRequest] = deque()
         self._poll_handler: Callable[[PollReceived], Sequence[bytes]] | None = None
         self._next_id = 1
@@ -111,8 +118,13 @@ class MicroModem:
         return self._reception.reception is not None
 
     @property
+    def _exchange(self) -> TransmitCycle | RequestExchange | None:
+        """The exchange in progress. The cycle of a poll takes precedence over the request during which it came."""
+        return self._cycle or self._request
+
+    @property
     def _idle(self) -> bool:
-        return self._cycle is None and self._requests.exchange is None
+        return self._exchange is None
 
     def start(self, now: float) -> None:
         """Configure the modem; the same as `port_opened`."""
@@ -159,7 +171,7 @@ class MicroModem:
         Raises:
             FrameError: An address outside 0..127.
         """
-        return self._request(RequestKind.PING, destination, ping_command(self.config.address, destination), now)
+        return self._enqueue_request(RequestKind.PING, destination, ping_command(self.config.address, destination), now)
 
     def send_mini(self, destination: int, bits: int, now: float) -> int:
         """Queue a user mini-packet of 13 bits; `RequestDone` or `RequestFailed` carries the result.
@@ -168,7 +180,7 @@ class MicroModem:
             FrameError: An address outside 0..127, or more than 13 bits.
         """
         command = mini_command(self.config.address, destination, bits)
-        return self._request(RequestKind.MINI_PACKET, destination, command, now)
+        return self._enqueue_request(RequestKind.MINI_PACKET, destination, command, now)
 
     def send_flexible(self, destination: int, rate: int, data: bytes, now: float) -> int:
         """Queue flexible data (Micro-Modem 2); `RequestDone` or `RequestFailed` carries the result.
@@ -177,7 +189,7 @@ class MicroModem:
             FrameError: An address outside 0..127, a rate other than 1, 3 or 5, no data or more than 2048 bytes.
         """
         command = flexible_command(destination, rate, data)
-        return self._request(RequestKind.FLEXIBLE_DATA, destination, command, now, rate)
+        return self._enqueue_request(RequestKind.FLEXIBLE_DATA, destination, command, now, rate)
 
     def request_packet(
         self, source: int, rate: int, frames: int | None = None, *, ack: bool = False, now: float
@@ -195,7 +207,7 @@ class MicroModem:
             FrameError: An address outside 0..127, an unknown rate, or more frames than the rate has.
         """
         command = poll_command(source, self.config.address, rate, frames, ack=ack)
-        return self._request(RequestKind.POLL, source, command, now, rate)
+        return self._enqueue_request(RequestKind.POLL, source, command, now, rate)
 
     def set_poll_handler(self, handler: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
         """Set the function that returns the frames when another modem polls this one.
@@ -242,7 +254,7 @@ class MicroModem:
         times_s = [self._events_since_s if self._events else None]
         times_s += [packet.queued_s + self.config.max_defer_s for packet in self._queue]
         if self.phase is not Phase.CLOSED:
-            exchange_s = self._requests.deadline_s if self._cycle is None else self._cycle.deadline_s
+            exchange_s = None if self._exchange is None else self._exchange.deadline_s
             # The modem is not queried during an exchange, which shows by itself whether the modem answers.
             check_s = None if not self._idle and self.phase is Phase.READY else self._supervisor.deadline_s
             times_s += [exchange_s, check_s, self._reception.deadline_s, self._busy_until_s]
@@ -263,27 +275,27 @@ class MicroModem:
         self._on_reception(self._reception.poll(now))
         if self._busy_until_s is not None and now >= self._busy_until_s:
             self._busy_until_s = None
-        self._advance_cycle(now)
-        self._advance_request(now)
+        self._advance_exchanges(now)
         self._events += self._supervisor.poll(now, may_check=self._idle)
         self._start_next(now)
 
-    def _advance_cycle(self, now: float) -> None:
-        if self._cycle is None:
-            return
-        self._cycle.poll(now)
-        if self._cycle.result is not None:
-            self._events.append(self._cycle.result)
-            if isinstance(self._cycle.result, PacketFailed):
+    def _advance_exchanges(self, now: float) -> None:
+        for exchange in (self._cycle, self._request):
+            if exchange is None:
+                continue
+            exchange.poll(now)
+            result = exchange.result
+            if result is None:
+                continue
+            self._events.append(result)
+            if exchange is self._cycle:
+                self._cycle = None
+            else:
+                self._request = None
+            # A request that failed after its echo shows that the modem itself works.
+            no_echo = isinstance(result, RequestFailed) and result.reason is FailureReason.NO_ECHO
+            if isinstance(result, PacketFailed) or no_echo:
                 self._supervisor.check(now)
-            self._cycle = None
-
-    def _advance_request(self, now: float) -> None:
-        events = self._requests.poll(now)
-        self._events += events
-        # Without an echo the modem itself has failed, not the channel or the far modem.
-        if any(isinstance(event, RequestFailed) and event.reason is FailureReason.NO_ECHO for event in events):
-            self._supervisor.check(now)
 
     def _start_next(self, now: float) -> None:
         channel_free = self._reception.reception is None and self._busy_until_s is None
@@ -293,9 +305,9 @@ class MicroModem:
         if isinstance(item, OutgoingPacket):
             self._cycle = TransmitCycle(item, self.config, self._send, now)
         else:
-            self._requests.start(item, now)
+            self._request = RequestExchange(item, self.config, self._send, now)
 
-    def _request(self, kind: RequestKind, peer: int, command: Sentence, now: float, rate: int = 0) -> int:
+    def _enqueue_request(self, kind: RequestKind, peer: int, command: Sentence, now: float, rate: int = 0) -> int:
         request = ModemRequest(self._next_id, kind, peer, command, rate, now)
         self._enqueue(request, now)
         return request.request_id
@@ -310,14 +322,15 @@ class MicroModem:
 
     def _on_reception(self, events: list[ModemEvent]) -> None:
         self._events += events
-        self._requests.on_reception(events)
+        if self._request is not None:
+            for event in events:
+                if isinstance(event, PacketReceived):
+                    self._request.on_answer(RequestKind.POLL, event.src)
 
     def _abort(self, reason: FailureReason) -> None:
         """Fail the exchange in progress and return the received frames: the modem has lost its state."""
-        if self._cycle is not None:
-            self._events.append(self._cycle.abort(reason))
-            self._cycle = None
-        self._events += self._requests.abort(reason)
+        self._events += [exchange.abort(reason) for exchange in (self._cycle, self._request) if exchange is not None]
+        self._cycle = self._request = None
         self._events += self._reception.flush()
         self._busy_until_s = None
 
@@ -352,8 +365,8 @@ class MicroModem:
         cycle = Cycle.parse(sentence)
         if self._cycle is not None and self._cycle.owns(cycle):
             self._cycle.on_echo(now)
-        elif self._requests.exchange is not None and self._requests.exchange.owns(cycle):
-            self._requests.exchange.on_echo("CYC", now)
+        elif self._request is not None and self._request.owns(cycle):
+            self._request.on_echo("CYC", now)
         elif cycle.src != self.config.address:
             self._on_reception(self._reception.on_cycle(cycle, now))
         elif not self._start_polled(cycle, now):
@@ -390,10 +403,8 @@ class MicroModem:
 
     def _on_transmission(self, sentence: Sentence, now: float) -> None:
         mark = TransmitMark.parse(sentence)
-        if self._cycle is not None:
-            self._cycle.on_transmission(mark, now)
-        elif self._requests.exchange is not None:
-            self._requests.exchange.on_transmission(ends=mark.ends, now=now)
+        if self._exchange is not None:
+            self._exchange.on_transmission(mark, now)
         else:
             self._busy_until_s = None if mark.ends else now + self.config.on_air_limit_s(None)
 
@@ -404,10 +415,8 @@ class MicroModem:
         except SentenceError as error:
             # Invalid statistics still mark the end of the transmission.
             self._events.append(SentenceRejected(error))
-        if self._cycle is not None:
-            self._cycle.on_statistics(statistics, now)
-        elif self._requests.exchange is not None:
-            self._requests.exchange.on_transmit_statistics(now)
+        if self._exchange is not None:
+            self._exchange.on_statistics(statistics, now)
         else:
             self._events.append(UnhandledSentence(sentence))
 
@@ -421,14 +430,36 @@ class MicroModem:
     def _on_message(self, sentence: Sentence, now: float) -> None:
         message = ModemMessage.parse(sentence)
         self._on_reception(self._reception.on_message(message, now))
-        if message.text == "PACKET_TIMEOUT" and self._requests.exchange is not None:
-            self._requests.exchange.on_no_answer()
+        if message.text == "PACKET_TIMEOUT" and self._request is not None:
+            self._request.on_no_answer()
 
     def _on_link_statistics(self, sentence: Sentence, now: float) -> None:
         self._on_reception(self._reception.on_statistics(sentence, now))
 
-    def _on_request_sentence(self, sentence: Sentence, now: float) -> None:
-        self._events += self._requests.receive(sentence, now)
+    def _on_request_echo(self, sentence: Sentence, now: float) -> None:
+        if self._request is not None:
+            self._request.on_echo(sentence.kind[2:], now)
+
+    def _on_ping_received(self, sentence: Sentence, now: float) -> None:
+        self._events.append(PingReceived.parse(sentence))
+
+    def _on_ping_answered(self, sentence: Sentence, now: float) -> None:
+        answer = PingAnswered.parse(sentence)
+        if self._request is not None:
+            self._request.on_answer(RequestKind.PING, answer.src)
+        self._events.append(answer)
+
+    def _on_mini_received(self, sentence: Sentence, now: float) -> None:
+        self._events.append(MiniPacketReceived.parse(sentence))
+
+    def _on_mini_answered(self, sentence: Sentence, now: float) -> None:
+        answer = MiniPacketAnswered.parse(sentence)
+        if self._request is not None:
+            self._request.on_answer(RequestKind.MINI_PACKET, answer.src)
+        self._events.append(answer)
+
+    def _on_flexible_data(self, sentence: Sentence, now: float) -> None:
+        self._events.append(FlexibleDataReceived(ReceivedFlexibleData.parse(sentence), now))
 
     def _on_acknowledgement(self, sentence: Sentence, now: float) -> None:
         acknowledgement = Acknowledgement.parse(sentence)
@@ -442,10 +473,8 @@ class MicroModem:
     def _on_error(self, sentence: Sentence, now: float) -> None:
         report = ErrorReport.parse(sentence)
         self._events.append(ModemError(report))
-        if self._cycle is not None:
-            self._cycle.on_error(report)
-        elif self._requests.exchange is not None:
-            self._requests.exchange.on_error(report, now)
+        if self._exchange is not None:
+            self._exchange.on_error(report, now)
 
     _HANDLERS: ClassVar[Mapping[str, Callable[[MicroModem, Sentence, float], None]]] = {
         "CAREV": _on_revision,
@@ -465,5 +494,12 @@ class MicroModem:
         "CACST": _on_link_statistics,
         "CAACK": _on_acknowledgement,
         "CAERR": _on_error,
-        **dict.fromkeys(RequestTracker.KINDS, _on_request_sentence),
+        "CAMPC": _on_request_echo,
+        "CAMUC": _on_request_echo,
+        "CATDP": _on_request_echo,
+        "CAMPA": _on_ping_received,
+        "CAMPR": _on_ping_answered,
+        "CAMUA": _on_mini_received,
+        "CAMUR": _on_mini_answered,
+        "CARDP": _on_flexible_data,
     }

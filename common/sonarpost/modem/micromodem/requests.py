@@ -6,33 +6,17 @@ limited, and a later sentence implies the earlier ones that were lost.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
 
 from sonarpost.errors import FrameError
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import (
-    FailureReason,
-    FlexibleDataReceived,
-    ModemEvent,
-    PacketReceived,
-    RequestDone,
-    RequestFailed,
-)
+from sonarpost.modem.micromodem.events import FailureReason, RequestDone, RequestFailed
 from sonarpost.modem.micromodem.nmea import MAX_ADDRESS, Sentence
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.modem.micromodem.sentences import (
-    FLEXIBLE_RATES,
-    MAX_MINI_BITS,
-    Cycle,
-    ErrorReport,
-    MiniPacketAnswered,
-    MiniPacketReceived,
-    PingAnswered,
-    PingReceived,
-    ReceivedFlexibleData,
-)
+from sonarpost.modem.micromodem.sentences import FLEXIBLE_RATES, MAX_MINI_BITS, Cycle, ErrorReport, TransmitMark
+from sonarpost.modem.micromodem.statistics import TransmitStatistics
 
 MAX_FLEXIBLE_BYTES = 2048
 
@@ -169,14 +153,14 @@ class RequestExchange:
         if self._stage is _Stage.ECHO and kind == self.request.command.kind[2:]:
             self._wait_on_air(now)
 
-    def on_transmission(self, *, ends: bool, now: float) -> None:
+    def on_transmission(self, mark: TransmitMark, now: float) -> None:
         """Process the start or the end of a transmission."""
-        if self._stage is _Stage.ECHO and not ends:
+        if self._stage is _Stage.ECHO and not mark.ends:
             self._wait_on_air(now)
-        elif self._stage in {_Stage.ECHO, _Stage.ON_AIR} and ends:
+        elif self._stage in {_Stage.ECHO, _Stage.ON_AIR} and mark.ends:
             self._transmitted(now)
 
-    def on_transmit_statistics(self, now: float) -> None:
+    def on_statistics(self, _statistics: TransmitStatistics | None, now: float) -> None:
         """Process `CAXST`, which implies the end of the transmission."""
         if self._stage is _Stage.ON_AIR:
             self._transmitted(now)
@@ -189,14 +173,21 @@ class RequestExchange:
     def on_no_answer(self) -> None:
         """Process the modem's report that no packet followed the poll."""
         if self.request.kind is RequestKind.POLL and self._stage is _Stage.ANSWER:
-            self._fail(FailureReason.NO_ANSWER)
+            self.abort(FailureReason.NO_ANSWER)
 
     def on_error(self, report: ErrorReport, now: float) -> None:
         """Process an NMEA error before the echo: the modem rejects the command."""
         if report.module == "NMEA" and self._stage is _Stage.ECHO:
             self.deadline_s = now
             if self._attempt >= self._config.tries:
-                self._fail(FailureReason.REFUSED)
+                self.abort(FailureReason.REFUSED)
+
+    def abort(self, reason: FailureReason) -> RequestFailed:
+        """End the exchange as failed and return the event."""
+        failed = self.request.failed(reason)
+        self.result = failed
+        self._stage = _Stage.OVER
+        return failed
 
     def poll(self, now: float) -> None:
         """Do what is due: send again, or end the exchange."""
@@ -207,12 +198,12 @@ class RequestExchange:
             self.deadline_s = now + self._config.reply_timeout_s
             self._send(self.request.command)
         elif self._stage is _Stage.ECHO:
-            self._fail(FailureReason.NO_ECHO)
+            self.abort(FailureReason.NO_ECHO)
         elif self._stage is _Stage.ON_AIR:
             # CATXF may have been lost, or this modem sends none for short packets.
             self._transmitted(now)
         else:
-            self._fail(FailureReason.NO_ANSWER)
+            self.abort(FailureReason.NO_ANSWER)
 
     def _wait_on_air(self, now: float) -> None:
         self._stage = _Stage.ON_AIR
@@ -232,84 +223,3 @@ class RequestExchange:
     def _finish(self) -> None:
         self.result = RequestDone(self.request.request_id, self.request.kind.value, self.request.peer)
         self._stage = _Stage.OVER
-
-    def _fail(self, reason: FailureReason) -> None:
-        self.result = self.request.failed(reason)
-        self._stage = _Stage.OVER
-
-
-class RequestTracker:
-    """Follows the request in progress; reports received pings, mini-packets and flexible data.
-
-    Args:
-        config: Time-outs and tries.
-        send: Sends a sentence.
-    """
-
-    KINDS = ("CAMPC", "CAMPA", "CAMPR", "CAMUC", "CAMUA", "CAMUR", "CATDP", "CARDP")
-    """Kinds of sentences for `receive`."""
-
-    def __init__(self, config: MicroModemConfig, send: Callable[[Sentence], None]) -> None:
-        self._config = config
-        self._send = send
-        self.exchange: RequestExchange | None = None
-
-    @property
-    def deadline_s(self) -> float | None:
-        """When `poll` has something to do, or None."""
-        return None if self.exchange is None else self.exchange.deadline_s
-
-    def start(self, request: ModemRequest, now: float) -> None:
-        """Start a request; no other is in progress."""
-        self.exchange = RequestExchange(request, self._config, self._send, now)
-
-    def receive(self, sentence: Sentence, now: float) -> list[ModemEvent]:
-        """Process a sentence of the kinds in `KINDS`.
-
-        Raises:
-            SentenceError: A wrong field.
-        """
-        if self.exchange is not None:
-            self.exchange.on_echo(sentence.kind[2:], now)
-        match sentence.kind:
-            case "CAMPA":
-                return [PingReceived.parse(sentence)]
-            case "CAMPR":
-                ping_answer = PingAnswered.parse(sentence)
-                self._on_answer(RequestKind.PING, ping_answer.src)
-                return [ping_answer]
-            case "CAMUA":
-                return [MiniPacketReceived.parse(sentence)]
-            case "CAMUR":
-                mini_answer = MiniPacketAnswered.parse(sentence)
-                self._on_answer(RequestKind.MINI_PACKET, mini_answer.src)
-                return [mini_answer]
-            case "CARDP":
-                return [FlexibleDataReceived(ReceivedFlexibleData.parse(sentence), now)]
-        return []
-
-    def on_reception(self, events: Iterable[ModemEvent]) -> None:
-        """Process events of the reception: the packet of a polled modem answers the poll."""
-        for event in events:
-            if isinstance(event, PacketReceived):
-                self._on_answer(RequestKind.POLL, event.src)
-
-    def poll(self, now: float) -> list[ModemEvent]:
-        """Do what is due; return the result of the request, once."""
-        if self.exchange is None:
-            return []
-        self.exchange.poll(now)
-        result = self.exchange.result
-        if result is None:
-            return []
-        self.exchange = None
-        return [result]
-
-    def abort(self, reason: FailureReason) -> list[ModemEvent]:
-        """End the request (the modem restarted, the port was lost)."""
-        exchange, self.exchange = self.exchange, None
-        return [] if exchange is None else [exchange.request.failed(reason)]
-
-    def _on_answer(self, kind: RequestKind, src: int | None) -> None:
-        if self.exchange is not None:
-            self.exchange.on_answer(kind, src)

@@ -191,7 +191,7 @@ class TransmitCycle:
         if self.stage is TransmitStage.ACKNOWLEDGEMENT and len(self._acknowledged) == len(self.packet.frames):
             self._finish(now)
 
-    def on_error(self, report: ErrorReport) -> None:
+    def on_error(self, report: ErrorReport, _now: float) -> None:
         """Process a data timeout of the modem."""
         if report.data_timeout and self.stage in {TransmitStage.REQUEST, TransmitStage.DATA_ECHO}:
             self.abort(FailureReason.DATA_TIMEOUT)
