@@ -7,7 +7,8 @@ rate 0 then has no `CACYC`. Announced frames without data have no line.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from datetime import datetime
 
 from sonarpost.modem.micromodem import nmea
 from sonarpost.modem.micromodem.sentences import Cycle
@@ -20,7 +21,7 @@ from sonarpost.simulation.channel.events import (
     PacketOutcome,
 )
 from sonarpost.simulation.modem.settings import EmulatedModemConfig, ModemClock, ModemSettings
-from sonarpost.simulation.modem.statistics import PacketType, ReceivedPacket, ReceiveMode, receive_statistics
+from sonarpost.simulation.modem.statistics import PacketType, packet_type, receive_statistics
 
 _GOOD = frozenset({FrameOutcome.DELIVERED, FrameOutcome.DAMAGED})
 _OTHER_DESTINATION = "addressed to another modem"
@@ -76,15 +77,6 @@ class _ExpectedData:
     def includes(self, packet: AcousticPacket) -> bool:
         h = self.header
         return (h.source, h.destination, h.rate) == (packet.source, packet.destination, packet.rate)
-
-
-def packet_type(packet: AcousticPacket) -> PacketType:
-    """Return the packet type for the statistics."""
-    if packet.kind is PacketKind.FLEXIBLE:
-        return PacketType.FLEXIBLE
-    if packet.kind is not PacketKind.DATA:
-        return PacketType.FSK_MINI
-    return PacketType.FSK if packet.rate == 0 else PacketType.PSK
 
 
 class Receiver:
@@ -157,17 +149,16 @@ class Receiver:
             return self._data(arrival)
         # A short packet between a header and its data does not end the wait.
         self._expected = expected
-        report, received = HostReport(), self._received(arrival)
+        report = HostReport()
         if packet.kind is PacketKind.CYCLE:
             if packet.source != self._settings["SRC"]:
                 self.expect_data(packet, arrival.time_s)
             report.lines.append(_cycle_line(packet, packet.announced_frames))
-            received = replace(received, frames=0, bad_frames=0)
         elif packet.kind is PacketKind.FLEXIBLE:
             self._flexible(arrival, report)
         else:
             self._short(arrival, report)
-        return self._with_statistics(report, received)
+        return self._with_statistics(report, arrival)
 
     def _missed_reason(self, arrival: ArrivalEnded) -> str | None:
         if arrival.transmission.packet.kind is PacketKind.NAVIGATION:
@@ -182,10 +173,7 @@ class Receiver:
 
     def _undecoded(self, arrival: ArrivalEnded, reason: str) -> HostReport:
         lines = [nmea.format("CAMSG", "PACKET_TIMEOUT", arrival.transmission.packet.rate)]
-        received = replace(
-            self._received(arrival), mode=ReceiveMode.TIMEOUT, source=0, destination=0, frames=0, bad_frames=0
-        )
-        return self._with_statistics(HostReport(lines, unreported_reason=reason), received)
+        return self._with_statistics(HostReport(lines, unreported_reason=reason), arrival, decoded=False)
 
     def _data(self, arrival: ArrivalEnded) -> HostReport:
         packet = arrival.transmission.packet
@@ -205,7 +193,7 @@ class Receiver:
                     report.unreported_reason = f"{switch} is off"
         report.lines += self._optional_lines(arrival)
         report.good_frames = tuple(frame.number for frame in arrival.frames if frame.outcome in _GOOD)
-        return self._with_statistics(report, self._received(arrival))
+        return self._with_statistics(report, arrival)
 
     @staticmethod
     def _frame_line(packet: AcousticPacket, frame: FrameArrival) -> tuple[bytes, str]:
@@ -241,38 +229,24 @@ class Receiver:
         else:
             report.lines.append(nmea.format("CAMUR", *ends))
 
-    def _received(self, arrival: ArrivalEnded) -> ReceivedPacket:
-        packet = arrival.transmission.packet
-        filled = [frame for frame in arrival.frames if frame.outcome is not FrameOutcome.EMPTY]
-        bad = sum(frame.outcome is FrameOutcome.LOST for frame in filled)
-        return ReceivedPacket(
-            mode=ReceiveMode.BAD_CRC if bad else ReceiveMode.GOOD,
-            arrived=self._clock.at(arrival.transmission.started_s + arrival.delay_s),
-            clock=self._clock.status(self._config.generation),
-            rate=packet.rate,
-            source=packet.source,
-            destination=packet.destination,
-            packet_type=packet_type(packet),
-            frames=len(filled),
-            bad_frames=bad,
-            snr_db=arrival.snr_db,
-            range_m=arrival.range_m,
-        )
-
     def _optional_lines(self, arrival: ArrivalEnded) -> list[bytes]:
         """Return the lines that are off by default."""
         lines = []
-        arrived = self._clock.at(arrival.transmission.started_s + arrival.delay_s)
         if self._settings.on("TOA"):
-            lines.append(nmea.format("CATOA", arrived.strftime("%H%M%S.%f")[:-2], int(self._clock.was_set)))
+            time = self._arrived(arrival).strftime("%H%M%S.%f")[:-2]
+            lines.append(nmea.format("CATOA", time, int(self._clock.was_set)))
         if self._settings.on("DQF") and packet_type(arrival.transmission.packet) is PacketType.FSK:
             lines.append(nmea.format("CADQF", max(0, min(254, round(180 + arrival.snr_db))), PacketType.FSK.value))
         return lines
 
-    def _with_statistics(self, report: HostReport, received: ReceivedPacket) -> HostReport:
+    def _with_statistics(self, report: HostReport, arrival: ArrivalEnded, *, decoded: bool = True) -> HostReport:
         if self._settings.on("CST"):
-            report.lines.append(receive_statistics(received, self._config.statistics_version))
+            version, clock = self._config.statistics_version, self._clock.status(self._config.generation)
+            report.lines.append(receive_statistics(arrival, version, self._arrived(arrival), clock, decoded=decoded))
         return report
+
+    def _arrived(self, arrival: ArrivalEnded) -> datetime:
+        return self._clock.at(arrival.transmission.started_s + arrival.delay_s)
 
 
 def _cycle_line(packet: AcousticPacket, frames: int) -> bytes:

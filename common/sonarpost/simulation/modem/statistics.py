@@ -8,11 +8,11 @@ to it, adds the actual carrier. Levels are plausible and follow range and packet
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum
 
 from sonarpost.modem.micromodem import nmea
+from sonarpost.simulation.channel.events import AcousticPacket, ArrivalEnded, FrameOutcome, PacketKind
 
 CARRIER_HZ = 25000
 BANDWIDTH_HZ = 5000
@@ -30,6 +30,9 @@ class ReceiveMode(IntEnum):
     TIMEOUT = 2
 
 
+_PSK_ERRORS = {ReceiveMode.GOOD: 0, ReceiveMode.BAD_CRC: 3, ReceiveMode.TIMEOUT: 2}
+
+
 class PacketType(IntEnum):
     """`pkt_type` of `CACST` and `CAXST`."""
 
@@ -39,117 +42,84 @@ class PacketType(IntEnum):
     FLEXIBLE = 5
 
 
-@dataclass(frozen=True, slots=True)
-class ReceivedPacket:
-    """Contents of `CACST`.
+def packet_type(packet: AcousticPacket) -> PacketType:
+    """Return the packet type of a packet."""
+    if packet.kind is PacketKind.FLEXIBLE:
+        return PacketType.FLEXIBLE
+    if packet.kind is not PacketKind.DATA:
+        return PacketType.FSK_MINI
+    return PacketType.FSK if packet.rate == 0 else PacketType.PSK
 
-    Attributes:
-        mode: How the reception ended.
+
+def receive_statistics(arrival: ArrivalEnded, version: int, arrived: datetime, clock: str, *, decoded: bool) -> bytes:
+    """Return the `CACST` of a received packet.
+
+    Args:
+        arrival: The packet.
+        version: Layout, 6 or 8.
         arrived: Date and time at which the packet began to arrive.
         clock: Status of the modem's clock.
-        rate: Rate number.
-        source: Source address, 0 when the header was not decoded.
-        destination: Destination address, 0 when the header was not decoded.
-        packet_type: Type of packet.
-        frames: Frames in the packet.
-        bad_frames: Frames with a bad CRC.
-        snr_db: Signal-to-noise ratio at the receiver.
-        range_m: Distance to the transmitter.
+        decoded: Whether the packet was decoded; without, addresses and frames are 0.
     """
-
-    mode: ReceiveMode
-    arrived: datetime
-    clock: str
-    rate: int
-    source: int
-    destination: int
-    packet_type: PacketType
-    frames: int
-    bad_frames: int
-    snr_db: float
-    range_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class TransmittedPacket:
-    """Contents of `CAXST`.
-
-    Attributes:
-        started: Date and time of the start of the transmission.
-        clock: Status of the modem's clock.
-        rate: Rate number.
-        source: Source address.
-        destination: Destination address.
-        ack_requested: Whether acknowledgement was requested.
-        frames_expected: Frames announced by the cycle.
-        frames_sent: Frames with data.
-        packet_type: Type of packet.
-        data_bytes: Data bytes in the packet.
-    """
-
-    started: datetime
-    clock: str
-    rate: int
-    source: int
-    destination: int
-    ack_requested: bool
-    frames_expected: int
-    frames_sent: int
-    packet_type: PacketType
-    data_bytes: int
-
-
-def receive_statistics(packet: ReceivedPacket, version: int) -> bytes:
-    """Return the `CACST` of one packet, in the layout of `version` (6 or 8)."""
-    level_db = _SOURCE_LEVEL_DB - 20 * math.log10(max(1.0, packet.range_m))
-    out_db = min(packet.snr_db - 3.0, _MAX_OUTPUT_SNR_DB)
-    psk = packet.packet_type in {PacketType.PSK, PacketType.FLEXIBLE}
-    psk_error = {ReceiveMode.GOOD: 0, ReceiveMode.BAD_CRC: 3, ReceiveMode.TIMEOUT: 2}[packet.mode] if psk else 0
+    packet, snr_db = arrival.transmission.packet, arrival.snr_db
+    filled = [frame for frame in arrival.frames if frame.outcome is not FrameOutcome.EMPTY]
+    bad = sum(frame.outcome is FrameOutcome.LOST for frame in filled)
+    mode = (ReceiveMode.BAD_CRC if bad else ReceiveMode.GOOD) if decoded else ReceiveMode.TIMEOUT
+    level_db = _SOURCE_LEVEL_DB - 20 * math.log10(max(1.0, arrival.range_m))
+    out_db = min(snr_db - 3.0, _MAX_OUTPUT_SNR_DB)
+    psk = packet_type(packet) in {PacketType.PSK, PacketType.FLEXIBLE}
     return nmea.format(
         "CACST",
         version,
-        packet.mode.value,
-        packet.arrived.strftime("%Y%m%d%H%M%S.%f"),
-        packet.clock,
-        max(1, min(32767, round(32767 * 10 ** ((packet.snr_db - 20) / 40)))),
-        max(0, min(99, round(packet.snr_db + 25))),
-        f"{max(0, min(9999, round(100 + 2 * packet.snr_db))):04d}",
+        mode.value,
+        arrived.strftime("%Y%m%d%H%M%S.%f"),
+        clock,
+        max(1, min(32767, round(32767 * 10 ** ((snr_db - 20) / 40)))),
+        max(0, min(99, round(snr_db + 25))),
+        f"{max(0, min(9999, round(100 + 2 * snr_db))):04d}",
         f"{max(0, round(level_db)):04d}",
         *("07", "00", "00", "00", "00"),
         packet.rate,
-        f"{packet.source:03d}",
-        f"{packet.destination:03d}",
-        psk_error,
-        packet.packet_type.value,
-        packet.frames,
-        packet.bad_frames,
+        f"{packet.source if decoded else 0:03d}",
+        f"{packet.destination if decoded else 0:03d}",
+        _PSK_ERRORS[mode] if psk else 0,
+        packet_type(packet).value,
+        len(filled) if decoded else 0,
+        bad if decoded else 0,
         max(0, round(level_db)),
-        f"{packet.snr_db:.1f}",
+        f"{snr_db:.1f}",
         f"{out_db:.2f}" if psk else "-100",
         "-100",
         f"{-out_db:.2f}" if psk else "-100",
-        "-01" if psk else f"{max(0, min(254, round(180 + packet.snr_db))):03d}",
+        "-01" if psk else f"{max(0, min(254, round(180 + snr_db))):03d}",
         *("0.00", 51, CARRIER_HZ, BANDWIDTH_HZ),
         *((0, -1, -1, "00") if version == 8 else ()),
     )
 
 
-def transmit_statistics(packet: TransmittedPacket, version: int) -> bytes:
-    """Return the `CAXST` of one packet, in the layout that belongs to `version` (6 or 8) of `CACST`."""
+def transmit_statistics(packet: AcousticPacket, version: int, started: datetime, *, clock_was_set: bool) -> bytes:
+    """Return the `CAXST` of a packet.
+
+    Args:
+        packet: The transmitted packet.
+        version: Layout of `CACST` to which this sentence belongs, 6 or 8.
+        started: Date and time of the start of the transmission.
+        clock_was_set: Whether a host has set the modem's clock.
+    """
     return nmea.format(
         "CAXST",
         7 if version == 8 else 6,
-        packet.started.strftime("%Y%m%d"),
-        packet.started.strftime("%H%M%S.%f"),
-        packet.clock,
+        started.strftime("%Y%m%d"),
+        started.strftime("%H%M%S.%f"),
+        int(clock_was_set),
         *(0, PROBE_SYMBOLS, BANDWIDTH_HZ, CARRIER_HZ),
         packet.rate,
         packet.source,
         packet.destination,
         int(packet.ack_requested),
-        packet.frames_expected,
-        packet.frames_sent,
-        packet.packet_type.value,
-        packet.data_bytes,
+        max(len(packet.frames), packet.announced_frames),
+        sum(map(bool, packet.frames)),
+        packet_type(packet).value,
+        sum(map(len, packet.frames)),
         *((CARRIER_HZ,) if version == 8 else ()),
     )

@@ -16,9 +16,8 @@ from sonarpost.modem.micromodem import RATES, nmea
 from sonarpost.modem.micromodem.sentences import Cycle
 from sonarpost.simulation.channel.events import AcousticPacket, ArrivalEnded, PacketKind, PacketOutcome
 from sonarpost.simulation.modem import commands
-from sonarpost.simulation.modem.receiver import packet_type
 from sonarpost.simulation.modem.settings import EmulatedModemConfig, ModemClock, ModemSettings
-from sonarpost.simulation.modem.statistics import TransmittedPacket, transmit_statistics
+from sonarpost.simulation.modem.statistics import transmit_statistics
 
 RANGING_PING_S = 0.01
 
@@ -297,24 +296,12 @@ class Transmitter:
         packet = ended.packet
         if packet.kind is PacketKind.NAVIGATION:
             return
-        total = sum(map(len, packet.frames))
         if self._settings.on("TXF"):
-            self._say("CATXF", total)
+            self._say("CATXF", sum(map(len, packet.frames)))
         if packet.kind not in _WITH_STATISTICS or not self._settings.on("XST"):
             return
-        statistics = TransmittedPacket(
-            started=self._clock.at(ended.started_s),
-            clock=str(int(self._clock.was_set)),
-            rate=packet.rate,
-            source=packet.source,
-            destination=packet.destination,
-            ack_requested=packet.ack_requested,
-            frames_expected=max(len(packet.frames), packet.announced_frames),
-            frames_sent=sum(map(bool, packet.frames)),
-            packet_type=packet_type(packet),
-            data_bytes=total,
-        )
-        self._write(transmit_statistics(statistics, self._config.statistics_version))
+        started, version = self._clock.at(ended.started_s), self._config.statistics_version
+        self._write(transmit_statistics(packet, version, started, clock_was_set=self._clock.was_set))
 
 
 @dataclass(frozen=True, slots=True)
