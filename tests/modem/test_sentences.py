@@ -27,7 +27,6 @@ from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
     ConfigurationSetting,
     Cycle,
-    DataAccepted,
     DataRequest,
     ErrorReport,
     FlexiblePart,
@@ -36,6 +35,7 @@ from sonarpost.modem.micromodem.sentences import (
     ReceivedFlexibleData,
     Revision,
     TransmitMark,
+    accepted_bytes,
     parse_clock,
     transmit_data,
 )
@@ -44,7 +44,6 @@ NINE_O_CLOCK = datetime(2016, 10, 12, 9, 0, 5, tzinfo=UTC)
 PARSED = [
     (b"$CACYC,0,3,1,4,0,2", Cycle(3, 1, 4, False, 2)),
     (b"$CADRQ,181807,3,1,0,256,2", DataRequest(3, 1, False, 256, 2)),
-    (b"$CATXD,2,1,0,3", DataAccepted(2, 1, False, 3)),
     (b"$CATXP,28", TransmitMark(False, 28)),
     (b"$CATXF,28", TransmitMark(True, 28)),
     (b"$CATXF", TransmitMark(True)),
@@ -94,6 +93,10 @@ def test_bytes_of_each_command(sentence: Sentence, line: bytes) -> None:
     assert sentence.encode().partition(b"*")[0] == line
 
 
+def test_accepted_bytes() -> None:
+    assert accepted_bytes(nmea.parse(b"$CATXD,2,1,0,3")) == 3
+
+
 def test_echo_has_the_fields_of_the_command() -> None:
     assert Cycle(3, 1, 4, True, 2).sentence("CACYC") == Sentence("CACYC", ("0", "3", "1", "4", "1", "2"))
     local = NINE_O_CLOCK.astimezone(timezone(timedelta(hours=2)))
@@ -115,7 +118,8 @@ def test_echo_has_the_fields_of_the_command() -> None:
         (b"$CARXD,3,1,0,1,ABC", ReceivedData.parse, "data"),
         (b"$CARXD,3,1,0,1,GG", ReceivedData.parse, "data"),
         (b"$CARXD,3,1,0,1,A B ", ReceivedData.parse, "data"),
-        (b"$CATXD,3,1,0,99999999", DataAccepted.parse, "nbytes"),
+        (b"$CATXD,3,1,0,99999999", accepted_bytes, "nbytes"),
+        (b"$CATXD,128,1,0,1", accepted_bytes, "src"),
         (b"$CATXF,x", TransmitMark.parse, "nbytes"),
         (b"$CAACK,1,3,0,1", Acknowledgement.parse, "frame"),
         (b"$CAMSG,", ModemMessage.parse, "text"),
@@ -151,7 +155,7 @@ def test_error_names_the_invalid_field(line: bytes, parse: Callable[[Sentence], 
 
 
 PARSERS: dict[str, Callable[[Sentence], object]] = {
-    "CACYC": Cycle.parse, "CADRQ": DataRequest.parse, "CATXD": DataAccepted.parse, "CATXP": TransmitMark.parse,
+    "CACYC": Cycle.parse, "CADRQ": DataRequest.parse, "CATXD": accepted_bytes, "CATXP": TransmitMark.parse,
     "CARXD": ReceivedData.parse, "CAACK": Acknowledgement.parse,
     "CAMSG": ModemMessage.parse, "CACFG": ConfigurationSetting.parse, "CAREV": Revision.parse,
     "CAERR": ErrorReport.parse, "CACLK": parse_clock, "CATMS": parse_clock, "CAMPA": PingReceived.parse,

@@ -44,7 +44,6 @@ from sonarpost.modem.micromodem.requests import (
 from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
     Cycle,
-    DataAccepted,
     DataRequest,
     ErrorReport,
     MiniPacketAnswered,
@@ -56,6 +55,7 @@ from sonarpost.modem.micromodem.sentences import (
     ReceivedFlexibleData,
     Revision,
     TransmitMark,
+    accepted_bytes,
     transmit_data,
 )
 from sonarpost.modem.micromodem.statistics import TransmitStatistics
@@ -397,9 +397,9 @@ class MicroModem:
             self._send(transmit_data(request.src, request.dest, b"", ack=request.ack))
 
     def _on_data_accepted(self, sentence: Sentence, now: float) -> None:
-        accepted = DataAccepted.parse(sentence)
+        nbytes = accepted_bytes(sentence)
         if self._cycle is not None:
-            self._cycle.on_data_accepted(accepted, now)
+            self._cycle.on_data_accepted(nbytes, now)
 
     def _on_transmission(self, sentence: Sentence, now: float) -> None:
         mark = TransmitMark.parse(sentence)

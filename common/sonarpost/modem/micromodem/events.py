@@ -1,4 +1,9 @@
-"""Events of the driver: frozen records, returned in order of time."""
+"""Events of the driver: frozen records, returned in order of time.
+
+`src` and `dest` are modem addresses, `peer` is the address of the other modem, and `rate` is a rate number; None where
+unknown. `packet_id` and `request_id` are the numbers returned when the packet or request was queued. Times (`_s`) are
+seconds on the driver's clock.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +48,6 @@ class ModemReady:
     """The modem has confirmed its address and settings.
 
     Attributes:
-        address: Its address.
         firmware: Version from its last `CAREV`, or None.
     """
 
@@ -120,13 +124,9 @@ class PacketSent:
     """A packet was transmitted.
 
     Attributes:
-        packet_id: Number returned by `send_packet`.
-        dest: Destination address.
-        rate: Rate number.
-        frames: The frames, as given.
         acknowledged: Numbers (from 1) of the frames that the far modem has acknowledged; empty without `ack`.
-        started_s: Start of the cycle on the driver's clock.
-        finished_s: End of the cycle on the driver's clock.
+        started_s: Start of the cycle.
+        finished_s: End of the cycle.
         statistics: Statistics of the transmission, or None.
     """
 
@@ -145,11 +145,6 @@ class PacketFailed:
     """A packet was not transmitted, or the driver cannot determine whether it was.
 
     Attributes:
-        packet_id: Number returned by `send_packet`.
-        dest: Destination address.
-        rate: Rate number.
-        frames: The frames, as given.
-        reason: Why it failed.
         maybe_sent: Whether all or part of it may have been transmitted.
     """
 
@@ -166,13 +161,9 @@ class FrameReceived:
     """One good frame. A modem may have padded the data of a short frame.
 
     Attributes:
-        src: Source address.
         dest: Destination address, possibly of another modem.
-        ack: Whether an acknowledgement was requested.
         frame_number: From 1.
-        data: Its bytes.
-        received_s: Time of reception on the driver's clock.
-        rate: Rate number, where known.
+        received_s: Time of reception.
         statistics: Statistics of its packet, None when the modem did not report them.
     """
 
@@ -201,12 +192,8 @@ class PacketReceived:
     """The end of a received packet; its `FrameReceived` events come just before.
 
     Attributes:
-        frames: The good frames.
         bad_frames: Number of frames that the modem reported as damaged.
         nframes: Number of frames in the packet, None when unknown.
-        src: Source address, where known.
-        dest: Destination address, where known.
-        rate: Rate number, where known.
         statistics: None when the modem did not report them.
         complete: Whether all announced frames were received and the modem reported the end of the packet.
     """
@@ -242,9 +229,7 @@ class RequestDone:
     """A ping or mini-packet was answered, flexible data was transmitted, or a polled modem has sent its packet.
 
     Attributes:
-        request_id: Number returned by `ping`, `send_mini`, `send_flexible` or `request_packet`.
         kind: "ping", "mini-packet", "flexible data" or "poll".
-        peer: Address of the other modem.
     """
 
     request_id: int
@@ -264,12 +249,7 @@ class RequestFailed:
 
 @dataclass(frozen=True, slots=True)
 class FlexibleDataReceived:
-    """A packet of the flexible data protocol.
-
-    Attributes:
-        packet: The packet, frame by frame.
-        received_s: Time of reception on the driver's clock.
-    """
+    """A packet of the flexible data protocol."""
 
     packet: ReceivedFlexibleData
     received_s: float
@@ -277,15 +257,7 @@ class FlexibleDataReceived:
 
 @dataclass(frozen=True, slots=True)
 class PollReceived:
-    """Another modem requests a packet; `PacketSent` or `PacketFailed` reports the result.
-
-    Attributes:
-        dest: Destination address of the packet.
-        rate: Rate number.
-        frames: Maximum number of frames.
-        frame_bytes: Maximum size of a frame.
-        ack: Whether acknowledgements are requested.
-    """
+    """Another modem requests a packet of at most `frames` frames; `PacketSent` or `PacketFailed` reports the result."""
 
     dest: int
     rate: int

@@ -19,8 +19,6 @@ class Rate:
     Attributes:
         number: 0..6, as in `CCCYC`.
         modulation: Name of modulation and code.
-        frames: Frames in a packet.
-        frame_bytes: Bytes in a frame.
         airtime_s: Nominal duration of a packet on the channel, however full its frames are.
     """
 

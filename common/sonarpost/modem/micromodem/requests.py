@@ -1,7 +1,8 @@
 """Requests other than data packets: pings, mini-packets, flexible data, and polls of other modems.
 
 A request waits for the modem's echo, for the end of the transmission and for the answer of the far modem. Every wait is
-limited, and a later sentence implies the earlier ones that were lost.
+limited, and a later sentence implies the earlier ones that were lost. The functions that build commands raise
+`FrameError` for values that the modem cannot send.
 """
 
 from __future__ import annotations
@@ -35,12 +36,7 @@ class ModemRequest:
     """A queued request.
 
     Attributes:
-        request_id: Number of the request.
-        kind: Kind.
-        peer: Address of the other modem.
-        command: Command for the modem.
         rate: Rate number; 0 for pings and mini-packets.
-        queued_s: Time at which it was queued.
     """
 
     request_id: int
@@ -56,21 +52,13 @@ class ModemRequest:
 
 
 def ping_command(src: int, dest: int) -> Sentence:
-    """Return `CCMPC,src,dest`.
-
-    Raises:
-        FrameError: An address outside 0..127.
-    """
+    """Return `CCMPC,src,dest`."""
     _check_address("ping", dest)
     return Sentence("CCMPC", (str(src), str(dest)))
 
 
 def mini_command(src: int, dest: int, bits: int) -> Sentence:
-    """Return `CCMUC,src,dest,HHHH`.
-
-    Raises:
-        FrameError: An address outside 0..127, or more than 13 bits.
-    """
+    """Return `CCMUC,src,dest,HHHH`."""
     _check_address("mini-packet", dest)
     if not 0 <= bits <= MAX_MINI_BITS:
         raise FrameError("mini-packet", "bits", bits, f"0..{MAX_MINI_BITS}")
@@ -78,11 +66,7 @@ def mini_command(src: int, dest: int, bits: int) -> Sentence:
 
 
 def flexible_command(dest: int, rate: int, data: bytes) -> Sentence:
-    """Return `CCTDP,dest,rate,ack,reserved,hex`, without acknowledgement.
-
-    Raises:
-        FrameError: An address outside 0..127, a rate that the protocol does not support, no data or too much.
-    """
+    """Return `CCTDP,dest,rate,ack,reserved,hex`, without acknowledgement."""
     _check_address("flexible data", dest)
     if rate not in FLEXIBLE_RATES:
         raise FrameError("flexible data", "rate", rate, f"one of {FLEXIBLE_RATES}")
@@ -92,18 +76,7 @@ def flexible_command(dest: int, rate: int, data: bytes) -> Sentence:
 
 
 def poll_command(src: int, dest: int, rate: int, frames: int | None, *, ack: bool) -> Sentence:
-    """Return the `CCCYC` that polls another modem.
-
-    Args:
-        src: The modem that shall transmit.
-        dest: Destination of its packet, usually this modem.
-        rate: Rate number.
-        frames: Number of frames, None for a full packet.
-        ack: Whether it shall request acknowledgements.
-
-    Raises:
-        FrameError: An address outside 0..127, an unknown rate, or more frames than the rate has.
-    """
+    """Return the `CCCYC` by which the modem `src` sends a packet to `dest`; without `frames`, a full packet."""
     _check_address("poll", src)
     _check_address("poll", dest)
     if rate not in RATES:

@@ -34,11 +34,7 @@ class Cycle:
     """`CCCYC,command,src,dest,rate,ack,nframes`, its echo `CACYC`, and the announcement `CACYC` at the far modem.
 
     Attributes:
-        src: Transmitting address.
-        dest: Destination address.
         rate: Rate number (newer firmware may announce others than those in `RATES`).
-        ack: Whether an acoustic acknowledgement is requested.
-        nframes: Number of announced frames.
         command: First field, 0 for a data cycle.
     """
 
@@ -96,21 +92,13 @@ def transmit_data(src: int, dest: int, data: bytes, *, ack: bool) -> Sentence:
     return Sentence("CCTXD", (str(src), str(dest), str(int(ack)), data.hex().upper()))
 
 
-@dataclass(frozen=True, slots=True)
-class DataAccepted:
-    """`CATXD,src,dest,ack,nbytes`: the modem has accepted `nbytes` of a frame."""
-
-    src: int
-    dest: int
-    ack: bool
-    nbytes: int
-
-    @classmethod
-    def parse(cls, sentence: Sentence) -> DataAccepted:
-        """Read `CATXD`."""
-        read = FieldReader(sentence, ("CATXD",), 4)
-        nbytes = read.integer(3, "nbytes", 0, _MAX_BYTES)
-        return cls(read.address(0, "src"), read.address(1, "dest"), read.flag(2, "ack"), nbytes)
+def accepted_bytes(sentence: Sentence) -> int:
+    """Return how many bytes of a frame the modem has accepted: `nbytes` of `CATXD,src,dest,ack,nbytes`."""
+    read = FieldReader(sentence, ("CATXD",), 4)
+    read.address(0, "src")
+    read.address(1, "dest")
+    read.flag(2, "ack")
+    return read.integer(3, "nbytes", 0, _MAX_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,10 +347,6 @@ class ReceivedFlexibleData:
     """`CARDP,src,dest,rate,ack,reserved,minis,datas`; each group holds `crc;nbytes;hex` any number of times.
 
     Attributes:
-        src: Source address.
-        dest: Destination address.
-        rate: Rate number.
-        ack: Whether an acknowledgement is requested.
         parts: Mini-frames first, then data frames.
     """
 

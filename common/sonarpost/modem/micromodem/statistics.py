@@ -25,30 +25,18 @@ class LinkStatistics:
     Attributes:
         mode: 0 good, 1 bad CRC, 2 time-out.
         arrival_time: As sent: YYYYMMDDhhmmss.ffffff, or hhmmss.ffff before version 6.
-        clock: Clock status, hex digits as sent.
-        mfd_peak: Matched-filter detector: peak.
-        mfd_power_db: Matched-filter detector: power.
-        mfd_ratio: Matched-filter detector: ratio.
+        mfd_peak: Peak of the matched-filter detector, like `mfd_power_db` and `mfd_ratio`.
         spl_db: Sound pressure level of the reception, dB re 1 µPa.
         agn: Analog gain.
         shift_ainp: Gain shift, as sent, like `shift_ain`, `shift_mfd` and `shift_p2b`.
-        rate: Rate number.
-        src: Source address.
-        dest: Destination address.
         psk_error: Error code of the PSK demodulator.
         packet_type: 1 FSK, 2 FSK mini, 3 PSK, 4 PSK mini, 5 flexible data.
-        nframes: Frames in the packet.
         nbad: Frames that failed their check.
         snr_rss_db: Signal level.
         snr_in_db: SNR at the equalizer's input, dB.
         snr_out_db: SNR at the equalizer's output, dB.
-        snr_symbol_db: SNR of the symbols, dB.
         mse_db: Mean squared error of the equalizer, dB.
         dqf: Data quality factor of FSK, -1 for PSK.
-        doppler: Doppler as reported by the firmware.
-        noise_db: Noise level.
-        carrier_hz: Carrier frequency.
-        bandwidth_hz: Bandwidth.
         version: Version of the sentence, None before version 6.
         more: Additional fields, as text.
     """
@@ -142,22 +130,9 @@ class TransmitStatistics:
     """`CAXST`, version 6 and later: one transmission. None where this modem does not report a value.
 
     Attributes:
-        version: Version of the sentence.
         date: YYYYMMDD, as sent.
         time: hhmmss.ffffff, as sent.
-        clock: Clock status, as sent.
-        mode: How the transmission was started.
-        probe_length: Length of the probe.
-        bandwidth_hz: Bandwidth.
-        carrier_hz: Carrier frequency.
-        rate: Rate number.
-        src: Source address.
-        dest: Destination address.
-        ack: Whether an acknowledgement was requested.
-        frames_expected: Frames the modem expected.
-        frames_sent: Frames it sent.
         packet_type: As in `LinkStatistics`.
-        nbytes: Bytes sent.
         more: Additional fields, as text (newer firmware adds the actual carrier).
     """
 

@@ -15,7 +15,6 @@ from sonarpost.modem.micromodem.reception import FSK_MINI_PACKET
 from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
     Cycle,
-    DataAccepted,
     DataRequest,
     ErrorReport,
     TransmitMark,
@@ -26,16 +25,7 @@ from sonarpost.modem.micromodem.statistics import TransmitStatistics
 
 @dataclass(frozen=True, slots=True)
 class OutgoingPacket:
-    """A queued packet.
-
-    Attributes:
-        packet_id: Number of the packet.
-        dest: Destination address.
-        rate: Rate number.
-        frames: Their bytes.
-        ack: Whether to request acknowledgements.
-        queued_s: Time at which it was queued.
-    """
+    """A queued packet."""
 
     packet_id: int
     dest: int
@@ -144,11 +134,11 @@ class TransmitCycle:
         self._send_data(frame)
         self._wait(TransmitStage.DATA_ECHO, now, self._config.reply_timeout_s)
 
-    def on_data_accepted(self, accepted: DataAccepted, now: float) -> None:
-        """Process `CATXD`: the modem has accepted all or part of a frame."""
+    def on_data_accepted(self, nbytes: int, now: float) -> None:
+        """Process `CATXD`: the modem has accepted `nbytes` of a frame."""
         if self.stage is not TransmitStage.DATA_ECHO:
             return
-        if accepted.nbytes != len(self._frame(self._frame_number)):
+        if nbytes != len(self._frame(self._frame_number)):
             self.abort(FailureReason.FRAME_REFUSED)
         elif self._missing():
             self._wait(TransmitStage.REQUEST, now, self._config.request_timeout_s)

@@ -43,17 +43,11 @@ class AcousticPacket:
     """A packet that a modem transmits.
 
     Attributes:
-        kind: Content.
-        source: Source address in its header.
-        destination: Destination address in its header.
-        rate: Rate number, 0..6.
-        airtime_s: Duration on the channel.
         frames: Frames in order; an empty one was announced and not filled.
         ack_requested: Acknowledgement flag of the cycle command.
         ack_frames: Numbers, from 1, of the frames whose data requests acknowledgement.
         ascii_frames: Numbers, from 1, of the frames given as text.
         acked_frames: Numbers, from 1, that an ACK packet acknowledges.
-        mini: The 13 bits of a user mini-packet.
         announced_frames: Frames that a CYCLE packet announces or requests.
     """
 
@@ -106,14 +100,8 @@ class ArrivalEnded:
     """A packet has passed a receiver: one such event for each modem except the transmitter, detected or not.
 
     Attributes:
-        receiver: Modem number.
         time_s: Simulated time at which the packet has passed.
-        transmission: The packet.
-        outcome: Outcome of the whole packet.
         detected: Whether an `ArrivalStarted` came before.
-        frames: Outcome of each frame.
-        range_m: Distance from transmitter to receiver.
-        snr_db: Signal-to-noise ratio at the receiver.
         delay_s: Travel time.
     """
 

@@ -1,19 +1,8 @@
 """Acoustic propagation between modems: travel time, half duplex, collisions, loss, fading and damage.
 
-The model does no input or output and reads no clock: packets and `now` go in, events come out. Its rules:
-
-- A packet occupies its whole air time, however full its frames are. It reaches every other modem after range / sound
-  speed. Positions at the moment of transmission count.
-- Half duplex: a modem receives nothing of a packet that overlaps its own transmission.
-- Packets whose arrivals overlap at a receiver destroy each other there, whatever their levels (no capture effect) and
-  addresses. The same packets may arrive complete at another modem. Arrivals that only touch do not overlap.
-- A packet may be lost as a whole (not detected). Each non-empty frame may be lost (a bad CRC is reported). The tail of
-  the last non-empty frame may be damaged without a CRC error.
-- With `range_loss`, the frame error rate of the rate at its signal-to-noise ratio is added, and packets below
-  `DETECTION_SNR_DB` are not detected.
-- With burst fading, a frame is judged at the time of its middle, and the detection of a packet at its start.
-- Packet draws depend only on (seed, transmitter, packet number, receiver, frame), fades only on (seed, path, time). A
-  run can be repeated whatever the timing of the process.
+The model does no input or output and reads no clock: packets and `now` go in, events come out. Its rules and their
+sources are in docs/explanation/channel-model.md. Packet draws depend only on (seed, transmitter, packet number,
+receiver, frame), fades only on (seed, path, time), so a run can be repeated.
 """
 
 from __future__ import annotations
@@ -46,7 +35,7 @@ class RandomDraws:
     """Random draws for one packet on its way to one receiver.
 
     A draw is a keyed hash of its subject, not the next number of a generator. It is the same on every platform and
-    Python version, whatever happened before it.
+    Python version, independent of other draws.
 
     Attributes:
         seed: Seed of the simulation.

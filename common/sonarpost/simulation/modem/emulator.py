@@ -5,8 +5,8 @@ reads no clock and owns no port; `sonarpost.simulation.channel.simulator` connec
 
 Choices where hardware documents are silent, and on which hosts should not rely:
 
-- Data, acknowledgements included, is reported to the host whatever its destination (`promiscuous`), as the hosts' own
-  filters suggest. Otherwise only packets for `SRC` or a broadcast address are. Only the addressed modem acknowledges,
+- Data and acknowledgements for any destination are reported to the host (`promiscuous`), as the hosts' own filters
+  suggest. Otherwise only packets for `SRC` or a broadcast address are. Only the addressed modem acknowledges,
   so a broadcast is never acknowledged. The flag of a frame's data requests acknowledgement, not that of the cycle
   command.
 - A cycle whose host does not answer within `DTO` seconds is dropped: nothing is transmitted.
@@ -99,7 +99,7 @@ class EmulatedMicroModem:
         return self._transmitter.busy or self._receiver.busy or self._ranging.busy
 
     def receive(self, data: bytes, now: float) -> None:
-        """Process bytes from the host; raises nothing, whatever they are."""
+        """Process bytes from the host; invalid ones are answered with errors."""
         items = [] if self.rebooting else self._lines.feed(data)
         for item in items:
             if not self.rebooting:

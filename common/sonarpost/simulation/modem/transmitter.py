@@ -69,6 +69,9 @@ class _OnAir:
 class Transmitter:
     """Transmitting half of one modem.
 
+    A method that processes a sentence raises `SentenceError` for a wrong field, or for a sentence out of place, and
+    `BusyError` while the host's previous command is not over.
+
     Args:
         config: The modem's configuration.
         settings: The modem's settings.
@@ -144,11 +147,7 @@ class Transmitter:
         self._packets.clear()
 
     def check_free(self, sentence: nmea.Sentence) -> None:
-        """Reject a command of the host before the previous one is over.
-
-        Raises:
-            BusyError: It is not over.
-        """
+        """Raise `BusyError` if the previous command of the host is not over."""
         pending = [packet for _, packet in self._waiting]
         if self._on_air:
             pending.append(self._on_air.packet)
@@ -156,12 +155,7 @@ class Transmitter:
             raise BusyError(sentence.kind, "moment", "", "the end of the cycle before it")
 
     def start_cycle(self, sentence: nmea.Sentence, now: float) -> None:
-        """Process `CCCYC`: fill a packet, or poll another modem for one.
-
-        Raises:
-            SentenceError: A wrong field.
-            BusyError: A cycle or transmission of the host is not over.
-        """
+        """Process `CCCYC`: fill a packet, or poll another modem for one."""
         cycle = commands.start_cycle(sentence)
         self.check_free(sentence)
         self._write(cycle.sentence("CACYC").encode())
@@ -182,11 +176,7 @@ class Transmitter:
         self.send(header, now)
 
     def fill_frame(self, sentence: nmea.Sentence, now: float) -> None:
-        """Process `CCTXD` and `CCTXA`: request the next frame, or transmit.
-
-        Raises:
-            SentenceError: A wrong field, no data request, or more data than a frame holds.
-        """
+        """Process `CCTXD` and `CCTXA`: request the next frame, or transmit."""
         frame = commands.frame_data(sentence)
         filling = self._filling
         if filling is None or filling.deadline_s is None:
@@ -205,12 +195,7 @@ class Transmitter:
         self.send(filling.packet(self._config.airtime_s(cycle.rate)), now)
 
     def send_mini(self, sentence: nmea.Sentence, now: float) -> None:
-        """Process `CCMPC` and `CCMUC`.
-
-        Raises:
-            SentenceError: A wrong field, or another modem's address as source.
-            BusyError: A cycle or transmission of the host is not over.
-        """
+        """Process `CCMPC` and `CCMUC`."""
         mini = commands.mini_packet(sentence)
         if mini.source != self._settings["SRC"]:
             raise SentenceError(sentence.kind, "source", mini.source, f"own address {self._settings['SRC']}")
@@ -223,12 +208,7 @@ class Transmitter:
         self.send(AcousticPacket(kind, mini.source, mini.destination, 0, airtime_s, mini=mini.bits), now)
 
     def send_flexible(self, sentence: nmea.Sentence, now: float) -> None:
-        """Process `CCTDP`.
-
-        Raises:
-            SentenceError: A wrong field.
-            BusyError: A cycle or transmission of the host is not over.
-        """
+        """Process `CCTDP`."""
         command = commands.flexible_data(sentence)
         self.check_free(sentence)
         self._flexible_packets += 1
@@ -358,12 +338,7 @@ class TransponderRanging:
         self._interrogation = None
 
     def start(self, sentence: nmea.Sentence, now: float) -> None:
-        """Process `CCPDT` and `CCPNT`.
-
-        Raises:
-            SentenceError: A wrong field.
-            BusyError: A cycle, transmission or interrogation of the host is not over.
-        """
+        """Process `CCPDT` and `CCPNT`."""
         command = commands.ranging(sentence)
         self._transmitter.check_free(sentence)
         if self._interrogation is not None:
