@@ -45,7 +45,7 @@ from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.protocol import CHUNK_BYTES
 from sonarpost.delivery.scheduler import WINDOW, WINDOW_BYTES
-from sonarpost.logs import set_up
+from sonarpost.logs import configure_logging
 from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.relay.config import RelayConfig
@@ -173,7 +173,7 @@ def measure_relay(endpoint: str, folder: Path, key: str, payloads: Sequence[byte
 def logged_to(path: Path, level: str) -> Iterator[None]:
     """Log as the services do, to a file in the place of standard error."""
     with path.open("w", buffering=1) as file, redirect_stderr(file):
-        set_up("relay", level)
+        configure_logging("relay", level)
         try:
             yield
         finally:

@@ -1,4 +1,4 @@
-"""Logs: one line an event, whatever the event holds."""
+"""Logs: one line for each event, and the log context."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ import math
 import re
 from collections.abc import Iterator
 
+import msgpack
 import pytest
+from builders.record_samples import COMPLETE_IMAGE, SAMPLES
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost import logs
-from sonarpost.logs import JsonFormatter, TextFormatter, kv
+from sonarpost import keys, logs, wire
+from sonarpost.logs import JsonFormatter, TextFormatter, context_of_payload, kv
+from sonarpost.messages import Contact, Decision, Pixels, Relayed, Snippet
 
 
 def record(message: str = "Picture stored", /, *args: object, **fields: object) -> logging.LogRecord:
@@ -37,7 +40,7 @@ def event(*args: object, **fields: object) -> dict[str, object]:
     return dict(json.loads(line, parse_constant=no_constant))
 
 
-def test_a_line_for_people() -> None:
+def test_text_line() -> None:
     assert (
         text(image_id="0001", bytes=232)
         == "2016-10-12T09:00:00.250Z WARNING relay: Picture stored image_id=0001 bytes=232"
@@ -69,11 +72,11 @@ def test_a_line_for_people() -> None:
         (b"\xff\n", "\"b'\\\\xff\\\\n'\""),
     ],
 )
-def test_a_value_for_people(value: object, shown: str) -> None:
+def test_text_value_is_quoted_if_needed(value: object, shown: str) -> None:
     assert text(x=value).endswith(f" x={shown}")
 
 
-def test_an_event_for_machines() -> None:
+def test_json_line() -> None:
     assert event(image_id="0001", ratio=0.5, missing=None) == {
         "time": "2016-10-12T09:00:00.250Z",
         "level": "warning",
@@ -85,12 +88,12 @@ def test_an_event_for_machines() -> None:
     }
 
 
-def test_what_json_has_no_type_for_is_text() -> None:
+def test_json_value_of_another_type_is_text() -> None:
     got = event(a=math.nan, b=-math.inf, c=b"x", d={1}, e=[math.nan], f=[1, "a"])
     assert [got[name] for name in "abcdef"] == ["nan", "-inf", "b'x'", "{1}", "[nan]", [1, "a"]]
 
 
-def test_a_field_does_not_take_the_place_of_time_or_level() -> None:
+def test_field_does_not_replace_time_or_level() -> None:
     got = event(time=1, level="x", service="y", message="z")
     assert (got["level"], got["service"], got["message"]) == ("warning", "relay", "Picture stored")
     assert (got["time_"], got["level_"], got["service_"], got["message_"]) == (1, "x", "y", "z")
@@ -115,7 +118,7 @@ def with_exception() -> logging.LogRecord:
     return made
 
 
-def test_a_traceback_follows_in_text_and_is_a_field_in_json() -> None:
+def test_traceback_follows_the_text_line_and_is_a_json_field() -> None:
     made = with_exception()
     lines = TextFormatter("relay").format(made).splitlines()
     assert lines[0].endswith("Picture stored")
@@ -127,7 +130,7 @@ def test_a_traceback_follows_in_text_and_is_a_field_in_json() -> None:
 
 
 @pytest.mark.parametrize("nothing", [None, False, ()])
-def test_no_exception_is_no_traceback(nothing: object) -> None:
+def test_no_traceback_without_an_exception(nothing: object) -> None:
     made = record()
     made.exc_info = nothing  # type: ignore[assignment]  # what logging leaves there for exc_info=False
     assert TextFormatter("relay").format(made).endswith("Picture stored")
@@ -143,13 +146,13 @@ def clean_root() -> Iterator[logging.Logger]:
     root.setLevel(level)
 
 
-def test_logs_go_to_standard_error_in_the_chosen_form(
+def test_logs_are_written_to_standard_error_in_the_configured_format(
     clean_root: logging.Logger, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    logs.set_up("relay", "warning", "json")
+    logs.configure_logging("relay", "warning", "json")
     logging.getLogger("a.b").info("Not shown")
     logging.getLogger("a.b").warning("Shown", extra=kv(n=1))
-    logs.set_up("c2", "debug")
+    logs.configure_logging("c2", "debug")
     logging.getLogger("a.b").debug("Shown too", exc_info=False)
     out, err = capsys.readouterr()
     assert out == ""
@@ -159,36 +162,86 @@ def test_logs_go_to_standard_error_in_the_chosen_form(
     assert len(clean_root.handlers) == 1
 
 
-def test_what_a_line_concerns_is_in_both_formats() -> None:
+def test_log_context_is_in_both_formats() -> None:
     with logs.log_context(vehicle="uuv-1", image_id=None):
         with logs.log_context(image_id="00A7"):
             assert text("Sent", bytes=3).endswith(": Sent vehicle=uuv-1 image_id=00A7 bytes=3")
-            assert event("Sent", image_id="00A8")["image_id"] == "00A8"  # the call knows better
+            assert event("Sent", image_id="00A8")["image_id"] == "00A8"  # the call overrides the context
         assert text("Sent").endswith(": Sent vehicle=uuv-1")
     assert text("Sent").endswith(": Sent")
 
 
-def test_what_a_line_concerns_ends_with_an_error() -> None:
+def test_log_context_ends_with_an_exception() -> None:
     with pytest.raises(ValueError, match="x"), logs.log_context(vehicle="uuv-1"):
         raise ValueError("x")
     assert text("Sent").endswith(": Sent")
 
 
-def test_what_a_line_concerns_is_looked_for_once_and_only_for_a_line() -> None:
-    looked = 0
+def test_context_of_a_record_is_read_once_and_only_for_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    reads: list[bytes] = []
 
-    def find() -> dict[str, object]:
-        nonlocal looked
-        looked += 1
-        return {"image_id": "00A7", "contact_id": None}
+    def read(payload: bytes) -> dict[str, str]:
+        reads.extend([payload] if payload else [])
+        return {"image_id": "00A7"} if payload else {}
 
-    with logs.log_context(vehicle="uuv-1"), logs.lazy_log_context(find):
-        assert looked == 0
+    monkeypatch.setattr(logs, "context_of_payload", read)
+    with logs.log_context(vehicle="uuv-1"), logs.log_context(b"record"):
+        assert reads == []
         assert text("Sent").endswith(": Sent vehicle=uuv-1 image_id=00A7")
         with logs.log_context(step=2):
             assert event("Sent")["step"] == 2
-        assert looked == 1
+        assert reads == [b"record"]
     assert text("Sent").endswith(": Sent")
-    with logs.lazy_log_context(find):
+    with logs.log_context(b"record"):
         pass
-    assert looked == 1
+    assert reads == [b"record"]
+
+
+def test_context_holds_vehicle_image_and_contact_of_a_record() -> None:
+    assert COMPLETE_IMAGE.contact is not None
+    image = {"vehicle": "uuv-1", "image_id": "00A7", "contact_id": COMPLETE_IMAGE.contact.contact_id}
+    contact = Contact(contact_id="line-7", vehicle_id="uuv-1")
+    snippet = Snippet(contact=contact, picture=Pixels(height_px=1, width_px=1, bits=8, data=b"\0"))
+    assert context_of_payload(wire.encode(snippet)) == {"vehicle": "uuv-1", "contact_id": "line-7"}
+    assert context_of_payload(wire.encode(COMPLETE_IMAGE)) == image
+    assert context_of_payload(relayed(wire.encode(COMPLETE_IMAGE))) == image
+    decision = next(record for record in SAMPLES.values() if isinstance(record, Decision))
+    assert context_of_payload(wire.encode(decision)) == {"vehicle": decision.vehicle_id, "image_id": decision.image_id}
+
+
+def relayed(payload: bytes) -> bytes:
+    key = keys.image_reconstructed("vessel-1")
+    return wire.encode(Relayed(vessel_id="vessel-1", key=key, payload=payload, relayed_utc_s=1.0))
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xc1", relayed(b"\xc1"), relayed(relayed(wire.encode(COMPLETE_IMAGE)))])
+def test_invalid_payload_has_no_context(payload: bytes) -> None:
+    assert context_of_payload(payload) == {}
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(["type", "vehicle_id", "image_id", "contact", "payload", "data"]),
+        st.none()
+        | st.integers(0, 9)
+        | st.text(max_size=3)
+        | st.binary(max_size=9)
+        | st.lists(st.integers(0, 9), max_size=2),
+    )
+)
+def test_context_omits_fields_of_other_types(fields: dict[str, object]) -> None:
+    assert all(isinstance(value, str) for value in context_of_payload(msgpack.packb(fields)).values())
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_context_of_every_record_type(name: str) -> None:
+    record = SAMPLES[name]
+    contact = getattr(record, "contact", None)
+    expected = {
+        "vehicle": getattr(record, "vehicle_id", None) or getattr(contact, "vehicle_id", None),
+        "image_id": getattr(record, "image_id", None),
+        "contact_id": getattr(contact, "contact_id", None),
+    }
+    if not isinstance(record, Relayed):
+        known = {field: value for field, value in expected.items() if value is not None}
+        assert context_of_payload(wire.encode(record)) == known

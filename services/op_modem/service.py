@@ -25,10 +25,10 @@ from sonarpost.modem.micromodem import (
     PacketReceived,
     PacketSent,
 )
-from sonarpost.monitoring.log_context import image_ids_of_frame
 from sonarpost.runtime.service import UnitOfWork
 from sonarpost.services.op_modem.arriving import pack, unpack
 from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.frame_images import image_ids_of_frame
 from sonarpost.services.op_modem.orders_service import DownlinkService
 
 log = logging.getLogger(__name__)

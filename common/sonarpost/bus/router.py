@@ -284,7 +284,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_arguments(parser)
     parsed = parser.parse_args(arguments)
     exit_with_parent()
-    logs.set_up("router")
+    logs.configure_logging("router")
     return run_parsed(parsed)
 
 

@@ -57,7 +57,7 @@ def run(parsed: argparse.Namespace) -> int:
         PortError: The address cannot be bound.
     """
     endpoints, tls = router_of(parsed)
-    logs.set_up("metrics", log_format=parsed.log_format)
+    logs.configure_logging("metrics", log_format=parsed.log_format)
     stop = threading.Event()
 
     def on_signal(_number: int, _frame: FrameType | None) -> None:

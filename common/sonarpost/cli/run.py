@@ -33,5 +33,5 @@ def run_service(parsed: argparse.Namespace) -> int:
 
 def run_router(parsed: argparse.Namespace) -> int:
     """Run an embedded router."""
-    logs.set_up("router")
+    logs.configure_logging("router")
     return router.run_parsed(parsed)

@@ -18,8 +18,7 @@ from sonarpost.delivery.records import ReceivedChunk
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import BadInputError, DeliveryError, PayloadError, RetryLaterError
-from sonarpost.logs import kv, lazy_log_context
-from sonarpost.monitoring.log_context import context_of_payload
+from sonarpost.logs import kv, log_context
 
 log = logging.getLogger(__name__)
 
@@ -228,7 +227,7 @@ class Inbox:
             raise RetryLaterError(reason)
 
     def _store_record(self, tx: Transaction, key: str, payload: bytes, chunk: ReceivedChunk | None) -> AckReply:
-        with lazy_log_context(lambda: context_of_payload(payload, key)):
+        with log_context(payload):
             try:
                 self._validate(key, payload)
             except DeliveryError:

@@ -19,8 +19,7 @@ from sonarpost.delivery.scheduler import MAX_WINDOW_BYTES, WINDOW, Chunk, Delive
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import DeliveryError, PayloadError
-from sonarpost.logs import kv
-from sonarpost.monitoring.log_context import context_of_payload
+from sonarpost.logs import kv, log_context
 
 log = logging.getLogger(__name__)
 
@@ -409,11 +408,11 @@ class QueueSender:
             tx.quarantine_refused(item, reason)
             if self._on_acknowledged is not None:
                 self._on_acknowledged(tx, item, reason)
-        context = context_of_payload(item.payload, item.key)
-        log.error(
-            "Record refused by its consumer and quarantined",
-            extra=kv(**context, consumer=self._queue, key=item.key, reason=reason),
-        )
+        with log_context(item.payload):
+            log.error(
+                "Record refused by its consumer and quarantined",
+                extra=kv(consumer=self._queue, key=item.key, reason=reason),
+            )
         self._scheduler.remove(transfer)
         self._clear(item.seq)
 

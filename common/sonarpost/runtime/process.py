@@ -44,7 +44,7 @@ def main(service_type: type[Service[C]], config_type: type[C], arguments: Sequen
         print(f"{service_type.NAME}: {error}", file=sys.stderr)
         return EXIT_CONFIG
     exit_with_parent()
-    logs.set_up(service_type.NAME, platform.log_level, platform.log_format)
+    logs.configure_logging(service_type.NAME, platform.log_level, platform.log_format)
     try:
         service = service_type(platform, own)
     except SonarpostError as error:

@@ -31,10 +31,9 @@ from sonarpost.delivery.records import InboxItem, OutboxItem
 from sonarpost.delivery.store import HANDLING_RESERVE_BYTES, DiskReserve, Store
 from sonarpost.delivery.transaction import Transaction, UnitOfWork
 from sonarpost.errors import BadInputError, DeliveryError
-from sonarpost.logs import kv, lazy_log_context
+from sonarpost.logs import kv, log_context
 from sonarpost.messages import Health, Record, ServiceState
 from sonarpost.monitoring.heartbeat import Heartbeat
-from sonarpost.monitoring.log_context import LogContext
 
 __all__ = ["Service", "ServiceStoppingError", "UnitOfWork"]
 
@@ -311,31 +310,24 @@ class Service(ABC, Generic[C]):
             self.commit(effects, item)
 
     def _effects_of(self, item: InboxItem) -> UnitOfWork | None:
-        """Handle a record; return its effects, or None if it was quarantined.
-
-        Log lines of this thread carry the record's context until the record is handled.
-        """
-        about = LogContext(item.payload, item.key)
-        with lazy_log_context(about.fields):
-            return self._handled(item, about)
-
-    def _handled(self, item: InboxItem, about: LogContext) -> UnitOfWork | None:
+        """Handle a record; return its effects, or None if it was quarantined."""
         effects = UnitOfWork(item.payload)
-        try:
-            about.record = record = wire.decode(self._record_type(item.key), item.payload, item.key)
-            self.handle(item.key, record, effects)
-        except (OSError, DeliveryError, ServiceStoppingError):
-            raise
-        except BadInputError as error:
-            self._refused(error)
-            self._quarantine_record(item, str(error))
-            return None
-        except Exception as error:
-            # An unexpected exception must neither block later records nor lose this one.
-            log.exception("Record quarantined after an unexpected exception", extra=kv(key=item.key))
-            self.count("records_failed")
-            self._quarantine_record(item, f"{type(error).__name__}: {error}")
-            return None
+        with log_context(item.payload):
+            try:
+                record = wire.decode(self._record_type(item.key), item.payload, item.key)
+                self.handle(item.key, record, effects)
+            except (OSError, DeliveryError, ServiceStoppingError):
+                raise
+            except BadInputError as error:
+                self._refused(error)
+                self._quarantine_record(item, str(error))
+                return None
+            except Exception as error:
+                # An unexpected exception must neither block later records nor lose this one.
+                log.exception("Record quarantined after an unexpected exception", extra=kv(key=item.key))
+                self.count("records_failed")
+                self._quarantine_record(item, f"{type(error).__name__}: {error}")
+                return None
         effects.count("records_handled")
         return effects
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+
 import msgpack
 import pytest
 from builders.common import eventually
 from builders.records import decision_record, picture_record
 
-from sonarpost import keys, wire
+from sonarpost import keys, logs, wire
 from sonarpost.messages import Pixels, Relayed
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
@@ -126,3 +128,15 @@ def test_a_full_disk_leaves_the_record_with_its_sender(begin, c2, source, image)
     service.store._db.execute("PRAGMA max_page_count=1000000")
     eventually(lambda: len(shore.received) == 6)
     eventually(lambda: service.health().state == "ok")
+
+
+def test_log_line_of_a_refused_record_names_vehicle_and_image(begin, source, image, capsys, monkeypatch):
+    root = logging.getLogger()
+    monkeypatch.setattr(root, "handlers", [])
+    monkeypatch.setattr(root, "level", root.level)
+    logs.configure_logging("relay")
+    service = begin()
+    source.send(IMAGES, "relay", image("00A7", vessel="vessel-2"))
+    eventually(lambda: service.health().counters.get("records_refused") == 1)
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "Record refused vehicle=" in line]
+    assert "vehicle=uuv-1 image_id=00A7" in line
