@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
-
 import pytest
 from builders.common import eventually
 from hypothesis import given, settings
@@ -15,7 +13,6 @@ from sonarpost.modem.micromodem import FrameReceived, LinkStatistics, PacketRece
 from sonarpost.services.op_modem import service as op_modem
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService, quality_of
-from sonarpost.simulation.modem.statistics import PacketType, ReceivedPacket, ReceiveMode, receive_statistics
 
 RX = keys.acoustic_rx("vessel-1")
 
@@ -44,20 +41,10 @@ def packet(*frames, bad=0, nframes=None, rate=1, statistics=None):
 
 def sentences(number, data, src=3, dest=1):
     """The sentences of a received packet of one frame."""
-    statistics = ReceivedPacket(
-        mode=ReceiveMode.GOOD,
-        arrived=datetime(2016, 10, 12, tzinfo=UTC),
-        clock="0",
-        rate=1,
-        source=src,
-        destination=dest,
-        packet_type=PacketType.PSK,
-        frames=1,
-        bad_frames=0,
-        snr_db=12.5,
-        range_m=150.0,
-    )
-    return nmea.format("CARXD", src, dest, 0, number, data.hex().upper()) + receive_statistics(statistics, 6)
+    clock = "20161012000000.000000,0,21286,38,0125,0141,07,00,00,00,00"
+    quality = "141,12.5,9.50,-100,-9.50,-01,0.00,51,25000,5000"
+    statistics = f"6,0,{clock},1,{src:03d},{dest:03d},0,3,1,0,{quality}"
+    return nmea.format("CARXD", src, dest, 0, number, data.hex().upper()) + nmea.format("CACST", *statistics.split(","))
 
 
 def test_packets_are_handed_on_with_their_numbers(modem_pair, begin, decompressor, check_monitoring):
