@@ -20,7 +20,7 @@ from research.detection.simulated import JudgedFile
 from sonarpost.codec.interface import Image
 from sonarpost.detection.detector import Detection, detect
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.snippets import HIGH_PERCENTILE, LOW_PERCENTILE, SnippetCut, cut_snippet
+from sonarpost.detection.snippets import HIGH_PERCENTILE, LOW_PERCENTILE, SurveySnippet, cut_snippet
 from sonarpost.sonar.survey import ChannelPing, Survey
 
 HEIGHT_PX: Final = 80
@@ -44,7 +44,7 @@ class Shot:
 
     survey: Survey
     found: Detection
-    cut: SnippetCut
+    cut: SurveySnippet
     confidence: float
 
 
@@ -121,7 +121,7 @@ def effects(pictures: Sequence[Shot], subject: Subject, budgets: Sequence[int]) 
     return found
 
 
-def confidence_with(survey: Survey, found: Detection, cut: SnippetCut, picture: Image) -> float:
+def confidence_with(survey: Survey, found: Detection, cut: SurveySnippet, picture: Image) -> float:
     """Return the greatest confidence at a contact's place with `picture` in its snippet's place; 0 without contact.
 
     Args:
@@ -150,7 +150,7 @@ def confidence_with(survey: Survey, found: Detection, cut: SnippetCut, picture: 
     )
 
 
-def _unmapped(picture: Image, cut: SnippetCut) -> npt.NDArray[np.float64]:
+def _unmapped(picture: Image, cut: SurveySnippet) -> npt.NDArray[np.float64]:
     """Return the sample values that a picture's greys stand for, by the snippet's own mapping, backwards."""
     root = np.sqrt(cut.image16.astype(np.float64) * cut.divisor16)
     low, high = np.percentile(root, (LOW_PERCENTILE, HIGH_PERCENTILE))

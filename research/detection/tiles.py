@@ -14,7 +14,7 @@ from research.common.images import JPEG_SUFFIXES, read_jpeg
 from research.common.sdvd import survey_line
 from research.common.statistics import Interval, auc, bootstrap_weights, interval
 from sonarpost.codec.interface import to_uint8
-from sonarpost.detection.image_detector import LevelImage, image_confidence
+from sonarpost.detection.image_detector import ScaledImage, detect_in_image
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.image_files import read_image
 
@@ -59,7 +59,7 @@ def _scored(folder: Path, row: dict[str, str], where: str) -> TileScore:
         raise SurveyFileError(where, "target_px", row["target_px"], "a whole number") from error
     path = folder / split / "images" / image
     pixels = read_jpeg(path) if path.suffix.lower() in JPEG_SUFFIXES else to_uint8(read_image(path))
-    best = image_confidence(LevelImage(pixels, PIXEL_M, PIXEL_M))
+    best = detect_in_image(ScaledImage(pixels, PIXEL_M, PIXEL_M))
     return TileScore(split, image, is_target, 0.0 if best is None else best.confidence)
 
 

@@ -27,9 +27,16 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 
 from research.detection.truth import Scale, object_at
-from sonarpost.detection.candidates import Candidate, candidates
-from sonarpost.detection.fusion import FILTERS, FusionModel, clutter_levels, fused_confidences, log_scores, suppress
-from sonarpost.detection.normalisation import LevelGrid, preprocess
+from sonarpost.detection.candidates import Candidate, find_candidates
+from sonarpost.detection.fusion import (
+    FILTERS,
+    FusionModel,
+    clutter_levels,
+    fused_confidences,
+    log_scores,
+    suppress_duplicates,
+)
+from sonarpost.detection.normalisation import LevelGrid, normalise_side
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.files import write_atomically
 from sonarpost.simulation.seabed.survey import SimulatedSurvey, SurveySpec, TruthObject, simulate_survey
@@ -86,15 +93,15 @@ def tables(made: SimulatedSurvey) -> list[SideTable]:
     survey, found = made.survey, []
     altitude_m = altitudes_m(survey)
     for side in survey.sides():
-        grid = preprocess(survey, side, SETTINGS, altitude_m)
+        grid = normalise_side(survey, side, SETTINGS, altitude_m)
         if grid is None:
             continue
-        places = candidates(grid, SETTINGS)
+        places = find_candidates(grid, SETTINGS)
         scale = Scale(grid.row_along_m, grid.cell_across_m / grid.samples_per_cell)
         objects = []
         for place in places:
-            sample = (place.measured.cell + 0.5) * grid.samples_per_cell
-            index = object_at(made.truth, side, place.measured.row, sample, scale)
+            sample = (place.measurement.cell + 0.5) * grid.samples_per_cell
+            index = object_at(made.truth, side, place.measurement.row, sample, scale)
             objects.append(None if index is None else made.truth[index])
         nothing = np.broadcast_to(np.float32(0.0), grid.level.shape)
         found.append(SideTable(replace(grid, level=nothing, ratio=nothing), places, objects))
@@ -111,11 +118,13 @@ def kept_rows(sides: list[SideTable], model: FusionModel) -> tuple[Floats, npt.N
     kinds: list[int] = []
     for side in sides:
         evidence = np.array([model.evidence(p.scores) for p in side.places])
-        levels = clutter_levels([p.measured for p in side.places], evidence, side.grid, SETTINGS, model.clutter_floor)
+        levels = clutter_levels(
+            [p.measurement for p in side.places], evidence, side.grid, SETTINGS, model.clutter_floor
+        )
         met: set[int] = set()
         row_of = {id(p): i for i, p in enumerate(side.places)}
         fused = fused_confidences(side.places, side.grid, SETTINGS, model)
-        for _, place in suppress(list(zip(fused, side.places, strict=True)), side.grid, SETTINGS):
+        for _, place in suppress_duplicates(list(zip(fused, side.places, strict=True)), side.grid, SETTINGS):
             index = row_of[id(place)]
             thing = side.objects[index]
             if thing is not None and id(thing) in met:

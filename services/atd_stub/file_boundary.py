@@ -66,7 +66,7 @@ class BoundaryDetection(DetectionPosition):
 
     def is_same_object(self, other: DetectionPosition) -> bool:
         """Return whether both detections are of one object."""
-        return _SAME_OBJECT.holds(self, other, abs(self.slant_range_m - other.slant_range_m))
+        return _SAME_OBJECT.matches(self, other, abs(self.slant_range_m - other.slant_range_m))
 
 
 @dataclass(frozen=True, slots=True)

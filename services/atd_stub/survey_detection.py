@@ -129,7 +129,7 @@ class _SurveySearch:
         lower = strip.first_row + self._overlap - half if strip.first_row else self._first_row
         upper = math.inf if strip.is_last else strip.first_row + len(strip.pings) - half
         for detection in detect(survey, self._settings):
-            position = BoundaryDetection.of(detection, strip.first_row)
+            position = BoundaryDetection.of_detection(detection, strip.first_row)
             if lower - _ROW_TOLERANCE <= position.row < upper + _ROW_TOLERANCE:
                 self._add(survey, detection, position)
 
@@ -174,8 +174,8 @@ class _SurveySearch:
             held_ids = {id(candidate.position) for candidate in held}
             others = (known for known in self._known if id(known) not in held_ids and known.end_row > start)
             detections = (
-                *(replace(known, held=None).moved(-start) for known in others),
-                *(replace(each.position, held=wire.encode(each.snippet)).moved(-start) for each in held),
+                *(replace(known, held=None).shifted(-start) for known in others),
+                *(replace(each.position, held=wire.encode(each.snippet)).shifted(-start) for each in held),
             )
             origins = tuple(self._origin_of(row) for row in range(start, end))
             pings = last.pings[len(last.pings) - stored :]

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from sonarpost.detection.candidates import (
     Candidate,
     FilterScores,
-    Measured,
+    Measurement,
     TextureMap,
-    candidates,
+    find_candidates,
     geometry_score,
     measure,
 )
@@ -21,15 +21,15 @@ from sonarpost.detection.fusion import (
     FILTERS,
     FusionModel,
     clutter_levels,
+    default_fusion_model,
     fused_confidences,
     log_scores,
-    shipped_model,
-    suppress,
+    suppress_duplicates,
 )
 from sonarpost.detection.matched_filter import matched_response, peaks
-from sonarpost.detection.normalisation import preprocess
+from sonarpost.detection.normalisation import normalise_side
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.structures import structures
+from sonarpost.detection.structures import find_structures
 from sonarpost.sonar.survey import Side
 
 SETTINGS = DetectorSettings()
@@ -42,7 +42,7 @@ def box(**fields):
 
 
 def best_near(survey, ping=100, sample=250):
-    grid = preprocess(survey, Side.PORT, SETTINGS)
+    grid = normalise_side(survey, Side.PORT, SETTINGS)
     response = matched_response(grid, SETTINGS)
     cell = sample // grid.samples_per_cell
     return float(response.score[ping - 8 : ping + 9, cell - 12 : cell + 13].max()), grid, response
@@ -105,13 +105,13 @@ five = st.tuples(scores, scores, scores, scores, scores)
 
 @given(five, st.floats(-50, 50))
 def test_confidence_stays_within_0_and_2(values, clutter):
-    model = shipped_model()
+    model = default_fusion_model()
     assert 0.0 <= model.confidence(model.evidence(FilterScores(*values)), clutter) <= 2.0
 
 
 @given(five, st.integers(0, 4), st.floats(0, 100))
 def test_confidence_never_falls_when_a_score_rises(values, which, more):
-    model = shipped_model()
+    model = default_fusion_model()
     raised = tuple(s + more if i == which else s for i, s in enumerate(values))
     assert model.evidence(FilterScores(*raised)) >= model.evidence(FilterScores(*values)) - 1e-12
 
@@ -133,7 +133,7 @@ def test_weights_that_could_let_the_confidence_fall_are_refused(wrong):
 
 
 def measured(row, cell, shadow_cells=10):
-    return Measured(row, cell, (row - 2, row + 3), (cell - 2, cell + 3), shadow_cells, False, 5.0, 3.0, 3.0)
+    return Measurement(row, cell, (row - 2, row + 3), (cell - 2, cell + 3), shadow_cells, False, 5.0, 3.0, 3.0)
 
 
 def candidate(row, cell, shadow_cells=10):
@@ -141,18 +141,18 @@ def candidate(row, cell, shadow_cells=10):
 
 
 def test_one_place_gives_its_most_confident_candidate(make_survey):
-    grid = preprocess(make_survey(), Side.PORT, SETTINGS)
+    grid = normalise_side(make_survey(), Side.PORT, SETTINGS)
     near, far, behind = candidate(60, 110), candidate(150, 110), candidate(50, 160)
     in_shadow_of_it = candidate(51, 205)
     long_shadow = candidate(50, 160, shadow_cells=60)
-    kept = suppress([(1.1, candidate(50, 100)), (1.3, near), (1.2, far), (1.15, behind)], grid, SETTINGS)
+    kept = suppress_duplicates([(1.1, candidate(50, 100)), (1.3, near), (1.2, far), (1.15, behind)], grid, SETTINGS)
     assert [c for c, _ in kept] == [1.3, 1.2, 1.15]
     assert kept[0][1] is near
-    assert suppress([(1.2, long_shadow), (1.1, in_shadow_of_it)], grid, SETTINGS) == [(1.2, long_shadow)]
+    assert suppress_duplicates([(1.2, long_shadow), (1.1, in_shadow_of_it)], grid, SETTINGS) == [(1.2, long_shadow)]
 
 
 def test_a_few_strong_neighbours_are_no_clutter_and_a_field_of_them_is(make_survey):
-    grid = preprocess(make_survey(), Side.PORT, SETTINGS)
+    grid = normalise_side(make_survey(), Side.PORT, SETTINGS)
     alone = [measured(100, 130)]
     few = [measured(20 + 60 * i, 40 + 60 * i) for i in range(3)]
     many = [measured(r, c) for r in range(10, 190, 31) for c in range(50, 240, 40)]
@@ -167,13 +167,13 @@ def test_a_few_strong_neighbours_are_no_clutter_and_a_field_of_them_is(make_surv
 
 
 def test_parts_of_the_same_thing_are_not_clutter(make_survey):
-    grid = preprocess(make_survey(), Side.PORT, SETTINGS)
+    grid = normalise_side(make_survey(), Side.PORT, SETTINGS)
     parts = [measured(100 + i, 130 + j) for i in range(-6, 7, 3) for j in range(-8, 9, 4)]
     assert (clutter_levels(parts, np.full(len(parts), 7.0), grid, SETTINGS, floor=-2.0) == -2.0).all()
 
 
 def test_texture_finds_an_object_and_not_the_seabed_nor_the_change_of_its_level(make_survey):
-    grid = preprocess(make_survey(box()), Side.PORT, SETTINGS)
+    grid = normalise_side(make_survey(box()), Side.PORT, SETTINGS)
     texture = TextureMap(grid)
     at_object = texture.anomaly(100, 125)
     elsewhere = [texture.anomaly(row, cell) for row in range(30, 180, 30) for cell in (80, 180, 210)]
@@ -183,31 +183,31 @@ def test_texture_finds_an_object_and_not_the_seabed_nor_the_change_of_its_level(
 
 
 def test_texture_says_nothing_where_nothing_is_known(make_survey):
-    grid = preprocess(make_survey(), Side.PORT, SETTINGS)
+    grid = normalise_side(make_survey(), Side.PORT, SETTINGS)
     assert TextureMap(grid).anomaly(50, 0) == 0.0
     unknown = replace(grid, level=np.full_like(grid.level, np.nan))
     assert TextureMap(unknown).anomaly(100, 125) == 0.0
 
 
 def test_candidates_come_with_every_score_and_an_object_is_the_best(make_survey):
-    grid = preprocess(make_survey(box()), Side.PORT, SETTINGS)
-    found = candidates(grid, SETTINGS)
+    grid = normalise_side(make_survey(box()), Side.PORT, SETTINGS)
+    found = find_candidates(grid, SETTINGS)
     best = max(zip(fused_confidences(found, grid, SETTINGS), found, strict=True), key=lambda c: c[0])
     assert best[0] > 1.5
-    assert abs(best[1].measured.row - 100) <= 4
+    assert abs(best[1].measurement.row - 100) <= 4
     assert all(value > 0 for value in (getattr(best[1].scores, name) for name in FILTERS))
 
 
 def test_a_wall_of_shadow_behind_a_bright_edge_is_a_structure_once(make_survey):
     rows = [box(ping=ping, pings=10, sample=200, samples=14, shadow_samples=180) for ping in range(60, 150, 10)]
-    grid = preprocess(make_survey(*rows), Side.PORT, SETTINGS)
-    found = structures(grid)
+    grid = normalise_side(make_survey(*rows), Side.PORT, SETTINGS)
+    found = find_structures(grid)
     assert len(found) == 1
-    one = found[0].candidate.measured
+    one = found[0].candidate.measurement
     assert found[0].confidence > 1.0
     assert (one.rows[0], one.rows[1]) == (pytest.approx(55, abs=6), pytest.approx(145, abs=6))
     assert 2 * one.cells[1] == pytest.approx(207, abs=10)
-    assert structures(preprocess(make_survey(box()), Side.PORT, SETTINGS)) == []
+    assert find_structures(normalise_side(make_survey(box()), Side.PORT, SETTINGS)) == []
 
 
 def test_height_is_that_of_similar_triangles():

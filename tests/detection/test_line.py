@@ -8,7 +8,7 @@ import pytest
 
 from sonarpost.detection.detector import detect
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.stream import StreamDetector, follows
+from sonarpost.detection.stream import StreamDetector, is_continuation
 from sonarpost.sonar.survey import ChannelPing, Side
 
 
@@ -23,7 +23,7 @@ def cut(survey, *seams):
 
 def all_of(files, settings=None):
     detector = StreamDetector(settings)
-    found = [contact for survey in files for contact in detector.feed(survey)]
+    found = [contact for survey in files for contact in detector.add_file(survey)]
     return [*found, *detector.finish()]
 
 
@@ -58,30 +58,30 @@ def test_every_contact_of_a_line_is_told_once_whatever_its_files(make_survey):
 def test_what_is_near_the_end_waits_for_the_next_file_or_the_end_of_the_line(make_survey):
     survey = make_survey({"ping": 60}, {"ping": 175})
     detector = StreamDetector()
-    (early,) = detector.feed(survey)
+    (early,) = detector.add_file(survey)
     assert early.ping == pytest.approx(60, abs=3)
     (late,) = detector.finish()
     assert late.ping == pytest.approx(175, abs=3)
     assert detector.finish() == ()
     stranger = replace(survey, sonar_id="another")
-    detector.feed(survey)
-    assert sorted(c.ping for c in detector.feed(stranger)) == [pytest.approx(60, abs=3), pytest.approx(175, abs=3)]
+    detector.add_file(survey)
+    assert sorted(c.ping for c in detector.add_file(stranger)) == [pytest.approx(60, abs=3), pytest.approx(175, abs=3)]
 
 
 def test_a_file_follows_another_when_time_sonar_and_sampling_go_on(make_survey):
     survey = make_survey()
     before, after = cut(survey, 100)
-    assert follows(before, after)
-    assert not follows(after, before)
-    assert not follows(before, replace(after, sonar_id="another"))
-    assert not follows(before, replace(after, pings=()))
+    assert is_continuation(before, after)
+    assert not is_continuation(after, before)
+    assert not is_continuation(before, replace(after, sonar_id="another"))
+    assert not is_continuation(before, replace(after, pings=()))
     late = tuple(replace(p, time_utc_s=p.time_utc_s + 60.0) for p in after.pings)
-    assert not follows(before, replace(after, pings=late))
+    assert not is_continuation(before, replace(after, pings=late))
     short = tuple(
         replace(p, channels=tuple(ChannelPing(c.side, c.samples[:300], c.slant_range_m) for c in p.channels))
         for p in after.pings
     )
-    assert not follows(before, replace(after, pings=short))
+    assert not is_continuation(before, replace(after, pings=short))
 
 
 def test_a_file_shorter_than_what_is_held_back_changes_nothing(make_survey):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sonarpost.detection.detector import detect
-from sonarpost.detection.image_detector import LevelImage, image_confidence, level_image
+from sonarpost.detection.image_detector import ScaledImage, detect_in_image, normalise_image
 from sonarpost.detection.snippets import cut_ground_snippet
 from sonarpost.sonar.survey import Side
 
@@ -25,39 +25,39 @@ def plain(picture):
 
 
 def test_an_object_in_a_piece_is_found_with_more_confidence_than_bare_seabed():
-    found = image_confidence(LevelImage(with_object(seabed()), 0.05, 0.05))
+    found = detect_in_image(ScaledImage(with_object(seabed()), 0.05, 0.05))
     assert found.confidence > 1.5
     assert (found.row, found.column) == (pytest.approx(120, abs=8), pytest.approx(120, abs=8))
     assert found.side is Side.STARBOARD
     for seed in range(3):
-        bare = image_confidence(LevelImage(plain(seabed(seed + 10)), 0.05, 0.05))
+        bare = detect_in_image(ScaledImage(plain(seabed(seed + 10)), 0.05, 0.05))
         assert bare is None or bare.confidence < 0.5 * found.confidence
 
 
 def test_a_mirrored_piece_gives_the_mirrored_place():
     piece = with_object(seabed())
-    one = image_confidence(LevelImage(piece, 0.05, 0.05))
-    other = image_confidence(LevelImage(np.ascontiguousarray(piece[:, ::-1]), 0.05, 0.05))
+    one = detect_in_image(ScaledImage(piece, 0.05, 0.05))
+    other = detect_in_image(ScaledImage(np.ascontiguousarray(piece[:, ::-1]), 0.05, 0.05))
     assert other.side is Side.PORT
     assert other.confidence == pytest.approx(one.confidence)
     assert other.column == 255 - one.column
-    assert image_confidence(LevelImage(piece, 0.05, 0.05), side=Side.PORT).confidence < one.confidence
+    assert detect_in_image(ScaledImage(piece, 0.05, 0.05), side=Side.PORT).confidence < one.confidence
 
 
 def test_padding_is_unknown_and_changes_little():
     picture = with_object(seabed())
     padded = picture.copy()
     padded[200:] = 0
-    assert image_confidence(LevelImage(padded, 0.05, 0.05)).confidence > 1.5
-    grid = level_image(LevelImage(padded, 0.06, 0.06), Side.STARBOARD)
+    assert detect_in_image(ScaledImage(padded, 0.05, 0.05)).confidence > 1.5
+    grid = normalise_image(ScaledImage(padded, 0.06, 0.06), Side.STARBOARD)
     assert np.isnan(grid.level[201:]).all()
     assert np.isfinite(grid.level[20:190, 10:240]).all()
 
 
 @pytest.mark.parametrize("value", [0, 7, 255])
 def test_a_piece_of_one_value_or_hardly_any_pixels_says_nothing(value):
-    assert image_confidence(LevelImage(np.full((256, 256), value, np.uint8), 0.05, 0.05)) is None
-    assert image_confidence(LevelImage(np.full((8, 8), value, np.uint8), 0.05, 0.05)) is None
+    assert detect_in_image(ScaledImage(np.full((256, 256), value, np.uint8), 0.05, 0.05)) is None
+    assert detect_in_image(ScaledImage(np.full((8, 8), value, np.uint8), 0.05, 0.05)) is None
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_a_piece_of_one_value_or_hardly_any_pixels_says_nothing(value):
 )
 def test_what_is_no_piece_is_refused(arguments):
     with pytest.raises(ValueError, match="expected"):
-        LevelImage(*arguments)
+        ScaledImage(*arguments)
 
 
 def test_the_ground_snippet_holds_the_contact_in_its_middle_at_its_scale(make_survey):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.detection.normalisation import preprocess
+from sonarpost.detection.normalisation import normalise_side
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
@@ -14,7 +14,7 @@ SETTINGS = DetectorSettings()
 
 
 def test_the_seabed_comes_out_flat_whatever_the_range(make_survey):
-    grid = preprocess(make_survey(), Side.PORT, SETTINGS)
+    grid = normalise_side(make_survey(), Side.PORT, SETTINGS)
     by_range = np.nanmedian(grid.level[:, 100:], axis=0)
     assert np.abs(by_range).max() < 0.35
     assert abs(float(np.nanmedian(grid.level))) < 0.05
@@ -22,7 +22,7 @@ def test_the_seabed_comes_out_flat_whatever_the_range(make_survey):
 
 
 def test_the_water_column_is_masked_and_the_seabed_is_not(make_survey):
-    grid = preprocess(make_survey(), Side.STARBOARD, SETTINGS)
+    grid = normalise_side(make_survey(), Side.STARBOARD, SETTINGS)
     first = 3.0 / grid.cell_across_m
     assert np.abs(grid.first_return_cell - first).max() <= 2
     assert np.isnan(grid.level[:, : int(first)]).all()
@@ -30,17 +30,17 @@ def test_the_water_column_is_masked_and_the_seabed_is_not(make_survey):
 
 
 def test_the_bottom_is_found_without_an_altitude(make_survey):
-    grid = preprocess(make_survey(altitude=False), Side.PORT, SETTINGS)
+    grid = normalise_side(make_survey(altitude=False), Side.PORT, SETTINGS)
     assert np.abs(grid.first_return_cell * grid.cell_across_m - 3.0).max() < 0.2
 
 
 def test_lengths_of_cells_and_rows(make_survey):
-    grid = preprocess(make_survey(), Side.PORT, SETTINGS)
+    grid = normalise_side(make_survey(), Side.PORT, SETTINGS)
     assert grid.samples_per_cell == 2
     assert grid.cell_across_m == pytest.approx(2 * 20.0 / 512)
     assert grid.row_along_m == pytest.approx(0.1, rel=0.02)
     assert grid.row_is_measured
-    unknown = preprocess(make_survey(navigation=False), Side.PORT, SETTINGS)
+    unknown = normalise_side(make_survey(navigation=False), Side.PORT, SETTINGS)
     assert not unknown.row_is_measured
     assert unknown.row_along_m == SETTINGS.assumed_row_along_m
 
@@ -51,7 +51,7 @@ def test_pings_without_the_channel_or_cut_short_are_unknown(make_survey):
     pings[50] = replace(pings[50], channels=())
     short = pings[60].channel(Side.PORT)
     pings[60] = replace(pings[60], channels=(ChannelPing(Side.PORT, short.samples[:300], short.slant_range_m),))
-    grid = preprocess(replace(survey, pings=tuple(pings)), Side.PORT, SETTINGS)
+    grid = normalise_side(replace(survey, pings=tuple(pings)), Side.PORT, SETTINGS)
     assert np.isnan(grid.level[50]).all()
     assert np.isnan(grid.level[60, 150:]).all()
     assert np.isfinite(grid.level[60, 100:148]).all()
@@ -62,7 +62,7 @@ def test_a_single_spike_does_not_survive(make_survey):
     survey = make_survey()
     samples = survey.pings[80].channel(Side.PORT).samples
     samples[301] = 65535
-    spiked = preprocess(survey, Side.PORT, SETTINGS)
+    spiked = normalise_side(survey, Side.PORT, SETTINGS)
     assert spiked.level[80, 150] < 2.0
 
 
@@ -79,7 +79,7 @@ def test_a_single_spike_does_not_survive(make_survey):
 )
 def test_a_side_that_holds_nothing_to_work_with_is_none(channels):
     survey = Survey(Path("x"), "x", "x", tuple(Ping(i, float(i), channels, altitude_m=2.0) for i in range(20)))
-    assert preprocess(survey, Side.PORT, SETTINGS) is None
+    assert normalise_side(survey, Side.PORT, SETTINGS) is None
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,10 @@ from builders.two_frequencies import read_both, with_second_frequency
 from research.detection.codec_effect import confidence_with
 from sonarpost.cli.detect import annotated_waterfall
 from sonarpost.detection.detector import detect
-from sonarpost.detection.normalisation import preprocess
+from sonarpost.detection.normalisation import normalise_side
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.snippets import cut_expanded, cut_ground_snippet, cut_snippet, ground_projected_image
-from sonarpost.detection.stream import StreamDetector, follows
+from sonarpost.detection.stream import StreamDetector, is_continuation
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.ground_range import MAX_COLUMNS
@@ -70,7 +70,7 @@ def test_an_object_without_altitude_and_navigation_too(samples, range_m, make_su
 @SECOND
 def test_cells_are_those_of_the_first_frequency(samples, range_m, make_survey, tmp_path):
     alone, both = (
-        preprocess(survey, Side.PORT, DetectorSettings())
+        normalise_side(survey, Side.PORT, DetectorSettings())
         for survey in read_both(make_survey({}), tmp_path, samples, range_m)
     )
     assert (both.cell_across_m, both.samples_per_cell) == (alone.cell_across_m, alone.samples_per_cell)
@@ -126,7 +126,7 @@ def test_a_line_of_several_files_too(samples, range_m, make_survey, tmp_path):
     for survey in read_both(make_survey({}), tmp_path, samples, range_m):
         detector = StreamDetector()
         files = (replace(survey, pings=survey.pings[:98]), replace(survey, pings=survey.pings[98:]))
-        contacts = [contact for file in files for contact in detector.feed(file)] + list(detector.finish())
+        contacts = [contact for file in files for contact in detector.add_file(file)] + list(detector.finish())
         found.append([(contact.file, contact.ping, contact.detection) for contact in contacts])
     assert found[0] == found[1] != []
 
@@ -134,10 +134,10 @@ def test_a_line_of_several_files_too(samples, range_m, make_survey, tmp_path):
 def test_files_whose_frequencies_change_places_are_not_one_line(make_survey):
     survey = with_second_frequency(make_survey({}), 512, 10.0)
     first, second = replace(survey, pings=survey.pings[:98]), replace(survey, pings=survey.pings[98:])
-    assert follows(first, second)
+    assert is_continuation(first, second)
     # Both sides' second channels come first: the picture would go on at another scale.
     turned = tuple(replace(p, channels=(*p.channels[2:], *p.channels[:2])) for p in second.pings)
-    assert not follows(first, replace(second, pings=turned))
+    assert not is_continuation(first, replace(second, pings=turned))
 
 
 @SECOND

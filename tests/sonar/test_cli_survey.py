@@ -13,7 +13,7 @@ from builders.surveys import MAKERS, make_xtf
 from PIL import Image
 
 from sonarpost.cli.main import main
-from sonarpost.cli.survey.plot import SIDE_PX, evened, nice_step, reduce_survey, thinned_track
+from sonarpost.cli.survey.plot import SIDE_PX, angle_normalised, nice_step, reduce_survey, thinned_track
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.options import SurveyOptions
@@ -139,7 +139,7 @@ def test_over_ground_the_nadir_is_in_the_middle_and_even_is_even():
     slant, ground = (reduce_survey(source, over_ground=over, max_rows=75) for over in (False, True))
     middle = slice(SIDE_PX + 5, SIDE_PX + 40)
     assert np.nanmean(slant.echo[:, middle]) < 0.5 * np.nanmean(ground.echo[:, middle])
-    even = evened(ground).echo
+    even = angle_normalised(ground).echo
     halves = np.nanmean(even[:, SIDE_PX + 60 : SIDE_PX + 200]), np.nanmean(even[:, SIDE_PX + 200 : SIDE_PX + 400])
     assert halves == pytest.approx((1, 1), abs=0.15)
 

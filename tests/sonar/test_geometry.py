@@ -14,15 +14,16 @@ from sonarpost.sonar.geometry import (
     WGS84_FLATTENING,
     Position,
     along_track_m,
+    georeference,
     ground_position,
     ground_to_slant_range_m,
     offset_between_m,
     offset_position,
     ping_spacing_m,
-    sample_position,
     sample_slant_range_m,
     slant_to_ground_range_m,
 )
+from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
@@ -94,6 +95,11 @@ def test_slant_and_ground_are_inverse(ground, altitude):
     assert np.nan_to_num(back) == pytest.approx(ground, abs=1e-5)
 
 
+def sample_position(ping: Ping, side: Side, sample_index: float, **changes: float) -> Position | None:
+    found = georeference(ping, side, sample_index, SurveyOptions(), **changes)
+    return None if found is None else found.position
+
+
 def ping_at(heading_deg: float | None, **changes: object) -> Ping:
     channels = tuple(ChannelPing(side, np.zeros(100, np.uint8), 50.0) for side in Side)
     ping = Ping(1, 0.0, channels, lat_deg=60.0, lon_deg=10.0, heading_deg=heading_deg, altitude_m=12.25)
@@ -122,8 +128,8 @@ def test_a_sample_lies_abeam_on_its_side(heading, side, north, east):
     assert place == ground_position(ping, side, ground_m)
 
 
-def test_a_tracked_altitude_takes_the_place_of_the_pings_own():
-    higher = sample_position(ping_at(0), Side.PORT, 60, altitude_m=25.0)
+def test_tracked_altitude_is_used_for_a_ping_without_altitude():
+    higher = sample_position(ping_at(0, altitude_m=None), Side.PORT, 60, tracked_altitude_m=25.0)
     assert offset_between_m(Position(60, 10), higher)[1] == pytest.approx(-math.sqrt(30.25**2 - 25**2), abs=1e-3)
     assert sample_position(ping_at(0, altitude_m=None), Side.PORT, 60) is None
 

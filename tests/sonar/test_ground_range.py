@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.sonar.ground_range import beam_normalised, ground_range_image, means_between, range_normalised
+from sonarpost.sonar.ground_range import beam_normalised, ground_range_image, interval_means, range_normalised
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 
@@ -45,12 +45,12 @@ def test_unknown_altitude_and_absent_side_are_nan():
 def test_a_step_has_the_mean_of_the_samples_it_spans_with_their_parts():
     samples = np.array([10, 20, 40, 80], np.uint8)
     places = np.array([0.0, 0.5, 2.0, 2.25, 2.75, 4.0])
-    np.testing.assert_allclose(means_between(samples, places), [10, (5 + 20) / 1.5, 40, 40, (10 + 80) / 1.25])
+    np.testing.assert_allclose(interval_means(samples, places), [10, (5 + 20) / 1.5, 40, 40, (10 + 80) / 1.25])
 
 
 def test_a_step_beyond_the_last_sample_or_too_narrow_has_no_mean():
     samples = np.array([10, 20], np.uint16)
-    means = means_between(samples, np.array([0.0, 0.0, 0.25, 1.0, 2.0, 2.5]), least_width=0.25)
+    means = interval_means(samples, np.array([0.0, 0.0, 0.25, 1.0, 2.0, 2.5]), min_width=0.25)
     np.testing.assert_array_equal(means, [np.nan, np.nan, 10, 20, np.nan])
 
 

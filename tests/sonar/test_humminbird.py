@@ -54,7 +54,7 @@ def test_depth_and_spacing_are_options(recording):
     path, *_ = recording
     plain = read_survey(path)
     assert plain.pings[0].altitude_m is None
-    assert any("slant range is not recorded: 0.0191 m" in w for w in plain.warnings)
+    assert any("slant range is not recorded: assuming 0.0191 m" in w for w in plain.warnings)
     told = SurveyOptions(humminbird_sample_spacing_m=0.05, humminbird_depth_as_altitude=True)
     survey = read_survey(path, told)
     assert survey.pings[0].altitude_m == pytest.approx(6.2)

@@ -13,7 +13,7 @@ from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.sonar import readers
 from sonarpost.sonar.options import SurveyOptions, load_options
 from sonarpost.sonar.readers import open_survey, read_survey, supported_suffixes
-from sonarpost.sonar.source import InMemorySource, blocks, gather
+from sonarpost.sonar.source import InMemorySource, blocks, load_survey
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_a_plug_in_opens_its_suffix(tmp_path, small_survey):
     assert len(read_survey(tmp_path / "line.JSF").pings) == 5
     with pytest.raises(SurveyFileError, match=r"survey reader sdf: got .absent_package:open: ModuleNotFoundError"):
         open_survey(tmp_path / "line.sdf")
-    with pytest.raises(SurveyFileError, match="something to call"):
+    with pytest.raises(SurveyFileError, match="a callable"):
         open_survey(tmp_path / "line.odd")
     # What comes with the package is not replaced.
     assert len(read_survey(make_xtf(small_survey(), tmp_path)).pings) == 5
@@ -70,9 +70,9 @@ def test_blocks_of_nothing_are_refused(small_survey):
 
 def test_too_much_to_hold_is_an_error(small_survey):
     source = InMemorySource(small_survey(), SurveyOptions())
-    assert len(gather(source, 400).pings) == 5
+    assert len(load_survey(source, 400).pings) == 5
     with pytest.raises(SurveyFileError, match="samples"):
-        gather(source, 399)
+        load_survey(source, 399)
 
 
 def test_options_from_a_file(tmp_path):

@@ -29,7 +29,7 @@ def test_a_waterfall_is_as_wide_as_the_first_channel(samples, range_m, survey, t
     for side in Side:
         assert both.waterfall(side).shape == (120, 256)
         np.testing.assert_array_equal(both.waterfall(side), alone.waterfall(side))
-        assert (both.sample_count(side), both.reach_m(side)) == (256, 30.0)
+        assert (both.sample_count(side), both.max_slant_range_m(side)) == (256, 30.0)
 
 
 @SECOND
@@ -72,7 +72,7 @@ def test_the_exported_range_is_that_of_the_picture(samples, range_m, survey, tmp
 def test_info_lists_what_the_file_holds_and_says_what_is_looked_at(samples, range_m, survey, tmp_path, capsys):
     alone, both = files_of(survey, tmp_path, samples, range_m)
     note = (
-        "several channels a side in 120 of 120 pings: pictures and contacts are of the first, 400 kHz, slant range 30 m"
+        "several channels a side in 120 of 120 pings: images and contacts are of the first, 400 kHz, slant range 30 m"
     )
     assert main(["survey", "info", "--json", str(both)]) == 0
     facts = json.loads(capsys.readouterr().out)
@@ -88,5 +88,5 @@ def test_info_lists_what_the_file_holds_and_says_what_is_looked_at(samples, rang
 
 def test_a_survey_without_a_side_has_no_range_there(survey):
     port = replace(survey, pings=tuple(replace(p, channels=p.channels[:1]) for p in survey.pings))
-    assert (port.sample_count(Side.STARBOARD), port.reach_m(Side.STARBOARD)) == (0, 0.0)
+    assert (port.sample_count(Side.STARBOARD), port.max_slant_range_m(Side.STARBOARD)) == (0, 0.0)
     assert port.waterfall(Side.STARBOARD).shape == (120, 0)

@@ -1,15 +1,9 @@
-"""`sonarpost detect FILE…`: the contacts of survey files, as a table, as JSON, or drawn into the waterfall.
-
-## sonarpost.cli.detect
-A contact of `sonarpost detect` as JSON: the fields of the contact record, and where it lies in the picture.
-
-## sonarpost.cli.detect
-A waterfall with its contacts drawn in, for people.
-"""
+"""`sonarpost detect FILE…`: the contacts of survey files as a table, as JSON, or drawn into the waterfall."""
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import hashlib
 import io
 import json
@@ -43,9 +37,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the subcommand."""
     parser = subparsers.add_parser(
         "detect",
-        help="find the contacts of survey files",
-        description="Find highlights with shadows in side-scan surveys and list them, most confident first. Files "
-        "that go on where the one before ended are one line: what lies on their seam is found once.",
+        help="detect contacts in survey files",
+        description="Detect highlights with shadows in side-scan surveys and list them, most confident first. Files "
+        "that continue each other are one line: an object at a file boundary is listed once.",
     )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="survey file")
     parser.add_argument("--json", action="store_true", help="print one JSON object with every file's contacts")
@@ -53,33 +47,35 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--plot",
         type=Path,
         metavar="FILE.png",
-        help="draw the contacts into the waterfall; with several survey files each one's name is put before the suffix",
+        help="draw the contacts into the waterfall; with several survey files, the name of each precedes the suffix",
     )
-    parser.add_argument("--snippets", type=Path, metavar="DIR", help="write each contact's pictures into this folder")
+    parser.add_argument(
+        "--snippets", type=Path, metavar="DIR", help="write the snippets of each contact into this folder"
+    )
     parser.add_argument(
         "--threshold",
         type=float,
         default=DetectorSettings().confidence_threshold,
         metavar="CONFIDENCE",
-        help="least confidence, 0 to 2 (default: %(default)s)",
+        help="minimum confidence, 0 to 2 (default: %(default)s)",
     )
     parser.add_argument(
-        "--max-contacts", type=int, metavar="N", help="list no more than the N most confident of a file"
+        "--max-contacts", type=int, metavar="N", help="list at most the N most confident contacts of a file"
     )
     parser.add_argument(
-        "--options", type=Path, metavar="FILE.toml", help="what the files do not say (see the page Surveys)"
+        "--options", type=Path, metavar="FILE.toml", help="mounting, errors, projection (see the page Surveys)"
     )
     parser.add_argument("--vehicle", default="uuv", metavar="ID", help="vehicle_id of the records (default: uuv)")
     parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Detect in every file and print what was found.
+    """Detect in every file and print the contacts.
 
     Raises:
         SurveyFileError: A file cannot be read.
-        OSError: A picture cannot be written.
-        ConfigError: An option's value is out of range.
+        OSError: An image cannot be written.
+        ConfigError: The value of an option is out of range.
     """
     try:
         settings = DetectorSettings(confidence_threshold=parsed.threshold, max_contacts=parsed.max_contacts)
@@ -88,7 +84,7 @@ def run(parsed: argparse.Namespace) -> int:
         raise ConfigError("detect", "--threshold, --max-contacts", value, str(error)) from error
     options = SurveyOptions() if parsed.options is None else load_options(parsed.options)
     files: list[Path] = parsed.files
-    results = _detected(files, settings, options)
+    results = _detect_files(files, settings, options)
     for result in results:
         if not parsed.json:
             _print_table(result)
@@ -102,30 +98,30 @@ def run(parsed: argparse.Namespace) -> int:
     return 0
 
 
-def _detected(files: Sequence[Path], settings: DetectorSettings, options: SurveyOptions) -> list[FoundIn]:
-    """Detect in the files as one line after another; a contact belongs to the file that holds its ping."""
+def _detect_files(files: Sequence[Path], settings: DetectorSettings, options: SurveyOptions) -> list[FileResult]:
+    """Detect in the files in their order; a contact belongs to the file that contains its ping."""
     detector = StreamDetector(settings, options)
-    results: list[FoundIn] = []
+    results: list[FileResult] = []
     for path in files:
         survey = read_survey(path, options)
-        began = time.perf_counter()
-        told = detector.feed(survey)
-        results.append(FoundIn(survey, []))
-        results[-1].seconds += time.perf_counter() - began
-        _hand_out(told, results)
-    _hand_out(detector.finish(), results)
+        started_s = time.perf_counter()
+        contacts = detector.add_file(survey)
+        results.append(FileResult(survey, []))
+        results[-1].seconds += time.perf_counter() - started_s
+        _assign(contacts, results)
+    _assign(detector.finish(), results)
     for result in results:
         result.contacts.sort(key=lambda c: -c.detection.confidence)
         del result.contacts[settings.max_contacts or len(result.contacts) :]
     return results
 
 
-def _hand_out(told: Sequence[StreamContact], results: Sequence[FoundIn]) -> None:
-    for contact in told:
+def _assign(contacts: Sequence[StreamContact], results: Sequence[FileResult]) -> None:
+    for contact in contacts:
         results[contact.file].contacts.append(contact)
 
 
-def _print_table(result: FoundIn) -> None:
+def _print_table(result: FileResult) -> None:
     survey = result.survey
     print(f"{survey.path}: {len(survey.pings)} pings, {len(result.contacts)} contacts")
     for warning in survey.warnings:
@@ -146,7 +142,7 @@ def _metres(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _file_json(result: FoundIn, vehicle_id: str) -> dict[str, object]:
+def _file_json(result: FileResult, vehicle_id: str) -> dict[str, object]:
     return {
         "file": str(result.survey.path),
         "pings": len(result.survey.pings),
@@ -159,8 +155,8 @@ def _plot_path(plot: Path, survey_path: Path, *, several: bool) -> Path:
     return plot.with_name(f"{plot.stem}-{survey_path.stem}{plot.suffix}") if several else plot
 
 
-def _write_snippets(folder: Path, result: FoundIn) -> None:
-    """Write each contact at the recording's own resolution and, where it is known, at 10 cm a pixel of seabed."""
+def _write_snippets(folder: Path, result: FileResult) -> None:
+    """Write the snippet of each contact at the resolution of the recording and, if possible, at 10 cm a pixel."""
     for number, contact in enumerate(result.contacts, start=1):
         name = f"{result.survey.path.stem}-{number:03d}"
         _write_png(folder / f"{name}.png", Image.fromarray(cut_snippet(contact.survey, contact.detection).image))
@@ -169,15 +165,15 @@ def _write_snippets(folder: Path, result: FoundIn) -> None:
             _write_png(folder / f"{name}-ground.png", Image.fromarray(ground.image))
 
 
-def _write_png(path: Path, picture: Image.Image) -> None:
+def _write_png(path: Path, image: Image.Image) -> None:
     buffer = io.BytesIO()
-    picture.save(buffer, format="PNG")
+    image.save(buffer, format="PNG")
     write_atomically(path, buffer.getvalue())
 
 
 @dataclass
-class FoundIn:
-    """A file, what was found in it, and the time that detecting took."""
+class FileResult:
+    """A file, its contacts, and the time of the detection."""
 
     survey: Survey
     contacts: list[StreamContact]
@@ -185,12 +181,12 @@ class FoundIn:
 
 
 def contact_json(survey: Survey, contact: StreamContact, vehicle_id: str) -> dict[str, object]:
-    """Return one contact as JSON types.
+    """Return one contact as JSON types: the fields of the contact record and its place in the survey.
 
     Args:
-        survey: The file that holds the contact's ping.
+        survey: The file that contains the ping of the contact.
         contact: The contact.
-        vehicle_id: Of the record.
+        vehicle_id: Vehicle of the record.
     """
     d = contact.detection
     line_name = survey.line_name.encode("utf-8", "backslashreplace").decode()
@@ -222,13 +218,7 @@ def contact_json(survey: Survey, contact: StreamContact, vehicle_id: str) -> dic
         "height_m": d.height_m,
         "pixel_along_m": d.pixel_along_m,
         "pixel_across_m": d.pixel_across_m,
-        "scores": {
-            "matched": d.scores.matched,
-            "cfar": d.scores.cfar,
-            "shadow": d.scores.shadow,
-            "texture": d.scores.texture,
-            "geometry": d.scores.geometry,
-        },
+        "scores": dataclasses.asdict(d.scores),
     }
 
 
@@ -244,21 +234,21 @@ _MARGIN_PX = 6
 
 
 def annotated_waterfall(survey: Survey, detections: Sequence[Detection]) -> Image.Image:
-    """Draw a survey as an operator sees it: port to the left, the vehicle's track in the middle, first ping on top.
+    """Draw a survey with port on the left, the track of the vehicle in the middle, and the first ping at the top.
 
-    Each contact is framed from its highlight to its shadow's end, red when mine-like, yellow otherwise, with its place
-    in `detections` (from 1) and its confidence.
+    A frame encloses highlight and shadow of each contact, red if mine-like, else yellow. Its text is the number in
+    `detections` (from 1) and the confidence.
 
     Returns:
-        RGB picture, one row a ping, one column a sample; 1 x 1 for a survey without samples.
+        RGB image, one row a ping, one column a sample; 1 x 1 for a survey without samples.
     """
     halves = {side: _grey(survey, side) for side in survey.sides()}
     if not halves or not survey.pings:
         return Image.new("RGB", (1, 1))
     track = halves[Side.PORT].shape[1] if Side.PORT in halves else 0
-    pieces = [image[:, ::-1] if side is Side.PORT else image for side, image in halves.items()]
-    picture = Image.fromarray(np.hstack(pieces)).convert("RGB")
-    draw = ImageDraw.Draw(picture)
+    columns = [image[:, ::-1] if side is Side.PORT else image for side, image in halves.items()]
+    waterfall = Image.fromarray(np.hstack(columns)).convert("RGB")
+    draw = ImageDraw.Draw(waterfall)
     for number, detection in enumerate(detections, start=1):
         near = detection.highlight_samples[0] - _MARGIN_PX
         far = detection.highlight_samples[1] + detection.shadow_samples + _MARGIN_PX
@@ -267,7 +257,7 @@ def annotated_waterfall(survey: Survey, detections: Sequence[Detection]) -> Imag
         colour = _COLOURS.get(detection.atd_class, _OTHER_COLOUR)
         draw.rectangle((left, top, right, bottom), outline=colour)
         draw.text((left, bottom + 1), f"{number}: {detection.confidence:.2f}", fill=colour)
-    return picture
+    return waterfall
 
 
 def _grey(survey: Survey, side: Side) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:

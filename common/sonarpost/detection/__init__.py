@@ -1,1 +1,1 @@
-"""Target detection: filters, fusion, contacts."""
+"""Target detection in side-scan surveys: filters, clutter normalisation, fusion, snippets."""

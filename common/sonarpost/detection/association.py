@@ -1,12 +1,12 @@
-"""Which contacts of two looks at one stream of pings are one object.
+"""Association of repeated detections: which detections from overlapping pings are one object.
 
-A line is recorded file after file, and a long file is looked at piece after piece; what lies near a cut is looked at
-twice. Two ask here, and differ beyond it on purpose:
+A line is recorded in several files, and a long file is processed in strips. Objects near a boundary are detected
+twice. Two programs use this module, with different rules for contacts at the end of a file:
 
-- `sonarpost.detection.stream`, for commands, has whole files in memory. It withholds contacts near the end of a file;
-  when the next file is there they are forgotten, as that end is looked at once more. The settings say what is near.
-- atd_stub has pieces of files of any length, and answers for each contact over restarts. What waits at a file's end is
-  replaced by the same contact seen whole, and sent as it is where the second look does not see it.
+- `sonarpost.detection.stream`, for commands, has whole files in memory. It holds contacts near the end of a file back
+  and detects them again together with the next file.
+- `atd_stub` has strips of files of any length and keeps its state over restarts. It replaces a held contact by the
+  same contact from the next file, or releases it unchanged if that file does not contain it.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from typing import Final, Self
 from sonarpost.detection.detector import Detection
 from sonarpost.sonar.survey import Side
 
-UNKNOWN_ALONG_M: Final = 0.2
-"""Travel between two rows where the survey does not tell it, as in the detector's own settings."""
+DEFAULT_ROW_SPACING_M: Final = 0.2
+"""Distance between two rows if the survey does not contain it, as in the settings of the detector."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionPosition:
-    """A contact as it was seen in one look at a stream of pings.
+    """The place of a detection in a stream of pings.
 
-    Rows count in that stream, not in times: a clock that stands still must not make all contacts one.
+    Places are compared by rows, not by time, so that a stopped clock does not merge all contacts.
 
     Attributes:
-        side: The side it was seen on.
-        row: Of the highlight's middle.
-        first_row: The highlight's first.
-        end_row: One past its last.
-        slant_range_m: To its middle.
-        along_m: Travel between two rows.
+        side: Side of the vehicle.
+        row: Row of the centre of the highlight.
+        first_row: First row of the highlight.
+        end_row: One past its last row.
+        slant_range_m: Slant range of its centre.
+        along_m: Distance between two rows.
     """
 
     side: Side
@@ -44,45 +44,48 @@ class DetectionPosition:
     along_m: float
 
     @classmethod
-    def of(cls, found: Detection, first_row: int = 0, unknown_along_m: float = UNKNOWN_ALONG_M) -> Self:
-        """Return a detection as a look.
+    def of_detection(
+        cls, detection: Detection, first_row: int = 0, default_along_m: float = DEFAULT_ROW_SPACING_M
+    ) -> Self:
+        """Return the place of a detection.
 
         Args:
-            found: The detection.
-            first_row: Row of the first ping of the survey it was found in.
-            unknown_along_m: Travel between two rows where the detection has none.
+            detection: The detection.
+            first_row: Row in the stream of the first ping of the detection's survey.
+            default_along_m: Distance between two rows if the detection has none.
         """
-        along_m = found.pixel_along_m if found.pixel_along_m is not None else unknown_along_m
-        first, end = found.highlight_pings
-        return cls(found.side, found.ping_index, first, end, found.slant_range_m, along_m).moved(first_row)
+        along_m = detection.pixel_along_m if detection.pixel_along_m is not None else default_along_m
+        first, end = detection.highlight_pings
+        place = cls(detection.side, detection.ping_index, first, end, detection.slant_range_m, along_m)
+        return place.shifted(first_row)
 
-    def moved(self, rows: int) -> Self:
-        """Return the look in a stream that begins so many rows earlier (later, where `rows` is negative)."""
+    def shifted(self, rows: int) -> Self:
+        """Return the place with `rows` added to its rows."""
         return replace(self, row=self.row + rows, first_row=self.first_row + rows, end_row=self.end_row + rows)
 
 
 @dataclass(frozen=True, slots=True)
 class AssociationRule:
-    """When two looks were at one object: on one side, and near each other in both directions.
+    """Condition under which two detections are one object: same side, and near in both directions.
 
     Attributes:
-        along_m: Middles nearer to each other than this are near along-track.
-        across_m: And nearer than this are near across-track.
-        overlapping: Highlights that share a row are near along-track however far their middles lie apart: a look that
-            ends at a cut has seen a part of what the other sees whole.
+        along_m: Centres nearer than this are near along-track.
+        across_m: Centres nearer than this are near across-track.
+        overlapping: Highlights with a common row are also near along-track: a detection at a boundary covers only a
+            part of the object.
     """
 
     along_m: float
     across_m: float
     overlapping: bool
 
-    def holds(self, one: DetectionPosition, other: DetectionPosition, across_m: float) -> bool:
-        """Tell whether both are looks at one object.
+    def matches(self, one: DetectionPosition, other: DetectionPosition, across_m: float) -> bool:
+        """Return whether two detections are one object.
 
         Args:
-            one: A look, whose travel between rows counts.
-            other: Another in the same stream, or with rows that count from the same ping.
-            across_m: How far they lie apart across-track: by slant range, or by samples where both have the same.
+            one: A detection; its distance between rows is used.
+            other: Another one, with rows of the same stream.
+            across_m: Their distance across-track: by slant range, or by samples if the sampling is the same.
         """
         if one.side is not other.side or not across_m < self.across_m:
             return False

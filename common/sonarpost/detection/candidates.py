@@ -1,22 +1,12 @@
-"""Every place the matched filter points to, with what each filter says of it.
+"""Candidates: peaks of the matched filter, measured and scored by four further filters.
 
-## sonarpost.detection.candidates
-What one candidate looks like up close: highlight, shadow, the seabed around, and two filters of their own.
+Each filter examines one property, so that their agreement is evidence:
 
-The matched filter says where to look; these two look again, each at one property alone, so that their agreement means
-something: the constant-false-alarm test compares the highlight with a guarded ring of seabed, the shadow test asks
-whether the dark behind it is dark, begins at the highlight, is not riddled with echoes, and goes on along-track no
-farther than the highlight suggests.
-
-
-## sonarpost.detection.candidates
-Local texture anomaly: does the seabed look otherwise here than around?
-
-The Reed-Xiaoli anomaly detector (Reed and Yu, IEEE Trans. ASSP 38(10), 1990) on texture instead of colour bands. The
-level picture is reduced to blocks; a window of blocks has five numbers: mean, spread, mean step along-track, mean step
-across-track, and the spread of its blocks' means. The score of a place is the Mahalanobis distance of its numbers from
-those of the windows in a ring around it, per square root of the numbers: about 1 on a seabed of one texture whatever
-that is, above 3 where something lies that the seabed around does not have.
+* CFAR (constant false alarm rate): is the highlight brighter than a guarded ring of seabed around it?
+* shadow: is the region behind the highlight dark, without echoes, and not much wider than the highlight?
+* texture: does the texture differ from that of the seabed around? The Reed-Xiaoli anomaly detector (Reed and Yu, IEEE
+  Trans. ASSP 38(10), 1990), with texture features in place of colour bands.
+* geometry: do highlight and shadow have the proportions of a compact object?
 """
 
 from __future__ import annotations
@@ -34,103 +24,43 @@ from sonarpost.detection.normalisation import LevelGrid
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import FloatImage
 
-_MOST_PER_KILOPING: Final = 250
+Features = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+_MAX_PER_1000_PINGS: Final = 250
+_MIN_RING_CELLS: Final = 30
+_SHADOW_GAP_M: Final = 0.25
+"""A gap of this length, caused by speckle, does not end a shadow."""
+_SHADOW_START_M: Final = 0.5
+"""A shadow begins within this distance of the outer edge of the highlight: the object rests on the seabed."""
+
+_BLOCK_M: Final = 0.25
+_WINDOW_BLOCKS: Final = 5
+_GUARD_BLOCKS: Final = 8
+_RING_BLOCKS: Final = 32
+_RING_STEP_BLOCKS: Final = 3
+_MIN_RING_WINDOWS: Final = 24
+_NEAR_BLOCKS: Final = 1
+_FEATURES: Final = 5
+_RIDGE: Final = 0.05
+"""Fraction of the variance of each feature over the image, added to the ring's covariance: a ring may be very even."""
 
 
 @dataclass(frozen=True, slots=True)
-class FilterScores:
-    """What each filter says of a place; 0 or more, and more is more like an object on the bottom.
-
-    Attributes:
-        matched: Highlight-and-shadow matched filter, in deviations of the noise around.
-        cfar: Highlight over the ring of seabed around it, in the ring's deviations.
-        shadow: Depth of the shadow below that ring, in the same, times the part of it that is dark.
-        texture: Distance of the texture, where highlight and shadow meet, from that of the seabed around
-            (`sonarpost.detection.candidates`).
-        geometry: 0 to 1, how well highlight and shadow have the proportions of a compact object, see `geometry_score`.
-    """
-
-    matched: float
-    cfar: float
-    shadow: float
-    texture: float
-    geometry: float
-
-
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """A place and its scores."""
-
-    measured: Measured
-    scores: FilterScores
-
-
-def candidates(grid: LevelGrid, settings: DetectorSettings) -> list[Candidate]:
-    """Return the places on one side that the matched filter points to, strongest first.
-
-    Args:
-        grid: One side of a survey, or a piece of a picture.
-        settings: How to look.
-    """
-    most = math.ceil(_MOST_PER_KILOPING * max(1.0, len(grid.level) / 1000))
-    found = peaks(matched_response(grid, settings), grid, settings, settings.least_matched)[:most]
-    measured = [m for m in (measure(grid, peak, settings) for peak in found) if m is not None]
-    texture = TextureMap(grid)
-    return [
-        Candidate(
-            one,
-            FilterScores(
-                matched=one.matched,
-                cfar=one.cfar,
-                shadow=one.shadow,
-                texture=texture.anomaly(one.row, one.cells[1]),
-                geometry=geometry_score(one, grid, settings),
-            ),
-        )
-        for one in measured
-    ]
-
-
-def geometry_score(one: Measured, grid: LevelGrid, settings: DetectorSettings) -> float:
-    """Return how well highlight and shadow have the proportions that a compact object's have, 0 to 1.
-
-    The score is exp(-d), d the sum of how far, in natural logarithms, each of these lies beyond what is granted: the
-    highlight's longer side beyond the greatest mine's length; its longer over its shorter side beyond 4; the shadow's
-    extent along-track beyond twice the highlight's (or a metre) or below half of it; a missing shadow counts 1.
-    """
-    length_m = (one.rows[1] - one.rows[0]) * grid.row_along_m
-    width_m = (one.cells[1] - one.cells[0]) * grid.cell_across_m
-    longer, shorter = max(length_m, width_m), max(min(length_m, width_m), 1e-3)
-    beyond = max(0.0, math.log(longer / settings.mine_length_m[1])) + max(0.0, math.log(longer / shorter / 4.0))
-    if one.shadow_rows == 0:
-        return math.exp(-beyond - 1.0)
-    shadow_along_m = one.shadow_rows * grid.row_along_m
-    beyond += max(0.0, math.log(shadow_along_m / max(2.0 * length_m, 1.0)))
-    beyond += max(0.0, math.log(0.5 * length_m / shadow_along_m))
-    return math.exp(-beyond)
-
-
-# A shadow may be broken by speckle for this much of its own length before it ends.
-_GAP_M = 0.25
-# A shadow begins within this distance of the highlight's outer edge: an object does not float far off the seabed.
-_START_M = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """A candidate in grid cells, and what the two filters say of it.
+class Measurement:
+    """Highlight and shadow of a candidate in grid cells, with the scores that follow from them.
 
     Attributes:
         row: Centre row of the highlight.
         cell: Centre cell of the highlight.
         rows: First and one-past-last row of the highlight.
         cells: First and one-past-last cell of the highlight.
-        shadow_cells: Number of cells of shadow behind the highlight's outer edge (0: none found).
-        shadow_is_cut: True when the shadow runs to the end of the recording.
-        matched: Matched-filter response in local-noise units.
-        cfar: Highlight over the ring's median, in the ring's deviations.
-        shadow: Depth of the shadow below the ring's median, in the ring's deviations, times its dark part.
-        shadow_rows: Along-track extent of the dark region that the shadow belongs to, in rows; 0 where none is.
+        shadow_cells: Length of the shadow behind the outer edge of the highlight in cells; 0 without shadow.
+        shadow_is_cut: True if the shadow extends to the end of the recording.
+        matched: Matched-filter response in local noise units.
+        cfar: Highlight above the median of the ring, in robust deviations of the ring.
+        shadow: Depth of the shadow below the median of the ring, in the same unit, times its dark fraction.
+        shadow_rows: Along-track extent of the dark region that contains the shadow, in rows; 0 without shadow.
     """
 
     row: int
@@ -145,17 +75,83 @@ class Measured:
     shadow_rows: int = 0
 
 
-def measure(grid: LevelGrid, peak: Peak, settings: DetectorSettings) -> Measured | None:
-    """Measure one peak of the matched filter, or return None when too little seabed surrounds it to compare with."""
-    ring = _ring(grid, peak, settings)
-    if ring.size < 30:
+@dataclass(frozen=True, slots=True)
+class FilterScores:
+    """The score of each filter at a place: 0 or more, greater for an object on the bottom.
+
+    Attributes:
+        matched: Highlight-and-shadow matched filter, in local noise units.
+        cfar: Highlight above the ring of seabed around it, in robust deviations of the ring.
+        shadow: Depth of the shadow below that ring, in the same unit, times its dark fraction.
+        texture: Mahalanobis distance of the texture between highlight and shadow from that of the seabed around.
+        geometry: 0 to 1, agreement with the proportions of a compact object, see `geometry_score`.
+    """
+
+    matched: float
+    cfar: float
+    shadow: float
+    texture: float
+    geometry: float
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A peak of the matched filter with its measurement and scores."""
+
+    measurement: Measurement
+    scores: FilterScores
+
+
+def find_candidates(grid: LevelGrid, settings: DetectorSettings) -> list[Candidate]:
+    """Return the candidates of one side of a survey, or of an image, in order of the matched-filter response."""
+    limit = math.ceil(_MAX_PER_1000_PINGS * max(1.0, len(grid.level) / 1000))
+    found = peaks(matched_response(grid, settings), grid, settings, settings.least_matched)[:limit]
+    measurements = [m for m in (measure(grid, peak, settings) for peak in found) if m is not None]
+    texture = TextureMap(grid)
+    return [
+        Candidate(
+            m,
+            FilterScores(
+                matched=m.matched,
+                cfar=m.cfar,
+                shadow=m.shadow,
+                texture=texture.anomaly(m.row, m.cells[1]),
+                geometry=geometry_score(m, grid, settings),
+            ),
+        )
+        for m in measurements
+    ]
+
+
+def geometry_score(measurement: Measurement, grid: LevelGrid, settings: DetectorSettings) -> float:
+    """Return how well highlight and shadow have the proportions of a compact object, 0 to 1.
+
+    The score is exp(-d). d is the sum of the natural logarithms by which these values exceed their limits: the longer
+    side of the highlight (limit: the greatest length of a mine), its ratio to the shorter side (limit: 4), the
+    along-track extent of the shadow (limits: half and twice the highlight's, at least 1 m). A missing shadow adds 1.
+    """
+    length_m = (measurement.rows[1] - measurement.rows[0]) * grid.row_along_m
+    width_m = (measurement.cells[1] - measurement.cells[0]) * grid.cell_across_m
+    longer, shorter = max(length_m, width_m), max(min(length_m, width_m), 1e-3)
+    excess = max(0.0, math.log(longer / settings.mine_length_m[1])) + max(0.0, math.log(longer / shorter / 4.0))
+    if measurement.shadow_rows == 0:
+        return math.exp(-excess - 1.0)
+    shadow_along_m = measurement.shadow_rows * grid.row_along_m
+    excess += max(0.0, math.log(shadow_along_m / max(2.0 * length_m, 1.0)))
+    excess += max(0.0, math.log(0.5 * length_m / shadow_along_m))
+    return math.exp(-excess)
+
+
+def measure(grid: LevelGrid, peak: Peak, settings: DetectorSettings) -> Measurement | None:
+    """Measure highlight and shadow at a peak of the matched filter; None if too little seabed surrounds it."""
+    ring = _ring_levels(grid, peak, settings)
+    if ring.size < _MIN_RING_CELLS:
         return None
     seabed = float(np.median(ring))
     deviation = max(1.4826 * float(np.median(np.abs(ring - seabed))), 0.1)
     rows, cells = _highlight_extent(grid, peak, seabed, deviation)
-    bright = _core_mean(grid.level, peak)
-    length, is_cut, depth, dark_part, spread_rows = _shadow(grid, rows, cells, seabed, deviation)
-    return Measured(
+    length, is_cut, depth, dark_fraction, shadow_rows = _shadow(grid, rows, cells, seabed, deviation)
+    return Measurement(
         row=(rows[0] + rows[1] - 1) // 2,
         cell=(cells[0] + cells[1] - 1) // 2,
         rows=rows,
@@ -163,21 +159,20 @@ def measure(grid: LevelGrid, peak: Peak, settings: DetectorSettings) -> Measured
         shadow_cells=length,
         shadow_is_cut=is_cut,
         matched=peak.score,
-        cfar=max(0.0, (bright - seabed) / deviation),
-        shadow=max(0.0, depth) * dark_part,
-        shadow_rows=spread_rows,
+        cfar=max(0.0, (_highlight_mean(grid.level, peak) - seabed) / deviation),
+        shadow=max(0.0, depth) * dark_fraction,
+        shadow_rows=shadow_rows,
     )
 
 
-def _core_mean(level: FloatImage, peak: Peak) -> float:
+def _highlight_mean(level: FloatImage, peak: Peak) -> float:
     top = max(0, peak.row - peak.highlight_rows // 2)
     left = max(0, peak.cell - peak.highlight_cells // 2)
-    core = level[top : top + peak.highlight_rows, left : left + peak.highlight_cells]
-    return float(np.nanmean(core))
+    return float(np.nanmean(level[top : top + peak.highlight_rows, left : left + peak.highlight_cells]))
 
 
-def _ring(grid: LevelGrid, peak: Peak, settings: DetectorSettings) -> npt.NDArray[np.float32]:
-    """Levels of the seabed around the highlight, without a guard band and the strip that its shadow falls on."""
+def _ring_levels(grid: LevelGrid, peak: Peak, settings: DetectorSettings) -> FloatImage:
+    """Return the levels of the seabed around the highlight, without a guard band and the strip of its shadow."""
     guard_rows = max(1, round(settings.guard_m / grid.row_along_m)) + peak.highlight_rows // 2
     guard_cells = max(1, round(settings.guard_m / grid.cell_across_m)) + peak.highlight_cells // 2
     far_rows = guard_rows + max(2, round(settings.ring_m / grid.row_along_m))
@@ -186,20 +181,20 @@ def _ring(grid: LevelGrid, peak: Peak, settings: DetectorSettings) -> npt.NDArra
     patch = grid.level[top : peak.row + far_rows + 1, left : peak.cell + far_cells + 1]
     row = np.arange(top, top + patch.shape[0])[:, None] - peak.row
     cell = np.arange(left, left + patch.shape[1])[None, :] - peak.cell
-    inside = (np.abs(row) <= guard_rows) & (cell >= -guard_cells)  # guard band and everything behind it
-    values: npt.NDArray[np.float32] = patch[~inside & np.isfinite(patch)]
+    excluded = (np.abs(row) <= guard_rows) & (cell >= -guard_cells)  # guard band and everything behind it
+    values: FloatImage = patch[~excluded & np.isfinite(patch)]
     return values
 
 
 def _highlight_extent(
     grid: LevelGrid, peak: Peak, seabed: float, deviation: float
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Bounds of the connected bright cells that hold the peak, above half of the peak's height over the seabed."""
+    """Return the bounds of the connected cells around the peak that exceed half of its height above the seabed."""
     reach_rows = max(3, round(6.0 / grid.row_along_m))
     reach_cells = max(6, round(4.0 / grid.cell_across_m))
     top, left = max(0, peak.row - reach_rows), max(0, peak.cell - reach_cells)
     patch = grid.level[top : peak.row + reach_rows + 1, left : peak.cell + reach_cells + 1]
-    # Smoothed over half of the filter's size that answered best: speckle must not break a large highlight into cells.
+    # Smoothing over half the highlight size of the filter: speckle must not split a large highlight.
     size = (max(1, peak.highlight_rows // 2), max(3, peak.highlight_cells // 2))
     smooth = ndimage.uniform_filter(np.nan_to_num(patch, nan=seabed), size=size, mode="nearest")
     row, cell = peak.row - top, peak.cell - left
@@ -210,18 +205,15 @@ def _highlight_extent(
     labels, _ = ndimage.label(smooth >= threshold)
     if labels[row, cell] == 0:
         return (peak.row, peak.row + 1), (peak.cell, peak.cell + 1)
-    mine = labels == labels[row, cell]
-    in_rows, in_cells = np.flatnonzero(mine.any(axis=1)), np.flatnonzero(mine.any(axis=0))
-    return (
-        (top + int(in_rows[0]), top + int(in_rows[-1]) + 1),
-        (left + int(in_cells[0]), left + int(in_cells[-1]) + 1),
-    )
+    region = labels == labels[row, cell]
+    rows, cells = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
+    return (top + int(rows[0]), top + int(rows[-1]) + 1), (left + int(cells[0]), left + int(cells[-1]) + 1)
 
 
 def _shadow(
     grid: LevelGrid, rows: tuple[int, int], cells: tuple[int, int], seabed: float, deviation: float
 ) -> tuple[int, bool, float, float, int]:
-    """Return the shadow's length in cells, whether it is cut, its depth in deviations, its dark part, its rows."""
+    """Return length in cells, whether it is cut, depth in deviations, dark fraction and rows of the shadow."""
     middle = (rows[0] + rows[1]) // 2
     half = max(0, (rows[1] - rows[0]) // 4)  # the middle half: a shadow narrows at its ends
     behind = grid.level[max(0, middle - half) : middle + half + 1, cells[1] :]
@@ -232,36 +224,32 @@ def _shadow(
     behind = behind[:, :end]
     profile = ndimage.uniform_filter1d(behind.mean(axis=0), size=3, mode="nearest")
     dark = profile < seabed - deviation
-    first, last = _run(dark, round(_START_M / grid.cell_across_m), max(1, round(_GAP_M / grid.cell_across_m)))
+    max_gap = max(1, round(_SHADOW_GAP_M / grid.cell_across_m))
+    first, last = _dark_run(dark, round(_SHADOW_START_M / grid.cell_across_m), max_gap)
     if last <= first:
         return 0, False, 0.0, 0.0, 0
     depth = (seabed - float(behind[:, first:last].mean())) / deviation
-    filled = float((behind[:, first:last] < seabed - 0.5 * deviation).mean())
-    return (
-        last,
-        last == end,
-        depth,
-        filled,
-        _dark_rows(grid, middle, (cells[1] + first, cells[1] + last), seabed - deviation),
-    )
+    dark_fraction = float((behind[:, first:last] < seabed - 0.5 * deviation).mean())
+    shadow_rows = _dark_rows(grid, middle, (cells[1] + first, cells[1] + last), seabed - deviation)
+    return last, last == end, depth, dark_fraction, shadow_rows
 
 
-def _run(dark: npt.NDArray[np.bool_], start_within: int, gap: int) -> tuple[int, int]:
-    """First dark cell within reach of the highlight, and one past the last before a gap longer than allowed."""
+def _dark_run(dark: Flags, start_within: int, max_gap: int) -> tuple[int, int]:
+    """Return the first dark cell up to `start_within`, and one past the last before a gap above `max_gap`."""
     begin = np.flatnonzero(dark[: start_within + 1])
     if begin.size == 0:
         return 0, 0
     first = int(begin[0])
-    where = np.flatnonzero(dark[first:]) + first
-    breaks = np.flatnonzero(np.diff(where) > gap + 1)
-    last = int(where[breaks[0]] if breaks.size else where[-1]) + 1
+    places = np.flatnonzero(dark[first:]) + first
+    breaks = np.flatnonzero(np.diff(places) > max_gap + 1)
+    last = int(places[breaks[0]] if breaks.size else places[-1]) + 1
     return first, last
 
 
 def _dark_rows(grid: LevelGrid, middle: int, cells: tuple[int, int], threshold: float) -> int:
-    """Along-track extent, in rows, of the dark region that the shadow belongs to, looked at for 6 m to either side.
+    """Return the along-track extent, in rows, of the dark region of a shadow, within 6 m to either side.
 
-    A trawl scar, a trench or the lee of a sand wave is dark behind something bright too, but goes on along-track.
+    A trawl scar, a trench or the lee of a sand wave is also dark behind a bright edge, but it is long along-track.
     """
     reach_rows = max(3, round(6.0 / grid.row_along_m))
     reach_cells = max(4, round(3.0 / grid.cell_across_m))
@@ -269,34 +257,19 @@ def _dark_rows(grid: LevelGrid, middle: int, cells: tuple[int, int], threshold: 
     patch = grid.level[top : middle + reach_rows + 1, left : cells[1] + reach_cells]
     smooth = ndimage.uniform_filter(np.nan_to_num(patch, nan=0.0), size=(3, 5), mode="nearest")
     labels, _ = ndimage.label(smooth < threshold)
-    own = labels[middle - top, cells[0] - left : cells[1] - left]
-    touched = np.unique(own[own > 0])
-    if touched.size == 0:
+    in_shadow = labels[middle - top, cells[0] - left : cells[1] - left]
+    regions = np.unique(in_shadow[in_shadow > 0])
+    if regions.size == 0:
         return 0
-    rows = np.flatnonzero(np.isin(labels, touched).any(axis=1))
+    rows = np.flatnonzero(np.isin(labels, regions).any(axis=1))
     return int(rows[-1] - rows[0]) + 1
 
 
-Features = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
-
-_BLOCK_M: Final = 0.25
-_WINDOW_BLOCKS: Final = 5
-_GUARD_BLOCKS: Final = 8
-_REACH_BLOCKS: Final = 32
-_STEP_BLOCKS: Final = 3
-_LEAST_WINDOWS: Final = 24
-_NEAR_BLOCKS: Final = 1
-_COUNT: Final = 5
-_RIDGE: Final = 0.05
-"""Part of each number's own variance over the whole picture that is added to the ring's: a ring may be very even."""
-
-
 class TextureMap:
-    """The texture of a level grid, from which `anomaly` is asked place by place.
+    """Texture features of a level grid, for the anomaly score of single places.
 
-    Args:
-        grid: One side of a survey, or a piece.
+    The grid is reduced to blocks of 0.25 m. A window of blocks has five features: mean, spread, mean step along-track,
+    mean step across-track, and spread of the means of its blocks.
     """
 
     def __init__(self, grid: LevelGrid) -> None:
@@ -305,41 +278,44 @@ class TextureMap:
         self._features = _window_features(grid.level, self._rows, self._cells)
         self._known: Flags = np.asarray(np.isfinite(self._features).all(axis=-1))
         known = self._features[self._known]
-        self._spread = known.var(axis=0) if len(known) else np.ones(_COUNT)
+        self._variance = known.var(axis=0) if len(known) else np.ones(_FEATURES)
 
     def anomaly(self, row: int, cell: int) -> float:
-        """Return the score at a cell of the grid; 0 where too little is known around it."""
-        top, left = row // self._rows, cell // self._cells
-        own = self._around(top, left, _NEAR_BLOCKS)
-        ring = self._ring(top, left)
-        if not len(own) or len(ring) < _LEAST_WINDOWS:
-            return 0.0
-        centre = ring.mean(axis=0)
-        covariance = np.cov(ring, rowvar=False) + np.diag(_RIDGE * self._spread + 1e-6)
-        off = own - centre
-        squared = np.einsum("ij,ij->i", off, np.linalg.solve(covariance, off.T).T)
-        return float(np.sqrt(max(float(squared.max()), 0.0) / _COUNT))
+        """Return the anomaly score at a cell of the grid; 0 if too little is known around it.
 
-    def _around(self, top: int, left: int, reach: int) -> Features:
-        rows = slice(max(0, top - reach), top + reach + 1)
-        columns = slice(max(0, left - reach), left + reach + 1)
+        The score is the Mahalanobis distance of the features from those of a ring around, divided by the square root
+        of their number. It is about 1 on a seabed of uniform texture and above 3 for an anomaly.
+        """
+        top, left = row // self._rows, cell // self._cells
+        local = self._features_near(top, left)
+        ring = self._ring(top, left)
+        if not len(local) or len(ring) < _MIN_RING_WINDOWS:
+            return 0.0
+        covariance = np.cov(ring, rowvar=False) + np.diag(_RIDGE * self._variance + 1e-6)
+        offset = local - ring.mean(axis=0)
+        squared = np.einsum("ij,ij->i", offset, np.linalg.solve(covariance, offset.T).T)
+        return float(np.sqrt(max(float(squared.max()), 0.0) / _FEATURES))
+
+    def _features_near(self, top: int, left: int) -> Features:
+        rows = slice(max(0, top - _NEAR_BLOCKS), top + _NEAR_BLOCKS + 1)
+        columns = slice(max(0, left - _NEAR_BLOCKS), left + _NEAR_BLOCKS + 1)
         near: Features = self._features[rows, columns][self._known[rows, columns]]
         return near
 
     def _ring(self, top: int, left: int) -> Features:
-        first_row, first_column = max(0, top - _REACH_BLOCKS), max(0, left - _REACH_BLOCKS)
-        rows = slice(first_row, top + _REACH_BLOCKS + 1, _STEP_BLOCKS)
-        columns = slice(first_column, left + _REACH_BLOCKS + 1, _STEP_BLOCKS)
-        wanted = self._known[rows, columns].copy()
-        far_rows = np.abs(first_row + _STEP_BLOCKS * np.arange(wanted.shape[0]) - top) > _GUARD_BLOCKS
-        far_columns = np.abs(first_column + _STEP_BLOCKS * np.arange(wanted.shape[1]) - left) > _GUARD_BLOCKS
-        wanted &= far_rows[:, None] | far_columns[None, :]
-        ring: Features = self._features[rows, columns][wanted]
+        first_row, first_column = max(0, top - _RING_BLOCKS), max(0, left - _RING_BLOCKS)
+        rows = slice(first_row, top + _RING_BLOCKS + 1, _RING_STEP_BLOCKS)
+        columns = slice(first_column, left + _RING_BLOCKS + 1, _RING_STEP_BLOCKS)
+        usable = self._known[rows, columns].copy()
+        far_rows = np.abs(first_row + _RING_STEP_BLOCKS * np.arange(usable.shape[0]) - top) > _GUARD_BLOCKS
+        far_columns = np.abs(first_column + _RING_STEP_BLOCKS * np.arange(usable.shape[1]) - left) > _GUARD_BLOCKS
+        usable &= far_rows[:, None] | far_columns[None, :]
+        ring: Features = self._features[rows, columns][usable]
         return ring
 
 
-def _window_features(level: npt.NDArray[np.float32], rows: int, cells: int) -> Features:
-    """Return the numbers of the window around each block, shape (blocks, blocks, 5), NaN where mostly unknown."""
+def _window_features(level: FloatImage, rows: int, cells: int) -> Features:
+    """Return the features of the window around each block, shape (rows, columns, 5), NaN where mostly unknown."""
     known = np.isfinite(level)
     filled = np.where(known, level, 0.0).astype(np.float32)
     along = np.zeros_like(filled)
@@ -359,8 +335,8 @@ def _window_features(level: npt.NDArray[np.float32], rows: int, cells: int) -> F
     return np.stack([mean, spread, step_along, step_across, structure], axis=-1)
 
 
-def _block_sums(plane: npt.NDArray[np.float32], rows: int, cells: int) -> Features:
-    """Sum over blocks; what is left of the last ones counts as a block of its own."""
+def _block_sums(plane: FloatImage, rows: int, cells: int) -> Features:
+    """Sum over blocks; an incomplete block at the end is padded with zeros."""
     padded = np.pad(plane, ((0, -plane.shape[0] % rows), (0, -plane.shape[1] % cells)))
     shape = (padded.shape[0] // rows, rows, padded.shape[1] // cells, cells)
     sums: Features = padded.reshape(shape).sum(axis=(1, 3), dtype=np.float64)
@@ -368,6 +344,5 @@ def _block_sums(plane: npt.NDArray[np.float32], rows: int, cells: int) -> Featur
 
 
 def _window_sums(plane: Features) -> Features:
-    size = _WINDOW_BLOCKS
-    sums: Features = ndimage.uniform_filter(plane, size=size, mode="constant") * size**2
+    sums: Features = ndimage.uniform_filter(plane, size=_WINDOW_BLOCKS, mode="constant") * _WINDOW_BLOCKS**2
     return sums

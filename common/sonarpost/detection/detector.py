@@ -1,15 +1,15 @@
-"""From a survey to the contacts worth sending."""
+"""Detection of contacts in a survey."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-from sonarpost.detection.candidates import Candidate, FilterScores, candidates
-from sonarpost.detection.fusion import fused_confidences, suppress
-from sonarpost.detection.normalisation import FloatVector, LevelGrid, preprocess
+from sonarpost.detection.candidates import Candidate, FilterScores, find_candidates
+from sonarpost.detection.fusion import fused_confidences, suppress_duplicates
+from sonarpost.detection.normalisation import FloatVector, LevelGrid, normalise_side
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.structures import is_within, structures
+from sonarpost.detection.structures import find_structures, is_part_of_structure
 from sonarpost.sonar.bottom_track import altitudes_m
 from sonarpost.sonar.geometry import Position, georeference, sample_slant_range_m, slant_to_ground_range_m
 from sonarpost.sonar.options import SurveyOptions
@@ -21,37 +21,37 @@ CLUTTER = "clutter"
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """One contact, as the detector found it. A value that the survey does not tell is None.
+    """One contact of the detector. A value that the survey does not contain is None.
 
     Attributes:
-        side: The side it was seen on.
-        ping_index: Index into `Survey.pings` of the highlight's middle.
-        ping_number: The file's number of that ping.
-        sample: Sample index of the highlight's middle in that ping's channel (0 is nearest the vehicle).
+        side: Side of the vehicle.
+        ping_index: Index into `Survey.pings` of the centre of the highlight.
+        ping_number: Number of that ping in the file.
+        sample: Sample index of the centre of the highlight in that ping's channel (0 is nearest the vehicle).
         time_utc_s: Time of that ping, seconds since 1970-01-01 UTC.
-        vehicle: Where the vehicle was.
-        position: Where the object lies: abeam of the vehicle at the ground range.
-        heading_deg: The vehicle's heading, 0 to 360 (360 not included).
-        altitude_m: The vehicle's height over the bottom: the file's, else from the first bottom return.
-        depth_m: The vehicle's depth.
-        speed_mps: The vehicle's speed.
-        slant_range_m: Slant range to the highlight's middle.
+        vehicle: Position of the vehicle.
+        position: Position of the object: abeam of the vehicle at the ground range.
+        heading_deg: Heading of the vehicle, 0 to 360 (360 not included).
+        altitude_m: Altitude of the vehicle: the file's, else from the first bottom return.
+        depth_m: Depth of the vehicle.
+        speed_mps: Speed of the vehicle.
+        slant_range_m: Slant range of the centre of the highlight.
         ground_range_m: The same on a flat bottom.
-        length_m: Extent of the highlight along-track; None when the travel between pings is not known.
-        width_m: Extent of the highlight across-track, on the slant-range picture.
-        shadow_m: Length of the shadow on the slant-range picture, from the highlight's outer edge.
+        length_m: Along-track extent of the highlight; None if the distance between pings is unknown.
+        width_m: Across-track extent of the highlight, in slant range.
+        shadow_m: Length of the shadow in slant range, from the outer edge of the highlight.
         height_m: shadow x altitude / (slant range + shadow), by similar triangles over a flat bottom.
-        shadow_is_cut: True when the recording ends before the shadow; `shadow_m` and `height_m` are then lower bounds.
+        shadow_is_cut: True if the recording ends within the shadow; `shadow_m` and `height_m` are then lower bounds.
         confidence: 0 to 2, see `sonarpost.detection.fusion`.
-        scores: The filters' own scores.
+        scores: Scores of the filters.
         atd_class: "mine-like" or "clutter", see `classify`.
-        pixel_along_m: Travel between two pings.
+        pixel_along_m: Distance between two pings.
         pixel_across_m: Slant range of one sample.
         highlight_pings: First and one-past-last ping index of the highlight.
         highlight_samples: First and one-past-last sample of the highlight.
         shadow_samples: Length of the shadow in samples.
-        position_sigma_m: Root mean square distance of the true place from `position`, from the error budget of the
-            survey's options; None where there is no position.
+        position_sigma_m: Root mean square distance (DRMS) between true position and `position`, from the error
+            budget of the survey's options; None without a position.
     """
 
     side: Side
@@ -86,51 +86,45 @@ class Detection:
 def detect(
     survey: Survey, settings: DetectorSettings | None = None, options: SurveyOptions | None = None
 ) -> tuple[Detection, ...]:
-    """Find the contacts of a survey.
+    """Detect the contacts of a survey.
 
     Args:
-        survey: The recording; pings of both sides, any sample type.
-        settings: How to look; the defaults when None.
-        options: The options the survey was opened with, for the errors of position, heading and altitude; the
-            defaults when None.
+        survey: The recording; both sides, any sample type.
+        settings: None for the defaults.
+        options: The options with which the survey was opened, for the error budget; None for the defaults.
 
     Returns:
-        The contacts of both sides whose confidence reaches the threshold, most confident first. Empty for a survey
+        The contacts of both sides at or above the confidence threshold, most confident first. Empty for a survey
         without samples.
     """
-    chosen = settings if settings is not None else DetectorSettings()
+    settings = settings if settings is not None else DetectorSettings()
+    options = options if options is not None else SurveyOptions()
     altitude_m = altitudes_m(survey)
-    known = options if options is not None else SurveyOptions()
-    found = [d for side in survey.sides() for d in _detect_side(survey, side, chosen, known, altitude_m)]
+    found = [d for side in survey.sides() for d in _detect_side(survey, side, settings, options, altitude_m)]
     found.sort(key=lambda d: (-d.confidence, d.ping_index, d.side.value, d.sample))
-    return tuple(found[: chosen.max_contacts])
+    return tuple(found[: settings.max_contacts])
 
 
 def _detect_side(
     survey: Survey, side: Side, settings: DetectorSettings, options: SurveyOptions, altitude_m: FloatVector
 ) -> list[Detection]:
-    grid = preprocess(survey, side, settings, altitude_m)
+    grid = normalise_side(survey, side, settings, altitude_m)
     if grid is None:
         return []
-    kept = suppress(_scored(grid, settings), grid, settings)
-    # What lies within a structure and is plainer than it has its contact already.
-    for structure in structures(grid):
+    candidates = find_candidates(grid, settings)
+    scored = zip(fused_confidences(candidates, grid, settings), candidates, strict=True)
+    kept = suppress_duplicates([c for c in scored if c[0] >= settings.confidence_threshold], grid, settings)
+    # A structure that contains a contact or a more confident structure is not reported again.
+    for structure in find_structures(grid):
         if structure.confidence < settings.confidence_threshold:
             break
-        if not any(is_within(other, structure.candidate, grid) for _, other in kept):
+        if not any(is_part_of_structure(other, structure.candidate, grid) for _, other in kept):
             kept.append((structure.confidence, structure.candidate))
-    described = [_describe(survey, grid, confidence, one, settings, options, altitude_m) for confidence, one in kept]
+    described = [_detection(survey, grid, confidence, c, settings, options, altitude_m) for confidence, c in kept]
     return [d for d in described if d is not None]
 
 
-def _scored(grid: LevelGrid, settings: DetectorSettings) -> list[tuple[float, Candidate]]:
-    """Return the places of a grid whose confidence reaches the threshold."""
-    found = candidates(grid, settings)
-    scored = zip(fused_confidences(found, grid, settings), found, strict=True)
-    return [c for c in scored if c[0] >= settings.confidence_threshold]
-
-
-def _describe(
+def _detection(
     survey: Survey,
     grid: LevelGrid,
     confidence: float,
@@ -139,31 +133,32 @@ def _describe(
     options: SurveyOptions,
     altitudes: FloatVector,
 ) -> Detection | None:
-    measured = candidate.measured
-    ping = survey.pings[measured.row]
+    """Convert a candidate from grid cells to metres and positions; None if its ping has no such channel."""
+    measurement = candidate.measurement
+    ping = survey.pings[measurement.row]
     channel = ping.channel(grid.side)
     if channel is None:
         return None
     across_m = channel.sample_spacing_m
-    samples = (measured.cells[0] * grid.samples_per_cell, measured.cells[1] * grid.samples_per_cell)
+    samples = (measurement.cells[0] * grid.samples_per_cell, measurement.cells[1] * grid.samples_per_cell)
     sample = min((samples[0] + samples[1]) // 2, channel.samples.shape[0] - 1)
     slant_m = sample_slant_range_m(channel, sample)
-    altitude_m = _altitude_m(altitudes, grid, measured.row)
+    altitude_m = _altitude_m(altitudes, grid, measurement.row)
     ground_m = float(slant_to_ground_range_m(slant_m, altitude_m)) if altitude_m is not None else math.nan
-    length_m = (measured.rows[1] - measured.rows[0]) * grid.row_along_m
+    length_m = (measurement.rows[1] - measurement.rows[0]) * grid.row_along_m
     width_m = (samples[1] - samples[0]) * across_m
-    shadow_m = measured.shadow_cells * grid.samples_per_cell * across_m
+    shadow_m = measurement.shadow_cells * grid.samples_per_cell * across_m
     height_m = height_from_shadow_m(shadow_m, slant_m, altitude_m) if altitude_m is not None else None
-    place = georeference(ping, grid.side, sample, options, tracked_altitude_m=altitude_m)
+    reference = georeference(ping, grid.side, sample, options, tracked_altitude_m=altitude_m)
     has_fix = ping.lat_deg is not None and ping.lon_deg is not None
     return Detection(
         side=grid.side,
-        ping_index=measured.row,
+        ping_index=measurement.row,
         ping_number=ping.number,
         sample=sample,
         time_utc_s=ping.time_utc_s,
         vehicle=Position(ping.lat_deg, ping.lon_deg) if has_fix else None,  # type: ignore[arg-type]
-        position=None if place is None else place.position,
+        position=None if reference is None else reference.position,
         heading_deg=None if ping.heading_deg is None else ping.heading_deg % 360.0,
         altitude_m=altitude_m,
         depth_m=ping.depth_m,
@@ -174,34 +169,33 @@ def _describe(
         width_m=width_m,
         shadow_m=shadow_m,
         height_m=height_m,
-        shadow_is_cut=measured.shadow_is_cut,
+        shadow_is_cut=measurement.shadow_is_cut,
         confidence=confidence,
         scores=candidate.scores,
         atd_class=classify(length_m, width_m, height_m, settings),
         pixel_along_m=grid.row_along_m if grid.row_is_measured else None,
         pixel_across_m=across_m,
-        highlight_pings=measured.rows,
+        highlight_pings=measurement.rows,
         highlight_samples=samples,
-        shadow_samples=measured.shadow_cells * grid.samples_per_cell,
-        position_sigma_m=None if place is None else place.drms_m,
+        shadow_samples=measurement.shadow_cells * grid.samples_per_cell,
+        position_sigma_m=None if reference is None else reference.drms_m,
     )
 
 
 def height_from_shadow_m(shadow_m: float, slant_range_m: float, altitude_m: float) -> float:
-    """Return the height of an object from its shadow, by similar triangles over a flat bottom.
+    """Return the height of an object from the length of its shadow, by similar triangles over a flat bottom.
 
-    The ray that grazes the object's top meets the bottom at the shadow's end, so that height over shadow equals
-    altitude over the slant range of the shadow's end.
+    The ray over the top of the object meets the bottom at the end of the shadow. Height over shadow length therefore
+    equals altitude over the slant range of the shadow's end.
     """
     return shadow_m * altitude_m / (slant_range_m + shadow_m)
 
 
 def classify(length_m: float, width_m: float, height_m: float | None, settings: DetectorSettings) -> str:
-    """Return "mine-like" for a contact of a mine's size and shape, else "clutter".
+    """Return "mine-like" for a contact with the size and shape of a mine, else "clutter".
 
-    Mine-like: the highlight's length and width and the height (where known) lie within the settings' limits, and the
-    highlight is not longer than `mine_elongation` times its width (nor the other way round). It is a statement about
-    size, not about what the object is.
+    Mine-like: length, width and (if known) height are within the limits of the settings, and neither side of the
+    highlight exceeds `mine_elongation` times the other. The class is about size only.
     """
     fits = (
         settings.mine_length_m[0] <= length_m <= settings.mine_length_m[1]
@@ -213,9 +207,9 @@ def classify(length_m: float, width_m: float, height_m: float | None, settings: 
 
 
 def _altitude_m(altitudes: FloatVector, grid: LevelGrid, row: int) -> float | None:
-    """The survey's altitude, else the slant range of this side's first bottom return; None where neither is known."""
-    given = float(altitudes[row])
-    if given > 0:
-        return given
+    """Return the altitude of the survey, else the slant range of the first bottom return; None if both are unknown."""
+    altitude_m = float(altitudes[row])
+    if altitude_m > 0:
+        return altitude_m
     cell = int(grid.first_return_cell[row])
     return (cell + 0.5) * grid.cell_across_m if 0 < cell < grid.level.shape[1] else None

@@ -1,13 +1,9 @@
-"""The matched filter: a highlight followed, away from the vehicle, by a shadow.
+"""Matched filter: a highlight followed, away from the vehicle, by a shadow.
 
-An object that stands on the seabed returns more than the seabed around it and hides the seabed behind it. For each
-highlight size and shadow length the filter takes the mean level of a rectangle and of the rectangle behind it, both
-in units of their own local noise, and joins them by the geometric mean, so that neither a bright patch without shadow
-nor a dark patch without highlight responds.
-
-
-## sonarpost.detection.matched_filter
-Box sums over a picture with holes, by integral images: every box costs the same, whatever its size.
+An object on the seabed returns more than the seabed around it and hides the seabed behind it. For each highlight size
+and shadow length the filter computes the mean level of a rectangle and of the rectangle behind it, both in units of
+the local noise. It combines them by the geometric mean, so neither a bright patch without shadow nor a dark patch
+without highlight responds. Integral images make the cost of a rectangle independent of its size.
 """
 
 from __future__ import annotations
@@ -16,21 +12,23 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 from sonarpost.detection.normalisation import LevelGrid
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import FloatImage
 
+Plane = npt.NDArray[np.float64]
+
 
 @dataclass(frozen=True, slots=True)
 class MatchedResponse:
-    """The filter's best answer at every cell.
+    """The best response of the filter at every cell.
 
     Attributes:
-        score: Shape (pings, cells), float32, noise units, 0 where there is no response; the cell is the highlight's
-            centre.
-        highlight_index: Same shape, which of the settings' highlight sizes answered best.
-        shadow_index: Same shape, which of the settings' shadow lengths did.
+        score: Shape (pings, cells), float32, in noise units, 0 without response; the cell is the highlight's centre.
+        highlight_index: Same shape, index of the highlight size with the best response.
+        shadow_index: Same shape, index of the shadow length with the best response.
     """
 
     score: FloatImage
@@ -51,103 +49,80 @@ class Peak:
 
 
 def matched_response(grid: LevelGrid, settings: DetectorSettings) -> MatchedResponse:
-    """Run the matched filter at every highlight size and shadow length of the settings."""
+    """Run the matched filter for every highlight size and shadow length of the settings."""
     sizes = [highlight_size_cells(grid, size) for size in settings.highlight_sizes_m]
     lengths = [max(2, round(length / grid.cell_across_m)) for length in settings.shadow_lengths_m]
     reach = (max(h for h, _ in sizes), max(w for _, w in sizes) + max(lengths) + 1)
-    boxes = IntegralImage(grid.level, reach)
+    integral = IntegralImage(grid.level, reach)
     half = (
         max(4, round(settings.noise_window_m[0] / grid.row_along_m / 2)),
         max(4, round(settings.noise_window_m[1] / grid.cell_across_m / 2)),
     )
     shape = grid.level.shape
     best = np.zeros(shape, dtype=np.float32)
-    which_size = np.zeros(shape, dtype=np.int8)
-    which_length = np.zeros(shape, dtype=np.int8)
+    best_size = np.zeros(shape, dtype=np.int8)
+    best_length = np.zeros(shape, dtype=np.int8)
     for i, (rows, cells) in enumerate(sizes):
         along = (-(rows // 2), rows - rows // 2)
-        bright = in_noise_units(boxes.mean(along, (-(cells // 2), cells - cells // 2)), half)
+        bright = in_noise_units(integral.mean(along, (-(cells // 2), cells - cells // 2)), half)
         bright = np.maximum(np.nan_to_num(bright), 0.0)
         start = cells - cells // 2
         for j, length in enumerate(lengths):
-            dark = -in_noise_units(boxes.mean(along, (start, start + length)), half)
+            dark = -in_noise_units(integral.mean(along, (start, start + length)), half)
             joint = np.sqrt(bright * np.maximum(np.nan_to_num(dark), 0.0))
             better = joint > best
             best[better] = joint[better]
-            which_size[better] = i
-            which_length[better] = j
+            best_size[better] = i
+            best_length[better] = j
     best[~np.isfinite(grid.level)] = 0.0
-    return MatchedResponse(best, which_size, which_length)
+    return MatchedResponse(best, best_size, best_length)
 
 
 def highlight_size_cells(grid: LevelGrid, size_m: tuple[float, float]) -> tuple[int, int]:
-    """Return a highlight's size in rows and cells, at least one row by two cells."""
+    """Return a highlight size in rows and cells, at least one row by two cells."""
     return max(1, round(size_m[0] / grid.row_along_m)), max(2, round(size_m[1] / grid.cell_across_m))
 
 
-def peaks(response: MatchedResponse, grid: LevelGrid, settings: DetectorSettings, least: float) -> tuple[Peak, ...]:
-    """Return the local maxima of at least `least`, strongest first, no two within half a metre of each other."""
-    reach = (max(1, round(0.5 / grid.row_along_m)), max(1, round(0.5 / grid.cell_across_m)))
+def peaks(response: MatchedResponse, grid: LevelGrid, settings: DetectorSettings, min_score: float) -> tuple[Peak, ...]:
+    """Return the local maxima of at least `min_score`, strongest first, at least half a metre apart."""
+    size = [2 * max(1, round(0.5 / metres)) + 1 for metres in (grid.row_along_m, grid.cell_across_m)]
     score = response.score
-    is_peak = (score >= least) & (score > 0) & (score >= _box_maximum(score, reach))
-    rows, cells = np.nonzero(is_peak)
+    local_maximum = ndimage.maximum_filter(score, size=size, mode="constant", cval=-np.inf)
+    rows, cells = np.nonzero((score >= min_score) & (score > 0) & (score >= local_maximum))
     order = np.argsort(-score[rows, cells], kind="stable")
     found = []
     for row, cell in zip(rows[order].tolist(), cells[order].tolist(), strict=True):
-        size = highlight_size_cells(grid, settings.highlight_sizes_m[response.highlight_index[row, cell]])
-        length_m = settings.shadow_lengths_m[response.shadow_index[row, cell]]
-        found.append(
-            Peak(row, cell, float(score[row, cell]), size[0], size[1], max(2, round(length_m / grid.cell_across_m)))
-        )
+        highlight = highlight_size_cells(grid, settings.highlight_sizes_m[response.highlight_index[row, cell]])
+        shadow_m = settings.shadow_lengths_m[response.shadow_index[row, cell]]
+        shadow_cells = max(2, round(shadow_m / grid.cell_across_m))
+        found.append(Peak(row, cell, float(score[row, cell]), *highlight, shadow_cells))
     return tuple(found)
 
 
-def _box_maximum(image: FloatImage, reach: tuple[int, int]) -> FloatImage:
-    out = image
-    for axis in (0, 1):
-        span = reach[axis]
-        padding = [(span, span) if a == axis else (0, 0) for a in (0, 1)]
-        padded = np.pad(out, padding, constant_values=-np.inf)
-        size = out.shape[axis]
-        # Doubling: after each step every element is the maximum over twice the window.
-        window, width = padded, 1
-        target = 2 * span + 1
-        while width < target:
-            shift = min(width, target - width)
-            first = np.take(window, range(window.shape[axis] - shift), axis=axis)
-            second = np.take(window, range(shift, window.shape[axis]), axis=axis)
-            window, width = np.maximum(first, second), width + shift
-        out = np.take(window, range(size), axis=axis)
-    return out
-
-
-Plane = npt.NDArray[np.float64]
-
-
 class IntegralImage:
-    """Means over rectangles placed relative to every pixel of a picture; NaN pixels do not count.
+    """Means over rectangles placed relative to every pixel of an image. NaN pixels are ignored.
 
     Args:
         image: Shape (rows, columns), float; NaN marks holes.
-        reach: The farthest that a rectangle may extend from its pixel, in pixels, along rows and columns.
+        reach: Maximum distance of a rectangle's edge from its pixel, in rows and columns.
     """
 
     def __init__(self, image: FloatImage, reach: tuple[int, int]) -> None:
         self._shape = image.shape
         self._reach = reach
         valid = np.isfinite(image)
-        self._sums = _integral(np.where(valid, image, 0.0), reach)
-        self._counts = _integral(valid.astype(np.float64), reach)
+        self._sums = _cumulative_sums(np.where(valid, image, 0.0), reach)
+        self._counts = _cumulative_sums(valid.astype(np.float64), reach)
 
-    def mean(self, rows: tuple[int, int], columns: tuple[int, int], least_fraction: float = 0.5) -> FloatImage:
+    def mean(self, rows: tuple[int, int], columns: tuple[int, int], min_fraction: float = 0.5) -> FloatImage:
         """Return the mean over pixels [r + rows[0], r + rows[1]) x [c + columns[0], c + columns[1]) for every (r, c).
 
         Returns:
-            float32, shape of the picture; NaN where fewer than `least_fraction` of the rectangle's pixels count
-            (holes and pixels beyond the border do not).
+            float32, shape of the image; NaN where fewer than `min_fraction` of the rectangle's pixels are valid
+            (holes and pixels beyond the border are not).
 
         Raises:
-            ValueError: When the rectangle is empty or reaches farther than allowed.
+            ValueError: The rectangle is empty or exceeds the reach.
         """
         reach_rows, reach_columns = self._reach
         if not (-reach_rows <= rows[0] < rows[1] <= reach_rows + 1):
@@ -155,14 +130,13 @@ class IntegralImage:
         if not (-reach_columns <= columns[0] < columns[1] <= reach_columns + 1):
             raise ValueError(f"columns: got {columns}, expected a non-empty span within {reach_columns} of the pixel")
         area = (rows[1] - rows[0]) * (columns[1] - columns[0])
-        count = self._box(self._counts, rows, columns)
-        total = self._box(self._sums, rows, columns)
+        count = self._box_sums(self._counts, rows, columns)
+        total = self._box_sums(self._sums, rows, columns)
         out = np.full(self._shape, np.nan, dtype=np.float32)
-        enough = count >= max(1.0, least_fraction * area)
-        np.divide(total, count, out=out, where=enough, casting="same_kind")
+        np.divide(total, count, out=out, where=count >= max(1.0, min_fraction * area), casting="same_kind")
         return out
 
-    def _box(self, plane: Plane, rows: tuple[int, int], columns: tuple[int, int]) -> Plane:
+    def _box_sums(self, plane: Plane, rows: tuple[int, int], columns: tuple[int, int]) -> Plane:
         height, width = self._shape
         top, bottom = (self._reach[0] + r for r in rows)
         left, right = (self._reach[1] + c for c in columns)
@@ -173,8 +147,8 @@ class IntegralImage:
         return box
 
 
-def _integral(image: npt.NDArray[np.floating], reach: tuple[int, int]) -> Plane:
-    """Running sums with a zero row and column first, extended on all sides so that boxes clip at the border."""
+def _cumulative_sums(image: npt.NDArray[np.floating], reach: tuple[int, int]) -> Plane:
+    """Return running sums with a zero row and column first, extended by `reach` so that boxes end at the border."""
     rows, columns = image.shape
     plane = np.zeros((rows + 1 + 2 * reach[0], columns + 1 + 2 * reach[1]))
     inner = plane[reach[0] + 1 : reach[0] + 1 + rows, reach[1] + 1 : reach[1] + 1 + columns]
@@ -186,16 +160,16 @@ def _integral(image: npt.NDArray[np.floating], reach: tuple[int, int]) -> Plane:
 
 
 def in_noise_units(response: FloatImage, half: tuple[int, int]) -> FloatImage:
-    """Express a filter's response in standard deviations of its own neighbourhood.
+    """Express a filter response in standard deviations of its neighbourhood.
 
-    The neighbourhood is `2 * half + 1` pixels a side, cut into five by five parts. Its level is the median of the
-    parts' means, its noise the 40th percentile of their deviations (an order statistic, so that a wreck or the edge
-    of another seabed, which fills some of the parts, does not pass for noise). Both change slowly and are taken from
-    every fourth row and pixel. Responses are first limited to three robust deviations of the whole picture, and the
-    noise is held between half and three times that deviation: a mirror-flat patch is not infinitely quiet.
+    The neighbourhood is `2 * half + 1` pixels a side, divided into five by five parts. Its level is the median of the
+    means of the parts. Its noise is the 40th percentile of their deviations: with an order statistic, a wreck or the
+    edge of another seabed in some of the parts is not counted as noise. Both are computed from every fourth row and
+    pixel. The response is first limited to three robust deviations of the whole image. The noise is limited to half
+    to three times that deviation, so that a very even patch does not have zero noise.
 
     Returns:
-        float32, shape of the response; NaN where the response is.
+        float32, shape of the response; NaN where the response is NaN.
     """
     coarse = response[::4, ::4]
     finite = coarse[np.isfinite(coarse)]
@@ -213,15 +187,15 @@ def in_noise_units(response: FloatImage, half: tuple[int, int]) -> FloatImage:
     mean = IntegralImage(limited, reach).mean(rows, columns, 0.3)[picked]
     square = IntegralImage(limited * limited, reach).mean(rows, columns, 0.3)[picked]
     deviation = np.sqrt(np.maximum(square - mean * mean, 0.0))
-    level = _rank(mean, 50.0, 0.0)
-    noise = np.clip(_rank(deviation, 40.0, spread), 0.5 * spread, 3.0 * spread)
-    units: FloatImage = response - np.float32(centre) - _fine(level, step, response.shape)
-    units /= _fine(noise, step, response.shape)
+    level = _neighbourhood_percentile(mean, 50.0, 0.0)
+    noise = np.clip(_neighbourhood_percentile(deviation, 40.0, spread), 0.5 * spread, 3.0 * spread)
+    units: FloatImage = response - np.float32(centre) - _upsampled(level, step, response.shape)
+    units /= _upsampled(noise, step, response.shape)
     return units
 
 
-def _rank(parts: FloatImage, percentile: float, fallback: float) -> FloatImage:
-    """Percentile over five by five parts, those that are NaN left out; `fallback` where all are."""
+def _neighbourhood_percentile(parts: FloatImage, percentile: float, fallback: float) -> FloatImage:
+    """Return the percentile over five by five parts without NaN; `fallback` where all are NaN."""
     padded = np.pad(parts, 2, constant_values=np.nan)
     around = np.lib.stride_tricks.sliding_window_view(padded, (5, 5)).reshape(*parts.shape, 25)
     ordered = np.sort(around, axis=-1)  # NaN sorts last
@@ -231,9 +205,9 @@ def _rank(parts: FloatImage, percentile: float, fallback: float) -> FloatImage:
     return np.where(count > 0, ranked, np.float32(fallback)).astype(np.float32)
 
 
-def _fine(parts: FloatImage, step: tuple[int, int], shape: tuple[int, ...]) -> FloatImage:
-    """Repeat values of parts of `4 * step` pixels back to a picture of `shape`; the last part runs to the border."""
+def _upsampled(parts: FloatImage, step: tuple[int, int], shape: tuple[int, ...]) -> FloatImage:
+    """Repeat each part over `4 * step` pixels of an image of `shape`; the last part extends to the border."""
     rows = np.minimum(np.arange(shape[0]) // (4 * step[0]), parts.shape[0] - 1)
     columns = np.minimum(np.arange(shape[1]) // (4 * step[1]), parts.shape[1] - 1)
-    fine: FloatImage = parts[rows][:, columns]
-    return fine
+    repeated: FloatImage = parts[rows][:, columns]
+    return repeated

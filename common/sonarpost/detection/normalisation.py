@@ -1,9 +1,8 @@
-"""From raw samples to a level picture in which the seabed is flat: despeckled, range-normalised, water masked.
+"""Normalisation of a survey: despeckling, water-column mask, division by the median echo at the same range.
 
-A side-scan waterfall cannot be thresholded as it is: the echo falls with range and grazing angle, speckle is
-multiplicative, and the water column is black. Here each side becomes a grid of *levels*: the base-2 logarithm of the
-echo over the median echo at the same range in the surrounding pings. A level of 0 is ordinary seabed, +1 twice its
-echo, -1 half of it.
+The raw echo decreases with range and grazing angle, speckle is multiplicative, and the water column is black. Each
+side therefore becomes a grid of *levels*: the base-2 logarithm of the echo over the median echo at the same range in
+the surrounding pings. Level 0 is ordinary seabed, +1 twice its echo, -1 half of it.
 """
 
 from __future__ import annotations
@@ -22,25 +21,25 @@ IntVector = npt.NDArray[np.int64]
 FloatVector = npt.NDArray[np.float64]
 FloatTable = npt.NDArray[np.float64]
 
-# Gain, in octaves, of a path through a place where the bottom cannot be.
-_NEVER = -4.0
+_EXCLUDED_RISE = -4.0
+"""Rise in octaves that excludes a cell from the bottom path."""
 
 
 @dataclass(frozen=True, slots=True)
 class LevelGrid:
-    """One side of a survey, ready for the filters.
+    """One side of a survey, normalised for the filters.
 
     Attributes:
         side: Port or starboard.
         level: Shape (pings, cells), float32, base-2 logarithm of echo over local median; NaN in the water column,
-            beyond the end of a ping, and where a ping has no such channel. Column 0 is nearest the vehicle.
+            beyond the end of a ping, and in a ping without this channel. Column 0 is nearest the vehicle.
         ratio: Same shape, the same before the logarithm (1.0 is ordinary seabed); NaN at the same cells.
-        bottom_cell: Shape (pings,), the first cell that is seabed (equal to the number of cells if none is).
-        first_return_cell: Shape (pings,), the cell of the first bottom return, where the slant range is the altitude.
-        samples_per_cell: How many of the file's samples make one cell.
-        cell_across_m: Slant range covered by one cell, in metres.
-        row_along_m: Travel between two pings, in metres.
-        row_is_measured: False when the file gives no speed or track and `row_along_m` is the assumed one.
+        bottom_cell: Shape (pings,), the first seabed cell (the number of cells if there is none).
+        first_return_cell: Shape (pings,), the cell of the first bottom return, where slant range equals altitude.
+        samples_per_cell: Number of file samples averaged into one cell.
+        cell_across_m: Slant range of one cell.
+        row_along_m: Distance between two pings.
+        row_is_measured: False if the file has no speed or track and `row_along_m` is the assumed one.
     """
 
     side: Side
@@ -54,46 +53,52 @@ class LevelGrid:
     row_is_measured: bool
 
 
-def preprocess(
+def levels_of_ratio(ratio: FloatImage) -> FloatImage:
+    """Return the base-2 logarithm of an echo ratio, float32, limited to -4..4."""
+    return np.clip(np.log2(np.maximum(ratio, 2.0**-6)), -4.0, 4.0).astype(np.float32)
+
+
+def normalise_side(
     survey: Survey, side: Side, settings: DetectorSettings, altitude_m: FloatVector | None = None
 ) -> LevelGrid | None:
-    """Return one side of a survey as a level grid, or None when the survey has no usable samples on that side.
-
-    A side is unusable when it has no channel, nothing but zeros, or fewer samples than one filter needs.
+    """Return one side of a survey as a level grid.
 
     Args:
         survey: The recording.
         side: Port or starboard.
-        settings: How to look.
-        altitude_m: Height over the bottom of every ping, shape (pings,), float64, NaN where not known; from
-            `sonarpost.sonar.bottom_track.altitudes_m` when None.
+        settings: Cell size, windows and margins.
+        altitude_m: Altitude of every ping, shape (pings,), float64, NaN if unknown; None: from
+            `sonarpost.sonar.bottom_track.altitudes_m`.
+
+    Returns:
+        The grid; None if the side has no channel, only zeros, or fewer than 16 cells.
     """
     spacing_m = _sample_spacing_m(survey, side)
     if spacing_m is None:
         return None
-    per_cell = max(1, round(settings.cell_across_m / spacing_m))
-    amplitude = _cells(_despeckled(survey.waterfall(side)), per_cell)
+    samples_per_cell = max(1, round(settings.cell_across_m / spacing_m))
+    amplitude = _averaged_cells(_despeckled(survey.waterfall(side)), samples_per_cell)
     if amplitude.shape[1] < 16 or not np.isfinite(amplitude).any():
         return None
     measured_m = ping_spacing_m(survey)
-    cell_m = spacing_m * per_cell
+    cell_m = spacing_m * samples_per_cell
     if altitude_m is None:
         altitude_m = altitudes_m(survey)
     first_return = _first_return_cells(amplitude, altitude_m / cell_m, cell_m, settings)
-    # A little farther: the first return's glare, and the two percent by which its slant range may be off.
+    # The margin covers the glare of the first return; its slant range may be two percent too short.
     margin = max(1, round(settings.bottom_margin_m / cell_m))
     bottom = np.minimum((first_return * 1.02).astype(np.int64) + margin, amplitude.shape[1])
     amplitude[np.arange(amplitude.shape[1])[None, :] < bottom[:, None]] = np.nan
-    ratio = _over_range_median(amplitude, settings.median_window_pings)
+    ratio = _ratio_to_range_median(amplitude, settings.median_window_pings)
     if ratio is None:
         return None
     return LevelGrid(
         side=side,
-        level=np.clip(np.log2(np.maximum(ratio, 2.0**-6)), -4.0, 4.0).astype(np.float32),
+        level=levels_of_ratio(ratio),
         ratio=ratio,
         bottom_cell=bottom,
         first_return_cell=first_return,
-        samples_per_cell=per_cell,
+        samples_per_cell=samples_per_cell,
         cell_across_m=cell_m,
         row_along_m=measured_m if measured_m is not None else settings.assumed_row_along_m,
         row_is_measured=measured_m is not None,
@@ -107,7 +112,7 @@ def _sample_spacing_m(survey: Survey, side: Side) -> float | None:
 
 
 def _despeckled(image: FloatImage) -> FloatImage:
-    """Median of three samples across-track: single-sample spikes go, edges stay; NaN only where the sample is."""
+    """Return the across-track median of three samples; a sample next to NaN stays, a NaN sample stays NaN."""
     if image.shape[1] < 3:
         return image
     left, middle, right = image[:, :-2], image[:, 1:-1], image[:, 2:]
@@ -117,35 +122,36 @@ def _despeckled(image: FloatImage) -> FloatImage:
     return out
 
 
-def _cells(image: FloatImage, per_cell: int) -> FloatImage:
-    """Average `per_cell` neighbouring samples; a cell is NaN when any of its samples is."""
-    width = image.shape[1] // per_cell
-    cells: FloatImage = image[:, : width * per_cell].reshape(image.shape[0], width, per_cell).mean(axis=2)
-    return cells
+def _averaged_cells(image: FloatImage, samples_per_cell: int) -> FloatImage:
+    """Average neighbouring samples; a cell is NaN if any of its samples is."""
+    width = image.shape[1] // samples_per_cell
+    cells = image[:, : width * samples_per_cell].reshape(image.shape[0], width, samples_per_cell)
+    mean: FloatImage = cells.mean(axis=2)
+    return mean
 
 
 def _first_return_cells(
     amplitude: FloatImage, altitude_cells: FloatVector, cell_m: float, settings: DetectorSettings
 ) -> IntVector:
-    """Return the cell of each ping's first bottom return on this side.
+    """Return the cell of the first bottom return of each ping.
 
-    It is the largest rise of level along range that is also continuous along-track (a path of greatest total rise,
-    moving at most three cells a ping). Where an altitude is known the path is held to within 30 percent of it, because
-    a transducer, a beam and an altimeter do not sit at the same place and a bottom slopes.
+    It lies on the path of greatest total rise of the level that moves at most three cells a ping. A known altitude
+    limits the path to within 30 percent, because transducer, beam and altimeter are at different places and the
+    bottom slopes.
     """
     pings, cells = amplitude.shape
-    rise = _rise(amplitude, max(3, round(settings.bottom_step_m / cell_m)))
-    rise[:, : max(1, round(settings.blanking_m / cell_m))] = _NEVER
+    rise = _level_rise(amplitude, max(3, round(settings.bottom_step_m / cell_m)))
+    rise[:, : max(1, round(settings.blanking_m / cell_m))] = _EXCLUDED_RISE
     known = np.flatnonzero(np.isfinite(altitude_cells) & (altitude_cells > 0))
     if known.size:
         expected = np.interp(np.arange(pings), known, altitude_cells[known])[:, None]
         columns = np.arange(cells)[None, :]
-        rise[(columns < 0.7 * expected - 3) | (columns > 1.3 * expected + 3)] = _NEVER
-    return _best_path(rise, step=3)
+        rise[(columns < 0.7 * expected - 3) | (columns > 1.3 * expected + 3)] = _EXCLUDED_RISE
+    return _best_path(rise, max_step=3)
 
 
-def _rise(amplitude: FloatImage, step: int) -> FloatImage:
-    """Rise of the mean log level from the `step` cells before to the `step` cells from each cell on, in octaves."""
+def _level_rise(amplitude: FloatImage, step: int) -> FloatImage:
+    """Return the mean log level of the next `step` cells minus that of the previous `step` cells, in octaves."""
     level = np.log2(np.nan_to_num(amplitude, nan=0.0) + 1.0)
     sums = np.concatenate([np.zeros((level.shape[0], 1)), np.cumsum(level, axis=1, dtype=np.float64)], axis=1)
     cells = level.shape[1]
@@ -157,52 +163,53 @@ def _rise(amplitude: FloatImage, step: int) -> FloatImage:
     return rise
 
 
-def _best_path(gain: FloatImage, step: int) -> IntVector:
-    """Return one column per row so that the summed gain is greatest and neighbours differ by at most `step`."""
+def _best_path(gain: FloatImage, max_step: int) -> IntVector:
+    """Return one column per row with the greatest total gain (dynamic programming).
+
+    Columns of neighbouring rows differ by at most `max_step`.
+    """
     rows, cells = gain.shape
     total = gain[0].astype(np.float64)
-    came_from = np.zeros((rows, cells), dtype=np.int64)
+    predecessor = np.zeros((rows, cells), dtype=np.int64)
     columns = np.arange(cells)
     for row in range(1, rows):
-        padded = np.pad(total, step, constant_values=-np.inf)
-        choice = np.argmax(np.lib.stride_tricks.sliding_window_view(padded, 2 * step + 1), axis=1)
-        came_from[row] = columns + choice - step
-        total = total[came_from[row]] + gain[row]
+        padded = np.pad(total, max_step, constant_values=-np.inf)
+        choice = np.argmax(np.lib.stride_tricks.sliding_window_view(padded, 2 * max_step + 1), axis=1)
+        predecessor[row] = columns + choice - max_step
+        total = total[predecessor[row]] + gain[row]
     path = np.empty(rows, dtype=np.int64)
     path[-1] = int(np.argmax(total))
     for row in range(rows - 1, 0, -1):
-        path[row - 1] = came_from[row, path[row]]
+        path[row - 1] = predecessor[row, path[row]]
     return path
 
 
-def _over_range_median(amplitude: FloatImage, window_pings: int) -> FloatImage | None:
-    """Divide by the median echo at the same range over a sliding window of pings; None when every echo is zero.
+def _ratio_to_range_median(amplitude: FloatImage, window_pings: int) -> FloatImage | None:
+    """Divide by the median echo at the same range over a sliding window of pings; None if every echo is zero.
 
-    The median is taken every half window and interpolated between. A range bin that a window never saw as seabed
-    takes the nearest window's value, or the nearest range's.
+    The median is computed every half window and interpolated between. A range without seabed in a window uses the
+    value of the nearest window, or of the nearest range.
     """
-    pings, cells = amplitude.shape
+    pings = amplitude.shape[0]
     half = max(1, window_pings // 2)
     centres = np.unique(np.append(np.arange(0, pings, half), pings - 1))
     table = np.stack([_column_medians(amplitude[max(0, c - half) : c + half + 1]) for c in centres])
     positive = table[np.isfinite(table) & (table > 0)]
     if positive.size == 0:
         return None
-    table = _filled(table, float(np.median(positive)))
-    table = _smoothed_across(table, 5)
+    table = _smoothed_across(_filled(table, float(np.median(positive))), 5)
     floor = 0.01 * float(np.median(positive))
-    where = np.searchsorted(centres, np.arange(pings), side="right") - 1
-    upper = np.minimum(where + 1, len(centres) - 1)
-    gap = np.maximum(centres[upper] - centres[where], 1)
-    weight = ((np.arange(pings) - centres[where]) / gap)[:, None]
-    reference = table[where] * (1 - weight) + table[upper] * weight
+    lower = np.searchsorted(centres, np.arange(pings), side="right") - 1
+    upper = np.minimum(lower + 1, len(centres) - 1)
+    gap = np.maximum(centres[upper] - centres[lower], 1)
+    weight = ((np.arange(pings) - centres[lower]) / gap)[:, None]
+    reference = table[lower] * (1 - weight) + table[upper] * weight
     ratio: FloatImage = (amplitude / np.maximum(reference, floor)).astype(np.float32)
-    assert ratio.shape == (pings, cells)
     return ratio
 
 
 def _column_medians(block: FloatImage) -> FloatTable:
-    """Median of the finite values of each column; NaN for a column with fewer than a quarter of them."""
+    """Return the median of the finite values of each column; NaN if fewer than a quarter are finite."""
     ordered = np.sort(block, axis=0)  # NaN sorts last
     count = np.isfinite(block).sum(axis=0)
     middle: FloatTable = ordered[np.maximum(count - 1, 0) // 2, np.arange(block.shape[1])].astype(np.float64)
@@ -211,13 +218,13 @@ def _column_medians(block: FloatImage) -> FloatTable:
 
 
 def _filled(table: FloatTable, fallback: float) -> FloatTable:
-    """Fill NaN along the windows first, then along range, then with `fallback`."""
+    """Interpolate over NaN along the windows first, then along range; `fallback` for what remains."""
     out = table.copy()
     for axis_view in (out.T, out):
         for line in axis_view:
-            good = np.isfinite(line)
-            if good.any() and not good.all():
-                line[~good] = np.interp(np.flatnonzero(~good), np.flatnonzero(good), line[good])
+            finite = np.isfinite(line)
+            if finite.any() and not finite.all():
+                line[~finite] = np.interp(np.flatnonzero(~finite), np.flatnonzero(finite), line[finite])
     out[~np.isfinite(out)] = fallback
     return out
 

@@ -1,4 +1,4 @@
-"""Settings of the detector, all with defaults that work without tuning."""
+"""Settings of the detector. The defaults work without tuning."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ from dataclasses import dataclass, fields
 
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
-    """What the detector looks for and how strict it is. Lengths are in metres on the slant-range picture.
+    """Object sizes, windows and thresholds of the detector. Lengths are in metres; across-track they are slant range.
 
     Attributes:
-        confidence_threshold: Least fused confidence (0 to 2) that becomes a contact; 1.0 is the operating point.
-        max_contacts: Greatest number of contacts a survey may give, strongest first; None for no limit.
-        cell_across_m: Wanted slant range of one working cell; the file's samples are averaged up to it.
-        assumed_row_along_m: Travel between pings for a file that gives neither speed nor track.
-        median_window_pings: Pings over which the seabed's median echo is taken for each range.
-        bottom_step_m: Range before and after the first bottom return that is compared to find it.
-        blanking_m: Range next to the transducer in which no bottom return is looked for (transmit pulse).
+        confidence_threshold: Minimum fused confidence (0 to 2) of a contact; 1.0 is the operating point.
+        max_contacts: Maximum number of contacts of a survey, most confident first; None for no limit.
+        cell_across_m: Target slant range of one grid cell; the samples of the file are averaged to it.
+        assumed_row_along_m: Distance between pings if the file has neither speed nor track.
+        median_window_pings: Window of the median echo at each range.
+        bottom_step_m: Range before and after the first bottom return over which the rise is measured.
+        blanking_m: Range next to the transducer in which no bottom return is searched (transmit pulse).
         bottom_margin_m: Range after the first bottom return that is not searched (nadir glare).
-        highlight_sizes_m: Highlights looked for, each (along-track, across-track).
-        shadow_lengths_m: Shadow lengths looked for behind each highlight.
-        noise_window_m: Along and across extent of the neighbourhood that defines the local noise.
-        guard_m: Distance from a highlight to the ring of seabed the constant-false-alarm test compares it with.
+        highlight_sizes_m: Highlight sizes of the matched filter, each (along-track, across-track).
+        shadow_lengths_m: Shadow lengths of the matched filter.
+        noise_window_m: Along-track and across-track extent of the neighbourhood that defines the local noise.
+        guard_m: Guard distance between a highlight and the ring of seabed of the CFAR test.
         ring_m: Width of that ring.
-        least_matched: Matched-filter response, in local-noise units, below which a place is not looked at closer.
-        clutter_radius_m: How far around a place, along and across, other places tell how cluttered the seabed is.
-        clutter_area_m2: Seabed to which one contact is granted: the local level of clutter is the evidence that is
-            reached by one place in this area.
-        separation_along_m: Contacts nearer than this along-track (and across) are one contact.
+        least_matched: Minimum matched-filter response, in local noise units, of a candidate.
+        clutter_radius_m: Distance, along and across, within which other candidates define the local clutter.
+        clutter_area_m2: Area of seabed for each accepted candidate: the local clutter level is the evidence that one
+            candidate in this area reaches.
+        separation_along_m: Candidates nearer than this along-track, and `separation_across_m` across, are one contact.
         separation_across_m: See `separation_along_m`.
-        mine_length_m: Least and greatest highlight length of a mine-like contact.
-        mine_width_m: Least and greatest highlight width of a mine-like contact.
-        mine_height_m: Least and greatest height of a mine-like contact, where the altitude is known.
-        mine_elongation: Greatest ratio of the highlight's longer to its shorter side of a mine-like contact.
+        mine_length_m: Minimum and maximum highlight length of a mine-like contact.
+        mine_width_m: Minimum and maximum highlight width of a mine-like contact.
+        mine_height_m: Minimum and maximum height of a mine-like contact, if the altitude is known.
+        mine_elongation: Maximum ratio of the longer to the shorter side of the highlight of a mine-like contact.
     """
 
     confidence_threshold: float = 1.0
@@ -60,15 +60,15 @@ class DetectorSettings:
     mine_elongation: float = 8.0
 
     def __post_init__(self) -> None:
-        """Refuse what no detector can work with.
+        """Check the values.
 
         Raises:
-            ValueError: A length, size or response is not a finite number above 0, the confidence is not within
-                0 to 2, or there is no size to look for.
+            ValueError: A length, size or response is not a finite number above 0, the confidence threshold is not
+                within 0 to 2, or there is no highlight size or shadow length.
         """
         for item in fields(self):
             value = getattr(self, item.name)
-            if item.name != "confidence_threshold" and not all(math.isfinite(n) and n > 0 for n in _flat(value)):
+            if item.name != "confidence_threshold" and not all(math.isfinite(n) and n > 0 for n in _numbers(value)):
                 raise ValueError(f"{item.name}: got {value!r}, expected finite numbers above 0")
         if not 0 <= self.confidence_threshold <= 2:
             raise ValueError(f"confidence_threshold: got {self.confidence_threshold!r}, expected 0 to 2")
@@ -76,8 +76,8 @@ class DetectorSettings:
             raise ValueError("highlight_sizes_m, shadow_lengths_m: got an empty tuple, expected at least one size")
 
 
-def _flat(value: object) -> list[float]:
-    """Every number in nested tuples; None has none."""
+def _numbers(value: object) -> list[float]:
+    """Return every number in nested tuples; none for None."""
     if isinstance(value, tuple):
-        return [n for item in value for n in _flat(item)]
+        return [n for item in value for n in _numbers(item)]
     return [float(value)] if isinstance(value, (int, float)) else []

@@ -1,17 +1,14 @@
-"""The picture of a contact: what the operator will see.
+"""Snippets: the pixels of a contact, cut from a survey.
 
-## sonarpost.detection.snippets
-The picture of a contact over a piece of seabed: the same scale whatever the range, the speed and the sonar.
+- `cut_snippet` and `cut_expanded` keep the resolution of the recording (pings by samples of slant range).
+- `ground_projected_image` projects to the bottom for the snippets of contact records: rows and columns of fixed size
+  in metres, counted from below the sonar, with the altitude of each ping. It averages the echo strength, with the
+  weight of the recorder applied, over the fraction of every ping that a row covers.
+- `cut_ground_snippet` projects to the bottom for files: a square with the contact in its centre, at the altitude of
+  the contact. It averages the values of the file over whole pings, and reports which pixels are unknown.
 
-There are two, which differ pixel by pixel and are not to be exchanged for each other:
-
-- `cut_ground_snippet` makes pictures for files: a square in metres with the contact in its very middle, over a flat
-  bottom at the contact's altitude, of the file's own values, each row the mean of whole pings. It says what is unknown.
-- `ground_projected_image` makes the pictures for records: rows and columns of pixels, counted from below the
-  sonar, over each ping's altitude, of the echo with the recorder's weight applied, each row of its share of every ping.
-
-In common they have which contacts have a place on the bottom, how a ping's samples are averaged over steps of it
-(`means_between`), and grey (`to_grey`), 0 where nothing was recorded.
+The two projections differ pixel by pixel and are not interchangeable. All images are grey as `to_grey` maps it, with 0
+where nothing was recorded.
 """
 
 from __future__ import annotations
@@ -24,32 +21,37 @@ import numpy.typing as npt
 
 from sonarpost.detection.detector import Detection
 from sonarpost.sonar.geometry import ground_to_slant_range_m
-from sonarpost.sonar.ground_range import MAX_COLUMNS, ground_range_image, means_between
+from sonarpost.sonar.ground_range import MAX_COLUMNS, ground_range_image, interval_means
 from sonarpost.sonar.survey import FloatImage, Side, Survey
 
 SNIPPET_HEIGHT_PX = 100
 SNIPPET_WIDTH_PX = 100
+MAX_SIDE_PX = 4096
 
-# Grey 0 and 255 lie at these percentiles of the window, so that one glint does not turn the rest black. The square root
-# of amplitude lies between: it spends the grey levels where seabed, shadow and highlight differ.
+# Percentiles of the window that map to grey 0 and 255, so that a single glint does not darken the rest.
 LOW_PERCENTILE = 0.5
 HIGH_PERCENTILE = 99.5
 
+_MIN_PIXEL_SAMPLES = 1e-9
+"""At the nadir a pixel may span less of a ping; its mean would be rounding error."""
+_GREY_STEPS = 1 << 24
+"""Steps of echo strength before the mapping to grey."""
+
 
 @dataclass(frozen=True, slots=True)
-class SnippetCut:
-    """A picture cut from a survey at its own resolution.
+class SurveySnippet:
+    """Pixels cut from a survey at its own resolution.
 
     Attributes:
         image: Shape (height_px, width_px), uint8; rows along-track in the order of recording, columns across-track,
             column 0 nearest the vehicle (nadir to the left on both sides).
-        image16: The same window, uint16: the file's own values, divided by `divisor16` where they exceed 16 bits.
+        image16: The same window, uint16: the values of the file, divided by `divisor16` if they exceed 16 bits.
         divisor16: File value per step of `image16`; 1 for files of 8 or 16 bits.
-        target_row: Row of the contact's highlight in the picture.
-        target_column: Column of it.
+        target_row: Row of the contact's highlight in the image.
+        target_column: Its column.
         first_ping_index: Index into `Survey.pings` of row 0.
         first_sample: Sample index of column 0.
-        pixel_along_m: Travel between rows; None when the survey does not tell.
+        pixel_along_m: Distance between rows; None if the survey does not contain it.
         pixel_across_m: Slant range of a column.
     """
 
@@ -66,24 +68,23 @@ class SnippetCut:
 
 def cut_snippet(
     survey: Survey, detection: Detection, height_px: int = SNIPPET_HEIGHT_PX, width_px: int = SNIPPET_WIDTH_PX
-) -> SnippetCut:
-    """Cut the picture of a contact.
+) -> SurveySnippet:
+    """Cut the snippet of a contact.
 
-    The window is centred on the highlight along-track, and on the highlight plus half the shadow across-track (but
-    never so far out that the highlight leaves its left quarter). At the recording's borders the window is shifted, not
-    shrunk; only a survey with fewer pings or samples than asked for gives a smaller picture. Samples that a ping does
-    not have are 0.
+    Along-track the window is centred on the highlight. Across-track it is centred on the highlight plus half the
+    shadow, at most so far out that the highlight stays in the left quarter. At the borders of the recording the window
+    is shifted; only a survey with fewer pings or samples gives a smaller image. Samples that a ping does not have
+    are 0.
 
     Raises:
-        ValueError: When a size is below 1, or the detection does not belong to this survey.
+        ValueError: A size below 1, or a detection outside this survey.
     """
-    samples = _samples(survey, detection, height_px, width_px)
-    centre_column = _centre_column(detection, width_px)
+    samples = _checked_samples(survey, detection, height_px, width_px)
     top, rows = _window(detection.ping_index, height_px, len(survey.pings))
-    left, columns = _window(centre_column, width_px, samples)
-    raw, known = _cut(survey, detection.side, (top, rows), (left, columns))
+    left, columns = _window(_centre_column(detection, width_px), width_px, samples)
+    raw, known = _file_values(survey, detection.side, (top, rows), (left, columns))
     divisor = 1 << max(0, int(raw.max()).bit_length() - 16)
-    return SnippetCut(
+    return SurveySnippet(
         image=to_grey(raw, known),
         image16=(raw // divisor).astype(np.uint16),
         divisor16=divisor,
@@ -97,47 +98,47 @@ def cut_snippet(
 
 
 def cut_expanded(survey: Survey, detection: Detection, height_px: int, width_px: int) -> npt.NDArray[np.uint8] | None:
-    """Cut twice the ground of `cut_snippet` in each direction, around the same centre, in pixels of twice the size.
+    """Cut twice the seabed of `cut_snippet` in each direction, around the same centre, at half the resolution.
 
-    A pixel is the mean of the four file values that it covers, of those there are; 0 where there is none. The window is
-    shifted at the recording's borders as that of `cut_snippet`.
+    A pixel is the mean of the recorded ones of the four file values that it covers; 0 if there is none. The window is
+    shifted at the borders of the recording like that of `cut_snippet`.
 
     Args:
-        survey: The pings in which it was found.
+        survey: The pings in which the contact was detected.
         detection: The contact.
         height_px: Rows of the snippet.
         width_px: Columns of the snippet.
 
     Returns:
-        Shape (height_px, width_px), uint8, or less where the survey has less than twice the snippet's pings or samples.
-        None where that would show no more ground than the snippet along, or across.
+        Shape (height_px, width_px), uint8, smaller if the survey has less than twice the snippet's pings or samples.
+        None if the result would cover no more seabed than the snippet in one direction.
 
     Raises:
         ValueError: As `cut_snippet`.
     """
-    samples = _samples(survey, detection, height_px, width_px)
+    samples = _checked_samples(survey, detection, height_px, width_px)
     top, rows = _window(detection.ping_index, 2 * height_px, len(survey.pings) // 2 * 2)
     left, columns = _window(_centre_column(detection, width_px), 2 * width_px, samples // 2 * 2)
     if rows <= height_px or columns <= width_px:
         return None
-    raw, known = _cut(survey, detection.side, (top, rows), (left, columns))
-    count = _by_fours(known.astype(np.float64))
-    means = _by_fours(raw.astype(np.float64)) / np.maximum(count, 1.0)
+    raw, known = _file_values(survey, detection.side, (top, rows), (left, columns))
+    count = _sums_of_four(known.astype(np.float64))
+    means = _sums_of_four(raw.astype(np.float64)) / np.maximum(count, 1.0)
     return to_grey(means, count > 0)
 
 
-def _by_fours(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Sums of blocks of two rows and two columns."""
+def _sums_of_four(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the sums of blocks of two rows by two columns."""
     rows, columns = values.shape
     sums: npt.NDArray[np.float64] = values.reshape(rows // 2, 2, columns // 2, 2).sum(axis=(1, 3))
     return sums
 
 
-def _samples(survey: Survey, detection: Detection, height_px: int, width_px: int) -> int:
-    """Return the most samples that a ping has on the detection's side.
+def _checked_samples(survey: Survey, detection: Detection, height_px: int, width_px: int) -> int:
+    """Return the maximum number of samples of a ping on the detection's side.
 
     Raises:
-        ValueError: When a size is below 1, or the detection does not belong to this survey.
+        ValueError: A size below 1, or a detection outside this survey.
     """
     if height_px < 1 or width_px < 1:
         raise ValueError(f"height_px, width_px: got {height_px}, {width_px}, expected 1 or more")
@@ -154,19 +155,26 @@ def _centre_column(detection: Detection, width_px: int) -> int:
     return detection.sample + min(detection.shadow_samples // 2, width_px // 4)
 
 
-def _cut(
+def _file_values(
     survey: Survey, side: Side, pings: tuple[int, int], samples: tuple[int, int]
 ) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.bool_]]:
-    """Return a window's file values, 0 where there are none, and where there are; `pings`, `samples`: first, count."""
+    """Return the file values of a window (0 where not recorded) and where they are recorded.
+
+    Args:
+        survey: The survey.
+        side: Port or starboard.
+        pings: First ping and number of pings.
+        samples: First sample and number of samples.
+    """
     (top, rows), (left, columns) = pings, samples
     raw = np.zeros((rows, columns), dtype=np.uint32)
     known = np.zeros((rows, columns), dtype=np.bool_)
     for row in range(rows):
         channel = survey.pings[top + row].channel(side)
         if channel is not None:
-            piece = channel.samples[left : left + columns]
-            raw[row, : piece.shape[0]] = piece
-            known[row, : piece.shape[0]] = True
+            values = channel.samples[left : left + columns]
+            raw[row, : values.shape[0]] = values
+            known[row, : values.shape[0]] = True
     return raw, known
 
 
@@ -176,12 +184,12 @@ def to_grey(
     """Map file values to grey.
 
     grey = 255 * (sqrt(value) - low) / (high - low), rounded and limited to 0..255, where low and high are the 0.5th and
-    99.5th percentile of sqrt(value) over the known pixels. A window of one value gives mid grey (128), unknown pixels
-    give 0.
+    99.5th percentile of sqrt(value) over the known pixels. The square root gives seabed, shadow and highlight similar
+    shares of the grey levels. A window of constant value is mid grey (128), unknown pixels are 0.
 
     Args:
-        raw: Shape (rows, columns), the file's values, or means of them.
-        known: Same shape, True where the file has a sample.
+        raw: Shape (rows, columns), values of the file, or means of them.
+        known: Same shape, True where recorded.
     """
     root = np.sqrt(raw.astype(np.float64))
     grey = np.zeros(raw.shape, dtype=np.uint8)
@@ -194,27 +202,20 @@ def to_grey(
 
 
 def _window(centre: int, size: int, limit: int) -> tuple[int, int]:
-    """First index and length of a window of `size` around `centre`, shifted to lie within `limit`."""
+    """Return first index and length of a window of `size` around `centre`, shifted to lie within `limit`."""
     length = min(size, limit)
     return min(max(centre - length // 2, 0), limit - length), length
 
 
-MAX_SIDE_PX = 4096
-_LEAST_SAMPLES = 1e-9
-"""A pixel that spans less of a ping, at the nadir, holds little but rounding."""
-_STEPS = 1 << 24
-"""Of grey are enough to keep the echo's range of values."""
-
-
 @dataclass(frozen=True, slots=True)
 class GroundSnippet:
-    """A square of seabed with a contact in its middle.
+    """A square of seabed with a contact in its centre.
 
     Attributes:
         image: Shape (n, n), uint8; rows along-track in the order of recording, columns over ground range, nadir to
             the left on both sides; 0 where nothing was recorded.
-        known: Same shape, True where something was.
-        pixel_m: Side of a pixel on the bottom, along and across the same.
+        known: Same shape, True where recorded.
+        pixel_m: Side of a pixel on the bottom, the same along-track and across-track.
     """
 
     image: npt.NDArray[np.uint8]
@@ -223,45 +224,44 @@ class GroundSnippet:
 
 
 @dataclass(frozen=True, slots=True)
-class _Place:
-    """Where a contact lies: `range_m` from the track, `altitude_m` below the sonar, pings `along_m` from each other."""
+class _GroundPlace:
+    """Place of a contact on the bottom: ground range, altitude of the sonar above it, distance between pings."""
 
     altitude_m: float
     range_m: float
     along_m: float
 
 
-def _place(found: Detection) -> _Place | None:
-    """Return a contact's place, None where the survey does not tell all of it."""
-    if found.altitude_m is None or found.ground_range_m is None or found.pixel_along_m is None:
+def _ground_place(detection: Detection) -> _GroundPlace | None:
+    if detection.altitude_m is None or detection.ground_range_m is None or detection.pixel_along_m is None:
         return None
-    return _Place(found.altitude_m, found.ground_range_m, found.pixel_along_m)
+    return _GroundPlace(detection.altitude_m, detection.ground_range_m, detection.pixel_along_m)
 
 
 def cut_ground_snippet(
     survey: Survey, detection: Detection, size_m: float = 10.0, pixel_m: float = 0.1
 ) -> GroundSnippet | None:
-    """Cut the seabed around a contact at a fixed size and scale.
+    """Cut the seabed around a contact with fixed size and scale.
 
-    Each pixel is the mean of the samples whose slant range falls into it over a flat bottom at the contact's altitude
-    (between the two nearest, where samples are coarser), in the pings that it spans, or the nearest one. Unlike
-    `cut_snippet` the contact's highlight is always the middle pixel; what lies beyond the recording is unknown.
+    The bottom is assumed flat at the altitude of the contact. A pixel is the mean of the samples whose slant range it
+    covers (interpolated where samples are coarser), in the pings that it covers, or in the nearest one. The highlight
+    of the contact is always in the centre; pixels beyond the recording are unknown.
 
     Args:
-        survey: The survey the contact was found in.
+        survey: The survey in which the contact was detected.
         detection: The contact.
         size_m: Side of the square.
         pixel_m: Side of a pixel.
 
     Returns:
-        The picture; None where the contact's altitude or the travel between pings is not known.
+        The snippet; None if the altitude of the contact or the distance between pings is unknown.
 
     Raises:
-        ValueError: A size or pixel that is not above 0, or more than 4096 pixels a side.
+        ValueError: A size or pixel that is not positive, or more than 4096 pixels a side.
     """
     if not (size_m > 0 and pixel_m > 0 and 1 <= size_m / pixel_m <= MAX_SIDE_PX):
         raise ValueError(f"size_m, pixel_m: got {size_m}, {pixel_m}, expected above 0 and 1 to {MAX_SIDE_PX} pixels")
-    place = _place(detection)
+    place = _ground_place(detection)
     if place is None:
         return None
     count = math.ceil(size_m / pixel_m)
@@ -275,79 +275,79 @@ def cut_ground_snippet(
         rows = range(max(round(top), 0), min(round(bottom), len(survey.pings))) or range(
             math.floor(top), math.floor(top) + 1
         )
-        lines = [_line(survey, detection, ping, slant_m) for ping in rows if 0 <= ping < len(survey.pings)]
+        lines = [_ping_means(survey, detection, ping, slant_m) for ping in rows if 0 <= ping < len(survey.pings)]
         if lines:
             stacked = np.stack(lines)
-            some = np.isfinite(stacked).any(axis=0)
-            values[row, some] = np.nanmean(stacked[:, some], axis=0)
+            recorded = np.isfinite(stacked).any(axis=0)
+            values[row, recorded] = np.nanmean(stacked[:, recorded], axis=0)
     values[:, edges_m[:-1] < 0] = np.nan
     known = np.isfinite(values)
     raw = np.rint(np.where(known, values, 0.0)).astype(np.uint32)
     return GroundSnippet(to_grey(raw, known), known, pixel_m)
 
 
-def _line(survey: Survey, detection: Detection, ping: int, slant_m: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _ping_means(
+    survey: Survey, detection: Detection, ping: int, slant_m: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
     """Return the mean of one ping's samples between neighbouring slant ranges, NaN beyond its end."""
     channel = survey.pings[ping].channel(detection.side)
     if channel is None or not len(channel.samples):
         return np.full(len(slant_m) - 1, np.nan)
-    return means_between(channel.samples, slant_m / channel.sample_spacing_m, least_width=_LEAST_SAMPLES)
+    return interval_means(channel.samples, slant_m / channel.sample_spacing_m, min_width=_MIN_PIXEL_SAMPLES)
 
 
 def ground_projected_image(
-    survey: Survey, found: Detection, height_px: int, width_px: int, pixel_m: float
+    survey: Survey, detection: Detection, height_px: int, width_px: int, pixel_m: float
 ) -> npt.NDArray[np.uint8] | None:
-    """Return the bottom around a contact, which lies in the middle.
+    """Return the bottom around a contact, with the contact in the centre.
 
     Args:
-        survey: The pings in which it was found.
-        found: The contact.
+        survey: The pings in which the contact was detected.
+        detection: The contact.
         height_px: Rows, along-track in the order of recording.
-        width_px: Columns, across-track, the nadir to the left.
+        width_px: Columns, across-track, nadir to the left.
         pixel_m: Side of a pixel on a flat bottom.
 
     Returns:
-        Shape (height_px, width_px), uint8, grey as `to_grey` makes it; 0 where nothing was recorded: beyond the
-        recording's ends and the sonar's range, and on the other side of the nadir. None where the survey does not
-        tell altitude or travel, or the pixels are too small for the sonar's range.
+        Shape (height_px, width_px), uint8, grey as `to_grey` maps it; 0 beyond the ends of the recording, beyond the
+        range of the sonar, and on the other side of the nadir. None if altitude or distance between pings is unknown,
+        or if the pixels are too small for the range of the sonar.
     """
-    place = _place(found)
-    if place is None:
-        return None
-    if survey.reach_m(found.side) / pixel_m > MAX_COLUMNS:
+    place = _ground_place(detection)
+    if place is None or survey.max_slant_range_m(detection.side) / pixel_m > MAX_COLUMNS:
         return None
     # Edges of the rows, in pings from the beginning of the survey.
-    edges = found.ping_index + 0.5 + (np.arange(height_px + 1) - height_px / 2) * pixel_m / place.along_m
+    edges = detection.ping_index + 0.5 + (np.arange(height_px + 1) - height_px / 2) * pixel_m / place.along_m
     first, end = max(int(edges[0]), 0), min(int(np.ceil(edges[-1])), len(survey.pings))
     pings = survey.pings[first:end]
     altitudes_m = np.array([p.altitude_m if p.altitude_m is not None else place.altitude_m for p in pings])
-    ground = ground_range_image(replace(survey, pings=pings), found.side, altitudes_m, pixel_m)
+    ground = ground_range_image(replace(survey, pings=pings), detection.side, altitudes_m, pixel_m)
     left = int(place.range_m / pixel_m) - width_px // 2
-    rows = _averaged_rows(_columns(ground, left, width_px), np.asarray(edges - first, dtype=np.float64))
+    rows = _row_means(_columns(ground, left, width_px), np.asarray(edges - first, dtype=np.float64))
     known = np.isfinite(rows)
     greatest = float(np.max(rows, where=known, initial=0.0))
-    scaled = np.where(known, rows, 0.0) * (_STEPS / greatest if greatest > 0 else 0.0)
+    scaled = np.where(known, rows, 0.0) * (_GREY_STEPS / greatest if greatest > 0 else 0.0)
     return to_grey(np.rint(scaled).astype(np.uint32), known)
 
 
 def _columns(image: FloatImage, left: int, width: int) -> FloatImage:
-    """Return columns from `left` on, NaN where the image has none."""
-    cut = np.full((image.shape[0], width), np.nan, dtype=np.float32)
+    """Return `width` columns from `left` on, NaN outside the image."""
+    out = np.full((image.shape[0], width), np.nan, dtype=np.float32)
     begin, end = max(left, 0), min(left + width, image.shape[1])
     if end > begin:
-        cut[:, begin - left : end - left] = image[:, begin:end]
-    return cut
+        out[:, begin - left : end - left] = image[:, begin:end]
+    return out
 
 
-def _averaged_rows(image: FloatImage, edges: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the mean of what is known between each two edges, which are in rows of the image; NaN where nothing is."""
+def _row_means(image: FloatImage, edges: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the mean of the finite values between neighbouring edges, given in rows; NaN where there is none."""
     known = np.isfinite(image)
     start = np.zeros((1, image.shape[1]))
     total = np.vstack([start, np.cumsum(np.where(known, image, 0.0), axis=0, dtype=np.float64)])
     count = np.vstack([start, np.cumsum(known, axis=0, dtype=np.float64)])
     inside = np.clip(edges, 0, image.shape[0])
     low = np.minimum(inside.astype(np.int64), max(image.shape[0] - 1, 0))
-    part = (inside - low)[:, None]
+    fraction = (inside - low)[:, None]
     high = np.minimum(low + 1, image.shape[0])
-    sums, counts = (np.diff(table[low] * (1 - part) + table[high] * part, axis=0) for table in (total, count))
+    sums, counts = (np.diff(table[low] * (1 - fraction) + table[high] * fraction, axis=0) for table in (total, count))
     return np.where(counts > 1e-6, sums / np.maximum(counts, 1e-6), np.nan)

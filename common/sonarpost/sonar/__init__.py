@@ -1,1 +1,1 @@
-"""Survey readers and writers, geometry, snippets and image files."""
+"""Side-scan surveys: readers, pings with navigation, geometry, ground range, image files."""

@@ -1,4 +1,4 @@
-"""Altitude from the picture itself: the water column is dark, and the bottom's first return ends it."""
+"""Bottom tracking: altitude from the first bottom return, which ends the dark water column."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ FloatArray = npt.NDArray[np.float64]
 
 _BINS: Final = 512
 _RING_DOWN_M: Final = 0.4
-"""The transducers still ring from the transmission this near; no vehicle surveys lower."""
+"""Range in which the transducers still ring from the transmission; below any survey altitude."""
 _SUSTAINED_FRACTION: Final = 1 / 40
-"""A rise must last this part of the range: fish and bubbles do not."""
+"""Fraction of the range that a rise must last; fish and bubbles are shorter."""
 _RISE: Final = 0.5
-"""Where between the water's level and the bottom's, in decibels, the first return is taken to begin."""
+"""Threshold of the first return between the levels of water and bottom, as a fraction in decibels."""
 _MIN_CONTRAST: Final = 1.8
 _SMOOTHING_PINGS: Final = 5
 _STEP_BINS: Final = 10
@@ -27,38 +27,38 @@ _MIN_STEP: Final = math.log(1.3)
 
 
 def track_bottom(survey: Survey, *, window_pings: int = 31) -> FloatArray:
-    """Estimate the altitude of every ping from its first sustained rise of echo strength.
+    """Estimate the altitude of every ping from the first sustained rise of the echo strength.
 
-    Both sides are averaged by slant range (a rise on one only is an object, not the bottom). In each ping the first
-    place after the transmission's ringing is sought where the echo climbs out of the water's level and stays up.
-    Recorders that compress the echo leave little between the water's level and the far bottom's; there an earlier
-    and sharper step is taken instead. The row of estimates is then cleaned by a median over `window_pings`.
+    Both sides are averaged by slant range: a rise on one side only is an object. The estimate is the first place after
+    the ringing of the transmission where the echo rises above the level of the water and stays there. If the recorder
+    compresses the echo, water and far bottom differ little; an earlier and sharper step is then used. A median over
+    `window_pings` smooths the estimates.
 
     Args:
-        survey: Pings of any sample count and range.
-        window_pings: Length of the median; odd. Also the longest gap that is bridged.
+        survey: Pings with any number of samples and any range.
+        window_pings: Window of the median, odd. Also the longest gap that is interpolated.
 
     Returns:
-        Altitude in metres, shape (pings,), float64; NaN where no rise stands out.
+        Altitude in metres, shape (pings,), float64; NaN without a clear rise.
 
     Raises:
         ValueError: `window_pings` is even or not positive.
     """
     if window_pings < 1 or window_pings % 2 == 0:
         raise ValueError(f"window_pings is {window_pings}, expected an odd number above 0")
-    reach_m = max(survey.reach_m(side) for side in Side)
-    if reach_m <= 0:
+    range_m = max(survey.max_slant_range_m(side) for side in Side)
+    if range_m <= 0:
         return np.full(len(survey.pings), np.nan)
-    echo = _common_range(survey, reach_m)
+    echo = _common_range(survey, range_m)
     echo = uniform_filter(echo, size=(_SMOOTHING_PINGS, 3), mode="nearest")
-    first = _first_rise(echo, round(_RING_DOWN_M / reach_m * _BINS))
-    first = _with_local_steps(echo, first, round(_RING_DOWN_M / reach_m * _BINS))
-    return _median_smoothed(first * reach_m / _BINS, window_pings)
+    first = _first_rise(echo, round(_RING_DOWN_M / range_m * _BINS))
+    first = _with_local_steps(echo, first, round(_RING_DOWN_M / range_m * _BINS))
+    return _median_smoothed(first * range_m / _BINS, window_pings)
 
 
-def _common_range(survey: Survey, reach_m: float) -> FloatArray:
-    """Return the mean echo of both sides, shape (pings, bins) over 0..reach_m, each side scaled to its own mean."""
-    centres_m = (np.arange(_BINS) + 0.5) * reach_m / _BINS
+def _common_range(survey: Survey, range_m: float) -> FloatArray:
+    """Return the mean echo of both sides, shape (pings, bins) over 0..range_m, each side scaled to a mean of 1."""
+    centres_m = (np.arange(_BINS) + 0.5) * range_m / _BINS
     total = np.zeros((len(survey.pings), _BINS))
     for side in survey.sides():
         image = np.zeros_like(total)
@@ -72,7 +72,7 @@ def _common_range(survey: Survey, reach_m: float) -> FloatArray:
 
 
 def _resampled(samples: npt.NDArray[np.float32], spacing_m: float, centres_m: FloatArray) -> FloatArray:
-    """Average the samples that fall into each bin (or interpolate, where bins are finer); 0 beyond the last one."""
+    """Return the mean of the samples in each bin (interpolated if bins are finer); 0 beyond the last one."""
     cumulative = np.concatenate([[0.0], np.cumsum(samples, dtype=np.float64)])
     half_m = (centres_m[1] - centres_m[0]) / 2
     edges = np.concatenate([centres_m - half_m, [centres_m[-1] + half_m]]) / spacing_m
@@ -82,30 +82,30 @@ def _resampled(samples: npt.NDArray[np.float32], spacing_m: float, centres_m: Fl
 
 
 def _first_rise(echo: FloatArray, skip: int) -> FloatArray:
-    """Return the bin of the first sustained rise of each row, float64, NaN where there is none."""
+    """Return the bin of the first sustained rise of each row, float64, NaN without one."""
     searched = echo[:, skip:]
     water = np.percentile(searched, 5, axis=1, keepdims=True)
     bottom = np.percentile(searched, 70, axis=1, keepdims=True)
-    # A silent water column (zeros) is given the level of a thousandth of the bottom's.
+    # The level of a silent water column (zeros) is set to a thousandth of the bottom's.
     water = np.maximum(water, bottom / 1000)
     level = water ** (1 - _RISE) * bottom**_RISE
     above = searched >= level
     hold = max(math.ceil(echo.shape[1] * _SUSTAINED_FRACTION), 2)
-    # How many of the `hold` bins that begin at each place are above the level.
+    # Number of bins above the level among the `hold` bins from each place on.
     counts = np.cumsum(np.pad(above, ((0, 0), (1, hold))), axis=1)
     sustained = above & (counts[:, hold:-1] - counts[:, : -hold - 1] >= 0.8 * hold)
-    # The search begins once the water's level has been seen: until then it is the transmission that is met.
+    # The search starts after the first bin below the level: before it is the transmission.
     started = np.maximum.accumulate(~above, axis=1)
     found = sustained & started
     first = np.where(found.any(axis=1), found.argmax(axis=1) + float(skip), np.nan)
-    # Sides are scaled to a mean of 1: a ping below a ten-thousandth of it is silent, whatever its contrast.
+    # Sides are scaled to a mean of 1: a ping below a ten-thousandth of it is silent at any contrast.
     flat = (bottom <= _MIN_CONTRAST * water) | (bottom < 1e-4)
     first[flat[:, 0]] = np.nan
     return first
 
 
 def _with_local_steps(echo: FloatArray, first: FloatArray, skip: int) -> FloatArray:
-    """Replace estimates by an earlier step of the echo that is higher, or where there is none by the highest.
+    """Replace an estimate by a higher step at a shorter range; a missing estimate by the highest step.
 
     The step at a bin is the logarithm of the mean echo just after it over that just before it.
     """
@@ -115,11 +115,11 @@ def _with_local_steps(echo: FloatArray, first: FloatArray, skip: int) -> FloatAr
     logs = np.log(means + floor)
     step = np.full(echo.shape, -np.inf)
     step[:, _STEP_BINS : echo.shape[1] - _STEP_BINS + 1] = logs[:, _STEP_BINS:] - logs[:, :-_STEP_BINS]
-    step[:, : skip + _STEP_BINS] = -np.inf  # its near half would be the ringing
+    step[:, : skip + _STEP_BINS] = -np.inf  # the near half of the step would be the ringing
     bins = np.arange(echo.shape[1])
     known = np.isfinite(first)
     place = np.where(known, first, echo.shape[1]).astype(np.intp)
-    # A gradual rise is found by its level some bins into its step: look around for how high that step is.
+    # The level threshold of a gradual rise lies some bins after its step: use the highest step nearby.
     near = np.abs(bins - place[:, None]) <= _STEP_BINS
     own = np.where(near & known[:, None], step, -np.inf).max(axis=1)
     earlier = np.where(bins < (place - 2 * _STEP_BINS)[:, None], step, -np.inf)
@@ -130,7 +130,7 @@ def _with_local_steps(echo: FloatArray, first: FloatArray, skip: int) -> FloatAr
 
 
 def _median_smoothed(values: FloatArray, window: int) -> FloatArray:
-    """Median over `window` rows, bridging gaps no longer than it."""
+    """Return the median over `window` rows; gaps up to that length are interpolated."""
     known = np.flatnonzero(np.isfinite(values))
     if not known.size:
         return values
@@ -143,19 +143,19 @@ def _median_smoothed(values: FloatArray, window: int) -> FloatArray:
 
 
 def _neighbours(rows: npt.NDArray[np.intp], known: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Return the places in `known` (ascending) just below and just above each row, shape (rows, 2)."""
+    """Return the indices in `known` (ascending) of the neighbours below and above each row, shape (rows, 2)."""
     above = np.searchsorted(known, rows).clip(0, known.size - 1)
     return np.stack([(above - 1).clip(0), above], axis=1)
 
 
 def altitudes_m(survey: Survey) -> FloatArray:
-    """Return the altitude of every ping: the file's own, and `track_bottom`'s where the file gives none.
+    """Return the altitude of every ping: that of the file, else from `track_bottom`.
 
     Returns:
-        Shape (pings,), float64, metres; NaN where neither is known.
+        Shape (pings,), float64, metres; NaN if both are unknown.
     """
-    given = np.array([math.nan if p.altitude_m is None else p.altitude_m for p in survey.pings], dtype=np.float64)
-    missing = np.isnan(given)
+    recorded = np.array([math.nan if p.altitude_m is None else p.altitude_m for p in survey.pings], dtype=np.float64)
+    missing = np.isnan(recorded)
     if missing.any() and any(side in survey.sides() for side in Side):
-        given[missing] = track_bottom(survey)[missing]
-    return given
+        recorded[missing] = track_bottom(survey)[missing]
+    return recorded

@@ -1,22 +1,18 @@
-"""Where a sample lies: slant range to ground range, to latitude and longitude.
+"""Geometry of a survey: slant range, ground range, positions of samples with their error ellipse.
 
 Positions are WGS-84. Distances within a survey (under about 1 km) use the local tangent plane with the ellipsoid's
 radii of curvature at the middle latitude, which agrees with the geodesic to well under a centimetre at 500 m.
 
-
-## sonarpost.sonar.geometry
-Where a sample lies and how well that is known: one error ellipse for every position.
-
-Contributions, as standard deviations across (c) and along (a) the track at ground range g, altitude h, slant range
-r = sqrt(g^2 + h^2), each independent of the others:
+The error ellipse of a sample has these independent contributions, as standard deviations across (c) and along (a) the
+track, at ground range g, altitude h and slant range r = sqrt(g^2 + h^2):
 
 * position of the carrier, p: c, a
-* heading, s radians: a = g s (the sample swings about the sonar)
-* slant range, from the speed of sound (a fraction v) and half a sample (q, uniform): r v r/g and q/sqrt(12) r/g in c
-* altitude, e: c = e h/g; near the nadir, where h/g grows without limit, it is held to what g can be at most
-* slope of the bottom, b radians: the bottom at g is g tan(b) higher or lower, which counts as an altitude error
-* time of the position against the ping, t: a = speed t
-* layback, l, where there is one: a
+* heading, s radians: a = g s (the sample rotates about the sonar)
+* slant range, from the sound speed (a fraction v) and half a sample (q, uniform): r v r/g and q/sqrt(12) r/g in c
+* altitude, e: c = e h/g; near the nadir, where h/g has no bound, limited to the possible range of g
+* slope of the bottom, b radians: the bottom at g is g tan(b) higher or lower, which is an altitude error
+* time of the position relative to the ping, t: a = speed t
+* layback, l, if there is one: a
 """
 
 from __future__ import annotations
@@ -37,12 +33,15 @@ WGS84_EQUATORIAL_RADIUS_M: Final = 6_378_137.0
 WGS84_FLATTENING: Final = 1 / 298.257_223_563
 _ECCENTRICITY_SQUARED: Final = WGS84_FLATTENING * (2 - WGS84_FLATTENING)
 _TRACK_SMOOTHING_S: Final = 4.0
-"""Navigation is averaged over this long: fixes are often rounded to metres and repeated over many pings."""
+"""Averaging time of the track: fixes are often rounded to metres and repeated over many pings."""
+_MAX_LATITUDE_DEG: Final = 89.0
+_DEFAULT_SPEED_MPS: Final = 2.0
+"""Typical speed of a survey vehicle, for the time contribution of a ping without speed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """A place on WGS-84, in degrees; longitude within -180 (included) and 180."""
+    """A WGS-84 position in degrees; longitude from -180 (included) to 180."""
 
     lat_deg: float
     lon_deg: float
@@ -53,7 +52,7 @@ def slant_to_ground_range_m(slant_range_m: npt.ArrayLike, altitude_m: npt.ArrayL
 
     Args:
         slant_range_m: Slant range in metres, any shape.
-        altitude_m: Height of the sonar over the bottom in metres, of a shape that broadcasts with it.
+        altitude_m: Altitude of the sonar above the bottom in metres, broadcastable shape.
 
     Returns:
         float64 of the broadcast shape; NaN in the water column, where slant range is less than altitude.
@@ -81,9 +80,9 @@ def _radii_of_curvature_m(lat_rad: float) -> tuple[float, float]:
 
 
 def offset_position(origin: Position, bearing_deg: float, distance_m: float) -> Position:
-    """Return the place `distance_m` away from `origin` in the direction `bearing_deg` (from true north, clockwise).
+    """Return the position at `distance_m` from `origin` and bearing `bearing_deg` (from true north, clockwise).
 
-    Good to centimetres under 500 m, except within a few kilometres of a pole.
+    Accurate to centimetres up to 500 m, except within a few kilometres of a pole.
     """
     north = distance_m * math.cos(math.radians(bearing_deg))
     east = distance_m * math.sin(math.radians(bearing_deg))
@@ -91,16 +90,16 @@ def offset_position(origin: Position, bearing_deg: float, distance_m: float) -> 
     meridional, _ = _radii_of_curvature_m(lat)
     middle = lat + north / meridional / 2
     meridional, prime_vertical = _radii_of_curvature_m(middle)
-    # A step east along the tangent plane ends a little nearer the equator than it began.
+    # A straight line east on the tangent plane ends slightly nearer the equator.
     bow = east**2 * math.tan(lat) / (2 * prime_vertical * meridional)
     lat_deg = math.degrees(lat + north / meridional - bow)
-    # The meridians have converged by the end of the leg north; the mean of both parallels is what counts.
+    # The east leg is at the latitude of the end of the north leg.
     lon_deg = origin.lon_deg + math.degrees(east / (prime_vertical * math.cos(lat + north / meridional)))
     return Position(lat_deg, (lon_deg + 180) % 360 - 180)
 
 
 def offset_between_m(origin: Position, other: Position) -> tuple[float, float]:
-    """Return how far `other` lies north and east of `origin` on the tangent plane, in metres."""
+    """Return the distances north and east from `origin` to `other` on the tangent plane, in metres."""
     lat = math.radians(origin.lat_deg)
     other_lat = math.radians(other.lat_deg)
     meridional, prime_vertical = _radii_of_curvature_m((lat + other_lat) / 2)
@@ -110,29 +109,8 @@ def offset_between_m(origin: Position, other: Position) -> tuple[float, float]:
     return (other_lat - lat) * meridional + bow, east
 
 
-def sample_position(ping: Ping, side: Side, sample_index: float, *, altitude_m: float | None = None) -> Position | None:
-    """Return where on the bottom a sample's echo came from.
-
-    Args:
-        ping: The ping, with position and heading.
-        side: The channel.
-        sample_index: The sample, 0 nearest the vehicle; may be fractional.
-        altitude_m: Height over the bottom to use in place of the ping's own (for one from `track_bottom`).
-
-    Returns:
-        The position; None where the ping has no fix, heading, altitude or channel, or the sample lies in the water
-        column.
-    """
-    channel = ping.channel(side)
-    height_m = ping.altitude_m if altitude_m is None else altitude_m
-    if channel is None or height_m is None:
-        return None
-    ground_m = float(slant_to_ground_range_m(sample_slant_range_m(channel, sample_index), height_m))
-    return None if math.isnan(ground_m) else ground_position(ping, side, ground_m)
-
-
 def ground_position(ping: Ping, side: Side, ground_range_m: float) -> Position | None:
-    """Return the place abeam of the vehicle at a ground range; None where the ping has no fix or heading."""
+    """Return the position abeam of the vehicle at a ground range; None if the ping has no fix or heading."""
     if ping.lat_deg is None or ping.lon_deg is None or ping.heading_deg is None:
         return None
     abeam_deg = ping.heading_deg + (90 if side is Side.STARBOARD else -90)
@@ -140,13 +118,13 @@ def ground_position(ping: Ping, side: Side, ground_range_m: float) -> Position |
 
 
 def along_track_m(survey: Survey) -> FloatArray | None:
-    """Return the distance travelled since the first ping.
+    """Return the distance along the track since the first ping.
 
-    From navigation, smoothed over a few seconds since fixes are often coarse and repeated, and interpolated over
-    pings without one; else from speed and time.
+    It is computed from the fixes, smoothed over a few seconds and interpolated over pings without one, else from speed
+    and time.
 
     Returns:
-        Shape (pings,), float64, not decreasing, starting at 0; None where the file gives neither.
+        Shape (pings,), float64, not decreasing, starting at 0; None if the file has neither.
     """
     times = np.array([ping.time_utc_s for ping in survey.pings], dtype=np.float64)
     fixed = [row for row, ping in enumerate(survey.pings) if ping.lat_deg is not None and ping.lon_deg is not None]
@@ -165,7 +143,7 @@ def along_track_m(survey: Survey) -> FloatArray | None:
 
 
 def ping_spacing_m(survey: Survey) -> float | None:
-    """Return the mean distance between pings along the track, in metres; None where navigation does not tell."""
+    """Return the mean distance between pings along the track, in metres; None without navigation."""
     distance_m = along_track_m(survey)
     if distance_m is None or len(distance_m) < 2 or distance_m[-1] <= 0:
         return None
@@ -174,32 +152,32 @@ def ping_spacing_m(survey: Survey) -> float | None:
 
 def _track_m(survey: Survey, fixed: list[int]) -> FloatArray:
     """Return (north, east) of every ping, shape (pings, 2), interpolated and extrapolated over missing fixes."""
-    places = [_place(survey.pings[row]) for row in fixed]
-    known = np.array([offset_between_m(places[0], place) for place in places], dtype=np.float64)
+    positions = [_position(survey.pings[row]) for row in fixed]
+    known = np.array([offset_between_m(positions[0], position) for position in positions], dtype=np.float64)
     rows = np.arange(len(survey.pings))
     track = np.stack([np.interp(rows, fixed, known[:, axis]) for axis in (0, 1)], axis=1)
     step = (known[-1] - known[0]) / (fixed[-1] - fixed[0])
-    # The track goes on at its mean pace before the first fix and after the last.
+    # Before the first fix and after the last one the track continues at its mean speed.
     track[: fixed[0]] = known[0] + (rows[: fixed[0]] - fixed[0])[:, None] * step
     track[fixed[-1] + 1 :] = known[-1] + (rows[fixed[-1] + 1 :] - fixed[-1])[:, None] * step
     return track
 
 
-def _place(ping: Ping) -> Position:
+def _position(ping: Ping) -> Position:
     assert ping.lat_deg is not None
     assert ping.lon_deg is not None
     return Position(ping.lat_deg, ping.lon_deg)
 
 
 def _window_pings(times: FloatArray) -> int:
-    """Return the odd number of pings that smoothing takes, from the ping rate."""
+    """Return the odd number of pings of the averaging time."""
     span_s = float(times[-1] - times[0])
     rate_hz = (len(times) - 1) / span_s if span_s > 0 else 0.0
     return 2 * min(round(_TRACK_SMOOTHING_S * rate_hz / 2), (len(times) - 1) // 4) + 1
 
 
 def _moving_average(values: FloatArray, window: int) -> FloatArray:
-    """Average over `window` (odd) with the ends mirrored through their end points, so that a straight line stays."""
+    """Return the moving average over `window` (odd). Point-mirrored ends preserve a straight line."""
     half = window // 2
     if half == 0:
         return values
@@ -208,21 +186,16 @@ def _moving_average(values: FloatArray, window: int) -> FloatArray:
     return np.convolve(np.concatenate([front, values, back]), np.full(window, 1 / window), mode="valid")
 
 
-_MAX_LATITUDE_DEG = 89.0
-_UNKNOWN_SPEED_MPS = 2.0
-"""What a survey vehicle makes, for the time's share where the ping has no speed."""
-
-
 @dataclass(frozen=True, slots=True)
 class GeoReference:
-    """A sample's position on the bottom.
+    """Position of a sample on the bottom with its error ellipse.
 
     Attributes:
-        position: WGS-84.
-        ground_range_m: From the sonar's track to it, over a flat bottom.
-        across_sigma_m: One standard deviation across the track.
-        along_sigma_m: One standard deviation along the track.
-        bearing_deg: From the sonar to it, from true north; the direction of `across_sigma_m`.
+        position: WGS-84 position.
+        ground_range_m: Distance from the track over a flat bottom.
+        across_sigma_m: Standard deviation across the track.
+        along_sigma_m: Standard deviation along the track.
+        bearing_deg: Bearing from the sonar, from true north; the direction of `across_sigma_m`.
     """
 
     position: Position
@@ -233,26 +206,25 @@ class GeoReference:
 
     @property
     def drms_m(self) -> float:
-        """Root mean square distance of the true place from `position`, in metres."""
+        """Root mean square distance between true position and `position`, in metres."""
         return math.hypot(self.across_sigma_m, self.along_sigma_m)
 
 
 def georeference(
     ping: Ping, side: Side, sample_index: float, options: SurveyOptions, *, tracked_altitude_m: float | None = None
 ) -> GeoReference | None:
-    """Return where on the bottom a sample's echo came from, and how well that is known.
+    """Return the position of a sample on the bottom with its error ellipse.
 
     Args:
-        ping: The ping, with the mounting applied (as every `SurveySource` gives it).
+        ping: The ping, with the mounting applied (as every `SurveySource` does).
         side: The channel.
         sample_index: The sample, 0 nearest the vehicle; may be fractional.
-        options: For `errors`, and for whether there is a layback.
+        options: For the error budget and the layback.
         tracked_altitude_m: An altitude from `track_bottom`, for a ping without its own.
 
     Returns:
-        The position; None where the ping has no fix, heading, altitude or channel, where the sample is not one of
-        the channel's, lies in the water column, or the ping lies within a degree of a pole, where the tangent plane
-        does not hold.
+        The position. None if the ping has no fix, heading, altitude or channel, if the sample is outside the channel
+        or in the water column, or within a degree of a pole, where the tangent plane is not valid.
     """
     channel = ping.channel(side)
     altitude_m = ping.altitude_m if ping.altitude_m is not None else tracked_altitude_m
@@ -264,8 +236,8 @@ def georeference(
         return None
     slant_m = sample_slant_range_m(channel, sample_index)
     ground_m = float(slant_to_ground_range_m(slant_m, altitude_m))
-    place = None if math.isnan(ground_m) else ground_position(ping, side, ground_m)
-    if place is None:
+    position = None if math.isnan(ground_m) else ground_position(ping, side, ground_m)
+    if position is None:
         return None
     budget = options.errors
     altitude_sigma_m = budget.altitude_m if ping.altitude_m is not None else budget.tracked_altitude_m
@@ -275,7 +247,7 @@ def georeference(
     across_m = math.hypot(
         budget.position_m, _ground_sigma_m(ground_m, altitude_m, slant_m, range_sigma_m, height_sigma_m)
     )
-    speed_mps = _UNKNOWN_SPEED_MPS if ping.speed_mps is None else ping.speed_mps
+    speed_mps = _DEFAULT_SPEED_MPS if ping.speed_mps is None else ping.speed_mps
     along_m = math.hypot(
         budget.position_m,
         ground_m * math.radians(budget.heading_deg),
@@ -283,16 +255,16 @@ def georeference(
         budget.layback_m if options.mounting.layback_m else 0.0,
     )
     bearing_deg = (ping.heading_deg + (90 if side is Side.STARBOARD else -90)) % 360
-    return GeoReference(place, ground_m, across_m, along_m, bearing_deg)
+    return GeoReference(position, ground_m, across_m, along_m, bearing_deg)
 
 
 def _ground_sigma_m(
     ground_m: float, altitude_m: float, slant_m: float, range_sigma_m: float, height_sigma_m: float
 ) -> float:
-    """Return the deviation of the ground range.
+    """Return the standard deviation of the ground range.
 
-    The derivative of sqrt(r^2 - h^2) is used while it describes the function; near the nadir it is unbounded, and
-    the range of values within one deviation of r^2 - h^2 is taken: sqrt of its deviation.
+    It follows from the derivative of sqrt(r^2 - h^2). Near the nadir the derivative has no bound; there the result is
+    limited to the square root of the deviation of r^2 - h^2.
     """
     squared_sigma = 2 * math.hypot(slant_m * range_sigma_m, altitude_m * height_sigma_m)
     return min(squared_sigma / (2 * ground_m), math.sqrt(squared_sigma)) if ground_m > 0 else math.sqrt(squared_sigma)

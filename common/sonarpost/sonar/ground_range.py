@@ -1,4 +1,4 @@
-"""A side without its water column, over equal steps on the bottom, and evened out across the swath."""
+"""Ground-range projection of a side, and normalisation across the swath."""
 
 from __future__ import annotations
 
@@ -15,78 +15,77 @@ FloatArray = npt.NDArray[np.float64]
 
 MAX_COLUMNS: Final = 1 << 16
 _ANGLE_BINS: Final = 90
-_LEAST_SAMPLES: Final = 30
-"""Fewer samples of an angle or range say nothing of its mean."""
+_MIN_SAMPLES: Final = 30
+"""Minimum number of samples for the mean of an angle."""
 
 
 def ground_range_image(survey: Survey, side: Side, altitude_m: FloatArray, spacing_m: float) -> FloatImage:
-    """Return one side over a flat bottom in equal steps of ground range.
+    """Project one side to a flat bottom, in equal steps of ground range.
 
-    Each column takes the echo at the slant range of its middle, between the two nearest samples; where a column
-    spans several samples (far from the nadir it never does by more than `spacing_m` over theirs) they are averaged.
+    Each column is the mean echo over the slant ranges that it covers.
 
     Args:
         survey: The pings.
-        side: The side.
-        altitude_m: Altitude of each ping, shape (pings,); NaN where unknown.
+        side: Port or starboard.
+        altitude_m: Altitude of each ping, shape (pings,); NaN if unknown.
         spacing_m: Width of a column in metres.
 
     Returns:
-        Shape (pings, columns), float32, NaN beyond a ping's range, in pings without that side and in pings without
+        Shape (pings, columns), float32, NaN beyond the range of a ping and in pings without that side or without
         altitude. Column 0 begins below the sonar.
 
     Raises:
-        ValueError: Another number of altitudes than pings, or a spacing that is not positive or gives over 65,536
-            columns.
+        ValueError: The number of altitudes differs from the number of pings, or the spacing is not positive or gives
+            more than 65,536 columns.
     """
     if altitude_m.shape != (len(survey.pings),):
         raise ValueError(f"altitudes of shape {altitude_m.shape}, expected one for each of {len(survey.pings)} pings")
-    reach_m = survey.reach_m(side)
-    if not spacing_m > 0 or reach_m / spacing_m > MAX_COLUMNS:
-        raise ValueError(f"spacing of {spacing_m} m over {reach_m} m, expected 1 to {MAX_COLUMNS} columns")
-    edges_m = np.arange(int(np.ceil(reach_m / spacing_m)) + 1) * spacing_m
+    range_m = survey.max_slant_range_m(side)
+    if not spacing_m > 0 or range_m / spacing_m > MAX_COLUMNS:
+        raise ValueError(f"spacing of {spacing_m} m over {range_m} m, expected 1 to {MAX_COLUMNS} columns")
+    edges_m = np.arange(int(np.ceil(range_m / spacing_m)) + 1) * spacing_m
     image = np.full((len(survey.pings), len(edges_m) - 1), np.nan, dtype=np.float32)
     for row, (ping, height_m) in enumerate(zip(survey.pings, altitude_m.tolist(), strict=True)):
         channel = ping.channel(side)
         if channel is None or not np.isfinite(height_m):
             continue
-        places = ground_to_slant_range_m(edges_m, height_m) / channel.sample_spacing_m
-        image[row] = means_between(channel.echo(), places)
+        edges = ground_to_slant_range_m(edges_m, height_m) / channel.sample_spacing_m
+        image[row] = interval_means(channel.echo(), edges)
     return image
 
 
-def means_between(samples: Samples | FloatImage, places: FloatArray, *, least_width: float = 0.0) -> FloatArray:
-    """Return the mean of a ping's samples between each two neighbouring places.
+def interval_means(samples: Samples | FloatImage, edges: FloatArray, *, min_width: float = 0.0) -> FloatArray:
+    """Return the mean of a ping's samples between neighbouring edges.
 
-    Places count samples from the beginning of the first one. A sample that a place cuts counts on both sides with its
-    part there, so a step within one sample has that sample's value.
+    A sample that contains an edge contributes to both intervals in proportion, so an interval within one sample has
+    the value of that sample.
 
     Args:
-        samples: Of one channel, or their echo strength, shape (n,), any number dtype, n from 1.
-        places: Not decreasing, from 0 on, shape (m + 1,).
-        least_width: A step must span more samples than this to have a mean.
+        samples: Samples of one channel, or their echo strength, shape (n,), any number dtype, n from 1.
+        edges: In samples from the beginning of the first one, not decreasing, from 0 on, shape (m + 1,).
+        min_width: An interval must be wider than this number of samples.
 
     Returns:
-        Shape (m,), float64; NaN where a step ends beyond the last sample or is not wider than `least_width`.
+        Shape (m,), float64; NaN where an interval ends beyond the last sample or is not wider than `min_width`.
     """
     cumulative = np.concatenate([[0.0], np.cumsum(samples, dtype=np.float64)])
-    totals = np.diff(np.interp(places, np.arange(len(cumulative)), cumulative))
-    widths = np.diff(places)
-    inside = (places[1:] <= len(samples)) & (widths > least_width)
+    totals = np.diff(np.interp(edges, np.arange(len(cumulative)), cumulative))
+    widths = np.diff(edges)
+    inside = (edges[1:] <= len(samples)) & (widths > min_width)
     means = np.full(len(widths), np.nan)
     means[inside] = totals[inside] / widths[inside]
     return means
 
 
 def range_normalised(image: FloatImage, *, window_pings: int = 501) -> FloatImage:
-    """Divide each column by its mean around each ping: what falls off with range becomes even.
+    """Divide each column by its moving mean along-track, which removes the decrease of the echo with range.
 
     Args:
-        image: Shape (pings, columns); NaN where nothing is known. Over ground or slant range.
-        window_pings: Pings over which the mean is taken; long against any object.
+        image: Shape (pings, columns) over ground or slant range; NaN where unknown.
+        window_pings: Window of the mean, much longer than any object.
 
     Returns:
-        Same shape, float32, about 1 everywhere; NaN stays.
+        Same shape, float32, about 1 on average; NaN stays NaN.
     """
     known = np.isfinite(image)
     values = np.where(known, image, 0).astype(np.float64)
@@ -97,18 +96,18 @@ def range_normalised(image: FloatImage, *, window_pings: int = 501) -> FloatImag
 
 
 def beam_normalised(image: FloatImage, altitude_m: FloatArray, spacing_m: float) -> FloatImage:
-    """Divide each sample by the mean of all samples seen at its angle: beam pattern and grazing angle become even.
+    """Divide each sample by the mean of all samples at its angle, which removes beam pattern and grazing angle.
 
-    The angle is that from the nadir, atan(ground range / altitude); its pattern is taken over the whole image, so it
-    holds when the altitude changes, where a mean by column does not.
+    The angle from the nadir is atan(ground range / altitude). Its mean is taken over the whole image, so it remains
+    valid when the altitude changes, unlike a mean by column.
 
     Args:
-        image: Over ground range, as `ground_range_image` gives it.
-        altitude_m: Altitude of each ping, shape (pings,); NaN where unknown.
+        image: Over ground range, from `ground_range_image`.
+        altitude_m: Altitude of each ping, shape (pings,); NaN if unknown.
         spacing_m: Width of a column in metres.
 
     Returns:
-        Same shape, float32, about 1 everywhere; NaN where nothing is known, or the angle was hardly seen.
+        Same shape, float32, about 1 on average; NaN where unknown or where the angle has fewer than 30 samples.
     """
     ground_m = (np.arange(image.shape[1]) + 0.5) * spacing_m
     angle = np.arctan2(ground_m[None, :], altitude_m[:, None])
@@ -116,7 +115,7 @@ def beam_normalised(image: FloatImage, altitude_m: FloatArray, spacing_m: float)
     place = np.where(known, angle / (np.pi / 2) * _ANGLE_BINS, 0).astype(np.intp).clip(0, _ANGLE_BINS - 1)
     count = np.bincount(place[known], minlength=_ANGLE_BINS)
     total = np.bincount(place[known], weights=image[known].astype(np.float64), minlength=_ANGLE_BINS)
-    mean = np.where(count >= _LEAST_SAMPLES, total / np.maximum(count, 1), 0.0)
+    mean = np.where(count >= _MIN_SAMPLES, total / np.maximum(count, 1), 0.0)
     divisor = mean[place]
     usable = known & (divisor > 0)
     result: FloatImage = np.where(usable, image / np.where(usable, divisor, 1), np.nan).astype(np.float32)

@@ -1,7 +1,7 @@
-"""Grey images on disk: TIFF for the record, PNG for people.
+"""Grey image files: TIFF as the record, PNG for display.
 
-Only plain grey of 8 or 16 bits goes through. What an image declares is checked before anything is decoded, so that a
-file of a few bytes cannot ask for gigabytes.
+Only grey of 8 or 16 bits is accepted. The declared size is checked before decoding, so that a small file cannot
+allocate gigabytes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sonarpost.files import write_atomically
 GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 MAX_PIXELS: Final = 1 << 26
-"""A whole survey of 30,000 pings of 2,000 samples fits; no snippet comes near."""
+"""Enough for a survey of 30,000 pings of 2,000 samples; snippets are much smaller."""
 MAX_FILE_BYTES: Final = 1 << 28
 
 _PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
@@ -34,10 +34,10 @@ _PNG_COLOURS: Final = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 
 
 
 def read_image(path: Path) -> GreyImage:
-    """Read a grey image, TIFF or PNG by its content (the suffix is not asked).
+    """Read a grey image, TIFF or PNG by its content (the suffix is ignored).
 
-    RGB of 8 or 16 bits whose three channels are equal is taken as the grey it is. A TIFF of several pages, an alpha
-    channel, a palette, float, 1-bit or 32-bit samples are refused.
+    RGB of 8 or 16 bits with three equal channels is read as grey. A TIFF of several pages, an alpha channel, a
+    palette, float, 1-bit or 32-bit samples are rejected.
 
     Args:
         path: The file.
@@ -46,7 +46,7 @@ def read_image(path: Path) -> GreyImage:
         Shape (rows, columns), uint8 or uint16 as in the file; 0 is black (a white-is-zero TIFF is inverted).
 
     Raises:
-        SurveyFileError: Not a readable grey image; an unwanted depth is named.
+        SurveyFileError: Not a readable grey image.
     """
     try:
         if not path.is_file():
@@ -65,7 +65,7 @@ def read_image(path: Path) -> GreyImage:
 
 
 def write_tiff(path: Path, image: GreyImage, description: str | None = None) -> None:
-    """Write a grey image as uncompressed TIFF, atomically; same image and description, same bytes.
+    """Write a grey image as uncompressed TIFF, atomically. The same image and description give the same bytes.
 
     Args:
         path: The file to create or replace.
@@ -80,7 +80,7 @@ def write_tiff(path: Path, image: GreyImage, description: str | None = None) -> 
 
 
 def tiff_bytes(path: Path, image: GreyImage, description: str | None = None) -> bytes:
-    """Return what `write_tiff` writes; the path is for errors only.
+    """Return the bytes that `write_tiff` writes; `path` is for error messages only.
 
     Raises:
         SurveyFileError: Another shape or depth, or a description that is not ASCII.
@@ -118,7 +118,7 @@ def write_png(path: Path, image: GreyImage) -> None:
 
 
 def png_bytes(path: Path, image: GreyImage) -> bytes:
-    """Return what `write_png` writes; the path is for errors only.
+    """Return the bytes that `write_png` writes; `path` is for error messages only.
 
     Raises:
         SurveyFileError: Another shape or depth.
@@ -137,7 +137,7 @@ def _check_writable(path: Path, image: GreyImage) -> None:
 
 
 def _read_png(raw: bytes, path: Path) -> npt.NDArray[np.generic]:
-    """Decode after the IHDR chunk has been judged: Pillow widens 1, 2 and 4 bits without saying so."""
+    """Check the IHDR chunk, then decode: Pillow converts 1, 2 and 4 bits silently."""
     if len(raw) < 33 or raw[12:16] != b"IHDR":
         raise SurveyFileError(str(path), "IHDR", raw[8:16], "a PNG header")
     columns, rows, depth, colour = struct.unpack(">IIBB", raw[16:26])
@@ -149,7 +149,7 @@ def _read_png(raw: bytes, path: Path) -> npt.NDArray[np.generic]:
         raise SurveyFileError(str(path), "depth", "RGB of 16 bits", _DEPTH_EXPECTED)
     _check_size(path, rows, columns)
     if _PNG_END not in raw:
-        # Pillow is content when the last pixel has arrived, though the checksum after it has not.
+        # Pillow accepts a file that ends after the last pixel, before the checksum.
         raise SurveyFileError(str(path), "IEND", "absent", "an end chunk: the file is truncated")
     try:
         with warnings.catch_warnings():
@@ -182,13 +182,13 @@ def _tiff_page(file: tifffile.TiffFile, path: Path) -> npt.NDArray[np.generic]:
         found = f"{channels} x {names.get(kind, f'sample format {kind}')} of {bits} bits"
         raise SurveyFileError(str(path), "depth", found, _DEPTH_EXPECTED)
     photometric = int(page.photometric)
-    # White is zero, black is zero, RGB: what remains is palettes, masks and print colours.
+    # Accepted: white is zero, black is zero, RGB; rejected: palettes, masks and print colours.
     if photometric not in ((0, 1) if channels == 1 else (2,)):
         raise SurveyFileError(str(path), "PhotometricInterpretation", photometric, _DEPTH_EXPECTED)
     rows, columns = int(page.imagelength), int(page.imagewidth)
     _check_size(path, rows, columns)
     if int(page.imagedepth) != 1 or (page.is_tiled and int(page.tilewidth) * int(page.tilelength) > MAX_PIXELS):
-        raise SurveyFileError(str(path), "layout", "a volume or a giant tile", "one flat picture")
+        raise SurveyFileError(str(path), "layout", "a volume or a giant tile", "a two-dimensional image")
     if len(file.pages) != 1:
         raise SurveyFileError(str(path), "pages", len(file.pages), "one")
     pixels = np.asarray(page.asarray(maxworkers=1))

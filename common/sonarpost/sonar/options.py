@@ -1,4 +1,4 @@
-"""What a survey file does not say, and its owner must: projection, mounting of the sonar, how good the sensors are."""
+"""Survey options: what survey files do not contain (projection, mounting of the sonar, accuracy of the sensors)."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class _Section(BaseModel):
 
 
 class Mounting(_Section):
-    """Where the sonar is, seen from the antenna or vehicle whose position the file holds.
+    """Position of the sonar relative to the recorded position (antenna or vehicle).
 
     Attributes:
-        forward_m: Sonar ahead of that point (negative: behind it).
+        forward_m: Sonar ahead of the recorded position (negative: behind it).
         starboard_m: Sonar to starboard of it.
-        layback_m: Horizontal distance of a towed body behind it, taken along the heading.
-        heading_offset_deg: Added to the recorded heading (a compass or transducer mounted askew).
+        layback_m: Horizontal distance of a towed body behind it, along the heading.
+        heading_offset_deg: Added to the recorded heading (compass or transducer mounted at an angle).
     """
 
     forward_m: _Offset = 0.0
@@ -36,30 +36,29 @@ class Mounting(_Section):
 
     @property
     def ahead_m(self) -> float:
-        """How far the sonar lies ahead of the recorded position, in metres."""
+        """Distance of the sonar ahead of the recorded position, in metres."""
         return self.forward_m - self.layback_m
 
     @property
-    def moves(self) -> bool:
-        """Whether the sonar is somewhere else than the recorded position."""
+    def is_offset(self) -> bool:
+        """Whether the position of the sonar differs from the recorded one."""
         return bool(self.ahead_m or self.starboard_m)
 
 
 class ErrorBudget(_Section):
-    """One standard deviation of each thing that goes into the position of a sample.
+    """Standard deviations of the quantities that determine the position of a sample.
 
-    The defaults are those of a small vehicle that dives on dead reckoning between fixes; a survey with better or
-    worse sensors states its own.
+    The defaults are those of a small vehicle that dives on dead reckoning between fixes.
 
     Attributes:
-        position_m: Of the recorded position, along each axis.
-        heading_deg: Of the heading, mounting included.
-        altitude_m: Of an altitude from the file.
-        tracked_altitude_m: Of an altitude from the picture (`track_bottom`).
-        sound_speed: Of the speed of sound the recorder assumed, as a fraction.
-        bottom_slope_deg: Of the bottom's slope across the track: the flat bottom is an assumption.
-        time_s: Of the ping's time against the position's.
-        layback_m: Of the layback, where there is one.
+        position_m: Recorded position, along each axis.
+        heading_deg: Heading, mounting included.
+        altitude_m: Altitude from the file.
+        tracked_altitude_m: Altitude from bottom tracking (`track_bottom`).
+        sound_speed: Sound speed assumed by the recorder, as a fraction.
+        bottom_slope_deg: Slope of the bottom across the track, which is assumed flat.
+        time_s: Time of the ping relative to the time of the position.
+        layback_m: Layback, if there is one.
     """
 
     position_m: _Sigma = 5.0
@@ -73,18 +72,18 @@ class ErrorBudget(_Section):
 
 
 class SurveyOptions(_Section):
-    """How survey files are to be understood where they leave a choice.
+    """Interpretation of survey files where the format leaves a choice.
 
     Attributes:
-        projected_crs: Coordinate system of positions in metres, as pyproj takes it (`EPSG:32619`). Without it a
+        projected_crs: Coordinate system of positions in metres, as pyproj accepts it (`EPSG:32619`). Without it a
             file in metres has no positions.
-        position_source: Which of XTF's two positions is taken: the sensor's, or the ship's (for a recorder that
-            left the sensor's at the ship's or at zero; give a layback with it).
-        port_order: Order of XTF's port samples; the format says farthest first, some recorders differ.
-        humminbird_sample_spacing_m: Slant range of one sample; Humminbird recordings do not hold it.
-        humminbird_depth_as_altitude: The echo sounder's depth is the altitude; else the picture tells it.
-        mounting: Where the sonar is.
-        errors: How good positions, headings and altitudes are.
+        position_source: Position field of XTF: the sensor's, or the ship's (for a recorder that leaves the sensor's
+            at the ship's or at zero; set a layback as well).
+        port_order: Order of the port samples of XTF; the format specifies farthest first, some recorders differ.
+        humminbird_sample_spacing_m: Slant range of one sample, which Humminbird recordings do not contain.
+        humminbird_depth_as_altitude: Use the depth of the echo sounder as altitude, in place of bottom tracking.
+        mounting: Position of the sonar.
+        errors: Accuracy of positions, headings and altitudes.
     """
 
     projected_crs: str | None = None
@@ -100,7 +99,7 @@ def load_options(path: Path) -> SurveyOptions:
     """Read options from a TOML file with the fields of `SurveyOptions`, `[mounting]` and `[errors]` as tables.
 
     Raises:
-        ConfigError: The file cannot be read, is not TOML, or a value is not one of the field's.
+        ConfigError: The file cannot be read, is not TOML, or contains an invalid field or value.
     """
     try:
         if path.stat().st_size > _MAX_BYTES:

@@ -1,4 +1,4 @@
-"""A survey that is read ping by ping, however long the recording is."""
+"""Survey sources: recordings of any length, read ping by ping."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from types import TracebackType
 from typing import Final, Self
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.navigation import NavigationStatistics, PositionJumpFilter, mounted
+from sonarpost.sonar.navigation import NavigationChecks, PositionJumpFilter, apply_mounting
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.survey import Ping, Side, Survey
 
 MAX_HELD_BYTES: Final = 1 << 30
-"""Of samples that a survey held in memory may have; a longer recording is read in blocks."""
+"""Maximum size of the samples of a survey in memory; a longer recording is read in blocks."""
 STRIP_BYTES: Final = 1 << 26
-"""Of samples that a strip holds: the detector needs about twenty times as much to work on it."""
+"""Target size of the samples of a strip; the detector needs about twenty times as much memory."""
 
 
 @dataclass(frozen=True, slots=True)
 class SurveyInfo:
-    """What is known of a recording once it has been walked through.
+    """Description of a recording, known after the first pass through the file.
 
     Attributes:
-        path: Where it is.
-        sonar_id: Name of the sonar as the file gives it, or "unknown".
-        line_name: Survey line, normally the file's stem.
-        ping_count: Pings that `pings()` gives.
-        sides: Sides that at least one ping has, port first.
-        warnings: What was met and could be explained, one line each.
+        path: The file.
+        sonar_id: Name of the sonar in the file, or "unknown".
+        line_name: Survey line, normally the stem of the file name.
+        ping_count: Number of pings.
+        sides: Sides of all pings together, port first.
+        warnings: Irregularities of the file, one line each.
     """
 
     path: Path
@@ -44,21 +44,21 @@ class SurveyInfo:
 
 
 class SurveySource(ABC):
-    """An open recording: a description, and as many walks through its pings as are asked for."""
+    """An open recording: its description, and iteration over its pings, any number of times."""
 
     info: SurveyInfo
     options: SurveyOptions
 
     @abstractmethod
     def pings(self) -> Iterator[Ping]:
-        """Yield the pings in the order of recording, the same ones each time.
+        """Yield the pings in the order of recording.
 
         Raises:
-            SurveyFileError: The file was changed since it was opened, or can no longer be read.
+            SurveyFileError: The file has changed since it was opened, or cannot be read.
         """
 
-    def close(self) -> None:  # noqa: B027 - a source that holds no file has nothing to close
-        """Close what is open; more than once does no harm."""
+    def close(self) -> None:  # noqa: B027 - a source without a file has nothing to close
+        """Close the files. Closing again has no effect."""
 
     def __enter__(self) -> Self:
         return self
@@ -70,10 +70,10 @@ class SurveySource(ABC):
 
 
 class StreamedSource(SurveySource):
-    """A source over a file: a reader fills in `_walk`, the checks that all formats share are made here.
+    """A source that reads a file with constant memory. It applies the navigation checks that all formats share.
 
-    A first walk when it is opened validates the whole file and collects the warnings; memory does not grow with the
-    file's length. A subclass prepares itself in its own `__init__`, then calls `_scan`.
+    A subclass implements `_read_pings`, opens its file in `__init__` and then calls `_validate`, which reads the whole
+    file once and collects the warnings.
     """
 
     def __init__(self, path: Path, options: SurveyOptions) -> None:
@@ -81,51 +81,51 @@ class StreamedSource(SurveySource):
         self.options = options
 
     @abstractmethod
-    def _walk(self, *, first: bool) -> Iterator[Ping]:
-        """Yield the pings as the file has them; on the first walk also collect what `_notes` tells."""
+    def _read_pings(self, *, first_pass: bool) -> Iterator[Ping]:
+        """Yield the pings as stored in the file; in the first pass also collect data for `_format_warnings`."""
 
-    def _notes(self) -> list[str]:
-        """Return the format's own warnings after the first walk."""
+    def _format_warnings(self) -> list[str]:
+        """Return the warnings specific to the format, after the first pass."""
         return []
 
-    def _scan(self, sonar_id: str, line_name: str) -> None:
-        """Walk through the whole file and describe it.
+    def _validate(self, sonar_id: str, line_name: str) -> None:
+        """Read the whole file and set `info`.
 
         Raises:
             SurveyFileError: The file is damaged, or has no ping with a port or starboard channel.
         """
-        scan = NavigationStatistics(self.options.mounting)
+        checks = NavigationChecks(self.options.mounting)
         sides: set[Side] = set()
         count = 0
-        for ping in self._walk(first=True):
-            scan.observe(count, ping)
+        for ping in self._read_pings(first_pass=True):
+            checks.observe(count, ping)
             sides.update(channel.side for channel in ping.channels)
             count += 1
         if not sides:
             raise SurveyFileError(str(self.path), "pings", count, "at least one ping with a port or starboard channel")
-        warnings = (*self._notes(), *scan.warnings(count))
+        warnings = (*self._format_warnings(), *checks.warnings(count))
         ordered = tuple(side for side in Side if side in sides)
         self.info = SurveyInfo(self.path, sonar_id, line_name, count, ordered, warnings)
 
     def pings(self) -> Iterator[Ping]:
-        """Yield the pings with implausible fixes left out and the sonar's mounting applied."""
-        gate = PositionJumpFilter()
-        for ping in self._walk(first=False):
-            yield mounted(gate.checked(ping), self.options.mounting)
+        """Yield the pings without implausible fixes and with the mounting applied."""
+        jumps = PositionJumpFilter()
+        for ping in self._read_pings(first_pass=False):
+            yield apply_mounting(jumps.filter(ping), self.options.mounting)
 
 
 class InMemorySource(SurveySource):
-    """A survey in memory as a source, for formats whose reader holds the whole file anyway."""
+    """A survey in memory as a source, for formats that are read as a whole."""
 
     def __init__(self, survey: Survey, options: SurveyOptions) -> None:
         self.options = options
-        scan = NavigationStatistics(options.mounting)
+        checks = NavigationChecks(options.mounting)
         for row, ping in enumerate(survey.pings):
-            scan.observe(row, ping)
-        gate = PositionJumpFilter()
-        pings = tuple(mounted(gate.checked(ping), options.mounting) for ping in survey.pings)
+            checks.observe(row, ping)
+        jumps = PositionJumpFilter()
+        pings = tuple(apply_mounting(jumps.filter(ping), options.mounting) for ping in survey.pings)
         self._survey = replace(survey, pings=pings)
-        warnings = (*survey.warnings, *scan.warnings(len(pings)))
+        warnings = (*survey.warnings, *checks.warnings(len(pings)))
         self.info = SurveyInfo(survey.path, survey.sonar_id, survey.line_name, len(pings), survey.sides(), warnings)
 
     def pings(self) -> Iterator[Ping]:
@@ -133,15 +133,15 @@ class InMemorySource(SurveySource):
         return iter(self._survey.pings)
 
 
-def gather(source: SurveySource, max_bytes: int = MAX_HELD_BYTES) -> Survey:
-    """Hold a whole source in memory.
+def load_survey(source: SurveySource, max_bytes: int = MAX_HELD_BYTES) -> Survey:
+    """Load a whole source into memory.
 
     Args:
         source: The recording.
-        max_bytes: Of samples that may be held.
+        max_bytes: Maximum size of its samples.
 
     Raises:
-        SurveyFileError: It has more, or cannot be read.
+        SurveyFileError: The samples are larger, or the file cannot be read.
     """
     info = source.info
     held = 0
@@ -155,20 +155,20 @@ def gather(source: SurveySource, max_bytes: int = MAX_HELD_BYTES) -> Survey:
 
 
 def blocks(source: SurveySource, length: int = 1000, overlap: int = 0) -> Iterator[tuple[int, Survey]]:
-    """Cut a recording into surveys that fit into memory.
+    """Divide a recording into surveys that fit into memory.
 
     Args:
         source: The recording.
         length: New pings of each block, at least 1.
-        overlap: Pings before and after the new ones, for filters that look around.
+        overlap: Pings before and after the new ones, for filters with a neighbourhood.
 
     Yields:
-        How many pings of the block's beginning are overlap, and the block: its first ones and its last `overlap`
-        are overlap (the last block has no later ones).
+        The number of overlap pings at the beginning of the block, and the block. Its last `overlap` pings are overlap
+        as well, except in the last block.
 
     Raises:
         ValueError: A length below 1 or an overlap below 0.
-        SurveyFileError: The file can no longer be read.
+        SurveyFileError: The file cannot be read.
     """
     if length < 1 or overlap < 0:
         raise ValueError(f"block of {length} with overlap {overlap}, expected at least 1 and 0")
@@ -186,12 +186,12 @@ def blocks(source: SurveySource, length: int = 1000, overlap: int = 0) -> Iterat
 
 @dataclass(frozen=True, slots=True)
 class Strip:
-    """A piece of a stream of pings.
+    """A part of a stream of pings.
 
     Attributes:
-        first_row: Place of its first ping in the stream.
+        first_row: Row of its first ping in the stream.
         pings: The pings; the last ones of a strip are the first ones of the next.
-        is_last: Nothing follows it.
+        is_last: Whether it is the last strip.
     """
 
     first_row: int
@@ -202,22 +202,22 @@ class Strip:
 def strips(
     pings: Iterable[Ping], length: int = 1000, overlap: int = 0, max_bytes: int = STRIP_BYTES
 ) -> Iterator[Strip]:
-    """Cut a stream of pings, of one recording or of several that follow each other, into pieces that fit into memory.
+    """Divide a stream of pings, of one recording or of consecutive ones, into overlapping strips that fit into memory.
 
-    What is left at the end and shorter than half a strip goes with the strip before it.
+    A remainder shorter than half a strip is added to the last strip.
 
     Args:
         pings: The stream.
-        length: Pings of a strip, more than `overlap`; the last one may have up to half as many more, or fewer.
+        length: Pings of a strip, more than `overlap`; the last strip has fewer, or up to half as many more.
         overlap: Pings that a strip has in common with the next.
-        max_bytes: Of samples that are held; strips of long pings are shorter.
+        max_bytes: Target size of the samples in memory; strips of long pings are shorter.
 
     Yields:
         The strips in order; none for an empty stream.
 
     Raises:
         ValueError: A length not above the overlap, or an overlap below 0.
-        SurveyFileError: `max_bytes` do not hold twice the overlap.
+        SurveyFileError: Twice the overlap exceeds `max_bytes`.
     """
     if overlap < 0 or length <= overlap:
         raise ValueError(f"strips of {length} with overlap {overlap}, expected more than the overlap, from 0")
@@ -233,11 +233,9 @@ def strips(
         held.append(ping)
         size += _size_bytes(ping)
         if size > 2 * max_bytes:
-            # The row counts within the stream, which may have begun in another file.
-            where, value = (
-                f"survey, row {first_row + len(held) - 1}",
-                f"over {2 * max_bytes} bytes in {len(held)} pings",
-            )
+            # The row is that of the stream, which may have started in another file.
+            where = f"survey, row {first_row + len(held) - 1}"
+            value = f"over {2 * max_bytes} bytes in {len(held)} pings"
             raise SurveyFileError(where, "samples", value, "pings of fewer samples")
     if held:
         yield Strip(first_row, tuple(held), is_last=True)

@@ -1,4 +1,4 @@
-"""Writer of XTF recordings, for the simulator, for cut-out surveys and for tests of other people's readers."""
+"""Writer of XTF recordings, for the simulator, for parts of surveys and for tests with other readers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from pyxtf import XTFFileHeader, XTFPingChanHeader, XTFPingHeader
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.files import write_atomically
-from sonarpost.sonar.readers.xtf import KNOT_MPS, NAV_UNITS_DEGREES
+from sonarpost.sonar.navigation import KNOT_MPS
+from sonarpost.sonar.readers.xtf import NAV_UNITS_DEGREES
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
@@ -26,23 +27,23 @@ _SOUND_SPEED_MPS: Final = 1500.0
 _ALIGNMENT_BYTES: Final = 64
 
 _Slot = tuple[Side, int]
-"""A channel of the file: a side, and the how-manieth channel of that side in a ping."""
+"""A channel of the file: a side, and the number of the channel on that side of a ping."""
 
 
 def write_xtf(survey: Survey, path: Path) -> None:
     """Write a survey as XTF, atomically.
 
-    Samples keep their size (8, 16 or 32 bits). Time is rounded to 10 ms, the format's resolution; altitude, depth,
-    heading, attitude and speed to 32-bit floats. XTF has no "not known": a value of None is written as zero, which
-    `read_xtf` takes for None where the format leaves no doubt (position, altitude, a field zero throughout).
-    A heading of exactly north is written as 360 degrees for the same reason. Same survey, same bytes.
+    Samples keep their size (8, 16 or 32 bits). Time is rounded to 10 ms, the resolution of the format; altitude,
+    depth, heading, attitude and speed to 32-bit floats. XTF has no code for an unknown value: None is written as zero,
+    which `read_xtf` reads as None for a position, an altitude, or a field that is zero in every ping. For the same
+    reason a heading of exactly 0 degrees is written as 360. The same survey gives the same bytes.
 
     Args:
         survey: The survey.
         path: The file to create or replace.
 
     Raises:
-        SurveyFileError: The survey cannot be put into the format (more than six channels, a channel whose sample
+        SurveyFileError: The format cannot represent the survey (more than six channels, a channel whose sample
             size changes, a sonar name over 15 ASCII characters, or a value out of range).
         OSError: The file cannot be written.
     """
@@ -54,7 +55,7 @@ def write_xtf(survey: Survey, path: Path) -> None:
 
 
 def _slots(survey: Survey, path: Path) -> dict[_Slot, ChannelPing]:
-    """Return the channels of the file in their order, each with the first ping's channel that stands for it."""
+    """Return the channels of the file in their order, each with its first occurrence in a ping."""
     found: dict[_Slot, ChannelPing] = {}
     for row, ping in enumerate(survey.pings):
         for slot, channel in _numbered(ping):
@@ -119,7 +120,7 @@ def _packet(ping: Ping, row: int, slots: dict[_Slot, ChannelPing], path: Path) -
 
 
 def _stored_samples(channel: ChannelPing) -> bytes:
-    """Return the samples little-endian, port farthest first as the format has it."""
+    """Return the samples little-endian, port farthest first as the format requires."""
     ordered = channel.samples[::-1] if channel.side is Side.PORT else channel.samples
     return ordered.astype(ordered.dtype.newbyteorder("<")).tobytes()
 
@@ -135,7 +136,7 @@ def _channel_header(channel: ChannelPing, number: int, row: int, path: Path) -> 
     head.SlantRange = slant_range_m
     head.TimeDuration = 2 * slant_range_m / _SOUND_SPEED_MPS
     frequency_khz = (channel.frequency_hz or 0.0) / 1000
-    # The ping's field holds whole kHz; another frequency stands in the file header alone.
+    # The field of the ping is an integer in kHz; other frequencies are in the file header only.
     if frequency_khz == round(frequency_khz) and 0 < frequency_khz < 10_000:
         head.Frequency = round(frequency_khz)
     head.NumSamples = channel.samples.shape[0]
@@ -149,7 +150,7 @@ def _ping_header(ping: Ping, row: int, path: Path) -> XTFPingHeader:
         raise _refuse(path, row, "number", ping.number, "0 to 4294967295")
     head.PingNumber = ping.number
     _set_time(head, ping, row, path)
-    # Two-way travel: the format's sound velocity is halved.
+    # Two-way travel: the sound velocity of the format is halved.
     head.SoundVelocity = _SOUND_SPEED_MPS / 2
     values = {
         "SensorYcoordinate": ping.lat_deg,

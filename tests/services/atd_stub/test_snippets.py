@@ -28,7 +28,7 @@ from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.image_files import read_image, write_tiff
 from sonarpost.sonar.options import ErrorBudget, Mounting
 from sonarpost.sonar.readers import open_survey
-from sonarpost.sonar.source import gather
+from sonarpost.sonar.source import load_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -45,7 +45,7 @@ def line(tmp_path_factory) -> Path:
 
 def best_contact_of(path: Path, config: AtdStubConfig, change=lambda ping: ping):
     with open_survey(path, config.survey_options()) as source:
-        survey = gather(source)
+        survey = load_survey(source)
     survey = replace(survey, pings=tuple(change(ping) for ping in survey.pings))
     found = detect(survey)[0]
     return survey, found, snippet_of(survey, found, ORIGIN, "uuv-1", config).contact

@@ -15,7 +15,8 @@ from sonarpost.simulation.seabed.echo import SonarSettings, Track, echo_intensit
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.targets import MINE_LIKE_KINDS, ObjectKind, SeabedObject, place_object
 from sonarpost.simulation.seabed.terrain import Seabed, SeabedKind
-from sonarpost.sonar.geometry import Position, offset_between_m, ping_spacing_m, sample_position
+from sonarpost.sonar.geometry import Position, georeference, offset_between_m, ping_spacing_m
+from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import Side
 
@@ -153,8 +154,8 @@ def test_the_truth_is_where_the_chart_and_the_picture_have_it():
     simulated = simulate_survey(spec)
     for thing in simulated.truth:
         ping = simulated.survey.pings[thing.ping]
-        place = sample_position(ping, thing.side, thing.sample_index)
-        north, east = offset_between_m(Position(thing.lat_deg, thing.lon_deg), place)
+        found = georeference(ping, thing.side, thing.sample_index, SurveyOptions())
+        north, east = offset_between_m(Position(thing.lat_deg, thing.lon_deg), found.position)
         # The middle of an object at half its height, against the flat bottom that geo-referencing assumes.
         assert math.hypot(north, east) < 1.0
         image = simulated.survey.waterfall(thing.side)

@@ -1,4 +1,4 @@
-"""The actions of `sonarpost survey`."""
+"""`sonarpost survey`: describe, draw and export recordings."""
 
 from __future__ import annotations
 

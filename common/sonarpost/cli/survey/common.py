@@ -1,4 +1,4 @@
-"""Options that the actions share."""
+"""Options and texts that the actions share."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from sonarpost.sonar.options import SurveyOptions, load_options
 
 
 def add_option_flags(parser: argparse.ArgumentParser) -> None:
-    """Add what says how a file is to be understood."""
+    """Add the options for the interpretation of a file."""
     parser.add_argument(
-        "--options", type=Path, metavar="FILE.toml", help="mounting, errors, projection (docs/explanation/surveys.md)"
+        "--options", type=Path, metavar="FILE.toml", help="mounting, errors, projection (see the page Surveys)"
     )
-    parser.add_argument("--crs", metavar="EPSG:N", help="what positions in metres are in; goes before the options file")
+    parser.add_argument("--crs", metavar="EPSG:N", help="coordinate system of positions in metres; overrides the file")
 
 
 def options_of(parsed: argparse.Namespace) -> SurveyOptions:
-    """Return the survey options that the command line asks for.
+    """Return the survey options of the command line.
 
     Raises:
-        ConfigError: The options file is wrong.
+        ConfigError: The options file is invalid.
     """
     options = load_options(parsed.options) if parsed.options is not None else SurveyOptions()
     return options if parsed.crs is None else options.model_copy(update={"projected_crs": parsed.crs})

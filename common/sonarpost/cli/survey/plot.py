@@ -1,11 +1,4 @@
-"""`sonarpost survey plot FILE…`: the waterfall with a range scale and the track, as PNG.
-
-## sonarpost.cli.survey.plot
-A recording's track on the tangent plane, with a scale, north up.
-
-## sonarpost.cli.survey.plot
-A recording as an operator's waterfall with scales, however long it is: rows of pings are averaged to fit.
-"""
+"""`sonarpost survey plot FILE…`: waterfall with scales, and track, as PNG; rows of pings are averaged to fit."""
 
 from __future__ import annotations
 
@@ -30,7 +23,18 @@ from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import SurveySource, blocks
 from sonarpost.sonar.survey import Ping, Side, Survey
 
-_MOST_ROWS = 20_000
+FloatArray = npt.NDArray[np.float64]
+
+SIDE_PX = 500
+"""Width of one side of the waterfall."""
+MAX_ROWS = 1500
+_MAX_ROWS_OPTION = 20_000
+_LEFT_PX, _BOTTOM_PX, _TOP_PX, _RIGHT_PX = 150, 34, 22, 30
+_BLOCK_PINGS, _OVERLAP_PINGS = 1000, 50
+_TRACK_PX, _MARGIN_PX = 800, 60
+_MAX_FIXES = 4096
+_INK, _PAPER, _BOTTOM_COLOUR = (20, 20, 20), (245, 245, 245), (255, 190, 0)
+_LINE, _START, _END = (20, 70, 160), (0, 140, 60), (200, 30, 30)
 
 
 def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -41,28 +45,32 @@ def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         description="Write NAME-waterfall.png and NAME-track.png for every survey file NAME.",
     )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="survey file")
-    parser.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder for the pictures (default: .)")
-    parser.add_argument("--ground", action="store_true", help="without the water column, over ground range")
-    parser.add_argument("--even", action="store_true", help="with --ground: divided by the mean echo of its angle")
+    parser.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="output folder (default: .)")
+    parser.add_argument("--ground", action="store_true", help="ground range, without the water column")
+    parser.add_argument("--even", action="store_true", help="with --ground: divide by the mean echo at each angle")
     parser.add_argument(
-        "--rows", type=int, default=MAX_ROWS, metavar="N", help="pings are averaged to fit (default: %(default)s)"
+        "--rows",
+        type=int,
+        default=MAX_ROWS,
+        metavar="N",
+        help="maximum rows, by averaging pings (default: %(default)s)",
     )
     add_option_flags(parser)
     parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Draw every file; print the names of the pictures; return 0.
+    """Draw every file; print the names of the images; return 0.
 
     Raises:
         SurveyFileError: A file cannot be read.
-        ConfigError: The options file or the number of rows is wrong.
-        OSError: A picture cannot be written.
+        ConfigError: The options file or the number of rows is invalid.
+        OSError: An image cannot be written.
     """
-    if not 1 <= parsed.rows <= _MOST_ROWS:
-        raise ConfigError("survey plot", "--rows", parsed.rows, f"1 to {_MOST_ROWS}")
+    if not 1 <= parsed.rows <= _MAX_ROWS_OPTION:
+        raise ConfigError("survey plot", "--rows", parsed.rows, f"1 to {_MAX_ROWS_OPTION}")
     if parsed.even and not parsed.ground:
-        raise ConfigError("survey plot", "--even", "without --ground", "--ground, which knows the angles")
+        raise ConfigError("survey plot", "--even", "without --ground", "--even together with --ground")
     options = options_of(parsed)
     for path in parsed.files:
         with open_survey(path, options) as source:
@@ -70,31 +78,26 @@ def run(parsed: argparse.Namespace) -> int:
             title = f"{name}   {source.info.sonar_id}   {source.info.ping_count} pings"
             reduced = reduce_survey(source, over_ground=parsed.ground, max_rows=parsed.rows)
             if parsed.even:
-                reduced = evened(reduced)
-            pictures = {
+                reduced = angle_normalised(reduced)
+            images = {
                 "waterfall": draw_waterfall(reduced, title, over_ground=parsed.ground),
                 "track": draw_track(thinned_track(source.pings()), title),
             }
-        for kind, picture in pictures.items():
+        for kind, image in images.items():
             target = parsed.out / f"{name}-{kind}.png"
-            write_atomically(target, _png(picture))
+            write_atomically(target, _png(image))
             print(target)
     return 0
 
 
-def _png(picture: Image.Image) -> bytes:
+def _png(image: Image.Image) -> bytes:
     buffer = io.BytesIO()
-    picture.save(buffer, format="PNG")
+    image.save(buffer, format="PNG")
     return buffer.getvalue()
 
 
-_SIDE_PX, _MARGIN_PX = 800, 60
-_MAX_FIXES = 4096
-_INK, _PAPER, _LINE, _START, _END = (20, 20, 20), (245, 245, 245), (20, 70, 160), (0, 140, 60), (200, 30, 30)
-
-
 def thinned_track(pings: Iterable[Ping]) -> list[Position]:
-    """Return at most 4096 fixes, evenly spread over the recording; the last is always among them."""
+    """Return at most 4096 fixes, evenly distributed over the recording, including the last one."""
     kept: list[Position] = []
     every, number = 1, 0
     last: Position | None = None
@@ -113,24 +116,24 @@ def thinned_track(pings: Iterable[Ping]) -> list[Position]:
 
 
 def draw_track(track: list[Position], title: str) -> Image.Image:
-    """Draw a track: start green, end red, a scale bar, and the position of the start in words.
+    """Draw a track, north up: start green, end red, a scale bar, and the position of the start as text.
 
     Returns:
-        RGB picture; one that says so for a recording without positions.
+        RGB image; with the text "no positions" for a recording without fixes.
     """
-    picture = Image.new("RGB", (_SIDE_PX, _SIDE_PX), _PAPER)
-    draw = ImageDraw.Draw(picture)
+    image = Image.new("RGB", (_TRACK_PX, _TRACK_PX), _PAPER)
+    draw = ImageDraw.Draw(image)
     draw.text((6, 4), title, fill=_INK)
     if not track:
-        draw.text((_SIDE_PX // 2, _SIDE_PX // 2), "no positions", fill=_INK, anchor="mm")
-        return picture
-    points_m = [offset_between_m(track[0], place) for place in track]
+        draw.text((_TRACK_PX // 2, _TRACK_PX // 2), "no positions", fill=_INK, anchor="mm")
+        return image
+    points_m = [offset_between_m(track[0], position) for position in track]
     norths, easts = zip(*points_m, strict=True)
     extent_m = max(max(norths) - min(norths), max(easts) - min(easts), 1.0)
-    metre_px = (_SIDE_PX - 2 * _MARGIN_PX) / extent_m
-    middle_n, middle_e = (max(norths) + min(norths)) / 2, (max(easts) + min(easts)) / 2
+    metre_px = (_TRACK_PX - 2 * _MARGIN_PX) / extent_m
+    centre_n, centre_e = (max(norths) + min(norths)) / 2, (max(easts) + min(easts)) / 2
     pixels = [
-        (_SIDE_PX / 2 + (east - middle_e) * metre_px, _SIDE_PX / 2 - (north - middle_n) * metre_px)
+        (_TRACK_PX / 2 + (east - centre_e) * metre_px, _TRACK_PX / 2 - (north - centre_n) * metre_px)
         for north, east in points_m
     ]
     if len(pixels) > 1:
@@ -139,60 +142,51 @@ def draw_track(track: list[Position], title: str) -> Image.Image:
         draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=colour)
         draw.text((x + 8, y - 5), name, fill=colour)
     step_m = nice_step(extent_m / 3)
-    left, y = _MARGIN_PX, _SIDE_PX - 28
+    left, y = _MARGIN_PX, _TRACK_PX - 28
     draw.line((left, y, left + step_m * metre_px, y), fill=_INK, width=3)
     draw.text((left, y + 6), f"{step_m:g} m", fill=_INK)
-    draw.text((_SIDE_PX - 20, 30), "N", fill=_INK, anchor="mm")
-    draw.line((_SIDE_PX - 20, 40, _SIDE_PX - 20, 70), fill=_INK, width=2)
+    draw.text((_TRACK_PX - 20, 30), "N", fill=_INK, anchor="mm")
+    draw.line((_TRACK_PX - 20, 40, _TRACK_PX - 20, 70), fill=_INK, width=2)
     start = track[0]
-    place = (
+    text = (
         f"start {abs(start.lat_deg):.6f} {'NS'[start.lat_deg < 0]} {abs(start.lon_deg):.6f} {'EW'[start.lon_deg < 0]}"
     )
-    draw.text((_SIDE_PX - 8, y + 6), f"{place}; {math.hypot(*points_m[-1]):.0f} m to the end", fill=_INK, anchor="ra")
-    return picture
-
-
-FloatArray = npt.NDArray[np.float64]
-
-SIDE_PX = 500
-"""Width of a side."""
-MAX_ROWS = 1500
-_LEFT_PX, _BOTTOM_PX, _TOP_PX, _RIGHT_PX = 150, 34, 22, 30
-_BLOCK_PINGS, _OVERLAP_PINGS = 1000, 50
-_INK, _PAPER, _BOTTOM_COLOUR = (20, 20, 20), (245, 245, 245), (255, 190, 0)
+    draw.text((_TRACK_PX - 8, y + 6), f"{text}; {math.hypot(*points_m[-1]):.0f} m to the end", fill=_INK, anchor="ra")
+    return image
 
 
 @dataclass
 class Reduced:
-    """A recording averaged to a picture's size.
+    """A recording averaged to the size of an image.
 
     Attributes:
-        echo: Mean echo, shape (rows, 2 * SIDE_PX), port mirrored to the left; NaN where nothing was recorded.
-        altitude_m: Mean altitude of each row; NaN where neither file nor picture tells.
-        times_utc_s: Time of each row's first ping.
-        numbers: Number of each row's first ping.
-        reach_m: Range of the outer edges.
+        echo: Mean echo, shape (rows, 2 * SIDE_PX), port mirrored to the left; NaN where not recorded.
+        altitude_m: Mean altitude of each row; NaN if unknown.
+        times_utc_s: Time of the first ping of each row.
+        numbers: Number of the first ping of each row.
+        max_range_m: Range of the outer edges.
     """
 
     echo: FloatArray
     altitude_m: FloatArray
     times_utc_s: list[float]
     numbers: list[int]
-    reach_m: float
+    max_range_m: float
 
 
 def reduce_survey(source: SurveySource, *, over_ground: bool, max_rows: int = MAX_ROWS) -> Reduced:
-    """Walk through a recording and average it into at most `max_rows` rows.
+    """Read a recording and average it into at most `max_rows` rows.
 
     Args:
         source: The recording.
-        over_ground: Columns are ground range, without the water column, in place of slant range.
-        max_rows: Rows of the picture, at least 1.
+        over_ground: Ground range without the water column, in place of slant range.
+        max_rows: Maximum rows of the image, at least 1.
 
     Raises:
-        SurveyFileError: The file can no longer be read.
+        SurveyFileError: The file cannot be read.
     """
-    reach_m = max(reach_m for ping in source.pings() if (reach_m := ping.reach_m()) is not None)
+    ranges_m = (ping.max_slant_range_m() for ping in source.pings())
+    max_range_m = max(range_m for range_m in ranges_m if range_m is not None)
     per_row = math.ceil(source.info.ping_count / max_rows)
     rows = math.ceil(source.info.ping_count / per_row)
     total, count = np.zeros((rows, 2 * SIDE_PX)), np.zeros((rows, 2 * SIDE_PX))
@@ -200,25 +194,25 @@ def reduce_survey(source: SurveySource, *, over_ground: bool, max_rows: int = MA
     times: list[float] = []
     numbers: list[int] = []
     first = 0
-    for survey, altitude_m in _parts(source):
-        place = (first + np.arange(len(survey.pings))) // per_row
-        image = _both_sides(survey, altitude_m if over_ground else np.zeros_like(altitude_m), reach_m)
+    for survey, altitude_m in _blocks_with_altitude(source):
+        row_of_ping = (first + np.arange(len(survey.pings))) // per_row
+        image = _both_sides(survey, altitude_m if over_ground else np.zeros_like(altitude_m), max_range_m)
         valid = np.isfinite(image)
-        np.add.at(total, place, np.where(valid, image, 0))
-        np.add.at(count, place, valid)
-        np.add.at(heights, place, np.nan_to_num(altitude_m))
-        np.add.at(known, place, np.isfinite(altitude_m))
-        for row, ping in zip(place.tolist(), survey.pings, strict=True):
+        np.add.at(total, row_of_ping, np.where(valid, image, 0))
+        np.add.at(count, row_of_ping, valid)
+        np.add.at(heights, row_of_ping, np.nan_to_num(altitude_m))
+        np.add.at(known, row_of_ping, np.isfinite(altitude_m))
+        for row, ping in zip(row_of_ping.tolist(), survey.pings, strict=True):
             if row == len(times):
                 times.append(ping.time_utc_s)
                 numbers.append(ping.number)
         first += len(survey.pings)
     echo = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    return Reduced(echo, np.where(known > 0, heights / np.maximum(known, 1), np.nan), times, numbers, reach_m)
+    return Reduced(echo, np.where(known > 0, heights / np.maximum(known, 1), np.nan), times, numbers, max_range_m)
 
 
-def _parts(source: SurveySource) -> Iterator[tuple[Survey, FloatArray]]:
-    """Yield pieces of the recording with their altitudes, tracked with pings of the neighbours in sight."""
+def _blocks_with_altitude(source: SurveySource) -> Iterator[tuple[Survey, FloatArray]]:
+    """Yield blocks of the recording with their altitudes; bottom tracking includes pings of the neighbouring blocks."""
     for lead, survey in blocks(source, _BLOCK_PINGS, _OVERLAP_PINGS):
         end = min(lead + _BLOCK_PINGS, len(survey.pings))
         altitude_m = altitudes_m(survey)[lead:end]
@@ -226,11 +220,11 @@ def _parts(source: SurveySource) -> Iterator[tuple[Survey, FloatArray]]:
         yield part, altitude_m
 
 
-def _both_sides(survey: Survey, altitude_m: FloatArray, reach_m: float) -> FloatArray:
-    """Return both sides in SIDE_PX columns each; an altitude of 0 leaves slant range as it is."""
+def _both_sides(survey: Survey, altitude_m: FloatArray, max_range_m: float) -> FloatArray:
+    """Return both sides in SIDE_PX columns each; an altitude of 0 gives slant range."""
     image = np.full((len(survey.pings), 2 * SIDE_PX), np.nan)
     for side in survey.sides():
-        half = ground_range_image(survey, side, altitude_m, reach_m / SIDE_PX)[:, :SIDE_PX]
+        half = ground_range_image(survey, side, altitude_m, max_range_m / SIDE_PX)[:, :SIDE_PX]
         if side is Side.PORT:
             image[:, SIDE_PX - half.shape[1] : SIDE_PX] = half[:, ::-1]
         else:
@@ -238,9 +232,9 @@ def _both_sides(survey: Survey, altitude_m: FloatArray, reach_m: float) -> Float
     return image
 
 
-def evened(reduced: Reduced) -> Reduced:
-    """Return a recording over ground range with beam pattern and grazing angle evened out, each side by itself."""
-    spacing_m = reduced.reach_m / SIDE_PX
+def angle_normalised(reduced: Reduced) -> Reduced:
+    """Return a recording over ground range, each side divided by the mean echo at each angle."""
+    spacing_m = reduced.max_range_m / SIDE_PX
     port = reduced.echo[:, :SIDE_PX][:, ::-1].astype(np.float32)
     starboard = reduced.echo[:, SIDE_PX:].astype(np.float32)
     halves = [beam_normalised(half, reduced.altitude_m, spacing_m) for half in (port, starboard)]
@@ -248,31 +242,31 @@ def evened(reduced: Reduced) -> Reduced:
 
 
 def draw_waterfall(reduced: Reduced, title: str, *, over_ground: bool) -> Image.Image:
-    """Draw a waterfall: first ping on top, port to the left, ranges below, times and pings at the left.
+    """Draw a waterfall: first ping at the top, port on the left, ranges below, times and ping numbers on the left.
 
     Returns:
-        RGB picture. In slant range the bottom's first return is drawn in yellow where the altitude is known.
+        RGB image. In slant range, the first bottom return is drawn in yellow where the altitude is known.
     """
     rows = reduced.echo.shape[0]
-    picture = Image.new("RGB", (_LEFT_PX + 2 * SIDE_PX + _RIGHT_PX, _TOP_PX + rows + _BOTTOM_PX), _PAPER)
-    picture.paste(Image.fromarray(_grey(reduced.echo)), (_LEFT_PX, _TOP_PX))
-    draw = ImageDraw.Draw(picture)
-    what = "ground range, m" if over_ground else "slant range, m"
-    draw.text((6, 4), f"{title}   {what}", fill=_INK)
+    image = Image.new("RGB", (_LEFT_PX + 2 * SIDE_PX + _RIGHT_PX, _TOP_PX + rows + _BOTTOM_PX), _PAPER)
+    image.paste(Image.fromarray(_grey(reduced.echo)), (_LEFT_PX, _TOP_PX))
+    draw = ImageDraw.Draw(image)
+    axis = "ground range, m" if over_ground else "slant range, m"
+    draw.text((6, 4), f"{title}   {axis}", fill=_INK)
     if not over_ground:
         _draw_bottom(draw, reduced)
-    _draw_ranges(draw, reduced.reach_m, _TOP_PX + rows)
+    _draw_ranges(draw, reduced.max_range_m, _TOP_PX + rows)
     step = max(rows // 12, 24)
     for row in range(0, rows, step):
         y = _TOP_PX + row
         draw.line((_LEFT_PX - 6, y, _LEFT_PX, y), fill=_INK)
         clock = utc_text(reduced.times_utc_s[row])[11:21]
         draw.text((6, y - 5), f"{clock}  {reduced.numbers[row]}", fill=_INK)
-    return picture
+    return image
 
 
 def _grey(echo: FloatArray) -> npt.NDArray[np.uint8]:
-    """Return the echo's logarithm stretched between its percentiles; what was not recorded is dark blue's grey, 30."""
+    """Return the logarithm of the echo, stretched between percentiles, as uint8; 30 where not recorded."""
     known = np.isfinite(echo)
     if not known.any():
         return np.full(echo.shape, 30, dtype=np.uint8)
@@ -287,24 +281,24 @@ def _grey(echo: FloatArray) -> npt.NDArray[np.uint8]:
 def _draw_bottom(draw: ImageDraw.ImageDraw, reduced: Reduced) -> None:
     middle = _LEFT_PX + SIDE_PX
     for row, altitude_m in enumerate(reduced.altitude_m.tolist()):
-        if math.isfinite(altitude_m) and altitude_m < reduced.reach_m:
-            x = round(altitude_m / reduced.reach_m * SIDE_PX)
+        if math.isfinite(altitude_m) and altitude_m < reduced.max_range_m:
+            x = round(altitude_m / reduced.max_range_m * SIDE_PX)
             draw.point([(middle - 1 - x, _TOP_PX + row), (middle + x, _TOP_PX + row)], fill=_BOTTOM_COLOUR)
 
 
-def _draw_ranges(draw: ImageDraw.ImageDraw, reach_m: float, y: int) -> None:
-    step_m = nice_step(reach_m / 5)
-    for number in range(int(reach_m / step_m) + 1):
+def _draw_ranges(draw: ImageDraw.ImageDraw, max_range_m: float, y: int) -> None:
+    step_m = nice_step(max_range_m / 5)
+    for number in range(int(max_range_m / step_m) + 1):
         x_m = number * step_m
         for sign in (-1, 1) if number else (1,):
-            x = _LEFT_PX + SIDE_PX + sign * round(x_m / reach_m * SIDE_PX)
+            x = _LEFT_PX + SIDE_PX + sign * round(x_m / max_range_m * SIDE_PX)
             draw.line((x, y, x, y + 6), fill=_INK)
             draw.text((x, y + 8), f"{x_m:g}", fill=_INK, anchor="mt")
     for text, x in (("port", _LEFT_PX + SIDE_PX // 2), ("starboard", _LEFT_PX + SIDE_PX * 3 // 2)):
         draw.text((x, y + 22), text, fill=_INK, anchor="mt")
 
 
-def nice_step(about: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is not above `about` (which is above 0)."""
-    power = 10.0 ** math.floor(math.log10(about))
-    return max(factor * power for factor in (1, 2, 5) if factor * power <= about * (1 + 1e-9))
+def nice_step(limit: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten up to `limit`, which is positive."""
+    power = 10.0 ** math.floor(math.log10(limit))
+    return max(factor * power for factor in (1, 2, 5) if factor * power <= limit * (1 + 1e-9))

@@ -1,8 +1,8 @@
-"""Which reader opens which survey file.
+"""Registry of the survey readers.
 
-A reader is a function from a path and options to an open `SurveySource`; it raises `SurveyFileError` and nothing else
-for a bad file. Packages of others add formats by entry points of the group `sonarpost.survey_readers`: the name is
-the suffix without its dot, the object the reader (docs/explanation/surveys.md has an example).
+A reader is a function from a path and options to an open `SurveySource`. For a bad file it raises `SurveyFileError`
+only. Other packages add formats by entry points of the group `sonarpost.survey_readers`: the name is the suffix
+without its dot, the object is the reader (example: docs/explanation/surveys.md).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers.humminbird import HumminbirdSource
 from sonarpost.sonar.readers.waterfall_images import WaterfallSource
 from sonarpost.sonar.readers.xtf import XtfSource
-from sonarpost.sonar.source import SurveySource, gather
+from sonarpost.sonar.source import SurveySource, load_survey
 from sonarpost.sonar.survey import Survey
 
 SurveyReader = Callable[[Path, SurveyOptions], SurveySource]
@@ -27,14 +27,14 @@ _READERS: dict[str, SurveyReader] = {}
 
 
 def register_reader(suffixes: Iterable[str], reader: SurveyReader) -> None:
-    """Let `reader` open files of these suffixes.
+    """Register a reader for file name suffixes.
 
     Args:
-        suffixes: Ends of file names, each with its dot first, in any case; of several that fit the longest counts.
-        reader: The function or class that opens them.
+        suffixes: Each with a leading dot, in any case. The longest matching suffix selects the reader.
+        reader: The function or class that opens the files.
 
     Raises:
-        ValueError: A suffix has no dot, or another reader has it.
+        ValueError: A suffix has no dot, or already has another reader.
     """
     for suffix in suffixes:
         key = suffix.lower()
@@ -45,22 +45,22 @@ def register_reader(suffixes: Iterable[str], reader: SurveyReader) -> None:
 
 
 def supported_suffixes() -> tuple[str, ...]:
-    """Return the suffixes that have a reader, plug-ins' included, lower case, sorted."""
+    """Return the suffixes that have a reader, including plug-ins, lower case, sorted."""
     return tuple(sorted({*_READERS, *_plug_ins()}))
 
 
 def open_survey(path: Path, options: SurveyOptions | None = None) -> SurveySource:
-    """Open a survey file of any supported format, chosen by its suffix, to be read ping by ping.
+    """Open a survey file of any supported format for reading ping by ping. The suffix selects the reader.
 
     Args:
         path: The file.
-        options: What the file does not say.
+        options: None for the defaults.
 
     Returns:
-        The open recording; a context manager.
+        The open recording, a context manager.
 
     Raises:
-        SurveyFileError: No reader for the suffix, or the reader refuses the file.
+        SurveyFileError: No reader for the suffix, or the file is invalid.
     """
     return _reader(path)(path, options or SurveyOptions())
 
@@ -69,36 +69,36 @@ def read_survey(path: Path, options: SurveyOptions | None = None) -> Survey:
     """Read a survey file of any supported format into memory.
 
     Raises:
-        SurveyFileError: No reader for the suffix, the reader refuses the file, or it holds over 1 GiB of samples.
+        SurveyFileError: No reader for the suffix, an invalid file, or more than 1 GiB of samples.
     """
     with open_survey(path, options) as source:
-        return gather(source)
+        return load_survey(source)
 
 
 def _reader(path: Path) -> SurveyReader:
     name = path.name.lower()
-    fitting = [suffix for suffix in supported_suffixes() if name.endswith(suffix)]
-    if not fitting:
+    matching = [suffix for suffix in supported_suffixes() if name.endswith(suffix)]
+    if not matching:
         raise SurveyFileError(str(path), "suffix", path.suffix, "one of " + ", ".join(supported_suffixes()))
-    suffix = max(fitting, key=len)
-    # What comes with the package goes first: an installed plug-in changes nothing that worked without it.
-    return _READERS[suffix] if suffix in _READERS else _loaded(path, _plug_ins()[suffix])
+    suffix = max(matching, key=len)
+    # The readers of the package have priority: a plug-in does not replace them.
+    return _READERS[suffix] if suffix in _READERS else _load_plug_in(path, _plug_ins()[suffix])
 
 
-def _loaded(path: Path, point: EntryPoint) -> SurveyReader:
+def _load_plug_in(path: Path, point: EntryPoint) -> SurveyReader:
     try:
         reader: SurveyReader = point.load()
-    except Exception as error:  # importing a stranger's module may raise anything
+    except Exception as error:  # importing a plug-in may raise anything
         value = f"{point.value}: {type(error).__name__}: {error}"
         raise SurveyFileError(str(path), f"survey reader {point.name}", value, "a plug-in that loads") from error
     if not callable(reader):
-        raise SurveyFileError(str(path), f"survey reader {point.name}", point.value, "something to call")
+        raise SurveyFileError(str(path), f"survey reader {point.name}", point.value, "a callable")
     return reader
 
 
 @cache
 def _plug_ins() -> dict[str, EntryPoint]:
-    """Return suffix to entry point; nothing of a plug-in is imported before its suffix is met."""
+    """Return suffix to entry point. A plug-in is imported only when its suffix is used."""
     return {f".{point.name.lower()}": point for point in entry_points(group=ENTRY_POINTS)}
 
 
@@ -107,4 +107,4 @@ register_reader((".dat",), HumminbirdSource)
 register_reader((".waterfall.toml",), WaterfallSource)
 
 SUPPORTED_SUFFIXES: tuple[str, ...] = (".xtf",)
-"""Formats of one file each, which a folder can be watched for; the others are whole only when several files are."""
+"""Formats of a single file, which a folder can be watched for; the others consist of several files."""

@@ -1,4 +1,4 @@
-"""A file that is read piece by piece, held to be the same from the first byte to the last."""
+"""Reading of a survey file in parts, with checks for truncation and for changes during reading."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ _LINE_BYTES: Final = 1 << 16
 
 
 class CheckedFile:
-    """A regular file opened once. A file put in its place later is not seen; one rewritten in place is an error.
+    """An open regular file. A file that replaces it later is ignored; a file rewritten in place is an error.
 
     Raises:
-        SurveyFileError: It cannot be opened, or is not a regular file.
+        SurveyFileError: The file cannot be opened, or is not a regular file.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            # Without blocking: a named pipe in the survey folder must not hold up the service.
+            # Non-blocking: a named pipe in the survey folder must not block the service.
             self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
-            what = getattr(error, "strerror", None) or str(error)
-            raise SurveyFileError(str(path), "", what, "a readable survey file") from error
+            reason = getattr(error, "strerror", None) or str(error)
+            raise SurveyFileError(str(path), "", reason, "a readable survey file") from error
         status = os.fstat(self._descriptor)
         self._stamp = (status.st_size, status.st_mtime_ns)
         self.size_bytes = status.st_size
@@ -41,39 +41,39 @@ class CheckedFile:
         """Return `count` bytes from `offset`.
 
         Raises:
-            SurveyFileError: The file ends before, or cannot be read; the message names `place`.
+            SurveyFileError: The file is shorter or cannot be read; the message contains `place`.
         """
         if offset + count > self.size_bytes:
-            left = max(self.size_bytes - offset, 0)
-            raise self.error(place, f"{left} bytes left", f"{count} bytes: the file is truncated")
-        pieces = []
+            remaining = max(self.size_bytes - offset, 0)
+            raise self.error(place, f"{remaining} bytes left", f"{count} bytes: the file is truncated")
+        parts = []
         while count:
             try:
-                piece = os.pread(self._descriptor, count, offset)
+                part = os.pread(self._descriptor, count, offset)
             except OSError as error:
                 raise self.error(place, error.strerror or str(error), "a readable file") from error
-            if not piece:
+            if not part:
                 raise self.error(place, f"{count} bytes fewer", "all bytes: the file shrank while it was read")
-            pieces.append(piece)
-            offset, count = offset + len(piece), count - len(piece)
-        return b"".join(pieces)
+            parts.append(part)
+            offset, count = offset + len(part), count - len(part)
+        return b"".join(parts)
 
     def text_lines(self) -> Iterator[str]:
-        """Yield the lines of a UTF-8 text, each with its end; a byte order mark is left out.
+        """Yield the lines of a UTF-8 text with their line ends, without a byte order mark.
 
         Raises:
-            SurveyFileError: Not UTF-8, a line over 64 KiB, or the file cannot be read; the message names the line.
+            SurveyFileError: Not UTF-8, a line over 64 KiB, or an unreadable file; the message contains the line number.
         """
-        walk = SequentialReader(self)
+        reader = SequentialReader(self)
         rest = b""
         number = 0
-        while walk.left or rest:
-            rest += walk.take(min(_LINE_BYTES, walk.left), f"line {number + 1}")
+        while reader.remaining or rest:
+            rest += reader.read(min(_LINE_BYTES, reader.remaining), f"line {number + 1}")
             *lines, rest = rest.split(b"\n")
-            if not walk.left:
+            if not reader.remaining:
                 lines, rest = [*lines, rest] if rest else lines, b""
             elif len(rest) > _LINE_BYTES:
-                lines = [*lines, rest]  # its end has not come yet, and is not waited for
+                lines = [*lines, rest]  # too long, although its end is not read yet
             for line in lines:
                 number += 1
                 if len(line) > _LINE_BYTES:
@@ -84,21 +84,21 @@ class CheckedFile:
                     raise self.error(f"line {number}", str(error), "UTF-8") from error
 
     def check_unchanged(self) -> None:
-        """Raise when the file has been written to since it was opened: what was read may be of two recordings.
+        """Check that the file was not written to since it was opened.
 
         Raises:
-            SurveyFileError: Its size or its time of change is another.
+            SurveyFileError: Its size or modification time has changed.
         """
         status = os.fstat(self._descriptor)
         if (status.st_size, status.st_mtime_ns) != self._stamp:
             raise self.error("file", "changed while it was read", "a finished recording")
 
     def error(self, field: str, value: object, expected: str) -> SurveyFileError:
-        """Return the error that names this file."""
+        """Return an error with the path of this file."""
         return SurveyFileError(str(self.path), field, value, expected)
 
     def close(self) -> None:
-        """Close the file; more than once does no harm."""
+        """Close the file. Closing again has no effect."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
@@ -117,7 +117,7 @@ class CheckedFile:
 
 
 class SequentialReader:
-    """A position that moves through an open file; several may walk one file at a time."""
+    """Buffered sequential reading of an open file. Several readers may use one file at the same time."""
 
     def __init__(self, file: CheckedFile, offset: int = 0) -> None:
         self._file = file
@@ -126,19 +126,19 @@ class SequentialReader:
         self._buffer_offset = offset
 
     @property
-    def left(self) -> int:
-        """Bytes between here and the end."""
+    def remaining(self) -> int:
+        """Number of bytes up to the end of the file."""
         return self._file.size_bytes - self.offset
 
-    def take(self, count: int, place: str) -> bytes:
-        """Return the next `count` bytes and move on.
+    def read(self, count: int, place: str) -> bytes:
+        """Return the next `count` bytes and advance.
 
         Raises:
-            SurveyFileError: The file ends before; the message names `place`.
+            SurveyFileError: The file is shorter; the message contains `place`.
         """
         start = self.offset - self._buffer_offset
         if start + count > len(self._buffer):
-            ahead = max(count, min(_BUFFER_BYTES, self.left))
+            ahead = max(count, min(_BUFFER_BYTES, self.remaining))
             self._buffer = self._file.read_at(self.offset, ahead, place)
             self._buffer_offset, start = self.offset, 0
         self.offset += count

@@ -1,13 +1,8 @@
-"""Reader of XTF (eXtended Triton Format) side-scan recordings, ping by ping (see `xtf_records` for the format).
-
-## sonarpost.sonar.readers.xtf
-Navigation of XTF pings: which values are real, and which are only fields left at zero.
-"""
+"""Reader of XTF (eXtended Triton Format) side-scan recordings, ping by ping (format: see `xtf_records`)."""
 
 from __future__ import annotations
 
 import ctypes
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -17,23 +12,40 @@ import numpy as np
 import numpy.typing as npt
 from pyxtf import XTFPacketStart, XTFPingHeader
 
-from sonarpost.sonar.navigation import NavigationRows, Projection
+from sonarpost.sonar.geometry import Position
+from sonarpost.sonar.navigation import (
+    KNOT_MPS,
+    NAVIGATION_LIMITS,
+    PingCounter,
+    Projection,
+    is_plausible,
+    position_in_degrees,
+)
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers.open_file import CheckedFile, SequentialReader
-from sonarpost.sonar.readers.xtf_records import HEADER_BYTES, Attitude, PingParser, attitude_of, read_header, text_of
-from sonarpost.sonar.source import StreamedSource, gather
+from sonarpost.sonar.readers.xtf_records import (
+    HEADER_BYTES,
+    Attitude,
+    PingParser,
+    decode_text,
+    parse_attitude,
+    read_header,
+)
+from sonarpost.sonar.source import StreamedSource, load_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 PACKET_MAGIC: Final = 0xFACE
 SONAR_PACKET: Final = 0
 ATTITUDE_PACKET: Final = 3
+NAV_UNITS_METRES: Final = 0
+NAV_UNITS_DEGREES: Final = 3
 MAX_FILE_BYTES: Final = 1 << 30
-"""`read_xtf` holds a survey in memory; a larger file is read through `XtfSource`."""
+"""Limit of `read_xtf`, which loads a survey into memory; larger files are read through `XtfSource`."""
 MAX_PACKET_BYTES: Final = 1 << 24
 
 _START_BYTES: Final = ctypes.sizeof(XTFPacketStart)
-_ATTITUDE_HOLD_S: Final = 1.0
-"""How long an attitude packet stands for the pings after it."""
+_ATTITUDE_VALID_S: Final = 1.0
+"""An attitude packet is valid for the pings of this time after it."""
 _ATTITUDE_FIELDS: Final = ("heading_deg", "pitch_deg", "roll_deg")
 _PROFILE_COLUMNS: Final = 32
 _PROFILE_PINGS: Final = 64
@@ -42,16 +54,16 @@ _PROFILE_PINGS: Final = 64
 def read_xtf(path: Path, options: SurveyOptions | None = None) -> Survey:
     """Read an XTF recording into memory.
 
-    A file must be whole: one that ends inside a packet is an error, since a vehicle's finished recording has no
-    such tail and half a ping is not worth a wrong position. What the file does not record (a field that is zero in
-    every ping) is None. HSeconds of 100 (a recorder's rounding) is taken as the next second.
+    The file must be complete: a file that ends inside a packet is an error, since a finished recording has no such
+    end. What the file does not record (a field that is zero in every ping) is None. HSeconds of 100 (rounding of a
+    recorder) is read as the next second.
 
     Args:
         path: The file.
-        options: What the file does not say; see there.
+        options: None for the defaults.
 
     Returns:
-        The survey, with one warning for each kind of thing that was left out.
+        The survey, with one warning for each kind of irregularity.
 
     Raises:
         SurveyFileError: Not an XTF file, truncated, inconsistent, too long, without sonar pings, or unreadable.
@@ -60,13 +72,13 @@ def read_xtf(path: Path, options: SurveyOptions | None = None) -> Survey:
         if file.size_bytes > MAX_FILE_BYTES:
             raise file.error("file size", file.size_bytes, f"at most {MAX_FILE_BYTES} bytes, or reading in blocks")
     with XtfSource(path, options or SurveyOptions()) as source:
-        return gather(source)
+        return load_survey(source)
 
 
 class XtfSource(StreamedSource):
     """An open XTF recording.
 
-    Pitch, roll and heading that no ping has are taken from attitude packets, the last one up to a second before.
+    Pitch, roll and heading that no ping contains are taken from attitude packets up to one second before the ping.
 
     Raises:
         SurveyFileError: Not an XTF file, truncated, inconsistent, without sonar pings, or unreadable.
@@ -84,59 +96,59 @@ class XtfSource(StreamedSource):
     def _open(self) -> None:
         if self._file.size_bytes < HEADER_BYTES:
             raise self._file.error("file size", self._file.size_bytes, f"at least {HEADER_BYTES} bytes")
-        walk = SequentialReader(self._file)
-        header, channels = read_header(walk, self._file)
-        self._first_packet = walk.offset
+        reader = SequentialReader(self._file)
+        header, channels = read_header(reader, self._file)
+        self._first_packet = reader.offset
         crs = self.options.projected_crs
         nav_units = int(header.NavUnits)
         projection = Projection(crs, self.path) if crs is not None and nav_units == NAV_UNITS_METRES else None
         self._cleaner = NavigationCleaner(nav_units, projection)
         farthest_first = self.options.port_order == "farthest_first"
         self._parser = PingParser(self._file, channels, port_farthest_first=farthest_first)
-        self._order = _PortOrder()
+        self._port_order = _PortOrderCheck()
         self._attitudes = 0
         self._attitude_fields: set[str] = set()
         self._pings = 0
-        self._scan(text_of(header.SonarName) or "unknown", self.path.stem)
+        self._validate(decode_text(header.SonarName) or "unknown", self.path.stem)
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
-    def _notes(self) -> list[str]:
-        notes = [f"{text} ({count} times)" for text, count in sorted(self._parser.notes.items())]
-        if self._attitudes and self._borrowed():
-            names = ", ".join(self._borrowed())
-            notes.append(f"{names} from attitude packets ({self._attitudes} of them)")
-        return [*notes, *self._cleaner.warnings(self._pings), *self._order.note()]
+    def _format_warnings(self) -> list[str]:
+        warnings = [f"{text} ({count} times)" for text, count in sorted(self._parser.notes.items())]
+        if self._attitudes and self._from_attitude():
+            names = ", ".join(self._from_attitude())
+            warnings.append(f"{names} from attitude packets ({self._attitudes} of them)")
+        return [*warnings, *self._cleaner.warnings(self._pings), *self._port_order.warnings()]
 
-    def _borrowed(self) -> tuple[str, ...]:
-        """Return the fields that come from attitude packets: those no ping has, and that are not zero there too."""
-        return tuple(name for name in sorted(self._attitude_fields) if not self._cleaner.records(name))
+    def _from_attitude(self) -> tuple[str, ...]:
+        """Return the fields taken from attitude packets: those that are zero in every ping, but not there."""
+        return tuple(name for name in sorted(self._attitude_fields) if not self._cleaner.is_recorded(name))
 
-    def _walk(self, *, first: bool) -> Iterator[Ping]:
+    def _read_pings(self, *, first_pass: bool) -> Iterator[Ping]:
         attitude: Attitude | None = None
         row = 0
         for kind, place, raw in self._packets():
-            if kind == ATTITUDE_PACKET and (met := attitude_of(raw)) is not None:
-                attitude = met
-                if first:
+            if kind == ATTITUDE_PACKET and (parsed := parse_attitude(raw)) is not None:
+                attitude = parsed
+                if first_pass:
                     self._attitudes += 1
-                    self._attitude_fields.update(name for name in _ATTITUDE_FIELDS if getattr(met, name))
+                    self._attitude_fields.update(name for name in _ATTITUDE_FIELDS if getattr(parsed, name))
             elif kind == SONAR_PACKET:
-                yield self._ping(raw, place, attitude, row if first else None)
+                yield self._ping(raw, place, attitude, row if first_pass else None)
                 row += 1
-            elif first:
+            elif first_pass:
                 self._parser.notes[f"skipped packet of type {kind}: not a sonar ping"] += 1
         self._pings = row
         self._file.check_unchanged()
 
     def _packets(self) -> Iterator[tuple[int, str, bytes]]:
-        """Yield (type, place, bytes of the whole record) of each packet."""
-        walk = SequentialReader(self._file, self._first_packet)
-        while walk.left:
-            place = f"packet at byte {walk.offset}"
-            raw = walk.take(_START_BYTES, place)
+        """Yield (type, place in the file, bytes of the whole record) of each packet."""
+        reader = SequentialReader(self._file, self._first_packet)
+        while reader.remaining:
+            place = f"packet at byte {reader.offset}"
+            raw = reader.read(_START_BYTES, place)
             start = XTFPacketStart.from_buffer_copy(raw)
             if start.MagicNumber != PACKET_MAGIC:
                 raise self._file.error(f"{place}, MagicNumber", hex(start.MagicNumber), hex(PACKET_MAGIC))
@@ -144,37 +156,38 @@ class XtfSource(StreamedSource):
             if not _START_BYTES <= length <= MAX_PACKET_BYTES:
                 expected = f"{_START_BYTES} to {MAX_PACKET_BYTES} bytes"
                 raise self._file.error(f"{place}, NumBytesThisRecord", length, expected)
-            yield int(start.HeaderType), place, raw + walk.take(length - _START_BYTES, place)
+            yield int(start.HeaderType), place, raw + reader.read(length - _START_BYTES, place)
 
     def _ping(self, raw: bytes, place: str, attitude: Attitude | None, row: int | None) -> Ping:
-        head, time_utc_s = self._parser.head(raw, place)
-        channels = tuple(self._parser.channels(raw, head, place))
-        record = NavigationRecord.of_ping(head, of_ship=self.options.position_source == "ship")
+        """Return a ping; `row` is its row in the first pass, else None."""
+        header, time_utc_s = self._parser.header(raw, place)
+        channels = tuple(self._parser.channels(raw, header, place))
+        record = NavigationRecord.of_ping(header, of_ship=self.options.position_source == "ship")
         if row is not None:
             self._cleaner.observe(row, record)
-            self._order.observe(channels)
-        fix = self._cleaner.clean(record)
-        values = {name: getattr(fix, name) for name in _ATTITUDE_FIELDS}
-        if attitude is not None and 0 <= time_utc_s - attitude.time_utc_s <= _ATTITUDE_HOLD_S:
-            values.update({name: getattr(attitude, name) for name in self._borrowed()})
+            self._port_order.observe(channels)
+        navigation = self._cleaner.clean(record)
+        values = {name: getattr(navigation, name) for name in _ATTITUDE_FIELDS}
+        if attitude is not None and 0 <= time_utc_s - attitude.time_utc_s <= _ATTITUDE_VALID_S:
+            values.update({name: getattr(attitude, name) for name in self._from_attitude()})
         return Ping(
-            number=int(head.PingNumber),
+            number=int(header.PingNumber),
             time_utc_s=time_utc_s,
             channels=channels,
-            lat_deg=fix.lat_deg,
-            lon_deg=fix.lon_deg,
-            altitude_m=fix.altitude_m,
-            depth_m=fix.depth_m,
-            speed_mps=fix.speed_mps,
+            lat_deg=navigation.lat_deg,
+            lon_deg=navigation.lon_deg,
+            altitude_m=navigation.altitude_m,
+            depth_m=navigation.depth_m,
+            speed_mps=navigation.speed_mps,
             **values,
         )
 
 
-class _PortOrder:
-    """Sees when port looks stored in the other order than was assumed: then it is turned the wrong way.
+class _PortOrderCheck:
+    """Detects port samples stored in the opposite order to the assumed one.
 
-    Both sides see the same water column and much the same seabed, so their mean profiles agree when both begin at
-    the vehicle. Nothing is turned on this evidence alone.
+    Both sides record the same water column and similar seabed, so their mean profiles correlate if both begin at the
+    vehicle. The check only gives a warning.
     """
 
     def __init__(self) -> None:
@@ -183,25 +196,25 @@ class _PortOrder:
 
     def observe(self, channels: tuple[ChannelPing, ...]) -> None:
         """Add the first channel of each side to its profile."""
-        seen: set[Side] = set()
+        added: set[Side] = set()
         for channel in channels:
             per_column = channel.samples.shape[0] // _PROFILE_COLUMNS
-            if channel.side in seen or per_column < 2:
+            if channel.side in added or per_column < 2:
                 continue
-            seen.add(channel.side)
+            added.add(channel.side)
             columns = channel.samples[: per_column * _PROFILE_COLUMNS].reshape(_PROFILE_COLUMNS, per_column)
             self._sums[channel.side] += columns.mean(axis=1)
             self._counts[channel.side] += 1
 
-    def note(self) -> list[str]:
-        """Return the warning, if there is reason for it."""
+    def warnings(self) -> list[str]:
+        """Return the warning, if the order seems wrong."""
         if min(self._counts.values()) < _PROFILE_PINGS:
             return []
         port, starboard = (self._profile(side) for side in Side)
         scale = float(np.linalg.norm(port) * np.linalg.norm(starboard))
         if scale == 0 or float(port[::-1] @ starboard) < 0.5 * scale or float(port @ starboard) > 0:
             return []
-        return ["port looks stored nearest sample first, against the format: its picture may be mirrored"]
+        return ["port looks stored nearest sample first, against the format: port may be mirrored"]
 
     def _profile(self, side: Side) -> npt.NDArray[np.float64]:
         profile: npt.NDArray[np.float64] = np.log1p(self._sums[side] / self._counts[side])
@@ -209,25 +222,11 @@ class _PortOrder:
         return profile
 
 
-KNOT_MPS: Final = 1852 / 3600
-NAV_UNITS_DEGREES: Final = 3
-NAV_UNITS_METRES: Final = 0
-_OPTIONAL: Final = ("heading_deg", "altitude_m", "depth_m", "speed_mps", "pitch_deg", "roll_deg")
-_LIMITS: Final = {
-    "heading_deg": (0.0, 360.0),
-    "altitude_m": (0.0, 11_000.0),
-    "depth_m": (-100.0, 11_000.0),
-    "speed_mps": (0.0, 50.0),
-    "pitch_deg": (-90.0, 90.0),
-    "roll_deg": (-180.0, 180.0),
-}
-
-
 @dataclass(frozen=True, slots=True)
 class NavigationRecord:
-    """Navigation of one ping: SI units and degrees, None where the file gives nothing usable.
+    """Navigation of one ping in SI units and degrees; None if unknown.
 
-    As stored (`of_ping`), `lat_deg` and `lon_deg` hold the Y and X coordinate in whatever unit the file has.
+    As stored in the file (`of_ping`), `lat_deg` and `lon_deg` contain the Y and X coordinate in the unit of the file.
     """
 
     lat_deg: float | None
@@ -240,20 +239,22 @@ class NavigationRecord:
     roll_deg: float | None
 
     @classmethod
-    def of_ping(cls, head: XTFPingHeader, *, of_ship: bool = False) -> NavigationRecord:
-        """Take the sensor's fields of a ping header as they stand; speed is in knots there.
+    def of_ping(cls, header: XTFPingHeader, *, of_ship: bool = False) -> NavigationRecord:
+        """Return the sensor fields of a ping header, without checks.
 
-        The ship's position is taken only when asked for: for a towed or independent sonar it is another place.
+        Args:
+            header: The header; its speed is in knots.
+            of_ship: Use the position of the ship, which differs for a towed or independent sonar.
         """
         return cls(
-            lat_deg=float(head.ShipYcoordinate if of_ship else head.SensorYcoordinate),
-            lon_deg=float(head.ShipXcoordinate if of_ship else head.SensorXcoordinate),
-            heading_deg=float(head.SensorHeading),
-            altitude_m=float(head.SensorPrimaryAltitude),
-            depth_m=float(head.SensorDepth),
-            speed_mps=float(head.SensorSpeed) * KNOT_MPS,
-            pitch_deg=float(head.SensorPitch),
-            roll_deg=float(head.SensorRoll),
+            lat_deg=float(header.ShipYcoordinate if of_ship else header.SensorYcoordinate),
+            lon_deg=float(header.ShipXcoordinate if of_ship else header.SensorXcoordinate),
+            heading_deg=float(header.SensorHeading),
+            altitude_m=float(header.SensorPrimaryAltitude),
+            depth_m=float(header.SensorDepth),
+            speed_mps=float(header.SensorSpeed) * KNOT_MPS,
+            pitch_deg=float(header.SensorPitch),
+            roll_deg=float(header.SensorRoll),
         )
 
     def is_empty(self) -> bool:
@@ -262,87 +263,72 @@ class NavigationRecord:
 
 
 class NavigationCleaner:
-    """Turns fields as stored into values or None.
+    """Replaces unknown and implausible navigation values by None.
 
-    None stands for: a position at 0/0, not finite or not on Earth; any position in metres of which nobody said what
-    projection they are in; an altitude of 0; any field that is zero in every ping; everything in a ping whose
-    navigation is all zero; and a value outside what a vehicle can have.
+    These are None: a position that is 0/0, not finite or out of range; a position in metres without a projection; an
+    altitude of 0; a field that is zero in every ping; all fields of a ping whose navigation is all zero; a value
+    outside `NAVIGATION_LIMITS`.
 
     Args:
-        nav_units: NavUnits of the file header: 3 is degrees, 0 projected metres. Values of the coordinates are never
-            asked which of the two they are.
-        projection: What metres are in, if known.
+        nav_units: NavUnits of the file header: 3 is degrees, 0 projected metres. The values are not used to guess it.
+        projection: Projection of coordinates in metres, if known.
     """
 
     def __init__(self, nav_units: int, projection: Projection | None) -> None:
         self._nav_units = nav_units
         self._projection = projection
         self._recorded: set[str] = set()
-        self._without_fix = NavigationRows()
-        self._odd: dict[str, NavigationRows] = {}
+        self._without_fix = PingCounter()
+        self._implausible: dict[str, PingCounter] = {}
 
     def observe(self, row: int, record: NavigationRecord) -> None:
-        """Take note of a record on the first walk through the file."""
-        if self._position(record).lat_deg is None:
+        """Count irregularities of a record in the first pass through the file."""
+        if self._position(record) is None:
             self._without_fix.add(row)
-        for name in _OPTIONAL:
+        for name in NAVIGATION_LIMITS:
             value = getattr(record, name)
             if value:
                 self._recorded.add(name)
-                if not _plausible(name, value):
-                    self._odd.setdefault(name, NavigationRows()).add(row)
+                if not is_plausible(name, value):
+                    self._implausible.setdefault(name, PingCounter()).add(row)
 
-    def records(self, name: str) -> bool:
-        """Return whether any ping seen so far has something in this field."""
+    def is_recorded(self, name: str) -> bool:
+        """Return whether the field is not zero in any ping observed so far."""
         return name in self._recorded
 
     def clean(self, record: NavigationRecord) -> NavigationRecord:
-        """Return the record with what is not real taken out, by what all pings observed so far have."""
-        values: dict[str, float | None] = {name: getattr(record, name) for name in _OPTIONAL}
+        """Return the record with None for unknown and implausible values."""
+        values: dict[str, float | None] = {name: getattr(record, name) for name in NAVIGATION_LIMITS}
         empty = record.is_empty()
         for name, value in values.items():
             unknown = empty or name not in self._recorded or (name == "altitude_m" and value == 0)
-            if unknown or value is None or not _plausible(name, value):
+            if unknown or value is None or not is_plausible(name, value):
                 values[name] = None
         if values["heading_deg"] == 360.0:
             values["heading_deg"] = 0.0
-        return replace(self._position(record), **values)
+        position = self._position(record)
+        lat_deg, lon_deg = (None, None) if position is None else (position.lat_deg, position.lon_deg)
+        return replace(record, lat_deg=lat_deg, lon_deg=lon_deg, **values)
 
     def warnings(self, total: int) -> list[str]:
-        """Return what was met in `total` pings, one line each."""
-        notes: list[str] = []
+        """Return one line for each kind of irregularity in `total` pings."""
+        warnings: list[str] = []
         if self._nav_units == NAV_UNITS_METRES and self._projection is None:
-            notes.append(
-                "no positions: NavUnits is 0 (projected metres) and the file does not say in which projection; "
-                "projected_crs of the options does"
+            warnings.append(
+                "no positions: NavUnits is 0 (projected metres) and the file does not contain the projection; "
+                "set the option projected_crs"
             )
         elif self._nav_units not in (NAV_UNITS_DEGREES, NAV_UNITS_METRES):
             expected = f"{NAV_UNITS_DEGREES} (degrees) or {NAV_UNITS_METRES} (projected metres)"
-            notes.append(f"no positions: NavUnits is {self._nav_units}, expected {expected}")
+            warnings.append(f"no positions: NavUnits is {self._nav_units}, expected {expected}")
         elif self._without_fix.count:
-            notes.append(f"no position fix in {self._without_fix.of(total)}")
-        return notes + [f"{name} out of range in {rows.of(total)}" for name, rows in sorted(self._odd.items())]
+            warnings.append(f"no position fix in {self._without_fix.summary(total)}")
+        implausible = sorted(self._implausible.items())
+        return warnings + [f"{name} out of range in {counter.summary(total)}" for name, counter in implausible]
 
-    def _position(self, record: NavigationRecord) -> NavigationRecord:
-        lat_deg, lon_deg = record.lat_deg, record.lon_deg
-        if lat_deg is None or lon_deg is None:
-            return record
+    def _position(self, record: NavigationRecord) -> Position | None:
+        if record.lat_deg is None or record.lon_deg is None:
+            return None
         if self._nav_units == NAV_UNITS_METRES and self._projection is not None:
-            place = self._projection.position(lon_deg, lat_deg)
-            if place is None:
-                return replace(record, lat_deg=None, lon_deg=None)
-            return replace(record, lat_deg=place.lat_deg, lon_deg=place.lon_deg)
-        usable = (
-            self._nav_units == NAV_UNITS_DEGREES
-            and math.isfinite(lat_deg)
-            and math.isfinite(lon_deg)
-            and abs(lat_deg) <= 90
-            and abs(lon_deg) <= 180
-            and (lat_deg, lon_deg) != (0.0, 0.0)
-        )
-        return record if usable else replace(record, lat_deg=None, lon_deg=None)
-
-
-def _plausible(name: str, value: float) -> bool:
-    low, high = _LIMITS[name]
-    return math.isfinite(value) and low <= value <= high
+            return self._projection.position(record.lon_deg, record.lat_deg)
+        return position_in_degrees(record.lat_deg, record.lon_deg) if self._nav_units == NAV_UNITS_DEGREES else None

@@ -1,14 +1,13 @@
-"""The records of an XTF file, parsed one at a time and held to what they declare.
+"""Parsing and validation of the records of an XTF file.
 
-The structures are pyxtf's. Walking from record to record is our own (`xtf_reader`), because pyxtf's trusts the file:
-it loops for ever on a record of length zero, returns short sample arrays from a truncated packet, takes a channel's
-sample size from its place in the ping and not from its number, and unpickles any `.pyxtf_idx` file lying beside the
-survey.
+The structures are pyxtf's. pyxtf's own file reader is not used because it trusts the file: it does not terminate on a
+record of length zero, returns short sample arrays for a truncated packet, selects a channel's sample size by its
+position in the ping in place of its number, and unpickles any `.pyxtf_idx` file beside the survey.
 
-Field meanings are those of the XTF file format, revision 35 and later. Two conventions matter most:
+Field meanings are those of the XTF file format, revision 35 and later:
 
-* A port channel is stored farthest sample first, so that port and starboard side by side make a picture. It is
-  turned round here: index 0 is nearest the vehicle on both sides.
+* A port channel is stored farthest sample first, so that port and starboard side by side form an image. It is
+  reversed here: index 0 is nearest the vehicle on both sides.
 * Speed is in knots, slant range in metres, frequency in kHz.
 """
 
@@ -40,16 +39,16 @@ _SIDES: Final = {1: Side.PORT, 2: Side.STARBOARD}
 _CHANNEL_NAMES: Final = {0: "sub-bottom", 3: "bathymetry"}
 _SAMPLE_BYTES: Final = (1, 2, 4)
 _FORMAT_BYTES: Final = {2: 4, 3: 2, 8: 1}
-"""SampleFormat of the integer encodings and their sizes; 0 is a file older than the field."""
+"""SampleFormat of the integer encodings and their sizes; 0: the file is older than the field."""
 _GROUND_RANGE: Final = 2
 _MAX_WEIGHT: Final = 31
 _DELAY_AGREEMENT: Final = 0.02
-"""How well slant range and time must agree before a delayed recording's samples are put in their places."""
+"""Maximum relative difference between slant range and time for a delayed recording."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelInfo:
-    """What the file header says of one channel."""
+    """Description of a channel in the file header."""
 
     kind: int
     bytes_per_sample: int
@@ -61,7 +60,7 @@ class ChannelInfo:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """An attitude packet: when, and what a motion sensor said."""
+    """An attitude packet: time and angles of a motion sensor."""
 
     time_utc_s: float
     pitch_deg: float
@@ -69,13 +68,13 @@ class Attitude:
     heading_deg: float
 
 
-def read_header(walk: SequentialReader, file: CheckedFile) -> tuple[XTFFileHeader, list[ChannelInfo]]:
+def read_header(reader: SequentialReader, file: CheckedFile) -> tuple[XTFFileHeader, list[ChannelInfo]]:
     """Read the file header with its channels.
 
     Raises:
-        SurveyFileError: Not an XTF file, truncated, or absurd channel counts.
+        SurveyFileError: Not an XTF file, truncated, or invalid channel counts.
     """
-    raw = walk.take(HEADER_BYTES, "file header")
+    raw = reader.read(HEADER_BYTES, "file header")
     header = XTFFileHeader.from_buffer_copy(raw)
     if header.FileFormat != FILE_MAGIC:
         raise file.error("FileFormat", hex(header.FileFormat), hex(FILE_MAGIC))
@@ -83,9 +82,9 @@ def read_header(walk: SequentialReader, file: CheckedFile) -> tuple[XTFFileHeade
     if not 1 <= count <= MAX_CHANNELS or not header.NumberOfSonarChannels:
         expected = f"1 to {MAX_CHANNELS} channels, at least one of them sonar"
         raise file.error("channel counts", (int(header.NumberOfSonarChannels), count), expected)
-    # The header holds six channels and grows by 1024 bytes for each further eight.
+    # The header contains six channels; every further eight channels add 1024 bytes.
     extra = math.ceil(max(count - 6, 0) / 8)
-    raw += walk.take(1024 * extra, "file header")
+    raw += reader.read(1024 * extra, "file header")
     return header, [_channel(raw, index) for index in range(6 + 8 * extra)]
 
 
@@ -101,8 +100,8 @@ def _channel(raw: bytes, index: int) -> ChannelInfo:
     )
 
 
-def attitude_of(raw: bytes) -> Attitude | None:
-    """Parse an attitude packet; None where it is too short or its clock was not set, or its angles are none."""
+def parse_attitude(raw: bytes) -> Attitude | None:
+    """Parse an attitude packet; None if it is too short, has no valid date or no valid angles."""
     if len(raw) < ctypes.sizeof(XTFAttitudeData):
         return None
     data = XTFAttitudeData.from_buffer_copy(raw)
@@ -111,13 +110,13 @@ def attitude_of(raw: bytes) -> Attitude | None:
         when = datetime(data.Year, data.Month, data.Day, data.Hour, data.Minute, data.Second, tzinfo=UTC)
     except ValueError:
         return None
-    if not (abs(values[0]) <= 90 and abs(values[1]) <= 180 and 0 <= values[2] < 360):  # NaN is none of these
+    if not (abs(values[0]) <= 90 and abs(values[1]) <= 180 and 0 <= values[2] < 360):  # excludes NaN
         return None
     return Attitude(when.timestamp() + float(data.Millisecond) / 1000, *values)
 
 
 class PingParser:
-    """Parses sonar packets of one file; `notes` counts what was left out or put right."""
+    """Parses the sonar packets of one file; `notes` counts skipped and corrected data."""
 
     def __init__(self, file: CheckedFile, channels: list[ChannelInfo], *, port_farthest_first: bool) -> None:
         self._file = file
@@ -125,11 +124,11 @@ class PingParser:
         self._reverse = {Side.PORT: port_farthest_first, Side.STARBOARD: False}
         self.notes: Counter[str] = Counter()
 
-    def head(self, raw: bytes, place: str) -> tuple[XTFPingHeader, float]:
-        """Parse a ping's header and its time, UTC seconds since 1970.
+    def header(self, raw: bytes, place: str) -> tuple[XTFPingHeader, float]:
+        """Parse the header of a ping and its time, UTC seconds since 1970.
 
         Raises:
-            SurveyFileError: Too short, or no date.
+            SurveyFileError: The packet is too short or has no valid date.
         """
         if len(raw) < _PING_BYTES:
             raise self._file.error(f"{place}, NumBytesThisRecord", len(raw), f"at least {_PING_BYTES} for a ping")
@@ -151,7 +150,7 @@ class PingParser:
         """Yield the side-scan channels of a ping.
 
         Raises:
-            SurveyFileError: A channel does not fit into the packet, or has samples that are no plain integers.
+            SurveyFileError: A channel exceeds the packet, or its samples are not integers.
         """
         where = f"ping {head.PingNumber}, {place}"
         count = int(head.NumChansToFollow)
@@ -169,8 +168,8 @@ class PingParser:
             samples = int(channel_head.NumSamples) or info.legacy_samples
             end = offset + samples * bytes_per_sample
             if end > len(raw):
-                room = (len(raw) - offset) // bytes_per_sample
-                raise self._file.error(f"{where}, channel {number}, NumSamples", samples, f"at most {room}")
+                limit = (len(raw) - offset) // bytes_per_sample
+                raise self._file.error(f"{where}, channel {number}, NumSamples", samples, f"at most {limit}")
             channel = self._channel_ping(channel_head, info, raw[offset:end], float(head.SoundVelocity))
             offset = end
             if channel is not None:
@@ -180,7 +179,7 @@ class PingParser:
         size = info.bytes_per_sample
         if size not in _SAMPLE_BYTES:
             raise self._file.error(f"channel {number}, BytesPerSample", size, "1, 2 or 4")
-        # A side-scan channel must hold plain integers; what else flows past unused may hold anything of that size.
+        # Only side-scan channels must contain integers; other channels are skipped.
         if info.kind in _SIDES and info.sample_format and _FORMAT_BYTES.get(info.sample_format) != size:
             expected = f"0, or the unsigned integer of {size} bytes"
             raise self._file.error(f"channel {number}, SampleFormat", info.sample_format, expected)
@@ -197,16 +196,16 @@ class PingParser:
             self.notes[f"skipped channel: {name}, not side-scan"] += 1
             return None
         slant_range_m = float(head.SlantRange)
-        if not raw or not 0 < slant_range_m <= MAX_SLANT_RANGE_M:  # NaN is not either
+        if not raw or not 0 < slant_range_m <= MAX_SLANT_RANGE_M:  # includes NaN
             self.notes[f"skipped {side.value} channel: no samples or no slant range"] += 1
             return None
         samples = _samples(raw, info.bytes_per_sample, reverse=self._reverse[side])
         if head.TimeDelay:
-            delayed = _delayed(samples, slant_range_m, head, sound_velocity_mps)
+            delayed = _with_delay(samples, slant_range_m, head, sound_velocity_mps)
             if delayed is None:
                 self.notes[f"skipped {side.value} channel: TimeDelay, SlantRange and TimeDuration disagree"] += 1
                 return None
-            self.notes["recording began after the transmission (TimeDelay): zeros stand for what was not recorded"] += 1
+            self.notes["recording began after the transmission (TimeDelay): zeros replace the missing samples"] += 1
             samples, slant_range_m = delayed
         return ChannelPing(
             side=side,
@@ -217,7 +216,7 @@ class PingParser:
         )
 
     def _scale(self, weight: int) -> float:
-        """Return the factor of a weight N: echo strength is the sample times 2^-N."""
+        """Return the scale of a weight N: echo strength is the sample times 2^-N."""
         if not -_MAX_WEIGHT <= weight <= _MAX_WEIGHT:
             self.notes[f"sample weight beyond ±{_MAX_WEIGHT} is not applied"] += 1
             return 1.0
@@ -225,7 +224,7 @@ class PingParser:
 
 
 def _samples(raw: bytes, bytes_per_sample: int, *, reverse: bool) -> Samples:
-    """Return little-endian unsigned integers in the machine's own order, turned round if asked."""
+    """Return little-endian unsigned integers in native byte order, reversed if requested."""
     step = -1 if reverse else 1
     if bytes_per_sample == 1:
         return np.frombuffer(raw, dtype=np.uint8)[::step].copy()
@@ -234,16 +233,17 @@ def _samples(raw: bytes, bytes_per_sample: int, *, reverse: bool) -> Samples:
     return np.frombuffer(raw, dtype="<u4")[::step].astype(np.uint32)
 
 
-def _delayed(
+def _with_delay(
     samples: Samples, slant_range_m: float, head: XTFPingChanHeader, velocity_mps: float
 ) -> tuple[Samples, float] | None:
-    """Put zeros where a recording that began late has no samples.
+    """Insert zeros for the delay between transmission and start of the recording.
 
-    Recorders differ in whether SlantRange counts the delay. Time tells: range is half the speed of sound times time,
-    and the two readings are told apart to 2 %. XTF's SoundVelocity is halved already; some write it whole.
+    Recorders differ in whether SlantRange includes the delay. The reading is selected by the time of the recording
+    (range is half the sound speed times time), with a tolerance of 2 %. SoundVelocity is halved in XTF, but some
+    recorders write the full value.
 
     Returns:
-        Samples from the transmission on and the slant range of their end; None where neither reading agrees.
+        Samples from the transmission on and the slant range of their end; None if neither reading agrees.
     """
     delay_s, duration_s = float(head.TimeDelay), float(head.TimeDuration)
     if not (math.isfinite(delay_s) and math.isfinite(duration_s) and 0 < delay_s <= 10 and 0 < duration_s <= 10):
@@ -254,24 +254,24 @@ def _delayed(
     lead = round(delay_s / duration_s * samples.shape[0])
     if lead > samples.shape[0] * 4:
         return None
-    whole_m, recorded_m = speed_mps * (delay_s + duration_s), speed_mps * duration_s
+    total_m, recorded_m = speed_mps * (delay_s + duration_s), speed_mps * duration_s
     padded: Samples = np.concatenate([np.zeros(lead, samples.dtype), samples])
-    if abs(slant_range_m - whole_m) <= _DELAY_AGREEMENT * whole_m:
+    if abs(slant_range_m - total_m) <= _DELAY_AGREEMENT * total_m:
         return padded, slant_range_m
     if abs(slant_range_m - recorded_m) <= _DELAY_AGREEMENT * recorded_m:
         return padded, slant_range_m * (delay_s + duration_s) / duration_s
     return None
 
 
-def text_of(raw: bytes) -> str:
-    """Decode a fixed-width text field: recorders pad with zeros or blanks and use their own code pages."""
+def decode_text(raw: bytes) -> str:
+    """Decode a fixed-width text field, padded with zeros or blanks, in any code page."""
     return "".join(c for c in raw.decode("latin-1") if c.isprintable()).strip()
 
 
 def _frequency_hz(value_khz: float) -> float | None:
     """Return the frequency in hertz; the field is in kHz, but some recorders write hertz.
 
-    Side-scan sonars work between about 50 kHz and 3 MHz, so the two readings cannot be confused.
+    Side-scan sonars use about 50 kHz to 3 MHz, so the unit is unambiguous.
     """
     if not math.isfinite(value_khz) or value_khz <= 0:
         return None
