@@ -1,23 +1,29 @@
-"""Writing files so that each is whole or absent, whatever happens."""
+"""Atomic and durable writes: after a crash or power cut each file is complete or absent."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+PRIVATE_FILE = 0o600
+PUBLIC_FILE = 0o644
+PRIVATE_FOLDER = 0o700
 
-def write_atomically(path: Path, data: bytes, mode: int = 0o644) -> None:
-    """Write `data` beside `path`, bring it to the disk, and put it in place of `path`.
+
+def write_atomically(path: Path, data: bytes, mode: int = PUBLIC_FILE) -> None:
+    """Write a temporary file, flush it to the disk and rename it to `path`.
 
     Args:
         path: The file to create or replace; its folder must exist.
-        data: Everything the file shall hold.
-        mode: Its permissions, whatever the umask says.
+        data: Content of the file.
+        mode: Its permissions, independent of the umask.
 
     Raises:
-        OSError: It cannot be written (a full disk, no right to write); `path` is as it was.
+        OSError: It cannot be written (full disk, no permission); `path` is unchanged.
     """
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
     temporary = Path(name)
@@ -25,7 +31,7 @@ def write_atomically(path: Path, data: bytes, mode: int = 0o644) -> None:
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)
             file.flush()
-            # mkstemp makes files private to the user; most of ours are meant to be read like any other.
+            # mkstemp creates files that only their owner can read.
             os.fchmod(file.fileno(), mode)
             os.fsync(file.fileno())
         temporary.replace(path)
@@ -44,9 +50,9 @@ class _Staged:
 
 
 class AtomicFiles:
-    """Files that are brought to the disk together: many share the waiting for it, and each is whole or absent.
+    """Files that are flushed to the disk together, which is faster than one at a time; each is complete or absent.
 
-    `add` writes beside the files' places, `commit` puts all in their places. Not for use from several threads.
+    `add` writes a temporary file, `commit` flushes and renames all of them. For use from one thread.
     """
 
     def __init__(self) -> None:
@@ -57,25 +63,25 @@ class AtomicFiles:
         return len(self._staged)
 
     def text_of(self, path: Path) -> bytes | None:
-        """Return what an uncommitted file added with `last` shall hold, None where there is none."""
+        """Return the content of an uncommitted file that was added with `last`, or None."""
         return self._texts.get(path)
 
     def add(self, path: Path, data: bytes, *, last: bool = False, mode: int = 0o644) -> None:
-        """Write a file beside its place.
+        """Write a temporary file for `path`.
 
         Args:
             path: The file to create or replace; its folder must exist.
-            data: Everything it shall hold.
-            last: It says that others are whole: it is put in its place when those are in theirs, on the disk.
-            mode: Its permissions, whatever the umask says.
+            data: Content of the file.
+            last: The file marks the others as complete: it is renamed after they are on the disk.
+            mode: Its permissions, independent of the umask.
 
         Raises:
-            OSError: It cannot be written; the other files are as they were.
+            OSError: It cannot be written; the files added before are not affected.
         """
         descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
         self._staged.append(_Staged(descriptor, Path(name), path, last))
         try:
-            # mkstemp makes files private to the user; most of ours are meant to be read like any other.
+            # mkstemp creates files that only their owner can read.
             os.fchmod(descriptor, mode)
             with os.fdopen(descriptor, "wb", closefd=False) as file:
                 file.write(data)
@@ -86,7 +92,7 @@ class AtomicFiles:
             self._texts[path] = data
 
     def drop_from(self, first: int) -> None:
-        """Take back what was added from the number `first` on."""
+        """Discard the files added from number `first` on."""
         dropped, self._staged = self._staged[first:], self._staged[:first]
         for staged in dropped:
             self._texts.pop(staged.path, None)
@@ -94,14 +100,15 @@ class AtomicFiles:
             staged.temporary.unlink(missing_ok=True)
 
     def commit(self) -> None:
-        """Bring all to the disk and put all in their places; afterwards nothing is added any more.
+        """Flush all files to the disk and rename them; the list is empty afterwards.
 
         Raises:
-            OSError: They cannot be written; each is whole or as it was, and those `last` only where all others are.
+            OSError: They cannot be written. Each file is complete or unchanged; files added with `last` are only
+                renamed after all others.
         """
         try:
             for staged in self._staged:
-                # All are on their way to the disk before the first is waited for.
+                # Start to write all of them before waiting for the first.
                 os.posix_fadvise(staged.descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
             for staged in self._staged:
                 os.fsync(staged.descriptor)
@@ -115,8 +122,53 @@ class AtomicFiles:
             self.drop_from(0)
 
 
+def write_new(path: Path, data: bytes, mode: int = PRIVATE_FILE) -> None:
+    """Write a file that must not exist, never readable by more users than `mode` allows.
+
+    Raises:
+        FileExistsError: It exists.
+        OSError: It cannot be written.
+    """
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, PRIVATE_FILE)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fchmod(file.fileno(), mode)
+        os.fsync(file.fileno())
+
+
+def write_new_folder(path: Path, files: Mapping[str, tuple[bytes, int]]) -> None:
+    """Create a private folder with files, complete or not at all.
+
+    Args:
+        path: The folder; it must not exist.
+        files: Content and mode of each file, by name.
+
+    Raises:
+        FileExistsError: `path` exists.
+        OSError: It cannot be written.
+    """
+    if path.exists() or path.is_symlink():
+        raise FileExistsError(f"{path} exists")
+    if not path.parent.is_dir():
+        path.parent.mkdir(parents=True)
+        path.parent.chmod(PRIVATE_FOLDER)
+    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    try:
+        temporary.chmod(PRIVATE_FOLDER)
+        for name, (data, mode) in files.items():
+            write_new(temporary / name, data, mode)
+        sync_folder(temporary)
+        # Fails if another process has created a folder with content in the meantime.
+        temporary.rename(path)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    sync_folder(path.parent)
+
+
 def sync_folder(folder: Path) -> None:
-    """Make a rename in a folder durable: it lives in the folder, not in the file."""
+    """Flush a folder to the disk, which makes a rename in it durable."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

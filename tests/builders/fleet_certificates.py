@@ -21,7 +21,7 @@ from builders.common import eventually, free_port
 from sonarpost.bus.session import client_config
 from sonarpost.config import TlsConfig
 from sonarpost.security.fleet import Fleet
-from sonarpost.security.router_config import Wanted, router_json5
+from sonarpost.security.router_config import RouterOptions, router_json5
 
 DAY_S = 86400.0
 TRACED = "warn,zenoh::net::routing::interceptor=trace"
@@ -119,7 +119,7 @@ class World:
     folders: dict[str, Path]
     routers: dict[str, Router] = field(default_factory=dict)
 
-    def start(self, platform: str, wanted: Wanted, zenoh_log: str | None = TRACED) -> Router:
+    def start(self, platform: str, wanted: RouterOptions, zenoh_log: str | None = TRACED) -> Router:
         path = self.folder / f"{platform}-{len(self.routers)}.json5"
         path.write_text(router_json5(self.fleet.index(), wanted, time.time()), encoding="utf-8")
         router = Router(path, zenoh_log)
@@ -127,8 +127,8 @@ class World:
         router.wait_for("Router started")
         return router
 
-    def shore_wanted(self, shore_tls: str, shore_local: str) -> Wanted:
-        return Wanted("shore-1", listen=[shore_tls], local=[shore_local], files=self.folders["shore-1"])
+    def shore_wanted(self, shore_tls: str, shore_local: str) -> RouterOptions:
+        return RouterOptions("shore-1", listen=[shore_tls], local=[shore_local], files=self.folders["shore-1"])
 
     @property
     def shore(self) -> Router:
@@ -164,7 +164,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
         "uuv-1": fleet.issue("uuv-1", "uuv").folder,
         "console-1": fleet.issue("console-1", "console").folder,
         "observer-1": fleet.issue("observer-1", "observer").folder,
-        # Issued 40 days ago for 10 days by the same authority.
+        # CertificateEntry 40 days ago for 10 days by the same authority.
         "expired": Fleet(fleet.folder, lambda: b"", shifted(-40)).issue("vessel-4", "vessel", days=10).folder,
         "nameless": fleet.issue("shore-2", "shore", ["elsewhere.example"]).folder,
     }
@@ -186,7 +186,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
         made.start("shore-1", made.shore_wanted(made.shore_tls, made.shore_local))
         made.start(
             "vessel-1",
-            Wanted(
+            RouterOptions(
                 "vessel-1",
                 listen=[made.vessel_tls],
                 local=[made.vessel_local],

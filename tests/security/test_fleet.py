@@ -14,9 +14,8 @@ from cryptography import x509
 
 from sonarpost.cli.main import main
 from sonarpost.errors import BadInputError
-from sonarpost.security import names
-from sonarpost.security.fleet import Fleet
-from sonarpost.security.index import FleetIndex, PkiError
+from sonarpost.security import certificates
+from sonarpost.security.fleet import Fleet, FleetIndex, PkiError
 
 DAY_S = 86400.0
 
@@ -51,9 +50,9 @@ def test_certificate_holds_hosts_and_usage(fleet):
     own = x509.load_pem_x509_certificate((folder / "certificate.pem").read_bytes())
     authority = x509.load_pem_x509_certificate((fleet.folder / "ca.pem").read_bytes())
     own.verify_directly_issued_by(authority)
-    names_in_it = own.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    assert names_in_it.get_values_for_type(x509.DNSName) == ["shore-1", "shore.example"]
-    assert [str(a) for a in names_in_it.get_values_for_type(x509.IPAddress)] == ["192.0.2.7", "2001:db8::7"]
+    alternatives = own.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert alternatives.get_values_for_type(x509.DNSName) == ["shore-1", "shore.example"]
+    assert [str(a) for a in alternatives.get_values_for_type(x509.IPAddress)] == ["192.0.2.7", "2001:db8::7"]
     assert own.extensions.get_extension_for_class(x509.BasicConstraints).value.ca is False
     constraints = authority.extensions.get_extension_for_class(x509.BasicConstraints).value
     assert (constraints.ca, constraints.path_length) == (True, 0)
@@ -81,7 +80,7 @@ def test_renewal_keeps_the_name_with_a_new_key(fleet):
 
 
 def test_existing_files_are_not_overwritten(fleet, tmp_path):
-    with pytest.raises(PkiError, match="not there yet"):
+    with pytest.raises(PkiError, match="does not exist yet"):
         Fleet.init(fleet.folder, "again")
     fleet.issue("vessel-1", "vessel")
     with pytest.raises(PkiError, match="renew"):
@@ -118,14 +117,14 @@ def test_invalid_host_is_rejected(fleet, host):
 
 @pytest.mark.parametrize("name", ["vessel-1", "vessel-1.g2", "v.g999999"])
 def test_common_names_hold_the_generation(name):
-    platform, generation = names.platform_of(name)
-    assert names.common_name(platform, generation) == name
+    platform, generation = certificates.platform_of(name)
+    assert certificates.common_name(platform, generation) == name
 
 
 @pytest.mark.parametrize("name", ["vessel-1.g1", "vessel-1.g0", "vessel-1.g02", "vessel-1.2", "x.g2.g3", ""])
 def test_other_common_names_are_rejected(name):
     with pytest.raises(BadInputError):
-        names.platform_of(name)
+        certificates.platform_of(name)
 
 
 def test_key_can_have_a_passphrase(tmp_path):
@@ -208,7 +207,7 @@ def test_commands_end_to_end(tmp_path, capsys):
     out = tmp_path / "router.json5"
     wanted = ["pki", "router-config", "--platform", "shore-1", "--listen", "tls/[::]:7448", "--dir", str(folder)]
     assert main([*wanted, "--out", str(out)]) == 0
-    assert "Revoked, and let in nowhere: vessel-1." in out.read_text()
+    assert "Revoked and denied: vessel-1." in out.read_text()
     assert '"cert_common_names"' not in out.read_text()
     assert main([*wanted, "--out", str(out)]) == 2
     assert main([*wanted, "--out", str(out), "--replace"]) == 0

@@ -14,7 +14,7 @@ from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Advice, Command, Decision, Record
 from sonarpost.runtime.service import Service, UnitOfWork
-from sonarpost.security.router_config import Wanted
+from sonarpost.security.router_config import RouterOptions
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
@@ -209,7 +209,7 @@ def test_revoked_vessel_reports_that_it_is_denied(world, start_service, caplog):
     stolen = type(world)(
         **{**vars(world), "fleet": _Unrevoked(before.model_copy(update={"certificates": entries[:-1]}))}
     )
-    wanted = Wanted("vessel-3", local=[local], connect=[world.shore_tls], files=world.folders["vessel-3"])
+    wanted = RouterOptions("vessel-3", local=[local], connect=[world.shore_tls], files=world.folders["vessel-3"])
     stolen.start("vessel-3", wanted)
     relay = start_service(
         RelayService, "vessel-3", local, RelayConfig(), upstream=(world.shore_tls,), tls=world.tls("vessel-3")

@@ -13,7 +13,7 @@ from sonarpost import keys, wire
 from sonarpost.bus.connectivity import ConnectivityState, probe_endpoint
 from sonarpost.bus.session import client_config
 from sonarpost.messages import Health
-from sonarpost.security.router_config import Wanted
+from sonarpost.security.router_config import RouterOptions
 
 INBOX_1 = keys.shore_inbox("vessel-1")
 INBOX_2 = keys.shore_inbox("vessel-2")
@@ -78,7 +78,7 @@ def test_connection_without_a_valid_certificate_is_refused(world, who, reason):
 
 def test_server_with_another_host_name_is_refused(world):
     endpoint = f"tls/localhost:{free_port()}"
-    wanted = Wanted("shore-2", listen=[endpoint], local=[], files=world.folders["nameless"])
+    wanted = RouterOptions("shore-2", listen=[endpoint], local=[], files=world.folders["nameless"])
     router = world.start("shore-2", wanted)
     outcome = probe_endpoint(endpoint, world.tls("vessel-2"))
     assert outcome.state is ConnectivityState.TLS_REFUSED
@@ -245,7 +245,7 @@ def test_router_health_reports_links_certificate_and_denied_peers(world, shore_s
 def test_default_log_shows_refused_certificates_plain_tcp_and_denied_peers(world):
     """Without RUST_LOG, as operators run it."""
     port = free_port()
-    wanted = Wanted("shore-1", listen=[f"tls/localhost:{port}"], local=[], files=world.folders["shore-1"])
+    wanted = RouterOptions("shore-1", listen=[f"tls/localhost:{port}"], local=[], files=world.folders["shore-1"])
     router = world.start("shore-1", wanted, zenoh_log=None)
     stranger = client_config([f"tls/localhost:{port}"], world.tls("stranger"))
     stranger.insert_json5("transport/link/tls/root_ca_certificate", f'"{world.fleet.folder / "ca.pem"}"')

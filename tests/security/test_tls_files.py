@@ -13,11 +13,10 @@ from builders.fleet_certificates import tls_of
 from cryptography.hazmat.primitives import serialization
 
 from sonarpost import config
-from sonarpost.bus.tls import TlsMonitor
 from sonarpost.config import ServiceConfig
 from sonarpost.errors import ConfigError
-from sonarpost.security import tls_files
 from sonarpost.security.fleet import Fleet
+from sonarpost.security.tls_files import HostCertificate, TlsMonitor, check_tls_files
 
 DAY_S = 86400.0
 
@@ -29,14 +28,12 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
 
 @pytest.fixture
 def folder(fleet: Fleet, tmp_path: Path) -> Path:
-    Fleet.index(fleet)
     platform = f"vessel-{len(fleet.index().certificates)}"
     return fleet.issue(platform, "vessel", out=tmp_path / "tls").folder
 
 
-def check(folder: Path, now_utc_s: float | None = None) -> tls_files.OwnCertificate:
-    tls = tls_of(folder)
-    return tls_files.check(tls.ca, tls.certificate, tls.key, time.time() if now_utc_s is None else now_utc_s)
+def check(folder: Path, now_utc_s: float | None = None) -> HostCertificate:
+    return check_tls_files(tls_of(folder), time.time() if now_utc_s is None else now_utc_s)
 
 
 def test_valid_files_return_the_certificate(folder):
@@ -122,7 +119,7 @@ def test_group_readable_key_gives_a_warning(folder):
 def test_key_given_instead_of_its_path_is_not_shown(folder):
     secret = (folder / "key.pem").read_text()
     with pytest.raises(ConfigError) as caught:
-        tls_files.check(folder / "ca.pem", folder / "certificate.pem", Path(secret), time.time())
+        check_tls_files(tls_of(folder).model_copy(update={"key": Path(secret)}), time.time())
     assert secret.splitlines()[1] not in str(caught.value)
 
 

@@ -10,8 +10,8 @@ from builders.common import eventually
 from builders.fleet_certificates import tls_of
 
 from sonarpost import keys
-from sonarpost.security import tls_files
 from sonarpost.security.fleet import Fleet
+from sonarpost.security.tls_files import check_tls_files
 
 VESSEL = "vessel-1"
 DECISION = keys.delivery_query(keys.contact_decision(VESSEL), "relay")
@@ -100,5 +100,4 @@ def test_ca_file_can_hold_two_authorities_during_a_change(world, tmp_path):
     young = Fleet.init(tmp_path / "young", "young")
     folder = young.issue("vessel-9", "vessel").folder
     (folder / "ca.pem").write_bytes((world.fleet.folder / "ca.pem").read_bytes() + (folder / "ca.pem").read_bytes())
-    tls = tls_of(folder)
-    assert tls_files.check(tls.ca, tls.certificate, tls.key, time.time()).common_name == "vessel-9"
+    assert check_tls_files(tls_of(folder), time.time()).common_name == "vessel-9"

@@ -26,11 +26,11 @@ import zenoh
 from sonarpost import keys, logs, wire
 from sonarpost.bus.connectivity import declare_presence
 from sonarpost.bus.session import router_config
-from sonarpost.bus.tls import TlsMonitor
 from sonarpost.config import TlsConfig
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError, SonarpostError
 from sonarpost.messages import Health, ServiceState
 from sonarpost.parent_process import exit_with_parent
+from sonarpost.security.tls_files import TlsMonitor
 
 log = logging.getLogger(__name__)
 

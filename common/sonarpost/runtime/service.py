@@ -23,7 +23,6 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
-from sonarpost.bus.tls import TlsMonitor
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.inbox import Inbox
 from sonarpost.delivery.outbox import Outbox, QueuePolicy
@@ -34,6 +33,7 @@ from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.logs import kv, log_context
 from sonarpost.messages import Health, Record, ServiceState
 from sonarpost.monitoring.heartbeat import Heartbeat
+from sonarpost.security.tls_files import TlsMonitor
 
 __all__ = ["Service", "ServiceStoppingError", "UnitOfWork"]
 

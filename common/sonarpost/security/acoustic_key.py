@@ -1,4 +1,4 @@
-"""The file with the key of the acoustic link."""
+"""Key file of the acoustic link."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ def read_key(path: Path) -> AcousticKey:
     """Read a key file: 64 hexadecimal digits, readable by its owner only.
 
     Raises:
-        ConfigError: It cannot be read, is no regular file, others may read or write it, or it holds no key.
+        ConfigError: It cannot be read, is not a regular file, is accessible to others, or holds no key.
     """
     where = str(path)
     try:
-        # One descriptor is both checked and read: nobody can swap the file in between. A pipe must not block.
+        # Check and read the same descriptor: the file cannot be replaced in between. A pipe must not block.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
         raise ConfigError(where, "acoustic key", error.strerror or str(error), "a readable file") from error
@@ -41,6 +41,6 @@ def _check_owner_only(status: os.stat_result, where: str) -> None:
     if not stat.S_ISREG(status.st_mode):
         raise ConfigError(where, "acoustic key", stat.filemode(status.st_mode), "a regular file")
     if status.st_mode & 0o077:
-        raise ConfigError(where, "mode", f"{stat.S_IMODE(status.st_mode):04o}", "0600, its owner's alone")
+        raise ConfigError(where, "mode", f"{stat.S_IMODE(status.st_mode):04o}", "0600, readable by its owner only")
     if status.st_uid not in {os.geteuid(), 0}:
         raise ConfigError(where, "owner", status.st_uid, f"user {os.geteuid()} or root")

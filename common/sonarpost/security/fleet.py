@@ -1,58 +1,186 @@
-"""A fleet's certificate authority in a folder: make it, issue, renew, revoke.
+"""Certificate authority of a fleet, stored in a folder: create, issue, renew, revoke.
 
     {folder}/             0700
-      ca.pem              0644  the authority's certificate, on every host
-      ca.key              0600  its key: on this machine only
+      ca.pem              0644  certificate of the authority, copied to every host
+      ca.key              0600  its private key, on this machine only
       index.json          0600  every certificate ever issued
-      issued/{name}/      0700  what one host needs: ca.pem, certificate.pem, key.pem (0600)
+      issued/{name}/      0700  files of one host: ca.pem, certificate.pem, key.pem (0600)
 
-The index is written before a certificate is handed out, so that there is none the index does not know.
+The index is written before a certificate, so that it lists every certificate that exists.
 """
 
 from __future__ import annotations
 
+import fcntl
+import os
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sonarpost.errors import BadInputError
-from sonarpost.files import write_atomically
-from sonarpost.security import names, private_files, x509_files
-from sonarpost.security.index import INDEX_FILE, FleetIndex, Issued, PkiError, Role
-from sonarpost.security.private_files import PRIVATE_FILE, PUBLIC_FILE
+from sonarpost.files import PRIVATE_FILE, PUBLIC_FILE, write_atomically, write_new_folder
+from sonarpost.security import certificates
+from sonarpost.security.certificates import SignedCertificate
 
 CA_CERTIFICATE = "ca.pem"
 CA_KEY = "ca.key"
 CERTIFICATE = "certificate.pem"
 KEY = "key.pem"
+INDEX_FILE = "index.json"
 ISSUED = "issued"
 AUTHORITY_DAYS = 3650
 CERTIFICATE_DAYS = 365.0
 MIN_PASSPHRASE_BYTES = 8
+DAY_S = 86400.0
 
-Passphrase = Callable[[], bytes]
+Role = Literal["uuv", "vessel", "shore", "console", "observer"]
+ROLES: tuple[Role, ...] = ("uuv", "vessel", "shore", "console", "observer")
+
+
+class PkiError(BadInputError):
+    """A request to the authority is invalid."""
+
+
+class CertificateEntry(BaseModel):
+    """Index entry of one certificate.
+
+    Attributes:
+        serial: Serial number, hexadecimal.
+        common_name: Platform and generation; the name that identifies it at routers.
+        platform: The platform.
+        role: Role of the platform, which determines its rights at routers.
+        hosts: DNS names and addresses of the platform.
+        not_before_utc_s: Start of the validity.
+        not_after_utc_s: End of the validity.
+        revoked_utc_s: When it was revoked; None if it was not.
+        reason: Why it was revoked.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    serial: Annotated[str, Field(pattern=r"^[0-9a-f]{1,40}$")]
+    common_name: str
+    platform: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")]
+    role: Role
+    hosts: tuple[str, ...]
+    not_before_utc_s: float
+    not_after_utc_s: float
+    revoked_utc_s: float | None = None
+    reason: str = ""
+
+    @property
+    def not_after(self) -> datetime:
+        """End of the validity."""
+        return datetime.fromtimestamp(self.not_after_utc_s, UTC)
+
+    def days_left(self, now_utc_s: float) -> float:
+        """Return the remaining validity in days, negative after its end."""
+        return (self.not_after_utc_s - now_utc_s) / DAY_S
+
+
+class FleetIndex(BaseModel):
+    """All certificates that the authority has issued, oldest first."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    v: Literal[1] = 1
+    fleet: Annotated[str, Field(min_length=1, max_length=64)]
+    certificates: tuple[CertificateEntry, ...] = ()
+
+    @classmethod
+    def read(cls, folder: Path) -> FleetIndex:
+        """Read the index of an authority.
+
+        Raises:
+            PkiError: It is missing or damaged; names the field.
+        """
+        path = folder / INDEX_FILE
+        try:
+            index = cls.model_validate_json(path.read_bytes())
+        except FileNotFoundError as error:
+            raise PkiError(str(path), "", "nothing", "an authority: `sonarpost pki init` creates one") from error
+        except OSError as error:
+            raise PkiError(str(path), "", str(error), "a readable file") from error
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            field = ".".join(str(part) for part in first["loc"])
+            raise PkiError(str(path), field, first.get("input"), first["msg"]) from error
+        for entry in index.certificates:
+            if certificates.platform_of(entry.common_name)[0] != entry.platform:
+                raise PkiError(str(path), "common_name", entry.common_name, f"a name of {entry.platform}")
+        return index
+
+    def to_bytes(self) -> bytes:
+        """Return the content of the file."""
+        return (self.model_dump_json(indent=1) + "\n").encode()
+
+    def find(self, platform: str) -> CertificateEntry | None:
+        """Return the newest certificate of a platform that is not revoked; it can have expired."""
+        entries = [e for e in self.certificates if e.platform == platform and e.revoked_utc_s is None]
+        return entries[-1] if entries else None
+
+    def current(self, platform: str) -> CertificateEntry:
+        """Return the newest certificate of a platform that is not revoked; it can have expired.
+
+        Raises:
+            PkiError: There is none.
+        """
+        entry = self.find(platform)
+        if entry is None:
+            raise PkiError("pki", "platform", platform, "a platform with a certificate that is not revoked")
+        return entry
+
+    def allowed(self, role: Role) -> Sequence[CertificateEntry]:
+        """Return the newest certificate of each common name of a role that is not revoked."""
+        newest = {e.common_name: e for e in self.certificates if e.revoked_utc_s is None and e.role == role}
+        return sorted(newest.values(), key=lambda e: e.common_name)
+
+    def revoked_names(self) -> Sequence[str]:
+        """Return all revoked common names."""
+        return sorted({entry.common_name for entry in self.certificates if entry.revoked_utc_s is not None})
+
+    def next_name(self, platform: str) -> str:
+        """Return an unused common name of a platform."""
+        names = (e.common_name for e in self.certificates if e.platform == platform)
+        generation = 1 + max((certificates.platform_of(name)[1] for name in names), default=0)
+        return certificates.common_name(platform, generation)
+
+    def with_revoked(self, name: str, now_utc_s: float, reason: str) -> FleetIndex:
+        """Return the index with all certificates of a common name revoked."""
+        update = {"revoked_utc_s": now_utc_s, "reason": reason}
+        entries = tuple(
+            entry.model_copy(update=update) if entry.common_name == name and entry.revoked_utc_s is None else entry
+            for entry in self.certificates
+        )
+        return self.model_copy(update={"certificates": entries})
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """A certificate that was just made, and the folder that holds it."""
+    """A new certificate and the folder with its files."""
 
-    entry: Issued
+    entry: CertificateEntry
     folder: Path
 
 
 class Fleet:
-    """The authority in a folder.
+    """Certificate authority in a folder.
 
     Args:
-        folder: Where it is.
-        passphrase: Asked for the key's passphrase when the key has one.
+        folder: The folder.
+        passphrase: Returns the passphrase; called if the key is encrypted.
         now_utc_s: The clock.
     """
 
-    def __init__(self, folder: Path, passphrase: Passphrase, now_utc_s: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self, folder: Path, passphrase: Callable[[], bytes], now_utc_s: Callable[[], float] = time.time
+    ) -> None:
         self.folder = folder
         self._passphrase = passphrase
         self._now_utc_s = now_utc_s
@@ -66,17 +194,17 @@ class Fleet:
         days: int = AUTHORITY_DAYS,
         now_utc_s: Callable[[], float] = time.time,
     ) -> Fleet:
-        """Make an authority in a new folder.
+        """Create an authority in a new folder.
 
         Args:
-            folder: Must not be there yet.
-            fleet: Name of the fleet, for people.
-            passphrase: Protects the authority's key; None keeps it in the clear (mode 0600).
+            folder: Must not exist.
+            fleet: Name of the fleet.
+            passphrase: Encrypts the key; None stores it unencrypted (mode 0600).
             days: Validity of the authority.
             now_utc_s: The clock.
 
         Raises:
-            PkiError: The folder is there, the name is empty or too long, the passphrase too short.
+            PkiError: The folder exists, the name is empty or too long, or the passphrase too short.
             OSError: It cannot be written.
         """
         if not 1 <= len(fleet) <= 48 or not fleet.isprintable():
@@ -84,23 +212,23 @@ class Fleet:
         if passphrase is not None and len(passphrase) < MIN_PASSPHRASE_BYTES:
             got = f"{len(passphrase)} bytes"
             raise PkiError("pki", "passphrase", got, f"at least {MIN_PASSPHRASE_BYTES} bytes")
-        _, certificate_pem, key_pem = x509_files.new_authority(fleet, days, x509_files.utc(now_utc_s()), passphrase)
+        authority = certificates.create_authority(fleet, days, now_utc_s())
         files = {
-            CA_CERTIFICATE: (certificate_pem, PUBLIC_FILE),
-            CA_KEY: (key_pem, PRIVATE_FILE),
+            CA_CERTIFICATE: (authority.certificate_pem(), PUBLIC_FILE),
+            CA_KEY: (authority.key_pem(passphrase), PRIVATE_FILE),
             INDEX_FILE: (FleetIndex(fleet=fleet).to_bytes(), PRIVATE_FILE),
         }
         try:
-            private_files.write_new_folder(folder, files)
+            write_new_folder(folder, files)
         except FileExistsError as error:
-            raise PkiError(str(folder), "", "something there already", "a folder that is not there yet") from error
+            raise _existing(folder) from error
         return cls(folder, lambda: passphrase or b"", now_utc_s)
 
     def index(self) -> FleetIndex:
-        """Return the list of certificates.
+        """Return the index of all certificates.
 
         Raises:
-            PkiError: There is no authority in the folder, or its index is damaged.
+            PkiError: The folder holds no authority, or its index is damaged.
         """
         return FleetIndex.read(self.folder)
 
@@ -112,24 +240,21 @@ class Fleet:
         days: float = CERTIFICATE_DAYS,
         out: Path | None = None,
     ) -> Bundle:
-        """Issue a platform's certificate under a name of its own.
-
-        The first has the platform's name; one after a revocation has the next generation's.
+        """Issue a certificate under a new common name: the platform, or its next generation after a revocation.
 
         Raises:
-            PkiError: The platform has a certificate that is not revoked (renew or revoke it), or `out` is there.
-            BadInputError: A name, a host, the passphrase or the authority's files are wrong.
-            OSError: Something cannot be written.
+            PkiError: The platform has a certificate that is not revoked (renew or revoke it), or `out` exists.
+            BadInputError: A name, a host, the passphrase or a file of the authority is invalid.
+            OSError: A file cannot be written.
         """
-        names.checked_platform(platform, "pki")
-        _check_days(days)
+        certificates.check_platform(platform)
         with self._locked():
             index = self.index()
-            if (known := index.current(platform)) is not None:
+            if (known := index.find(platform)) is not None:
                 got = f"a valid certificate, {known.common_name}, serial {known.serial}"
-                raise PkiError("pki", platform, got, "none; `pki renew` prolongs it, `pki revoke` ends it")
-            name = names.common_name(platform, index.next_generation(platform))
-            return self._make(index, name, platform, role, hosts, days, out or self.folder / ISSUED / name)
+                raise PkiError("pki", platform, got, "none; `pki renew` extends it, `pki revoke` ends it")
+            name = index.next_name(platform)
+            return self._issue(index, name, platform, role, hosts, days, out or self.folder / ISSUED / name)
 
     def renew(
         self,
@@ -140,28 +265,26 @@ class Fleet:
     ) -> Bundle:
         """Issue a new key and certificate under the platform's present name.
 
-        Routers need no new configuration. The old certificate stays good until it ends: after a loss, revoke instead.
+        The configuration of routers does not change. The old certificate remains valid until its end: after a loss,
+        revoke it instead.
 
         Raises:
-            PkiError: The platform has no certificate to renew, or `out` is there.
-            BadInputError: A host, the passphrase or the authority's files are wrong.
-            OSError: Something cannot be written.
+            PkiError: The platform has no certificate to renew, or `out` exists.
+            BadInputError: A host, the passphrase or a file of the authority is invalid.
+            OSError: A file cannot be written.
         """
-        _check_days(days)
         with self._locked():
             index = self.index()
             entry = index.current(platform)
-            if entry is None:
-                raise PkiError("pki", "platform", platform, "a platform with a certificate that is not revoked")
             name = entry.common_name
-            made_before = sum(e.common_name == name for e in index.certificates)
-            folder = out or self.folder / ISSUED / f"{name}.renewal-{made_before}"
-            return self._make(index, name, platform, entry.role, entry.hosts if hosts is None else hosts, days, folder)
+            number = sum(e.common_name == name for e in index.certificates)
+            folder = out or self.folder / ISSUED / f"{name}.renewal-{number}"
+            return self._issue(index, name, platform, entry.role, entry.hosts if hosts is None else hosts, days, folder)
 
-    def revoke(self, platform: str, reason: str) -> Issued:
-        """Revoke every certificate under a platform's present name, for good.
+    def revoke(self, platform: str, reason: str) -> CertificateEntry:
+        """Revoke all certificates under a platform's present name, permanently.
 
-        It takes effect where a router runs with an access control list made after this.
+        It takes effect at each router that is restarted with a new access control list.
 
         Raises:
             PkiError: The platform has no certificate that is not revoked.
@@ -170,21 +293,19 @@ class Fleet:
         with self._locked():
             index = self.index()
             entry = index.current(platform)
-            if entry is None:
-                raise PkiError("pki", "platform", platform, "a platform with a certificate that is not revoked")
-            self._keep(index.with_revoked(entry.common_name, self._now_utc_s(), reason))
+            self._write(index.with_revoked(entry.common_name, self._now_utc_s(), reason))
             return entry
 
     def authority_days_left(self) -> float:
-        """Return how many days the authority itself is valid.
+        """Return the remaining validity of the authority in days.
 
         Raises:
             PkiError: Its certificate cannot be read.
         """
-        authority = x509_files.load_certificate(self._read(CA_CERTIFICATE), str(self.folder / CA_CERTIFICATE))
-        return (authority.not_valid_after_utc.timestamp() - self._now_utc_s()) / 86400.0
+        authority = certificates.load_certificate(self._read(CA_CERTIFICATE), str(self.folder / CA_CERTIFICATE))
+        return (authority.not_valid_after_utc.timestamp() - self._now_utc_s()) / DAY_S
 
-    def _make(
+    def _issue(
         self,
         index: FleetIndex,
         name: str,
@@ -194,16 +315,14 @@ class Fleet:
         days: float,
         folder: Path,
     ) -> Bundle:
+        if not 0 < days <= AUTHORITY_DAYS:
+            raise BadInputError("pki", "days", days, f"more than 0 to {AUTHORITY_DAYS}")
         if folder.exists() or folder.is_symlink():
-            raise PkiError(str(folder), "", "something there already", "a folder that is not there yet")
+            raise _existing(folder)
         authority = self._authority()
-        now_utc_s = self._now_utc_s()
-        if authority.certificate.not_valid_after_utc.timestamp() <= now_utc_s:
-            end = authority.certificate.not_valid_after_utc.isoformat()
-            raise PkiError(str(self.folder / CA_CERTIFICATE), "", f"an authority that ended on {end}", "a valid one")
-        signed = x509_files.sign(authority, name, hosts, days, x509_files.utc(now_utc_s))
-        entry = Issued(
-            serial=signed.serial,
+        signed = certificates.sign(authority, name, hosts, days, self._now_utc_s())
+        entry = CertificateEntry(
+            serial=f"{signed.certificate.serial_number:x}",
             common_name=name,
             platform=platform,
             role=role,
@@ -211,27 +330,32 @@ class Fleet:
             not_before_utc_s=signed.certificate.not_valid_before_utc.timestamp(),
             not_after_utc_s=signed.certificate.not_valid_after_utc.timestamp(),
         )
-        self._keep(index.with_added(entry))
+        self._write(index.model_copy(update={"certificates": (*index.certificates, entry)}))
         files = {
             CA_CERTIFICATE: (self._read(CA_CERTIFICATE), PUBLIC_FILE),
-            CERTIFICATE: (signed.certificate_pem, PUBLIC_FILE),
-            KEY: (signed.key_pem, PRIVATE_FILE),
+            CERTIFICATE: (signed.certificate_pem(), PUBLIC_FILE),
+            KEY: (signed.key_pem(), PRIVATE_FILE),
         }
         try:
-            private_files.write_new_folder(folder, files)
+            write_new_folder(folder, files)
         except OSError:
-            # Nobody has the key: the entry would only block the next try.
-            self._keep(index)
+            # The key was not stored: an index entry would only block the next attempt.
+            self._write(index)
             raise
         return Bundle(entry, folder)
 
-    def _authority(self) -> x509_files.Authority:
+    def _authority(self) -> SignedCertificate:
         key_pem = self._read(CA_KEY)
         mode = (self.folder / CA_KEY).stat().st_mode & 0o777
         if mode & 0o077:
-            raise PkiError(str(self.folder / CA_KEY), "mode", f"{mode:04o}", "0600: nobody else may read this key")
-        passphrase = self._passphrase() if x509_files.is_encrypted(key_pem) else None
-        return x509_files.load_authority(self._read(CA_CERTIFICATE), key_pem, passphrase, str(self.folder))
+            raise PkiError(str(self.folder / CA_KEY), "mode", f"{mode:04o}", "0600: readable by its owner only")
+        passphrase = self._passphrase() if b"ENCRYPTED" in key_pem else None
+        authority = certificates.load_authority(self._read(CA_CERTIFICATE), key_pem, passphrase, str(self.folder))
+        end = authority.certificate.not_valid_after_utc
+        if end.timestamp() <= self._now_utc_s():
+            path = str(self.folder / CA_CERTIFICATE)
+            raise PkiError(path, "", f"an authority that ended on {end.isoformat()}", "a valid one")
+        return authority
 
     def _read(self, name: str) -> bytes:
         try:
@@ -239,15 +363,21 @@ class Fleet:
         except OSError as error:
             raise PkiError(str(self.folder / name), "", str(error), "a readable file") from error
 
-    def _keep(self, index: FleetIndex) -> None:
+    def _write(self, index: FleetIndex) -> None:
         write_atomically(self.folder / INDEX_FILE, index.to_bytes(), PRIVATE_FILE)
 
-    def _locked(self) -> AbstractContextManager[None]:
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Lock the folder, so that concurrent commands never issue the same name twice."""
         if not self.folder.is_dir():
-            raise PkiError(str(self.folder), "", "nothing", "an authority: `sonarpost pki init` makes one")
-        return private_files.locked(self.folder)
+            raise PkiError(str(self.folder), "", "nothing", "an authority: `sonarpost pki init` creates one")
+        descriptor = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT, PRIVATE_FILE)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(descriptor)
 
 
-def _check_days(days: float) -> None:
-    if not 0 < days <= AUTHORITY_DAYS:
-        raise BadInputError("pki", "days", days, f"more than 0 to {AUTHORITY_DAYS}")
+def _existing(folder: Path) -> PkiError:
+    return PkiError(str(folder), "", "an existing file or folder", "a folder that does not exist yet")

@@ -1,7 +1,12 @@
-"""The configuration of a platform's router, as JSON5 for zenohd and for sonarpost's own router.
+"""Configuration of a platform's router as JSON5, for zenohd and for the embedded router.
 
-Outside: TLS with certificates on both sides, and access control by common name. Inside: plain TCP for the platform's
-own services, on the loopback address or on a network that nobody else is in.
+Other platforms connect by TLS with certificates on both sides; access control identifies them by common name. The
+platform's own services connect by plain TCP, on the loopback address or on a network of their own.
+
+Access control denies everything that no rule allows. Flows are seen from the router: *ingress* is what the peer sends,
+*egress* what it receives. Zenoh also filters declarations: if the egress of `declare_subscriber` is denied, a vessel
+never learns of a subscription at the shore and does not send its publications of that key. The router that a peer
+connects to enforces the rules; the peer's own router need not be trusted.
 """
 
 from __future__ import annotations
@@ -12,39 +17,51 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
+from typing import Literal
 
+from sonarpost import keys
 from sonarpost.errors import BadInputError
-from sonarpost.keys import SHORE
-from sonarpost.security import access, fleet
-from sonarpost.security.access import Json
-from sonarpost.security.index import FleetIndex, Issued, PkiError
+from sonarpost.security import fleet
+from sonarpost.security.fleet import CertificateEntry, FleetIndex, PkiError, Role
 
 LEASE_MS = 3000
-# A thin radio link takes long over what is under way; five seconds, Zenoh's own choice, close it too early.
+# A message in transmission on a slow radio link takes longer than Zenoh's default of five seconds.
 WAIT_BEFORE_CLOSE_US = 60_000_000
-# A record is at most 8 MiB; the rest is for Zenoh's own headers.
+# A record has at most 8 MiB; the difference is for Zenoh's headers.
 MAX_PAYLOAD_BYTES = 8 * 1024 * 1024
 MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES + 64 * 1024
+TLS_FOLDER = PurePosixPath("/etc/sonarpost/tls")
+PEER_ROLES: dict[Role, tuple[Role, ...]] = {
+    "shore": ("vessel", "uuv", "console", "observer", "shore"),
+    "vessel": ("shore", "console", "observer"),
+}
+"""Roles that the router of a platform admits, by the role of the platform."""
+
+# Subscriptions are not secret and are allowed on every key: otherwise a subscriber of `**` would not receive the keys
+# that it may read. The rules for `put` decide what it receives.
+INTEREST = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
+EVERY_MESSAGE = ("put", "delete", "query", "reply", "declare_queryable", "liveliness_token", *INTEREST)
 _ENDPOINT = re.compile(
     r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9a-fA-F:.%a-z]+\]|[A-Za-z0-9._-]+|\*):(?P<port>[0-9]{1,5})"
 )
 _LOOPBACK = re.compile(r"localhost|127\.[0-9.]+|\[::1\]")
 
-
-ON_HOST = PurePosixPath("/etc/sonarpost/tls")
+Json = dict[str, object]
+Rule = tuple[Literal["ingress", "egress"], tuple[str, ...], tuple[str, ...]]
+"""Something that is allowed: flow, kinds of Zenoh messages, key expressions."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """What is asked of a router.
+class RouterOptions:
+    """Options of a router configuration.
 
     Attributes:
-        platform: Whose router it is; it must have a certificate.
+        platform: Platform of the router; it must have a certificate.
         listen: TLS endpoints for other platforms.
         local: Plain TCP endpoints for the platform's own services.
         connect: TLS endpoints of routers to link to.
         files: Folder of ca.pem, certificate.pem and key.pem on the router's host.
-        sites: Words that the shore answers to in keys.
+        sites: Names of the shore site in keys.
         open_local: Whether `local` may be other than a loopback address.
     """
 
@@ -52,51 +69,46 @@ class Wanted:
     listen: Sequence[str] = ()
     local: Sequence[str] = ("tcp/127.0.0.1:7447",)
     connect: Sequence[str] = ()
-    files: PurePosixPath = ON_HOST
-    sites: Sequence[str] = (SHORE,)
+    files: PurePosixPath = TLS_FOLDER
+    sites: Sequence[str] = (keys.SHORE,)
     open_local: bool = False
 
 
-def router_json5(index: FleetIndex, wanted: Wanted, now_utc_s: float) -> str:
-    """Return the file.
+def router_json5(index: FleetIndex, options: RouterOptions, now_utc_s: float) -> str:
+    """Return the content of a configuration file.
 
     Raises:
-        BadInputError: The platform has no certificate or its role has no router; an endpoint is not what it must be.
+        BadInputError: The platform has no certificate, its role has no router, or an endpoint is invalid.
     """
-    entry = index.current(wanted.platform)
-    if entry is None:
-        raise PkiError("pki", "platform", wanted.platform, "a platform with a certificate that is not revoked")
-    _check_endpoints(wanted)
-    settings = router_settings(index, entry, wanted)
+    entry = index.current(options.platform)
+    _check_endpoints(options)
     head = [
         f"// Router of {entry.platform} ({entry.role}), fleet {index.fleet}.",
         f"// Written by `sonarpost pki router-config` on {datetime.fromtimestamp(now_utc_s, UTC):%Y-%m-%d %H:%M} UTC.",
-        "// Zenoh reads it when the router starts: after `sonarpost pki issue` or `revoke`, write it anew and restart.",
+        "// Zenoh reads it at the start only: after `sonarpost pki issue` or `revoke`, write it again and restart.",
     ]
     if revoked := index.revoked_names():
-        head.append("// Revoked, and let in nowhere: " + ", ".join(revoked) + ".")
-    return "\n".join(head) + "\n" + json.dumps(settings, indent=2) + "\n"
+        head.append("// Revoked and denied: " + ", ".join(revoked) + ".")
+    return "\n".join(head) + "\n" + json.dumps(_settings(index, entry, options), indent=2) + "\n"
 
 
-def router_settings(index: FleetIndex, entry: Issued, wanted: Wanted) -> Json:
-    """Return Zenoh's settings of a platform's router."""
-    file = {name: str(wanted.files / name) for name in (fleet.CA_CERTIFICATE, fleet.CERTIFICATE, fleet.KEY)}
+def _settings(index: FleetIndex, router: CertificateEntry, options: RouterOptions) -> Json:
     tls: Json = {
         "enable_mtls": True,
         "verify_name_on_connect": True,
         "close_link_on_expiration": True,
-        "root_ca_certificate": file[fleet.CA_CERTIFICATE],
+        "root_ca_certificate": str(options.files / fleet.CA_CERTIFICATE),
     }
     for side in ("listen", "connect"):
-        tls[f"{side}_certificate"] = file[fleet.CERTIFICATE]
-        tls[f"{side}_private_key"] = file[fleet.KEY]
+        tls[f"{side}_certificate"] = str(options.files / fleet.CERTIFICATE)
+        tls[f"{side}_private_key"] = str(options.files / fleet.KEY)
     return {
         "mode": "router",
-        # Zenoh carries this along; sonarpost's own router takes from it whose health to publish and whom to answer.
-        "metadata": {"platform": entry.platform, "sites": list(wanted.sites) if entry.role == "shore" else []},
-        "listen": {"endpoints": [*wanted.local, *wanted.listen], "timeout_ms": 0, "exit_on_failure": True},
+        # Read by the embedded router: platform of its health record, sites of its presence replies.
+        "metadata": {"platform": router.platform, "sites": list(options.sites) if router.role == "shore" else []},
+        "listen": {"endpoints": [*options.local, *options.listen], "timeout_ms": 0, "exit_on_failure": True},
         "connect": {
-            "endpoints": list(wanted.connect),
+            "endpoints": list(options.connect),
             "timeout_ms": -1,
             "exit_on_failure": False,
             "retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
@@ -124,45 +136,149 @@ def router_settings(index: FleetIndex, entry: Issued, wanted: Wanted) -> Json:
                 "size_limit": MAX_PAYLOAD_BYTES,
             }
         ],
-        "access_control": access.access_control(grants(index, entry, wanted.sites)),
+        "access_control": _access_control(index, router, options.sites),
     }
 
 
-def grants(index: FleetIndex, router: Issued, sites: Sequence[str]) -> list[access.Grant]:
-    """Return who may do what at a platform's router: its own services, and every certificate that is not revoked.
-
-    Raises:
-        PkiError: A platform of this role has no router.
-    """
-    roles = access.roles_at(router.role)
-    if not roles:
-        raise PkiError("pki", "role", router.role, "shore or vessel: only those have a router for others")
-    found = [access.local_grant()]
-    for role in roles:
-        for entry in index.allowed(role):
-            if entry.platform == router.platform:
-                continue
-            if router.role == "shore":
-                rules = access.at_shore(entry, sites)
-            else:
-                rules = access.at_vessel(entry, router.platform, sites)
-            found.append(access.certificate_grant(entry, rules))
-    return found
-
-
-def _check_endpoints(wanted: Wanted) -> None:
+def _check_endpoints(options: RouterOptions) -> None:
     for field, endpoints, protocol in (
-        ("listen", wanted.listen, "tls"),
-        ("connect", wanted.connect, "tls"),
-        ("local", wanted.local, "tcp"),
+        ("listen", options.listen, "tls"),
+        ("connect", options.connect, "tls"),
+        ("local", options.local, "tcp"),
     ):
         for endpoint in endpoints:
             match = _ENDPOINT.fullmatch(endpoint)
             if match is None or match["protocol"] != protocol or not 0 < int(match["port"]) < 65536:
                 raise BadInputError("router-config", field, endpoint, f"{protocol}/HOST:PORT")
-            if field == "local" and not _LOOPBACK.fullmatch(match["host"]) and not wanted.open_local:
+            if field == "local" and not _LOOPBACK.fullmatch(match["host"]) and not options.open_local:
                 expected = (
-                    "a loopback address; whoever reaches this one may do everything, --open-local says that "
-                    "only the platform's own services do"
+                    "a loopback address; every program that reaches this endpoint has all rights, --open-local "
+                    "confirms that only the platform's own services do"
                 )
                 raise BadInputError("router-config", field, endpoint, expected)
+
+
+# Access control
+
+
+def _access_control(index: FleetIndex, router: CertificateEntry, sites: Sequence[str]) -> Json:
+    """Return Zenoh's `access_control` section: the platform's own services, and all certificates not revoked.
+
+    Raises:
+        PkiError: A platform of this role has no router.
+    """
+    if router.role not in PEER_ROLES:
+        raise PkiError("pki", "role", router.role, "shore or vessel: only those have a router for other platforms")
+    everywhere = (keys.ANY, keys.ROUTER_ADMINISTRATION)
+    local: list[Rule] = [("ingress", EVERY_MESSAGE, everywhere), ("egress", EVERY_MESSAGE, everywhere)]
+    # The own services connect by plain TCP, to an address that no other program can reach.
+    grants: list[tuple[str, Json, list[Rule]]] = [("local services", {"link_protocols": ["tcp"]}, local)]
+    for entry in (entry for role in PEER_ROLES[router.role] for entry in index.allowed(role)):
+        if entry.platform != router.platform:
+            peer: Json = {"cert_common_names": [entry.common_name], "link_protocols": ["tls"]}
+            at_shore = router.role == "shore"
+            rules = _rules_at_shore(entry, sites) if at_shore else _rules_at_vessel(entry, router.platform, sites)
+            grants.append((f"{entry.role} {entry.common_name}", peer, rules))
+    named = [(subject, number, rule) for subject, _, rules in grants for number, rule in enumerate(rules, start=1)]
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [
+            {
+                "id": f"{subject} {number}",
+                "permission": "allow",
+                "flows": [flow],
+                "messages": list(messages),
+                "key_exprs": list(expressions),
+            }
+            for subject, number, (flow, messages, expressions) in named
+        ],
+        "subjects": [{"id": subject, **peer} for subject, peer, _ in grants],
+        "policies": [
+            {
+                "id": subject,
+                "rules": [f"{subject} {number}" for number in range(1, len(rules) + 1)],
+                "subjects": [subject],
+            }
+            for subject, _, rules in grants
+        ],
+    }
+
+
+def _rules_at_shore(entry: CertificateEntry, sites: Sequence[str]) -> list[Rule]:
+    """Return the rights of a certificate at the router of a shore site."""
+    own = (keys.everything_of(entry.platform),)
+    match entry.role:
+        case "vessel":
+            inboxes = tuple(keys.below(keys.shore_inbox(entry.platform, site)) for site in sites)
+            return [
+                ("ingress", ("put", "reply", "declare_queryable", "liveliness_token"), own),
+                ("ingress", ("declare_subscriber",), own),
+                ("ingress", ("query",), inboxes),
+                ("egress", INTEREST, (keys.ANY,)),
+                ("egress", ("query", "put"), own),
+                ("egress", ("reply",), inboxes),
+                ("egress", ("declare_queryable",), _inbox_queryables(sites)),
+            ]
+        case "uuv":
+            # A vehicle on deck, linked for a transfer or a test: it publishes below its own prefix.
+            return [("ingress", ("put", "liveliness_token"), own), ("egress", INTEREST, (keys.ANY,))]
+        case "console":
+            taskings = [(keys.tasking_advice_all(site), keys.tasking_command_all(site)) for site in sites]
+            return [*_reading(), *_sending(tuple(keys.below(key) for pair in taskings for key in pair))]
+        case "observer":
+            return _reading()
+        case "shore":
+            # Another shore site reads what this one has accepted.
+            accepted = tuple(keys.below(keys.shore_contact_all(site)) for site in sites)
+            return [("ingress", INTEREST, (keys.ANY,)), ("egress", ("put",), accepted)]
+
+
+def _rules_at_vessel(entry: CertificateEntry, vessel: str, sites: Sequence[str]) -> list[Rule]:
+    """Return the rights of a certificate at the router of a vessel.
+
+    The shore can send advice and commands. It can neither send images or decisions as if they came from the vessel nor
+    read the vessel's internal records.
+    """
+    match entry.role:
+        case "shore":
+            downward = (keys.below(keys.advice(vessel)), keys.below(keys.command_all(vessel)))
+            inboxes = tuple(keys.below(keys.shore_inbox(vessel, site)) for site in sites)
+            return [
+                ("ingress", INTEREST, (keys.ANY,)),
+                ("ingress", ("query", "put"), downward),
+                ("ingress", ("reply",), inboxes),
+                ("ingress", ("declare_queryable",), _inbox_queryables(sites)),
+                ("egress", ("put", "liveliness_token"), (keys.everything_of(vessel),)),
+                ("egress", ("reply", "declare_queryable", "declare_subscriber"), downward),
+                ("egress", ("query",), inboxes),
+            ]
+        case "console":
+            # A console on the vessel sends decisions and commands, and receives advice.
+            sent = (keys.below(keys.contact_decision(vessel)), keys.below(keys.command_all(vessel)))
+            received = (keys.delivery_query_any(keys.advice(vessel)),)
+            return [
+                *_reading(),
+                *_sending(sent),
+                ("ingress", ("reply", "declare_queryable"), received),
+                ("egress", ("query",), received),
+            ]
+        case _:
+            return _reading()
+
+
+def _reading() -> list[Rule]:
+    return [("ingress", INTEREST, (keys.ANY,)), ("egress", ("put", "liveliness_token"), (keys.everything(),))]
+
+
+def _sending(expressions: tuple[str, ...]) -> list[Rule]:
+    return [
+        ("ingress", ("query", "put"), expressions),
+        ("egress", ("reply", "declare_queryable", "declare_subscriber"), expressions),
+    ]
+
+
+def _inbox_queryables(sites: Sequence[str]) -> tuple[str, ...]:
+    """Return the keys that the services of a site declare for all vessels at once."""
+    inboxes = [keys.shore_inbox_all(site) for site in sites]
+    return tuple(key for inbox in inboxes for key in (keys.delivery_query_any(inbox), keys.below(inbox)))

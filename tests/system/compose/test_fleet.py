@@ -1,4 +1,4 @@
-"""The script that makes the fleet's certificates for the containers."""
+"""`sonarpost-fleet`, which creates the certificates for the containers."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from builders.common import REPOSITORY
 
 from sonarpost.bus import router
 from sonarpost.errors import ConfigError
-from sonarpost.security.fleet import Fleet
-from sonarpost.security.index import FleetIndex
+from sonarpost.security.fleet import Fleet, FleetIndex
 
 FILES = {"ca.pem": 0o644, "certificate.pem": 0o644, "key.pem": 0o600, "router.json5": 0o644}
 
@@ -43,7 +42,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_one_host_gets_what_both_routers_need(script: ModuleType, root: Path) -> None:
+def test_make_writes_the_files_of_both_routers(script: ModuleType, root: Path) -> None:
     assert script.run(["make"], {}, root) == 0
     for platform, listens in (("shore", "shore-1"), ("vessel", "vessel-1")):
         folder = root / "tls" / platform
@@ -58,7 +57,7 @@ def test_one_host_gets_what_both_routers_need(script: ModuleType, root: Path) ->
     assert connect == ["tls/router-shore:7448"]
 
 
-def test_a_second_time_changes_no_certificate(script: ModuleType, root: Path) -> None:
+def test_repeated_make_changes_no_certificate(script: ModuleType, root: Path) -> None:
     script.run(["make"], {}, root)
     before = (root / "tls" / "vessel" / "certificate.pem").read_bytes()
     script.run(["make"], {"FLEET_OBSERVERS": "desk-1"}, root)
@@ -66,7 +65,7 @@ def test_a_second_time_changes_no_certificate(script: ModuleType, root: Path) ->
     assert "desk-1" in (root / "tls" / "shore" / "router.json5").read_text()
 
 
-def test_a_renewed_certificate_is_the_one_laid_out(script: ModuleType, root: Path) -> None:
+def test_make_installs_the_renewed_certificate(script: ModuleType, root: Path) -> None:
     script.run(["make"], {}, root)
     before = (root / "tls" / "vessel" / "certificate.pem").read_bytes()
     assert script.run(["pki", "renew", "vessel-1"], {}, root) == 0
@@ -74,7 +73,7 @@ def test_a_renewed_certificate_is_the_one_laid_out(script: ModuleType, root: Pat
     assert (root / "tls" / "vessel" / "certificate.pem").read_bytes() != before
 
 
-def test_a_revoked_platform_gets_nothing_by_itself(
+def test_revoked_platform_gets_no_new_certificate(
     script: ModuleType, root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     script.run(["make"], {}, root)
@@ -83,11 +82,11 @@ def test_a_revoked_platform_gets_nothing_by_itself(
     assert list((root / "tls" / "vessel").iterdir()) == []
     assert "vessel-1: revoked" in capsys.readouterr().out
     assert '"vessel-1"' not in (root / "tls" / "shore" / "router.json5").read_text()
-    with pytest.raises(ConfigError, match="a platform with a certificate"):
+    with pytest.raises(PkiError, match="a platform with a certificate"):
         script.Depot(root, script.Plan.from_environment({})).files("vessel-1")
 
 
-def test_a_bundle_carries_a_vessel_to_its_own_host(
+def test_bundle_is_installed_on_another_host(
     script: ModuleType, root: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     environment = {"FLEET_VESSELS": "vessel-1 vessel-2", "SHORE_HOST": "c2.example", "SHORE_PORT": "9448"}
@@ -119,26 +118,26 @@ def tar_of(name: str, kind: bytes = tarfile.REGTYPE) -> bytes:
 @pytest.mark.parametrize(
     "data", [b"", b"not a tar", tar_of("../../etc/passwd"), tar_of("key.pem", tarfile.SYMTYPE), tar_of("ca.pem")]
 )
-def test_anything_else_than_a_bundle_is_refused(script: ModuleType, data: bytes) -> None:
+def test_invalid_bundle_is_rejected(script: ModuleType, data: bytes) -> None:
     with pytest.raises(ConfigError, match="bundle"):
         script.unpack(data)
 
 
-def test_what_is_wrong_in_the_environment_is_named(script: ModuleType) -> None:
+def test_error_names_the_environment_variable(script: ModuleType) -> None:
     with pytest.raises(ConfigError, match="SHORE_PORT: got 'x'"):
         script.Plan.from_environment({"SHORE_PORT": "x"})
     with pytest.raises(ConfigError, match="observer: got 'vessel-1', expected a name that no vessel has"):
         script.Plan.from_environment({"FLEET_OBSERVERS": "vessel-1"})
 
 
-def test_unknown_arguments_are_answered_with_the_known_ones(
+def test_unknown_arguments_show_the_usage(
     script: ModuleType, root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert script.run(["mak"], {}, root) == 2
     assert "got 'mak'" in capsys.readouterr().err
 
 
-def test_the_authority_is_made_once(script: ModuleType, root: Path) -> None:
+def test_authority_is_created_once(script: ModuleType, root: Path) -> None:
     script.run(["make"], {}, root)
     key = (root / "pki" / "fleet" / "ca.key").read_bytes()
     script.run(["make"], {}, root)

@@ -1,0 +1,309 @@
+"""`sonarpost pki`: certificates of a fleet and the access control of its routers.
+
+Options cannot be abbreviated: `--passphrase SECRET` would be read as `--passphrase-file` and appear in `ps`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import json
+import stat
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path, PurePosixPath
+
+from sonarpost.files import PUBLIC_FILE, write_atomically, write_new
+from sonarpost.keys import SHORE
+from sonarpost.security.fleet import (
+    AUTHORITY_DAYS,
+    CA_CERTIFICATE,
+    CERTIFICATE_DAYS,
+    ROLES,
+    Bundle,
+    CertificateEntry,
+    Fleet,
+    PkiError,
+)
+from sonarpost.security.router_config import TLS_FOLDER, RouterOptions, router_json5
+
+DEFAULT_FOLDER = Path("pki")
+WARN_DAYS = 30.0
+EXIT_ENDING = 1
+UPDATE_ROUTERS = "write the routers' configurations again (`sonarpost pki router-config`) and restart them"
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command and its actions."""
+    parser = subparsers.add_parser("pki", help="certificates of the fleet and access control of its routers")
+
+    def show_help(_: argparse.Namespace) -> int:
+        parser.print_help()
+        return 0
+
+    parser.set_defaults(run=show_help)
+    actions = parser.add_subparsers(metavar="ACTION")
+
+    init = _add_action(actions, "init", run_init, "create the fleet's authority in a new folder")
+    init.add_argument("--fleet", default="sonarpost", metavar="NAME", help="name of the fleet")
+    init.add_argument("--days", type=int, default=AUTHORITY_DAYS, help=f"validity in days ({AUTHORITY_DAYS})")
+    _add_passphrase_file(init)
+    init.add_argument("--ask-passphrase", action="store_true", help="ask for a passphrase at the terminal")
+
+    issue = _add_action(actions, "issue", run_issue, "issue a platform's certificate")
+    issue.add_argument("platform", help="name of the platform, `id` in its [platform] table")
+    issue.add_argument("--role", choices=ROLES, required=True, help="role, which determines the rights at routers")
+    _add_certificate_options(issue)
+
+    renew = _add_action(actions, "renew", run_renew, "issue a new key and certificate under the present name")
+    renew.add_argument("platform", help="name of the platform")
+    _add_certificate_options(renew)
+
+    revoke = _add_action(actions, "revoke", run_revoke, "remove a platform's name from access control permanently")
+    revoke.add_argument("platform", help="name of the platform")
+    revoke.add_argument("--reason", default="", help="reason, for the list")
+
+    listing = _add_action(actions, "list", run_list, "list all certificates; exit status 1 if one in use ends soon")
+    listing.add_argument("--json", action="store_true", help="one JSON object for each line")
+    listing.add_argument("--warn-days", type=float, default=WARN_DAYS, metavar="DAYS", help="limit of soon (30)")
+
+    router = _add_action(actions, "router-config", run_router_config, "write a router's configuration (JSON5)")
+    _add_router_options(router)
+
+
+def _add_action(
+    actions: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    run: Callable[[argparse.Namespace], int],
+    text: str,
+) -> argparse.ArgumentParser:
+    parser = actions.add_parser(name, allow_abbrev=False, help=text)
+    parser.add_argument(
+        "--dir", type=Path, default=DEFAULT_FOLDER, dest="folder", metavar="DIR", help="folder of the authority (pki)"
+    )
+    parser.set_defaults(run=run)
+    return parser
+
+
+def _add_certificate_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--host",
+        action="append",
+        dest="hosts",
+        metavar="NAME_OR_ADDRESS",
+        help="DNS name or IP address of its router; can be repeated",
+    )
+    parser.add_argument("--days", type=float, default=CERTIFICATE_DAYS, help=f"validity in days ({CERTIFICATE_DAYS:g})")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="new folder for its files (DIR/issued/NAME)")
+    _add_passphrase_file(parser)
+
+
+def _add_passphrase_file(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--passphrase-file", type=Path, metavar="FILE", help="file with the passphrase of the key in its first line"
+    )
+
+
+def _add_router_options(parser: argparse.ArgumentParser) -> None:
+    default = RouterOptions("")
+    parser.add_argument("--platform", required=True, help="platform of the router")
+    parser.add_argument(
+        "--listen", nargs="*", default=[], metavar="ENDPOINT", help="for other platforms: tls/ADDRESS:PORT"
+    )
+    parser.add_argument(
+        "--local",
+        nargs="*",
+        default=list(default.local),
+        metavar="ENDPOINT",
+        help=f"for the platform's own services, without certificates ({', '.join(default.local)})",
+    )
+    parser.add_argument(
+        "--open-local",
+        action="store_true",
+        help="allow other than loopback addresses there: no other program can reach that network",
+    )
+    parser.add_argument(
+        "--connect", nargs="*", default=[], metavar="ENDPOINT", help="routers to link to: tls/HOST:PORT"
+    )
+    parser.add_argument(
+        "--files",
+        type=PurePosixPath,
+        default=TLS_FOLDER,
+        metavar="DIR",
+        help=f"folder of ca.pem, certificate.pem and key.pem on the router's host ({TLS_FOLDER})",
+    )
+    parser.add_argument(
+        "--site", action="append", dest="sites", metavar="NAME", help=f"name of the shore site in keys ({SHORE})"
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: standard output)")
+    parser.add_argument("--replace", action="store_true", help="overwrite an existing file")
+
+
+def run_init(args: argparse.Namespace) -> int:
+    """Create the authority; return 0.
+
+    Raises:
+        PkiError: The folder exists, or the passphrase is invalid.
+    """
+    secret = None
+    if args.passphrase_file is not None:
+        secret = _passphrase_from(args.passphrase_file)
+    elif args.ask_passphrase:
+        secret = _ask("Passphrase for the authority's key: ")
+        if secret != _ask("Repeat: "):
+            raise PkiError("pki", "passphrase", "two different ones", "the same twice")
+    if not 0 < args.days <= 36500:
+        raise PkiError("pki", "days", args.days, "1 to 36500")
+    fleet = Fleet.init(args.folder, args.fleet, secret, args.days)
+    print(f"authority  {fleet.folder / CA_CERTIFICATE}")
+    print("key        " + ("encrypted" if secret else "not encrypted: keep this folder off the vessels"))
+    return 0
+
+
+def run_issue(args: argparse.Namespace) -> int:
+    """Issue a certificate; return 0.
+
+    Raises:
+        BadInputError: The platform has one already, or an argument is invalid.
+    """
+    _show(_fleet(args).issue(args.platform, args.role, args.hosts or (), args.days, args.out))
+    print(f"To admit it, {UPDATE_ROUTERS}.")
+    return 0
+
+
+def run_renew(args: argparse.Namespace) -> int:
+    """Renew a certificate; return 0.
+
+    Raises:
+        BadInputError: The platform has none, or an argument is invalid.
+    """
+    _show(_fleet(args).renew(args.platform, args.hosts, args.days, args.out))
+    print("Routers need no new configuration. The old certificate remains valid until its end.")
+    return 0
+
+
+def run_revoke(args: argparse.Namespace) -> int:
+    """Revoke a platform's name; return 0.
+
+    Raises:
+        PkiError: The platform has no certificate that is not revoked.
+    """
+    entry = _fleet(args).revoke(args.platform, args.reason)
+    print(f"revoked    {entry.common_name}")
+    print(f"Not in force yet: {UPDATE_ROUTERS}.")
+    return 0
+
+
+def run_list(args: argparse.Namespace) -> int:
+    """Print all certificates; return 1 if one that is in use ends within `--warn-days`, else 0.
+
+    Raises:
+        PkiError: There is no authority, or its index is damaged.
+    """
+    fleet = _fleet(args)
+    index = fleet.index()
+    now_utc_s = time.time()
+    in_use = {e.serial for platform in {e.platform for e in index.certificates} if (e := index.find(platform))}
+    rows = [
+        (entry, _state(entry, args.warn_days, now_utc_s, in_use=entry.serial in in_use)) for entry in index.certificates
+    ]
+    if args.json:
+        for entry, state in rows:
+            print(json.dumps({**entry.model_dump(mode="json"), "state": state}))
+    else:
+        _print_table(rows)
+    ending = [f"{e.common_name} {e.not_after:%Y-%m-%d}" for e, state in rows if state in ("ending", "expired")]
+    authority_days = fleet.authority_days_left()
+    if authority_days <= args.warn_days:
+        ending.append(f"the authority itself, in {authority_days:.1f} days")
+    for text in ending:
+        print(f"sonarpost: ends soon or has ended: {text}", file=sys.stderr)
+    return EXIT_ENDING if ending else 0
+
+
+def run_router_config(args: argparse.Namespace) -> int:
+    """Write a router's configuration with TLS and the present access control; return 0.
+
+    Raises:
+        BadInputError: The platform has no certificate or no router, or an endpoint is invalid.
+    """
+    options = RouterOptions(
+        platform=args.platform,
+        listen=args.listen,
+        local=args.local,
+        connect=args.connect,
+        files=args.files,
+        sites=tuple(args.sites or (SHORE,)),
+        open_local=args.open_local,
+    )
+    text = router_json5(_fleet(args).index(), options, time.time())
+    if args.out is None:
+        sys.stdout.write(text)
+    elif args.replace:
+        write_atomically(args.out, text.encode())
+    else:
+        try:
+            write_new(args.out, text.encode(), PUBLIC_FILE)
+        except FileExistsError as error:
+            raise PkiError(str(args.out), "", "an existing file", "a new file, or --replace") from error
+    return 0
+
+
+def _state(entry: CertificateEntry, warn_days: float, now_utc_s: float, *, in_use: bool) -> str:
+    if entry.revoked_utc_s is not None:
+        return "revoked"
+    if not in_use:
+        return "replaced"
+    days = entry.days_left(now_utc_s)
+    if days <= 0:
+        return "expired"
+    return "ending" if days <= warn_days else "valid"
+
+
+def _print_table(rows: Sequence[tuple[CertificateEntry, str]]) -> None:
+    lines = [("name", "role", "state", "valid to", "serial", "hosts")] + [
+        (e.common_name, e.role, state, f"{e.not_after:%Y-%m-%d}", e.serial[:16], " ".join(e.hosts)) for e, state in rows
+    ]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for line in lines:
+        print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
+
+
+def _show(bundle: Bundle) -> None:
+    entry = bundle.entry
+    print(f"name       {entry.common_name} ({entry.role})")
+    print(f"valid to   {entry.not_after:%Y-%m-%d %H:%M} UTC")
+    print(f"files      {bundle.folder}")
+
+
+def _fleet(args: argparse.Namespace) -> Fleet:
+    def passphrase() -> bytes:
+        file = getattr(args, "passphrase_file", None)
+        return _ask("Passphrase of the authority's key: ") if file is None else _passphrase_from(file)
+
+    return Fleet(args.folder, passphrase)
+
+
+def _ask(prompt: str) -> bytes:
+    if not sys.stdin.isatty():
+        raise PkiError("pki", "passphrase", "no terminal to ask", "--passphrase-file FILE")
+    return getpass.getpass(prompt).encode()
+
+
+def _passphrase_from(file: Path) -> bytes:
+    """Return the first line of a file that only its owner can read.
+
+    Raises:
+        PkiError: It cannot be read, others can read it, or it is empty.
+    """
+    try:
+        mode = stat.S_IMODE(file.stat().st_mode)
+        lines = file.read_bytes().splitlines()
+    except OSError as error:
+        raise PkiError(str(file), "passphrase", str(error), "a readable file") from error
+    if mode & 0o077:
+        raise PkiError(str(file), "mode", f"{mode:04o}", "0600: readable by its owner only")
+    if not lines or not lines[0]:
+        raise PkiError(str(file), "passphrase", "an empty first line", "the passphrase")
+    return lines[0]
