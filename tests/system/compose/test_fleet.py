@@ -17,7 +17,7 @@ from builders.common import REPOSITORY
 
 from sonarpost.bus import router
 from sonarpost.errors import ConfigError
-from sonarpost.security.fleet import Fleet, FleetIndex
+from sonarpost.security.fleet import Fleet, FleetIndex, PkiError
 
 FILES = {"ca.pem": 0o644, "certificate.pem": 0o644, "key.pem": 0o600, "router.json5": 0o644}
 
