@@ -1,4 +1,4 @@
-"""Configuration files: every mistake is named with file, line and key; the environment overrides."""
+"""Configuration files: errors name file, line and key; environment variables override values."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Part(ServiceConfig):
 
 
 class Table(ServiceConfig):
-    """A table with every kind of key that services have."""
+    """A table with every kind of key."""
 
     out_dir: Path = Path("out")
     poll_s: Annotated[float, Field(gt=0, le=60)] = 1.0
@@ -73,13 +73,13 @@ def error(tmp_path: Path, text: str, model: type[ServiceConfig] = Table, **envir
 PLATFORM = '[platform]\nid = "vessel-1"\n'
 
 
-def test_every_kind_of_value_is_taken(tmp_path: Path) -> None:
+def test_every_kind_of_value_is_accepted(tmp_path: Path) -> None:
     platform, table = load(
         tmp_path,
         PLATFORM + 'router = ["tcp/a:1", "tcp/b:2"]\nstate_dir = "/x"\nhealth_interval_s = 2\nlog_format = "json"\n'
         '[relay]\nout_dir = "o"\npoll_s = 5\nrate = 6\nkind = "two"\nnames = ["a"]\nby_address = { 3 = "uuv-1" }\n'
         'airtime_s = { 4 = 1, 1 = 2.5 }\n[[relay.part]]\ndepth_m = 1\n[[relay.part]]\ndepth_m = 2.5\nname = "n"\n'
-        '[c2]\nsomebody_elses = "concern"\n',
+        '[c2]\nother_service = "ignored"\n',
     )
     assert platform == PlatformConfig(
         id="vessel-1",
@@ -100,14 +100,14 @@ def test_every_kind_of_value_is_taken(tmp_path: Path) -> None:
     )
 
 
-def test_absent_tables_mean_defaults(tmp_path: Path) -> None:
+def test_absent_table_has_default_values(tmp_path: Path) -> None:
     platform, table = load(tmp_path, PLATFORM)
     assert table == Table()
     assert (platform.router, platform.health_interval_s) == (("tcp/127.0.0.1:7447",), 5.0)
 
 
-# Mistakes: (text, line or None, key, what the message says)
-MISTAKES: dict[str, tuple[str, int | None, str, str]] = {
+# Invalid configurations: (text, line or None, key, part of the message)
+INVALID: dict[str, tuple[str, int | None, str, str]] = {
     "unknown table": (PLATFORM + "\n[relais]\nx = 1\n", 4, "relais", "got 'an unknown table', expected platform, atd_"),
     "unknown table below another": (PLATFORM + "[relais.a.b]\n", 3, "relais", "an unknown table"),
     "key before any table": ("# c\nrate = 1\n" + PLATFORM, 2, "rate", "an unknown table"),
@@ -211,10 +211,8 @@ MISTAKES: dict[str, tuple[str, int | None, str, str]] = {
 }
 
 
-@pytest.mark.parametrize(("text", "line", "key", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_is_named_with_file_line_and_key(
-    tmp_path: Path, text: str, line: int | None, key: str, message: str
-) -> None:
+@pytest.mark.parametrize(("text", "line", "key", "message"), INVALID.values(), ids=INVALID)
+def test_error_names_file_line_and_key(tmp_path: Path, text: str, line: int | None, key: str, message: str) -> None:
     caught = error(tmp_path, text)
     where = str(tmp_path / "vessel.toml")
     assert caught.where == (where if line is None else f"{where}:{line}")
@@ -222,12 +220,12 @@ def test_a_mistake_is_named_with_file_line_and_key(
     assert message in str(caught)
 
 
-def test_a_missing_key_of_an_absent_table_is_named(tmp_path: Path) -> None:
+def test_error_names_a_missing_key_of_an_absent_table(tmp_path: Path) -> None:
     caught = error(tmp_path, PLATFORM, Needy)
     assert str(caught) == f"{tmp_path / 'vessel.toml'}: relay.port: got 'nothing', expected a value"
 
 
-def test_a_service_without_keys_says_so(tmp_path: Path) -> None:
+def test_error_of_a_service_without_keys(tmp_path: Path) -> None:
     caught = error(tmp_path, PLATFORM + "[relay]\nx = 1\n", ServiceConfig)
     assert "expected no keys in this table" in str(caught)
 
@@ -244,13 +242,13 @@ def test_a_service_without_keys_says_so(tmp_path: Path) -> None:
         ("\ufeff[platform]\n", "at line 1"),
     ],
 )
-def test_what_is_not_toml_is_refused_with_its_place(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_toml_is_rejected_with_its_position(tmp_path: Path, text: str, message: str) -> None:
     caught = error(tmp_path, text)
     assert caught.expected == "valid TOML"
     assert message in str(caught.value)
 
 
-def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+def test_error_names_an_unreadable_file(tmp_path: Path) -> None:
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"[platform]\nid = '\xff'\n")
     for path, message in ((tmp_path / "absent", "No such file"), (tmp_path, "Is a directory"), (binary, "codec")):
@@ -262,17 +260,17 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
 
 
 @given(st.text(max_size=60))
-def test_any_text_is_a_configuration_or_a_config_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+def test_arbitrary_text_raises_config_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
     path = tmp_path_factory.getbasetemp() / "any.toml"
     path.write_text(text, encoding="utf-8", newline="")
-    with pytest.raises(ConfigError):  # none of them names the platform
+    with pytest.raises(ConfigError):  # no such text defines the platform
         config.load(path, "relay", Table, {})
 
 
-# The environment
+# Environment variables
 
 
-def test_the_environment_overrides_the_file(tmp_path: Path) -> None:
+def test_environment_overrides_the_file(tmp_path: Path) -> None:
     platform, table = load(
         tmp_path,
         PLATFORM + "[relay]\nrate = 1\nnames = ['a']\nquiet_dir = 'q'\n",
@@ -285,7 +283,7 @@ def test_the_environment_overrides_the_file(tmp_path: Path) -> None:
         SONARPOST_RELAY__OUT_DIR="'7'",
         SONARPOST_RELAY__KIND="two",
         SONARPOST_RELAY__BY_ADDRESS='{ 3 = "uuv-1" }',
-        SONARPOST_C2__OUT_DIR="somebody else's",
+        SONARPOST_C2__OUT_DIR="of another service",
         SONARPOST_DATA="no override",
         SONARPOST_EXIT_WITH_PARENT="1",
         OTHER_RELAY__RATE="9",
@@ -297,12 +295,12 @@ def test_the_environment_overrides_the_file(tmp_path: Path) -> None:
     assert (table.kind, table.by_address, table.names) == (Kind.TWO, {"3": "uuv-1"}, ("a",))
 
 
-def test_the_environment_can_give_what_the_file_lacks(tmp_path: Path) -> None:
+def test_environment_can_define_missing_keys(tmp_path: Path) -> None:
     platform, table = load(tmp_path, "", Needy, SONARPOST_PLATFORM__ID="v", SONARPOST_RELAY__PORT="/dev/ttyUSB0")
     assert (platform.id, table) == ("v", Needy(port="/dev/ttyUSB0"))
 
 
-def test_text_of_several_lines_is_one_value(tmp_path: Path) -> None:
+def test_multi_line_text_is_one_value(tmp_path: Path) -> None:
     _, table = load(tmp_path, PLATFORM, Needy, SONARPOST_RELAY__PORT='"a"\nother = 1')
     assert table == Needy(port='"a"\nother = 1')
 
@@ -325,8 +323,8 @@ def test_text_of_several_lines_is_one_value(tmp_path: Path) -> None:
         ("SONARPOST_PLATFORM__ID", "No Name", "match pattern"),
     ],
 )
-def test_a_wrong_override_is_named_by_its_variable(tmp_path: Path, name: str, value: str, message: str) -> None:
-    # The file has the same key, right, on a line that must not be blamed.
+def test_error_of_an_override_names_the_variable(tmp_path: Path, name: str, value: str, message: str) -> None:
+    # The file has the same key with a valid value; the error must not name its line.
     caught = error(tmp_path, PLATFORM + "[relay]\nrate = 1\n", Table, **{name: value})
     assert caught.where == "environment"
     assert caught.field == name
@@ -348,7 +346,7 @@ def quoted(text: str) -> str:
 
 
 class Writer:
-    """Writes a document and notes for itself where each key comes to lie."""
+    """Writes a document and records the line of each key."""
 
     def __init__(self, draw: st.DrawFn) -> None:
         self.draw, self.text = draw, ""
@@ -384,7 +382,7 @@ class Writer:
 
 
 @given(st.data())
-def test_every_key_of_any_document_is_found_on_its_line(data: st.DataObject) -> None:
+def test_line_of_every_key_of_an_arbitrary_document(data: st.DataObject) -> None:
     tables = data.draw(st.dictionaries(_keys, st.dictionaries(_keys, _values, max_size=3), max_size=3))
     writer = Writer(data.draw)
     for name, table in tables.items():
@@ -402,7 +400,7 @@ def test_every_key_of_any_document_is_found_on_its_line(data: st.DataObject) -> 
 
 
 @pytest.mark.parametrize("name", ["uuv", "vessel", "shore"])
-def test_the_files_that_come_with_the_project_have_every_key_on_a_line(name: str) -> None:
+def test_line_of_every_key_of_the_example_files(name: str) -> None:
     text = (REPOSITORY / "config" / f"{name}.toml").read_text(encoding="utf-8")
     lines = key_lines(text)
     for table, keys in tomllib.loads(text).items():
@@ -414,9 +412,10 @@ def test_the_files_that_come_with_the_project_have_every_key_on_a_line(name: str
 @pytest.mark.parametrize(
     ("table", "old", "new"), [(t, o, n) for t, keys in config.RENAMED_KEYS.items() for o, n in keys.items()]
 )
-def test_a_renamed_key_is_refused_with_its_new_name(tmp_path: Path, table: str, old: str, new: str) -> None:
+def test_renamed_key_is_rejected_with_its_new_name(tmp_path: Path, table: str, old: str, new: str) -> None:
     model = service_config(table)
-    assert new in model.model_fields
+    new_table, _, key = new.rpartition(".")
+    assert key in service_config(new_table or table).model_fields
     assert old not in model.model_fields
     path = tmp_path / "platform.toml"
     path.write_text(f'[platform]\nid = "uuv-1"\n[{table}]\n{old} = 1\n')
@@ -429,7 +428,7 @@ def test_a_renamed_key_is_refused_with_its_new_name(tmp_path: Path, table: str, 
 
 
 def service_config(name: str) -> type[ServiceConfig]:
-    """Return the type of a service's table."""
+    """Return the model of a service's table."""
     module = importlib.import_module(f"sonarpost.services.{name}.config")
     (found,) = [
         kind

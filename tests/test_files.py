@@ -1,4 +1,4 @@
-"""Files that are whole or absent."""
+"""Atomic file writes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def leftovers(folder: Path) -> list[str]:
 
 
 @given(st.lists(st.binary(max_size=200), min_size=1, max_size=3))
-def test_a_file_holds_what_was_written_last(tmp_path_factory: pytest.TempPathFactory, versions: list[bytes]) -> None:
+def test_file_holds_the_last_version(tmp_path_factory: pytest.TempPathFactory, versions: list[bytes]) -> None:
     folder = tmp_path_factory.mktemp("atomic")
     for data in versions:
         write_atomically(folder / "file.bin", data)
@@ -31,15 +31,13 @@ def test_a_file_holds_what_was_written_last(tmp_path_factory: pytest.TempPathFac
     assert [path.name for path in folder.iterdir()] == ["file.bin"]
 
 
-def test_others_may_read_the_file(tmp_path: Path) -> None:
+def test_file_is_readable_by_others(tmp_path: Path) -> None:
     write_atomically(tmp_path / "f", b"x")
     assert (tmp_path / "f").stat().st_mode & 0o777 == 0o644
 
 
 @pytest.mark.parametrize("call", ["fsync", "fchmod", "write", "replace"])
-def test_when_a_step_fails_the_old_file_stays_and_nothing_else(
-    call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_write_keeps_the_old_file_only(call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "f"
     target.write_bytes(b"old")
 
@@ -73,7 +71,7 @@ def test_when_a_step_fails_the_old_file_stays_and_nothing_else(
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write anywhere")
-def test_a_folder_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+def test_read_only_folder_raises(tmp_path: Path) -> None:
     tmp_path.chmod(0o555)
     try:
         with pytest.raises(PermissionError):
@@ -82,12 +80,12 @@ def test_a_folder_that_cannot_be_written_says_so(tmp_path: Path) -> None:
         tmp_path.chmod(0o755)
 
 
-def test_a_folder_that_is_absent_says_so(tmp_path: Path) -> None:
+def test_absent_folder_raises(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         write_atomically(tmp_path / "absent" / "f", b"x")
 
 
-def test_a_folder_in_the_files_place_stays(tmp_path: Path) -> None:
+def test_folder_in_place_of_the_file_is_kept(tmp_path: Path) -> None:
     (tmp_path / "f").mkdir()
     with pytest.raises(OSError, match="directory"):
         write_atomically(tmp_path / "f", b"x")
@@ -95,7 +93,7 @@ def test_a_folder_in_the_files_place_stays(tmp_path: Path) -> None:
     assert leftovers(tmp_path) == []
 
 
-def test_the_data_are_on_the_disk_before_the_name_and_the_name_before_the_return(
+def test_data_is_flushed_before_the_rename_and_the_rename_before_the_return(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     steps: list[str] = []
@@ -115,7 +113,7 @@ def test_the_data_are_on_the_disk_before_the_name_and_the_name_before_the_return
     assert steps == ["sync file", "rename", "sync folder"]
 
 
-def test_a_reader_never_meets_half_a_file(tmp_path: Path) -> None:
+def test_reader_never_sees_a_partial_file(tmp_path: Path) -> None:
     target = tmp_path / "f"
     versions = [bytes([n]) * 20_000 for n in range(1, 40)]
     write_atomically(target, versions[0])
@@ -136,7 +134,7 @@ def test_a_reader_never_meets_half_a_file(tmp_path: Path) -> None:
     assert met <= set(versions)
 
 
-def test_a_killed_writer_leaves_a_whole_file(tmp_path: Path) -> None:
+def test_killed_writer_leaves_a_complete_file(tmp_path: Path) -> None:
     script = (
         "import sys, itertools; from pathlib import Path; from sonarpost.files import AtomicFiles, write_atomically\n"
         "for n in itertools.count(1):\n"
@@ -159,7 +157,7 @@ def test_a_killed_writer_leaves_a_whole_file(tmp_path: Path) -> None:
     assert int(number) >= written
 
 
-def test_files_of_a_batch_are_put_in_their_places_together_and_the_last_ones_last(tmp_path: Path) -> None:
+def test_batch_is_renamed_together_with_the_last_files_last(tmp_path: Path) -> None:
     files = AtomicFiles()
     files.add(tmp_path / "b", b"2", last=True)
     files.add(tmp_path / "a", b"1")
@@ -169,9 +167,7 @@ def test_files_of_a_batch_are_put_in_their_places_together_and_the_last_ones_las
     assert sorted((p.name, p.read_bytes()) for p in tmp_path.iterdir()) == [("a", b"1"), ("b", b"2")]
 
 
-def test_of_a_batch_that_cannot_be_brought_to_the_disk_nothing_is_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_batch_leaves_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a").write_bytes(b"before")
     files = AtomicFiles()
     files.add(tmp_path / "a", b"1")
@@ -187,7 +183,7 @@ def test_of_a_batch_that_cannot_be_brought_to_the_disk_nothing_is_left(
     assert len(files) == 0
 
 
-def test_the_end_of_a_batch_can_be_taken_back(tmp_path: Path) -> None:
+def test_end_of_a_batch_can_be_discarded(tmp_path: Path) -> None:
     files = AtomicFiles()
     files.add(tmp_path / "a", b"1")
     before = len(files)

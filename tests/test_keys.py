@@ -1,4 +1,4 @@
-"""Key expressions: what they are, and that no name can break out of its place in one."""
+"""Key expressions, and rejection of names that would change a key."""
 
 from __future__ import annotations
 
@@ -95,17 +95,17 @@ OF_ONE_NAME: list[Callable[[str], str]] = [
 
 
 @pytest.mark.parametrize("expected", EXPECTED)
-def test_keys_are_as_documented(expected: str) -> None:
+def test_keys_match_the_specification(expected: str) -> None:
     assert EXPECTED[expected] == expected
     assert str(zenoh.KeyExpr(expected)) == expected
 
 
-def test_the_keys_of_a_platform_have_one_prefix() -> None:
+def test_keys_of_a_platform_have_one_prefix() -> None:
     own = zenoh.KeyExpr("sonarpost/v1/uuv-1/**")
     assert [key for key in EXPECTED if own.includes(key)] == [key for key in EXPECTED if "/uuv-1/" in key]
 
 
-def test_no_two_kinds_of_records_meet_on_one_key() -> None:
+def test_keys_of_different_records_do_not_overlap() -> None:
     written = [key for key in EXPECTED if "*" not in key]
     for key in written:
         assert [other for other in written if zenoh.KeyExpr(key).intersects(other)] == [key]
@@ -118,13 +118,13 @@ def test_no_two_kinds_of_records_meet_on_one_key() -> None:
     "name",
     ["", "a/b", "*", "**", "$*", "a$*", "UUV", "-a", "_a", "a b", "a\n", "a#", "a?b", "ü", "a" * 41, "@a", "1\x00"],
 )
-def test_a_name_that_would_change_the_key_is_refused(make: Callable[[str], str], name: str) -> None:
+def test_name_that_would_change_the_key_is_rejected(make: Callable[[str], str], name: str) -> None:
     with pytest.raises(BadInputError, match="expected 1 to 40 of a-z, 0-9"):
         make(name)
 
 
 @given(st.text(max_size=45))
-def test_any_text_is_a_name_or_refused(name: str) -> None:
+def test_arbitrary_text_is_a_name_or_rejected(name: str) -> None:
     allowed = set(string.ascii_lowercase + string.digits + "-_")
     good = 1 <= len(name) <= 40 and set(name) <= allowed and name[0] not in "-_"
     try:

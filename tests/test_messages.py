@@ -1,4 +1,4 @@
-"""Records: what each field takes and what it refuses, and pictures to and from arrays."""
+"""Records: valid and invalid values of each field, and conversion of images to and from arrays."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NO_COUNT = [-1, 2**63]
 NO_IMAGE = ["", "001", "00001", "00a7", "00 7", "00A\n"]
 NO_ID = ["", "x" * 65, "two words", "ünïcode", "tab\t", "\x7f"]
 
-# For every field that does not take all of its type: values of the right type that it refuses.
+# For every field with a restricted range: invalid values of the correct type.
 OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
     SAMPLES["contact-full"].__class__: {
         "contact_id": ["", "x" * 121],
@@ -211,7 +211,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "gauges": [{"n": NAN}, {"n": -INF}],
     },
 }
-# These take every value of their type, or are records with fields of their own.
+# Fields that accept every value of their type, or that are records themselves.
 ANY_VALUE = {
     ("snippet", "contact"),
     ("snippet", "picture"),
@@ -237,7 +237,7 @@ def label(value: object) -> str:
     return value.TYPE if isinstance(value, type) else str(value)
 
 
-def test_the_examples_are_of_every_record_there_is() -> None:
+def test_samples_cover_every_record_type() -> None:
     def subclasses(of: type[Record]) -> set[type[Record]]:
         direct = {t for t in of.__subclasses__() if t.__module__ == "sonarpost.messages"}
         return direct | {deeper for t in direct for deeper in subclasses(t)}
@@ -247,7 +247,7 @@ def test_the_examples_are_of_every_record_there_is() -> None:
 
 
 @pytest.mark.parametrize(("record_type", "name"), FIELDS, ids=label)
-def test_a_field_refuses_what_is_out_of_its_range(record_type: type[Record], name: str) -> None:
+def test_field_rejects_values_out_of_range(record_type: type[Record], name: str) -> None:
     if (record_type.TYPE, name) in ANY_VALUE:
         assert name not in OUT_OF_RANGE[record_type]
         return
@@ -261,23 +261,23 @@ WRONG_TYPES: list[object] = [None, True, 1, 1.5, "text", b"bytes", (1,), {"a": 1
 
 
 @pytest.mark.parametrize(("record_type", "name"), FIELDS, ids=label)
-def test_a_field_refuses_what_is_of_another_type(record_type: type[Record], name: str) -> None:
-    """Right types are told from the example's own value, None from the annotation; a whole number may stand for a
-    real one, in no other case does one type stand for another."""
+def test_field_rejects_values_of_another_type(record_type: type[Record], name: str) -> None:
+    """The valid type is that of the sample; None is valid if the annotation allows it. An integer is valid for a float,
+    no other conversion exists."""
     right = type(getattr(EXAMPLE[record_type], name))
     nullable = type(None) in getattr(record_type.model_fields[name].annotation, "__args__", ())
     for value in WRONG_TYPES:
         if type(value) is right or (value is None and nullable) or (right is float and type(value) is int):
             continue
         if isinstance(value, dict) and issubclass(right, (Record, dict)):
-            continue  # the maps are of the right type; what is in them is another test
+            continue  # the maps have the correct type; their content is tested elsewhere
         with pytest.raises(ValidationError) as caught:
             changed(record_type, **{name: value})
         assert caught.value.errors()[0]["loc"][0] == name, value
 
 
 @pytest.mark.parametrize(("record_type", "name"), FIELDS, ids=label)
-def test_a_field_without_a_default_must_be_there(record_type: type[Record], name: str) -> None:
+def test_field_without_a_default_is_required(record_type: type[Record], name: str) -> None:
     fields = EXAMPLE[record_type].model_dump()
     del fields[name]
     if record_type.model_fields[name].is_required():
@@ -290,19 +290,19 @@ def test_a_field_without_a_default_must_be_there(record_type: type[Record], name
 
 
 @pytest.mark.parametrize("sample", SAMPLES.values(), ids=SAMPLES)
-def test_records_cannot_be_changed(sample: Record) -> None:
+def test_records_are_immutable(sample: Record) -> None:
     name = next(iter(type(sample).model_fields))
     with pytest.raises(ValidationError, match="frozen"):
         setattr(sample, name, getattr(sample, name))
 
 
 @pytest.mark.parametrize("text", ["\ud800", "a\udcffb"])
-def test_text_that_utf8_has_no_bytes_for_is_refused(text: str) -> None:
+def test_text_that_utf8_cannot_encode_is_rejected(text: str) -> None:
     with pytest.raises(ValidationError):
         changed(Contact, contact_id=text)
 
 
-# Pictures
+# Images
 
 pictures = st.one_of(
     *(
@@ -313,18 +313,18 @@ pictures = st.one_of(
 
 
 @given(pictures)
-def test_a_raster_gives_back_the_array_it_was_made_of(image: Any) -> None:
+def test_pixels_round_trip(image: Any) -> None:
     raster = Pixels.from_array(image)
     back = raster.to_array()
     assert back.dtype == (np.uint8 if image.dtype.itemsize == 1 else np.uint16)
     assert back.dtype.isnative
     np.testing.assert_array_equal(back, image)
     assert raster.sha256 == hashlib.sha256(raster.data).hexdigest()
-    back[0, 0] ^= 1  # the caller's own
+    back[0, 0] ^= 1  # a copy that the caller owns
     np.testing.assert_array_equal(raster.to_array(), image)
 
 
-def test_pixels_lie_row_by_row_and_little_endian() -> None:
+def test_pixels_are_row_major_and_little_endian() -> None:
     image = np.array([[1, 2], [0x1234, 0xFFFE]], dtype=">u2")
     assert Pixels.from_array(image).data == bytes.fromhex("0100 0200 3412 feff")
     assert Pixels.from_array(image.T).data == bytes.fromhex("0100 3412 0200 feff")
@@ -345,19 +345,19 @@ def test_pixels_lie_row_by_row_and_little_endian() -> None:
     ],
     ids=lambda image: f"{image.dtype}-{image.ndim}d",
 )
-def test_an_array_that_is_no_picture_is_refused(image: Any) -> None:
+def test_array_that_is_not_an_image_is_rejected(image: Any) -> None:
     with pytest.raises(BadInputError, match="expected rows and columns of uint8 or uint16"):
         Pixels.from_array(image)
 
 
 @pytest.mark.parametrize("shape", [(0, 4), (4, 0), (4097, 1), (1, 4097)])
-def test_an_array_of_a_size_no_raster_has_is_refused(shape: tuple[int, int]) -> None:
+def test_array_of_an_invalid_size_is_rejected(shape: tuple[int, int]) -> None:
     with pytest.raises(ValidationError):
         Pixels.from_array(np.zeros(shape, np.uint8))
 
 
 @given(hnp.arrays(np.bool_, hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=11)))
-def test_the_mask_says_which_pixels_are_missing(missing: Any) -> None:
+def test_mask_marks_the_missing_pixels(missing: Any) -> None:
     picture = Pixels.from_array(np.zeros(missing.shape, np.uint8))
     fields = COMPLETE_IMAGE.model_dump() | {
         "picture": picture,
@@ -367,13 +367,13 @@ def test_the_mask_says_which_pixels_are_missing(missing: Any) -> None:
     np.testing.assert_array_equal(ReconstructedImage(**fields).missing(), missing)
 
 
-def test_the_first_bit_of_a_mask_is_the_first_pixel() -> None:
+def test_first_bit_of_a_mask_is_the_first_pixel() -> None:
     assert DAMAGED_IMAGE.missing_mask == b"\xa8"
     assert DAMAGED_IMAGE.missing().tolist() == [[True, False, True], [False, True, False]]
     assert COMPLETE_IMAGE.missing().tolist() == [[False] * 3] * 2
 
 
-def test_the_digest_of_another_picture_is_refused_by_name() -> None:
+def test_error_names_the_digest_of_another_image() -> None:
     with pytest.raises(ValidationError) as caught:
         changed(ReconstructedImage, picture=RASTER_16)
     assert caught.value.errors()[0]["loc"] == ("picture_sha256",)
@@ -393,7 +393,7 @@ def test_the_digest_of_another_picture_is_refused_by_name() -> None:
         ("revisit", {"image_id": "0001"}, "lat_deg"),
     ],
 )
-def test_a_command_without_its_object_is_refused_by_name(
+def test_error_names_the_missing_argument_of_a_command(
     kind: str, given_fields: dict[str, object], missing: str
 ) -> None:
     common = {"command_id": "c", "kind": kind, "vehicle_id": "uuv-1", "issued_by": "op", "issued_utc_s": 0.0}

@@ -1,4 +1,4 @@
-"""Records to bytes and back: golden vectors, any bytes, and what an error says."""
+"""Encoding of records: golden vectors, arbitrary bytes, error messages."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ RECORD_VECTORS = [(t, name) for t in BY_TYPE for name in vectors(t)]
 
 
 @pytest.mark.parametrize(("record_type", "name"), RECORD_VECTORS)
-def test_old_bytes_decode_for_ever(record_type: str, name: str) -> None:
+def test_golden_bytes_decode(record_type: str, name: str) -> None:
     vector = vectors(record_type)[name]
     payload = bytes.fromhex(vector["hex"])
-    # The bytes mean to any msgpack library what the vector says.
+    # Any msgpack library decodes the bytes to the fields of the vector.
     assert plain(msgpack.unpackb(payload)) == vector["fields"]
     record = wire.decode(BY_TYPE[record_type], payload, KEY)
     dumped = plain(record.model_dump())
@@ -50,7 +50,7 @@ def test_old_bytes_decode_for_ever(record_type: str, name: str) -> None:
 
 
 @pytest.mark.parametrize(("record_type", "name"), RECORD_VECTORS)
-def test_encoding_today_gives_the_same_bytes(record_type: str, name: str) -> None:
+def test_encoding_gives_the_golden_bytes(record_type: str, name: str) -> None:
     vector = vectors(record_type)[name]
     model = BY_TYPE[record_type]
     if set(vector["fields"]) != {"type", "v", *model.model_fields}:
@@ -60,18 +60,18 @@ def test_encoding_today_gives_the_same_bytes(record_type: str, name: str) -> Non
 
 
 @pytest.mark.parametrize("record_type", BY_TYPE)
-def test_every_record_has_a_vector_of_its_present_fields(record_type: str) -> None:
+def test_every_record_type_has_a_vector_with_its_present_fields(record_type: str) -> None:
     fields = {"type", "v", *BY_TYPE[record_type].model_fields}
     assert any(set(vector["fields"]) == fields for vector in vectors(record_type).values())
 
 
 @pytest.mark.parametrize("name", SAMPLES)
-def test_the_samples_still_give_their_vectors(name: str) -> None:
+def test_samples_match_their_vectors(name: str) -> None:
     record = SAMPLES[name]
     assert wire.encode(record).hex() == vectors(record.TYPE)[name]["hex"]
 
 
-def test_old_handoff_messages_parse_for_ever_and_are_made_alike_today() -> None:
+def test_golden_delivery_messages_parse_and_encode_unchanged() -> None:
     made = handoff_samples()
     for name, vector in vectors("handoff-reply").items():
         payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
@@ -95,7 +95,7 @@ def test_old_handoff_messages_parse_for_ever_and_are_made_alike_today() -> None:
         assert attachment(chunk.origin, item, chunk.offset, chunk.done_up_to) == payload
 
 
-def test_old_queries_of_several_records_parse_for_ever_and_are_made_alike_today() -> None:
+def test_golden_batch_messages_parse_and_encode_unchanged() -> None:
     made = batch_samples()
     sizes = [size for _, size in BATCH]
     data = b"".join(bytes([number]) * size for number, size in enumerate(sizes))
@@ -121,7 +121,7 @@ def test_old_queries_of_several_records_parse_for_ever_and_are_made_alike_today(
 
 @given(any_record)
 @settings(max_examples=200)
-def test_any_record_comes_back_as_it_was(record: Record) -> None:
+def test_record_round_trip(record: Record) -> None:
     payload = wire.encode(record)
     back = wire.decode(type(record), payload, KEY)
     assert back == record
@@ -129,25 +129,25 @@ def test_any_record_comes_back_as_it_was(record: Record) -> None:
 
 
 @pytest.mark.parametrize("record_type", RECORD_TYPES, ids=lambda t: t.TYPE)
-def test_every_record_is_among_those_that_come_back(record_type: type[Record]) -> None:
+def test_round_trip_covers_every_record_type(record_type: type[Record]) -> None:
     @given(STRATEGIES[record_type])
     @settings(max_examples=15)
-    def comes_back(record: Record) -> None:
+    def round_trip(record: Record) -> None:
         assert wire.decode(record_type, wire.encode(record), KEY) == record
 
-    comes_back()
+    round_trip()
 
 
 @given(any_record)
 @settings(max_examples=50)
-def test_a_payload_is_a_plain_map_with_type_and_version_first(record: Record) -> None:
+def test_payload_is_a_map_with_type_and_version_first(record: Record) -> None:
     fields = msgpack.unpackb(wire.encode(record))
     assert list(fields) == ["type", "v", *type(record).model_fields]
     assert (fields["type"], fields["v"]) == (record.TYPE, 1)
     assert wire.encoding_of(type(record)) == f"application/msgpack;schema=sonarpost.{record.TYPE}.v1"
 
 
-# Anything from outside is a record or a PayloadError
+# External data is a record or a PayloadError
 
 msgpack_values = st.recursive(
     st.none()
@@ -166,7 +166,7 @@ def record_or_payload_error(record_type: type[Record], payload: bytes) -> None:
     try:
         record = wire.decode(record_type, payload, KEY)
     except PayloadError as error:
-        assert error.where == KEY  # noqa: PT017  # both outcomes are right
+        assert error.where == KEY  # noqa: PT017  # both results are valid
         assert error.field  # noqa: PT017
         assert KEY in str(error)  # noqa: PT017
         assert ", expected " in str(error)  # noqa: PT017
@@ -176,18 +176,18 @@ def record_or_payload_error(record_type: type[Record], payload: bytes) -> None:
 
 @given(record_types, st.binary(max_size=200))
 @settings(max_examples=300)
-def test_any_bytes_are_a_record_or_a_payload_error(record_type: type[Record], payload: bytes) -> None:
+def test_arbitrary_bytes_are_a_record_or_a_payload_error(record_type: type[Record], payload: bytes) -> None:
     record_or_payload_error(record_type, payload)
 
 
 @given(record_types, msgpack_values)
-def test_any_msgpack_is_a_record_or_a_payload_error(record_type: type[Record], value: object) -> None:
+def test_arbitrary_msgpack_is_a_record_or_a_payload_error(record_type: type[Record], value: object) -> None:
     record_or_payload_error(record_type, msgpack.packb(value))
 
 
 @given(st.data())
 @settings(max_examples=300)
-def test_a_record_with_any_value_in_any_field_is_a_record_or_a_payload_error(data: st.DataObject) -> None:
+def test_arbitrary_field_value_is_a_record_or_a_payload_error(data: st.DataObject) -> None:
     sample = data.draw(st.sampled_from(list(SAMPLES.values())))
     fields = msgpack.unpackb(wire.encode(sample))
     fields[data.draw(st.sampled_from(sorted(fields)))] = data.draw(msgpack_values)
@@ -227,26 +227,26 @@ def test_damaged_bytes_are_a_record_or_a_payload_error(data: st.DataObject) -> N
     ],
     ids=lambda payload: payload[:8].hex() or "nothing",
 )
-def test_what_is_no_map_with_text_keys_is_refused(payload: bytes) -> None:
+def test_payload_must_be_a_map_with_text_keys(payload: bytes) -> None:
     with pytest.raises(PayloadError, match="a msgpack map") as caught:
         wire.unpack_map(payload, KEY)
     assert (caught.value.where, caught.value.field) == (KEY, "payload")
     assert len(str(caught.value)) < 400
 
 
-def test_a_payload_above_the_limit_is_refused_unread(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_oversized_payload_is_rejected_unread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wire, "MAX_PAYLOAD_BYTES", 100)
     assert wire.unpack_map(msgpack.packb({"a": b"x" * 94}), KEY) == {"a": b"x" * 94}
     with pytest.raises(PayloadError, match="got '101 bytes', expected at most 100 bytes"):
         wire.unpack_map(msgpack.packb({"a": b"x" * 96}), KEY)
 
 
-def test_the_largest_raster_is_below_the_limit() -> None:
+def test_largest_image_is_below_the_limit() -> None:
     raster = Pixels(height_px=4096, width_px=4096, bits=16, data=bytes(4096 * 4096 * 2))
     assert wire.decode(Pixels, wire.encode(raster), KEY) == raster
 
 
-# What an error says
+# Error messages
 
 
 def of(sample: str, **change: object) -> bytes:
@@ -275,7 +275,7 @@ def of(sample: str, **change: object) -> bytes:
         ),
     ],
 )
-def test_an_error_names_key_field_value_and_expectation(
+def test_error_names_key_field_value_and_expectation(
     sample: str, change: dict[str, object], field: str, message: str
 ) -> None:
     with pytest.raises(PayloadError) as caught:
@@ -284,7 +284,7 @@ def test_an_error_names_key_field_value_and_expectation(
     assert str(caught.value) == f"{KEY}: {message}"
 
 
-def test_a_field_inside_a_record_is_named_with_its_path() -> None:
+def test_error_names_the_path_of_a_nested_field() -> None:
     fields = msgpack.unpackb(wire.encode(SAMPLES["snippet-without-wide"]))
     del fields["contact"]["vehicle_id"]
     with pytest.raises(PayloadError) as caught:
@@ -293,7 +293,7 @@ def test_a_field_inside_a_record_is_named_with_its_path() -> None:
 
 
 @pytest.mark.parametrize("name", ["type", "v"])
-def test_type_and_version_must_be_there(name: str) -> None:
+def test_type_and_version_are_required(name: str) -> None:
     fields = msgpack.unpackb(wire.encode(SAMPLES["contact-bare"]))
     del fields[name]
     with pytest.raises(PayloadError) as caught:
@@ -301,7 +301,7 @@ def test_type_and_version_must_be_there(name: str) -> None:
     assert caught.value.field == name
 
 
-# Other languages, newer versions
+# Other languages and newer versions
 
 
 @given(st.sampled_from(list(SAMPLES.values())), msgpack_values)
@@ -310,7 +310,7 @@ def test_unknown_fields_are_ignored(sample: Record, value: object) -> None:
     assert wire.decode(type(sample), msgpack.packb(fields), KEY) == sample
 
 
-def test_unknown_fields_inside_records_are_ignored() -> None:
+def test_unknown_nested_fields_are_ignored() -> None:
     fields = msgpack.unpackb(wire.encode(SAMPLES["snippet-without-wide"]))
     fields["contact"]["invented_later"] = fields["picture"]["and_this"] = [1]
     assert (
@@ -319,12 +319,12 @@ def test_unknown_fields_inside_records_are_ignored() -> None:
     )
 
 
-def test_optional_fields_may_be_absent_and_fields_in_any_order() -> None:
+def test_optional_fields_can_be_absent_and_order_is_free() -> None:
     small = {"vehicle_id": "uuv-1", "v": 1, "contact_id": "c1", "type": "contact"}
     assert wire.decode(Contact, msgpack.packb(small), KEY) == SAMPLES["contact-bare"]
 
 
-def test_whole_numbers_and_short_floats_may_stand_for_real_ones() -> None:
+def test_integers_and_single_precision_are_valid_for_floats() -> None:
     whole = wire.decode(Contact, of("contact-bare", lat_deg=41, heading_deg=0), KEY)
     assert (whole.lat_deg, whole.heading_deg) == (41.0, 0.0)
     assert isinstance(whole.lat_deg, float)
@@ -333,11 +333,11 @@ def test_whole_numbers_and_short_floats_may_stand_for_real_ones() -> None:
     assert wire.decode(Contact, short, KEY).lat_deg == 0.5
 
 
-def test_the_last_of_repeated_fields_counts() -> None:
+def test_last_of_repeated_fields_is_used() -> None:
     assert wire.unpack_map(b"\x82\xa1a\x01\xa1a\x02", KEY) == {"a": 2}
 
 
-def test_counters_of_any_name_come_through() -> None:
+def test_counters_of_any_name_round_trip() -> None:
     health = SAMPLES["health"]
     assert isinstance(health, Health)
     assert wire.decode(Health, of("health", counters={"": 2**63 - 1}), KEY).counters == {"": 2**63 - 1}

@@ -1,8 +1,8 @@
-"""Configuration: one TOML file a platform, one table a service, every key known.
+"""Configuration: one TOML file for each platform, with a table for each service.
 
-`[platform]` is common to all services of the file, `[{service}]` is each service's own. An unknown table or key is
-refused with file, line and key. `SONARPOST_{TABLE}__{KEY}` in the environment overrides a value (the environment is
-what compose files set); its text is read as a TOML value, or as a plain string when it is none.
+`[platform]` applies to all services of the file, `[{service}]` to one service. An unknown table or key is an error that
+names file, line and key. The environment variable `SONARPOST_{TABLE}__{KEY}` overrides a value; its text is parsed as a
+TOML value, or used as a string if it is not one.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ SERVICES = (
 )
 
 
-# Tables inside a table that the environment can set key by key.
-TABLES_INSIDE = {("platform", "tls")}
+# Inline tables of which environment variables can override single keys: SONARPOST_PLATFORM__TLS__KEY.
+NESTED_TABLES = {("platform", "tls")}
 
-# Keys of version 0.1 and their names since version 0.2; a configuration that uses an old name is refused.
+# Keys of version 0.1 and their present names; `table.key` for a key that moved to another table. Old names are rejected.
 RENAMED_KEYS: Mapping[str, Mapping[str, str]] = {
     "atd_stub": {
         "max_on_the_way": "max_in_flight",
@@ -75,7 +75,7 @@ RENAMED_KEYS: Mapping[str, Mapping[str, str]] = {
 
 
 class ServiceConfig(BaseModel):
-    """Base of every configuration table: unknown keys are errors."""
+    """Base class of all configuration tables; unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -84,13 +84,13 @@ C = TypeVar("C", bound=ServiceConfig)
 
 
 class TlsConfig(ServiceConfig):
-    """The `tls` key of `[platform]`: the host's own certificate, for routers reached by `tls/…`.
+    """The `tls` key of `[platform]`: the host's own certificate, for `tls/...` endpoints.
 
     Attributes:
         ca: Certificate of the fleet's authority (PEM).
         certificate: This platform's certificate (PEM).
         key: Its private key (PEM, no passphrase, readable by its owner only).
-        warn_days: From how many days before its end on health warns of it.
+        warn_days: Remaining validity in days below which health shows a warning.
     """
 
     ca: Path
@@ -106,12 +106,12 @@ class PlatformConfig(ServiceConfig):
         id: Name of the platform in key expressions, for example "uuv-1".
         router: Zenoh endpoints of the platform's router, tried in turn.
         state_dir: Folder of the services' durable stores.
-        tls: The host's own certificate; needed where `router` or `upstream` has a `tls/…` endpoint.
+        tls: The host's own certificate; required if `router` or `upstream` has a `tls/...` endpoint.
         upstream: Endpoints of the routers that the platform's router links to. Services do not connect to them; the
-            relay tries them when the shore does not answer, to say why.
-        acoustic_key_file: Key that vehicles and vessel have in common; with it, only frames sealed with it are sent and
-            taken on the `v1` acoustic link.
-        health_interval_s: How often a service publishes its health.
+            relay probes them if the shore does not reply, to report the reason.
+        acoustic_key_file: Key shared by vehicles and vessel. With it, the `v1` acoustic link sends and accepts
+            authenticated frames only.
+        health_interval_s: Interval of the health records.
         log_level: Least severity of log lines: debug, info, warning or error.
         log_format: Log lines as text or as JSON objects.
     """
@@ -128,16 +128,17 @@ class PlatformConfig(ServiceConfig):
 
 
 def load(path: Path, service: str, model: type[C], environment: Mapping[str, str]) -> tuple[PlatformConfig, C]:
-    """Read a platform's file and return its common table and the table of one service.
+    """Read a configuration file; return the `[platform]` table and the table of one service.
 
     Args:
         path: The TOML file.
-        service: The service whose table is wanted; an absent table means all defaults.
-        model: The table's type.
-        environment: Overrides, normally os.environ.
+        service: Name of the service; an absent table has default values.
+        model: Type of its table.
+        environment: Environment variables with overrides.
 
     Raises:
-        ConfigError: Unreadable, not TOML, an unknown table or key, a wrong value; names file, line and key.
+        ConfigError: The file is unreadable or not TOML, a table or key is unknown, or a value is invalid; names file,
+            line and key.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -147,7 +148,7 @@ def load(path: Path, service: str, model: type[C], environment: Mapping[str, str
         tables: dict[str, object] = tomllib.loads(text)
         source = _Source(path, text)
     except (ValueError, RecursionError) as error:
-        # Besides its own error tomllib lets through what endless digits and brackets lead to.
+        # tomllib raises other errors than its own for very long numbers and deep nesting.
         raise ConfigError(str(path), "", str(error), "valid TOML") from error
     for name, table in tables.items():
         if name not in ("platform", *SERVICES):
@@ -160,7 +161,7 @@ def load(path: Path, service: str, model: type[C], environment: Mapping[str, str
 
 
 class _Source:
-    """Names the file and the line of a key in errors."""
+    """Creates errors with the file and line of a key."""
 
     def __init__(self, path: Path, text: str) -> None:
         self._path = path
@@ -171,7 +172,7 @@ class _Source:
         return ConfigError(where, ".".join(names), value, expected)
 
     def _line(self, names: Sequence[str]) -> int | None:
-        """Return the line of a key or, where it is not written, of the nearest table around it."""
+        """Return the line of a key or, if the key is absent, of the nearest table around it."""
         for length in range(len(names), 0, -1):
             if (line := self._lines.get(tuple(names[:length]))) is not None:
                 return line
@@ -190,21 +191,17 @@ def _overrides(environment: Mapping[str, str]) -> dict[str, dict[str, object]]:
     return found
 
 
-def _with_extra(table: str, written: Mapping[str, object], extra: Mapping[str, object]) -> dict[str, object]:
-    """Return a table with its overrides; `SONARPOST_PLATFORM__TLS__KEY` is a key of the table inside `[platform]`."""
-    inside = {name: value for name, value in extra.items() if _outer(table, name)}
-    whole = {**written, **{name: value for name, value in extra.items() if name not in inside}}
-    for name, value in inside.items():
+def _merged(table: str, written: Mapping[str, object], overrides: Mapping[str, object]) -> dict[str, object]:
+    """Return a table with its overrides."""
+    merged = dict(written)
+    # In this order, the override of a nested table precedes those of its keys.
+    for name in sorted(overrides):
         outer, _, inner = name.partition("__")
-        below = whole.get(outer, {})
-        if isinstance(below, dict):  # what is no table is refused below, with its own name
-            whole[outer] = {**below, inner: value}
-    return whole
-
-
-def _outer(table: str, name: str) -> bool:
-    outer, separator, inner = name.partition("__")
-    return bool(separator and inner) and (table, outer) in TABLES_INSIDE
+        if not inner or (table, outer) not in NESTED_TABLES:
+            merged[name] = overrides[name]
+        elif isinstance(nested := merged.get(outer, {}), dict):  # otherwise the validation rejects it
+            merged[outer] = {**nested, inner: overrides[name]}
+    return merged
 
 
 def _toml_value(text: str) -> object:
@@ -212,7 +209,7 @@ def _toml_value(text: str) -> object:
         parsed = tomllib.loads(f"value = {text}")
     except (ValueError, RecursionError):
         return text
-    # A text of several lines may look like more keys; it is one value all the same.
+    # Text of several lines can parse as several keys; it is one value.
     return parsed["value"] if len(parsed) == 1 else text
 
 
@@ -225,11 +222,11 @@ def _validated(
 ) -> C:
     written = tables.get(table, {})
     assert isinstance(written, dict)
-    extra = overrides.get(table, {})
-    _refuse_renamed(table, written, extra, source)
+    own_overrides = overrides.get(table, {})
+    _reject_renamed(table, written, own_overrides, source)
     try:
-        # As JSON, because pydantic's strictness (no "5" for 5, no true for 1) is made for the types that JSON has.
-        return model.model_validate_json(to_json(_with_extra(table, written, extra)), strict=True)
+        # As JSON, whose types fit pydantic's strict mode: no "5" for 5, no true for 1.
+        return model.model_validate_json(to_json(_merged(table, written, own_overrides)), strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         names = [str(part) for part in first["loc"] if part != "[key]"]
@@ -237,20 +234,22 @@ def _validated(
         expected = expected_text(first["type"], first["msg"])
         if first["type"] == "extra_forbidden":
             value, expected = "an unknown key", _known_keys(model, names)
-        by_environment = next((n for n in ("__".join(names[:2]), *names[:1]) if n in extra), None)
+        by_environment = next((n for n in ("__".join(names[:2]), *names[:1]) if n in own_overrides), None)
         if by_environment is not None:
             name = f"{ENVIRONMENT_PREFIX}{table.upper()}__{by_environment.upper()}"
             raise ConfigError("environment", name, value, expected) from error
         raise source.error((table, *names), value, expected) from error
 
 
-def _refuse_renamed(table: str, written: Mapping[str, object], extra: Mapping[str, object], source: _Source) -> None:
-    """Raise ConfigError where a key has its name of version 0.1, naming the new one."""
+def _reject_renamed(
+    table: str, written: Mapping[str, object], overrides: Mapping[str, object], source: _Source
+) -> None:
+    """Raise ConfigError if a key has its name of version 0.1; the error names the present one."""
     for old, new in RENAMED_KEYS.get(table, {}).items():
         value, expected = "the key's name of version 0.1", f"its new name, {new}"
         if old in written:
             raise source.error((table, old), value, expected)
-        if old in extra:
+        if old in overrides:
             raise ConfigError("environment", f"{ENVIRONMENT_PREFIX}{table.upper()}__{old.upper()}", value, expected)
 
 

@@ -1,4 +1,4 @@
-"""Where each key of a TOML file is written, for error messages: the parser in the standard library does not tell."""
+"""Line numbers of the keys of a TOML file, for error messages; `tomllib` does not report them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 import tomllib
 
 _STRING = re.compile(
-    r'"""(?:[^\\]|\\.)*?"{3,5}'  # multi-line basic: up to two quotes may stand before the closing three
+    r'"""(?:[^\\]|\\.)*?"{3,5}'  # multi-line basic, which can end with up to two more quotes
     r"|'''.*?'{3,5}"  # multi-line literal
     r'|"(?:[^"\\\n]|\\.)*"'  # basic
     r"|'[^'\n]*'",  # literal
@@ -21,13 +21,13 @@ KeyPath = tuple[str, ...]
 
 
 def key_lines(text: str) -> dict[KeyPath, int]:
-    """Return the line, from 1, on which each table and each key first appears.
+    """Return the first line of each table and key, from 1.
 
     Args:
         text: A TOML document that `tomllib` accepts.
 
     Returns:
-        Lines by path; an element of an array has its index, as text, for a name: ("modems", "0", "address").
+        Lines by path; the elements of an array are named by their index: ("modems", "0", "address").
     """
     scanner = _Scanner(text)
     scanner.document()
@@ -35,10 +35,10 @@ def key_lines(text: str) -> dict[KeyPath, int]:
 
 
 class _Scanner:
-    """Walks a document that is known to be valid, so that what it skips needs no second judgement."""
+    """Scanner of a valid document."""
 
     def __init__(self, text: str) -> None:
-        # As the parser does: both ends of line are one character, and lines stay countable.
+        # As in tomllib.
         self._text = text.replace("\r\n", "\n")
         self._at = 0
         self._counted_to = 0
@@ -55,7 +55,7 @@ class _Scanner:
                 self._pair(table)
 
     def _skip_blank(self) -> bool:
-        """Go over white space, ends of line and comments; tell whether anything follows."""
+        """Skip white space, line ends and comments; return whether anything follows."""
         if blank := _BLANK.match(self._text, self._at):
             self._at = blank.end()
         return self._at < len(self._text)
@@ -74,7 +74,7 @@ class _Scanner:
         return table
 
     def _in_elements(self, names: KeyPath) -> KeyPath:
-        """Return a header's path with the element that is meant, the last one so far, after each array of tables."""
+        """Return the path of a header, with the index of the last element after each array of tables."""
         path: KeyPath = ()
         for name in names:
             path = (*path, name)
@@ -91,7 +91,7 @@ class _Scanner:
         self._value(path)
 
     def _key(self) -> KeyPath:
-        """Read a key, dotted or not, and stop at what follows it."""
+        """Read a key, which can be dotted."""
         names: list[str] = []
         while True:
             self._at = self._after_space()
@@ -117,13 +117,13 @@ class _Scanner:
         else:
             found = _STRING.match(self._text, self._at)
             if found is None:
-                # A number, a date (which may hold one space) or a truth value: it ends with its line, or a bracket.
+                # A number, date (which can hold a space) or boolean ends with its line or at a bracket.
                 found = _BARE_VALUE.match(self._text, self._at)
             assert found is not None
             self._at = found.end()
 
     def _items(self, closing: str, path: KeyPath) -> None:
-        """Go over an array, or an inline table, whose keys are noted."""
+        """Scan an array or an inline table."""
         self._at += 1
         element = 0
         while self._skip_blank() and self._text[self._at] != closing:
@@ -138,7 +138,7 @@ class _Scanner:
         self._at += 1
 
     def _note(self, path: KeyPath, line: int) -> None:
-        # A key of a dotted name stands for the tables before its last dot as well.
+        # A dotted key also defines the tables before its last dot.
         for length in range(1, len(path) + 1):
             self.lines.setdefault(path[:length], line)
 

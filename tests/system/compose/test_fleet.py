@@ -130,9 +130,7 @@ def test_error_names_the_environment_variable(script: ModuleType) -> None:
         script.Plan.from_environment({"FLEET_OBSERVERS": "vessel-1"})
 
 
-def test_unknown_arguments_show_the_usage(
-    script: ModuleType, root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unknown_arguments_show_the_usage(script: ModuleType, root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert script.run(["mak"], {}, root) == 2
     assert "got 'mak'" in capsys.readouterr().err
 
