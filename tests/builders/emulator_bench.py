@@ -1,4 +1,4 @@
-"""Emulated Micro-Modems in one water on simulated time, and what each tells its host."""
+"""Emulated modems and their channel on simulated time, with the output of each modem."""
 
 from __future__ import annotations
 
@@ -16,49 +16,49 @@ START_UTC_S = datetime(2016, 10, 12, 9, 0, 0, tzinfo=UTC).timestamp()
 RANGE_M = 150.0
 
 
-class Bench:
-    """Modems 150 m apart in one water, with what each told its host."""
+class EmulatorBench:
+    """Modems 150 m apart, with their output for the hosts."""
 
     def __init__(self, modems: int = 2, serial_baud: float | None = None, **config: object) -> None:
-        water = {name: config.pop(name) for name in list(config) if name in ChannelParameters.model_fields}
+        parameters = {name: config.pop(name) for name in list(config) if name in ChannelParameters.model_fields}
         places = {
             n: PlacedModem(
                 EmulatedModemConfig(n, utc_at_zero_s=START_UTC_S, **config), LocalPosition(RANGE_M * (n - 1))
             )  # type: ignore[arg-type]
             for n in range(1, modems + 1)
         }
-        self.world = ChannelSimulator(ChannelParameters(**water), places, serial_baud)  # type: ignore[arg-type]
-        self.told = dict.fromkeys(places, b"")
+        self.simulator = ChannelSimulator(ChannelParameters(**parameters), places, serial_baud)  # type: ignore[arg-type]
+        self.output = dict.fromkeys(places, b"")
         self.reports: list[PacketReport] = []
         self.transmissions: list[Transmission] = []
         self.now = 0.0
         self.advance(1.0)
-        self.clear()
+        self.clear_output()
 
     def advance(self, now: float) -> None:
         self.now = now
-        for happened in self.world.advance(now):
+        for happened in self.simulator.advance(now):
             (self.reports if isinstance(happened, PacketReport) else self.transmissions).append(happened)  # type: ignore[arg-type]
-        for n in self.told:
-            for output in self.world.take_outputs(n):
-                self.told[n] += output.data
+        for n in self.output:
+            for output in self.simulator.take_outputs(n):
+                self.output[n] += output.data
                 if output.report:
                     self.reports.append(output.report)
 
-    def say(self, modem: int, *sentences: tuple[str | int, ...]) -> None:
+    def send(self, modem: int, *sentences: tuple[str | int, ...]) -> None:
         for kind, *fields in sentences:
-            self.world.receive(modem, nmea.format(str(kind), *fields), self.now)
+            self.simulator.receive(modem, nmea.format(str(kind), *fields), self.now)
             self.advance(self.now)
 
-    def clear(self) -> None:
-        self.told = dict.fromkeys(self.told, b"")
+    def clear_output(self) -> None:
+        self.output = dict.fromkeys(self.output, b"")
 
-    def lines(self, modem: int) -> list[str]:
-        """What the host was told since the last call, without checksums, which are checked."""
-        told, self.told[modem] = self.told[modem], b""
-        assert told == b"" or told.endswith(b"\r\n")
+    def sentences(self, modem: int) -> list[str]:
+        """Return the sentences for the host since the last call, without `CAREV`; checksums are checked and removed."""
+        sentences, self.output[modem] = self.output[modem], b""
+        assert sentences == b"" or sentences.endswith(b"\r\n")
         shown = []
-        for line in told.split(b"\r\n")[:-1]:
+        for line in sentences.split(b"\r\n")[:-1]:
             body, _, digits = line[1:].partition(b"*")
             assert digits == b"%02X" % nmea.checksum(body), line
             shown.append(body.decode())
@@ -66,7 +66,7 @@ class Bench:
 
 
 def cst(clock: str, rate: int, *, kind: int = 3, frames: int, bad: int = 0, mode: int = 0) -> str:
-    """The statistics of a packet from 1 to 2 at 150 m; the levels follow the range and the first packet's draw."""
+    """Return the statistics of the first packet from 1 to 2 at 150 m; its draw determines the levels."""
     psk = kind == 3
     error = 3 if bad and psk else 0
     snr = "15.4,12.41,-100,-12.41,-01" if psk else "15.4,-100,-100,-100,195"

@@ -1,4 +1,4 @@
-"""A scripted modem for the driver's tests: answers as the fact sheet says, and loses the sentences it is told to."""
+"""A scripted modem for tests of the driver, independent of the emulator; it drops selected sentences."""
 
 from __future__ import annotations
 
@@ -10,71 +10,75 @@ from itertools import count
 from sonarpost.modem.micromodem import RATES, FrameDecoded, MicroModem, ModemEvent, nmea
 from sonarpost.modem.micromodem.sentences import Cycle
 
-Loses = Callable[[nmea.Sentence, int], bool]
+DropRule = Callable[[nmea.Sentence, int], bool]
 
 
-def never(sentence: nmea.Sentence, nth: int) -> bool:
-    """Lose nothing."""
+def drop_nothing(sentence: nmea.Sentence, nth: int) -> bool:
+    """Drop nothing."""
     return False
 
 
-def nth_of(kind: str, nth: int) -> Loses:
-    """Lose the nth (from 1) sentence of a kind, once."""
+def drop_nth(kind: str, nth: int) -> DropRule:
+    """Drop the nth (from 1) sentence of a kind."""
     return lambda sentence, seen: sentence.kind == kind and seen == nth
 
 
 class FakeModem:
-    """The modem's side and the simulated clock; `run` lets the driver and it talk until a given time.
+    """The modem and the simulated clock; `run` exchanges sentences with the driver until a given time.
 
     Args:
         driver: The driver under test.
-        loses: Tells which sentences never arrive, in either direction, by the sentence and how many of its kind
-            have been sent so far, itself included.
+        drops: Returns whether a sentence is lost, in either direction. Arguments: the sentence, and the number of its
+            kind sent so far (from 1).
     """
 
     data_timeout_s = 4.0
 
-    def __init__(self, driver: MicroModem, loses: Loses = never) -> None:
+    def __init__(self, driver: MicroModem, drops: DropRule = drop_nothing) -> None:
         self.driver = driver
-        self.loses = loses
+        self.drops = drops
         self.now = 0.0
         self.settings = {"SRC": "0", "CST": "0", "RXP": "0"}
         self.events: list[ModemEvent] = []
-        self.frames_heard: list[FrameDecoded] = []
-        self.heard: list[nmea.Sentence] = []
-        self.on_air: list[tuple[bytes, ...]] = []
-        self.dead = False
+        self.frames_decoded: list[FrameDecoded] = []
+        self.received: list[nmea.Sentence] = []
+        self.transmitted: list[tuple[bytes, ...]] = []
+        self.unresponsive = False
         self.silent_kinds: set[str] = set()
         self.echo_settings = True
         self._cycle: Cycle | None = None
         self._frames: list[bytes] = []
         self._cycle_number = 0
-        self._seen: Counter[str] = Counter()
+        self.sentence_counts: Counter[str] = Counter()
         self._due: list[tuple[float, int, Callable[[], None]]] = []
         self._order = count()
         self._lines = nmea.LineAssembler("host")
 
-    def say(self, kind: str, *fields: str | int) -> None:
+    def send(self, kind: str, *fields: str | int) -> None:
         """Send a sentence to the driver now."""
         sentence = nmea.Sentence(kind, tuple(str(f) for f in fields))
-        self._seen[kind] += 1
-        if not self.dead and kind not in self.silent_kinds and not self.loses(sentence, self._seen[kind]):
-            self._note(self.driver.receive(sentence.encode(), self.now))
+        self.sentence_counts[kind] += 1
+        if (
+            not self.unresponsive
+            and kind not in self.silent_kinds
+            and not self.drops(sentence, self.sentence_counts[kind])
+        ):
+            self._store(self.driver.receive(sentence.encode(), self.now))
 
-    def raw(self, data: bytes) -> None:
-        """Send any bytes to the driver now."""
-        self._note(self.driver.receive(data, self.now))
+    def send_bytes(self, data: bytes) -> None:
+        """Send bytes to the driver now."""
+        self._store(self.driver.receive(data, self.now))
 
-    def _note(self, events: list[ModemEvent]) -> None:
-        """Keep the events; a frame's first news apart from the packets' story."""
-        self.frames_heard += [event for event in events if isinstance(event, FrameDecoded)]
+    def _store(self, events: list[ModemEvent]) -> None:
+        """Store the events, `FrameDecoded` separately."""
+        self.frames_decoded += [event for event in events if isinstance(event, FrameDecoded)]
         self.events += [event for event in events if not isinstance(event, FrameDecoded)]
 
-    def later(self, delay_s: float, action: Callable[[], None]) -> None:
+    def schedule(self, delay_s: float, action: Callable[[], None]) -> None:
         heapq.heappush(self._due, (self.now + delay_s, next(self._order), action))
 
     def run(self, until_s: float) -> None:
-        """Let time pass, from one deadline to the next."""
+        """Advance the time from deadline to deadline."""
         while True:
             self._take()
             wakeup_s = self.driver.next_wakeup()
@@ -88,85 +92,85 @@ class FakeModem:
                 heapq.heappop(self._due)[2]()
                 self._take()
             before = self.driver.next_wakeup()
-            self._note(self.driver.poll(self.now))
+            self._store(self.driver.poll(self.now))
             after = self.driver.next_wakeup()
             assert after is None or after > self.now or before != after or self._due, (
-                "the driver asks to be polled for nothing"
+                "the driver must not request a poll without effect"
             )
         self.now = until_s
 
-    def of(self, *kinds: type) -> list[ModemEvent]:
-        """The events of some types."""
+    def events_of(self, *kinds: type) -> list[ModemEvent]:
+        """Return the events of some types."""
         return [event for event in self.events if isinstance(event, kinds)]
 
     def commands(self, kind: str) -> list[tuple[str, ...]]:
-        """The fields of the sentences of a kind that have arrived from the driver."""
-        return [sentence.fields for sentence in self.heard if sentence.kind == kind]
+        """Return the fields of the received commands of a kind."""
+        return [sentence.fields for sentence in self.received if sentence.kind == kind]
 
     def _take(self) -> None:
         for sentence in self._lines.feed(self.driver.bytes_to_send()):
             assert isinstance(sentence, nmea.Sentence), sentence
-            self._seen[sentence.kind] += 1
-            if self.dead or self.loses(sentence, self._seen[sentence.kind]):
+            self.sentence_counts[sentence.kind] += 1
+            if self.unresponsive or self.drops(sentence, self.sentence_counts[sentence.kind]):
                 continue
-            self.heard.append(sentence)
+            self.received.append(sentence)
             answer = getattr(self, f"_on_{sentence.kind.lower()}", None)
-            assert answer is not None, f"the driver sent {sentence}, which no modem knows"
+            assert answer is not None, f"the driver sent {sentence}, which is unknown"
             answer(*sentence.fields)
 
     def _on_cccfg(self, name: str, value: str) -> None:
         self.settings[name] = value
         if self.echo_settings:
-            self.later(0.05, lambda: self.say("CACFG", name, value))
+            self.schedule(0.05, lambda: self.send("CACFG", name, value))
 
     def _on_cccfq(self, name: str) -> None:
-        self.later(0.05, lambda: self.say("CACFG", name, self.settings[name]))
+        self.schedule(0.05, lambda: self.send("CACFG", name, self.settings[name]))
 
     def _on_ccclk(self, *fields: str) -> None:
-        self.later(0.05, lambda: self.say("CACLK", *fields))
+        self.schedule(0.05, lambda: self.send("CACLK", *fields))
 
     def _on_cccyc(self, *fields: str) -> None:
         if self._cycle is not None:
-            self.later(0.05, lambda: self.say("CAERR", "000000", "CYC", 7, "busy"))
+            self.schedule(0.05, lambda: self.send("CAERR", "000000", "CYC", 7, "busy"))
             return
         self._cycle = Cycle.parse(nmea.Sentence("CCCYC", fields))
         self._frames = []
         self._cycle_number += 1
-        self.later(0.05, lambda: self.say("CACYC", *fields))
-        self.later(0.10, self._ask)
+        self.schedule(0.05, lambda: self.send("CACYC", *fields))
+        self.schedule(0.10, self._request_data)
 
-    def _ask(self) -> None:
+    def _request_data(self) -> None:
         cycle, number, wanted = self._cycle, self._cycle_number, len(self._frames) + 1
         assert cycle is not None
         size = RATES[cycle.rate].frame_bytes
-        self.say("CADRQ", "000000", cycle.src, cycle.dest, int(cycle.ack), size, wanted)
+        self.send("CADRQ", "000000", cycle.src, cycle.dest, int(cycle.ack), size, wanted)
 
         def give_up() -> None:
             if self._cycle_number == number and self._cycle is not None and len(self._frames) == wanted - 1:
-                self.say("CAERR", "000000", "DATA_TIMEOUT", wanted)
+                self.send("CAERR", "000000", "DATA_TIMEOUT", wanted)
                 self._cycle = None
 
-        self.later(self.data_timeout_s, give_up)
+        self.schedule(self.data_timeout_s, give_up)
 
     def _on_cctxd(self, src: str, dest: str, ack: str, data: str) -> None:
         cycle = self._cycle
         if cycle is None or len(self._frames) >= cycle.nframes:
             return
         self._frames.append(bytes.fromhex(data))
-        self.later(0.05, lambda: self.say("CATXD", src, dest, ack, len(data) // 2))
-        self.later(0.10, self._ask if len(self._frames) < cycle.nframes else self._transmit)
+        self.schedule(0.05, lambda: self.send("CATXD", src, dest, ack, len(data) // 2))
+        self.schedule(0.10, self._request_data if len(self._frames) < cycle.nframes else self._transmit)
 
     def _transmit(self) -> None:
         cycle, frames = self._cycle, tuple(self._frames)
         assert cycle is not None
         size = sum(map(len, frames))
-        self.say("CATXP", size)
+        self.send("CATXP", size)
 
         def end() -> None:
-            self.on_air.append(frames)
+            self.transmitted.append(frames)
             self._cycle = None
-            self.say("CATXF", size)
-            self.say("CAXST", 7, "20250606", "230117.336548", 3, 0, 200, 5000, 25000, cycle.rate, cycle.src, cycle.dest,
-                     int(cycle.ack), len(frames), len(frames), 3, size)  # fmt: skip
+            self.send("CATXF", size)
+            statistics = (7, "20250606", "230117.336548", 3, 0, 200, 5000, 25000, cycle.rate, cycle.src, cycle.dest)
+            self.send("CAXST", *statistics, int(cycle.ack), len(frames), len(frames), 3, size)
 
-        self.later(RATES[cycle.rate].airtime_s, end)
+        self.schedule(RATES[cycle.rate].airtime_s, end)

@@ -1,9 +1,9 @@
-"""A host that treats its modem as Goby3's Micro-Modem driver is known to: how it starts, waits, retries and delivers.
+"""A host that uses its modem like Goby3's Micro-Modem driver: start, waits, retries and delivery.
 
-Goby cannot be built here. This is written from what its source and test program show: commands wait in a queue for the
-sentence that answers them, a setting for an echo of all three parts; five seconds without an answer mean another try,
-five in all that the modem is dead; a start ends when the clock is within a second; what was received is delivered when
-its statistics come. It runs at 10 Hz on simulated time.
+Goby cannot be built here; the host follows its source and test program. A command waits in a queue for the sentence
+that answers it, a setting for an echo of all three parts. After five seconds without an answer the command is sent
+again; five failures in all mean that the modem is dead. The start ends when the clock is within a second. A reception
+is delivered with its statistics. The host runs at 10 Hz on simulated time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ALLOWED_SKEW_S = 1.0
 
 @dataclass
 class Delivery:
-    """One received transmission as the application sees it."""
+    """One received transmission, as delivered to the application."""
 
     kind: str = ""
     src: int | None = None
@@ -35,12 +35,13 @@ class Delivery:
 
 
 class GobyHost:
-    """One driver.
+    """One host.
 
     Args:
-        address: The modem's.
-        mm: 1 or 2, as its test program is told.
+        address: Address of its modem.
+        mm: Generation of its modem, 1 or 2.
         true_utc_s: UTC at simulated time zero.
+        settings: Further settings.
     """
 
     def __init__(self, address: int, mm: int, true_utc_s: float, settings: tuple[str, ...] = ()) -> None:
@@ -62,10 +63,10 @@ class GobyHost:
         self._written_s = 0.0
         self._fails = 0
         self._present_fails = 0
-        self._asleep_until_s = 0.0
-        self._alive_s = -1e9
+        self._paused_until_s = 0.0
+        self._last_sentence_s = -1e9
         self._dump_s: float | None = None
-        self._heard = b""
+        self._received = b""
         self._message = Delivery()
         self._expected_cst = 0
         self._expected_xst = 0
@@ -83,7 +84,7 @@ class GobyHost:
             self.configure(setting)
         self._put("CCMSC", address, address, 0)
 
-    # What an application asks for.
+    # Requests of an application.
 
     def configure(self, setting: str) -> None:
         self._put("CCCFG", *setting.split(","))
@@ -130,22 +131,22 @@ class GobyHost:
         if self.nvram.get("TAT") != str(turnaround_ms):
             self.configure(f"TAT,{turnaround_ms}")
 
-    # Ten times a second.
+    # Called ten times a second.
 
-    def work(self, now: float, heard: bytes) -> None:
-        self._heard += heard
-        if now < self._asleep_until_s or self.dead:
+    def work(self, now: float, received: bytes) -> None:
+        self._received += received
+        if now < self._paused_until_s or self.dead:
             return
         if self._dump_s is not None and self._waiting and now >= max(self._dump_s, self._written_s) + 2.0:
             self._dump_s = None
             self._pop()
         self._clock(now)
-        if now >= self._alive_s + 10.0:
+        if now >= self._last_sentence_s + 10.0:
             self._put(*(("CCTMQ", 0) if (self.major or 0) >= 2 else ("CCCFQ", "SRC")))
-            self._alive_s = now
+            self._last_sentence_s = now
         self._try_send(now)
-        while now >= self._asleep_until_s and b"\r\n" in self._heard:
-            line, _, self._heard = self._heard.partition(b"\r\n")
+        while now >= self._paused_until_s and b"\r\n" in self._received:
+            line, _, self._received = self._received.partition(b"\r\n")
             self._take(line, now)
 
     def _clock(self, now: float) -> None:
@@ -159,7 +160,7 @@ class GobyHost:
         else:
             self._put("CCCLK", true.year, true.month, true.day, true.hour, true.minute, true.second + 1)
             self._try_send(now)
-            self._asleep_until_s = now + 1.0
+            self._paused_until_s = now + 1.0
 
     def _put(self, kind: str, *fields: str | int) -> None:
         self._out.append(nmea.Sentence(kind, tuple(str(f) for f in fields)))
@@ -192,12 +193,12 @@ class GobyHost:
         self._present_fails = 0
         self._out.popleft()
 
-    # What the modem says.
+    # Sentences of the modem.
 
     def _take(self, line: bytes, now: float) -> None:
         sentence = nmea.parse(line, checksum_required=True)
         self.raw.append(line.decode())
-        self._alive_s, self._fails = now, 0
+        self._last_sentence_s, self._fails = now, 0
         handler = getattr(self, f"_on_{sentence.kind[2:].lower()}", None)
         if handler is not None:
             handler(sentence.fields, now)
@@ -219,7 +220,7 @@ class GobyHost:
 
     def _on_rev(self, f: tuple[str, ...], now: float) -> None:
         if f[1] == "INIT":
-            self._asleep_until_s = now + 2.0
+            self._paused_until_s = now + 2.0
             self.clock_set = False
         elif f[1] == "AUV":
             self.major = int(f[2].split(".")[0])
@@ -276,7 +277,7 @@ class GobyHost:
             self._next_frame += 1
 
     def _on_xst(self, f: tuple[str, ...], now: float) -> None:
-        assert f[0] == "6", "Goby takes any version but 6 for the first"
+        assert f[0] == "6", "Goby reads any other version as the first"
         if self._expected_xst:
             self._expected_xst -= 1
         else:
@@ -321,7 +322,7 @@ class GobyHost:
         self._deliver()
 
     def _on_cst(self, f: tuple[str, ...], now: float) -> None:
-        assert f[0] == "6", "Goby takes any version but 6 for the first"
+        assert f[0] == "6", "Goby reads any other version as the first"
         self._message.modes.append(int(f[1]))
         if self._expected_cst:
             self._expected_cst -= 1

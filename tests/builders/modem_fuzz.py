@@ -1,8 +1,9 @@
-"""Throws damaged, misplaced and invented lines at the NMEA parser and the driver, and checks what must always hold.
+"""Fuzzes the NMEA parser and the driver, and checks their invariants.
 
-`PYTHONPATH=tests python -m builders.modem_fuzz --lines 1000000 --seed 1` runs a million; the suite runs a few thousand.
-Lines are what a modem says in real exchanges, or made of every kind of sentence with likely and unlikely fields; then
-some are damaged: bytes flipped, lost, doubled, lines cut, joined and repeated. The same seed gives the same lines.
+`PYTHONPATH=tests python -m builders.modem_fuzz --lines 1000000 --seed 1` processes a million lines; the test suite some
+thousands. Lines are recorded from real exchanges, or composed of every kind of sentence with likely and unlikely
+fields. Some are damaged: bytes flipped, lost or duplicated, lines truncated, joined or repeated. A seed determines the
+lines.
 """
 
 # ruff: noqa: SIM905 - lists of this length are harder to read
@@ -36,33 +37,33 @@ LIKELY = (
 ).split()
 ENDS = (PacketSent, PacketFailed, RequestDone, RequestFailed)
 ROUND_LINES = 500
-MOST_BYTES_TO_SEND = 1 << 20
+MAX_BYTES_TO_SEND = 1 << 20
 
 
 @dataclass
 class Fuzz:
-    """One run.
+    """One fuzz run.
 
     Attributes:
-        seed: Of every draw.
-        lines: Thrown so far.
-        kinds_taken: How many sentences the parser took as valid.
+        seed: Seed of every random draw.
+        lines: Number of lines so far.
+        sentences_parsed: Number of lines that were valid sentences.
     """
 
     seed: int
     lines: int = 0
-    kinds_taken: int = 0
+    sentences_parsed: int = 0
     real: list[bytes] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.dice = random.Random(self.seed)
+        self.rng = random.Random(self.seed)
         self.real = real_lines()
 
     def run(self, lines: int) -> None:
-        """Throw so many lines, in rounds with a driver each.
+        """Process lines up to a total number, in rounds with a driver each.
 
         Raises:
-            AssertionError: Something that must always hold did not.
+            AssertionError: An invariant is violated.
         """
         while self.lines < lines:
             self._round(min(ROUND_LINES, lines - self.lines))
@@ -71,37 +72,37 @@ class Fuzz:
         driver = MicroModem(MicroModemConfig(1))
         driver.set_poll_handler(lambda polled: [b"x" * min(3, polled.frame_bytes)] * (polled.frames // 2))
         parser = nmea.LineAssembler()
-        now, asked, ended = 0.0, [], []
+        now, requested, ended = 0.0, [], []
         driver.start(now)
-        if self.dice.random() < 0.8:
+        if self.rng.random() < 0.8:
             self._make_ready(driver)
         for _ in range(count):
             self.lines += 1
             line = self.line()
-            self.kinds_taken += sum(isinstance(item, nmea.Sentence) for item in parser.feed(line))
-            if self.dice.random() < 0.02:
-                asked.append(self._ask(driver, now))
+            self.sentences_parsed += sum(isinstance(item, nmea.Sentence) for item in parser.feed(line))
+            if self.rng.random() < 0.02:
+                requested.append(self._send_request(driver, now))
             events = driver.receive(line, now)
-            now += self.dice.choice((0.0, 0.0, 0.01, 0.5, 7.0))
+            now += self.rng.choice((0.0, 0.0, 0.01, 0.5, 7.0))
             events += driver.poll(now)
             ended += [e for e in events if isinstance(e, ENDS)]
             self._check(driver, parser, now)
-        self._recover(driver, now, asked, ended)
+        self._recover(driver, now, requested, ended)
 
     @staticmethod
     def _check(driver: MicroModem, parser: nmea.LineAssembler, now: float) -> None:
         assert parser.pending_bytes <= nmea.MAX_SENTENCE_BYTES
         assert driver.queued <= driver.config.queued_packets + 1
         out = driver.bytes_to_send()
-        assert len(out) < MOST_BYTES_TO_SEND
+        assert len(out) < MAX_BYTES_TO_SEND
         for item in nmea.LineAssembler().feed(out):
-            assert isinstance(item, nmea.Sentence), "the driver writes whole sentences"
+            assert isinstance(item, nmea.Sentence), "the driver writes complete sentences"
         wakeup_s = driver.next_wakeup()
-        assert wakeup_s is None or wakeup_s > now, "a poll leaves nothing that is due"
+        assert wakeup_s is None or wakeup_s > now, "nothing is due after a poll"
 
     @staticmethod
-    def _recover(driver: MicroModem, now: float, asked: list[int], ended: list[object]) -> None:
-        """With silence, whatever was asked for comes to one end, and a modem that answers is used again."""
+    def _recover(driver: MicroModem, now: float, requested: list[int], ended: list[object]) -> None:
+        """Without further input every request ends once, and the driver becomes ready when the modem answers."""
         driver.receive(b"\r\n", now)
         for _ in range(400):
             now += 5.0
@@ -113,8 +114,8 @@ class Fuzz:
                 elif item.kind == "CCCFQ":
                     driver.receive(nmea.format("CACFG", item.fields[0], 1), now)
         numbers = [getattr(e, "packet_id", None) or getattr(e, "request_id", None) for e in ended]
-        assert len(numbers) == len(set(numbers)), "nothing ends twice"
-        assert set(asked) <= set(numbers), "everything ends"
+        assert len(numbers) == len(set(numbers)), "no request ends twice"
+        assert set(requested) <= set(numbers), "every request ends"
         assert driver.ready
         assert not driver.receiving
         assert driver.queued == 0
@@ -128,8 +129,8 @@ class Fuzz:
                 driver.receive(nmea.format("CACFG", item.fields[0], value), 0.0)
         assert driver.ready
 
-    def _ask(self, driver: MicroModem, now: float) -> int:
-        choice = self.dice.randrange(5)
+    def _send_request(self, driver: MicroModem, now: float) -> int:
+        choice = self.rng.randrange(5)
         if choice == 0:
             return driver.ping(2, now)
         if choice == 1:
@@ -137,27 +138,27 @@ class Fuzz:
         if choice == 2:
             return driver.send_flexible(2, 1, b"flexible", now)
         if choice == 3:
-            return driver.request_packet(2, self.dice.choice((0, 1, 4)), now=now)
-        return driver.send_packet(2, self.dice.choice((0, 4)), [b"ab"], ack=self.dice.random() < 0.5, now=now)
+            return driver.request_packet(2, self.rng.choice((0, 1, 4)), now=now)
+        return driver.send_packet(2, self.rng.choice((0, 4)), [b"ab"], ack=self.rng.random() < 0.5, now=now)
 
     def line(self) -> bytes:
-        """Return the next line, or what is left of it."""
-        draw = self.dice.random()
+        """Return the next line, possibly damaged."""
+        draw = self.rng.random()
         if draw < 0.45:
-            line = self.dice.choice(self.real)
+            line = self.rng.choice(self.real)
         elif draw < 0.95:
-            fields = [self.dice.choice(LIKELY) for _ in range(self.dice.randrange(10))]
-            line = nmea.format(self.dice.choice(KINDS), *fields)
+            fields = [self.rng.choice(LIKELY) for _ in range(self.rng.randrange(10))]
+            line = nmea.format(self.rng.choice(KINDS), *fields)
         else:
-            return self.dice.randbytes(self.dice.randrange(80))
-        return self._damaged(line) if self.dice.random() < 0.4 else line
+            return self.rng.randbytes(self.rng.randrange(80))
+        return self._damaged(line) if self.rng.random() < 0.4 else line
 
     def _damaged(self, line: bytes) -> bytes:
-        at = self.dice.randrange(len(line))
-        other = self.dice.choice(self.real)
-        return self.dice.choice(
+        at = self.rng.randrange(len(line))
+        other = self.rng.choice(self.real)
+        return self.rng.choice(
             (
-                line[:at] + bytes([line[at] ^ 1 << self.dice.randrange(8)]) + line[at + 1 :],
+                line[:at] + bytes([line[at] ^ 1 << self.rng.randrange(8)]) + line[at + 1 :],
                 line[:at] + line[at + 1 :],
                 line[:at] + line[at : at + 4] + line[at:],
                 line[:at],
@@ -169,18 +170,18 @@ class Fuzz:
         )
 
     def _swapped(self, line: bytes) -> list[str]:
-        """One field replaced, with a checksum that is right."""
+        """Replace one field; the checksum stays correct."""
         fields = line[1:].split(b"*")[0].decode("ascii").split(",")
         if len(fields) > 1:
-            fields[self.dice.randrange(1, len(fields))] = self.dice.choice(LIKELY)
+            fields[self.rng.randrange(1, len(fields))] = self.rng.choice(LIKELY)
         return fields
 
 
 def real_lines() -> list[bytes]:
-    """Return what the modem says to a driver in an exchange of each kind."""
+    """Return the sentences for a driver in an exchange of each kind."""
     rig = TwoDrivers()
     rig.drivers[2].set_poll_handler(lambda polled: [b"polled"])
-    rig.arm()
+    rig.start_counting()
     rig.run(10.0)
     for rate in (0, 1, 4):
         rig.drivers[1].send_packet(2, rate, [b"real"], ack=True, now=rig.now)
@@ -190,11 +191,11 @@ def real_lines() -> list[bytes]:
     rig.drivers[2].send_flexible(1, 1, b"flexible", rig.now)
     rig.drivers[2].request_packet(1, 1, now=rig.now)
     rig.run(150.0)
-    return [passed.line for passed in rig.passed if passed.host == 1 and not passed.to_modem]
+    return [passed.line for passed in rig.transferred if passed.host == 1 and not passed.to_modem]
 
 
 def parse_alone(lines: list[bytes]) -> int:
-    """Parse lines one by one; return how many are valid. Nothing but `SentenceError` is raised."""
+    """Parse lines one by one and return the number of valid ones; only `SentenceError` may be raised."""
     valid = 0
     for line in lines:
         try:
@@ -202,7 +203,7 @@ def parse_alone(lines: list[bytes]) -> int:
         except SentenceError:
             continue
         valid += 1
-        assert nmea.parse(sentence.encode()) == sentence, "what was parsed is written as it was"
+        assert nmea.parse(sentence.encode()) == sentence, "a parsed sentence formats to itself"
     return valid
 
 
@@ -217,7 +218,7 @@ def main() -> None:
     valid = parse_alone([fuzz.line() for _ in range(parsed.lines // 10)])
     seconds = time.monotonic() - started_s
     alone = f"{valid} of {parsed.lines // 10} alone"
-    print(f"{fuzz.lines} lines, {fuzz.kinds_taken} taken as sentences, {alone}; {seconds:.0f} s")
+    print(f"{fuzz.lines} lines, {fuzz.sentences_parsed} taken as sentences, {alone}; {seconds:.0f} s")
 
 
 if __name__ == "__main__":

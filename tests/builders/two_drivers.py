@@ -1,4 +1,4 @@
-"""Two of the project's drivers on two emulated modems, on simulated time, with serial lines that a test can spoil."""
+"""Two drivers on two emulated modems, on simulated time, with faults on the serial lines."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sonarpost.simulation.channel.parameters import ChannelParameters
 from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
 from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
-Spoil = Callable[[bytes], bytes]
+Fault = Callable[[bytes], bytes]
 
 
 def drop(line: bytes) -> bytes:
@@ -19,25 +19,25 @@ def drop(line: bytes) -> bytes:
     return b""
 
 
-def garble(line: bytes) -> bytes:
-    """Damage one byte in the middle of it."""
+def corrupt(line: bytes) -> bytes:
+    """Change one bit in the middle of the sentence."""
     middle = len(line) // 2
     return line[:middle] + bytes([line[middle] ^ 0x04]) + line[middle + 1 :]
 
 
-def cut(line: bytes) -> bytes:
-    """Lose its second half, line end and all."""
+def truncate(line: bytes) -> bytes:
+    """Lose the second half with the line end."""
     return line[: len(line) // 2]
 
 
-def double(line: bytes) -> bytes:
-    """Say it twice."""
+def duplicate(line: bytes) -> bytes:
+    """Repeat the sentence."""
     return line + line
 
 
 @dataclass
-class Passed:
-    """One sentence on a serial line: which host's, and in which direction."""
+class LineSentence:
+    """One sentence on a serial line: its host and direction."""
 
     host: int
     to_modem: bool
@@ -46,88 +46,88 @@ class Passed:
 
 @dataclass
 class TwoDrivers:
-    """The rig.
+    """Two drivers, two modems and the lines between them.
 
     Attributes:
-        spoil_number: Which of the sentences from `arm` on is spoiled, from 0; None for none.
-        spoil: How.
-        mishap: What happens besides, when that sentence passes.
+        fault_number: Number (from 0, after `start_counting`) of the sentence with the fault; None for none.
+        fault: The fault.
+        disturbance: Called when that sentence is transferred.
     """
 
-    spoil_number: int | None = None
-    spoil: Spoil = drop
-    mishap: Callable[[TwoDrivers], None] | None = None
+    fault_number: int | None = None
+    fault: Fault = drop
+    disturbance: Callable[[TwoDrivers], None] | None = None
     generation: int = 2
-    water: ChannelParameters = field(default_factory=ChannelParameters)
+    parameters: ChannelParameters = field(default_factory=ChannelParameters)
     config: Callable[[int], MicroModemConfig] = MicroModemConfig
 
     def __post_init__(self) -> None:
         places = {n: PlacedModem(EmulatedModemConfig(n, self.generation), LocalPosition(150.0 * n)) for n in (1, 2)}
-        self.world = ChannelSimulator(self.water, places)
+        self.simulator = ChannelSimulator(self.parameters, places)
         self.drivers = {n: MicroModem(self.config(n)) for n in (1, 2)}
         self.events: dict[int, list[ModemEvent]] = {1: [], 2: []}
-        self.passed: list[Passed] = []
-        self.armed = False
-        self.spoiled: Passed | None = None
+        self.transferred: list[LineSentence] = []
+        self.counting = False
+        self.faulty: LineSentence | None = None
         self.now = 0.0
-        self.ports_back: list[tuple[float, int]] = []
+        self.reopening_ports: list[tuple[float, int]] = []
         for driver in self.drivers.values():
             driver.start(0.0)
 
-    def arm(self) -> None:
-        """Count sentences from now on."""
-        self.passed.clear()
-        self.armed = True
+    def start_counting(self) -> None:
+        """Count sentences from now on; the fault applies to the one with the given number."""
+        self.transferred.clear()
+        self.counting = True
 
     def run(self, until_s: float, done: Callable[[], bool] = lambda: False) -> bool:
-        """Let everything happen, from event to event, until a time or until something holds."""
+        """Run from event to event until a time, or until a condition holds."""
         while self.now < until_s:
             self._exchange()
             if done():
                 return True
-            times_s = [self.world.next_deadline_s(), *(d.next_wakeup() or until_s for d in self.drivers.values())]
-            times_s += [at_s for at_s, _ in self.ports_back]
-            # A modem's answer to what it was told a moment ago must not wait for the next event.
+            times_s = [self.simulator.next_deadline_s(), *(d.next_wakeup() or until_s for d in self.drivers.values())]
+            times_s += [at_s for at_s, _ in self.reopening_ports]
+            # The next step follows within 1 ms, so that an answer of a modem does not wait for the next event.
             self.now = min(until_s, max(min(times_s), self.now + 0.001))
         self._exchange()
         return done()
 
-    def got(self, host: int, *kinds: type) -> list[ModemEvent]:
-        """The events of some types at a host."""
+    def events_of(self, host: int, *kinds: type) -> list[ModemEvent]:
+        """Return the events of some types at a host."""
         return [event for event in self.events[host] if isinstance(event, kinds)]
 
     def unplug(self, host: int, for_s: float) -> None:
-        """Take a host's port away for some time."""
+        """Remove the port of a host for some time."""
         self.drivers[host].port_lost(self.now)
-        self.ports_back.append((self.now + for_s, host))
+        self.reopening_ports.append((self.now + for_s, host))
 
     def _exchange(self) -> None:
-        for at_s, host in [back for back in self.ports_back if back[0] <= self.now]:
-            self.ports_back.remove((at_s, host))
+        for at_s, host in [port for port in self.reopening_ports if port[0] <= self.now]:
+            self.reopening_ports.remove((at_s, host))
             self.drivers[host].port_opened(self.now)
         for n, driver in self.drivers.items():
             self.events[n] += driver.poll(self.now)
             for line in driver.bytes_to_send().splitlines(keepends=True):
-                self.world.receive(n, self._through(Passed(n, True, line)), self.now)
-        self.world.advance(self.now)
+                self.simulator.receive(n, self._transfer(LineSentence(n, True, line)), self.now)
+        self.simulator.advance(self.now)
         for n, driver in self.drivers.items():
-            for output in self.world.take_outputs(n):
-                self.events[n] += driver.receive(self._through(Passed(n, False, output.data)), self.now)
+            for output in self.simulator.take_outputs(n):
+                self.events[n] += driver.receive(self._transfer(LineSentence(n, False, output.data)), self.now)
 
-    def _through(self, passed: Passed) -> bytes:
-        if not self.armed:
-            return passed.line
-        number = len(self.passed)
-        self.passed.append(passed)
-        if number != self.spoil_number:
-            return passed.line
-        self.spoiled = passed
-        if self.mishap is not None:
-            self.mishap(self)
-        return self.spoil(passed.line)
+    def _transfer(self, sentence: LineSentence) -> bytes:
+        if not self.counting:
+            return sentence.line
+        number = len(self.transferred)
+        self.transferred.append(sentence)
+        if number != self.fault_number:
+            return sentence.line
+        self.faulty = sentence
+        if self.disturbance is not None:
+            self.disturbance(self)
+        return self.fault(sentence.line)
 
 
-def kinds_of(passed: list[Passed]) -> list[str]:
-    """The kinds of sentences that have passed."""
-    items = nmea.LineAssembler().feed(b"".join(each.line for each in passed))
+def kinds_of(sentences: list[LineSentence]) -> list[str]:
+    """Return the kinds of the transferred sentences."""
+    items = nmea.LineAssembler().feed(b"".join(each.line for each in sentences))
     return [item.kind for item in items if isinstance(item, nmea.Sentence)]

@@ -15,7 +15,7 @@ def _split(body: str) -> Sentence:
     return Sentence(kind, tuple(parts))
 
 
-# Seen on the wire between modems and third-party clients.
+# Recorded between modems and third-party clients.
 GOLDEN = {
     b"$CAREV,181807,AUV,2.0.27087*12": Sentence("CAREV", ("181807", "AUV", "2.0.27087")),
     b"$CAREV,000052,AUV,0.93.0.09*07": Sentence("CAREV", ("000052", "AUV", "0.93.0.09")),
@@ -43,13 +43,13 @@ sentences = st.builds(Sentence, kinds, st.lists(fields, max_size=8).map(tuple))
 
 
 @pytest.mark.parametrize("line", GOLDEN)
-def test_golden_sentences_both_ways(line: bytes) -> None:
+def test_golden_sentences_parse_and_format(line: bytes) -> None:
     assert nmea.parse(line) == nmea.parse(line + b"\r\n") == GOLDEN[line]
     assert GOLDEN[line].encode() == line + b"\r\n"
 
 
 @pytest.mark.parametrize("step", [1, 2, 7, 64, len(STREAM)])
-def test_stream_in_pieces_of_any_size(step: int) -> None:
+def test_stream_split_at_any_position(step: int) -> None:
     lines = LineAssembler()
     assert [item for at in range(0, len(STREAM), step) for item in lines.feed(STREAM[at : at + step])] == SENTENCES
     assert lines.pending_bytes == 0
@@ -66,7 +66,7 @@ def test_stream_in_pieces_of_any_size(step: int) -> None:
         (b"!AIVDM,1*00\n", b"", 1),
     ],
 )
-def test_junk_around_costs_no_sentence(before: bytes, after: bytes, errors: int) -> None:
+def test_noise_around_sentences_loses_no_sentence(before: bytes, after: bytes, errors: int) -> None:
     items = LineAssembler("port A").feed(before + STREAM + after)
     assert [item for item in items if isinstance(item, Sentence)] == SENTENCES
     rejected = [item for item in items if isinstance(item, SentenceError)]
@@ -74,11 +74,11 @@ def test_junk_around_costs_no_sentence(before: bytes, after: bytes, errors: int)
     assert all(error.where == "port A" for error in rejected)
 
 
-def test_lost_line_end_costs_nothing_when_the_checksum_is_there() -> None:
+def test_line_without_line_end_is_accepted_with_checksum() -> None:
     assert LineAssembler().feed(STREAM.replace(b"\r\n", b"") + b"\n") == SENTENCES
 
 
-def test_checksums_once_seen_are_required_until_the_port_is_opened_again() -> None:
+def test_checksum_is_required_after_the_first_one_until_reset() -> None:
     lines = LineAssembler(learn_checksums=True)
     assert lines.feed(b"$CATXF,28\r\n$CATXF,28*6E\r\n") == [Sentence("CATXF", ("28",))] * 2
     assert isinstance(lines.feed(b"$CATXF,28\r\n")[0], SentenceError)
@@ -86,14 +86,14 @@ def test_checksums_once_seen_are_required_until_the_port_is_opened_again() -> No
     assert lines.feed(b"$CATXF,28\r\n") == [Sentence("CATXF", ("28",))]
 
 
-def test_cut_off_line_without_checksum_is_no_sentence() -> None:
+def test_truncated_line_without_checksum_is_rejected() -> None:
     items = LineAssembler().feed(b"$CARXD,1,2,0,1,AB$CATXF,28*6E\r\n")
     assert isinstance(items[0], SentenceError)
     assert items[0].field == "checksum"
     assert items[1:] == [Sentence("CATXF", ("28",))]
 
 
-def test_checksum_absent_lower_case_and_wrong() -> None:
+def test_missing_lower_case_and_wrong_checksum() -> None:
     assert nmea.parse(b"$CATXF,28") == nmea.parse(b"$CATXF,28*6e") == nmea.parse(b"$CATXF,28*6E")
     assert nmea.format("CATXF", 28) == b"$CATXF,28*6E\r\n"
     for wrong in (b"*6F", b"*6", b"*", b"*6E0", b"*G0", b"* 6E", b"*6E*6E"):
@@ -104,7 +104,7 @@ def test_checksum_absent_lower_case_and_wrong() -> None:
 
 
 @pytest.mark.parametrize("position", range(1, 33))
-def test_any_flipped_bit_is_noticed(position: int) -> None:
+def test_any_flipped_bit_is_detected(position: int) -> None:
     line = bytearray(b"$CAREV,181807,AUV,2.0.27087*12")
     line[position % len(line)] ^= 1 << (position % 7)
     lines = LineAssembler(learn_checksums=True)
@@ -117,7 +117,7 @@ def test_any_flipped_bit_is_noticed(position: int) -> None:
 @pytest.mark.parametrize(
     "line", [b"", b"$", b"$*00", b"CATXF,28*6E", b"$caTXF,28", b"$C\x00TXF,28", b"$CA,1", b"$CATXF,\xe9", b"$\r\n"]
 )
-def test_what_is_no_sentence(line: bytes) -> None:
+def test_invalid_line_is_rejected(line: bytes) -> None:
     with pytest.raises(SentenceError):
         nmea.parse(line)
 
@@ -126,25 +126,25 @@ def test_what_is_no_sentence(line: bytes) -> None:
     ("kind", "field"),
     [("", "1"), ("ccCYC", "1"), ("CC,YC", "1"), ("CCCFG", "a,b"), ("CCCFG", "a*b"), ("CCCFG", "a$b"), ("CCCFG", "é")],
 )
-def test_format_refuses_what_it_could_not_read_back(kind: str, field: str) -> None:
+def test_format_rejects_fields_that_cannot_be_parsed(kind: str, field: str) -> None:
     with pytest.raises(SentenceError):
         nmea.format(kind, field)
 
 
-def test_format_refuses_line_ends_and_too_long_ones() -> None:
+def test_format_rejects_line_ends_and_too_long_sentences() -> None:
     for field in ("1\r\n$CCMSC,1,1,0", "\x00", "A" * MAX_SENTENCE_BYTES):
         with pytest.raises(SentenceError):
             nmea.format("CCTXD", field)
 
 
-def test_longest_sentence_is_exactly_the_limit() -> None:
+def test_longest_sentence_has_exactly_the_maximum_length() -> None:
     line = nmea.format("CCTXD", "A" * (MAX_SENTENCE_BYTES - len("$CCTXD,*00")))
     assert len(line.rstrip()) == MAX_SENTENCE_BYTES
     assert isinstance(LineAssembler().feed(line)[0], Sentence)
     assert isinstance(LineAssembler().feed(line.replace(b"AA", b"AAA", 1))[0], SentenceError)
 
 
-def test_endless_line_holds_no_memory_and_ends_at_the_next_sentence() -> None:
+def test_endless_line_uses_bounded_memory_and_ends_at_the_next_sentence() -> None:
     for start in (b"$CARXD,", b"\xffnoise"):
         lines = LineAssembler()
         tracemalloc.start()
@@ -161,7 +161,7 @@ def test_endless_line_holds_no_memory_and_ends_at_the_next_sentence() -> None:
         assert sentence == Sentence("CATXF", ("28",))
 
 
-def test_reset_forgets_the_first_half() -> None:
+def test_reset_drops_an_unfinished_line() -> None:
     lines = LineAssembler()
     lines.feed(b"$CATXF,2")
     lines.reset()
@@ -170,22 +170,22 @@ def test_reset_forgets_the_first_half() -> None:
 
 @given(st.lists(st.binary(max_size=200) | st.sampled_from(list(GOLDEN)), max_size=20))
 @example([b"$", b"*", b"\r"])
-def test_any_bytes_give_sentences_or_errors_and_nothing_else(pieces: list[bytes]) -> None:
+def test_result_is_independent_of_the_read_boundaries(pieces: list[bytes]) -> None:
     lines = LineAssembler()
     items = [item for piece in pieces for item in lines.feed(piece)]
     assert all(isinstance(item, (Sentence, SentenceError)) for item in items)
     whole = LineAssembler().feed(b"".join(pieces))
-    assert [str(item) for item in whole] == [str(item) for item in items], "the cuts between reads do not matter"
+    assert [str(item) for item in whole] == [str(item) for item in items], "the read boundaries have no effect"
     assert lines.pending_bytes <= MAX_SENTENCE_BYTES
 
 
 @given(sentences)
-def test_every_sentence_survives_the_wire(sentence: Sentence) -> None:
+def test_formatted_sentence_parses_back(sentence: Sentence) -> None:
     assert nmea.parse(sentence.encode()) == sentence
     assert LineAssembler().feed(sentence.encode()) == [sentence]
 
 
 @given(st.binary(max_size=100))
-def test_parse_raises_nothing_else(line: bytes) -> None:
+def test_parse_raises_only_sentence_error(line: bytes) -> None:
     with contextlib.suppress(SentenceError):
         assert nmea.parse(b"$" + line).kind

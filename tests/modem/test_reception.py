@@ -29,29 +29,29 @@ def ready() -> FakeModem:
     modem.run(5.0)
     assert modem.events == [ModemReady(1, None)]
     modem.events.clear()
-    modem.heard.clear()
+    modem.received.clear()
     return modem
 
 
 def cst(modem: FakeModem, rate: int = 4, nframes: int = 2, nbad: int = 0, mode: int = 0, packet_type: int = 3) -> None:
     fields = f"8,{mode},20250606230123.348554,06,32767,45,0102,0123,07,00,00,00,00,{rate},003,001,0,{packet_type}"
-    modem.say("CACST", *f"{fields},{nframes},{nbad},150,26.0,9.48,-100,-6.48,-01,0.01,51,25000,5000".split(","))
+    modem.send("CACST", *f"{fields},{nframes},{nbad},150,26.0,9.48,-100,-6.48,-01,0.01,51,25000,5000".split(","))
 
 
 def packet_steps(modem: FakeModem, frames: tuple[bytes, ...] = FRAMES) -> list[Callable[[], None]]:
     return [
-        lambda: modem.say("CARXP", 1),
-        lambda: modem.say("CACYC", 0, 3, 1, 4, 0, len(frames)),
-        *[lambda n=n, f=f: modem.say("CARXD", 3, 1, 0, n, f.hex().upper()) for n, f in enumerate(frames, 1)],
+        lambda: modem.send("CARXP", 1),
+        lambda: modem.send("CACYC", 0, 3, 1, 4, 0, len(frames)),
+        *[lambda n=n, f=f: modem.send("CARXD", 3, 1, 0, n, f.hex().upper()) for n, f in enumerate(frames, 1)],
         lambda: cst(modem),
     ]
 
 
 def frames_of(modem: FakeModem) -> list[bytes]:
-    return [event.data for event in modem.of(FrameReceived)]
+    return [event.data for event in modem.events_of(FrameReceived)]
 
 
-def test_packet_with_everything() -> None:
+def test_complete_packet() -> None:
     modem = ready()
     for step in packet_steps(modem)[:-1]:
         step()
@@ -70,21 +70,21 @@ def test_packet_with_everything() -> None:
 
 
 @pytest.mark.parametrize("lost", range(5), ids=["CARXP", "CACYC", "CARXD 1", "CARXD 2", "CACST"])
-def test_any_sentence_lost_costs_at_most_its_own_frame(lost: int) -> None:
+def test_lost_sentence_loses_at_most_its_own_frame(lost: int) -> None:
     modem = ready()
     for number, step in enumerate(packet_steps(modem)):
         if number != lost:
             step()
     modem.run(30.0)
     assert frames_of(modem) == [f for number, f in enumerate(FRAMES, 2) if number != lost]
-    (packet,) = modem.of(PacketReceived)
+    (packet,) = modem.events_of(PacketReceived)
     assert packet.complete == (lost in {0, 1})
     assert (packet.statistics is None) == (lost == 4)
-    assert all(event.statistics is packet.statistics for event in modem.of(FrameReceived))
+    assert all(event.statistics is packet.statistics for event in modem.events_of(FrameReceived))
     assert not modem.driver.receiving
 
 
-def test_without_statistics_frames_come_late_but_come() -> None:
+def test_frames_without_statistics_are_reported_after_the_timeout() -> None:
     modem = ready()
     for step in packet_steps(modem)[:-1]:
         step()
@@ -92,40 +92,40 @@ def test_without_statistics_frames_come_late_but_come() -> None:
     assert modem.events == []
     modem.run(5.0 + CONFIG.on_air_limit_s(4) + 0.1)
     assert frames_of(modem) == list(FRAMES)
-    (packet,) = modem.of(PacketReceived)
+    (packet,) = modem.events_of(PacketReceived)
     assert not packet.complete
     assert packet.rate == 4
 
 
 @pytest.mark.parametrize("skipped", [0, 1, 2], ids=["nothing", "CARXP", "CARXP and CACYC"])
-def test_next_packet_flushes_one_without_statistics(skipped: int) -> None:
+def test_next_packet_ends_a_packet_without_statistics(skipped: int) -> None:
     modem = ready()
     for step in packet_steps(modem)[:-1]:
         step()
     for step in packet_steps(modem, (b"third", b"fourth"))[skipped:]:
         step()
     assert frames_of(modem) == [*FRAMES, b"third", b"fourth"]
-    first, second = modem.of(PacketReceived)
+    first, second = modem.events_of(PacketReceived)
     assert not first.complete
     assert second.complete
 
 
-def test_frame_of_another_sender_is_another_packet() -> None:
+def test_frame_of_another_source_starts_another_packet() -> None:
     modem = ready()
-    modem.say("CARXD", 3, 1, 0, 1, "AA")
-    modem.say("CARXD", 4, 1, 0, 2, "BB")
+    modem.send("CARXD", 3, 1, 0, 1, "AA")
+    modem.send("CARXD", 4, 1, 0, 2, "BB")
     cst(modem, nframes=0)
-    assert [packet.src for packet in modem.of(PacketReceived)] == [3, 4]
+    assert [packet.src for packet in modem.events_of(PacketReceived)] == [3, 4]
 
 
 @pytest.mark.parametrize(("bad_messages", "nbad"), [(1, 1), (1, 0), (0, 1)])
-def test_damaged_frames(bad_messages: int, nbad: int) -> None:
+def test_damaged_frames_are_counted(bad_messages: int, nbad: int) -> None:
     modem = ready()
     steps = packet_steps(modem)
     for step in steps[:3]:
         step()
     for _ in range(bad_messages):
-        modem.say("CAMSG", "BAD_CRC", 2)
+        modem.send("CAMSG", "BAD_CRC", 2)
     cst(modem, nbad=nbad, mode=1)
     (frame, packet) = modem.events
     assert frame.data == FRAMES[0]
@@ -133,97 +133,97 @@ def test_damaged_frames(bad_messages: int, nbad: int) -> None:
     assert packet.statistics.mode == 1
 
 
-def test_packet_of_which_nothing_was_readable() -> None:
+def test_packet_without_any_good_frame() -> None:
     modem = ready()
-    modem.say("CARXP", 1)
+    modem.send("CARXP", 1)
     cst(modem, nframes=2, nbad=2, mode=1)
     (packet,) = modem.events
     assert (packet.frames, packet.bad_frames, packet.src, packet.rate, packet.complete) == ((), 2, 3, 4, False)
 
 
-def test_all_frames_but_a_bad_mode_is_not_complete() -> None:
+def test_packet_with_bad_mode_is_not_complete() -> None:
     modem = ready()
     for step in packet_steps(modem)[:-1]:
         step()
     cst(modem, mode=2)
-    assert not modem.of(PacketReceived)[0].complete
+    assert not modem.events_of(PacketReceived)[0].complete
 
 
-def test_modem_that_stops_waiting_for_a_packet() -> None:
+def test_packet_timeout_of_the_modem_ends_the_packet() -> None:
     modem = ready()
     for step in packet_steps(modem)[:3]:
         step()
-    modem.say("CAMSG", "PACKET_TIMEOUT", 4)
+    modem.send("CAMSG", "PACKET_TIMEOUT", 4)
     assert [type(event) for event in modem.events] == [ModemMessageReceived]
     modem.run(5.0 + CONFIG.statistics_timeout_s + 0.1)
     assert frames_of(modem) == [FRAMES[0]]
-    assert not modem.of(PacketReceived)[0].complete
+    assert not modem.events_of(PacketReceived)[0].complete
 
 
-def test_unreadable_statistics_end_the_packet_without_them() -> None:
+def test_invalid_statistics_end_the_packet() -> None:
     modem = ready()
     for step in packet_steps(modem)[:-1]:
         step()
-    modem.say("CACST", 8, "what", 1)
+    modem.send("CACST", 8, "what", 1)
     assert frames_of(modem) == list(FRAMES)
-    assert modem.of(PacketReceived)[0].complete
-    assert modem.of(PacketReceived)[0].statistics is None
-    assert len(modem.of(SentenceRejected)) == 1
+    assert modem.events_of(PacketReceived)[0].complete
+    assert modem.events_of(PacketReceived)[0].statistics is None
+    assert len(modem.events_of(SentenceRejected)) == 1
 
 
-def test_frame_with_damaged_fields_is_rejected_and_the_others_come() -> None:
+def test_frame_with_invalid_fields_is_rejected_alone() -> None:
     modem = ready()
-    modem.say("CARXP", 1)
-    modem.say("CACYC", 0, 3, 1, 4, 0, 2)
-    modem.say("CARXD", 3, 1, 0, 1, "ABC")
-    modem.say("CARXD", 3, 1, 0, 2, "AB")
+    modem.send("CARXP", 1)
+    modem.send("CACYC", 0, 3, 1, 4, 0, 2)
+    modem.send("CARXD", 3, 1, 0, 1, "ABC")
+    modem.send("CARXD", 3, 1, 0, 2, "AB")
     cst(modem)
     assert frames_of(modem) == [b"\xab"]
-    assert not modem.of(PacketReceived)[0].complete
-    assert modem.of(SentenceRejected)[0].error.field == "data"
+    assert not modem.events_of(PacketReceived)[0].complete
+    assert modem.events_of(SentenceRejected)[0].error.field == "data"
 
 
-def test_rate_0_comes_in_two_parts_with_statistics_each() -> None:
+def test_rate_0_packet_has_a_header_with_its_own_statistics() -> None:
     modem = ready()
-    modem.say("CARXP", 0)
-    modem.say("CACYC", 0, 3, 1, 0, 0, 1)
+    modem.send("CARXP", 0)
+    modem.send("CACYC", 0, 3, 1, 0, 0, 1)
     cst(modem, rate=0, nframes=0, packet_type=2)
     assert [type(event) for event in modem.events] == [StatisticsReceived]
     assert modem.driver.receiving
     modem.run(7.0)
-    modem.say("CARXP", 0)
-    modem.say("CARXD", 3, 1, 0, 1, "AB")
+    modem.send("CARXP", 0)
+    modem.send("CARXD", 3, 1, 0, 1, "AB")
     cst(modem, rate=0, nframes=1, packet_type=1)
-    (packet,) = modem.of(PacketReceived)
+    (packet,) = modem.events_of(PacketReceived)
     assert packet.complete
     assert packet.rate == 0
     assert frames_of(modem) == [b"\xab"]
 
 
-def test_acknowledgements_are_no_packet() -> None:
+def test_acknowledgements_are_not_a_packet() -> None:
     modem = ready()
-    modem.say("CARXP", 1)
-    modem.say("CAACK", 3, 1, 1, 1)
-    modem.say("CAACK", 3, 1, 2, 0)
+    modem.send("CARXP", 1)
+    modem.send("CAACK", 3, 1, 1, 1)
+    modem.send("CAACK", 3, 1, 2, 0)
     cst(modem, nframes=0, packet_type=4)
     assert [type(event) for event in modem.events] == [FrameAcknowledged, StatisticsReceived]
     assert not modem.driver.receiving
 
 
-def test_frames_for_another_modem_are_handed_over_too() -> None:
+def test_frames_for_another_modem_are_reported() -> None:
     modem = ready()
-    modem.say("CARXD", 3, 9, 1, 1, "AB")
+    modem.send("CARXD", 3, 9, 1, 1, "AB")
     cst(modem, nframes=1)
     assert (modem.events[0].dest, modem.events[0].ack) == (9, True)
 
 
-def test_restart_or_lost_port_hands_over_what_has_come() -> None:
+def test_restart_or_lost_port_reports_the_received_frames() -> None:
     for end in ("restart", "port"):
         modem = ready()
         for step in packet_steps(modem)[:3]:
             step()
         if end == "restart":
-            modem.say("CAREV", "000001", "INIT", "1.2.3")
+            modem.send("CAREV", "000001", "INIT", "1.2.3")
         else:
             modem.driver.port_lost(modem.now)
             modem.events += modem.driver.poll(modem.now)
@@ -231,99 +231,99 @@ def test_restart_or_lost_port_hands_over_what_has_come() -> None:
         assert [type(event) for event in modem.events] == kinds
 
 
-def test_revision_in_the_middle_of_a_packet_changes_nothing() -> None:
+def test_revision_during_a_packet_has_no_effect() -> None:
     for configured in (True, False):
         modem = ready() if configured else FakeModem(MicroModem(CONFIG))
         if not configured:
             modem.silent_kinds.add("CACFG")
             modem.driver.start(0.0)
         for step in packet_steps(modem):
-            modem.say("CAREV", "181807", "AUV", "2.0.27087")
-            modem.say("CACFG", "X", 1)
+            modem.send("CAREV", "181807", "AUV", "2.0.27087")
+            modem.send("CACFG", "X", 1)
             step()
-        assert modem.of(PacketReceived)[0].complete
+        assert modem.events_of(PacketReceived)[0].complete
 
 
-def test_no_cycle_is_started_while_a_packet_arrives() -> None:
+def test_no_cycle_starts_during_a_reception() -> None:
     modem = ready()
     steps = packet_steps(modem)
     steps[0]()
     modem.driver.send_packet(3, 4, [b"answer"], now=modem.now)
     for step in steps[1:-1]:
         modem.run(modem.now + 1.0)
-        assert modem.heard == []
+        assert modem.received == []
         step()
     cst(modem)
     modem.run(modem.now + 6.0)
-    assert [s.kind for s in modem.heard] == ["CCCYC", "CCTXD"]
-    assert len(modem.of(PacketSent)) == 1
+    assert [s.kind for s in modem.received] == ["CCCYC", "CCTXD"]
+    assert len(modem.events_of(PacketSent)) == 1
 
 
-def test_the_wait_for_a_packet_that_never_comes_is_bounded() -> None:
+def test_wait_for_an_announced_packet_is_bounded() -> None:
     modem = ready()
-    modem.say("CARXP", 1)
+    modem.send("CARXP", 1)
     modem.driver.send_packet(3, 4, [b"answer"], now=modem.now)
     modem.run(5.0 + CONFIG.on_air_limit_s(None) - 0.1)
-    assert modem.heard == []
+    assert modem.received == []
     modem.run(5.0 + CONFIG.on_air_limit_s(None) + 0.1)
-    assert [s.kind for s in modem.heard][:1] == ["CCCYC"]
-    assert modem.of(PacketReceived) == [], "noise is no packet"
+    assert [s.kind for s in modem.received][:1] == ["CCCYC"]
+    assert modem.events_of(PacketReceived) == [], "noise is not a packet"
 
 
 @given(st.lists(st.integers(0, 6), max_size=40), st.data())
-def test_no_frame_is_ever_lost_or_given_twice(script: list[int], data: st.DataObject) -> None:
-    """Sentences of the receiving side in any order, with any pauses: each frame comes out once, in order."""
+def test_every_frame_is_reported_exactly_once(script: list[int], data: st.DataObject) -> None:
+    """The sentences of receptions come in any order, with any pauses."""
     modem = ready()
     given_frames: list[bytes] = []
     for step in script:
         if step == 0:
-            modem.say("CARXP", 1)
+            modem.send("CARXP", 1)
         elif step == 1:
-            modem.say("CACYC", 0, data.draw(st.integers(2, 4)), 1, data.draw(st.integers(0, 6)), 0, 2)
+            modem.send("CACYC", 0, data.draw(st.integers(2, 4)), 1, data.draw(st.integers(0, 6)), 0, 2)
         elif step in {2, 3}:
             given_frames.append(len(given_frames).to_bytes(2, "big"))
-            modem.say("CARXD", 3, 1, 0, data.draw(st.integers(1, 3)), given_frames[-1].hex())
+            modem.send("CARXD", 3, 1, 0, data.draw(st.integers(1, 3)), given_frames[-1].hex())
         elif step == 4:
-            modem.say("CAMSG", "BAD_CRC", 1)
+            modem.send("CAMSG", "BAD_CRC", 1)
         elif step == 5:
             cst(modem)
         else:
             modem.run(modem.now + data.draw(st.floats(0.1, 20.0)))
     modem.run(modem.now + 60.0)
     assert frames_of(modem) == given_frames
-    assert [f.data for packet in modem.of(PacketReceived) for f in packet.frames] == given_frames
+    assert [f.data for packet in modem.events_of(PacketReceived) for f in packet.frames] == given_frames
     assert not modem.driver.receiving
 
 
-def test_slow_serial_line_does_not_tear_a_packet() -> None:
-    """Eight full frames in hex take seconds at 19200 baud, after the air time is over."""
+def test_slow_serial_line_does_not_split_a_packet() -> None:
+    """At 19200 baud, eight full frames in hex take seconds, beyond the air time of the packet."""
     modem = ready()
     for step in packet_steps(modem)[:2]:
         step()
     modem.run(5.0 + CONFIG.on_air_limit_s(4) - 0.1)
-    modem.say("CARXD", 3, 1, 0, 1, "AA")
+    modem.send("CARXD", 3, 1, 0, 1, "AA")
     modem.run(modem.now + CONFIG.statistics_timeout_s - 0.1)
-    modem.say("CARXD", 3, 1, 0, 2, "BB")
+    modem.send("CARXD", 3, 1, 0, 2, "BB")
     modem.run(modem.now + CONFIG.statistics_timeout_s - 0.1)
     assert modem.events == []
     cst(modem)
-    assert modem.of(PacketReceived)[0].complete
+    assert modem.events_of(PacketReceived)[0].complete
 
 
-def test_damage_alone_is_told_when_nothing_else_comes() -> None:
+def test_single_damaged_frame_is_reported_as_a_packet() -> None:
     modem = ready()
-    modem.say("CAMSG", "BAD_CRC", 1)
+    modem.send("CAMSG", "BAD_CRC", 1)
     modem.run(30.0)
     (packet,) = modem.events
     assert (packet.frames, packet.bad_frames, packet.nframes, packet.complete) == ((), 1, None, False)
 
 
-def test_announcement_of_the_next_packet_ends_the_one_before() -> None:
+def test_announcement_of_the_next_packet_ends_the_previous_one() -> None:
     modem = ready()
-    modem.say("CACYC", 0, 3, 1, 4, 0, 2)
-    modem.say("CARXD", 3, 1, 0, 1, "AA")
-    modem.say("CACYC", 0, 3, 1, 4, 0, 2)
-    modem.say("CARXD", 3, 1, 0, 2, "BB")
+    modem.send("CACYC", 0, 3, 1, 4, 0, 2)
+    modem.send("CARXD", 3, 1, 0, 1, "AA")
+    modem.send("CACYC", 0, 3, 1, 4, 0, 2)
+    modem.send("CARXD", 3, 1, 0, 2, "BB")
     cst(modem)
-    assert [[f.data for f in packet.frames] for packet in modem.of(PacketReceived)] == [[b"\xaa"], [b"\xbb"]]
-    assert [packet.complete for packet in modem.of(PacketReceived)] == [False, False]
+    assert [[f.data for f in packet.frames] for packet in modem.events_of(PacketReceived)] == [[b"\xaa"], [b"\xbb"]]
+    assert [packet.complete for packet in modem.events_of(PacketReceived)] == [False, False]

@@ -1,4 +1,4 @@
-"""Pings, mini-packets, flexible data and the second clock: sentences, and what the driver makes of them."""
+"""Requests of the driver: pings, mini-packets, flexible data, polls, and the clock of both generations."""
 
 from __future__ import annotations
 
@@ -48,73 +48,73 @@ def ready(firmware: str = "") -> MicroModem:
     return driver
 
 
-def tell(driver: MicroModem, *texts: str, now: float = 1.0) -> list[object]:
+def receive(driver: MicroModem, *texts: str, now: float = 1.0) -> list[object]:
     return [event for text in texts for event in driver.receive(sentence(text).encode(), now)]
 
 
-def test_what_others_say_is_told() -> None:
+def test_unsolicited_short_packets_are_reported() -> None:
     driver = ready()
-    told = tell(driver, "CAMPA,2,1", "CAMUA,2,1,1ABC", "CAMPR,2,1,0.1000", "CAMUR,2,1", "CARDP,2,1,1,0,0,1;1;AA,")
-    assert told[:4] == [
+    events = receive(driver, "CAMPA,2,1", "CAMUA,2,1,1ABC", "CAMPR,2,1,0.1000", "CAMUR,2,1", "CARDP,2,1,1,0,0,1;1;AA,")
+    assert events[:4] == [
         PingReceived(2, 1),
         MiniPacketReceived(2, 1, 0x1ABC),
         PingAnswered(2, 1, 0.1),
         MiniPacketAnswered(2, 1),
     ]
-    assert isinstance(told[4], FlexibleDataReceived)
-    assert (told[4].packet.data, told[4].received_s) == (b"\xaa", 1.0)
-    (rejected,) = tell(driver, "CAMUA,2,1,FFFF")
+    assert isinstance(events[4], FlexibleDataReceived)
+    assert (events[4].packet.data, events[4].received_s) == (b"\xaa", 1.0)
+    (rejected,) = receive(driver, "CAMUA,2,1,FFFF")
     assert isinstance(rejected, SentenceRejected)
 
 
-def test_bytes_of_each_request() -> None:
+def test_bytes_and_events_of_each_request() -> None:
     driver = ready()
     driver.ping(2, 1.0)
     assert driver.bytes_to_send() == b"$CCMPC,1,2*5D\r\n"
-    assert tell(driver, "CAMPC,1,2", "CATXP,0", "CATXF,0", "CARXP,0") == []
-    assert tell(driver, "CAMPR,2,1,0.0667") == [PingAnswered(2, 1, 0.0667), RequestDone(1, "ping", 2)]
-    assert any(isinstance(e, StatisticsReceived) for e in tell(driver, "CACST,6,0,20250606230123.348554"))
+    assert receive(driver, "CAMPC,1,2", "CATXP,0", "CATXF,0", "CARXP,0") == []
+    assert receive(driver, "CAMPR,2,1,0.0667") == [PingAnswered(2, 1, 0.0667), RequestDone(1, "ping", 2)]
+    assert any(isinstance(e, StatisticsReceived) for e in receive(driver, "CACST,6,0,20250606230123.348554"))
     driver.send_mini(2, 5, 2.0)
     assert driver.bytes_to_send().startswith(b"$CCMUC,1,2,0005*")
-    assert tell(driver, "CAMUR,2,1") == [MiniPacketAnswered(2, 1), RequestDone(2, "mini-packet", 2)]
+    assert receive(driver, "CAMUR,2,1") == [MiniPacketAnswered(2, 1), RequestDone(2, "mini-packet", 2)]
     driver.send_flexible(2, 1, b"\x01\xff", 3.0)
     assert driver.bytes_to_send().startswith(b"$CCTDP,2,1,0,0,01FF*")
-    assert tell(driver, "CATDP,0,1,2,1,0,0,2", "CATXP,2", "CATXF,2") == [RequestDone(3, "flexible data", 2)]
+    assert receive(driver, "CATDP,0,1,2,1,0,0,2", "CATXP,2", "CATXF,2") == [RequestDone(3, "flexible data", 2)]
     driver.request_packet(2, 4, now=4.0)
     assert driver.bytes_to_send().startswith(b"$CCCYC,0,2,1,4,0,2*")
-    assert tell(driver, "CACYC,0,2,1,4,0,2", "CATXP,0", "CATXF,0") == []
-    told = tell(driver, "CARXP,1", "CACYC,0,2,1,4,0,2", "CARXD,2,1,0,1,AA", "CACST,6,0,,,,,,,,,,,,4,2,1,0,3,1,0")
-    assert [type(e) for e in told[1:]] == [FrameReceived, PacketReceived, RequestDone]
+    assert receive(driver, "CACYC,0,2,1,4,0,2", "CATXP,0", "CATXF,0") == []
+    events = receive(driver, "CARXP,1", "CACYC,0,2,1,4,0,2", "CARXD,2,1,0,1,AA", "CACST,6,0,,,,,,,,,,,,4,2,1,0,3,1,0")
+    assert [type(e) for e in events[1:]] == [FrameReceived, PacketReceived, RequestDone]
 
 
-def test_a_request_waits_for_its_answer_only_so_long() -> None:
+def test_request_fails_without_an_answer() -> None:
     driver = ready()
     driver.ping(2, 1.0)
-    tell(driver, "CAMPC,1,2", "CATXF,0")
+    receive(driver, "CAMPC,1,2", "CATXF,0")
     assert driver.poll(20.9) == []
     assert driver.poll(21.1) == [RequestFailed(1, "ping", 2, FailureReason.NO_ANSWER)]
     driver.request_packet(2, 1, now=30.0)
-    tell(driver, "CACYC,0,2,1,1,0,3", "CATXF,0", now=31.0)
-    told = tell(driver, "CAMSG,PACKET_TIMEOUT,1", now=45.0)
-    assert told[-1] == RequestFailed(2, "poll", 2, FailureReason.NO_ANSWER)
+    receive(driver, "CACYC,0,2,1,1,0,3", "CATXF,0", now=31.0)
+    events = receive(driver, "CAMSG,PACKET_TIMEOUT,1", now=45.0)
+    assert events[-1] == RequestFailed(2, "poll", 2, FailureReason.NO_ANSWER)
 
 
-def test_a_command_the_modem_does_not_know_is_given_up_soon() -> None:
+def test_unknown_command_fails_after_its_tries() -> None:
     driver = ready("0.93.0.09")
     assert driver.generation == 1
     driver.send_flexible(2, 1, b"x", 1.0)
-    told: list[object] = []
+    events: list[object] = []
     for _ in range(3):
         assert driver.bytes_to_send().startswith(b"$CCTDP")
-        told += tell(driver, "CAERR,120000,NMEA,2,unknown CCTDP")
-    assert RequestFailed(1, "flexible data", 2, FailureReason.REFUSED) in told
+        events += receive(driver, "CAERR,120000,NMEA,2,unknown CCTDP")
+    assert RequestFailed(1, "flexible data", 2, FailureReason.REFUSED) in events
     assert driver.queued == 0
 
 
-def test_a_reboot_or_a_lost_port_ends_a_request() -> None:
+def test_reboot_or_lost_port_ends_a_request() -> None:
     driver = ready()
     driver.ping(2, 1.0)
-    assert RequestFailed(1, "ping", 2, FailureReason.REBOOTED) in tell(driver, "CAREV,120000,INIT,2.0.27087")
+    assert RequestFailed(1, "ping", 2, FailureReason.REBOOTED) in receive(driver, "CAREV,120000,INIT,2.0.27087")
     driver = ready()
     driver.ping(2, 1.0)
     driver.port_lost(2.0)
@@ -122,7 +122,7 @@ def test_a_reboot_or_a_lost_port_ends_a_request() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ask", "field"),
+    ("command", "field"),
     [
         (lambda d: d.ping(128, 0.0), "address"),
         (lambda d: d.send_mini(2, 0x2000, 0.0), "bits"),
@@ -133,54 +133,54 @@ def test_a_reboot_or_a_lost_port_ends_a_request() -> None:
         (lambda d: d.request_packet(-1, 1, now=0.0), "address"),
     ],
 )
-def test_what_cannot_be_asked_for_is_refused(ask, field: str) -> None:  # type: ignore[no-untyped-def]
+def test_invalid_request_is_rejected(command, field: str) -> None:  # type: ignore[no-untyped-def]
     driver = ready()
     with pytest.raises(FrameError) as caught:
-        ask(driver)
+        command(driver)
     assert caught.value.field == field
     assert driver.bytes_to_send() == b""
 
 
-def test_a_poll_is_answered_with_what_the_application_gives() -> None:
+def test_poll_is_answered_with_the_frames_of_the_handler() -> None:
     driver = ready()
-    asked: list[PollReceived] = []
+    polls: list[PollReceived] = []
 
-    def uplink(polled: PollReceived) -> list[bytes]:
-        asked.append(polled)
+    def handler(polled: PollReceived) -> list[bytes]:
+        polls.append(polled)
         return [b"one"]
 
-    driver.set_poll_handler(uplink)
-    told = tell(driver, "CARXP,0", "CACYC,0,1,2,1,1,3", "CADRQ,120000,1,2,1,64,1")
-    assert asked == [PollReceived(2, 1, 3, 64, True)] == [e for e in told if isinstance(e, PollReceived)]
+    driver.set_poll_handler(handler)
+    events = receive(driver, "CARXP,0", "CACYC,0,1,2,1,1,3", "CADRQ,120000,1,2,1,64,1")
+    assert polls == [PollReceived(2, 1, 3, 64, True)] == [e for e in events if isinstance(e, PollReceived)]
     assert driver.bytes_to_send() == nmea.format("CCTXD", 1, 2, 1, "6F6E65")
-    tell(driver, "CATXD,1,2,1,3", "CADRQ,120000,1,2,1,64,2")
-    assert driver.bytes_to_send() == nmea.format("CCTXD", 1, 2, 1, ""), "there is no more"
-    told = tell(driver, "CATXD,1,2,1,0", "CATXP,3", "CATXF,3", "CAXST,6,20250606,230117.336548", "CAACK,2,1,1,1")
-    (sent,) = [e for e in told if isinstance(e, PacketSent)]
+    receive(driver, "CATXD,1,2,1,3", "CADRQ,120000,1,2,1,64,2")
+    assert driver.bytes_to_send() == nmea.format("CCTXD", 1, 2, 1, ""), "there is no second frame"
+    events = receive(driver, "CATXD,1,2,1,0", "CATXP,3", "CATXF,3", "CAXST,6,20250606,230117.336548", "CAACK,2,1,1,1")
+    (sent,) = [e for e in events if isinstance(e, PacketSent)]
     assert (sent.dest, sent.frames, sent.acknowledged) == (2, (b"one",), (1,))
 
 
-def test_a_poll_with_nothing_to_send_gets_an_empty_answer() -> None:
+def test_poll_without_frames_gets_an_empty_answer() -> None:
     driver = ready()
     driver.set_poll_handler(lambda polled: [])
-    tell(driver, "CACYC,0,1,2,1,0,3", "CADRQ,120000,1,2,0,64,1")
+    receive(driver, "CACYC,0,1,2,1,0,3", "CADRQ,120000,1,2,0,64,1")
     assert driver.bytes_to_send() == nmea.format("CCTXD", 1, 2, 0, "")
     driver.set_poll_handler(lambda polled: [b"x" * 65])
     with pytest.raises(FrameError):
-        tell(driver, "CACYC,0,1,2,1,0,3")
+        receive(driver, "CACYC,0,1,2,1,0,3")
 
 
-def test_a_polled_packet_that_does_not_go_has_its_end_too() -> None:
+def test_polled_packet_that_is_not_requested_fails() -> None:
     driver = ready()
     driver.set_poll_handler(lambda polled: [b"one"])
-    tell(driver, "CACYC,0,1,2,1,0,1")
+    receive(driver, "CACYC,0,1,2,1,0,1")
     (failed,) = [e for e in driver.poll(100.0) if isinstance(e, PacketFailed)]
     assert failed.reason is FailureReason.NO_DATA_REQUEST
 
 
-def test_text_is_a_frame_like_any_other() -> None:
-    told = tell(ready(), "CARXP,1", "CACYC,0,2,1,1,0,1", "CARXA,2,1,0,1,hello, sea", "CACST,6,0")
-    assert [e.data for e in told if isinstance(e, FrameReceived)] == [b"hello, sea"]
+def test_text_frame_is_received() -> None:
+    events = receive(ready(), "CARXP,1", "CACYC,0,2,1,1,0,1", "CARXA,2,1,0,1,hello, sea", "CACST,6,0")
+    assert [e.data for e in events if isinstance(e, FrameReceived)] == [b"hello, sea"]
 
 
 @pytest.mark.parametrize(
@@ -191,12 +191,12 @@ def test_text_is_a_frame_like_any_other() -> None:
         ("2.0.27087", "CCTMS,2025-06-06T23:01:23Z,0", "CATMS,0,2025-06-06T23:01:23Z"),
     ],
 )
-def test_the_clock_is_set_in_the_words_of_the_generation(firmware: str, command: str, answer: str) -> None:
+def test_clock_is_set_with_the_command_of_the_generation(firmware: str, command: str, answer: str) -> None:
     driver = ready(firmware)
     utc = datetime(2025, 6, 6, 23, 1, 23, tzinfo=UTC)
     assert driver.set_clock(utc, 1.0)
     assert driver.bytes_to_send() == sentence(command).encode()
-    assert tell(driver, answer) == [ClockConfirmed(utc)]
+    assert receive(driver, answer) == [ClockConfirmed(utc)]
     assert driver.set_clock(utc + timedelta(seconds=9), 2.0)
-    tell(driver, answer, now=2.0)
-    assert [type(e) for e in driver.poll(8.0)] == [SettingUnconfirmed], "the answer to another time is no answer"
+    receive(driver, answer, now=2.0)
+    assert [type(e) for e in driver.poll(8.0)] == [SettingUnconfirmed], "the echo of another time is not accepted"

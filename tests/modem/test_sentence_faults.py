@@ -1,7 +1,7 @@
-"""Each sentence of each exchange, in either direction, is lost, garbled, cut off or doubled once: the next packet goes.
+"""One fault in any sentence of any exchange: the sentence is lost, corrupted, truncated or duplicated.
 
-Both sides are whole: two drivers on two emulated modems. What is spoiled may cost the exchange it belongs to, never the
-one after it, never a wrong byte, and never more than a bounded time.
+Two drivers run on two emulated modems. A fault may fail its own exchange. It never affects the next exchange, never
+changes a byte of a frame, and its delay is bounded.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from builders.two_drivers import Spoil, TwoDrivers, cut, double, drop, garble, kinds_of
+from builders.two_drivers import Fault, TwoDrivers, corrupt, drop, duplicate, kinds_of, truncate
 
 from sonarpost.modem.micromodem import (
     RATES,
@@ -31,7 +31,7 @@ READY_S = 30.0
 RECOVERY_S = 150.0
 FRAMES = [b"first of two", b"\x00\xff" * 20]
 NEXT = [b"the next packet", b"its second frame"]
-UPLINK = [b"what was polled"]
+POLLED = [b"polled"]
 
 Exchange = Callable[[TwoDrivers], None]
 
@@ -58,114 +58,114 @@ ENDS = (PacketSent, PacketFailed, RequestDone, RequestFailed)
 
 
 def run_exchange(
-    exchange: Exchange, number: int | None, spoil: Spoil, mishap: Callable[[TwoDrivers], None] | None = None
+    exchange: Exchange, number: int | None, fault: Fault, disturbance: Callable[[TwoDrivers], None] | None = None
 ) -> TwoDrivers:
-    """Do the exchange with one sentence spoiled or a mishap at that moment, then send the next packet."""
-    rig = TwoDrivers(number, spoil, mishap)
-    rig.drivers[2].set_poll_handler(lambda polled: UPLINK)
-    assert rig.run(READY_S, lambda: all(rig.got(n, ModemReady) for n in (1, 2)))
+    """Run the exchange with a fault or a disturbance at one sentence, then send the next packet."""
+    rig = TwoDrivers(number, fault, disturbance)
+    rig.drivers[2].set_poll_handler(lambda polled: POLLED)
+    assert rig.run(READY_S, lambda: all(rig.events_of(n, ModemReady) for n in (1, 2)))
     rig.run(rig.now + 1.0)
-    rig.arm()
+    rig.start_counting()
     exchange(rig)
-    assert rig.run(rig.now + RECOVERY_S, lambda: bool(rig.got(1, *ENDS))), "the exchange has an end"
-    rig.run(rig.now + 12.0)  # answers that are still under way are part of it
-    rig.armed = False
-    if mishap is not None:
-        rig.run(rig.now + 12.0)  # it may have come with the very last of them, and is no part of the next packet
-    before = len(rig.got(1, *ENDS))
+    assert rig.run(rig.now + RECOVERY_S, lambda: bool(rig.events_of(1, *ENDS))), "the exchange ends"
+    rig.run(rig.now + 12.0)  # answers in flight belong to the exchange
+    rig.counting = False
+    if disturbance is not None:
+        rig.run(rig.now + 12.0)  # a disturbance at the last sentence must not affect the next packet
+    before = len(rig.events_of(1, *ENDS))
     rig.drivers[1].send_packet(2, 4, NEXT, now=rig.now)
-    assert rig.run(rig.now + RECOVERY_S, lambda: len(rig.got(1, *ENDS)) > before), "the next packet has an end"
+    assert rig.run(rig.now + RECOVERY_S, lambda: len(rig.events_of(1, *ENDS)) > before), "the next packet ends"
     rig.run(rig.now + 12.0)
     return rig
 
 
 def data_of(rig: TwoDrivers, host: int) -> list[bytes]:
-    return [event.data for event in rig.got(host, FrameReceived) if isinstance(event, FrameReceived)]
+    return [event.data for event in rig.events_of(host, FrameReceived) if isinstance(event, FrameReceived)]
 
 
 @pytest.mark.parametrize("name", EXCHANGES)
-def test_the_exchange_succeeds_when_nothing_is_spoiled(name: str) -> None:
+def test_exchange_succeeds_without_a_fault(name: str) -> None:
     rig = run_exchange(EXCHANGES[name], None, drop)
-    assert isinstance(rig.got(1, *ENDS)[0], PacketSent | RequestDone)
+    assert isinstance(rig.events_of(1, *ENDS)[0], PacketSent | RequestDone)
     assert data_of(rig, 2)[-2:] == NEXT
     if name.startswith("rate"):
         assert data_of(rig, 2)[0] == FRAMES[0]
-        (first, _) = rig.got(1, PacketSent)
+        (first, _) = rig.events_of(1, PacketSent)
         assert isinstance(first, PacketSent)
         assert first.acknowledged == (() if name == "rate 4" else tuple(range(1, len(first.frames) + 1)))
     if name.startswith("poll"):
-        assert data_of(rig, 1) == UPLINK
-        (answered,) = rig.got(2, PacketSent)
+        assert data_of(rig, 1) == POLLED
+        (answered,) = rig.events_of(2, PacketSent)
         assert isinstance(answered, PacketSent)
         assert answered.acknowledged == ((1,) if "4" in name else ())
     if name == "ping":
-        assert rig.got(1, PingAnswered) == [PingAnswered(2, 1, 0.1)]
+        assert rig.events_of(1, PingAnswered) == [PingAnswered(2, 1, 0.1)]
     if name == "mini-packet":
-        assert rig.got(2, MiniPacketReceived) == [MiniPacketReceived(1, 2, 0x1ABC)]
+        assert rig.events_of(2, MiniPacketReceived) == [MiniPacketReceived(1, 2, 0x1ABC)]
     if name == "flexible data":
-        (got,) = rig.got(2, FlexibleDataReceived)
+        (got,) = rig.events_of(2, FlexibleDataReceived)
         assert isinstance(got, FlexibleDataReceived)
         assert got.packet.data == b"\x00" + b"flexible" * 4
 
 
-@pytest.mark.parametrize("spoil", [drop, garble, cut, double], ids=lambda spoil: spoil.__name__)
+@pytest.mark.parametrize("fault", [drop, corrupt, truncate, duplicate], ids=lambda fault: fault.__name__)
 @pytest.mark.parametrize("name", EXCHANGES)
-def test_any_sentence_spoiled_once_and_the_next_packet_goes(name: str, spoil: Spoil) -> None:
+def test_next_packet_is_sent_after_a_fault_in_any_sentence(name: str, fault: Fault) -> None:
     baseline = run_exchange(EXCHANGES[name], None, drop)
-    count = len(baseline.passed)
-    assert count >= 8, kinds_of(baseline.passed)
-    good = {FRAMES[0], FRAMES[1], FRAMES[0][:32], *NEXT, *UPLINK}
+    count = len(baseline.transferred)
+    assert count >= 8, kinds_of(baseline.transferred)
+    good = {FRAMES[0], FRAMES[1], FRAMES[0][:32], *NEXT, *POLLED}
     for number in range(count):
-        rig = run_exchange(EXCHANGES[name], number, spoil)
-        what = f"sentence {number}, {rig.spoiled}"
-        assert rig.spoiled is not None, what
-        assert data_of(rig, 2)[-2:] == NEXT, what
-        assert isinstance(rig.got(1, *ENDS)[-1], PacketSent), what
-        assert {*data_of(rig, 1), *data_of(rig, 2)} <= good, what
-        assert all(driver.ready and not driver.receiving for driver in rig.drivers.values()), what
+        rig = run_exchange(EXCHANGES[name], number, fault)
+        where = f"sentence {number}, {rig.faulty}"
+        assert rig.faulty is not None, where
+        assert data_of(rig, 2)[-2:] == NEXT, where
+        assert isinstance(rig.events_of(1, *ENDS)[-1], PacketSent), where
+        assert {*data_of(rig, 1), *data_of(rig, 2)} <= good, where
+        assert all(driver.ready and not driver.receiving for driver in rig.drivers.values()), where
 
 
 def _restart(host: int) -> Callable[[TwoDrivers], None]:
-    return lambda rig: rig.world.receive(host, nmea.format("CCMSC", host, host, 0), rig.now)
+    return lambda rig: rig.simulator.receive(host, nmea.format("CCMSC", host, host, 0), rig.now)
 
 
 def _unplug(host: int) -> Callable[[TwoDrivers], None]:
     return lambda rig: rig.unplug(host, 3.0)
 
 
-MISHAPS = {
+DISTURBANCES = {
     "the sender's modem restarts": _restart(1),
     "the receiver's modem restarts": _restart(2),
-    "the sender's port goes away": _unplug(1),
-    "the receiver's port goes away": _unplug(2),
+    "the sender's port is lost": _unplug(1),
+    "the receiver's port is lost": _unplug(2),
 }
 
 
-@pytest.mark.parametrize("mishap", MISHAPS)
+@pytest.mark.parametrize("disturbance", DISTURBANCES)
 @pytest.mark.parametrize("name", ["rate 0", "rate 4 with acknowledgement", "ping", "poll at rate 4"])
-def test_a_restart_or_a_lost_port_at_any_moment_and_the_next_packet_goes(name: str, mishap: str) -> None:
-    count = len(run_exchange(EXCHANGES[name], None, drop).passed)
+def test_next_packet_is_sent_after_a_disturbance_at_any_sentence(name: str, disturbance: str) -> None:
+    count = len(run_exchange(EXCHANGES[name], None, drop).transferred)
     for number in range(count):
-        rig = run_exchange(EXCHANGES[name], number, lambda line: line, MISHAPS[mishap])
-        what = f"sentence {number}, {rig.spoiled}"
-        assert rig.spoiled is not None, what
-        assert data_of(rig, 2)[-2:] == NEXT, what
-        ends = rig.got(1, *ENDS)
+        rig = run_exchange(EXCHANGES[name], number, lambda line: line, DISTURBANCES[disturbance])
+        where = f"sentence {number}, {rig.faulty}"
+        assert rig.faulty is not None, where
+        assert data_of(rig, 2)[-2:] == NEXT, where
+        ends = rig.events_of(1, *ENDS)
         numbers = [getattr(end, "packet_id", None) or getattr(end, "request_id", None) for end in ends]
-        assert len(numbers) == len(set(numbers)), what
-        assert isinstance(ends[-1], PacketSent), what
-        assert all(driver.ready and not driver.receiving for driver in rig.drivers.values()), what
+        assert len(numbers) == len(set(numbers)), where
+        assert isinstance(ends[-1], PacketSent), where
+        assert all(driver.ready and not driver.receiving for driver in rig.drivers.values()), where
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_damage_to_any_frame_costs_that_frame(seed: int) -> None:
-    rig = TwoDrivers(water=ChannelParameters(seed=seed, frame_loss=0.5))
-    assert rig.run(READY_S, lambda: all(rig.got(n, ModemReady) for n in (1, 2)))
+def test_damaged_frame_loses_only_that_frame(seed: int) -> None:
+    rig = TwoDrivers(parameters=ChannelParameters(seed=seed, frame_loss=0.5))
+    assert rig.run(READY_S, lambda: all(rig.events_of(n, ModemReady) for n in (1, 2)))
     frames = [bytes([n]) * 40 for n in range(1, 9)]
     for _ in range(3):
         rig.drivers[1].send_packet(2, 5, frames, now=rig.now)
     rig.run(rig.now + 60.0)
-    packets = [event for event in rig.got(2, PacketReceived) if isinstance(event, PacketReceived)]
+    packets = [event for event in rig.events_of(2, PacketReceived) if isinstance(event, PacketReceived)]
     assert len(packets) == 3
     for packet in packets:
         assert len(packet.frames) + packet.bad_frames == 8
@@ -174,16 +174,16 @@ def test_damage_to_any_frame_costs_that_frame(seed: int) -> None:
     assert any(packet.bad_frames for packet in packets)
 
 
-@pytest.mark.parametrize("spoil", [drop, garble, cut, double], ids=lambda spoil: spoil.__name__)
-def test_any_sentence_of_the_start_spoiled_once_and_the_modem_is_ready(spoil: Spoil) -> None:
+@pytest.mark.parametrize("fault", [drop, corrupt, truncate, duplicate], ids=lambda fault: fault.__name__)
+def test_modem_is_ready_after_a_fault_in_any_start_up_sentence(fault: Fault) -> None:
     baseline = TwoDrivers()
-    baseline.arm()
-    baseline.run(READY_S, lambda: all(baseline.got(n, ModemReady) for n in (1, 2)))
-    for number in range(len(baseline.passed)):
-        rig = TwoDrivers(number, spoil)
-        rig.arm()
-        assert rig.run(READY_S, lambda r=rig: all(r.got(n, ModemReady) for n in (1, 2))), rig.spoiled
+    baseline.start_counting()
+    baseline.run(READY_S, lambda: all(baseline.events_of(n, ModemReady) for n in (1, 2)))
+    for number in range(len(baseline.transferred)):
+        rig = TwoDrivers(number, fault)
+        rig.start_counting()
+        assert rig.run(READY_S, lambda r=rig: all(r.events_of(n, ModemReady) for n in (1, 2))), rig.faulty
         rig.drivers[1].send_packet(2, 4, NEXT, now=rig.now)
-        assert rig.run(rig.now + RECOVERY_S, lambda r=rig: bool(r.got(1, PacketSent))), rig.spoiled
+        assert rig.run(rig.now + RECOVERY_S, lambda r=rig: bool(r.events_of(1, PacketSent))), rig.faulty
         rig.run(rig.now + 5.0)
-        assert data_of(rig, 2) == NEXT, rig.spoiled
+        assert data_of(rig, 2) == NEXT, rig.faulty

@@ -2,7 +2,7 @@ import itertools
 from datetime import UTC, datetime
 
 import pytest
-from builders.fake_modem import FakeModem, nth_of
+from builders.fake_modem import FakeModem, drop_nth
 
 from sonarpost.errors import ConfigError
 from sonarpost.modem.micromodem import (
@@ -30,7 +30,7 @@ def started(config: MicroModemConfig = CONFIG, **options) -> FakeModem:
     return modem
 
 
-def test_first_bytes_on_the_wire() -> None:
+def test_first_bytes_of_the_configuration() -> None:
     driver = MicroModem(MicroModemConfig(address=1))
     assert driver.next_wakeup() is None
     driver.start(10.0)
@@ -41,7 +41,7 @@ def test_first_bytes_on_the_wire() -> None:
     assert not driver.ready
 
 
-def test_sets_address_and_statistics_and_asks_for_them() -> None:
+def test_configuration_sets_and_verifies_address_and_statistics() -> None:
     modem = started()
     modem.run(5.0)
     assert modem.events == [ModemReady(address=3, firmware=None)]
@@ -50,22 +50,22 @@ def test_sets_address_and_statistics_and_asks_for_them() -> None:
     assert modem.driver.ready
 
 
-def test_more_settings_are_sent_and_one_without_answer_is_done_without() -> None:
+def test_unconfirmed_optional_setting_does_not_block_the_start() -> None:
     config = MicroModemConfig(address=3, settings=(("RXP", 1), ("gain.x", 7)))
-    modem = started(config, loses=lambda sentence, _: sentence.fields[:1] == ("gain.x",))
+    modem = started(config, drops=lambda sentence, _: sentence.fields[:1] == ("gain.x",))
     modem.run(30.0)
     assert modem.events == [SettingUnconfirmed("CCCFG,gain.x,7"), ModemReady(3, None)]
 
 
 @pytest.mark.parametrize("kind", ["CCCFG", "CACFG", "CCCFQ"])
 @pytest.mark.parametrize("nth", [1, 2, 3, 4, 5])
-def test_any_lost_sentence_only_delays(kind: str, nth: int) -> None:
-    modem = started(loses=nth_of(kind, nth))
+def test_lost_sentence_delays_the_configuration(kind: str, nth: int) -> None:
+    modem = started(drops=drop_nth(kind, nth))
     modem.run(CONFIG.reply_timeout_s + 2.0)
     assert modem.events == [ModemReady(3, None)]
 
 
-def test_echo_of_leading_zeros_and_more_fields_counts() -> None:
+def test_echo_with_leading_zeros_and_additional_fields_is_accepted() -> None:
     driver = MicroModem(CONFIG)
     driver.start(0.0)
     driver.bytes_to_send()
@@ -73,7 +73,7 @@ def test_echo_of_leading_zeros_and_more_fields_counts() -> None:
     assert driver.bytes_to_send() == b"$CCCFG,CST,1*37\r\n"
 
 
-def test_wrong_echo_is_no_answer() -> None:
+def test_wrong_echo_is_not_accepted() -> None:
     driver = MicroModem(CONFIG)
     driver.start(0.0)
     driver.bytes_to_send()
@@ -82,45 +82,45 @@ def test_wrong_echo_is_no_answer() -> None:
         assert driver.bytes_to_send() == b""
 
 
-def test_configuration_dump_and_revisions_in_between() -> None:
-    """A dump of 200 settings, one of them our own with its old value, begins before the echo comes."""
-    modem = started(loses=nth_of("CACFG", 1))
+def test_configuration_during_a_dump_with_revisions() -> None:
+    """A dump of 200 settings, with the old value of the address among them, starts before the echo."""
+    modem = started(drops=drop_nth("CACFG", 1))
     for number in range(200):
-        modem.later(0.02 + number * 0.05, lambda n=number: modem.say("CACFG", f"X{n}", n))
-    modem.later(0.5, lambda: modem.say("CACFG", "SRC", 0))
-    modem.later(1.0, lambda: modem.say("CAREV", "181807", "AUV", "2.0.27087"))
-    modem.loses = lambda sentence, _: sentence.fields == ("SRC", "3") and modem.now < 9.0
+        modem.schedule(0.02 + number * 0.05, lambda n=number: modem.send("CACFG", f"X{n}", n))
+    modem.schedule(0.5, lambda: modem.send("CACFG", "SRC", 0))
+    modem.schedule(1.0, lambda: modem.send("CAREV", "181807", "AUV", "2.0.27087"))
+    modem.drops = lambda sentence, _: sentence.fields == ("SRC", "3") and modem.now < 9.0
     modem.run(25.0)
     assert modem.events == [ModemReady(3, "2.0.27087")]
-    assert len([c for c in modem.commands("CCCFG") if c[0] == "SRC"]) <= 2, "asking more often would only prolong it"
+    assert len([c for c in modem.commands("CCCFG") if c[0] == "SRC"]) <= 2, "more queries would prolong the dump"
 
 
-def test_dump_without_end_does_not_wait_for_ever() -> None:
-    modem = started(loses=lambda sentence, _: sentence.kind == "CCCFG")
+def test_wait_during_an_endless_dump_is_bounded() -> None:
+    modem = started(drops=lambda sentence, _: sentence.kind == "CCCFG")
 
     def dump() -> None:
-        modem.say("CACFG", "X", 1)
-        modem.later(0.5, dump)
+        modem.send("CACFG", "X", 1)
+        modem.schedule(0.5, dump)
 
-    modem.later(0.5, dump)
+    modem.schedule(0.5, dump)
     modem.run(CONFIG.dump_limit_s + 1.0)
-    assert len(modem.heard) == 0
-    assert modem._seen["CCCFG"] == 2
+    assert len(modem.received) == 0
+    assert modem.sentence_counts["CCCFG"] == 2
 
 
-def test_silent_modem_is_reported_once_and_asked_for_ever() -> None:
+def test_silent_modem_is_reported_once_and_retried() -> None:
     modem = started()
-    modem.dead = True
+    modem.unresponsive = True
     modem.run(3600.0)
     assert modem.events == [ModemUnresponsive("CCCFG,SRC,3", attempts=3, silent_s=None)]
-    tries = modem._seen["CCCFG"]
-    assert 3600 / CONFIG.retry_cap_s - 2 < tries < 3600 / CONFIG.retry_cap_s + 10, "waits grow, up to the cap"
-    modem.dead = False
+    tries = modem.sentence_counts["CCCFG"]
+    assert 3600 / CONFIG.retry_cap_s - 2 < tries < 3600 / CONFIG.retry_cap_s + 10, "waits grow up to the limit"
+    modem.unresponsive = False
     modem.run(3600.0 + 2 * CONFIG.retry_cap_s)
     assert modem.events[1:] == [ModemReady(3, None)]
 
 
-def test_waits_double_up_to_the_cap() -> None:
+def test_retry_waits_double_up_to_the_limit() -> None:
     driver = MicroModem(MicroModemConfig(address=3, reply_timeout_s=1.0, retry_cap_s=10.0))
     driver.start(0.0)
     sent_s, now = [], 0.0
@@ -134,10 +134,10 @@ def test_waits_double_up_to_the_cap() -> None:
     assert gaps == [1.0, 2.0, 4.0, 8.0, 10.0, 10.0, 10.0]
 
 
-def test_modem_that_dies_while_idle_is_noticed_and_set_up_again() -> None:
+def test_idle_modem_that_fails_is_detected_and_reconfigured() -> None:
     modem = started()
     modem.run(10.0)
-    modem.dead = True
+    modem.unresponsive = True
     modem.settings["SRC"] = "0"
     modem.run(150.0)
     unresponsive = modem.events[1]
@@ -145,26 +145,26 @@ def test_modem_that_dies_while_idle_is_noticed_and_set_up_again() -> None:
     assert unresponsive.waiting_for == "CCCFQ,SRC"
     assert unresponsive.silent_s > CONFIG.keepalive_s
     assert not modem.driver.ready
-    modem.dead = False
+    modem.unresponsive = False
     modem.run(300.0)
     assert modem.events[2:] == [ModemReady(3, None)]
     assert modem.settings["SRC"] == "3"
 
 
-def test_idle_modem_is_asked_only_when_it_says_nothing() -> None:
+def test_idle_modem_is_queried_only_when_silent() -> None:
     modem = started()
     modem.run(5.0)
     for second in range(600):
-        modem.later(float(second), lambda: modem.say("CAREV", "000000", "AUV", "0.93.0.09"))
-    before = len(modem.heard)
+        modem.schedule(float(second), lambda: modem.send("CAREV", "000000", "AUV", "0.93.0.09"))
+    before = len(modem.received)
     modem.run(600.0)
-    assert len(modem.heard) == before
+    assert len(modem.received) == before
     modem.run(700.0)
     assert modem.commands("CCCFQ")[2:] == [("SRC",)] * 3
     assert modem.events == [ModemReady(3, None)]
 
 
-def test_another_address_than_ours_is_put_right() -> None:
+def test_changed_address_is_corrected() -> None:
     modem = started()
     modem.run(5.0)
     modem.settings["SRC"] = "9"
@@ -173,63 +173,63 @@ def test_another_address_than_ours_is_put_right() -> None:
     assert modem.events == [ModemReady(3, None)] * 2
 
 
-def test_restart_of_an_idle_modem() -> None:
+def test_restarted_modem_is_reconfigured() -> None:
     modem = started()
     modem.run(5.0)
     modem.settings = {}
-    modem.say("CAREV", "000001", "INIT", "0.93.0.09")
+    modem.send("CAREV", "000001", "INIT", "0.93.0.09")
     assert not modem.driver.ready
-    sent = len(modem.heard)
+    sent = len(modem.received)
     modem.run(5.0 + 0.9 * CONFIG.init_pause_s)
-    assert len(modem.heard) == sent, "a modem that starts is left alone for a moment"
+    assert len(modem.received) == sent, "nothing is sent during the pause after a restart"
     modem.run(20.0)
     assert modem.events[1:] == [ModemRebooted("0.93.0.09"), ModemReady(3, "0.93.0.09")]
     assert modem.settings == {"SRC": "3", "CST": "1", "RXP": "1"}
 
 
-def test_packets_wait_for_the_modem_and_fail_when_it_takes_too_long() -> None:
+def test_packet_fails_when_the_modem_is_not_ready_in_time() -> None:
     modem = started()
-    modem.dead = True
+    modem.unresponsive = True
     packet_id = modem.driver.send_packet(1, 4, [b"x"], now=0.0)
     modem.run(CONFIG.max_defer_s + 1.0)
-    (failed,) = modem.of(PacketFailed)
+    (failed,) = modem.events_of(PacketFailed)
     assert (failed.packet_id, failed.reason) == (packet_id, FailureReason.DEFERRED_TOO_LONG)
     assert not failed.maybe_sent
     modem.driver.send_packet(1, 4, [b"y"], now=modem.now)
-    modem.dead = False
+    modem.unresponsive = False
     modem.run(modem.now + 100.0)
-    assert [event.frames for event in modem.of(PacketSent)] == [(b"y",)]
+    assert [event.frames for event in modem.events_of(PacketSent)] == [(b"y",)]
 
 
-def test_clock_is_set_once_and_confirmed() -> None:
+def test_clock_command_is_sent_once() -> None:
     modem = started()
     utc = datetime(2016, 10, 12, 9, 0, 5, tzinfo=UTC)
-    assert not modem.driver.set_clock(utc, modem.now), "not before the modem is ready"
+    assert not modem.driver.set_clock(utc, modem.now), "the modem is not ready yet"
     modem.run(5.0)
     assert modem.driver.set_clock(utc, modem.now)
     modem.run(6.0)
     assert modem.commands("CCCLK") == [("2016", "10", "12", "9", "0", "5")]
     assert modem.events[1:] == [ClockConfirmed(utc)]
-    modem.loses = lambda sentence, _: sentence.kind == "CACLK"
+    modem.drops = lambda sentence, _: sentence.kind == "CACLK"
     assert modem.driver.set_clock(utc, modem.now)
     modem.run(40.0)
-    assert len(modem.commands("CCCLK")) == 2, "an old time is not sent again"
+    assert len(modem.commands("CCCLK")) == 2, "a past time is not sent again"
     assert modem.events[2:] == [SettingUnconfirmed("CCCLK,2016,10,12,9,0,5")]
     assert modem.driver.phase is Phase.READY
 
 
-def test_what_the_driver_does_not_know_is_passed_on() -> None:
+def test_unhandled_and_invalid_sentences_are_reported() -> None:
     modem = started()
     modem.run(5.0)
-    modem.say("CATOA", "120000.1234", 1)
-    modem.say("CACFG", "BW", 2)
-    modem.raw(b"$CATXF,28*00\r\nnoise\r\n")
-    modem.say("CAREV", "000000")
-    assert [event.sentence.kind for event in modem.of(UnhandledSentence)] == ["CATOA", "CACFG"]
-    assert [event.error.field for event in modem.of(SentenceRejected)] == ["checksum", "", "fields"]
+    modem.send("CATOA", "120000.1234", 1)
+    modem.send("CACFG", "BW", 2)
+    modem.send_bytes(b"$CATXF,28*00\r\nnoise\r\n")
+    modem.send("CAREV", "000000")
+    assert [event.sentence.kind for event in modem.events_of(UnhandledSentence)] == ["CATOA", "CACFG"]
+    assert [event.error.field for event in modem.events_of(SentenceRejected)] == ["checksum", "", "fields"]
 
 
-def test_nothing_happens_while_the_port_is_closed() -> None:
+def test_closed_port_has_no_activity() -> None:
     driver = MicroModem(CONFIG)
     assert driver.receive(b"$CAREV,000001,INIT,1\r\n", 0.0) == []
     assert driver.poll(100.0) == []
@@ -240,7 +240,7 @@ def test_nothing_happens_while_the_port_is_closed() -> None:
     assert driver.phase is Phase.CLOSED
 
 
-def test_half_a_line_of_before_does_not_meet_the_new_port() -> None:
+def test_unfinished_line_is_dropped_when_the_port_reopens() -> None:
     driver = MicroModem(CONFIG)
     driver.start(0.0)
     driver.receive(b"$CACFG,SRC", 0.1)
@@ -266,13 +266,13 @@ def test_half_a_line_of_before_does_not_meet_the_new_port() -> None:
         ("airtimes_s", {1: 0.0}),
     ],
 )
-def test_wrong_configuration_names_the_field(field: str, wrong: object) -> None:
+def test_configuration_error_names_the_field(field: str, wrong: object) -> None:
     with pytest.raises(ConfigError) as caught:
         MicroModemConfig(**{"address": 1, field: wrong})
     assert caught.value.field.startswith(field)
 
 
-def test_scaled_configuration_changes_times_only() -> None:
+def test_air_times_of_the_configuration() -> None:
     config = MicroModemConfig(address=1, airtimes_s={1: 3.1})
     assert (config.airtime_s(1), config.airtime_s(5), config.airtime_s(None), config.airtime_s(77)) == (
         3.1,
@@ -282,13 +282,13 @@ def test_scaled_configuration_changes_times_only() -> None:
     )
 
 
-def test_every_outage_is_reported() -> None:
+def test_every_outage_is_reported_once() -> None:
     modem = started()
     for outage in range(3):
         modem.run(modem.now + 10.0)
-        modem.dead = True
+        modem.unresponsive = True
         modem.run(modem.now + 200.0)
-        assert len(modem.of(ModemUnresponsive)) == outage + 1
-        modem.dead = False
+        assert len(modem.events_of(ModemUnresponsive)) == outage + 1
+        modem.unresponsive = False
         modem.run(modem.now + 100.0)
         assert modem.driver.ready

@@ -1,4 +1,4 @@
-"""The emulated modems on real pseudo-terminals and TCP ports: what hosts read is what the log says."""
+"""The channel emulator on pseudo-terminals and TCP ports: library, command and service."""
 
 from __future__ import annotations
 
@@ -38,23 +38,23 @@ SCALE = 100.0
 
 
 class Host:
-    """A client of one modem that fills cycles and collects what it is told."""
+    """A client of one modem that fills cycles and collects the received sentences."""
 
     def __init__(self, device: str) -> None:
         self._port = serial.serial_for_url(device, timeout=0)
         self._lines = nmea.LineAssembler(device)
-        self.told: list[nmea.Sentence] = []
+        self.sentences: list[nmea.Sentence] = []
         self._query_until_answered()
 
     def _query_until_answered(self) -> None:
         def answered() -> bool:
-            self.say("CCCFQ", "SRC")
+            self.send_sentence("CCCFQ", "SRC")
             self.wait(0.02)
-            return any(sentence.kind == "CACFG" for sentence in self.told)
+            return any(sentence.kind == "CACFG" for sentence in self.sentences)
 
         eventually(answered, what="answer to CCCFQ")
 
-    def say(self, kind: str, *fields: str | int) -> None:
+    def send_sentence(self, kind: str, *fields: str | int) -> None:
         self._port.write(nmea.format(kind, *fields))
 
     def write(self, data: bytes) -> None:
@@ -63,34 +63,34 @@ class Host:
     def read(self) -> None:
         for item in self._lines.feed(self._port.read(65536)):
             assert isinstance(item, nmea.Sentence), item
-            self.told.append(item)
+            self.sentences.append(item)
 
     def wait(self, wait_s: float) -> None:
         select.select([self._port], [], [], wait_s)
         self.read()
 
     def count(self, kind: str) -> int:
-        return sum(sentence.kind == kind for sentence in self.told)
+        return sum(sentence.kind == kind for sentence in self.sentences)
 
     def expect(self, kind: str, number: int = 1) -> None:
-        def come() -> bool:
+        def arrived() -> bool:
             self.wait(0.02)
             return self.count(kind) >= number
 
-        eventually(come, what=f"{number} x {kind}")
+        eventually(arrived, what=f"{number} x {kind}")
 
     def send(self, destination: int, rate: int, frames: list[bytes], source: int = 1) -> None:
-        """Run a whole cycle, to the end of the transmission."""
-        sent, asked = self.count("CAXST"), self.count("CADRQ")
-        self.say("CCCYC", 0, source, destination, rate, 0, len(frames))
+        """Run a cycle to the end of its transmission."""
+        sent, requests = self.count("CAXST"), self.count("CADRQ")
+        self.send_sentence("CCCYC", 0, source, destination, rate, 0, len(frames))
         for number, frame in enumerate(frames, start=1):
-            self.expect("CADRQ", asked + number)
-            self.say("CCTXD", source, destination, 0, frame.hex())
+            self.expect("CADRQ", requests + number)
+            self.send_sentence("CCTXD", source, destination, 0, frame.hex())
         self.expect("CAXST", sent + 1)
 
     def received(self) -> list[tuple[int, bytes]]:
         """Frame number and bytes of every `CARXD`."""
-        return [(int(s.fields[3]), bytes.fromhex(s.fields[4])) for s in self.told if s.kind == "CARXD"]
+        return [(int(s.fields[3]), bytes.fromhex(s.fields[4])) for s in self.sentences if s.kind == "CARXD"]
 
     def close(self) -> None:
         self._port.close()
@@ -101,22 +101,22 @@ Make = Callable[..., ChannelEmulator]
 
 @pytest.fixture
 def make(tmp_path: Path) -> Iterator[Make]:
-    """Starts channels, with ptys and a log in a temporary folder unless told otherwise, and stops them."""
+    """Start emulators, by default with pseudo-terminals and a log in a temporary folder, and stop them."""
     running: list[ChannelEmulator] = []
 
     def start(**config: object) -> ChannelEmulator:
-        defaults: dict[str, object] = {"sites": SITES, "time_scale": SCALE, "log_path": tmp_path / "water.jsonl"}
+        defaults: dict[str, object] = {"sites": SITES, "time_scale": SCALE, "log_path": tmp_path / "channel.jsonl"}
         if "tcp_ports" not in config:
             defaults["pty_dir"] = tmp_path / "ports"
-        channel = ChannelEmulator(EmulatorConfig(**(defaults | config)))  # type: ignore[arg-type]
-        running.append(channel)
-        channel.start()
-        return channel
+        emulator = ChannelEmulator(EmulatorConfig(**(defaults | config)))  # type: ignore[arg-type]
+        running.append(emulator)
+        emulator.start()
+        return emulator
 
     yield start
-    for channel in running:
-        channel.stop()
-        assert channel.failure is None
+    for emulator in running:
+        emulator.stop()
+        assert emulator.failure is None
 
 
 def log_of(path: Path, event: str | None = None) -> list[dict[str, object]]:
@@ -124,30 +124,30 @@ def log_of(path: Path, event: str | None = None) -> list[dict[str, object]]:
     return [line for line in lines if event is None or line["event"] == event]
 
 
-def hosts_of(channel: ChannelEmulator) -> list[Host]:
-    return [Host(device.device) for device in channel.devices()]
+def hosts_of(emulator: ChannelEmulator) -> list[Host]:
+    return [Host(device.device) for device in emulator.devices()]
 
 
 @pytest.mark.parametrize("tcp", [False, True])
-def test_the_log_is_what_the_receiver_read(make: Make, tmp_path: Path, tcp: bool):
-    water = ChannelParameters(seed=3, frame_loss=0.3, tail_damage=0.4)
-    channel = make(channel=water, **({"tcp_ports": (0, 0)} if tcp else {}))
-    sender, receiver = hosts_of(channel)
+def test_log_matches_the_received_sentences(make: Make, tmp_path: Path, tcp: bool):
+    parameters = ChannelParameters(seed=3, frame_loss=0.3, tail_damage=0.4)
+    emulator = make(channel=parameters, **({"tcp_ports": (0, 0)} if tcp else {}))
+    sender, receiver = hosts_of(emulator)
     for n in range(12):
         sender.send(2, 5, [bytes([n, k]) * 20 for k in range(3)] + [b""])
         receiver.expect("CACST", n + 1)
     sender.close()
     receiver.close()
-    channel.stop()
+    emulator.stop()
 
-    packets = log_of(tmp_path / "water.jsonl", "packet")
+    packets = log_of(tmp_path / "channel.jsonl", "packet")
     assert [p["packet"] for p in packets] == list(range(1, 13))
     assert all(
         p["heard"] and (p["source"], p["destination"], p["receiver"], p["rate"]) == (1, 2, 2, 5) for p in packets
     )
     frames = [frame for p in packets for frame in p["frames"]]
-    told = [(f["number"], bytes.fromhex(f["hex"])) for f in frames if f["fate"] in {"delivered", "damaged"}]
-    assert told == receiver.received()
+    received = [(f["number"], bytes.fromhex(f["hex"])) for f in frames if f["fate"] in {"delivered", "damaged"}]
+    assert received == receiver.received()
     assert {f["fate"] for f in frames} == {"delivered", "lost", "damaged", "empty"}
     for frame in frames:
         data = bytes.fromhex(frame["hex"])
@@ -156,59 +156,59 @@ def test_the_log_is_what_the_receiver_read(make: Make, tmp_path: Path, tcp: bool
     lost = sum(f["fate"] == "lost" for f in frames)
     assert receiver.count("CAMSG") == lost
 
-    start, *_, stop, totals = log_of(tmp_path / "water.jsonl")
+    start, *_, stop, totals = log_of(tmp_path / "channel.jsonl")
     assert (start["event"], stop["event"], totals["event"]) == ("start", "stop", "totals")
     assert start["water"]["seed"] == 3
     assert (totals["transmitted"], totals["heard"], totals["not_heard"], totals["in_flight"]) == (12, 12, {}, 0)
     assert totals["frames"] == {fate: sum(f["fate"] == fate for f in frames) for fate in totals["frames"]}
 
 
-def test_two_runs_of_one_seed_have_one_outcome(make: Make, tmp_path: Path):
+def test_runs_with_one_seed_have_equal_outcomes(make: Make, tmp_path: Path):
     seen = []
     for run in ("a", "b"):
-        channel = make(
+        emulator = make(
             channel=ChannelParameters(seed=8, frame_loss=0.5, tail_damage=0.5),
             pty_dir=tmp_path / run,
             log_path=tmp_path / f"{run}.jsonl",
         )
-        sender, receiver = hosts_of(channel)
+        sender, receiver = hosts_of(emulator)
         for _ in range(5):
             sender.send(2, 1, [b"abcdefgh", b"ijklmnop", b"qrstuvwx"])
         receiver.expect("CACST", 5)
-        channel.stop()
+        emulator.stop()
         seen.append([p["frames"] for p in log_of(tmp_path / f"{run}.jsonl", "packet")])
     assert seen[0] == seen[1]
 
 
-def test_what_no_client_reads_is_delivered_and_not_heard(make: Make, tmp_path: Path):
-    channel = make()
-    sender = Host(channel.devices()[0].device)
+def test_packet_without_a_client_is_logged_as_not_heard(make: Make, tmp_path: Path):
+    emulator = make()
+    sender = Host(emulator.devices()[0].device)
     sender.send(2, 1, [b"abc"])
-    eventually(lambda: channel.totals().unreported == {"no client connected": 1}, what="packet in the totals")
-    channel.stop()
-    (packet,) = log_of(tmp_path / "water.jsonl", "packet")
+    eventually(lambda: emulator.totals().unreported == {"no client connected": 1}, what="packet in the totals")
+    emulator.stop()
+    (packet,) = log_of(tmp_path / "channel.jsonl", "packet")
     assert (packet["heard"], packet["not_heard_because"]) == (False, "no client connected")
     assert packet["frames"][0]["fate"] == "delivered"
 
 
 @pytest.mark.parametrize("tcp", [False, True])
-def test_a_client_can_leave_and_return_and_finds_nothing_stale(make: Make, tcp: bool):
-    channel = make(**({"tcp_ports": (0, 0)} if tcp else {}))
-    sender, receiver = hosts_of(channel)
+def test_reconnected_client_receives_no_stale_output(make: Make, tcp: bool):
+    emulator = make(**({"tcp_ports": (0, 0)} if tcp else {}))
+    sender, receiver = hosts_of(emulator)
     for n in range(3):
-        # The receiver leaves with the packet unread in its port.
+        # The receiver disconnects without reading the packet.
         sender.send(2, 1, [b"unread"])
-        eventually(lambda n=n: channel.totals().reported == n + 1, what="packet written to the port")
+        eventually(lambda n=n: emulator.totals().reported == n + 1, what="packet written to the port")
         receiver.close()
-        eventually(lambda: channel.connected() == 1, what="client seen to have left")
-        receiver = Host(channel.devices()[1].device)
+        eventually(lambda: emulator.connected() == 1, what="client seen to have left")
+        receiver = Host(emulator.devices()[1].device)
         assert receiver.count("CARXD") == 0
     sender.send(2, 1, [b"fresh"])
     receiver.expect("CACST")
     assert receiver.received() == [(1, b"fresh")]
 
 
-def test_a_restarted_emulator_has_the_same_paths(make: Make, tmp_path: Path):
+def test_restarted_emulator_has_the_same_paths(make: Make, tmp_path: Path):
     first = make()
     devices = [device.device for device in first.devices()]
     assert devices == [str(tmp_path / "ports" / f"modem-{n}") for n in (1, 2)]
@@ -218,61 +218,63 @@ def test_a_restarted_emulator_has_the_same_paths(make: Make, tmp_path: Path):
     second = make()
     assert [device.device for device in second.devices()] == devices
     Host(devices[0]).close()
-    # One that takes the paths over while the other still runs keeps them when the other ends.
+    # An emulator that has replaced the paths of another keeps them when the other stops.
     third = make()
     second.stop()
     Host(third.devices()[0].device).close()
 
 
-def test_a_short_lived_client_is_understood(make: Make):
-    channel = make()
-    device = Path(channel.devices()[0].device)
+def test_command_of_a_short_lived_client_is_processed(make: Make):
+    emulator = make()
+    device = Path(emulator.devices()[0].device)
     with device.open("wb", buffering=0) as port:
         port.write(nmea.format("CCCFG", "SRC", 42))
     host = Host(str(device))
-    assert {sentence.fields for sentence in host.told if sentence.kind == "CACFG"} == {("SRC", "42")}
+    assert {sentence.fields for sentence in host.sentences if sentence.kind == "CACFG"} == {("SRC", "42")}
 
 
-def test_a_new_tcp_client_takes_the_place_of_a_dead_one(make: Make):
-    channel = make(tcp_ports=(0, 0))
-    first = Host(channel.devices()[0].device)
-    second = Host(channel.devices()[0].device)
-    second.say("CCCFQ", "CST")
+def test_new_tcp_client_replaces_the_previous_one(make: Make):
+    emulator = make(tcp_ports=(0, 0))
+    first = Host(emulator.devices()[0].device)
+    second = Host(emulator.devices()[0].device)
+    second.send_sentence("CCCFQ", "CST")
     second.expect("CACFG", 2)
     with pytest.raises(serial.SerialException):
         eventually(lambda: first.wait(0.05) is not None, timeout_s=5.0)
 
 
-def test_garbage_is_answered_with_errors_and_does_no_harm(make: Make):
-    channel = make(tcp_ports=(0, 0))
-    host = Host(channel.devices()[0].device)
+def test_noise_is_answered_with_errors(make: Make):
+    emulator = make(tcp_ports=(0, 0))
+    host = Host(emulator.devices()[0].device)
     host.write(random.Random(5).randbytes(20_000) + b"\r\n$CCCYC,0,1,2,1,0,1*00\r\n")
     host.expect("CAERR")
-    host.say("CCCFQ", "XST")
-    eventually(lambda: host.wait(0.02) or ("XST", "1") in [s.fields for s in host.told], what="answer after garbage")
+    host.send_sentence("CCCFQ", "XST")
+    eventually(
+        lambda: host.wait(0.02) or ("XST", "1") in [s.fields for s in host.sentences], what="answer after garbage"
+    )
 
 
-def test_a_host_that_never_answers_is_given_up_after_two_real_seconds(make: Make):
-    channel = make(time_scale=1000.0)
-    host = Host(channel.devices()[0].device)
-    began_s = time.monotonic()
-    host.say("CCCYC", 0, 1, 2, 1, 0, 1)
+def test_data_timeout_is_two_seconds_of_real_time(make: Make):
+    emulator = make(time_scale=1000.0)
+    host = Host(emulator.devices()[0].device)
+    started_s = time.monotonic()
+    host.send_sentence("CCCYC", 0, 1, 2, 1, 0, 1)
     host.expect("CAERR")
-    assert 1.9 < time.monotonic() - began_s < 6.0
-    timeout = next(sentence for sentence in host.told if sentence.kind == "CAERR")
+    assert 1.9 < time.monotonic() - started_s < 6.0
+    timeout = next(sentence for sentence in host.sentences if sentence.kind == "CAERR")
     assert timeout.fields[1:] == ("DATA_TIMEOUT", "1")
-    assert channel.totals().transmitted == 0
+    assert emulator.totals().transmitted == 0
 
 
-def test_a_client_that_does_not_read_loses_whole_sentences_only(make: Make):
-    channel = make(tcp_ports=(0, 0))
-    device = channel.devices()[0].device
+def test_client_that_does_not_read_loses_whole_sentences(make: Make):
+    emulator = make(tcp_ports=(0, 0))
+    device = emulator.devices()[0].device
     with socket.create_connection(("127.0.0.1", int(device.rsplit(":", 1)[1]))) as idle:
         query = nmea.format("CCCFQ", "ALL") * 50
         idle.settimeout(10.0)
         for _ in range(200):  # some 10 MB of answers
             idle.sendall(query)
-        eventually(lambda: channel.connected() == 1, what="client seen")
+        eventually(lambda: emulator.connected() == 1, what="client seen")
         assembler = nmea.LineAssembler()
         seen = 0
         try:
@@ -286,33 +288,33 @@ def test_a_client_that_does_not_read_loses_whole_sentences_only(make: Make):
         except TimeoutError:
             pass
         assert seen > 1000
-    other = Host(channel.devices()[1].device)
+    other = Host(emulator.devices()[1].device)
     other.close()
 
 
-def test_air_time_runs_at_the_time_scale(make: Make):
-    channel = make(time_scale=10.0, modem=EmulatedModemConfig(address=0, airtimes_s={1: 5.0}))
-    host = Host(channel.devices()[0].device)
-    host.say("CCCYC", 0, 1, 2, 1, 0, 1)
+def test_air_time_is_scaled(make: Make):
+    emulator = make(time_scale=10.0, modem=EmulatedModemConfig(address=0, airtimes_s={1: 5.0}))
+    host = Host(emulator.devices()[0].device)
+    host.send_sentence("CCCYC", 0, 1, 2, 1, 0, 1)
     host.expect("CADRQ")
-    began_s = time.monotonic()
-    host.say("CCTXD", 1, 2, 0, "AA")
+    started_s = time.monotonic()
+    host.send_sentence("CCTXD", 1, 2, 0, "AA")
     host.expect("CATXF")
-    assert 0.5 <= time.monotonic() - began_s < 2.0
+    assert 0.5 <= time.monotonic() - started_s < 2.0
 
 
-def test_a_moved_modem_is_elsewhere(make: Make, tmp_path: Path):
-    channel = make()
-    sender, receiver = hosts_of(channel)
-    channel.move(2, LocalPosition(300.0))
+def test_moved_modem(make: Make, tmp_path: Path):
+    emulator = make()
+    sender, receiver = hosts_of(emulator)
+    emulator.move(2, LocalPosition(300.0))
     sender.send(2, 1, [b"abc"])
     receiver.expect("CACST")
-    channel.stop()
-    assert log_of(tmp_path / "water.jsonl", "packet")[0]["range_m"] == 300.0
-    assert log_of(tmp_path / "water.jsonl", "move")[0]["modem"] == 2
+    emulator.stop()
+    assert log_of(tmp_path / "channel.jsonl", "packet")[0]["range_m"] == 300.0
+    assert log_of(tmp_path / "channel.jsonl", "move")[0]["modem"] == 2
 
 
-def test_ports_that_cannot_be_had_are_named(make: Make, tmp_path: Path):
+def test_port_error_names_the_port(make: Make, tmp_path: Path):
     (tmp_path / "ports").mkdir()
     (tmp_path / "ports" / "modem-2").write_text("not a link")
     with pytest.raises(PortError, match="modem-2"):
@@ -326,14 +328,14 @@ def test_ports_that_cannot_be_had_are_named(make: Make, tmp_path: Path):
         make(log_path=tmp_path, tcp_ports=(0, 0))
 
 
-def test_a_log_that_cannot_be_written_ends_the_channel(tmp_path: Path):
+def test_log_that_cannot_be_written_ends_the_emulator(tmp_path: Path):
     config = EmulatorConfig(sites=SITES, pty_dir=tmp_path / "ports", log_path=Path("/dev/full"))
-    channel = ChannelEmulator(config)
-    channel.start()
-    eventually(lambda: channel.failure is not None, what="failure")
-    assert isinstance(channel.failure, PortError)
+    emulator = ChannelEmulator(config)
+    emulator.start()
+    eventually(lambda: emulator.failure is not None, what="failure")
+    assert isinstance(emulator.failure, PortError)
     assert list((tmp_path / "ports").iterdir()) == []
-    channel.stop()
+    emulator.stop()
 
 
 @pytest.mark.parametrize(
@@ -348,7 +350,7 @@ def test_a_log_that_cannot_be_written_ends_the_channel(tmp_path: Path):
         {"serial_baud": -1.0},
     ],
 )
-def test_configurations_that_make_no_sense_are_refused(config: dict[str, object], tmp_path: Path):
+def test_invalid_configuration_is_rejected(config: dict[str, object], tmp_path: Path):
     complete = {"sites": SITES} | ({} if "tcp_ports" in config else {"pty_dir": tmp_path}) | config
     with pytest.raises(ValueError, match=next(iter(config))):
         EmulatorConfig(**complete)  # type: ignore[arg-type]
@@ -371,7 +373,7 @@ def run_command(*arguments: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
-def test_the_command_lists_its_devices_first_and_ends_cleanly(tmp_path: Path, ending: signal.Signals):
+def test_command_lists_its_devices_first_and_ends_cleanly(tmp_path: Path, ending: signal.Signals):
     log, ports = tmp_path / "log.jsonl", tmp_path / "ports"
     with run_command(
         "--modems", "3", "--pty", str(ports), "--log", str(log), "--time-scale", "100", "--json"
@@ -383,7 +385,7 @@ def test_the_command_lists_its_devices_first_and_ends_cleanly(tmp_path: Path, en
         host.send(2, 1, [b"abc"])
         host.close()
         process.send_signal(ending)
-        # Not communicate(): it would miss what readline has already taken into its buffer.
+        # communicate() would miss the output that readline has buffered.
         rest = process.stdout.read()
         assert process.stderr is not None
         assert (process.wait(timeout=10), process.stderr.read()) == (0, "")
@@ -392,7 +394,7 @@ def test_the_command_lists_its_devices_first_and_ends_cleanly(tmp_path: Path, en
     assert list(ports.iterdir()) == []
 
 
-def test_the_command_offers_tcp_ports():
+def test_command_with_tcp_ports():
     ports = [free_port(), free_port()]
     with run_command("--tcp", *map(str, ports)) as process:
         assert process.stdout is not None
@@ -404,15 +406,17 @@ def test_the_command_offers_tcp_ports():
 
 
 @pytest.mark.parametrize("arguments", [(), ("--json",)])
-def test_the_command_goes_on_when_nobody_reads_its_output(arguments: tuple[str, ...]):
+def test_command_continues_when_its_output_is_closed(arguments: tuple[str, ...]):
     with run_command("--tcp", "--mm", "1", "--time-scale", "100", *arguments) as process:
         assert process.stdout is not None
         listed = json.loads(process.stdout.readline())
         process.stdout.close()
         host = Host(listed["modems"][0]["device"])
         host.send(2, 1, [b"abc"])
-        eventually(lambda: (host.wait(0.05), any(s.kind == "CATXF" for s in host.told))[1], what="end of the packet")
-        eventually(lambda: (host.wait(0.05), "0.93.0.09" in str(host.told))[1], what="a Micro-Modem 1")
+        eventually(
+            lambda: (host.wait(0.05), any(s.kind == "CATXF" for s in host.sentences))[1], what="end of the packet"
+        )
+        eventually(lambda: (host.wait(0.05), "0.93.0.09" in str(host.sentences))[1], what="a Micro-Modem 1")
         host.close()
         assert process.poll() is None
         process.terminate()
@@ -436,7 +440,7 @@ def test_the_command_goes_on_when_nobody_reads_its_output(arguments: tuple[str, 
         (("--spacing", "nan"), "position"),
     ],
 )
-def test_the_command_refuses_values_out_of_bounds(arguments: tuple[str, ...], named: str):
+def test_command_rejects_invalid_options(arguments: tuple[str, ...], named: str):
     import argparse
 
     parser = argparse.ArgumentParser()
@@ -449,11 +453,11 @@ def test_the_command_refuses_values_out_of_bounds(arguments: tuple[str, ...], na
 # The service
 
 
-def test_the_service_offers_modems_and_reports_what_the_water_did(
+def test_service_provides_modems_and_publishes_gauges(
     platform: Callable[[str], PlatformConfig], client: zenoh.Session, tmp_path: Path
 ):
     config = AcousticChannelConfig(
-        pty_dir=tmp_path / "ports", log=tmp_path / "water.jsonl", time_scale=SCALE, airtime_s={"1": 2.0}
+        pty_dir=tmp_path / "ports", log=tmp_path / "channel.jsonl", time_scale=SCALE, airtime_s={"1": 2.0}
     )
     service = AcousticChannelService(platform("sea"), config)
     reports: list[Health] = []
@@ -476,11 +480,11 @@ def test_the_service_offers_modems_and_reports_what_the_water_did(
     finally:
         service.stop()
         subscriber.undeclare()
-    assert log_of(tmp_path / "water.jsonl")[-1]["frames"]["delivered"] == 1
-    assert log_of(tmp_path / "water.jsonl", "packet")[0]["airtime_s"] == 2.0
+    assert log_of(tmp_path / "channel.jsonl")[-1]["frames"]["delivered"] == 1
+    assert log_of(tmp_path / "channel.jsonl", "packet")[0]["airtime_s"] == 2.0
 
 
-def test_the_service_table_refuses_what_does_not_go_together():
+def test_invalid_service_table_is_rejected():
     for wrong in (
         {"modem": [{"address": 1}, {"address": 1}]},
         {"tcp_ports": [1, 2, 3]},

@@ -1,4 +1,4 @@
-"""WHOI's own client, unmodified, on both sides of the emulator: every rate, both directions, byte for byte."""
+"""WHOI's unmodified client on both modems of the emulator: every rate in both directions, byte for byte."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
 
 with warnings.catch_warnings():
-    # Strings of that package have escapes that Python no longer likes; it shows when the package is compiled.
+    # Strings of the package have escapes that Python reports as deprecated when it compiles them.
     warnings.filterwarnings("ignore", category=DeprecationWarning, module=r"acomms(\.|$)")
     warnings.filterwarnings("ignore", message="invalid escape sequence", category=DeprecationWarning)
     acomms = pytest.importorskip("acomms", reason="acomms, WHOI's client, is not installed")
@@ -31,7 +31,7 @@ SCALE = 20.0
 
 
 class Client:
-    """One of WHOI's clients with what it hears."""
+    """One client of WHOI and what it receives."""
 
     def __init__(self, name: str, device: str, folder: Path) -> None:
         log = UnifiedLog(log_path=str(folder), file_name=f"{name}.log", rootname=f"acomms-{name}")
@@ -59,7 +59,7 @@ class Client:
         return str(self.modem.state) == "Idle"
 
     def close(self) -> None:
-        """End it; its reading thread has no end and would open the port anew, so it is put to sleep for good."""
+        """Close the client. Its reading thread never ends and would reopen the port, so it is blocked for good."""
         connection, asleep, never = self.modem.connection, threading.Event(), threading.Event()
 
         def sleep() -> None:
@@ -86,7 +86,7 @@ def clients(tmp_path: Path) -> Iterator[tuple[Client, Client]]:
     logging.getLogger("acomms-m1").handlers.clear()
 
 
-def test_it_learns_its_address_at_start(clients: tuple[Client, Client]):
+def test_client_reads_its_address_at_start(clients: tuple[Client, Client]):
     assert [client.modem.id for client in clients] == [1, 2]
     assert [client.modem.config_data["SRC"] for client in clients] == ["1", "2"]
     eventually(lambda: clients[0].modem.fw_version == "2.0.27087", what="CAREV")
@@ -96,7 +96,7 @@ def test_it_learns_its_address_at_start(clients: tuple[Client, Client]):
 
 
 @pytest.mark.parametrize("rate", sorted(RATES))
-def test_a_full_packet_goes_both_ways_byte_for_byte(clients: tuple[Client, Client], rate: int):
+def test_full_packet_in_both_directions(clients: tuple[Client, Client], rate: int):
     shape = RATES[rate]
     for sender, receiver in (clients, clients[::-1]):
         data = bytes((7 * n + rate + sender.modem.id) % 256 for n in range(shape.packet_bytes))
@@ -108,16 +108,16 @@ def test_a_full_packet_goes_both_ways_byte_for_byte(clients: tuple[Client, Clien
         ]
         expected = [(receiver.modem.id, sender.modem.id, n) for n in range(1, shape.frames + 1)]
         eventually(lambda s=sender, e=expected: s.acks == e, what="acknowledgement of every frame")
-        eventually(lambda r=receiver: len(r.packets) == 1, what="a whole packet")
+        eventually(lambda r=receiver: len(r.packets) == 1, what="a complete packet")
         assert b"".join(bytes(frame.data) for frame in receiver.packets[0].frames) == data
-        # An acknowledging client waits for the end of its answer, or is wedged.
+        # A client that acknowledges blocks until its reply is transmitted.
         eventually(lambda r=receiver, s=sender: r.idle() and s.idle(), what="both clients idle")
         csts = [receiver.statistics.get(timeout=5.0) for _ in range(2 if rate == 0 else 1)]
         assert (csts[-1]["mode"], csts[-1]["rate_num"], csts[-1]["num_frames"]) == (0, rate, shape.frames)
         assert (csts[-1]["src"], csts[-1]["dest"]) == (sender.modem.id, receiver.modem.id)
         xsts = [sender.sent.get(timeout=5.0) for _ in range(2 if rate == 0 else 1)]
         assert (xsts[-1]["nbytes"], xsts[-1]["num_frames_sent"]) == (shape.packet_bytes, shape.frames)
-        sender.statistics.get(timeout=5.0)  # the acknowledgement's, not to be taken for the next packet's
+        sender.statistics.get(timeout=5.0)  # those of the acknowledgement
         for client in clients:
             client.acks.clear()
             client.packets.clear()
@@ -137,19 +137,19 @@ def test_ping_and_mini_packet(clients: tuple[Client, Client]):
 
 
 @pytest.mark.parametrize("rate", [0, 1])
-def test_polling_for_data(clients: tuple[Client, Client], rate: int):
+def test_poll(clients: tuple[Client, Client], rate: int):
     one, two = clients
-    asked: list[Any] = []
+    requests: list[Any] = []
 
     def uplink(request: Any) -> bytearray:
-        asked.append(request)
-        return bytearray(b"what you asked for")
+        requests.append(request)
+        return bytearray(b"requested data")
 
     two.modem.set_uplink_data_function(uplink)
     one.modem.send_uplink_request(2, rate_num=rate)
     frame = one.frames.get(timeout=15.0)
-    assert (frame.src, frame.dest, bytes(frame.data)) == (2, 1, b"what you asked for")
-    assert [(r.src, r.dest, r.num_bytes, r.frame_num) for r in asked] == [(2, 1, RATES[rate].frame_bytes, 1)]
+    assert (frame.src, frame.dest, bytes(frame.data)) == (2, 1, b"requested data")
+    assert [(r.src, r.dest, r.num_bytes, r.frame_num) for r in requests] == [(2, 1, RATES[rate].frame_bytes, 1)]
     eventually(lambda: one.idle() and two.idle(), what="both clients idle")
 
 

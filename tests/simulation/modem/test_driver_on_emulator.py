@@ -1,9 +1,9 @@
-"""The project's own driver on the emulated Micro-Modem: packets, reboots, lost frames and collisions."""
+"""The driver on the emulated modem: packets, reboots, lost frames and collisions."""
 
 from __future__ import annotations
 
 import pytest
-from builders.emulator_bench import Bench
+from builders.emulator_bench import EmulatorBench
 
 from sonarpost.modem.micromodem import (
     RATES,
@@ -20,22 +20,22 @@ from sonarpost.modem.micromodem import (
 )
 
 
-def drive(bench: Bench, drivers: dict[int, MicroModem], until_s: float) -> dict[int, list[ModemEvent]]:
-    """Run the project's own drivers on the emulated modems, without any real time."""
+def drive(bench: EmulatorBench, drivers: dict[int, MicroModem], until_s: float) -> dict[int, list[ModemEvent]]:
+    """Run the drivers on simulated time."""
     events: dict[int, list[ModemEvent]] = {n: [] for n in drivers}
     while bench.now < until_s:
         for n, driver in drivers.items():
-            told, bench.told[n] = bench.told[n], b""
-            events[n] += driver.receive(told, bench.now) + driver.poll(bench.now)
-            bench.world.receive(n, driver.bytes_to_send(), bench.now)
+            sentences, bench.output[n] = bench.output[n], b""
+            events[n] += driver.receive(sentences, bench.now) + driver.poll(bench.now)
+            bench.simulator.receive(n, driver.bytes_to_send(), bench.now)
         bench.advance(round(bench.now + 0.05, 6))
     return events
 
 
 @pytest.mark.parametrize("rate", sorted(RATES))
 @pytest.mark.parametrize("ack", [False, True])
-def test_the_driver_gets_along_with_the_emulator(rate: int, ack: bool):
-    bench = Bench()
+def test_packets_between_two_drivers(rate: int, ack: bool):
+    bench = EmulatorBench()
     drivers = {n: MicroModem(MicroModemConfig(n)) for n in (1, 2)}
     for driver in drivers.values():
         driver.start(bench.now)
@@ -57,22 +57,22 @@ def test_the_driver_gets_along_with_the_emulator(rate: int, ack: bool):
     assert not [event for n in events for event in events[n] if isinstance(event, unwanted)]
 
 
-def test_the_driver_recovers_from_a_reboot_of_the_emulator():
-    bench = Bench()
+def test_driver_recovers_from_a_modem_reboot():
+    bench = EmulatorBench()
     driver = MicroModem(MicroModemConfig(1))
     driver.start(bench.now)
     drive(bench, {1: driver}, 10.0)
-    bench.say(1, ("CCMSC", 1, 1, 0))
+    bench.send(1, ("CCMSC", 1, 1, 0))
     events = drive(bench, {1: driver}, 30.0)[1]
     assert sum(isinstance(event, ModemRebooted) for event in events) == 1
     assert driver.ready
     driver.send_packet(2, 1, [b"after"], now=bench.now)
     drive(bench, {1: driver}, 45.0)
-    assert "CARXD,1,2,0,1,6166746572" in bench.lines(2)
+    assert "CARXD,1,2,0,1,6166746572" in bench.sentences(2)
 
 
-def test_the_driver_sees_lost_frames_and_collisions():
-    bench = Bench(modems=3, frame_loss=0.4, seed=2)
+def test_driver_reports_lost_frames_and_collisions():
+    bench = EmulatorBench(modems=3, frame_loss=0.4, seed=2)
     drivers = {n: MicroModem(MicroModemConfig(n)) for n in (1, 2, 3)}
     for driver in drivers.values():
         driver.start(bench.now)
@@ -81,8 +81,8 @@ def test_the_driver_sees_lost_frames_and_collisions():
     drivers[1].send_packet(2, 5, frames, now=bench.now)
     events = drive(bench, drivers, 20.0)
     (packet,) = (event for event in events[2] if isinstance(event, PacketReceived))
-    told = next(r for r in bench.reports if r.arrival.receiver == 2)
-    good = [frame.received for frame in told.arrival.frames if frame.outcome.value == "delivered"]
+    sentences = next(r for r in bench.reports if r.arrival.receiver == 2)
+    good = [frame.received for frame in sentences.arrival.frames if frame.outcome.value == "delivered"]
     assert [frame.data for frame in packet.frames] == good
     assert packet.bad_frames == 8 - len(good) > 0
     assert not packet.complete

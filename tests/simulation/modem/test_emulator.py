@@ -1,9 +1,9 @@
-"""The emulated Micro-Modem's serial line: errors are answered, no bytes break it, and it takes its time."""
+"""Serial line of the emulated modem: errors, arbitrary input, timing."""
 
 from __future__ import annotations
 
 import pytest
-from builders.emulator_bench import START_UTC_S, Bench
+from builders.emulator_bench import START_UTC_S, EmulatorBench
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -36,7 +36,7 @@ from sonarpost.simulation.modem.settings import EmulatedModemConfig
         (b"$CCTXD,1,2,0,ABC\r\n", "NMEA,3,CCTXD bad data"),
     ],
 )
-def test_what_does_not_parse_is_answered_with_an_error(line: bytes, answer: str):
+def test_invalid_sentence_is_answered_with_an_error(line: bytes, answer: str):
     modem = EmulatedMicroModem(EmulatedModemConfig(1, utc_at_zero_s=START_UTC_S))
     modem.bytes_to_send()
     modem.receive(line, 2.0)
@@ -57,49 +57,49 @@ SENTENCES = st.tuples(
 
 
 @given(st.lists(st.tuples(st.sampled_from([1, 2]), st.one_of(st.binary(max_size=80), SENTENCES), st.floats(0, 5))))
-def test_no_bytes_break_it(steps: list[tuple[int, bytes, float]]):
-    bench = Bench(frame_loss=0.2, tail_damage=0.2)
+def test_modem_answers_after_any_input(steps: list[tuple[int, bytes, float]]):
+    bench = EmulatorBench(frame_loss=0.2, tail_damage=0.2)
     for modem, data, pause_s in steps:
-        bench.world.receive(modem, data, bench.now)
+        bench.simulator.receive(modem, data, bench.now)
         bench.advance(bench.now + pause_s)
     bench.advance(bench.now + 400.0)
     for modem in (1, 2):
         assembler = nmea.LineAssembler()
-        items = assembler.feed(bench.told[modem])
+        items = assembler.feed(bench.output[modem])
         assert all(isinstance(item, nmea.Sentence) for item in items)
         assert assembler.pending_bytes == 0
-    # Whatever was sent, the modem still lives: a reboot has ended and a query has an answer.
-    bench.clear()
-    bench.world.receive(1, b"\r\n" + nmea.format("CCCFQ", "SRC"), bench.now)
+    # The modem answers a query: a reboot, if any, has ended.
+    bench.clear_output()
+    bench.simulator.receive(1, b"\r\n" + nmea.format("CCCFQ", "SRC"), bench.now)
     bench.advance(bench.now)
-    assert bench.lines(1)[-1].startswith("CACFG,SRC,")
+    assert bench.sentences(1)[-1].startswith("CACFG,SRC,")
 
 
 @given(st.integers(1, 7), st.integers(0, 2**32))
-def test_lateness_of_the_driver_changes_nothing(steps: int, seed: int):
+def test_result_is_independent_of_the_step_size(steps: int, seed: int):
     def run(advances: int) -> tuple[dict[int, bytes], list[Transmission]]:
-        bench = Bench(frame_loss=0.3, seed=seed)
-        bench.say(1, ("CCCYC", 0, 1, 2, 5, 1, 3), *(("CCTXD", 1, 2, 1, f"{n:02X}" * 20) for n in range(3)))
+        bench = EmulatorBench(frame_loss=0.3, seed=seed)
+        bench.send(1, ("CCCYC", 0, 1, 2, 5, 1, 3), *(("CCTXD", 1, 2, 1, f"{n:02X}" * 20) for n in range(3)))
         for n in range(1, advances + 1):
             bench.advance(1.0 + 24.0 * n / advances)
-        return bench.told, bench.transmissions
+        return bench.output, bench.transmissions
 
     assert run(steps) == run(1)
 
 
-def test_the_serial_line_takes_its_time():
-    bench = Bench(serial_baud=19200)
+def test_serial_line_delays_by_its_baud_rate():
+    bench = EmulatorBench(serial_baud=19200)
     query = nmea.format("CCCFQ", "SRC")
-    bench.world.receive(1, query, 1.0)
+    bench.simulator.receive(1, query, 1.0)
     answer = b"$CACFG,SRC,1*33\r\n"
     arrives_s = 1.0 + (len(query) + len(answer)) * 10 / 19200
     bench.advance(arrives_s - 0.0001)
-    assert bench.told[1] == b""
+    assert bench.output[1] == b""
     bench.advance(arrives_s + 0.0001)
-    assert bench.told[1] == answer
+    assert bench.output[1] == answer
 
 
-def test_what_is_on_a_serial_line_comes_out_in_order_or_is_dropped():
+def test_serial_line_keeps_order_and_discards():
     line: SerialLine[str] = SerialLine(100)
     line.put("a", 10, 0.0)
     line.put("b", 10, 0.0)

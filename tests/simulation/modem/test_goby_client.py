@@ -1,4 +1,4 @@
-"""Goby3's start-up and its driver test, step by step, against the emulator: see `goby_host`."""
+"""Start-up and driver test of Goby3, step by step, on the emulator; see `goby_host`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SETTINGS = ("AGC,0", "AGN,0")
 
 
 class Pair:
-    """Two drivers on two modems, as Goby's test program has them."""
+    """Two hosts on two modems, as in the test program of Goby."""
 
     def __init__(self, mm: int, start_utc: datetime = datetime(2024, 2, 29, 23, 59, 51, 430_000, tzinfo=UTC)) -> None:
         start_utc_s = start_utc.timestamp()
@@ -27,21 +27,21 @@ class Pair:
             for n in (1, 2)
         }
         transponders = {"A": LocalPosition(300.0), "B": LocalPosition(450.0)}
-        self.world = ChannelSimulator(ChannelParameters(), places, transponders=transponders)
+        self.simulator = ChannelSimulator(ChannelParameters(), places, transponders=transponders)
         settings = SETTINGS + (("psk.packet.mod_hdr_version,0",) if mm == 2 else ())
         self.hosts = {n: GobyHost(n, mm, start_utc_s, settings) for n in (1, 2)}
         self.now = 0.0
 
     def run(self, limit_s: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Let the drivers work for a time, or until something holds."""
+        """Run for a time, or until a condition holds."""
         end_s = self.now + limit_s
         while self.now < end_s:
             self.now = round(self.now + 0.1, 6)
-            self.world.advance(self.now)
+            self.simulator.advance(self.now)
             for n, host in self.hosts.items():
-                host.work(self.now, b"".join(output.data for output in self.world.take_outputs(n)))
+                host.work(self.now, b"".join(output.data for output in self.simulator.take_outputs(n)))
                 data, host.to_modem = host.to_modem, b""
-                self.world.receive(n, data, self.now)
+                self.simulator.receive(n, data, self.now)
             if until():
                 return True
         return False
@@ -64,7 +64,7 @@ def tester(request: pytest.FixtureRequest) -> Pair:
     return tester
 
 
-def test_start_up_sets_everything_and_the_clock_stays_right(tester: Pair):
+def test_start_up_configures_modem_and_clock(tester: Pair):
     tester.run(60.0)
     for n, host in tester.hosts.items():
         assert {"SRC": str(n), "CST": "1", "REV": "1", "RXP": "1", "AGC": "0"}.items() <= host.nvram.items()
@@ -77,14 +77,14 @@ def test_start_up_sets_everything_and_the_clock_stays_right(tester: Pair):
 
 
 @pytest.mark.parametrize("second", [58, 59])
-def test_a_clock_that_is_set_at_the_end_of_a_minute(second: int):
+def test_clock_set_at_the_end_of_a_minute(second: int):
     for tenths in range(0, 10, 3):
         tester = Pair(1, datetime(2024, 12, 31, 23, 59, second - 6, tenths * 100_000, tzinfo=UTC))
         assert tester.run(30.0, lambda t=tester: all(host.started for host in t.hosts.values()))
         assert all(host.given_up == [] for host in tester.hosts.values())
 
 
-def test_the_configuration_dump_ends_by_silence(tester: Pair):
+def test_configuration_dump_ends_by_silence(tester: Pair):
     tester.run(15.0)
     host = tester.hosts[1]
     host.nvram.clear()

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sonarpost.simulation.seabed.targets import (
+    CLUTTER_KINDS,
+    MINE_LIKE_KINDS,
+    ObjectKind,
+    SeabedObject,
+    place_object,
+    random_object,
+    surface_height_m,
+)
+from sonarpost.simulation.seabed.terrain import Seabed
+
+
+def plan(extent_m: float = 6.0, step_m: float = 0.02) -> tuple[np.ndarray, np.ndarray]:
+    axis = np.arange(-extent_m, extent_m + step_m / 2, step_m, dtype=np.float32)
+    u, v = np.meshgrid(axis, axis, indexing="ij")
+    return u, v
+
+
+@pytest.mark.parametrize("kind", list(ObjectKind))
+def test_object_surfaces_have_the_specified_size(kind):
+    rng = np.random.default_rng(8)
+    u, v = plan()
+    for _ in range(4):
+        item = random_object(kind, 0.0, 0.0, rng)
+        top = surface_height_m(item, u, v)
+        assert (top >= 0).all()
+        tall = 0.75 * item.height_m, 1.25 * item.height_m
+        assert tall[0] <= top.max() <= tall[1]
+        solid = top > 0.3 * top.max()
+        long_m = u[solid].max() - u[solid].min()
+        wide_m = v[solid].max() - v[solid].min()
+        assert 0.5 * item.length_m < long_m <= 1.3 * item.length_m + 0.05
+        assert wide_m <= 1.3 * max(item.width_m, 0.4 * item.length_m) + 0.5
+
+
+def test_mine_shapes_match_their_geometry():
+    u, v = plan()
+    cylinder = SeabedObject(ObjectKind.CYLINDER, 0, 0, length_m=2.0, width_m=0.5, height_m=0.5)
+    top = surface_height_m(cylinder, u, v)
+    middle = u.shape[0] // 2
+    assert top[middle, middle] == pytest.approx(0.5)
+    assert top[middle, middle + 5] == pytest.approx(0.25 + math.sqrt(0.25**2 - 0.1**2), abs=1e-3)
+    assert (top > 0).any(axis=1).sum() * 0.02 == pytest.approx(2.0, abs=0.05)
+    cone = SeabedObject(ObjectKind.TRUNCATED_CONE, 0, 0, length_m=1.0, width_m=1.0, height_m=0.44)
+    top = surface_height_m(cone, u, v)
+    assert (top > 0).sum() * 0.02**2 == pytest.approx(math.pi / 4, rel=0.02)
+    assert (top >= 0.4399).sum() * 0.02**2 == pytest.approx(math.pi * 0.275**2, rel=0.03)
+    sphere = SeabedObject(ObjectKind.SPHERE, 0, 0, length_m=1.0, width_m=1.0, height_m=0.5)
+    assert surface_height_m(sphere, u, v).sum() * 0.02**2 == pytest.approx(2 / 3 * math.pi * 0.5**3, rel=0.02)
+
+
+def test_only_mine_shapes_are_mine_like():
+    assert set(MINE_LIKE_KINDS) | set(CLUTTER_KINDS) == set(ObjectKind)
+    rng = np.random.default_rng(0)
+    assert [random_object(k, 0, 0, rng).is_mine_like for k in MINE_LIKE_KINDS] == [True] * 4
+    assert [random_object(k, 0, 0, rng).is_mine_like for k in CLUTTER_KINDS] == [False] * 3
+
+
+def flat(cell_m: float = 0.05) -> Seabed:
+    shape = (401, 801)
+    return Seabed(np.zeros(shape, np.float32), np.full(shape, 0.3, np.float32), cell_m, 0.0, -20.0)
+
+
+def test_object_is_placed_at_its_position_and_orientation():
+    bed = flat()
+    item = SeabedObject(ObjectKind.CYLINDER, 10.0, 5.0, 2.0, 0.5, 0.5, orientation_deg=90)
+    assert place_object(bed, item) == 0.0
+    rows, columns = np.nonzero(bed.height_m)
+    assert (rows.mean() * 0.05, columns.mean() * 0.05 - 20) == pytest.approx((10.0, 5.0), abs=0.03)
+    # Rotated by 90 degrees, it lies across the track.
+    assert np.ptp(columns) * 0.05 == pytest.approx(2.0, abs=0.1)
+    assert np.ptp(rows) * 0.05 == pytest.approx(0.5, abs=0.1)
+    assert (bed.backscatter[rows, columns] > 0.3).all()
+    assert (bed.backscatter == np.float32(0.3)).sum() == bed.backscatter.size - rows.size
+
+
+def test_objects_at_and_beyond_the_edge():
+    bed = flat()
+    place_object(bed, SeabedObject(ObjectKind.SPHERE, 0.0, 20.0, 1.0, 1.0, 1.0))
+    assert bed.height_m[0, -1] == pytest.approx(1.0)
+    before = bed.height_m.copy()
+    assert math.isnan(place_object(bed, SeabedObject(ObjectKind.SPHERE, 900.0, 0.0, 1.0, 1.0, 1.0)))
+    assert math.isnan(place_object(bed, SeabedObject(ObjectKind.SPHERE, -900.0, 0.0, 1.0, 1.0, 1.0)))
+    np.testing.assert_array_equal(bed.height_m, before)
