@@ -430,6 +430,7 @@ def test_command_continues_when_its_output_is_closed(arguments: tuple[str, ...])
         (("--modems", "0"), "--modems"),
         (("--set", "snr_spread_db=-1"), "snr_spread_db"),
         (("--set", "colour=blue"), "colour"),
+        (("--water", "sea.toml"), "--water.*--channel"),
         (("--transponder", "A=far"), "--transponder"),
         (("--transponder", "E=1"), "transponders"),
         (("--loss", "1.5"), "frame_loss"),
