@@ -13,19 +13,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-import msgpack
 import numpy as np
 
 from research.common.command import command_parser, run_command
 from sonarpost.errors import ConfigError
-from sonarpost.link.config import ReceiverConfig
-from sonarpost.link.events import ContactUpdate, Event, MessageReceived
+from sonarpost.link.config import QueueConfig, ReceiverConfig
+from sonarpost.link.downlink.messages import image_of_number, number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.feedback import Feedback
+from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.mac import Tdma
-from sonarpost.link.queue.state import export_queue, restore_queue
-from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, TransmitQueue
-from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.queue.transmit_queue import TransmitQueue
+from sonarpost.link.receiver import Event, ImageUpdate, MessageReceived
+from sonarpost.link.sender import ImageToSend
 from sonarpost.modem.micromodem import RATES
 
 _SLOT_S: Final = 7.5
@@ -172,7 +172,7 @@ class _Vehicle:
         self._spec = spec
         self._rng = rng
         self.config = QueueConfig(
-            rates=(_RATE,), first_rate=_RATE, expected_loss=spec.loss, group_delay_s=60.0, kept_pictures=_KEPT
+            rates=(_RATE,), first_rate=_RATE, expected_loss=spec.loss, group_delay_s=60.0, kept_images=_KEPT
         )
         self.queue = TransmitQueue(self.config)
         self.number = 0
@@ -182,9 +182,9 @@ class _Vehicle:
 
     def restart(self) -> None:
         """Save the queue and take it up as another process does."""
-        parts = {name: msgpack.packb(part) for name, part in export_queue(self.queue).items()}
+        parts = self.queue.parts()
         self.queue = TransmitQueue(self.config)
-        restore_queue(self.queue, {n: msgpack.unpackb(p, strict_map_key=False) for n, p in parts.items()})
+        assert not self.queue.restore(parts)
 
     def work(self, now: float, mission: _Mission) -> None:
         for place, traffic in enumerate(self._spec.traffic):
@@ -199,8 +199,8 @@ class _Vehicle:
             self.number += 1
             contact = ContactSummary(height_px=80, width_px=80, time_utc_s=round(self.contact_due))
             stream = self._rng.bytes(self._spec.stream_bytes)
-            name_of_it = ImageName("0001", f"{self.address}-{self.number}")
-            self.queue.add_picture(self.number, name_of_it, contact, stream, now)
+            image_id, contact_id = image_of_number(self.number), f"{self.address}-{self.number}"
+            self.queue.add_image(ImageToSend(image_id, contact_id, contact, stream), now)
             mission.offer_picture((self.address, self.number), self.contact_due, stream)
             self.contact_due += float(self._rng.exponential(self._spec.contact_every_s))
 
@@ -235,8 +235,8 @@ class _Mission:
         if isinstance(event, MessageReceived) and event.data in self._offered:
             source, at = self._offered.pop(event.data)
             self.messages[source].delays_s.append(now - at)
-        elif isinstance(event, ContactUpdate):
-            name = (event.source, event.number)
+        elif isinstance(event, ImageUpdate):
+            name = (event.source, number_of_image(event.image_id))
             if name not in self._pictures:
                 return
             at, stream = self._pictures[name]
@@ -259,7 +259,7 @@ def run_mission(spec: MissionSpec) -> MissionResult:
     vehicles = [_Vehicle(n + 1, spec, rng) for n in range(spec.vehicles)]
     frame_s = (spec.vehicles + 1) * _SLOT_S
     slots = [Tdma(frame_s, n * _SLOT_S, _SLOT_S, _GUARD_S) for n in range(spec.vehicles)]
-    receiver = LinkReceiver(ReceiverConfig(max_sources=16))
+    receiver = V1Receiver(ReceiverConfig(max_sources=16))
     now, hour, restarts = 0.0, 0, 0
     state_bytes: list[int] = []
     while now < spec.hours * _HOUR_S:
@@ -273,11 +273,12 @@ def run_mission(spec: MissionSpec) -> MissionResult:
             vehicle.work(now, mission)
             packet = vehicle.queue.next_packet(now)
             now += RATES[_RATE].airtime_s
-            for frame in packet:
+            frames = packet.frames if packet else ()
+            for frame in frames:
                 if not mission.water.loses(vehicle.address):
                     for event in receiver.accept(vehicle.address, frame, now):
                         mission.arrived(event, now)
-            vehicle.queue.sent(frame_s)
+            vehicle.queue.sent(frames, frame_s)
         _report(vehicles, receiver, mission.water, now, deaf=now < spec.deaf_hours * _HOUR_S)
         now = (now // frame_s + 1) * frame_s
     return MissionResult(
@@ -293,23 +294,23 @@ def run_mission(spec: MissionSpec) -> MissionResult:
     )
 
 
-def _report(vehicles: Sequence[_Vehicle], receiver: LinkReceiver, water: _Water, now: float, *, deaf: bool) -> None:
+def _report(vehicles: Sequence[_Vehicle], receiver: V1Receiver, water: _Water, now: float, *, deaf: bool) -> None:
     """Let the vessel report to the vehicles that need it most, as many as its slot holds."""
     sent = 0
-    for vehicle in sorted(vehicles, key=lambda v: v.queue.last_report_at or -1.0):
+    for vehicle in sorted(vehicles, key=lambda v: v.queue.last_feedback_s or -1.0):
         if sent == _REPORTS_A_SLOT:
             return
-        if not receiver.report_is_due(vehicle.address, now):
+        if not receiver.feedback_is_due(vehicle.address, now):
             continue
-        report = receiver.report(vehicle.address, now)
+        report = receiver.feedback(vehicle.address, now)
         sent += 1
         if isinstance(report, Feedback) and not water.loses(-vehicle.address) and not deaf:
-            vehicle.queue.on_report(report, now, 100)
+            vehicle.queue.on_feedback(report, now, 100)
 
 
-def _state_bytes(vehicles: Sequence[_Vehicle], receiver: LinkReceiver) -> int:
-    queues = sum(len(msgpack.packb(part)) for v in vehicles for part in export_queue(v.queue).values())
-    return queues + len(msgpack.packb(receiver.snapshot()))
+def _state_bytes(vehicles: Sequence[_Vehicle], receiver: V1Receiver) -> int:
+    queues = sum(len(part) for v in vehicles for part in v.queue.parts().values())
+    return queues + sum(len(part) for part in receiver.parts().values())
 
 
 def new_parser() -> argparse.ArgumentParser:

@@ -16,13 +16,16 @@ import numpy as np
 
 from research.common.command import command_parser, run_command
 from sonarpost.errors import ConfigError
+from sonarpost.link.config import QueueConfig
 from sonarpost.link.downlink.commands import CommandTracker
+from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.downlink.vessel_endpoint import DownlinkPacket, VesselEndpoint
-from sonarpost.link.events import FeedbackReceived
 from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.mac import Continuous
-from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, TransmitQueue
-from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.queue.transmit_queue import TransmitQueue
+from sonarpost.link.receiver import FeedbackReceived
+from sonarpost.link.sender import ImageToSend
 from sonarpost.modem.micromodem import (
     RATES,
     FrameDecoded,
@@ -147,7 +150,7 @@ class _Vehicle:
         self._rate = spec.rate
         self.queue = TransmitQueue(QueueConfig(rates=(spec.rate,), first_rate=spec.rate, expected_loss=spec.frame_loss))
         self._medium = Continuous(spec.tx_burst_s, spec.rx_window_s, holdoff_s=2.0)
-        self._receiver = LinkReceiver()
+        self._receiver = V1Receiver()
         self._asked = False
         self._rng = np.random.default_rng(1)
         self._number = 0
@@ -157,6 +160,7 @@ class _Vehicle:
         match event:
             case PacketSent():
                 self._medium.sent(event.started_s, now)
+                self.queue.sent(event.frames, now - event.started_s)
                 self._asked = False
             case PacketFailed():
                 self._asked = False
@@ -165,7 +169,7 @@ class _Vehicle:
             case FrameReceived():
                 for found in self._receiver.accept(event.src, event.data, now):
                     if isinstance(found, FeedbackReceived):
-                        self.queue.on_report(found.report, now, event.src)
+                        self.queue.on_feedback(found.feedback, now, event.src)
                         self.reports += 1
 
     def work(self, driver: MicroModem, now: float) -> float:
@@ -173,15 +177,15 @@ class _Vehicle:
         while len(self.queue.sender.waiting) < _ALWAYS_WAITING:
             self._number = self._number % 65535 + 1
             contact = ContactSummary(80, 80, time_utc_s=self._number)
-            name, stream = ImageName("0001", str(self._number)), self._rng.bytes(_STREAM_BYTES)
-            self.queue.add_picture(self._number, name, contact, stream, now)
+            image_id, stream = image_of_number(self._number), self._rng.bytes(_STREAM_BYTES)
+            self.queue.add_image(ImageToSend(image_id, str(self._number), contact, stream), now)
         if self._asked:
             return 0.0
         wait_s = self._medium.wait_s(RATES[self._rate].airtime_s, now) or 0.0
-        if wait_s == 0.0 and driver.ready and (frames := self.queue.next_packet(now)):
-            driver.send_packet(_VESSEL, self._rate, frames, now=now)
+        if wait_s == 0.0 and driver.ready and (packet := self.queue.next_packet(now)):
+            driver.send_packet(_VESSEL, self._rate, packet.frames, now=now)
             self._asked = True
-            self.frames += len(frames)
+            self.frames += len(packet.frames)
         return wait_s
 
 
@@ -197,7 +201,7 @@ class _Vessel:
     def take(self, event: ModemEvent, now: float) -> None:
         match event:
             case FrameReceived():
-                self._link.hear(event.src, event.data, now)
+                self._link.accept(event.src, event.data, now)
                 self._heard_s = now
             case PacketSent() if self._under_way is not None:
                 self._link.sent(self._under_way, now)
@@ -208,13 +212,13 @@ class _Vessel:
 
     def work(self, driver: MicroModem, now: float) -> None:
         quiet = now - self._heard_s >= _QUIET_S and not driver.receiving and driver.ready
-        if self._under_way is None and quiet and self._link.wants_to_send(now) is not None:
+        if self._under_way is None and quiet and self._link.due_address(now) is not None:
             rate = RATES[_DOWNLINK_RATE]
-            packet = self._link.packet(rate.frames, rate.frame_bytes, now)
+            packet = self._link.next_packet(rate.frames, rate.frame_bytes, now)
             if packet is not None:
                 driver.send_packet(packet.address, rate.number, packet.frames, now=now)
                 self._under_way = packet
-                self.reports += packet.reports
+                self.reports += packet.has_feedback
 
 
 def run_busy(spec: BusySpec) -> BusyResult:

@@ -11,14 +11,14 @@ import numpy as np
 from research.link.images import GREY, Codecs, LinkPicture, Quality, judge
 from sonarpost.link.coding.channel_capacity import LossChannel, received_distribution
 from sonarpost.link.config import ReceiverConfig, SenderConfig
-from sonarpost.link.events import ContactUpdate, FeedbackReceived
+from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.contact_record import RECORD_SIZE
-from sonarpost.link.frames.paper.events import ContactOnly, ImageReady
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import plan_packets
-from sonarpost.link.receiver import LinkReceiver
-from sonarpost.link.sender import LinkSender
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.receiver import FeedbackReceived, ImageUpdate
 
 SEQUENTIAL_HEADER_BYTES: Final = 4
 """Checksum, picture and place: what a plain stream needs a frame."""
@@ -112,15 +112,16 @@ def run_paper(pictures: Sequence[LinkPicture], codecs: Codecs, setting: Setting)
             if water.passes():
                 events += receiver.accept(_SOURCE, planned[place % len(planned)], 0.0)
         events += receiver.poll(1e6)
-        last = next((e for e in reversed(events) if isinstance(e, ImageReady)), None)
-        has_contact = any(isinstance(e, ContactOnly) or (isinstance(e, ImageReady) and e.contact) for e in events)
+        updates = [event for event in events if isinstance(event, ImageUpdate)]
+        last = next((update for update in reversed(updates) if update.stream), None)
+        has_contact = any(update.contact for update in updates)
         if last is None:
             quality = judge(picture.pixels, np.zeros_like(picture.pixels))
             delivered.append(Delivered(quality, RECORD_SIZE if has_contact else 0, False, False))  # noqa: FBT003
             continue
         quality = codecs.paper_quality(picture, last.stream, last.received_mask())
-        there = sum(stop - start for start, stop in last.received)
-        payload = there + last.header.size + (RECORD_SIZE if has_contact else 0)
+        header_bytes = len(last.stream) - last.total_bytes
+        payload = last.received_bytes + header_bytes + (RECORD_SIZE if has_contact else 0)
         delivered.append(Delivered(quality, payload, has_contact, last.complete))
     return Outcome(tuple(delivered), setting.frames * len(pictures))
 
@@ -184,30 +185,30 @@ def run_v1(pictures: Sequence[LinkPicture], codecs: Codecs, setting: Setting, *,
         feedback=feedback,
         frames_per_image=setting.frames,
         stream_bytes=feedback_stream_bytes(setting),
-        group_pictures=setting.group,
+        group_images=setting.group,
         depth=setting.depth,
-        kept_pictures=max(len(pictures), 1),
+        kept_images=max(len(pictures), 1),
     )
-    sender, receiver = LinkSender(config), LinkReceiver(ReceiverConfig(max_contacts=65535))
+    sender, receiver = V1Sender(config), V1Receiver(ReceiverConfig(max_contacts=65535))
     for number, picture in enumerate(pictures, start=1):
-        sender.add_picture(number, picture.contact, picture.stream, 0.0, picture.mean_square_error)
-    latest: dict[int, ContactUpdate] = {}
+        sender.add_image(number, picture.contact, picture.stream, 0.0, picture.mean_square_error)
+    latest: dict[int, ImageUpdate] = {}
     frames, reports = 0, 0
     for now, frame, is_report in _exchange(sender, receiver, Water(setting.channel, setting.seed), feedback=feedback):
         frames += 1
         reports += is_report
         for event in receiver.accept(_SOURCE, frame, now) if frame else []:
-            if isinstance(event, ContactUpdate):
-                latest[event.number] = event
+            if isinstance(event, ImageUpdate):
+                latest[number_of_image(event.image_id)] = event
     delivered = tuple(_v1_delivered(p, latest.get(n), codecs) for n, p in enumerate(pictures, start=1))
     return Outcome(delivered, frames, reports)
 
 
 def _exchange(
-    sender: LinkSender, receiver: LinkReceiver, water: Water, *, feedback: bool
+    sender: V1Sender, receiver: V1Receiver, water: Water, *, feedback: bool
 ) -> Iterator[tuple[float, bytes, bool]]:
     """Yield time, what arrives (empty where it is lost) and whether it is a report, of each frame sent either way."""
-    vessel, back = LinkSender(replace(sender.config, feedback=False)), LinkReceiver()
+    vessel, back = V1Sender(replace(sender.config, feedback=False)), V1Receiver()
     for step in range(1, _MOST_STEPS):
         now = step * _FRAME_S
         if sender.is_idle:
@@ -215,18 +216,19 @@ def _exchange(
         frame = sender.next_frame(now)
         if frame is not None:
             yield now, (frame if water.passes() else b""), False
-        report = receiver.report(_SOURCE, now) if feedback and receiver.report_is_due(_SOURCE, now) else None
+        due = feedback and receiver.feedback_is_due(_SOURCE, now)
+        report = receiver.feedback(_SOURCE, now) if due else None
         if report is None:
             continue
-        vessel.add_report(report)
-        told, passed = vessel.next_frame(now), water.passes()
+        vessel.add_feedback(report)
+        sent, passed = vessel.next_frame(now), water.passes()
         yield now, b"", True
-        for event in back.accept(_VESSEL, told, now) if told and passed else []:
+        for event in back.accept(_VESSEL, sent, now) if sent and passed else []:
             if isinstance(event, FeedbackReceived):
-                sender.on_report(event.report, now)
+                sender.on_feedback(event.feedback, now)
 
 
-def _v1_delivered(picture: LinkPicture, update: ContactUpdate | None, codecs: Codecs) -> Delivered:
+def _v1_delivered(picture: LinkPicture, update: ImageUpdate | None, codecs: Codecs) -> Delivered:
     if update is None:
         return Delivered(judge(picture.pixels, np.full_like(picture.pixels, GREY)), 0, False, False)  # noqa: FBT003
     if not picture.stream.startswith(update.stream) or update.contact != picture.contact.rounded():

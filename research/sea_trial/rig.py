@@ -12,8 +12,9 @@ from typing import Final
 
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import format_image_id
-from sonarpost.link.frames.paper.receiver import ContactOnly, Event, ImageReady, PaperReceiver
+from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import Packet, plan_packets
+from sonarpost.link.receiver import Event, ImageUpdate
 from sonarpost.modem.micromodem import (
     RATES,
     FrameReceived,
@@ -205,8 +206,7 @@ def cross(water: ChannelParameters, range_m: float, rate: int, samples: Sequence
 def _show(shown: dict[str, bytes | None], events: Sequence[Event]) -> None:
     """Keep the best that is known of each picture."""
     for event in events:
-        match event:
-            case ImageReady():
-                shown[event.image_id] = event.stream if event.complete else shown.get(event.image_id) or b""
-            case ContactOnly():
-                shown.setdefault(event.image_id, None)
+        if isinstance(event, ImageUpdate) and event.stream:
+            shown[event.image_id] = event.stream if event.complete else shown.get(event.image_id) or b""
+        elif isinstance(event, ImageUpdate):
+            shown.setdefault(event.image_id, None)

@@ -6,8 +6,8 @@ from typing import Annotated
 from pydantic import Field
 
 from sonarpost.config import ServiceConfig
+from sonarpost.link.receiver import WireFormat
 from sonarpost.messages import PlatformId
-from sonarpost.services.decompressor.hearing import LinkName
 
 ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 
@@ -26,7 +26,7 @@ class DecompressorConfig(ServiceConfig):
     """
 
     out_dir: Path = Path("out")
-    wire_formats: Annotated[tuple[LinkName, ...], Field(min_length=1)] = ("v1", "paper")
+    wire_formats: Annotated[tuple[WireFormat, ...], Field(min_length=1)] = ("v1", "paper")
     pairing_timeout_s: Annotated[float, Field(gt=0, le=86400)] = 120.0
     codebooks: Annotated[tuple[str, ...], Field(min_length=1)] = ("nominal-10", "nominal-20")
     image_consumers: tuple[ConsumerName, ...] = ("relay",)

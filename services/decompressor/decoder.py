@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,12 +11,9 @@ from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.codec import codebook_tag
 from sonarpost.codec.vq.tiles import TileDatabase
-from sonarpost.errors import CodebookError, StreamError
-from sonarpost.link.downlink.messages import image_of_number
-from sonarpost.link.events import ContactUpdate
+from sonarpost.errors import CodebookError
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.paper.events import ContactOnly, ImageReady
-from sonarpost.link.frames.paper.frame import HalfName
+from sonarpost.link.receiver import ImageUpdate
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
 
 
@@ -42,45 +38,26 @@ class Decoder:
                 raise CodebookError(name, "identity", tiles.identity, f"a tag other than {tag:#06x}, which is taken")
             self._tiles[tag] = tiles
 
-    def image(self, event: ImageReady, vehicle_id: str) -> ReconstructedImage:
-        """Decode an image, or what there is of it.
+    def image(self, event: ImageUpdate, vehicle_id: str) -> ReconstructedImage:
+        """Decode an image as far as it has arrived; without a stream header all of it is missing.
 
         Raises:
             CodebookError: It was made with a codebook that is not at hand.
             StreamError: It cannot be decoded.
         """
-        codec = self._codec(event.header, event)
+        if not event.has_header:
+            contact = event.contact
+            shape = (contact and contact.height_px) or 16, (contact and contact.width_px) or 16
+            decoded = DecodedImage(np.zeros(shape, dtype=np.uint8), np.ones(shape, dtype=np.bool_))
+            return self._record(event, vehicle_id, decoded, None, ["only the contact record arrived"])
+        codec = self._codec(StreamHeader.unpack(event.stream), event)
         decoded = codec.decode(event.stream, event.received_mask())
         notes = list(decoded.notes)
         if event.conflicts:
             notes.append(f"{event.conflicts} frames disagreed with others of this image")
         return self._record(event, vehicle_id, decoded, codec, notes)
 
-    def refined(self, event: ContactUpdate, vehicle_id: str) -> ReconstructedImage:
-        """Decode the beginning of a picture's stream, as far as it has arrived.
-
-        Nothing is filled in: what an embedded codec shows of each pixel is what the stream says of it so far.
-
-        Raises:
-            CodebookError: It was made with a codebook that is not at hand.
-            StreamError: It cannot be decoded.
-        """
-        if not _has_header(event.stream):
-            return self._without_picture(event, vehicle_id)
-        codec = self._codec(StreamHeader.unpack(event.stream), event)
-        decoded = codec.decode(event.stream)
-        return self._record(event, vehicle_id, decoded, codec, decoded.notes)
-
-    def contact_only(self, event: ContactOnly, vehicle_id: str) -> ReconstructedImage:
-        """Return the record of a contact whose picture did not arrive: all of it is missing."""
-        return self._without_picture(event, vehicle_id)
-
-    def _without_picture(self, event: ContactOnly | ContactUpdate, vehicle_id: str) -> ReconstructedImage:
-        shape = (event.contact.height_px or 16, event.contact.width_px or 16)
-        decoded = DecodedImage(np.zeros(shape, dtype=np.uint8), np.ones(shape, dtype=np.bool_))
-        return self._record(event, vehicle_id, decoded, None, ["only the contact record arrived"])
-
-    def _codec(self, header: StreamHeader, event: ImageReady | ContactUpdate) -> Codec:
+    def _codec(self, header: StreamHeader, event: ImageUpdate) -> Codec:
         registry, tiles = default_registry(), None
         # The tag of a codec without tiles is that of another kind of model, or of none.
         if registry.spec_for_id(header.codec_id).needs_tiles:
@@ -88,80 +65,40 @@ class Decoder:
             tiles = self._tiles.get(tag)
             if tiles is None:
                 own = ", ".join(f"{known:#06x}" for known in self._tiles)
-                where = f"image {image_id_of(event)}"
+                where = f"image {event.image_id}"
                 raise CodebookError(where, "model_tag", f"{tag:#06x}", f"a codebook at hand: {own}")
         return registry.create_for_stream(event.stream, CodecResources(tiles))
 
     def _record(
         self,
-        event: ImageReady | ContactOnly | ContactUpdate,
+        event: ImageUpdate,
         vehicle_id: str,
         decoded: DecodedImage,
         codec: Codec | None,
         notes: Sequence[str],
     ) -> ReconstructedImage:
         picture = Pixels.from_array(decoded.image)
-        amount = _amount_of(event)
         return ReconstructedImage(
             vessel_id=self._vessel_id,
             vehicle_id=vehicle_id,
-            image_id=image_id_of(event),
+            image_id=event.image_id,
             version=event.version,
             contact=contact_of(event, vehicle_id),
             codec=codec.name if codec else "",
             model=codec.model_hash if codec else "",
             picture=picture,
             picture_sha256=picture.sha256,
-            complete=amount.complete and not decoded.missing.any(),
+            complete=event.complete and not decoded.missing.any(),
             missing_fraction=float(decoded.missing.mean()),
             missing_mask=pack_mask(decoded.missing),
-            missing_halves=amount.missing_halves,
-            bytes_received=amount.bytes_received,
-            bytes_total=amount.bytes_total,
-            frames_received=amount.frames,
-            first_frame_utc_s=event.first_at,
-            last_frame_utc_s=event.last_at,
+            missing_halves=event.missing_halves,
+            bytes_received=event.received_bytes,
+            bytes_total=event.total_bytes,
+            frames_received=event.frames,
+            first_frame_utc_s=event.first_frame_s,
+            last_frame_utc_s=event.last_frame_s,
             notes=tuple(notes),
         )
-
-
-@dataclass(frozen=True)
-class _Amount:
-    """How much of a picture arrived, in the terms of its wire format."""
-
-    complete: bool
-    missing_halves: tuple[HalfName, ...]
-    bytes_received: int
-    bytes_total: int
-    frames: int
-
-
-def _amount_of(event: ImageReady | ContactOnly | ContactUpdate) -> _Amount:
-    match event:
-        case ImageReady():
-            received = sum(stop - start for start, stop in event.received)
-            return _Amount(event.complete, event.missing_halves, received, len(event.body), event.frames)
-        case ContactOnly():
-            return _Amount(complete=False, missing_halves=("top", "bottom"), bytes_received=0, bytes_total=0, frames=0)
-        case ContactUpdate():
-            # There are no halves, and a frame may be of many pictures. Where the stream ends is known when it is there.
-            halves: tuple[HalfName, ...] = () if _has_header(event.stream) else ("top", "bottom")
-            received = len(event.stream)
-            return _Amount(event.complete, halves, received, received if event.complete else 0, 0)
-
-
-def _has_header(stream: bytes) -> bool:
-    try:
-        StreamHeader.unpack(stream)
-    except StreamError:
-        # Either too short as yet, or of no codec: a stream of `MAX_SIZE` bytes and more must have one.
-        return len(stream) >= StreamHeader.MAX_SIZE
-    return True
-
-
-def image_id_of(event: ImageReady | ContactOnly | ContactUpdate) -> str:
-    """Return the identifier that a picture has on the vessel."""
-    return image_of_number(event.number) if isinstance(event, ContactUpdate) else event.image_id
 
 
 def pack_mask(missing: Mask) -> bytes:
@@ -169,7 +106,7 @@ def pack_mask(missing: Mask) -> bytes:
     return np.packbits(missing).tobytes() if missing.any() else b""
 
 
-def contact_of(event: ImageReady | ContactOnly | ContactUpdate, vehicle_id: str) -> Contact | None:
+def contact_of(event: ImageUpdate, vehicle_id: str) -> Contact | None:
     """Return the contact as the vessel knows it, None when its record has not arrived.
 
     The vehicle's own contact identifier does not travel; on this side a contact is vehicle and image identifier.
@@ -178,7 +115,7 @@ def contact_of(event: ImageReady | ContactOnly | ContactUpdate, vehicle_id: str)
     if summary is None:
         return None
     return Contact(
-        contact_id=f"{vehicle_id}/{image_id_of(event)}",
+        contact_id=f"{vehicle_id}/{event.image_id}",
         vehicle_id=vehicle_id,
         channel=summary.side.value if summary.side else None,
         time_utc_s=summary.time_utc_s,

@@ -14,20 +14,19 @@ from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
-from sonarpost.link.events import ContactUpdate, FrameRefused
-from sonarpost.link.frames.paper.events import ContactOnly, ImageReady, PaperFrameRejected
+from sonarpost.link.receiver import FrameRejected, ImageUpdate
+from sonarpost.link.state import SavedParts
 from sonarpost.logs import kv, log_context
 from sonarpost.messages import AcousticFrame, ReconstructedImage, Record
 from sonarpost.runtime.service import RETRY_AFTER_S, Service, UnitOfWork
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.decompressor.config import DecompressorConfig
-from sonarpost.services.decompressor.decoder import Decoder, image_id_of
-from sonarpost.services.decompressor.hearing import Event, FrameReceivers
+from sonarpost.services.decompressor.decoder import Decoder
+from sonarpost.services.decompressor.hearing import FrameReceivers
 
 log = logging.getLogger(__name__)
 
-Picture = ImageReady | ContactOnly | ContactUpdate
-
+_PARTS = "receivers/"
 POLL_S = 0.2
 QUIET_S = 2.0
 """No image's time is up before frames have stopped coming for this long, twice the longest pause of a hand-over."""
@@ -59,6 +58,7 @@ class DecompressorService(Service[DecompressorConfig]):
             )
         super().__init__(platform, config)
         self._hearing = self._new_hearing()
+        self._saved_parts = SavedParts({})
         self._pairing_problem = ""
         self._last_frame_s = time.monotonic()
         # One thread handles frames, another the waiting time; the receiver belongs to whoever holds the lock.
@@ -99,7 +99,15 @@ class DecompressorService(Service[DecompressorConfig]):
         """Go back to the last committed state when memory may be ahead of it."""
         if not self._in_step:
             self._hearing = self._new_hearing()
-            self._hearing.restore({name: self.store.get_state(name) for name in FrameReceivers.STATES})
+            names = self.store.state_names(_PARTS)
+            parts = {name.removeprefix(_PARTS): self.store.get_state(name) or b"" for name in names}
+            self._saved_parts = SavedParts(parts)
+            old = {n: state for n in FrameReceivers.OLD_STATES if (state := self.store.get_state(n)) is not None}
+            errors = self._hearing.restore(parts) if parts or not old else self._hearing.restore_old(old)
+            for name, reason in errors.items():
+                log.error(
+                    "Discarding an unreadable part of the receivers' state", extra=kv(part=name, reason=str(reason))
+                )
         self._in_step = False
 
     def _watch_deadlines(self) -> None:
@@ -131,22 +139,29 @@ class DecompressorService(Service[DecompressorConfig]):
         self._in_step = True
         self._pairing_problem = ""
 
-    def _follow(self, events: Iterable[Event], effects: UnitOfWork) -> None:
+    def _follow(self, events: Iterable[ImageUpdate | FrameRejected], effects: UnitOfWork) -> None:
         for event in events:
-            if isinstance(event, (PaperFrameRejected, FrameRefused)):
+            if isinstance(event, FrameRejected):
                 effects.count("frames_rejected")
                 log.warning("Frame rejected", extra=kv(source=event.source, reason=str(event.reason)))
             else:
                 self._give_out(event, effects)
-        for name, state in self._hearing.changes().items():
-            effects.put_state(name, state)
+        parts = self._hearing.parts()
+        for name, data in self._saved_parts.changes(parts).items():
+            if data is None:
+                effects.delete_state(_PARTS + name)
+            else:
+                effects.put_state(_PARTS + name, data)
+        for name in FrameReceivers.OLD_STATES:
+            effects.delete_state(name)
+        self._saved_parts.commit(parts)
 
-    def _give_out(self, event: Picture, effects: UnitOfWork) -> None:
+    def _give_out(self, event: ImageUpdate, effects: UnitOfWork) -> None:
         vehicle = self.config.vehicles.get(str(event.source), f"modem-{event.source}")
-        with log_context(vehicle=vehicle, image_id=image_id_of(event)):
+        with log_context(vehicle=vehicle, image_id=event.image_id):
             self._give_out_of(event, vehicle, effects)
 
-    def _give_out_of(self, event: Picture, vehicle: str, effects: UnitOfWork) -> None:
+    def _give_out_of(self, event: ImageUpdate, vehicle: str, effects: UnitOfWork) -> None:
         try:
             image = self._decode(event, vehicle)
         except BadInputError as error:
@@ -174,19 +189,12 @@ class DecompressorService(Service[DecompressorConfig]):
             ),
         )
 
-    def _keep_apart_image(self, event: Picture, vehicle: str, reason: str, effects: UnitOfWork) -> None:
+    def _keep_apart_image(self, event: ImageUpdate, vehicle: str, reason: str, effects: UnitOfWork) -> None:
         effects.count("images_undecodable")
-        body = b"" if isinstance(event, ContactOnly) else event.stream
-        effects.quarantine(f"image {vehicle}/{image_id_of(event)}", body, reason)
+        effects.quarantine(f"image {vehicle}/{event.image_id}", event.stream, reason)
 
-    def _decode(self, event: Picture, vehicle: str) -> ReconstructedImage:
-        match event:
-            case ContactOnly():
-                return self._decoder.contact_only(event, vehicle)
-            case ImageReady():
-                return self._decoder.image(event, vehicle)
-            case ContactUpdate():
-                return self._decoder.refined(event, vehicle)
+    def _decode(self, event: ImageUpdate, vehicle: str) -> ReconstructedImage:
+        return self._decoder.image(event, vehicle)
 
     def gauges(self) -> Mapping[str, float]:
         """Return whether an image of the paper's format still waits for something."""

@@ -18,6 +18,7 @@ from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
 from sonarpost.link.downlink.commands import PendingCommand
 from sonarpost.link.downlink.vessel_endpoint import DownlinkPacket
+from sonarpost.link.state import Parts, SavedParts
 from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame, Command, Decision, ReceivedMessage, Record
 from sonarpost.modem.micromodem import RATES, FrameReceived, PacketFailed, PacketReceived, PacketSent
@@ -31,6 +32,8 @@ from sonarpost.services.op_modem.station import VesselStation
 log = logging.getLogger(__name__)
 
 _STATION = "station"
+"""The whole state, as version 0.1 kept it."""
+_STATION_PARTS = "station/"
 _SEAL_LIMIT = "seal-limit/"
 TICK_S = 0.1
 EVERYBODY = 127
@@ -53,6 +56,7 @@ class DownlinkService(ModemService[OpModemConfig]):
         # The station belongs to whoever holds this lock; `_in_step`: it is as it is on the disk.
         self._station_lock = threading.RLock()
         self._station = self._new_station()
+        self._saved_parts = SavedParts({})
         self._in_step = False
         self._under_way: tuple[int, DownlinkPacket] | None = None
         self._link_problem = ""
@@ -63,7 +67,7 @@ class DownlinkService(ModemService[OpModemConfig]):
         if not self._speaks:
             return
         with self._station_step() as station:
-            still_open = station.book.open_orders
+            still_open = station.book.open_commands
             self._in_step = True
         self._show(still_open, time.time())
         self.start_thread(self._speak, "speak")
@@ -121,21 +125,34 @@ class DownlinkService(ModemService[OpModemConfig]):
         """Go back to the last committed state when memory may be ahead of it. Needs the lock."""
         if not self._in_step:
             self._station = self._new_station()
-            kept = self.store.get_state(_STATION)
-            if kept is not None:
-                self._restore(kept)
+            names = self.store.state_names(_STATION_PARTS)
+            parts = {name.removeprefix(_STATION_PARTS): self.store.get_state(name) or b"" for name in names}
+            self._saved_parts = SavedParts(parts)
+            old = self.store.get_state(_STATION)
+            self._restore(parts, old)
         self._in_step = False
 
-    def _restore(self, kept: bytes) -> None:
-        try:
-            self._station.restore(kept)
-        except FrameError as error:
+    def _restore(self, parts: Parts, old: bytes | None) -> None:
+        errors = self._station.restore(parts)
+        if not parts and old is not None:
+            try:
+                self._station.restore_old(old)
+            except FrameError as error:
+                errors = {_STATION: error}
+        for name, reason in errors.items():
             self.count("states_discarded")
-            log.error("The state of the link cannot be read, it begins anew", extra=kv(reason=str(error)))
-            self._station = self._new_station()
+            log.error("Discarding an unreadable part of the link state", extra=kv(part=name, reason=str(reason)))
 
     def _keep_station(self, effects: UnitOfWork) -> None:
-        effects.put_state(_STATION, self._station.snapshot())
+        """Write the parts of the station that changed; a step that is not committed is followed by `_load`."""
+        parts = self._station.parts()
+        for name, data in self._saved_parts.changes(parts).items():
+            if data is None:
+                effects.delete_state(_STATION_PARTS + name)
+            else:
+                effects.put_state(_STATION_PARTS + name, data)
+        effects.delete_state(_STATION)
+        self._saved_parts.commit(parts)
 
     @contextmanager
     def _station_step(self) -> Iterator[VesselStation]:
@@ -164,7 +181,7 @@ class DownlinkService(ModemService[OpModemConfig]):
     def _expire_orders(self) -> None:
         now = time.time()
         with self._station_lock:
-            if all(order.expires_at > now for order in self._station.book.open_orders):
+            if all(order.expires_s > now for order in self._station.book.open_commands):
                 return
             with self._station_step() as station:
                 expired = station.book.expire(now)
@@ -180,7 +197,7 @@ class DownlinkService(ModemService[OpModemConfig]):
         now_s, now = time.monotonic(), time.time()
         receiving = self.modem.receiving or bool(self._arriving)
         with self._station_lock:
-            wanted = self._station.link.wants_to_send(now) is not None
+            wanted = self._station.link.due_address(now) is not None
             if self._turn.may_speak(now_s, now, receiving=receiving, wanted=wanted):
                 self._send(now)
             elif not wanted and not receiving:
@@ -191,7 +208,7 @@ class DownlinkService(ModemService[OpModemConfig]):
         rate = RATES[self.config.downlink_rate]
         with self._station_step() as station:
             self._reserve_counters(station)
-            packet = station.link.packet(rate.frames, rate.frame_bytes, now)
+            packet = station.link.next_packet(rate.frames, rate.frame_bytes, now)
             effects = UnitOfWork()
             self._keep_station(effects)
             self.commit(effects)
@@ -202,7 +219,7 @@ class DownlinkService(ModemService[OpModemConfig]):
     def _reserve_counters(self, station: VesselStation) -> None:
         """Make the counters of seals durable before they are used."""
         seal = station.seal
-        if seal is None or self._key is None or (limit := seal.wanted_limit) is None:
+        if seal is None or self._key is None or (limit := seal.requested_limit) is None:
             return
         with self.store.transaction() as tx:
             tx.put_state(_SEAL_LIMIT + self._key.fingerprint, str(limit).encode())
@@ -236,7 +253,7 @@ class DownlinkService(ModemService[OpModemConfig]):
             changed = station.link.sent(packet, now)
             effects = UnitOfWork()
             effects.count("packets_sent")
-            effects.count("reports_sent", int(packet.reports))
+            effects.count("reports_sent", int(packet.has_feedback))
             self._keep_station(effects)
             try:
                 self.commit(effects)
@@ -282,7 +299,7 @@ class DownlinkService(ModemService[OpModemConfig]):
     def _station_gauges(self) -> Mapping[str, float]:
         with self._station_lock:
             seal = self._station.seal
-            gauges = {"orders_open": float(len(self._station.book.open_orders))}
+            gauges = {"orders_open": float(len(self._station.book.open_commands))}
             if seal is not None:
                 counts = seal.counts
                 gauges |= {"frames_forged": float(counts.forged), "frames_replayed": float(counts.replayed)}
@@ -300,10 +317,10 @@ class DownlinkService(ModemService[OpModemConfig]):
         for frame in packet.frames:
             if frame.dest not in (self.config.address, EVERYBODY) or not 0 <= frame.src < EVERYBODY:
                 continue
-            heard = self._station.link.hear(frame.src, frame.data, heard_utc_s)
-            changed += heard.orders
-            effects.count("frames_foreign", len(heard.refused))
-            for data in heard.data:
+            heard = self._station.link.accept(frame.src, frame.data, heard_utc_s)
+            changed += heard.commands
+            effects.count("frames_foreign", len(heard.rejected))
+            for data in heard.messages:
                 self._take_message(frame.src, data, heard_utc_s, effects)
         self._keep_station(effects)
         return tuple(changed)

@@ -5,15 +5,18 @@ from __future__ import annotations
 import msgpack
 
 from sonarpost.errors import FrameError, PayloadError
+from sonarpost.link import migration
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.downlink import messages as dl
 from sonarpost.link.downlink.commands import MAX_PENDING, CommandTracker, PendingCommand
 from sonarpost.link.downlink.vessel_endpoint import VesselEndpoint
 from sonarpost.link.frames.v1.frame import segments_room
+from sonarpost.link.state import Parts, below, prefixed, unpack_plain
 from sonarpost.messages import Command, Decision, DownlinkState
 from sonarpost.modem.micromodem import RATES
 from sonarpost.services.op_modem.config import OpModemConfig
 
+_LINK, _AUTHENTICATION = "link/", "authentication/"
 _MESSAGE_OVERHEAD_BYTES = 3  # kind, length and number of a message segment
 LATEST_UTC_S = 2**32 - 1
 
@@ -32,12 +35,12 @@ class VesselStation:
         self._config = config
         self.seal = seal
         book = CommandTracker(config.retry_s)
-        self.link = VesselEndpoint(book, config.receiver_config(), seal=seal, feedback=config.feedback)
+        self.link = VesselEndpoint(book, config.receiver_config(), protection=seal, feedback=config.feedback)
 
     @property
     def book(self) -> CommandTracker:
         """The orders."""
-        return self.link.book
+        return self.link.commands
 
     def check(self, record: Command | Decision, where: str) -> None:
         """Refuse what can never be sent.
@@ -51,7 +54,7 @@ class VesselStation:
         issued = _issued_utc_s(record)
         if issued > LATEST_UTC_S:
             raise PayloadError(where, "time", issued, f"a time to {LATEST_UTC_S} s")
-        if len(self.book.open_orders) >= MAX_PENDING:
+        if len(self.book.open_commands) >= MAX_PENDING:
             raise PayloadError(where, "", f"{MAX_PENDING} open orders", "one at most fewer")
 
     def ask(self, record: Command | Decision, now: float) -> PendingCommand | None:
@@ -63,7 +66,7 @@ class VesselStation:
         """
         kind = record.kind if isinstance(record, Command) else "decision"
         record_id = record.command_id if isinstance(record, Command) else record.decision_id
-        if self.book.known(kind, record_id) is not None:
+        if self.book.find(kind, record_id) is not None:
             return None
         self.check(record, f"{kind} {record_id}")
         address = self._config.address_of(record.vehicle_id)
@@ -73,7 +76,7 @@ class VesselStation:
         # A clock ashore that is ahead of ours must not make an order last longer.
         expires_at = min(_issued_utc_s(record), now) + self._config.command_lifetime_s
         order = PendingCommand(kind, record_id, record.vehicle_id, address, token, message, now, expires_at)
-        return self.book.ask(order, now)
+        return self.book.add(order, now)
 
     @property
     def message_room(self) -> int:
@@ -91,33 +94,38 @@ class VesselStation:
                 "record_id": order.record_id,
                 "state": str(order.state),
                 "times_sent": order.times_sent,
-                "expires_utc_s": max(0.0, order.expires_at),
+                "expires_utc_s": max(0.0, order.expires_s),
                 "changed_utc_s": now,
                 "reason": order.reason,
             }
         )
 
-    def snapshot(self) -> bytes:
+    def parts(self) -> dict[str, bytes]:
         """Return what has to be kept."""
-        state = {"link": self.link.snapshot(), "seal": None if self.seal is None else self.seal.snapshot()}
-        return bytes(msgpack.packb(state))
+        parts = prefixed(_LINK, self.link.parts())
+        return parts if self.seal is None else {**parts, **prefixed(_AUTHENTICATION, self.seal.parts())}
 
-    def restore(self, kept: bytes) -> None:
-        """Take up what `snapshot` returned. The state of a seal with another key is left alone.
+    def restore(self, parts: Parts) -> dict[str, FrameError]:
+        """Take up what `parts` returned; return why parts were skipped. The state of another key is left alone."""
+        errors = {_LINK + name: error for name, error in self.link.restore(below(_LINK, parts)).items()}
+        if self.seal is not None:
+            skipped = self.seal.restore(below(_AUTHENTICATION, parts))
+            errors |= {_AUTHENTICATION + name: error for name, error in skipped.items()}
+        return errors
+
+    def restore_old(self, kept: bytes) -> None:
+        """Take up the state of version 0.1.
 
         Raises:
-            FrameError: It did not return this.
+            FrameError: It is none.
         """
-        try:
-            state = msgpack.unpackb(kept, strict_map_key=False)
-        except (ValueError, msgpack.exceptions.UnpackException) as error:
-            raise FrameError("op_modem state", "", kept[:20], "msgpack") from error
-        if not isinstance(state, dict) or not isinstance(state.get("link"), dict):
+        state = unpack_plain(dict, kept, "op_modem state")
+        if not isinstance(state.get("link"), dict):
             raise FrameError("op_modem state", "link", kept[:20], "a map")
-        self.link.restore(state["link"])
-        seal = state.get("seal")
-        if self.seal is not None and isinstance(seal, dict) and seal.get("key") == self.seal.snapshot()["key"]:
-            self.seal.restore(seal)
+        parts = prefixed(_LINK, migration.endpoint_parts(msgpack.packb(state["link"])))
+        if isinstance(state.get("seal"), dict):
+            parts |= prefixed(_AUTHENTICATION, migration.authentication_parts(msgpack.packb(state["seal"])))
+        self.restore(parts)
 
 
 def order_of(record: Command | Decision, token: int) -> dl.DownlinkCommand:

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from sonarpost.link.config import QueueConfig
 from sonarpost.link.mac import Continuous, Csma, MediumAccess, Polled, Tdma
-from sonarpost.link.queue.transmit_queue import QueueConfig
 from sonarpost.modem.micromodem import RATES
 from sonarpost.runtime.modem_service import ModemServiceConfig
 

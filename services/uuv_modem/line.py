@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-import secrets
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
+
+import msgpack
 
 from sonarpost import wire
 from sonarpost.codec.interface import StreamHeader
@@ -14,6 +14,7 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import BadInputError, FrameError
+from sonarpost.link import migration
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
 from sonarpost.link.downlink.messages import (
@@ -28,17 +29,16 @@ from sonarpost.link.downlink.messages import (
     pack,
     unpack,
 )
-from sonarpost.link.events import FeedbackReceived, FrameRefused, MessageReceived
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.feedback import unpack_mini
-from sonarpost.link.frames.v1.frame import BLOCKS
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
-from sonarpost.link.queue.state import export_queue, restore_queue, salvage_queue
-from sonarpost.link.queue.transmit_queue import ImageName, TransmitQueue
-from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.queue.transmit_queue import TransmitQueue
+from sonarpost.link.receiver import FeedbackReceived, FrameRejected, MessageReceived
+from sonarpost.link.sender import ImageToSend, OutgoingPacket
+from sonarpost.link.state import below, prefixed, unpack_plain
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage
-from sonarpost.modem.micromodem import RATES
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.line_store import LineStore
@@ -49,19 +49,12 @@ log = logging.getLogger(__name__)
 _CONFIRMATION_PRIORITY: Final = 2
 _CONFIRMATION_LIFETIME_S: Final = 900.0
 _OWN: Final = "uuv_modem"
-_QUEUE, _HEARD, _ORDERS, _PACKET, _SEAL = "queue/", "heard", "orders", "packet", "seal"
+_QUEUE, _RECEIVER, _COMMANDS, _AUTHENTICATION = "queue/", "receiver/", "orders", "authentication/"
 _LIMIT: Final = "v1-seal-limit/"
 IMAGES_ACCEPTED: Final = "images_accepted"
+_OLD_QUEUE: Final = ("queue/core", "queue/picture/")
 
 Summarise = Callable[[EncodedImage], ContactSummary]
-
-
-@dataclass(frozen=True, slots=True)
-class PendingPacket:
-    """A packet that was chosen and has not gone, as far as is known."""
-
-    rate: int
-    frames: tuple[bytes, ...]
 
 
 class VehicleEndpoint:
@@ -92,7 +85,6 @@ class VehicleEndpoint:
         self.count = count
         self._parts = LineStore(store)
         self.seal = self._new_seal(platform)
-        self.under_way: PendingPacket | None = None
         self._to_hand: list[CommandRecord] = []
         self._outcomes: list[tuple[int, CommandOutcome]] = []
         self._taken: list[str] = []
@@ -111,62 +103,32 @@ class VehicleEndpoint:
     def _begin_anew(self, platform_id: str) -> None:
         first_block = self._store.origin[0]
         self.queue = self._new_queue(first_block)
-        self.receiver = LinkReceiver(seal=self.seal)
+        self.receiver = V1Receiver(protection=self.seal)
         self.orders = ReceivedCommands(platform_id, self._config)
-        self.under_way = None
 
     def _new_queue(self, first_block: int) -> TransmitQueue:
-        return TransmitQueue(self._config.queue_config(), first_block=first_block, seal=self.seal)
+        return TransmitQueue(self._config.queue_config(), first_block=first_block, protection=self.seal)
 
     def load(self, platform_id: str, now: float) -> None:
-        """Go on where the last process was.
-
-        What cannot be read is logged and kept apart as it is; pictures and messages are put into a new queue again.
-        """
-        parts, unreadable = self._parts.load()
-        if not parts and not unreadable:
-            return
-        queue_parts = {n.removeprefix(_QUEUE): part for n, part in parts.items() if n.startswith(_QUEUE)}
-        reasons = {name: f"{len(data)} bytes that are no msgpack map" for name, data in unreadable.items()}
-        try:
-            restore_queue(self.queue, queue_parts)
-        except BadInputError as error:
-            reasons[_QUEUE + "core"] = str(error)
-            # Another first block, so that receivers do not take new blocks for those they know.
-            self.queue = self._new_queue(secrets.randbelow(BLOCKS))
-            saved, refused = salvage_queue(self.queue, queue_parts, now)
-            reasons |= {_QUEUE + each.where.rpartition(": ")[2]: str(each) for each in refused}
-            log.error("The queue is made anew of its pictures and messages", extra=kv(saved=saved))
-        reasons |= self._load_others(parts, platform_id)
+        """Continue from the state of the last process; parts that cannot be read are logged and quarantined."""
+        saved = self._parts.load()
+        parts, reasons = _migrated(saved)
+        reasons |= {_QUEUE + name: error for name, error in self.queue.restore(below(_QUEUE, parts)).items()}
+        reasons |= {_RECEIVER + name: error for name, error in self.receiver.restore(below(_RECEIVER, parts)).items()}
+        if self.seal is not None:
+            errors = self.seal.restore(below(_AUTHENTICATION, parts))
+            reasons |= {_AUTHENTICATION + name: error for name, error in errors.items()}
+        if _COMMANDS in parts:
+            try:
+                self.orders.restore(unpack_plain(dict, parts[_COMMANDS], "uuv_modem state"))
+            except BadInputError as error:
+                reasons[_COMMANDS] = error
+                self.orders = ReceivedCommands(platform_id, self._config)
         if reasons:
             for name, reason in reasons.items():
-                log.error("A part of the link's state cannot be read", extra=kv(part=name, reason=reason))
+                log.error("Discarding an unreadable part of the link state", extra=kv(part=name, reason=str(reason)))
             self.count("states_discarded")
-            self._parts.quarantine(reasons)
-
-    def _load_others(self, parts: Mapping[str, Mapping[str, object]], platform_id: str) -> dict[str, str]:
-        """Take up what is kept beside the queue; return why, by part, where that cannot be."""
-        reasons: dict[str, str] = {}
-        try:
-            self.receiver.restore(parts.get(_HEARD, {}))
-        except BadInputError as error:
-            reasons[_HEARD] = str(error)
-        try:
-            self.orders.restore(parts.get(_ORDERS, {}))
-        except BadInputError as error:
-            reasons[_ORDERS] = str(error)
-            self.orders = ReceivedCommands(platform_id, self._config)
-        match parts.get(_PACKET, {}):
-            case {"rate": int(rate), "frames": [*listed]} if rate in RATES:
-                frames = tuple(frame for frame in listed if isinstance(frame, bytes))
-                self.under_way = PendingPacket(rate, frames) if frames else None
-        seal_state = parts.get(_SEAL)
-        try:
-            if self.seal is not None and seal_state and seal_state.get("key") == self.seal.snapshot()["key"]:
-                self.seal.restore(seal_state)
-        except BadInputError as error:
-            reasons[_SEAL] = str(error)
-        return reasons
+            self._parts.quarantine({name: str(reason) for name, reason in reasons.items() if name in saved})
 
     def save(self) -> None:
         """Write what has changed, records for consumers included, in one transaction.
@@ -179,8 +141,9 @@ class VehicleEndpoint:
             for name in self._taken:
                 tx.delete_state(name)
             tx.put_state(IMAGES_ACCEPTED, str(self.images_accepted).encode())
-            digests = self._parts.write(tx, self._export())
-        self._parts.wrote(digests)
+            parts = self._export()
+            self._parts.write(tx, parts)
+        self._parts.wrote(parts)
         self._to_hand.clear()
         self._taken.clear()
 
@@ -190,14 +153,11 @@ class VehicleEndpoint:
                 encoding = wire.encoding_of(type(handed.record))
                 tx.send(handed.key, consumer, wire.encode(handed.record), encoding=encoding, priority=1)
 
-    def _export(self) -> dict[str, dict[str, object]]:
-        packet = self.under_way
-        parts = {_QUEUE + name: dict(part) for name, part in export_queue(self.queue).items()}
-        parts[_HEARD] = self.receiver.snapshot()
-        parts[_ORDERS] = self.orders.export()
-        parts[_PACKET] = {"rate": packet.rate, "frames": list(packet.frames)} if packet else {}
+    def _export(self) -> dict[str, bytes]:
+        parts = {**prefixed(_QUEUE, self.queue.parts()), **prefixed(_RECEIVER, self.receiver.parts())}
+        parts[_COMMANDS] = bytes(msgpack.packb(self.orders.export()))
         if self.seal is not None:
-            parts[_SEAL] = self.seal.snapshot()
+            parts |= prefixed(_AUTHENTICATION, self.seal.parts())
         return parts
 
     # From the vehicle's programs
@@ -233,11 +193,10 @@ class VehicleEndpoint:
                 lifetime_s=left_s,
             )
             return
-        number = number_of_image(record.image_id)
-        if number not in self.queue.sender.kept:
+        if number_of_image(record.image_id) not in self.queue.sender.kept:
             self.images_accepted += 1
-        name_of_it = ImageName(record.image_id, record.contact.contact_id)
-        self.queue.add_picture(number, name_of_it, self._summarise(record), record.stream, now)
+        summary = self._summarise(record)
+        self.queue.add_image(ImageToSend(record.image_id, record.contact.contact_id, summary, record.stream), now)
 
     def accepted(self, most: int = 64) -> list[tuple[str, bytes]]:
         """Return records that are not in the queue yet."""
@@ -259,7 +218,7 @@ class VehicleEndpoint:
                         self._report(event, now)
                     case MessageReceived():
                         self._message(event, now)
-                    case FrameRefused():
+                    case FrameRejected():
                         self._refused(event)
                     case _:
                         log.debug("Not for a vehicle: %s", type(event).__name__)
@@ -271,13 +230,13 @@ class VehicleEndpoint:
             self.count("frames_forged")
             return
         block, needed = unpack_mini(bits)
-        self.queue.on_mini(block, needed, now, source)
+        self.queue.on_mini_feedback(block, needed, now, source)
         self.count("reports_received")
 
     def _report(self, event: FeedbackReceived, now: float) -> None:
         self.count("reports_received")
         try:
-            self.queue.on_report(event.report, now, event.source)
+            self.queue.on_feedback(event.feedback, now, event.source)
         except FrameError as error:
             log.warning("Report of no use", extra=kv(source=event.source, reason=str(error)))
 
@@ -295,8 +254,8 @@ class VehicleEndpoint:
         self._order(event.source, content, now)
 
     def _order(self, source: int, order: DownlinkCommand, now: float) -> None:
-        known = None if isinstance(order, RevisitMessage) else self.queue.names.get(order.number)
-        outcome, handed = self.orders.take(source, order, known.image_id if known else None)
+        image_id = None if isinstance(order, RevisitMessage) else self.queue.image_id_of(order.number)
+        outcome, handed = self.orders.take(source, order, image_id)
         self._outcomes.append((order.token, outcome))
         if handed is None:
             return
@@ -307,7 +266,7 @@ class VehicleEndpoint:
             return
         self._to_hand.append(handed)
 
-    def _refused(self, event: FrameRefused) -> None:
+    def _refused(self, event: FrameRejected) -> None:
         reason = event.reason
         forged = self.seal is not None and reason.field == "tag"
         replayed = self.seal is not None and reason.field == "counter"
@@ -329,30 +288,39 @@ class VehicleEndpoint:
 
     # Into the water
 
-    def choose(self, now: float, most_frames: int | None = None) -> PendingPacket | None:
+    def choose(self, now: float) -> OutgoingPacket | None:
         """Choose the next packet; it is under way from then on, and must be saved before it is sent.
 
         Raises:
             HandoffError: No counters could be reserved for the seal.
             FrameError: The key is used up.
         """
-        assert self.under_way is None
         self._reserve_counters()
-        frames = self.queue.next_packet(now, most_frames)
-        if frames:
-            self.under_way = PendingPacket(self.queue.rate, frames)
-        return self.under_way
+        return self.queue.next_packet(now)
 
     def _reserve_counters(self) -> None:
-        if self.seal is None or (limit := self.seal.wanted_limit) is None:
+        if self.seal is None or (limit := self.seal.requested_limit) is None:
             return
         with self._store.transaction() as tx:
             tx.put_state(self._limit_name, str(limit).encode())
         self.seal.grant(limit)
 
-    def gone(self, frames: Sequence[bytes]) -> None:
-        """Note that frames of the packet under way have gone; the others stay under way."""
-        if self.under_way is None:
-            return
-        left = tuple(frame for frame in self.under_way.frames if frame not in frames)
-        self.under_way = PendingPacket(self.under_way.rate, left) if left else None
+
+def _migrated(saved: Mapping[str, bytes]) -> tuple[dict[str, bytes], dict[str, BadInputError]]:
+    """Return the parts of this version, and why parts of version 0.1 were skipped."""
+    parts, errors = dict(saved), dict[str, BadInputError]()
+    if any(name.startswith(_OLD_QUEUE) for name in saved):
+        old_queue = {name: parts.pop(name) for name in saved if name.startswith(_QUEUE) or name == "packet"}
+        found, skipped = migration.queue_parts({name.removeprefix(_QUEUE): data for name, data in old_queue.items()})
+        parts |= prefixed(_QUEUE, found)
+        errors |= {name if name == "packet" else _QUEUE + name: error for name, error in skipped.items()}
+    for name, prefix, convert in (
+        ("heard", _RECEIVER, migration.v1_receiver_parts),
+        ("seal", _AUTHENTICATION, migration.authentication_parts),
+    ):
+        if name in saved:
+            try:
+                parts |= prefixed(prefix, convert(saved[name]))
+            except BadInputError as error:
+                errors[name] = error
+    return parts, errors

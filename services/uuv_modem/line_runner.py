@@ -152,9 +152,8 @@ class LineRunner:
         self._packet_s[sent.rate] = taken_s
         self._mac.sent(now - taken_s, now)
         began = self._ended_at if self._ended_at is not None else now - taken_s
-        self._line.queue.sent(now - began)
+        self._line.queue.sent(sent.frames, now - began)
         self._ended_at = now
-        self._line.gone(sent.frames)
         self._offered = ()
         self._changed = True
         self._show(sent)
@@ -197,15 +196,16 @@ class LineRunner:
             self._changed = True
 
     def _send(self, now: float) -> float:
-        rate = self._line.under_way.rate if self._line.under_way else self._line.queue.rate
+        packet = self._line.queue.in_flight
+        rate = packet.rate if packet else self._line.queue.rate
         wait_s = self._mac.wait_s(self._packet_s.get(rate, RATES[rate].airtime_s), now)
         polled = wait_s is None
         wait_s = max(wait_s or 0.0, self._retry_at - now if self._retry_at - now <= self._config.retry_s else 0.0)
         if wait_s > 0 or not (polled or self._modem.ready):
             return wait_s or LONGEST_WAIT_S
-        if self._line.under_way is None:
-            self._changed = self._line.choose(now) is not None or self._changed
-        packet = self._line.under_way
+        if packet is None:
+            packet = self._line.choose(now)
+            self._changed = packet is not None or self._changed
         if packet is None:
             self._ended_at = None
             return LONGEST_WAIT_S

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-import msgpack
-
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
+from sonarpost.link.state import SavedParts
 
 _PREFIX: Final = "v1/"
 ARRIVAL: Final = "arrival/"
@@ -25,26 +23,16 @@ class LineStore:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._written: dict[str, bytes] = {}
+        self._saved = SavedParts({})
         self._arrivals = max((_number(name) for name in store.state_names(ARRIVAL)), default=0)
 
-    def load(self) -> tuple[dict[str, Mapping[str, object]], dict[str, bytes]]:
-        """Return the parts that were saved, and the bytes of those that are no map."""
-        parts: dict[str, Mapping[str, object]] = {}
-        unreadable: dict[str, bytes] = {}
-        for full_name in self._store.state_names(_PREFIX):
-            data = self._store.get_state(full_name) or b""
-            name = full_name.removeprefix(_PREFIX)
-            self._written[name] = _digest(data)
-            try:
-                part = msgpack.unpackb(data, strict_map_key=False)
-            except (ValueError, msgpack.exceptions.UnpackException):
-                part = None
-            if isinstance(part, dict):
-                parts[name] = part
-            else:
-                unreadable[name] = data
-        return parts, unreadable
+    def load(self) -> dict[str, bytes]:
+        """Return the parts that were saved."""
+        parts = {
+            name.removeprefix(_PREFIX): self._store.get_state(name) or b"" for name in self._store.state_names(_PREFIX)
+        }
+        self._saved = SavedParts(parts)
+        return parts
 
     def quarantine(self, reasons: Mapping[str, str]) -> None:
         """Keep parts apart as they are on the disk, where a person can find them, before others take their place.
@@ -59,21 +47,17 @@ class LineStore:
             for name, reason in reasons.items():
                 tx.quarantine("in", f"state {_PREFIX}{name}", self._store.get_state(_PREFIX + name) or b"", reason)
 
-    def write(self, tx: Transaction, parts: Mapping[str, Mapping[str, object]]) -> dict[str, bytes]:
-        """Write the parts that differ from what is on the disk; return what `wrote` wants once it is committed."""
-        digests: dict[str, bytes] = {}
-        for name, part in parts.items():
-            data = msgpack.packb(part)
-            digests[name] = _digest(data)
-            if self._written.get(name) != digests[name]:
+    def write(self, tx: Transaction, parts: Mapping[str, bytes]) -> None:
+        """Write the parts that differ from those on the disk; call `wrote` after the commit."""
+        for name, data in self._saved.changes(parts).items():
+            if data is None:
+                tx.delete_state(_PREFIX + name)
+            else:
                 tx.put_state(_PREFIX + name, data)
-        for name in self._written.keys() - digests.keys():
-            tx.delete_state(_PREFIX + name)
-        return digests
 
-    def wrote(self, digests: dict[str, bytes]) -> None:
-        """Note that the transaction of `write` is committed."""
-        self._written = digests
+    def wrote(self, parts: Mapping[str, bytes]) -> None:
+        """Record that the transaction of `write` is committed."""
+        self._saved.commit(parts)
 
     def arrival_name(self) -> str:
         """Return the name of a state for the next record that is accepted."""
@@ -90,7 +74,3 @@ class LineStore:
 
 def _number(name: str) -> int:
     return int(name.removeprefix(ARRIVAL))
-
-
-def _digest(data: bytes) -> bytes:
-    return hashlib.sha256(data).digest()

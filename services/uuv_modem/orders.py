@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from sonarpost import keys
-from sonarpost.errors import FrameError
 from sonarpost.link.downlink.messages import (
     CommandOutcome,
     DecisionMessage,
@@ -20,7 +19,7 @@ from sonarpost.link.downlink.messages import (
     pack,
     record_id_of,
 )
-from sonarpost.link.receiver_state import read_list
+from sonarpost.link.state import from_plain
 from sonarpost.messages import Command, CommandKind, Decision, Record
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 
@@ -65,7 +64,7 @@ class ReceivedCommands:
         if name in self.known:
             return self.known[name], None
         handed = self._handed(source, order, image_id)
-        outcome = CommandOutcome.TAKEN if handed.consumers else CommandOutcome.UNSUPPORTED
+        outcome = CommandOutcome.ACCEPTED if handed.consumers else CommandOutcome.UNSUPPORTED
         self.known[name] = outcome
         while len(self.known) > _REMEMBERED:
             del self.known[next(iter(self.known))]
@@ -132,14 +131,8 @@ class ReceivedCommands:
         Raises:
             FrameError: It is no such map.
         """
-        known: dict[tuple[int, bytes], CommandOutcome] = {}
-        for entry in read_list(part, "known"):
-            match entry:
-                case [int(source), bytes(order), int(outcome)] if outcome in tuple(CommandOutcome):
-                    known[source, order] = CommandOutcome(outcome)
-                case _:
-                    raise FrameError("uuv_modem state", "orders", entry, "[modem, order, outcome]")
-        self.known = known
+        known = from_plain(list[tuple[int, bytes, CommandOutcome]], part.get("known"), "uuv_modem state", "known")
+        self.known = {(source, order): outcome for source, order, outcome in known}
 
 
 _COMMANDS: Final[dict[type, CommandKind]] = {

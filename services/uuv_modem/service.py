@@ -99,7 +99,11 @@ class UuvModemService(ModemService[UuvModemConfig]):
 
     def check_capacity(self, key: str) -> None:
         """Leave messages with their programs while too many wait."""
-        if self._line is not None and key == keys.message_outgoing(self.platform.id) and not self._line.queue.has_room:
+        if (
+            self._line is not None
+            and key == keys.message_outgoing(self.platform.id)
+            and not self._line.queue.accepts_messages
+        ):
             raise RetryLaterError(f"{key}: {self.config.max_messages} messages wait already")
 
     def on_start(self) -> None:
@@ -126,10 +130,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
         # Read while the link works on it: numbers of one moment or the next, never of a half-done change.
         return {
             **super().gauges(),
-            "messages_waiting": float(len(line.queue.messages.waiting)),
-            "messages_expired": float(line.queue.messages.expired),
-            "rate": float(line.queue.rate),
-            "frame_loss": line.queue.sender.config.worst.loss,
+            **line.queue.gauges(),
         }
 
     def degraded_reason(self) -> str:
@@ -246,11 +247,11 @@ class UuvModemService(ModemService[UuvModemConfig]):
         expected = waiting.expected(now_utc_s)
         images = tuple(
             QueuedImage(
-                image_id=each.name.image_id,
-                contact_id=each.name.contact_id,
+                image_id=each.image_id,
+                contact_id=each.contact_id,
                 bytes_left=each.bytes_left,
-                preview_utc_s=each.preview_at,
-                expected_utc_s=each.done_at,
+                preview_utc_s=each.preview_s,
+                expected_utc_s=each.done_s,
             )
             for each in expected[:MAX_IMAGES_TOLD]
         )
@@ -258,10 +259,10 @@ class UuvModemService(ModemService[UuvModemConfig]):
             platform_id=self.platform.id,
             time_utc_s=now_utc_s,
             rate=waiting.rate,
-            frame_loss=waiting.loss,
+            frame_loss=waiting.measured_loss,
             packet_interval_s=min(waiting.packet_interval_s, 86400.0),
-            messages_waiting=len(waiting.messages.waiting),
-            message_bytes=waiting.messages.waiting_bytes,
+            messages_waiting=waiting.messages_waiting,
+            message_bytes=waiting.message_bytes,
             images_waiting=len(expected),
             images=images,
             images_accepted=self._line.images_accepted,

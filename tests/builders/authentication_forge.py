@@ -13,6 +13,7 @@ import sys
 import time
 
 from builders.authentication_world import VEHICLE, vehicle_seal, vessel_seal
+from builders.link_state import group
 from sonarpost.errors import FrameError
 from sonarpost.link.auth.key import AuthenticationSettings
 
@@ -45,28 +46,28 @@ def run(frames: int, seed: int, *, encrypt: bool, farther: int) -> dict[str, flo
     settings = AuthenticationSettings(encrypt=encrypt)
     start = settings.lifetime_frames - settings.counter_step * (farther + 1)
     vehicle, vessel = vehicle_seal(settings, first_counter=start), vessel_seal(settings)
-    recorded = [vehicle.seal(b"\x80" + rng.randbytes(56)) for _ in range(100)]
+    recorded = [vehicle.protect(b"\x80" + rng.randbytes(56)) for _ in range(100)]
     for n, sealed in enumerate(recorded):
         try:
-            vessel.open(VEHICLE, sealed)
+            vessel.verify(VEHICLE, sealed)
         except FrameError:
             assert n == 0  # the first waits to be confirmed
     before, began = vessel.counts, time.process_time()
-    windows = vessel.snapshot()["windows"]
+    windows = group(vessel.parts(), "window")
     genuine = {sealed[-5:]: sealed for sealed in recorded}
     passed = 0
     for _ in range(frames):
-        forged = forge(rng, recorded, settings.size)
+        forged = forge(rng, recorded, settings.overhead_bytes)
         if genuine.get(forged[-5:]) == forged:
             continue
         try:
-            vessel.open(VEHICLE, forged)
+            vessel.verify(VEHICLE, forged)
         except FrameError:
             continue
         passed += 1
     seconds = time.process_time() - began
     after = vessel.counts
-    assert passed or vessel.snapshot()["windows"] == windows
+    assert passed or group(vessel.parts(), "window") == windows
     return {
         "forged": after.forged - before.forged,
         "passed": passed,

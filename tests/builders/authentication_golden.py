@@ -29,7 +29,7 @@ def make() -> dict[str, object]:
         seal = FrameAuthenticator(key, source, direction, settings, first_counter=counter)
         seal.grant(counter + 1)
         if direction == Direction.FROM_VEHICLE:
-            symbol = Symbol(SymbolKind.OBJECT, 5, 17, 40, bytes(range(59 - settings.size)))
+            symbol = Symbol(SymbolKind.OBJECT, 5, 17, 40, bytes(range(59 - settings.overhead_bytes)))
             frame = pack_symbol(symbol, seal)
         else:
             frame = pack_segments([Segment(SegmentKind.MESSAGE, b"\x09go to 12")], 32, seal)

@@ -35,4 +35,4 @@ def vessel_seal(
 def skip(seal: FrameAuthenticator, frames: int) -> None:
     """Let so many frames be lost."""
     for _ in range(frames):
-        seal.seal(b"\x80lost")
+        seal.protect(b"\x80lost")

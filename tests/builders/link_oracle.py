@@ -12,8 +12,8 @@ from typing import Final
 
 from builders import v1_fuzz
 from builders.modem_fuzz import ENDS, LIKELY, Fuzz, real_lines
-from sonarpost.link.events import ContactUpdate, MessageReceived
-from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.receiver import ImageUpdate, MessageReceived
 from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, nmea
 
 VEHICLE: Final = 3
@@ -47,7 +47,7 @@ def check_receiver(data: bytes) -> int:
     Raises:
         AssertionError: Something that must hold does not.
     """
-    receiver, now, shown = LinkReceiver(v1_fuzz.SMALL), 0.0, 0
+    receiver, now, shown = V1Receiver(v1_fuzz.SMALL), 0.0, 0
     for kind, body in _steps(data):
         now += (0.0, 1.0, 70.0, 4000.0)[kind >> 2 & 3]
         if kind & 3 == 0:
@@ -59,16 +59,16 @@ def check_receiver(data: bytes) -> int:
         for source, frame in frames:
             for event in receiver.accept(source, frame, now):
                 assert source == STRANGER or v1_fuzz.is_right(event), f"shown though never sent: {event}"
-                shown += isinstance(event, ContactUpdate | MessageReceived)
+                shown += isinstance(event, ImageUpdate | MessageReceived)
         for source in receiver.sources:
-            if receiver.report_is_due(source, now):
-                report = receiver.report(source, now)
+            if receiver.feedback_is_due(source, now):
+                report = receiver.feedback(source, now)
                 assert report is None or len(report.pack()) <= 19
-            receiver.mini_report(source)
+            receiver.mini_feedback(source)
     v1_fuzz.check_bounds(receiver)
-    restored = LinkReceiver(v1_fuzz.SMALL)
-    restored.restore(receiver.snapshot())
-    assert restored.snapshot() == receiver.snapshot()
+    restored = V1Receiver(v1_fuzz.SMALL)
+    assert not restored.restore(receiver.parts())
+    assert restored.parts() == receiver.parts()
     return shown
 
 

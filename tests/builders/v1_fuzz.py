@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
 
 from sonarpost.link.config import ReceiverConfig, SenderConfig
-from sonarpost.link.events import ContactUpdate, MessageReceived
+from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import checksum
-from sonarpost.link.receiver import LinkReceiver
-from sonarpost.link.sender import LinkSender
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.receiver import ImageUpdate, MessageReceived
 
 SMALL = ReceiverConfig(max_sources=3, max_contacts=20, block_memory_s=300.0, contact_memory_s=900.0)
 MESSAGE = b"status: "
@@ -34,17 +36,17 @@ def genuine(seed: int) -> Iterator[bytes]:
     """Yield frames of a vehicle that goes on for ever, with every kind of content, sizes and settings changing."""
     rng, number = np.random.default_rng(seed), 0
     while True:
-        sender = LinkSender(
+        sender = V1Sender(
             SenderConfig(
                 frame_bytes=int(rng.choice([32, 64, 256])),
-                group_pictures=int(rng.integers(1, 9)),
+                group_images=int(rng.integers(1, 9)),
                 feedback=bool(rng.random() < 0.5),
             ),
             first_block=int(rng.integers(0, 32)),
         )
         for _ in range(int(rng.integers(1, 12))):
             number = number % 5000 + 1
-            sender.add_picture(number, record(number), picture_stream(number), 0.0)
+            sender.add_image(number, record(number), picture_stream(number), 0.0)
             if rng.random() < 0.3:
                 sender.add_message(MESSAGE + bytes([number % 256]) * int(rng.integers(1, 150)), 0.0)
         while (frame := sender.next_frame(0.0)) is not None:
@@ -86,8 +88,9 @@ def with_checksum(covered: bytes) -> bytearray:
 
 def is_right(event: object) -> bool:
     """Whether what the receiver shows was sent."""
-    if isinstance(event, ContactUpdate):
-        return event.contact == record(event.number) and picture_stream(event.number).startswith(event.stream)
+    if isinstance(event, ImageUpdate):
+        number = number_of_image(event.image_id)
+        return event.contact == record(number) and picture_stream(number).startswith(event.stream)
     if isinstance(event, MessageReceived):
         return event.data.startswith(MESSAGE)
     return True
@@ -101,7 +104,7 @@ def run(frames: int, seed: int = 0) -> dict[str, int]:
     source of their own, whose events are counted apart; of all others none may be wrong.
     """
     rng = np.random.default_rng(seed)
-    source, receiver, now = genuine(seed), LinkReceiver(SMALL), 0.0
+    source, receiver, now = genuine(seed), V1Receiver(SMALL), 0.0
     past: list[bytes] = []
     counts = {"frames": 0, "shown": 0, "wrong": 0, "forged": 0}
     for step in range(frames):
@@ -121,41 +124,39 @@ def run(frames: int, seed: int = 0) -> dict[str, int]:
         counts["frames"] += 1
         for event in events:
             wrong = not is_right(event)
-            counts["shown"] += isinstance(event, ContactUpdate | MessageReceived)
+            counts["shown"] += isinstance(event, ImageUpdate | MessageReceived)
             counts["wrong" if address == 3 else "forged"] += wrong
         if step % 5000 == 0:
             check_bounds(receiver)
-            restored = LinkReceiver(SMALL)
-            restored.restore(receiver.snapshot())
+            restored = V1Receiver(SMALL)
+            assert not restored.restore(receiver.parts())
             receiver = restored
     check_bounds(receiver)
     return counts
 
 
-def check_bounds(receiver: LinkReceiver) -> None:
+def check_bounds(receiver: V1Receiver) -> None:
     """Assert that memory is bounded."""
-    sources = receiver.snapshot()["sources"]
-    assert isinstance(sources, list)
-    assert len(sources) <= SMALL.max_sources
-    for source in sources:
-        assert len(source["contacts"]) <= SMALL.max_contacts
-        assert len(source["blocks"]) <= 32
-        assert all(len(block["symbols"]) <= 255 for block in source["blocks"])
+    assert len(receiver.sources) <= SMALL.max_sources
+    groups = Counter(name.rpartition("/")[0] for name in receiver.parts())
+    assert all(n <= SMALL.max_contacts for group, n in groups.items() if group.startswith("image/"))
+    assert all(n <= 32 for group, n in groups.items() if group.startswith(("block/", "rival/")))
+    assert all(n <= 16 for group, n in groups.items() if group.startswith(("block-symbols/", "rival-symbols/")))
 
 
 def one_input(data: bytes) -> None:
     """Take frames from one string: a length byte, then a frame, with its checksum put right."""
-    receiver, at, now = LinkReceiver(SMALL), 0, 0.0
+    receiver, at, now = V1Receiver(SMALL), 0, 0.0
     while at < len(data):
         covered = data[at + 1 : at + 1 + data[at]]
         at += 1 + data[at]
         now += 1.0
         receiver.accept(3, bytes(with_checksum(covered)), now)
         receiver.accept(3, covered, now)
-    receiver.report(3, now)
-    receiver.mini_report(3)
+    receiver.feedback(3, now)
+    receiver.mini_feedback(3)
     check_bounds(receiver)
-    LinkReceiver(SMALL).restore(receiver.snapshot())
+    assert not V1Receiver(SMALL).restore(receiver.parts())
 
 
 def main(arguments: list[str]) -> None:

@@ -14,9 +14,9 @@ from builders.common import GOLDEN_FOLDER
 from sonarpost.link.coding import erasure_code as fec
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
-from sonarpost.link.events import ContactUpdate, Event, FeedbackReceived, FrameRefused, MessageReceived
+from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import Feedback, FeedbackRequest, pack_mini
+from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest, pack_mini
 from sonarpost.link.frames.v1.frame import (
     Content,
     Segment,
@@ -30,8 +30,9 @@ from sonarpost.link.frames.v1.frame import (
 from sonarpost.link.frames.v1.layers import Layering, layered_symbols
 from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, StreamPiece
 from sonarpost.link.frames.v1.preview import Preview
-from sonarpost.link.receiver import LinkReceiver
-from sonarpost.link.sender import LinkSender
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.receiver import Event, FeedbackReceived, FrameRejected, ImageUpdate, MessageReceived
 from sonarpost.sonar.survey import Side
 
 FOLDER = GOLDEN_FOLDER / "acoustic-v1"
@@ -71,19 +72,19 @@ def describe_content(content: Content) -> dict[str, Any]:
 
 def describe_event(event: Event) -> dict[str, Any]:
     match event:
-        case ContactUpdate():
+        case ImageUpdate():
             return {
-                "contact": event.number,
+                "contact": number_of_image(event.image_id),
                 "version": event.version,
-                "record": event.contact.pack().hex(),
+                "record": event.contact.pack().hex() if event.contact else "",
                 "stream": event.stream.hex(),
                 "complete": event.complete,
             }
         case MessageReceived():
             return {"message": event.number, "data": event.data.hex()}
-        case FeedbackReceived(report=report):
+        case FeedbackReceived(feedback=report):
             return {"report": type(report).__name__, "data": report.pack().hex()}
-        case FrameRefused():
+        case FrameRejected():
             return {"refused": event.reason.field}
 
 
@@ -105,7 +106,7 @@ def frames() -> dict[str, Any]:
         ((Segment(SegmentKind.PREVIEW, Preview(9, CONTACT, counted(20)).pack(49)),), 64),
         ((Segment(SegmentKind.SYMBOL, Symbol(SymbolKind.OBJECT, 4, 3, 2, counted(27)).head() + counted(27)),), 64),
         ((Segment(SegmentKind.FEEDBACK, Feedback(3, 1000, (12, 0, 255)).pack()),), 32),
-        ((Segment(SegmentKind.REQUEST, FeedbackRequest(7, 700).pack()),), 32),
+        ((Segment(SegmentKind.REQUEST, RefineRequest(7, 700).pack()),), 32),
     ]
     good = [
         {"frame": (pack_symbol(c) if isinstance(c, Symbol) else pack_segments(c, size)).hex(), **describe_content(c)}
@@ -160,7 +161,7 @@ def objects() -> dict[str, Any]:
                 "final": g.final,
                 "object": data.hex(),
             }
-            for g, data in ((base, base.pack(180)), (above, above.pack(14, base)), (apart, apart.pack(40)))
+            for g, data in ((base, base.pack(180)), (above, above.pack(14, base.ends)), (apart, apart.pack(40)))
         ],
         "messages": [
             {"number": 200, "data": counted(20).hex(), "object": MessageObject(200, counted(20)).pack(54).hex()}
@@ -172,18 +173,18 @@ def objects() -> dict[str, Any]:
 def exchange() -> dict[str, Any]:
     """Frames with times, and what a receiver must report of them."""
     steps: list[dict[str, Any]] = []
-    receiver, rng = LinkReceiver(), np.random.default_rng(1)
+    receiver, rng = V1Receiver(), np.random.default_rng(1)
     for channels, size in (
         ((LossChannel(0.2),), 64),
         ((LossChannel(0.05), LossChannel(0.6)), 64),
         ((LossChannel(0.2),), 32),
     ):
-        sender = LinkSender(SenderConfig(frame_bytes=size, channels=channels, frames_per_image=9.0), first_block=30)
+        sender = V1Sender(SenderConfig(frame_bytes=size, channels=channels, frames_per_image=9.0), first_block=30)
         source = 3 + len(channels) + size
         for number in range(1, 7):
             length = 250 if number % 2 else 12
             record = ContactSummary(lat_deg=number / 10, lon_deg=-1.0)
-            sender.add_picture(number, record, counted(length, number), 0.0)
+            sender.add_image(number, record, counted(length, number), 0.0)
         sender.add_message(b"hello", 0.0, times=1)
         sender.add_message(counted(150), 0.0)
         while (frame := sender.next_frame(0.0)) is not None:
@@ -197,7 +198,7 @@ def exchange() -> dict[str, Any]:
     reports = {
         str(source): report.pack().hex()
         for source in sorted({s["source"] for s in steps})
-        if (report := receiver.report(source, float(len(steps)))) is not None
+        if (report := receiver.feedback(source, float(len(steps)))) is not None
     }
     return {"steps": steps, "reports": reports}
 

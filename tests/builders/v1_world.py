@@ -8,10 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sonarpost.link.config import ReceiverConfig, SenderConfig
-from sonarpost.link.events import ContactUpdate, Event, FeedbackReceived, FrameRefused, MessageReceived
+from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.receiver import LinkReceiver
-from sonarpost.link.sender import LinkSender
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.receiver import Event, FeedbackReceived, FrameRejected, ImageUpdate, MessageReceived
+from sonarpost.link.sender import ImageSender
 
 VEHICLE = 3
 VESSEL = 1
@@ -25,12 +27,20 @@ def stream(number: int, length: int) -> bytes:
     return np.random.default_rng(number).integers(0, 256, length, dtype=np.uint8).tobytes()
 
 
+def take_packet(queue: ImageSender, now: float) -> tuple[bytes, ...]:
+    """Return the frames of the next packet, which counts as sent, none if there is none."""
+    packet = queue.next_packet(now)
+    frames = () if packet is None else packet.frames
+    queue.sent(frames, queue.packet_interval_s)
+    return frames
+
+
 @dataclass
 class World:
     """Sends frames of 1 s through water that loses those it says."""
 
-    sender: LinkSender
-    receiver: LinkReceiver
+    sender: V1Sender
+    receiver: V1Receiver
     passes: Callable[[], bool]
     feedback: bool = False
     now: float = 0.0
@@ -43,15 +53,15 @@ class World:
     def make(cls, loss: float, seed: int = 0, *, receiver: ReceiverConfig | None = None, **config: object) -> World:
         rng = np.random.default_rng(seed)
         made = SenderConfig(**config)  # type: ignore[arg-type]
-        return cls(LinkSender(made), LinkReceiver(receiver), lambda: bool(rng.random() >= loss), feedback=made.feedback)
+        return cls(V1Sender(made), V1Receiver(receiver), lambda: bool(rng.random() >= loss), feedback=made.feedback)
 
     def add(self, count: int, length: int, first: int = 1) -> None:
         for number in range(first, first + count):
             self.sent[number] = stream(number, length)
-            self.sender.add_picture(number, contact(number), self.sent[number], self.now)
+            self.sender.add_image(number, contact(number), self.sent[number], self.now)
 
     def run(self, most_frames: int = 100_000) -> None:
-        back, vessel = LinkReceiver(), LinkSender(SenderConfig(frame_bytes=32))
+        back, vessel = V1Receiver(), V1Sender(SenderConfig(frame_bytes=32))
         stop = self.now + most_frames
         while not self.sender.is_idle and self.now < stop:
             self.now += 1.0
@@ -61,11 +71,11 @@ class World:
                 self.frames += 1
                 if self.passes():
                     self.take(frame)
-            if not (self.feedback and self.receiver.report_is_due(VEHICLE, self.now)):
+            if not (self.feedback and self.receiver.feedback_is_due(VEHICLE, self.now)):
                 continue
-            report = self.receiver.report(VEHICLE, self.now)
+            report = self.receiver.feedback(VEHICLE, self.now)
             assert report is not None
-            vessel.add_report(report)
+            vessel.add_feedback(report)
             told = vessel.next_frame(self.now)
             assert told is not None
             assert len(told) == 32
@@ -73,23 +83,24 @@ class World:
             if self.passes():
                 (event,) = back.accept(VESSEL, told, self.now)
                 assert isinstance(event, FeedbackReceived)
-                self.sender.on_report(event.report, self.now)
+                self.sender.on_feedback(event.feedback, self.now)
 
     def take(self, frame: bytes) -> None:
         found = self.receiver.accept(VEHICLE, frame, self.now)
         for event in found:
-            assert not isinstance(event, FrameRefused), event.reason
-            if isinstance(event, ContactUpdate):
+            assert not isinstance(event, FrameRejected), event.reason
+            if isinstance(event, ImageUpdate):
                 self.check(event)
         self.events += found
 
-    def check(self, event: ContactUpdate) -> None:
-        assert self.sent[event.number].startswith(event.stream)
-        assert event.contact == contact(event.number)
+    def check(self, event: ImageUpdate) -> None:
+        number = number_of_image(event.image_id)
+        assert self.sent[number].startswith(event.stream)
+        assert event.contact == contact(number)
 
     @property
-    def latest(self) -> dict[int, ContactUpdate]:
-        return {e.number: e for e in self.events if isinstance(e, ContactUpdate)}
+    def latest(self) -> dict[int, ImageUpdate]:
+        return {number_of_image(e.image_id): e for e in self.events if isinstance(e, ImageUpdate)}
 
     @property
     def messages(self) -> list[bytes]:

@@ -23,7 +23,7 @@ SAMPLES: dict[str, dl.Content] = {
     "decision": dl.DecisionMessage(6, 1_790_000_003, 300, 4, "not_mine_like", 0.5, "Manta"),
     "decision-bare": dl.DecisionMessage(7, 4_294_967_295, 300, 300, "unsure"),
     "confirmation": dl.ConfirmationMessage(
-        ((1, dl.CommandOutcome.TAKEN), (2**32 - 1, dl.CommandOutcome.UNKNOWN_IMAGE))
+        ((1, dl.CommandOutcome.ACCEPTED), (2**32 - 1, dl.CommandOutcome.UNKNOWN_IMAGE))
     ),
     "wider": dl.ExpandMessage(0x0A0B0C0D, 1_790_000_004, 7),
     "data": dl.DataMessage(b"\x00status"),
@@ -121,7 +121,7 @@ def test_wrong_messages_name_the_field(packed: bytes, field: str) -> None:
 
 
 def test_confirmations_fill_messages() -> None:
-    outcomes = [(token, dl.CommandOutcome.TAKEN) for token in range(12)]
+    outcomes = [(token, dl.CommandOutcome.ACCEPTED) for token in range(12)]
     made = dl.confirmations(outcomes)
     assert [len(each.outcomes) for each in made] == [5, 5, 2]
     assert [pair for each in made for pair in each.outcomes] == outcomes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import json
 import math
@@ -11,19 +10,14 @@ from typing import Any
 import msgpack
 import pytest
 from builders.common import GOLDEN_FOLDER
+from builders.link_state import field_names, group, plain_of, with_fields
+from builders.paper_images import body_of, header_of, received_of
 
 from sonarpost.codec.interface import StreamHeader
-from sonarpost.errors import FrameError
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, format_image_id, half_bounds
-from sonarpost.link.frames.paper.receiver import (
-    ContactOnly,
-    Event,
-    ImageReady,
-    PaperFrameRejected,
-    PaperReceiver,
-    PaperReceiverCounts,
-)
+from sonarpost.link.frames.paper.receiver import ImageCandidate, PaperReceiver, PaperReceiverCounts, PendingImage
+from sonarpost.link.receiver import Event, FrameRejected, ImageUpdate
 
 GOLDEN = json.loads((GOLDEN_FOLDER / "link" / "paper_receiver.json").read_text())["scenarios"]
 HEADER = StreamHeader(0x10, 0xBEEF, 113, 49)
@@ -45,29 +39,40 @@ def contact(image_id: str = "00A7", record: ContactSummary = CONTACT) -> bytes:
     return ContactFrame(image_id, record).pack()
 
 
-def images(events: list[Event]) -> list[ImageReady]:
-    assert all(isinstance(e, ImageReady) for e in events)
-    return [e for e in events if isinstance(e, ImageReady)]
+def images(events: list[Event]) -> list[ImageUpdate]:
+    """Return the events, which must all be images with a stream."""
+    updates = [e for e in events if isinstance(e, ImageUpdate) and e.stream]
+    assert len(updates) == len(events)
+    return updates
+
+
+def contacts_only(events: list[Event]) -> list[ImageUpdate]:
+    """Return the events, which must all be contact records without a stream."""
+    updates = [e for e in events if isinstance(e, ImageUpdate) and not e.stream]
+    assert len(updates) == len(events)
+    return updates
 
 
 def describe(event: Event) -> dict[str, Any]:
     """The event as the golden files write it."""
     match event:
-        case ImageReady():
+        case ImageUpdate() if event.stream:
             return {
                 "event": "image",
                 "source": event.source,
                 "image_id": event.image_id,
                 "version": event.version,
-                "body": event.body.hex(),
-                "received": [list(r) for r in event.received],
+                "body": body_of(event).hex(),
+                "received": [list(r) for r in received_of(event)],
                 "missing_halves": list(event.missing_halves),
                 "complete": event.complete,
                 "has_contact": event.contact is not None,
                 "frames": event.frames,
                 "conflicts": event.conflicts,
             }
-        case ContactOnly():
+        case ImageUpdate():
+            assert event.contact is not None
+            assert (event.complete, event.missing_halves) == (False, ("top", "bottom"))
             return {
                 "event": "contact",
                 "source": event.source,
@@ -75,8 +80,9 @@ def describe(event: Event) -> dict[str, Any]:
                 "version": event.version,
                 "conflicts": event.conflicts,
             }
-        case PaperFrameRejected():
+        case FrameRejected():
             return {"event": "rejected", "source": event.source, "field": event.reason.field}
+    raise AssertionError(event)
 
 
 @pytest.mark.parametrize("case", GOLDEN, ids=[c["name"] for c in GOLDEN])
@@ -97,7 +103,7 @@ def test_an_event_carries_times_stream_and_mask_for_the_decoder() -> None:
     assert receiver.accept(2, piece(5, 8), 12) == []
     assert receiver.next_deadline() == 72
     (event,) = images(receiver.poll(72))
-    assert (event.first_at, event.last_at) == (10, 12)
+    assert (event.first_frame_s, event.last_frame_s) == (10, 12)
     assert event.contact == CONTACT
     assert event.stream == HEADER.pack() + BODY[:2] + bytes(3) + BODY[5:8] + bytes(1)
     assert event.received_mask().tolist() == [True, True, False, False, False, True, True, True, False]
@@ -113,7 +119,7 @@ def test_the_wait_counts_from_the_last_frame_that_added_something() -> None:
     assert receiver.next_deadline() == 110
     assert receiver.poll(109.9) == []
     (event,) = images(receiver.poll(110))
-    assert event.received == ((0, 3),)
+    assert received_of(event) == ((0, 3),)
     assert receiver.counts.duplicates == 1
 
 
@@ -122,7 +128,7 @@ def test_accept_first_gives_out_what_is_due() -> None:
     receiver.accept(2, half("top"), 0)
     first, second = images(receiver.accept(2, half("bottom"), 1000))
     assert (first.version, first.complete) == (1, False)
-    assert (second.version, second.complete, second.body) == (2, True, BODY)
+    assert (second.version, second.complete, body_of(second)) == (2, True, BODY)
 
 
 def test_a_late_frame_does_not_push_out_the_image_that_waits() -> None:
@@ -156,8 +162,7 @@ def test_a_half_of_another_image_leaves_a_contact_record_waiting_for_its_picture
     receiver = PaperReceiver(60)
     receiver.accept(2, contact("00A7"), 0)
     assert receiver.accept(2, half("top", "00A8"), 1) == []
-    (event,) = receiver.poll(60)
-    assert isinstance(event, ContactOnly)
+    (event,) = contacts_only(receiver.poll(60))
     assert event.image_id == "00A7"
 
 
@@ -167,8 +172,7 @@ def test_a_second_different_contact_record_is_counted_and_the_first_stays() -> N
     receiver.accept(2, contact(), 0)
     receiver.accept(2, contact(record=other), 1)
     receiver.accept(2, contact(), 2)
-    (event,) = receiver.poll(60)
-    assert isinstance(event, ContactOnly)
+    (event,) = contacts_only(receiver.poll(60))
     assert event.contact == CONTACT
     assert event.conflicts == 1
     assert receiver.counts == PaperReceiverCounts(frames=3, duplicates=2, conflicts=1, contacts_only=1)
@@ -180,7 +184,7 @@ def test_bytes_that_are_there_stay_when_a_repetition_says_otherwise() -> None:
     damaged = HalfFrame("top", "00A7", 1, 9, HEADER, b"\xa2\x00\xa4\xa5").pack()
     receiver.accept(2, damaged, 1)
     (event,) = images(receiver.poll(61))
-    assert event.body == BODY[:5] + bytes(4)
+    assert body_of(event) == BODY[:5] + bytes(4)
     assert (event.frames, event.conflicts) == (2, 1)
 
 
@@ -192,7 +196,7 @@ def test_the_checked_contact_record_decides_between_stream_headers() -> None:
     receiver.accept(2, half("top"), 2)
     assert receiver.accept(2, contact(), 3) == []
     (event,) = images(receiver.poll(63))
-    assert event.header == HEADER
+    assert header_of(event) == HEADER
     assert event.frames == 1
 
 
@@ -203,18 +207,18 @@ def test_more_frames_outvote_more_bytes() -> None:
     receiver.accept(2, piece(0, 1), 1)
     receiver.accept(2, piece(1, 2), 2)
     (event,) = images(receiver.poll(62))
-    assert (event.header, event.received) == (HEADER, ((0, 2),))
+    assert (header_of(event), received_of(event)) == (HEADER, ((0, 2),))
 
 
 def test_a_header_outvoted_after_it_was_given_out_is_corrected_by_a_new_version() -> None:
     wrong = StreamHeader(0x10, 0xBEEF, 113, 48)
     receiver = PaperReceiver(60)
     receiver.accept(2, half("top", header=wrong), 0)
-    assert [e.header for e in images(receiver.poll(60))] == [wrong]
+    assert [header_of(e) for e in images(receiver.poll(60))] == [wrong]
     assert receiver.accept(2, half("top"), 61) == []  # a draw: the first one stays, nothing new to give out
     assert receiver.next_deadline() is None
     (event,) = images(receiver.accept(2, half("bottom"), 62))
-    assert (event.version, event.header, event.body, event.complete) == (2, HEADER, BODY, True)
+    assert (event.version, header_of(event), body_of(event), event.complete) == (2, HEADER, BODY, True)
 
 
 def test_a_fourth_stream_header_is_refused() -> None:
@@ -222,7 +226,7 @@ def test_a_fourth_stream_header_is_refused() -> None:
     for width in (49, 50, 51):
         assert receiver.accept(2, half("top", header=dataclasses.replace(HEADER, width_px=width)), 0) == []
     (event,) = receiver.accept(2, half("top", header=dataclasses.replace(HEADER, width_px=52)), 1)
-    assert isinstance(event, PaperFrameRejected)
+    assert isinstance(event, FrameRejected)
     assert event.source == 2
     assert event.reason.field == "stream header"
     assert receiver.counts == PaperReceiverCounts(frames=4, rejected=1, conflicts=3)
@@ -234,7 +238,7 @@ def test_frames_that_disagree_on_the_body_length_are_kept_apart() -> None:
     assert receiver.accept(2, longer, 0) == []
     assert receiver.accept(2, half("top"), 1) == []
     (event,) = images(receiver.accept(2, half("bottom"), 2))
-    assert (event.header, event.body, event.complete) == (HEADER, BODY, True)
+    assert (header_of(event), body_of(event), event.complete) == (HEADER, BODY, True)
     assert event.conflicts == 2
     assert receiver.counts.rejected == 0
 
@@ -244,7 +248,7 @@ def test_a_fourth_body_length_is_refused() -> None:
     for length in (9, 10, 11):
         assert receiver.accept(2, HalfFrame("top", "00A7", 0, length, HEADER, b"x").pack(), 0) == []
     (event,) = receiver.accept(2, HalfFrame("top", "00A7", 0, 12, HEADER, b"x").pack(), 1)
-    assert isinstance(event, PaperFrameRejected)
+    assert isinstance(event, FrameRejected)
     assert receiver.counts == PaperReceiverCounts(frames=4, rejected=1, conflicts=3)
 
 
@@ -252,14 +256,14 @@ def test_a_fourth_body_length_is_refused() -> None:
 def test_an_image_without_a_bottom_half_is_complete_with_its_top(length: int) -> None:
     receiver = PaperReceiver(60)
     (event,) = images(receiver.accept(2, half("top", body=BODY[:length]), 0))
-    assert (event.complete, event.body, event.missing_halves) == (True, BODY[:length], ())
+    assert (event.complete, body_of(event), event.missing_halves) == (True, BODY[:length], ())
 
 
 def test_a_frame_without_body_bytes_announces_the_picture() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, half("bottom")[:16], 0)
     (event,) = images(receiver.poll(60))
-    assert (event.received, event.body, event.missing_halves) == ((), bytes(9), ("top", "bottom"))
+    assert (received_of(event), body_of(event), event.missing_halves) == ((), bytes(9), ("top", "bottom"))
     assert event.received_mask().tolist() == [False] * 9
 
 
@@ -271,7 +275,7 @@ def test_an_identifier_used_again_much_later_is_a_new_image() -> None:
     assert receiver.counts.duplicates == 1  # heard again, so remembered from here
     assert receiver.accept(2, half("top"), 7202) == []
     (event,) = images(receiver.accept(2, half("bottom"), 7203))
-    assert (event.version, event.first_at, event.complete) == (1, 7202, True)
+    assert (event.version, event.first_frame_s, event.complete) == (1, 7202, True)
 
 
 def test_a_clock_that_is_set_back_does_not_hold_an_image() -> None:
@@ -287,7 +291,7 @@ def test_a_clock_that_was_set_back_stays_so_over_a_restart() -> None:
     receiver.accept(2, half("top"), 1_000_000)
     receiver.poll(500)
     other = PaperReceiver(60)
-    other.restore(receiver.snapshot())
+    assert not other.restore(receiver.parts())
     assert other.next_deadline() == 560
 
 
@@ -308,8 +312,7 @@ def test_memory_is_bounded_and_nothing_is_dropped_unsaid() -> None:
         frame = HalfFrame("top", format_image_id(number), 0, 65535, HEADER, b"x").pack()
         events += receiver.accept(number, frame, number / 100)
     assert [e.source for e in images(events)] == list(range(46))  # the longest unheard first
-    state: Any = receiver.snapshot()
-    assert len(state["images"]) == 4
+    assert len(group(receiver.parts(), "image")) == 4
     assert receiver.counts.evicted == 46
     assert sorted(e.source for e in images(receiver.poll(100))) == [46, 47, 48, 49]
 
@@ -327,7 +330,7 @@ def test_making_room_forgets_what_was_given_out_before_what_waits() -> None:
 def test_contact_frames_alone_are_bounded_too() -> None:
     receiver = PaperReceiver(60, max_images=3)
     events = [e for n in range(10) for e in receiver.accept(2, contact(format_image_id(n)), n / 10)]
-    assert [e.image_id for e in events if isinstance(e, ContactOnly)] == [format_image_id(n) for n in range(7)]
+    assert [e.image_id for e in contacts_only(events)] == [format_image_id(n) for n in range(7)]
 
 
 @pytest.mark.parametrize(
@@ -356,72 +359,77 @@ def busy_receiver() -> PaperReceiver:
     return receiver
 
 
-def test_the_state_survives_msgpack_and_is_the_same_state() -> None:
+def test_a_restored_state_is_the_same() -> None:
     receiver = busy_receiver()
-    state = msgpack.unpackb(msgpack.packb(receiver.snapshot()))
     other = PaperReceiver(60)
-    other.restore(state)
-    assert other.snapshot() == receiver.snapshot()
+    assert other.restore(receiver.parts()) == {}
+    assert other.parts() == receiver.parts()
     assert other.counts == receiver.counts
     assert other.next_deadline() == receiver.next_deadline()
 
 
-def _edits() -> list[Any]:
-    """One wrong value for every place of a state, as (path, value)."""
-    image = ("images", 0)
+IMAGE = "image/2/00A7"
+
+
+def _wrong_fields() -> list[tuple[str, dict[str, Any]]]:
+    """One wrong value for every field of a state, as (part, fields)."""
+    plain = plain_of(busy_receiver().parts(), IMAGE)
+    candidates = plain[field_names(PendingImage).index("candidates")]
+    candidate = dict(zip(field_names(ImageCandidate)[1:], candidates[0], strict=True))
+    wrong_candidates: list[Any] = [
+        7,
+        {"header": b"\x10sh"},
+        {"header": HEADER.pack() + b"\0"},
+        {"header": b"\x10\xbe\xef\xe1"},
+        {"body": None},
+        {"body": "9"},
+        {"body": packed_body(-1)},
+        {"body": packed_body(65536)},
+        {"body": packed_body(8, [5, bytes(5)])},
+        {"body": packed_body(9, [-1, b"x"])},
+        {"body": packed_body(9, ["0", b"x"])},
+        {"body": packed_body(9, [3, b"x"], [0, b"x"])},
+        {"frames": 1.5},
+    ]
+    values: list[tuple[str, Any]] = [
+        ("version", "1"),
+        ("source", "2"),
+        ("image_id", "a7"),
+        ("image_id", 7),
+        ("first_frame_s", "1"),
+        ("wait_from_s", math.nan),
+        ("last_seen_s", None),
+        ("candidates", []),
+        ("candidates", None),
+        ("candidates", [candidate] * 4),
+        *(("candidates", [{**candidate, **c} if isinstance(c, dict) else c]) for c in wrong_candidates),
+        ("contact", bytes(24)),
+        ("contact", "text"),
+        ("conflicts", None),
+        ("reported", [0, 9]),
+        ("reported", "reported"),
+    ]
     return [
-        (("format",), 2),
-        (("images",), {}),
-        (("images", 0), 7),
-        ((*image, "source"), "2"),
-        ((*image, "image_id"), "a7"),
-        ((*image, "image_id"), 7),
-        ((*image, "first_at"), 1),
-        ((*image, "news_at"), math.nan),
-        ((*image, "heard_at"), None),
-        ((*image, "candidates"), []),
-        ((*image, "candidates"), None),
-        ((*image, "candidates", 0), []),
-        ((*image, "candidates", 0, "header"), b"\x10sh"),
-        ((*image, "candidates", 0, "header"), HEADER.pack() + b"\0"),
-        ((*image, "candidates", 0, "header"), b"\x10\xbe\xef\xe1"),
-        ((*image, "candidates", 0, "body_length"), None),
-        ((*image, "candidates", 0, "body_length"), "9"),
-        ((*image, "candidates", 0, "body_length"), -1),
-        ((*image, "candidates", 0, "body_length"), 65536),
-        ((*image, "candidates", 0, "body_length"), 8),
-        ((*image, "candidates", 0, "pieces", 0), [5, bytes(5)]),
-        ((*image, "candidates", 0, "pieces", 0), [-1, b"x"]),
-        ((*image, "candidates", 0, "pieces", 0), ["0", b"x"]),
-        ((*image, "candidates", 0, "frames"), 1.5),
-        ((*image, "contact"), bytes(24)),
-        ((*image, "contact"), "text"),
-        ((*image, "conflicts"), None),
-        ((*image, "version"), "1"),
-        ((*image, "given"), [0, 9]),
-        ((*image, "given"), "given"),
-        (("counts",), []),
-        (("counts", "frames"), None),
+        *((IMAGE, {name: value}) for name, value in values),
+        ("counts", {"format version": 3}),
+        ("counts", {"frames": None}),
     ]
 
 
-@pytest.mark.parametrize(("path", "value"), _edits(), ids=str)
-def test_a_damaged_state_is_refused_and_changes_nothing(path: tuple[Any, ...], value: Any) -> None:
-    state: Any = copy.deepcopy(busy_receiver().snapshot())
-    inner = state
-    for key in path[:-1]:
-        inner = inner[key]
-    inner[path[-1]] = value
-    receiver = busy_receiver()
-    before = receiver.snapshot()
-    with pytest.raises(FrameError) as caught:
-        receiver.restore(state)
-    assert "receiver state" in str(caught.value)
-    assert receiver.snapshot() == before
+def packed_body(length: int, *pieces: object) -> bytes:
+    data: bytes = msgpack.packb([length, list(pieces)])
+    return data
 
 
-def test_too_many_candidates_in_a_state_are_refused() -> None:
-    state: Any = busy_receiver().snapshot()
-    state["images"][0]["candidates"] *= 4
-    with pytest.raises(FrameError, match="candidates"):
-        PaperReceiver(60).restore(state)
+@pytest.mark.parametrize(("name", "change"), _wrong_fields(), ids=str)
+def test_a_malformed_part_is_reported_and_the_others_are_restored(name: str, change: dict[str, Any]) -> None:
+    parts = busy_receiver().parts()
+    receiver = PaperReceiver(60)
+    errors = receiver.restore(
+        with_fields(parts, name, PaperReceiverCounts if name == "counts" else PendingImage, change)
+    )
+    assert list(errors) == [name]
+    assert str(errors[name]).startswith(f"paper receiver state: {name}: ")
+    kept = {part: data for part, data in parts.items() if part != name}
+    assert {part: data for part, data in receiver.parts().items() if part in kept} == kept
+    assert (IMAGE in receiver.parts()) == (name != IMAGE)

@@ -7,7 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-import msgpack
+from builders.link_state import field_names, group, plain_of
+from builders.paper_images import body_of, header_of, received_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,8 +17,9 @@ from sonarpost.errors import FrameError
 from sonarpost.link.coding.byte_ranges import Ranges
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, parse_frame
-from sonarpost.link.frames.paper.receiver import ContactOnly, Event, ImageReady, PaperFrameRejected, PaperReceiver
+from sonarpost.link.frames.paper.receiver import PaperReceiver, PendingImage
 from sonarpost.link.frames.paper.sender import plan_packets
+from sonarpost.link.receiver import Event, FrameRejected, ImageUpdate
 
 RATES = [(1, 32), (3, 64), (2, 256), (6, 32)]
 CONTACT = ContactSummary(height_px=80, width_px=140, lat_deg=44.7, lon_deg=-63.6, confidence=1.5)
@@ -113,7 +115,7 @@ class Ledger:
         self.images = {(image.source, image.image_id): image for image in images}
         self.bytes_there: dict[Key, set[int]] = defaultdict(set)
         self.contact_there: dict[Key, bool] = defaultdict(bool)
-        self.versions: dict[Key, list[ImageReady | ContactOnly]] = defaultdict(list)
+        self.versions: dict[Key, list[ImageUpdate]] = defaultdict(list)
 
     def deliver(self, step: Step) -> bool:
         """Note what the frame brings; return whether it parses."""
@@ -128,14 +130,14 @@ class Ledger:
             self.contact_there[key] = True
         return True
 
-    def check(self, event: ImageReady | ContactOnly) -> None:
+    def check(self, event: ImageUpdate) -> None:
         key = (event.source, event.image_id)
         earlier = self.versions[key]
         assert event.version == len(earlier) + 1
-        if isinstance(event, ImageReady):
-            image, there = self.images[key], positions(event.received)
-            assert event.header == image.header
-            assert event.body == bytes(b if i in there else 0 for i, b in enumerate(image.body))
+        if event.stream:
+            image, there = self.images[key], positions(received_of(event))
+            assert header_of(event) == image.header
+            assert body_of(event) == bytes(b if i in there else 0 for i, b in enumerate(image.body))
             assert there <= self.bytes_there[key]
             assert event.complete == (len(there) == len(image.body))
             assert event.conflicts == 0
@@ -145,10 +147,10 @@ class Ledger:
         earlier.append(event)
 
 
-def knowledge(event: ImageReady | ContactOnly) -> tuple[int, ...]:
-    if isinstance(event, ContactOnly):
+def knowledge(event: ImageUpdate) -> tuple[int, ...]:
+    if not event.stream:
         return 1, -1
-    return int(event.contact is not None) + len(positions(event.received)), int(event.contact is not None)
+    return int(event.contact is not None) + len(positions(received_of(event))), int(event.contact is not None)
 
 
 @settings(max_examples=250, deadline=None)
@@ -161,20 +163,20 @@ def test_any_frames_in_any_order_give_right_bytes_and_every_version_once(
     for step in steps:
         parses = step.frame is None or ledger.deliver(step)
         events = take(receiver, step)
-        rejected = [e for e in events if isinstance(e, PaperFrameRejected)]
+        rejected = [e for e in events if isinstance(e, FrameRejected)]
         assert len(rejected) == (0 if parses else 1)
         for event in events:
-            if not isinstance(event, PaperFrameRejected):
+            if isinstance(event, ImageUpdate):
                 ledger.check(event)
     for event in receiver.poll(1e9):
-        assert not isinstance(event, PaperFrameRejected)
+        assert isinstance(event, ImageUpdate)
         ledger.check(event)
     assert receiver.next_deadline() is None
     # Nothing that arrived is held back: the last version of each image tells all of it.
     for key, there in ledger.bytes_there.items():
         last = ledger.versions[key][-1]
-        assert isinstance(last, ImageReady)
-        assert positions(last.received) == there
+        assert last.stream
+        assert positions(received_of(last)) == there
         assert (last.contact is not None) == ledger.contact_there[key]
     assert set(ledger.versions) == set(ledger.bytes_there) | set(ledger.contact_there)
 
@@ -186,18 +188,18 @@ def test_a_restart_at_every_point_changes_nothing(delivery: tuple[list[Sent], li
     steady = PaperReceiver(TIMEOUT_S, max_images=max_images)
     restarted = PaperReceiver(TIMEOUT_S, max_images=max_images)
     for step in steps:
-        state = msgpack.unpackb(msgpack.packb(restarted.snapshot()))
+        parts = restarted.parts()
         restarted = PaperReceiver(TIMEOUT_S, max_images=max_images)
-        restarted.restore(state)
+        assert not restarted.restore(parts)
         assert comparable(take(restarted, step)) == comparable(take(steady, step))
         assert restarted.next_deadline() == steady.next_deadline()
         assert restarted.counts == steady.counts
-        assert restarted.snapshot() == steady.snapshot()
+        assert restarted.parts() == steady.parts()
 
 
 def comparable(events: list[Event]) -> list[Any]:
     """Errors have no equality of their own."""
-    return [(e.source, e.at, str(e.reason)) if isinstance(e, PaperFrameRejected) else e for e in events]
+    return [(e.source, e.received_s, str(e.reason)) if isinstance(e, FrameRejected) else e for e in events]
 
 
 @st.composite
@@ -225,17 +227,20 @@ def test_hostile_frames_at_wild_times_never_raise_and_memory_stays_bounded(
             if isinstance(parsed := parse_frame(frame), HalfFrame):
                 told[source, parsed.image_id].add((parsed.header, parsed.body_length))
         for event in receiver.accept(source, frame, now):
-            if isinstance(event, PaperFrameRejected):
+            if not isinstance(event, ImageUpdate):
+                assert isinstance(event, FrameRejected)
                 continue
             key = (event.source, event.image_id)
             # Forgotten images start again at 1; otherwise versions count up one by one.
             assert event.version in (1, versions.get(key, 0) + 1)
             versions[key] = event.version
-            if isinstance(event, ImageReady):
-                there = positions(event.received)
-                assert (event.header, len(event.body)) in told[key]
-                assert all(byte == 0 for i, byte in enumerate(event.body) if i not in there)
-        state: Any = receiver.snapshot()
-        assert len(state["images"]) <= 3
-        assert all(len(image["candidates"]) <= 3 for image in state["images"])
+            if event.stream:
+                there = positions(received_of(event))
+                assert (header_of(event), len(body_of(event))) in told[key]
+                assert all(byte == 0 for i, byte in enumerate(body_of(event)) if i not in there)
+        parts = receiver.parts()
+        stored = group(parts, "image")
+        assert len(stored) <= 3
+        at = field_names(PendingImage).index("candidates")
+        assert all(len(plain_of(parts, name)[at]) <= 3 for name in stored)
     assert receiver.counts.frames == len(arrivals)

@@ -14,8 +14,9 @@ from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, half_bounds, parse_frame
-from sonarpost.link.frames.paper.receiver import ImageReady, PaperReceiver
+from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import Packet, body_capacity_bytes, plan_packets
+from sonarpost.link.receiver import ImageUpdate
 
 GOLDEN = json.loads((GOLDEN_FOLDER / "link" / "paper_packets.json").read_text())["plans"]
 RATES = {0: (1, 32), 1: (3, 64), 2: (3, 64), 3: (2, 256), 4: (2, 256), 5: (8, 256), 6: (6, 32)}
@@ -168,7 +169,7 @@ def test_a_picture_sent_without_loss_is_complete_with_its_position(length: int, 
     plan = plan_packets("0K3P", stream, CONTACT, *RATES[rate])
     events = [e for packet in plan for frame in packet for e in receiver.accept(2, frame, 0)]
     (event,) = events  # one version: nothing that comes later was worth another
-    assert isinstance(event, ImageReady)
+    assert isinstance(event, ImageUpdate)
     assert event.complete
     assert event.stream == stream
     assert event.contact == CONTACT.rounded()

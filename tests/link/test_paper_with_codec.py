@@ -8,8 +8,9 @@ import pytest
 from sonarpost.codec.vq.codec import VqCodec
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.paper.receiver import ImageReady, PaperReceiver
+from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import Packet, plan_packets
+from sonarpost.link.receiver import ImageUpdate
 
 HEIGHT_PX, WIDTH_PX, TILE_PX = 80, 140, 10
 CONTACT = ContactSummary(height_px=HEIGHT_PX, width_px=WIDTH_PX, lat_deg=44.7, lon_deg=-63.6)
@@ -25,7 +26,7 @@ def codec(picture: np.ndarray) -> VqCodec:
     return VqCodec(TileDatabase.from_tiles(TILE_PX, cut_tiles(picture, TILE_PX)))
 
 
-def send(packets: tuple[Packet, ...], lost: set[int]) -> ImageReady:
+def send(packets: tuple[Packet, ...], lost: set[int]) -> ImageUpdate:
     """Hand over every packet but the lost ones, each as long after the one before as at rate 1."""
     receiver = PaperReceiver(60)
     events = []
@@ -34,7 +35,7 @@ def send(packets: tuple[Packet, ...], lost: set[int]) -> ImageReady:
             events += [e for frame in packet for e in receiver.accept(1, frame.ljust(64, b"\0"), number * 6.1)]
     events += receiver.poll(1000)
     (event,) = events
-    assert isinstance(event, ImageReady)
+    assert isinstance(event, ImageUpdate)
     return event
 
 

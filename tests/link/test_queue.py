@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-import msgpack
 import numpy as np
 import pytest
+from builders.link_state import group, with_fields
+from builders.v1_world import take_packet
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.errors import ConfigError, FrameError
-from sonarpost.link.events import ContactUpdate, MessageReceived
+from sonarpost.errors import ConfigError
+from sonarpost.link.config import QueueConfig
+from sonarpost.link.downlink.messages import image_of_number, number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.queue.state import export_queue, restore_queue
-from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, TransmitQueue
-from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.queue.messages import MessageIdentifier, QueuedMessage
+from sonarpost.link.queue.transmit_queue import InFlight, QueueState, TransmitQueue
+from sonarpost.link.receiver import ImageUpdate, MessageReceived
+from sonarpost.link.sender import ImageToSend
+from sonarpost.link.state import SavedParts
 from sonarpost.modem.micromodem import RATES
 
 CONTACT = ContactSummary(height_px=80, width_px=80, lat_deg=56.4, lon_deg=-5.6, confidence=1.5)
@@ -23,24 +28,28 @@ def stream(number: int, length: int = 300) -> bytes:
     return np.random.default_rng(number).bytes(length)
 
 
+def image(number: int, data: bytes | None = None) -> ImageToSend:
+    return ImageToSend(image_of_number(number), f"c{number}", CONTACT, stream(number) if data is None else data)
+
+
 def filled(queue: TransmitQueue, pictures: int, now: float = 0.0) -> TransmitQueue:
     for number in range(1, pictures + 1):
-        assert queue.add_picture(number, ImageName(f"{number:04d}", f"c{number}"), CONTACT, stream(number), now)
+        assert queue.add_image(image(number), now)
     return queue
 
 
 def run(queue: TransmitQueue, seconds: float, *, now: float = 0.0, lost=lambda: False, receiver=None, reports=False):
     """Send for so long; return events with times, and the time."""
-    receiver = receiver or LinkReceiver()
+    receiver = receiver or V1Receiver()
     found, end = [], now + seconds
     while now < end:
-        packet = queue.next_packet(now)
+        frames = take_packet(queue, now)
         now += RATES[queue.rate].airtime_s
-        for frame in packet:
+        for frame in frames:
             if not lost():
                 found += receiver.accept(3, frame, now)
-        if reports and receiver.report_is_due(3, now) and (report := receiver.report(3, now)) and not lost():
-            queue.on_report(report, now, 1)
+        if reports and receiver.feedback_is_due(3, now) and (report := receiver.feedback(3, now)) and not lost():
+            queue.on_feedback(report, now, 1)
     return found, now
 
 
@@ -55,15 +64,15 @@ def messages(events) -> list[bytes]:
 
 def test_every_contact_is_seen_before_the_detail_of_any():
     queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0)), 120)
-    receiver, now, first = LinkReceiver(), 0.0, None
-    seen: set[int] = set()
+    receiver, now, first = V1Receiver(), 0.0, None
+    seen: set[str] = set()
     while len(seen) < 120:
-        for frame in queue.next_packet(now):
+        for frame in take_packet(queue, now):
             for event in receiver.accept(3, frame, now):
-                assert isinstance(event, ContactUpdate)
+                assert isinstance(event, ImageUpdate)
                 if len(event.stream) > 40 and first is None:
-                    first = (event.number, len(seen))
-                seen.add(event.number)
+                    first = (event.image_id, len(seen))
+                seen.add(event.image_id)
         now += 6.1
         assert now < 6.1 * 60, "no more than a frame a contact"
     assert first is None, f"detail of {first} before all contacts were seen"
@@ -75,9 +84,8 @@ def test_messages_go_by_priority_and_an_urgent_one_waits_for_one_packet_at_most(
         queue.add_message(f"m{n}", "status", b"%4d" % n * 10, 0.0, priority=5)
     run(queue, 30.0)
     queue.add_message("alarm", "safety", b"leak", 30.0, priority=1)
-    receiver = LinkReceiver()
-    packet = queue.next_packet(30.0)
-    first = [e for frame in packet for e in receiver.accept(3, frame, 30.0)]
+    receiver = V1Receiver()
+    first = [e for frame in take_packet(queue, 30.0) for e in receiver.accept(3, frame, 30.0)]
     assert b"leak" in messages(first)
 
 
@@ -99,9 +107,9 @@ def test_pictures_keep_their_share_in_a_flood_and_a_flood_is_not_starved():
     queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0, image_airtime_share=0.25)), 4)
     for n in range(1500):
         queue.add_message(f"m{n}", "flood", b"F" * 55, 0.0, priority=1, lifetime_s=1e5)
-    receiver, now, pictures, frames = LinkReceiver(), 0.0, 0, 0
+    receiver, now, pictures, frames = V1Receiver(), 0.0, 0, 0
     while queue.open_numbers():
-        for frame in queue.next_packet(now):
+        for frame in take_packet(queue, now):
             pictures += not messages(receiver.accept(3, frame, now))
             frames += 1
         now += 6.1
@@ -114,12 +122,12 @@ def test_what_fills_only_gets_through_when_it_has_aged():
         queue = TransmitQueue(QueueConfig(expected_loss=0.0, aging_s=600.0))
         queue.add_message("log", "logger", b"L" * 55, 0.0, priority=priority, lifetime_s=1e6)
         now, n = 0.0, 0
-        receiver = LinkReceiver()
+        receiver = V1Receiver()
         while True:
             n += 1
             if n % 2:  # never idle, and no room left
-                queue.add_picture(n, ImageName("0001", "c"), CONTACT, stream(n), now)
-            for frame in queue.next_packet(now):
+                queue.add_image(image(n), now)
+            for frame in take_packet(queue, now):
                 if messages(receiver.accept(3, frame, now)):
                     return now
             now += 6.1
@@ -153,23 +161,22 @@ def test_with_reports_everything_arrives_whatever_is_lost(share):
     queue = filled(TransmitQueue(QueueConfig(expected_loss=0.3)), 12)
     for n in range(60):
         queue.add_message(f"m{n}", "s", b"%3d" % n * 5, 0.0, priority=4, lifetime_s=1e5)
-    receiver = LinkReceiver()
+    receiver = V1Receiver()
     run(queue, 6000.0, lost=losses(share), receiver=receiver, reports=True)
-    state = {c["number"]: c for s in receiver.snapshot()["sources"] for c in s["contacts"]}
-    assert set(state) == set(range(1, 13))
+    assert set(group(receiver.parts(), "image")) == {f"image/3/{number}" for number in range(1, 13)}
     assert not queue.open_numbers()
     if share >= 0.1:
-        assert abs(queue.loss - share) < 0.12
-        assert abs(queue.sender.config.worst.loss - share) < 0.15
+        assert abs(queue.measured_loss - share) < 0.12
+        assert abs(queue.planned_loss - share) < 0.15
 
 
 def test_a_receiver_that_falls_silent_stops_nothing():
     queue = filled(TransmitQueue(QueueConfig(rates=(0, 1), first_rate=1, feedback_memory_s=300.0)), 30)
-    receiver = LinkReceiver()
+    receiver = V1Receiver()
     _, now = run(queue, 300.0, receiver=receiver, reports=True)
     assert queue.sender.config.feedback
     for number in range(31, 61):
-        queue.add_picture(number, ImageName(f"{number:04d}", "c"), CONTACT, stream(number), now)
+        queue.add_image(image(number), now)
     _, now = run(queue, 12_000.0, now=now, receiver=receiver)
     assert not queue.sender.config.feedback
     assert queue.rate == 0
@@ -178,19 +185,19 @@ def test_a_receiver_that_falls_silent_stops_nothing():
 
 def test_the_rate_follows_the_loss():
     queue = filled(TransmitQueue(QueueConfig(rates=(1, 5), first_rate=5, stream_bytes=4000)), 0)
-    receiver, now = LinkReceiver(), 0.0
+    receiver, now = V1Receiver(), 0.0
     rates = []
     lost = {1: losses(0.05), 5: losses(0.97)}
     for n in range(1, 200):
         if len(queue.open_numbers()) < 3:
-            queue.add_picture(n, ImageName("0001", "c"), CONTACT, stream(n, 2000), now)
-        for frame in queue.next_packet(now):
+            queue.add_image(image(n, stream(n, 2000)), now)
+        for frame in take_packet(queue, now):
             if not lost[queue.rate]():
                 receiver.accept(3, frame, now)
         now += RATES[queue.rate].airtime_s
         rates.append(queue.rate)
-        if n % 6 == 0 and (report := receiver.report(3, now)):
-            queue.on_report(report, now, 1)
+        if n % 6 == 0 and (report := receiver.feedback(3, now)):
+            queue.on_feedback(report, now, 1)
     assert rates[0] == 5
     assert rates.count(1) > 150
 
@@ -198,27 +205,26 @@ def test_the_rate_follows_the_loss():
 def test_expected_times_come_true():
     queue = filled(TransmitQueue(QueueConfig(expected_loss=0.2)), 10)
     queue.next_packet(0.0)
-    told = {e.name.image_id: e for e in queue.expected(0.0)}
-    assert set(told) == {f"{n:04d}" for n in range(1, 11)}
-    assert all(e.preview_at is not None and e.preview_at <= e.done_at and e.bytes_left > 0 for e in told.values())
+    told = {e.image_id: e for e in queue.expected(0.0)}
+    assert set(told) == {image_of_number(n) for n in range(1, 11)}
+    assert all(e.preview_s is not None and e.preview_s <= e.done_s and e.bytes_left > 0 for e in told.values())
     now = 0.0
     gone = {}
     while queue.open_numbers():
-        queue.next_packet(now)
+        packet = queue.next_packet(now)
         now += RATES[1].airtime_s
-        queue.sent(RATES[1].airtime_s)
+        queue.sent(packet.frames if packet else (), RATES[1].airtime_s)
         for number in range(1, 11):
             if number not in queue.open_numbers():
-                gone.setdefault(f"{number:04d}", now)
+                gone.setdefault(image_of_number(number), now)
     for image_id, at in gone.items():
-        assert abs(told[image_id].done_at - at) <= max(15.0, 0.35 * at)
+        assert abs(told[image_id].done_s - at) <= max(15.0, 0.35 * at)
     assert queue.expected(now) == []
 
 
-def copy_of(queue: TransmitQueue, seal=None) -> TransmitQueue:
-    parts = {name: msgpack.packb(part) for name, part in export_queue(queue).items()}
-    again = TransmitQueue(queue.config, seal=seal)
-    restore_queue(again, {name: msgpack.unpackb(data, strict_map_key=False) for name, data in parts.items()})
+def copy_of(queue: TransmitQueue, protection=None) -> TransmitQueue:
+    again = TransmitQueue(queue.config, protection=protection)
+    assert not again.restore(queue.parts())
     return again
 
 
@@ -229,44 +235,106 @@ def test_a_queue_that_was_saved_and_taken_up_sends_what_it_would_have_sent(data)
     for n in range(data.draw(st.integers(0, 20))):
         priority = data.draw(st.integers(1, 7))
         queue.add_message(f"m{n}", "ab"[n % 2], bytes([n + 1]) * (n + 1), 0.0, priority=priority)
-    receiver = LinkReceiver()
+    receiver = V1Receiver()
     _, now = run(queue, data.draw(st.floats(0, 400)), receiver=receiver, reports=data.draw(st.booleans()))
     again = copy_of(queue)
-    assert export_queue(again) == export_queue(queue)
+    assert again.parts() == queue.parts()
     for _ in range(20):
         now += 6.1
-        assert again.next_packet(now) == queue.next_packet(now)
+        assert take_packet(again, now) == take_packet(queue, now)
         assert again.expected(now) == queue.expected(now)
 
 
-def test_most_parts_do_not_change_with_a_packet():
+def test_a_packet_changes_few_small_parts():
     queue = filled(TransmitQueue(QueueConfig()), 30)
+    for n in range(300):
+        queue.add_message(f"m{n}", "s", b"%3d" % n * 10, 0.0, lifetime_s=1e5)
+    take_packet(queue, 0.0)
+    saved = SavedParts(queue.parts())
+    for now in range(7, 700, 7):
+        queue.next_packet(float(now))
+        changes = saved.changes(queue.parts())
+        assert {"queue", "sender", "packet"} <= changes.keys()
+        assert sum(len(name) + len(data or b"") for name, data in changes.items()) < 8_000
+        saved.commit(queue.parts())
+        queue.sent(queue.in_flight.frames, 6.1)
+
+
+def test_a_packet_stays_in_flight_until_its_frames_are_sent_also_over_a_restart():
+    queue = filled(TransmitQueue(QueueConfig()), 3)
+    packet = queue.next_packet(0.0)
+    assert queue.next_packet(7.0) == queue.in_flight == packet
+    again = copy_of(queue)
+    assert again.next_packet(14.0) == packet
+    assert again.sent(packet.frames[:1], 6.1) == ()
+    assert again.next_packet(14.0).frames == packet.frames[1:]
+    again.sent(packet.frames[1:], 6.1)
+    assert again.in_flight is None
+    assert set(again.next_packet(14.0).frames).isdisjoint(packet.frames)
+
+
+def test_sent_names_the_images_of_which_nothing_is_left():
+    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0)), 2)
+    ended = []
+    while (packet := queue.next_packet(0.0)) is not None:
+        ended += queue.sent(packet.frames, 6.1)
+    assert sorted(ended) == ["0001", "0002"]
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("queue", {"format version": 1}),
+        ("queue", {"rate": 9}),
+        ("queue", {"losses": {1: [1.5, 0.0]}}),
+        ("queue", {"planned_loss": "no"}),
+        ("packet", {"packet": {"rate": 1, "frames": "no"}}),
+        ("message/0", {"priority": 0}),
+        ("message-id/0", {"name": None}),
+    ],
+    ids=str,
+)
+def test_a_malformed_part_is_reported_and_the_rest_restored(name, change):
+    queue = filled(TransmitQueue(QueueConfig()), 3)
     queue.next_packet(0.0)
-    before = {name: msgpack.packb(part) for name, part in export_queue(queue).items()}
-    queue.next_packet(7.0)
-    after = {name: msgpack.packb(part) for name, part in export_queue(queue).items()}
-    changed = {name for name in after if before.get(name) != after[name]}
-    assert changed == {"core"}
-    assert len(after["core"]) < 10_000
+    for n in range(2):
+        queue.add_message(f"m{n}", "s", b"data", 0.0)
+    again = TransmitQueue(QueueConfig())
+    kinds = {"queue": QueueState, "packet": InFlight, "message": QueuedMessage, "message-id": MessageIdentifier}
+    errors = again.restore(with_fields(queue.parts(), name, kinds[name.partition("/")[0]], change))
+    assert set(errors) == {name}
+    assert f"queue state: {name}: " in str(errors[name])
+    kept = {part: data for part, data in queue.parts().items() if part not in (name, "queue", "packet")}
+    assert {part: data for part, data in again.parts().items() if part in kept} == kept
 
 
-def test_a_state_that_is_none_is_refused():
-    good = export_queue(filled(TransmitQueue(QueueConfig()), 3))
-    core = dict(good["core"])
-    for bad in ({}, {"core": {**core, "format": 2}}, {**good, "core": {**core, "rate": 9}}, {"core": core}):
-        with pytest.raises(FrameError):
-            restore_queue(TransmitQueue(QueueConfig()), bad)
+def test_parts_of_something_else_are_reported_and_nothing_is_restored():
+    again = TransmitQueue(QueueConfig())
+    junk = {"queue": b"junk", "sender": b"", "image/1": b"\x80", "block/7": b"\xc1", "message/x": b"\x01"}
+    assert set(again.restore(junk)) == set(junk)
+    assert again.is_idle
+    assert again.next_packet(0.0) is None
+
+
+def test_images_are_sent_again_when_their_progress_is_unknown():
+    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0)), 5)
+    take_packet(queue, 0.0)
+    parts = {name: data for name, data in queue.parts().items() if name.startswith(("image/", "message"))}
+    again = TransmitQueue(QueueConfig(expected_loss=0.0), first_block=20)
+    assert again.restore(parts) == {}
+    events, _ = run(again, 600.0)
+    assert {e.image_id for e in events if isinstance(e, ImageUpdate)} == {image_of_number(n) for n in range(1, 6)}
 
 
 def test_a_rate_that_is_no_longer_configured_is_left():
     queue = filled(TransmitQueue(QueueConfig(rates=(5,), first_rate=5)), 5)
-    queue.next_packet(0.0)
+    take_packet(queue, 0.0)
     again = TransmitQueue(QueueConfig(rates=(1,), first_rate=1))
-    restore_queue(again, export_queue(queue))
+    assert not again.restore(queue.parts())
     assert again.rate == 1
-    receiver = LinkReceiver()
+    receiver = V1Receiver()
     events, _ = run(again, 600.0, receiver=receiver)
-    assert {e.number for e in events if isinstance(e, ContactUpdate)} == {1, 2, 3, 4, 5}
+    assert {number_of_image(e.image_id) for e in events if isinstance(e, ImageUpdate)} == {1, 2, 3, 4, 5}
 
 
 @pytest.mark.parametrize(
@@ -291,43 +359,42 @@ def test_a_rate_that_there_is_not_is_named():
 
 def test_a_longer_stream_of_a_picture_that_has_gone_brings_only_what_is_new():
     queue = TransmitQueue(QueueConfig(expected_loss=0.0))
-    name, whole = ImageName("0001", "c1"), stream(1, 1200)
-    receiver = LinkReceiver()
-    queue.add_picture(1, name, CONTACT, whole[:300], 0.0)
+    whole = stream(1, 1200)
+    receiver = V1Receiver()
+    queue.add_image(image(1, whole[:300]), 0.0)
     _, now = run(queue, 200.0, receiver=receiver)
     assert not queue.open_numbers()
     assert not queue.refine(1, 1000, now), "there is no more"
     before = queue.sender.frames_sent
-    assert queue.add_picture(1, name, CONTACT, whole, now)
+    assert queue.add_image(image(1, whole), now)
     events, now = run(queue, 600.0, now=now, receiver=receiver)
-    assert max(len(e.stream) for e in events if isinstance(e, ContactUpdate)) == 1200
+    assert max(len(e.stream) for e in events if isinstance(e, ImageUpdate)) == 1200
     assert queue.sender.frames_sent - before < 900 / 50 + 8
 
 
 def test_a_picture_that_is_given_again_goes_again_unless_it_waits():
     queue = TransmitQueue(QueueConfig(expected_loss=0.0))
-    name = ImageName("0001", "c1")
-    assert queue.add_picture(1, name, CONTACT, stream(1), 0.0)
-    assert not queue.add_picture(1, name, CONTACT, stream(1), 0.0)
+    assert queue.add_image(image(1), 0.0)
+    assert not queue.add_image(image(1), 0.0)
     _, now = run(queue, 200.0)
-    assert queue.add_picture(1, name, CONTACT, stream(1), now)
+    assert queue.add_image(image(1), now)
     events, _ = run(queue, 200.0, now=now)
-    assert [e.number for e in events if isinstance(e, ContactUpdate)]
+    assert [e for e in events if isinstance(e, ImageUpdate)]
 
 
 def test_a_picture_of_which_more_is_here_is_refined_at_once():
     queue = TransmitQueue(QueueConfig(expected_loss=0.0, frames_per_image=3.0))
-    queue.add_picture(1, ImageName("0001", "c1"), CONTACT, stream(1, 900), 0.0)
-    receiver = LinkReceiver()
+    queue.add_image(image(1, stream(1, 900)), 0.0)
+    receiver = V1Receiver()
     _, now = run(queue, 200.0, receiver=receiver)
     assert queue.refine(1, 900, now)
     events, _ = run(queue, 600.0, now=now, receiver=receiver)
-    assert max(len(e.stream) for e in events if isinstance(e, ContactUpdate)) == 900
+    assert max(len(e.stream) for e in events if isinstance(e, ImageUpdate)) == 900
 
 
 def test_a_longer_stream_that_does_not_continue_what_was_sent_is_not_mixed_with_it():
     queue = TransmitQueue(QueueConfig(expected_loss=0.0))
-    queue.add_picture(1, ImageName("0001", "c1"), CONTACT, stream(1, 300), 0.0)
+    queue.add_image(image(1, stream(1, 300)), 0.0)
     _, now = run(queue, 200.0)
-    assert not queue.add_picture(1, ImageName("0001", "c1"), CONTACT, stream(2, 600), now)
+    assert not queue.add_image(image(1, stream(2, 600)), now)
     assert not queue.open_numbers()

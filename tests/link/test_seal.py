@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 import random
 import re
 
 import pytest
 from builders.authentication_world import VEHICLE, VESSEL, key, skip, vehicle_seal, vessel_seal
+from builders.link_state import group, with_fields
 from builders.v1_world import contact, stream
 
 from sonarpost.errors import ConfigError, FrameError
-from sonarpost.link.auth.authentication import RESERVED, AuthenticationCounts, FrameAuthenticator
+from sonarpost.link.auth.authentication import (
+    RESERVED,
+    WINDOW,
+    AuthenticationCounts,
+    AuthenticationState,
+    FrameAuthenticator,
+    ReplayWindow,
+    SavedWindow,
+)
 from sonarpost.link.auth.key import AuthenticationSettings, Direction
-from sonarpost.link.auth.replay_window import WINDOW, ReplayWindow
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
-from sonarpost.link.events import ContactUpdate, FeedbackReceived, FrameRefused
+from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.v1.frame import Symbol, SymbolKind, checksum, pack_symbol, parse_frame
-from sonarpost.link.receiver import LinkReceiver
-from sonarpost.link.sender import LinkSender
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.receiver import FeedbackReceived, FrameRejected, ImageUpdate
 
 ALL_SETTINGS = [
     AuthenticationSettings(counter, tag, encrypt)
@@ -32,7 +40,7 @@ COVERED = b"\x80 a frame after its checksum"
 def refusal(seal: FrameAuthenticator, sealed: bytes, source: int = VEHICLE) -> str:
     """The field of the error with which a frame is refused."""
     with pytest.raises(FrameError) as caught:
-        seal.open(source, sealed)
+        seal.verify(source, sealed)
     return caught.value.field
 
 
@@ -40,28 +48,32 @@ def refusal(seal: FrameAuthenticator, sealed: bytes, source: int = VEHICLE) -> s
 def test_a_sealed_frame_opens_and_costs_what_it_says(settings: AuthenticationSettings) -> None:
     vehicle, vessel = vehicle_seal(settings), vessel_seal(settings)
     for covered in (COVERED, b"\x80", b"\x80" + bytes(300)):
-        sealed = vehicle.seal(covered)
-        assert len(sealed) == len(covered) + settings.counter_bytes + settings.tag_bytes == len(covered) + vehicle.size
+        sealed = vehicle.protect(covered)
+        assert (
+            len(sealed)
+            == len(covered) + settings.counter_bytes + settings.tag_bytes
+            == len(covered) + vehicle.overhead_bytes
+        )
         assert sealed[0] == 0x80
         assert (covered[1:] in sealed) == (not settings.encrypt or len(covered) == 1)
-        assert vessel.open(VEHICLE, sealed) == covered
-    assert (vehicle.counts, vessel.counts) == (AuthenticationCounts(sealed=3), AuthenticationCounts(genuine=3))
+        assert vessel.verify(VEHICLE, sealed) == covered
+    assert (vehicle.counts, vessel.counts) == (AuthenticationCounts(protected=3), AuthenticationCounts(genuine=3))
 
 
 @pytest.mark.parametrize("settings", [AuthenticationSettings(), AuthenticationSettings(encrypt=True)], ids=str)
 def test_every_bit_is_covered(settings: AuthenticationSettings) -> None:
-    sealed = vehicle_seal(settings).seal(COVERED)
+    sealed = vehicle_seal(settings).protect(COVERED)
     vessel = vessel_seal(settings)
     for bit in range(8 * len(sealed)):
         damaged = bytearray(sealed)
         damaged[bit // 8] ^= 1 << bit % 8
         assert refusal(vessel, bytes(damaged)) == "tag"
     assert vessel.counts.forged == 8 * len(sealed)
-    assert vessel.open(VEHICLE, sealed) == COVERED
+    assert vessel.verify(VEHICLE, sealed) == COVERED
 
 
 def test_who_may_have_sealed_it_matters() -> None:
-    sealed = vehicle_seal().seal(COVERED)
+    sealed = vehicle_seal().protect(COVERED)
     vessel = vessel_seal()
     assert refusal(vessel, sealed, VEHICLE + 1) == "tag"  # another vehicle's
     assert refusal(vessel_seal(name="another key"), sealed) == "tag"
@@ -69,19 +81,19 @@ def test_who_may_have_sealed_it_matters() -> None:
     assert refusal(vessel_seal(AuthenticationSettings(tag_bytes=6)), sealed) == "tag"
     own = FrameAuthenticator(key("fleet"), VEHICLE, Direction.TO_VEHICLE)
     own.grant(10)
-    assert refusal(own, own.seal(COVERED)) == "tag"  # its own, come back
+    assert refusal(own, own.protect(COVERED)) == "tag"  # its own, come back
     for source in (-1, 128, 2**40):
         assert refusal(vessel, sealed, source) == "tag"
-    for short in (b"", b"\x80", sealed[: vessel.size]):
+    for short in (b"", b"\x80", sealed[: vessel.overhead_bytes]):
         assert refusal(vessel, short) == "tag"
-    assert vessel.open(VEHICLE, sealed) == COVERED
+    assert vessel.verify(VEHICLE, sealed) == COVERED
 
 
 def test_a_replay_is_told_from_a_forgery_however_old() -> None:
     vehicle, vessel = vehicle_seal(), vessel_seal()
-    recorded = [vehicle.seal(COVERED) for _ in range(3000)]
+    recorded = [vehicle.protect(COVERED) for _ in range(3000)]
     for sealed in recorded:
-        vessel.open(VEHICLE, sealed)
+        vessel.verify(VEHICLE, sealed)
     for sealed in recorded[::100] + recorded[-70:]:
         assert refusal(vessel, sealed) == "counter"
     assert refusal(vessel, COVERED + b"\x07guess") == "tag"
@@ -90,11 +102,11 @@ def test_a_replay_is_told_from_a_forgery_however_old() -> None:
 
 def test_late_frames_pass_once_if_the_window_still_knows_them() -> None:
     vehicle, vessel = vehicle_seal(), vessel_seal()
-    sealed = [vehicle.seal(bytes([0x80, n])) for n in range(WINDOW + 1)]
-    vessel.open(VEHICLE, sealed[WINDOW])
+    sealed = [vehicle.protect(bytes([0x80, n])) for n in range(WINDOW + 1)]
+    vessel.verify(VEHICLE, sealed[WINDOW])
     assert refusal(vessel, sealed[0]) == "counter"
     for late in reversed(sealed[1:WINDOW]):
-        vessel.open(VEHICLE, late)
+        vessel.verify(VEHICLE, late)
         assert refusal(vessel, late) == "counter"
     assert vessel.counts.genuine == WINDOW
 
@@ -105,27 +117,27 @@ def test_late_frames_pass_once_if_the_window_still_knows_them() -> None:
 def test_losses_cost_nothing_up_to_a_bound_and_one_frame_beyond(settings: AuthenticationSettings, bridged: int) -> None:
     assert bridged + 1 == settings.counter_step - WINDOW
     vehicle, vessel = vehicle_seal(settings), vessel_seal(settings)
-    vessel.open(VEHICLE, vehicle.seal(COVERED))
+    vessel.verify(VEHICLE, vehicle.protect(COVERED))
     skip(vehicle, bridged)
-    assert vessel.open(VEHICLE, vehicle.seal(COVERED)) == COVERED
+    assert vessel.verify(VEHICLE, vehicle.protect(COVERED)) == COVERED
     skip(vehicle, bridged + 1)
-    first = vehicle.seal(COVERED)
+    first = vehicle.protect(COVERED)
     assert refusal(vessel, first) == "counter"
     assert refusal(vessel, first) == "counter"  # the same again confirms nothing
     skip(vehicle, bridged)  # nor need the second be the very next
-    assert vessel.open(VEHICLE, vehicle.seal(COVERED)) == COVERED
-    assert vessel.open(VEHICLE, vehicle.seal(COVERED)) == COVERED
+    assert vessel.verify(VEHICLE, vehicle.protect(COVERED)) == COVERED
+    assert vessel.verify(VEHICLE, vehicle.protect(COVERED)) == COVERED
     assert vessel.counts == AuthenticationCounts(genuine=4, unconfirmed=2)
 
 
 def test_a_receiver_without_memory_finds_any_counter_of_the_key() -> None:
     last = AuthenticationSettings().lifetime_frames - 2
     vehicle, vessel = vehicle_seal(first_counter=last), vessel_seal()
-    assert refusal(vessel, vehicle.seal(COVERED)) == "counter"
-    assert vessel.open(VEHICLE, vehicle.seal(COVERED)) == COVERED
+    assert refusal(vessel, vehicle.protect(COVERED)) == "counter"
+    assert vessel.verify(VEHICLE, vehicle.protect(COVERED)) == COVERED
     with pytest.raises(FrameError, match="a new key after 1048576 frames"):
-        vehicle.seal(COVERED)
-    assert (vehicle.frames_left, vehicle.wanted_limit) == (0, None)
+        vehicle.protect(COVERED)
+    assert (vehicle.frames_left, vehicle.requested_limit) == (0, None)
 
 
 def test_counters_are_used_once_whenever_the_sender_crashes() -> None:
@@ -133,27 +145,27 @@ def test_counters_are_used_once_whenever_the_sender_crashes() -> None:
     for frames_until_crash in (0, 1, 31, 32, 33, 64, 65, 200, 0, 5):
         seal = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=durable)
         for _ in range(frames_until_crash):
-            if (limit := seal.wanted_limit) is not None:
+            if (limit := seal.requested_limit) is not None:
                 durable = limit
                 seal.grant(limit)
-            used.append(seal.seal(COVERED)[-5:])
-        if (limit := seal.wanted_limit) is not None:
+            used.append(seal.protect(COVERED)[-5:])
+        if (limit := seal.requested_limit) is not None:
             durable = limit  # crashed between writing it down and granting it
     assert len(set(used)) == len(used)
     vessel = vessel_seal()
     for ending in used:
-        assert vessel.open(VEHICLE, COVERED + ending) == COVERED
+        assert vessel.verify(VEHICLE, COVERED + ending) == COVERED
     assert RESERVED < WINDOW * 2
 
 
 def test_without_a_reservation_nothing_is_sealed() -> None:
     seal = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
-    with pytest.raises(FrameError, match="a limit granted above it"):
-        seal.seal(COVERED)
+    with pytest.raises(FrameError, match="a granted limit above it"):
+        seal.protect(COVERED)
     seal.grant(1)
-    seal.seal(COVERED)
+    seal.protect(COVERED)
     with pytest.raises(FrameError):
-        seal.seal(COVERED)
+        seal.protect(COVERED)
     for wrong in (0, AuthenticationSettings().lifetime_frames + 1):
         with pytest.raises(ConfigError, match="limit"):
             seal.grant(wrong)
@@ -161,66 +173,85 @@ def test_without_a_reservation_nothing_is_sealed() -> None:
 
 def test_a_restarted_receiver_still_knows_what_it_took() -> None:
     vehicle, before = vehicle_seal(), vessel_seal()
-    taken = [vehicle.seal(COVERED) for _ in range(50)]
+    taken = [vehicle.protect(COVERED) for _ in range(50)]
     for sealed in taken[::2]:
-        before.open(VEHICLE, sealed)
+        before.verify(VEHICLE, sealed)
     after = vessel_seal()
-    after.restore(before.snapshot())
-    assert after.snapshot() == before.snapshot()
+    assert not after.restore(before.parts())
+    assert after.parts() == before.parts()
     for sealed in taken[::2]:
         assert refusal(after, sealed) == "counter"
     for sealed in taken[1:-2:2]:
-        after.open(VEHICLE, sealed)
+        after.verify(VEHICLE, sealed)
 
 
 def test_a_restored_sender_goes_on_behind_its_reservation() -> None:
     vehicle = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
     vehicle.grant(64)
     vessel = vessel_seal()
-    vessel.open(VEHICLE, vehicle.seal(COVERED))
-    older = vehicle.snapshot()
+    vessel.verify(VEHICLE, vehicle.protect(COVERED))
+    older = vehicle.parts()
     again = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=128)
-    again.restore(older)
-    assert again.wanted_limit == 128 + RESERVED
+    assert not again.restore(older)
+    assert again.requested_limit == 128 + RESERVED
     again.grant(128 + RESERVED)
-    vessel.open(VEHICLE, again.seal(COVERED))
+    vessel.verify(VEHICLE, again.protect(COVERED))
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("name", "change"),
     [
-        {"format": 2},
-        {"key": "00000000"},
-        {"limit": -1},
-        {"limit": 2**20 + 1},
-        {"limit": True},
-        {"windows": None},
-        {"windows": [[3, -1, bytes(8)]]},
-        {"windows": [[3, 2**20, bytes(8)]]},
-        {"windows": [[128, 5, bytes(8)]]},
-        {"windows": [[3, 5, bytes(9)]]},
-        {"counts": {}},
-        {"counts": {"sealed": -1}},
+        ("authentication", {"format version": 1}),
+        ("authentication", {"key": 7}),
+        ("authentication", {"limit": -1}),
+        ("authentication", {"limit": True}),
+        ("authentication", {"counts": None}),
+        ("authentication", {"counts": {"protected": -1}}),
+        ("window/3", {"format version": None}),
+        ("window/3", {"window": None}),
+        ("window/3", {"source": 128}),
+        ("window/3", {"window": {"newest": -1, "seen": 0}}),
+        ("window/3", {"window": {"newest": 2**20, "seen": 0}}),
+        ("window/3", {"window": {"newest": 5, "seen": bytes(8)}}),
     ],
 )
-def test_another_state_is_refused_and_changes_nothing(change: dict[str, object]) -> None:
+def test_a_malformed_part_is_reported_and_skipped(name: str, change: dict[str, object]) -> None:
     vehicle, vessel = vehicle_seal(), vessel_seal()
-    vessel.open(VEHICLE, vehicle.seal(COVERED))
-    state = vessel.snapshot()
-    kept = copy.deepcopy(state)
-    with pytest.raises(FrameError, match="seal state"):
-        vessel.restore(state | change)
-    assert vessel.snapshot() == kept
+    vessel.verify(VEHICLE, vehicle.protect(COVERED))
+    restored = vessel_seal()
+    errors = restored.restore(
+        with_fields(vessel.parts(), name, SavedWindow if "window" in name else AuthenticationState, change)
+    )
+    assert set(errors) == {name}
+    assert f"authentication state: {name}: " in str(errors[name])
+    assert "window/3" not in restored.parts()
+    assert restored.counts == (vessel.counts if name == "window/3" else AuthenticationCounts())
+
+
+def test_a_state_of_another_key_has_no_effect() -> None:
+    vehicle, vessel = vehicle_seal(name="another key"), vessel_seal(name="another key")
+    vessel.verify(VEHICLE, vehicle.protect(COVERED))
+    restored = vessel_seal()
+    assert restored.restore(vessel.parts()) == {}
+    assert restored.parts() == vessel_seal().parts()
+
+
+def test_a_limit_beyond_the_lifetime_leaves_no_counter() -> None:
+    vehicle = vehicle_seal()
+    parts = with_fields(vehicle.parts(), "authentication", AuthenticationState, {"limit": 2**20 + 1})
+    restored = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
+    assert restored.restore(parts) == {}
+    assert restored.frames_left == 0
 
 
 def test_memory_is_of_genuine_senders_only() -> None:
     vessel = vessel_seal(AuthenticationSettings(2))
     for source in range(128):
         assert refusal(vessel, COVERED + b"\0\0fake", source) == "tag"
-    assert vessel.snapshot()["windows"] == []
+    assert group(vessel.parts(), "window") == {}
     window = ReplayWindow()
     for counter in (0, 10**6, 10**9):
-        window.take(counter)
+        window.accept(counter)
         assert window.seen < 1 << WINDOW
 
 
@@ -229,7 +260,7 @@ def test_settings_out_of_range_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         AuthenticationSettings(**wrong)  # type: ignore[arg-type]
     for address, first in ((-1, 0), (128, 0), (1, -1), (1, 2**20 + 1)):
-        with pytest.raises(ConfigError, match="acoustic seal"):
+        with pytest.raises(ConfigError, match="acoustic authentication"):
             FrameAuthenticator(key("fleet"), address, Direction.FROM_VEHICLE, first_counter=first)
 
 
@@ -246,7 +277,7 @@ def test_damage_is_told_from_a_wrong_seal() -> None:
     assert vessel.counts == AuthenticationCounts(forged=1)
     padded = frame + bytes(192)
     assert parse_frame(padded, VEHICLE, vessel) == Symbol(SymbolKind.OBJECT, 1, 2, 3, bytes(54))
-    with pytest.raises(FrameError, match=re.escape("one not taken yet")):
+    with pytest.raises(FrameError, match=re.escape("one not accepted before")):
         parse_frame(frame, VEHICLE, vessel)
 
 
@@ -256,11 +287,11 @@ def test_pictures_and_reports_travel_sealed(frame_bytes: int, settings: Authenti
     up, down = vehicle_seal(settings), vessel_seal(settings)
     down.grant(1000)
     config = SenderConfig(frame_bytes=frame_bytes, channels=(LossChannel(0.2),), feedback=True, stream_bytes=200)
-    vehicle, hears = LinkSender(config, seal=up), LinkReceiver(seal=up)
-    vessel, reports = LinkReceiver(seal=down), LinkSender(SenderConfig(frame_bytes=32), seal=down)
+    vehicle, hears = V1Sender(config, protection=up), V1Receiver(protection=up)
+    vessel, reports = V1Receiver(protection=down), V1Sender(SenderConfig(frame_bytes=32), protection=down)
     pictures = {number: stream(number, 200) for number in range(1, 5)}
     for number, data in pictures.items():
-        vehicle.add_picture(number, contact(number), data, 0.0)
+        vehicle.add_image(number, contact(number), data, 0.0)
     vehicle.add_message(b"status", 0.0)
     shown: dict[int, bytes] = {}
     now, water = 0.0, random.Random(1)
@@ -271,18 +302,18 @@ def test_pictures_and_reports_travel_sealed(frame_bytes: int, settings: Authenti
             assert len(frame) == frame_bytes
             if water.random() < 0.8:
                 events = vessel.accept(VEHICLE, frame, now)
-                assert not [e for e in events if isinstance(e, FrameRefused)]
-                shown |= {e.number: e.stream for e in events if isinstance(e, ContactUpdate)}
+                assert not [e for e in events if isinstance(e, FrameRejected)]
+                shown |= {number_of_image(e.image_id): e.stream for e in events if isinstance(e, ImageUpdate)}
                 (again,) = vessel.accept(VEHICLE, frame, now)
-                assert isinstance(again, FrameRefused)
+                assert isinstance(again, FrameRejected)
                 assert again.reason.field == "counter"
-        if vessel.report_is_due(VEHICLE, now):
-            told = vessel.report(VEHICLE, now)
+        if vessel.feedback_is_due(VEHICLE, now):
+            told = vessel.feedback(VEHICLE, now)
             assert told is not None
-            reports.add_report(told)
+            reports.add_feedback(told)
             (report,) = hears.accept(VESSEL, reports.next_frame(now) or b"", now)
             assert isinstance(report, FeedbackReceived)
-            vehicle.on_report(report.report, now)
+            vehicle.on_feedback(report.feedback, now)
     assert vehicle.is_idle
     assert shown == pictures
-    assert up.counts.sealed > down.counts.genuine == down.counts.replayed > 0
+    assert up.counts.protected > down.counts.genuine == down.counts.replayed > 0

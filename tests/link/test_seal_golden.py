@@ -13,12 +13,12 @@ from builders.common import REPOSITORY
 from builders.v1_golden import FOLDER
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
-from sonarpost.link.auth.authentication import RESERVED, FrameAuthenticator
+from sonarpost.link.auth.authentication import RESERVED, WINDOW, FrameAuthenticator, ReplayWindow, SavedWindow
 from sonarpost.link.auth.key import AuthenticationSettings, Direction, parse_key
-from sonarpost.link.auth.replay_window import WINDOW
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, Symbol, checksum, parse_frame
-from sonarpost.link.sender import LinkSender
+from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.state import pack_part
 from sonarpost.modem.micromodem import RATES
 
 SEAL = FrameAuthenticator(parse_key(seal_golden.KEY, "golden"), 3, Direction.FROM_VEHICLE)
@@ -64,7 +64,8 @@ def test_another_implementation_seals_the_same(case: dict[str, Any]) -> None:
     seal = FrameAuthenticator(parse_key(GOLDEN["key"], "golden"), 99, Direction(case["direction"]).opposite, settings)
     # A receiver without memory takes a first frame only of a counter that is near; its neighbour's seal tells it that.
     newest = max(0, case["counter"] - 1)
-    seal.restore(seal.snapshot() | {"windows": [[case["source"], newest, bytes(8)]]})
+    window = SavedWindow(case["source"], ReplayWindow(newest))
+    assert not seal.restore({**seal.parts(), "window/0": pack_part(window)})
     content = parse_frame(frame, case["source"], seal)
     assert isinstance(content, Symbol) or content == (Segment(SegmentKind.MESSAGE, b"\x09go to 12"),)
 
@@ -73,7 +74,7 @@ def test_another_implementation_seals_the_same(case: dict[str, Any]) -> None:
     plain = (
         bytes([0x80 | content.head()[0]]) + content.head()[1:] + content.data
         if isinstance(content, Symbol)
-        else (b"\xc1\x09\x09go to 12").ljust(len(frame) - 2 - settings.size, b"\0")
+        else (b"\xc1\x09\x09go to 12").ljust(len(frame) - 2 - settings.overhead_bytes, b"\0")
     )
     head, data = (plain[:1], plain[1:]) if settings.encrypt else (plain, b"")
     made = ccm(key, case["counter"].to_bytes(13, "big"), head, data, settings.tag_bytes)
@@ -86,7 +87,7 @@ def test_the_page_has_the_numbers_of_the_code() -> None:
     page = (REPOSITORY / "docs" / "specifications" / "acoustic-v1.md").read_text(encoding="utf-8")
     section = " ".join(page[page.index("## Authentication") : page.index("## What a receiver may show")].split())
     one, two = AuthenticationSettings(), AuthenticationSettings(2)
-    assert f"{one.size} by default" in section
+    assert f"{one.overhead_bytes} by default" in section
     assert f"t = {one.tag_bytes} and c = {one.counter_bytes} unless said otherwise" in section
     assert (one.lifetime_frames, two.lifetime_frames) == (2**20, 2**28) == (4096 * 256, 4096 * 256**2)
     assert "after 2^20 frames" in section
@@ -102,6 +103,6 @@ def test_the_page_has_the_numbers_of_the_code() -> None:
         assert 0.7 * percent < 100 * chance * frames_per_s * 30 * 86400 < percent
     for frame_bytes in (32, 64, 256):
         bare, sealed = (
-            LinkSender(SenderConfig(frame_bytes=frame_bytes), seal=seal).symbol_bytes for seal in (None, SEAL)
+            V1Sender(SenderConfig(frame_bytes=frame_bytes), protection=seal).symbol_bytes for seal in (None, SEAL)
         )
         assert f"{sealed} of {bare}" in section

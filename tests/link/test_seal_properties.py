@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from builders.authentication_world import VEHICLE, key, vehicle_seal, vessel_seal
+from builders.link_state import group
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from sonarpost.errors import FrameError
-from sonarpost.link.auth.authentication import RESERVED, FrameAuthenticator
+from sonarpost.link.auth.authentication import RESERVED, WINDOW, FrameAuthenticator, ReplayWindow
 from sonarpost.link.auth.key import AuthenticationSettings, Direction
-from sonarpost.link.auth.replay_window import WINDOW, ReplayWindow
 
 NEAR = AuthenticationSettings().counter_step - WINDOW
 
@@ -18,7 +18,7 @@ NEAR = AuthenticationSettings().counter_step - WINDOW
 def offered(seal: FrameAuthenticator, source: int, sealed: bytes) -> tuple[bytes, str]:
     """What a frame opens to, or the field of the error with which it is refused."""
     try:
-        return seal.open(source, sealed), ""
+        return seal.verify(source, sealed), ""
     except FrameError as error:
         return b"", error.field
 
@@ -39,12 +39,12 @@ class Attack(RuleBasedStateMachine):
         return FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=self.durable)
 
     def record(self, data: bytes) -> tuple[int, bytes, bytes]:
-        if (limit := self.vehicle.wanted_limit) is not None:
+        if (limit := self.vehicle.requested_limit) is not None:
             self.durable = limit
             self.vehicle.grant(limit)
         counter = self.vehicle.settings.lifetime_frames - self.vehicle.frames_left
         covered = b"\x80" + data
-        self.recorded.append((counter, covered, self.vehicle.seal(covered)))
+        self.recorded.append((counter, covered, self.vehicle.protect(covered)))
         return self.recorded[-1]
 
     def offer(self, counter: int, covered: bytes, sealed: bytes) -> bool:
@@ -84,9 +84,9 @@ class Attack(RuleBasedStateMachine):
         _, _, sealed = data.draw(st.sampled_from(self.recorded[-20:]))
         forged = bytearray(sealed)
         forged[at % len(forged)] ^= 1 << bit
-        before = self.vessel.snapshot()
+        before = group(self.vessel.parts(), "window")
         assert offered(self.vessel, VEHICLE, bytes(forged)) == (b"", "tag")
-        assert self.vessel.snapshot()["windows"] == before["windows"]
+        assert group(self.vessel.parts(), "window") == before
 
     @rule()
     def the_vehicle_restarts(self) -> None:
@@ -94,9 +94,9 @@ class Attack(RuleBasedStateMachine):
 
     @rule()
     def the_vessel_restarts(self) -> None:
-        state = self.vessel.snapshot()
+        state = self.vessel.parts()
         self.vessel = vessel_seal()
-        self.vessel.restore(state)
+        assert not self.vessel.restore(state)
 
     @invariant()
     def no_counter_is_sealed_twice(self) -> None:
@@ -126,7 +126,7 @@ def test_the_window_agrees_with_a_set(steps: list[int]) -> None:
         expected = counter > max(taken, default=-1) - WINDOW and counter not in taken
         assert window.is_new(counter) == expected
         if expected:
-            window.take(counter)
+            window.accept(counter)
             taken.add(counter)
         assert window.newest == max(taken)
         assert window.seen < 1 << WINDOW
@@ -135,8 +135,8 @@ def test_the_window_agrees_with_a_set(steps: list[int]) -> None:
 def test_a_leap_forgets_what_was_before_it() -> None:
     window = ReplayWindow()
     for counter in range(WINDOW):
-        window.take(counter)
-    window.take(2 * WINDOW)
+        window.accept(counter)
+    window.accept(2 * WINDOW)
     assert not window.is_new(WINDOW)
     assert all(window.is_new(counter) for counter in range(WINDOW + 1, 2 * WINDOW))
 
@@ -155,4 +155,4 @@ def test_any_bytes_are_refused(sealed: bytes, source: int, encrypt: bool) -> Non
     vessel = vessel_seal(chosen)
     assert offered(vessel, source, sealed) == (b"", "tag")
     assert vessel.counts.forged == 1
-    assert vessel.open(VEHICLE, vehicle_seal(chosen).seal(b"\x80ok")) == b"\x80ok"
+    assert vessel.verify(VEHICLE, vehicle_seal(chosen).protect(b"\x80ok")) == b"\x80ok"

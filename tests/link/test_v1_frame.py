@@ -135,16 +135,16 @@ def test_fields_without_meaning_are_refused(covered: bytes) -> None:
 class Keyed:
     """A seal for tests: four bytes of a keyed hash."""
 
-    size = 4
+    overhead_bytes = 4
 
     def __init__(self, key: bytes) -> None:
         self.key = key
 
-    def seal(self, covered: bytes) -> bytes:
+    def protect(self, covered: bytes) -> bytes:
         return covered + hashlib.blake2s(covered, key=self.key, digest_size=4).digest()
 
-    def open(self, source: int, sealed: bytes, where: str) -> bytes:
-        if source != 3 or self.seal(sealed[:-4]) != sealed:
+    def verify(self, source: int, sealed: bytes, where: str) -> bytes:
+        if source != 3 or self.protect(sealed[:-4]) != sealed:
             raise FrameError(where, "tag", sealed[-4:], "a tag made with the common key")
         return sealed[:-4]
 

@@ -15,7 +15,7 @@ from sonarpost.link.frames.v1.frame import parse_frame
 from sonarpost.link.frames.v1.layers import Layering, recover_layer, recover_layering
 from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, unpack_object
 from sonarpost.link.frames.v1.preview import Preview
-from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.frames.v1.receiver import V1Receiver
 
 
 def golden(name: str) -> Any:
@@ -62,7 +62,7 @@ def test_the_objects_parse() -> None:
         assert preview.link == entry["link"]
     below: PieceList | None = None
     for entry, follows in zip(read["pieces"], (False, True, False), strict=True):
-        pieces = unpack_object(bytes.fromhex(entry["object"]), below if follows else None)
+        pieces = unpack_object(bytes.fromhex(entry["object"]), below.ends if below and follows else None)
         assert isinstance(pieces, PieceList)
         assert [[p.number, p.link, p.start, p.data.hex()] for p in pieces.pieces] == entry["pieces"]
         assert pieces.final == entry["final"]
@@ -72,11 +72,11 @@ def test_the_objects_parse() -> None:
 
 
 def test_the_receiver_reports_what_the_file_says() -> None:
-    read, receiver = golden("exchange"), LinkReceiver()
+    read, receiver = golden("exchange"), V1Receiver()
     for step in read["steps"]:
         events = receiver.accept(step["source"], bytes.fromhex(step["frame"]), step["at"])
         assert [v1_golden.describe_event(e) for e in events] == step["events"], step["at"]
     for source, report in read["reports"].items():
-        found = receiver.report(int(source), float(len(read["steps"])))
+        found = receiver.feedback(int(source), float(len(read["steps"])))
         assert found is not None
         assert found.pack().hex() == report

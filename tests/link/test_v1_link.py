@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import msgpack
 import numpy as np
 import pytest
+from builders.link_state import group, with_fields
 from builders.v1_world import VEHICLE, World, contact, stream
 
 from sonarpost.errors import ConfigError, FrameError, StreamError
+from sonarpost.link.coding.blocks import OutgoingImage, SendBlock
 from sonarpost.link.coding.channel_capacity import LossChannel, erasure_bound_frames
 from sonarpost.link.config import ReceiverConfig, SenderConfig
-from sonarpost.link.events import ContactUpdate, FrameRefused
-from sonarpost.link.frames.v1.feedback import Feedback, FeedbackRequest
+from sonarpost.link.downlink.messages import image_of_number, number_of_image
+from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest
 from sonarpost.link.frames.v1.frame import (
     Segment,
     SegmentKind,
@@ -23,9 +24,9 @@ from sonarpost.link.frames.v1.frame import (
     pack_symbol,
     parse_frame,
 )
-from sonarpost.link.receiver import LinkReceiver
-from sonarpost.link.sender import LinkSender
-from sonarpost.link.sender_state import export_sender, restore_sender
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.frames.v1.sender import SenderState, V1Sender, WaitingImages
+from sonarpost.link.receiver import FrameRejected, ImageUpdate
 
 SIZES = (32, 64, 256, 100)
 
@@ -52,9 +53,9 @@ def test_a_broadcast_for_a_third_lost_shows_contacts_and_most_pictures(frame_byt
 
 
 def test_previews_of_every_contact_go_before_the_detail_of_any() -> None:
-    sender = LinkSender(SenderConfig())
+    sender = V1Sender(SenderConfig())
     for number in range(1, 25):
-        sender.add_picture(number, contact(number), stream(number, 500), 0.0)
+        sender.add_image(number, contact(number), stream(number, 500), 0.0)
     kinds = [parse_frame(frame) for _ in range(30) if (frame := sender.next_frame(0.0))]
     first = [k.kind for k in kinds if isinstance(k, Symbol)]
     assert set(first[:24]) == {SymbolKind.PREVIEW}
@@ -64,9 +65,9 @@ def test_previews_of_every_contact_go_before_the_detail_of_any() -> None:
 def test_receivers_with_good_and_bad_water_both_get_what_their_water_allows() -> None:
     channels = (LossChannel(0.05), LossChannel(0.6))
     config = SenderConfig(channels=channels, frames_per_image=9.0)
-    sender, receivers = LinkSender(config), [LinkReceiver(), LinkReceiver()]
+    sender, receivers = V1Sender(config), [V1Receiver(), V1Receiver()]
     for number in range(1, 25):
-        sender.add_picture(number, contact(number), stream(number, 900), 0.0)
+        sender.add_image(number, contact(number), stream(number, 900), 0.0)
     rng, kinds, got = np.random.default_rng(2), set(), [dict[int, int](), dict[int, int]()]
     while (frame := sender.next_frame(0.0)) is not None:
         parsed = parse_frame(frame)
@@ -74,8 +75,8 @@ def test_receivers_with_good_and_bad_water_both_get_what_their_water_allows() ->
         kinds.add(parsed.kind)
         for receiver, channel, lengths in zip(receivers, channels, got, strict=True):
             for event in receiver.accept(VEHICLE, frame, 0.0) if rng.random() >= channel.loss else []:
-                assert isinstance(event, ContactUpdate)
-                lengths[event.number] = len(event.stream)
+                assert isinstance(event, ImageUpdate)
+                lengths[number_of_image(event.image_id)] = len(event.stream)
     assert kinds == {SymbolKind.PREVIEW, SymbolKind.LAYERED}
     assert len(got[0]) == 24
     assert len(got[1]) >= 22
@@ -83,15 +84,15 @@ def test_receivers_with_good_and_bad_water_both_get_what_their_water_allows() ->
 
 
 def test_one_frame_shows_a_contact_and_a_coarse_picture() -> None:
-    sender, receiver = LinkSender(SenderConfig()), LinkReceiver()
+    sender, receiver = V1Sender(SenderConfig()), V1Receiver()
     for number in range(1, 11):
-        sender.add_picture(number, contact(number), stream(number, 500), 0.0)
+        sender.add_image(number, contact(number), stream(number, 500), 0.0)
     for number in range(1, 11):
         frame = sender.next_frame(0.0)
         assert frame is not None
-        (event,) = LinkReceiver().accept(VEHICLE, frame, 0.0)
-        assert isinstance(event, ContactUpdate)
-        assert (event.number, event.stream) == (number, stream(number, 500)[:30])
+        (event,) = V1Receiver().accept(VEHICLE, frame, 0.0)
+        assert isinstance(event, ImageUpdate)
+        assert (event.image_id, event.stream) == (image_of_number(number), stream(number, 500)[:30])
         assert receiver.accept(VEHICLE, frame, 0.0)
 
 
@@ -141,8 +142,8 @@ def test_messages_come_through_once_and_share_frames() -> None:
 
 
 def test_several_messages_go_in_one_frame_and_contacts_fill_it() -> None:
-    sender = LinkSender(SenderConfig(frame_bytes=128, group_delay_s=100.0))
-    sender.add_picture(1, contact(1), stream(1, 300), 0.0)
+    sender = V1Sender(SenderConfig(frame_bytes=128, group_delay_s=100.0))
+    sender.add_image(1, contact(1), stream(1, 300), 0.0)
     for data in (b"one", b"two"):
         sender.add_message(data, 0.0, times=1)
     frame = sender.next_frame(0.0)
@@ -150,14 +151,14 @@ def test_several_messages_go_in_one_frame_and_contacts_fill_it() -> None:
     listed = parse_frame(frame)
     assert isinstance(listed, tuple)
     assert [s.kind for s in listed] == [SegmentKind.MESSAGE, SegmentKind.MESSAGE, SegmentKind.PREVIEW]
-    (event,) = [e for e in LinkReceiver().accept(VEHICLE, frame, 0.0) if isinstance(e, ContactUpdate)]
+    (event,) = [e for e in V1Receiver().accept(VEHICLE, frame, 0.0) if isinstance(e, ImageUpdate)]
     assert stream(1, 300).startswith(event.stream)
     assert len(event.stream) > 60
 
 
 def test_priorities_and_lifetimes() -> None:
-    sender = LinkSender(SenderConfig())
-    sender.add_picture(1, contact(1), stream(1, 300), 0.0)
+    sender = V1Sender(SenderConfig())
+    sender.add_image(1, contact(1), stream(1, 300), 0.0)
     sender.add_message(b"late", 0.0, priority=-1, times=1)
     sender.add_message(b"expired", 0.0, lifetime_s=1.0)
     sender.add_message(b"stop!", 0.0, priority=9, times=1)
@@ -170,9 +171,9 @@ def test_priorities_and_lifetimes() -> None:
 
 
 def test_copies_of_a_message_are_apart() -> None:
-    sender = LinkSender(SenderConfig(channels=(LossChannel(0.3, 3.0),)))
+    sender = V1Sender(SenderConfig(channels=(LossChannel(0.3, 3.0),)))
     for number in range(1, 11):
-        sender.add_picture(number, contact(number), stream(number, 600), 0.0)
+        sender.add_image(number, contact(number), stream(number, 600), 0.0)
     sender.add_message(b"go", 0.0)
     places = [n for n in range(60) if (f := sender.next_frame(0.0)) and isinstance(parse_frame(f), tuple)]
     assert len(places) == 4
@@ -184,31 +185,31 @@ def test_more_detail_than_planned_can_be_asked_for() -> None:
     world.add(3, 900)
     world.run()
     assert all(100 <= len(e.stream) < 200 and e.complete for e in world.latest.values())
-    world.sender.on_report(FeedbackRequest(2, 700), world.now)
+    world.sender.on_feedback(RefineRequest(2, 700), world.now)
     world.run()
     assert len(world.latest[2].stream) >= 700
     assert world.latest[2].complete
-    assert not world.sender.refine(FeedbackRequest(2, 100), world.now)
+    assert not world.sender.refine(RefineRequest(2, 100), world.now)
     with pytest.raises(FrameError, match="contact number"):
-        world.sender.refine(FeedbackRequest(77, 100), world.now)
+        world.sender.refine(RefineRequest(77, 100), world.now)
 
 
 def test_a_minipacket_asks_for_symbols() -> None:
-    sender, receiver = LinkSender(SenderConfig(feedback=True, channels=(LossChannel(0.0),))), LinkReceiver()
-    sender.add_picture(1, contact(1), stream(1, 400), 0.0)
+    sender, receiver = V1Sender(SenderConfig(feedback=True, channels=(LossChannel(0.0),))), V1Receiver()
+    sender.add_image(1, contact(1), stream(1, 400), 0.0)
     frames = []
     while (frame := sender.next_frame(1.0)) is not None:
         frames.append(frame)
     for frame in frames[:-2]:
         receiver.accept(VEHICLE, frame, 1.0)
-    bits = receiver.mini_report(VEHICLE)
+    bits = receiver.mini_feedback(VEHICLE)
     assert bits is not None
     assert (bits >> 8, bits & 255) == (1, 2)
-    sender.on_mini(bits >> 8, bits & 255, 2.0)
+    sender.on_mini_feedback(bits >> 8, bits & 255, 2.0)
     events = [e for _ in range(2) if (f := sender.next_frame(2.0)) for e in receiver.accept(VEHICLE, f, 2.0)]
-    assert isinstance(events[-1], ContactUpdate)
+    assert isinstance(events[-1], ImageUpdate)
     assert events[-1].complete
-    assert receiver.mini_report(VEHICLE) is None
+    assert receiver.mini_feedback(VEHICLE) is None
 
 
 def test_a_new_frame_size_keeps_what_fits_and_starts_again_what_does_not() -> None:
@@ -222,7 +223,7 @@ def test_a_new_frame_size_keeps_what_fits_and_starts_again_what_does_not() -> No
 
 
 def test_numbers_of_blocks_and_contacts_wrap() -> None:
-    world = World.make(0.2, 3, channels=(LossChannel(0.2),), group_pictures=2, frames_per_image=9.0)
+    world = World.make(0.2, 3, channels=(LossChannel(0.2),), group_images=2, frames_per_image=9.0)
     number = 65500
     for _ in range(60):
         world.add(2, 200, first=number)
@@ -234,91 +235,116 @@ def test_numbers_of_blocks_and_contacts_wrap() -> None:
 
 
 def test_a_vehicle_that_starts_anew_does_not_mix_pictures() -> None:
-    receiver = LinkReceiver()
+    receiver = V1Receiver()
     first, second = (
-        LinkSender(SenderConfig(channels=(LossChannel(0.0),))),
-        LinkSender(SenderConfig(channels=(LossChannel(0.0),))),
+        V1Sender(SenderConfig(channels=(LossChannel(0.0),))),
+        V1Sender(SenderConfig(channels=(LossChannel(0.0),))),
     )
     for number in range(1, 6):
-        first.add_picture(number, contact(number), stream(number, 400), 0.0)
-        second.add_picture(number, contact(number + 100), stream(number + 100, 400), 0.0)
+        first.add_image(number, contact(number), stream(number, 400), 0.0)
+        second.add_image(number, contact(number + 100), stream(number + 100, 400), 0.0)
     for _ in range(9):  # previews, and too little detail
         frame = first.next_frame(0.0)
         assert frame is not None
         receiver.accept(VEHICLE, frame, 0.0)
-    latest: dict[int, ContactUpdate] = {}
+    latest: dict[int, ImageUpdate] = {}
     while (frame := second.next_frame(1.0)) is not None:
         for event in receiver.accept(VEHICLE, frame, 1.0):
-            if isinstance(event, ContactUpdate):
-                assert event.contact == contact(event.number + 100)
-                assert stream(event.number + 100, 400).startswith(event.stream)
-                latest[event.number] = event
+            if isinstance(event, ImageUpdate):
+                number = number_of_image(event.image_id) + 100
+                assert event.contact == contact(number)
+                assert stream(number, 400).startswith(event.stream)
+                latest[number] = event
     assert len(latest) == 5
     assert all(e.complete for e in latest.values())
 
 
 def test_vehicles_do_not_disturb_each_other() -> None:
-    receiver, senders = LinkReceiver(), {}
+    receiver, senders = V1Receiver(), {}
     for address in (3, 4, 5):
-        senders[address] = LinkSender(SenderConfig(channels=(LossChannel(0.0),)))
+        senders[address] = V1Sender(SenderConfig(channels=(LossChannel(0.0),)))
         for number in (1, 2):
-            senders[address].add_picture(
-                number, contact(10 * address + number), stream(10 * address + number, 300), 0.0
-            )
+            senders[address].add_image(number, contact(10 * address + number), stream(10 * address + number, 300), 0.0)
     latest = {}
     for _ in range(40):
         for address, sender in senders.items():
             for event in receiver.accept(address, f, 0.0) if (f := sender.next_frame(0.0)) else []:
-                assert isinstance(event, ContactUpdate)
-                latest[event.source, event.number] = event
+                assert isinstance(event, ImageUpdate)
+                latest[event.source, number_of_image(event.image_id)] = event
     assert {k: v.contact for k, v in latest.items()} == {(a, n): contact(10 * a + n) for a in (3, 4, 5) for n in (1, 2)}
     assert all(stream(10 * a + n, 300).startswith(e.stream) and e.complete for (a, n), e in latest.items())
 
 
 def test_the_sender_goes_on_after_a_restart_at_every_frame() -> None:
-    def add_all(sender: LinkSender) -> None:
+    def add_all(sender: V1Sender) -> None:
         for number in range(1, 6):
-            sender.add_picture(number, contact(number), stream(number, 300), 0.0)
+            sender.add_image(number, contact(number), stream(number, 300), 0.0)
         sender.add_message(b"hello", 0.0)
         sender.add_message(stream(7, 200), 0.0)
 
     config = SenderConfig(feedback=True, channels=(LossChannel(0.3),))
-    steady, restarted = LinkSender(config), LinkSender(config)
+    steady, restarted = V1Sender(config), V1Sender(config)
     add_all(steady)
     add_all(restarted)
     for step in range(90):
         if step == 40:
             for sender in (steady, restarted):
                 sender.on_feedback(Feedback(1, 30, (5, 2)), 40.0)
-        state = msgpack.unpackb(msgpack.packb(export_sender(restarted)))
-        restarted = LinkSender(config)
-        restore_sender(restarted, state)
+        parts = restarted.parts()
+        restarted = V1Sender(config)
+        assert not restarted.restore(parts)
         assert restarted.next_frame(float(step)) == steady.next_frame(float(step))
-    assert export_sender(restarted) == export_sender(steady)
+    assert restarted.parts() == steady.parts()
 
 
 @pytest.mark.parametrize(
-    "change", [{"format": 2}, {"pictures": [{}]}, {"blocks": 3}, {"waiting": [9]}, {"meters": [[1, 7.0, [1, 1]]]}]
+    ("name", "change"),
+    [
+        ("sender", {"format version": 1}),
+        ("sender", {"next_block": 32}),
+        ("sender", {"meters": {1: {"loss": 7.0}}}),
+        ("sender", {"feedback": [{"kind": 99, "data": b""}]}),
+        ("waiting", {"numbers": 3}),
+        ("waiting", {"numbers": [0]}),
+        ("image/1", {"number": 0}),
+        ("image/1", {"curve": b""}),
+        ("image/1", {"contact": b"short"}),
+        ("image-progress/1", {"delivered": [[9, 3]]}),
+        ("block/0", {"objects": []}),
+        ("block/0", {"kind": 2}),
+        ("block-progress/0", {"needs": {1: 256}}),
+    ],
+    ids=str,
 )
-def test_a_state_that_no_sender_made_is_refused(change: dict[str, object]) -> None:
-    sender = LinkSender(SenderConfig())
-    sender.add_picture(1, contact(1), stream(1, 50), 0.0)
-    state = {**export_sender(sender), **change}
-    before = export_sender(sender)
-    with pytest.raises(FrameError):
-        restore_sender(sender, state)
-    assert export_sender(sender) == before
+def test_the_sender_reports_a_malformed_part_and_sends_everything_else_again(
+    name: str, change: dict[str, object]
+) -> None:
+    sender = V1Sender(SenderConfig(group_images=1, depth=1))
+    for number in (1, 2):
+        sender.add_image(number, contact(number), stream(number, 50), 0.0)
+    assert sender.next_frame(0.0)
+    restored = V1Sender(sender.config)
+    kinds = {"sender": SenderState, "waiting": WaitingImages, "image": OutgoingImage, "block": SendBlock}
+    kind = kinds[name.partition("/")[0].removesuffix("-progress")]
+    errors = restored.restore(with_fields(sender.parts(), name, kind, change))
+    assert name in errors
+    assert f"sender state: {name}: " in str(errors[name])
+    left = {2} if name == "image/1" else {1, 2}
+    assert set(restored.kept) == left
+    world = World(restored, V1Receiver(), lambda: True, sent={n: stream(n, 50) for n in left})
+    world.run()
+    assert set(world.latest) == left
 
 
 def test_what_the_sender_refuses() -> None:
-    sender = LinkSender(SenderConfig())
-    sender.add_picture(1, contact(1), b"x", 0.0)
+    sender = V1Sender(SenderConfig())
+    sender.add_image(1, contact(1), b"x", 0.0)
     with pytest.raises(FrameError, match="contact number"):
-        sender.add_picture(1, contact(1), b"x", 0.0)
+        sender.add_image(1, contact(1), b"x", 0.0)
     with pytest.raises(FrameError, match="contact number"):
-        sender.add_picture(0, contact(1), b"x", 0.0)
+        sender.add_image(0, contact(1), b"x", 0.0)
     with pytest.raises(StreamError):
-        sender.add_picture(2, contact(1), b"", 0.0)
+        sender.add_image(2, contact(1), b"", 0.0)
     for data in (b"", bytes(4097)):
         with pytest.raises(FrameError, match="message"):
             sender.add_message(data, 0.0)
@@ -330,45 +356,44 @@ def test_what_the_sender_refuses() -> None:
 
 
 def test_memory_is_bounded() -> None:
-    receiver = LinkReceiver(ReceiverConfig(max_sources=2, max_contacts=5))
+    receiver = V1Receiver(ReceiverConfig(max_sources=2, max_contacts=5))
     for address in range(6):
-        sender = LinkSender(SenderConfig(channels=(LossChannel(0.0),)))
+        sender = V1Sender(SenderConfig(channels=(LossChannel(0.0),)))
         for number in range(1, 30):
-            sender.add_picture(number, contact(number), stream(number, 90), 0.0)
+            sender.add_image(number, contact(number), stream(number, 90), 0.0)
         while (frame := sender.next_frame(0.0)) is not None:
             receiver.accept(address, frame, 0.0)
-    state = receiver.snapshot()
-    sources = state["sources"]
-    assert isinstance(sources, list)
-    assert len(sources) == 2
-    assert all(len(s["contacts"]) <= 5 and len(s["blocks"]) <= 16 for s in sources)
-    assert receiver.counts.forgotten_sources == 4
+    parts = receiver.parts()
+    assert len(receiver.sources) == len(group(parts, "peer")) == 2
+    assert all(len(group(parts, f"image/{source}")) <= 5 for source in receiver.sources)
+    assert all(len(group(parts, f"block/{source}")) <= 16 for source in receiver.sources)
+    assert receiver.counts.evicted_sources == 4
 
 
 def test_old_blocks_and_contacts_are_forgotten() -> None:
     config = ReceiverConfig(block_memory_s=10.0, contact_memory_s=100.0)
-    sender, receiver = LinkSender(SenderConfig()), LinkReceiver(config)
-    sender.add_picture(1, contact(1), stream(1, 300), 0.0)
+    sender, receiver = V1Sender(SenderConfig()), V1Receiver(config)
+    sender.add_image(1, contact(1), stream(1, 300), 0.0)
     frame = sender.next_frame(0.0)
     assert frame is not None
     assert len(receiver.accept(VEHICLE, frame, 0.0)) == 1
     assert receiver.accept(VEHICLE, frame, 50.0) == []  # known, though the block was forgotten
     (event,) = receiver.accept(VEHICLE, frame, 200.0)
-    assert isinstance(event, ContactUpdate)
+    assert isinstance(event, ImageUpdate)
     assert event.version == 1
 
 
 def test_unknown_segments_are_told_and_do_not_hide_the_others() -> None:
     frame = pack_segments([Segment(25, b"new"), Segment(SegmentKind.MESSAGE, b"\x01hello")], 64)
-    refused, message = LinkReceiver().accept(VEHICLE, frame, 0.0)
-    assert isinstance(refused, FrameRefused)
+    refused, message = V1Receiver().accept(VEHICLE, frame, 0.0)
+    assert isinstance(refused, FrameRejected)
     assert "segment kind" in str(refused.reason)
     assert getattr(message, "data", None) == b"hello"
 
 
 def test_one_frame_that_passed_damaged_does_not_replace_a_block() -> None:
-    sender, receiver = LinkSender(SenderConfig(channels=(LossChannel(0.0),), frames_per_image=20.0)), LinkReceiver()
-    sender.add_picture(1, contact(1), stream(1, 900), 0.0)
+    sender, receiver = V1Sender(SenderConfig(channels=(LossChannel(0.0),), frames_per_image=20.0)), V1Receiver()
+    sender.add_image(1, contact(1), stream(1, 900), 0.0)
     frames = []
     while (frame := sender.next_frame(0.0)) is not None:
         frames.append(frame)
@@ -379,28 +404,28 @@ def test_one_frame_that_passed_damaged_does_not_replace_a_block() -> None:
     false = Symbol(other.kind, other.block, parse_frame(frames[1]).index, other.parameter, bytes(59))  # type: ignore[union-attr]
     receiver.accept(VEHICLE, pack_symbol(false), 0.0)
     events = [e for frame in frames[3:] for e in receiver.accept(VEHICLE, frame, 0.0)]
-    assert isinstance(events[-1], ContactUpdate)
+    assert isinstance(events[-1], ImageUpdate)
     assert events[-1].complete
     assert stream(1, 900).startswith(events[-1].stream)
 
 
 def test_a_block_goes_on_until_every_receiver_has_it() -> None:
-    sender = LinkSender(SenderConfig(feedback=True, channels=(LossChannel(0.4),), stream_bytes=300))
-    receivers = {address: LinkReceiver() for address in (1, 2, 9)}
-    latest: dict[tuple[int, int], ContactUpdate] = {}
+    sender = V1Sender(SenderConfig(feedback=True, channels=(LossChannel(0.4),), stream_bytes=300))
+    receivers = {address: V1Receiver() for address in (1, 2, 9)}
+    latest: dict[tuple[int, int], ImageUpdate] = {}
     for number in range(1, 21):
-        sender.add_picture(number, contact(number), stream(number, 300), 0.0)
+        sender.add_image(number, contact(number), stream(number, 300), 0.0)
     rng, now = np.random.default_rng(4), 0.0
     while not sender.is_idle and now < 20_000:
         now += 1.0
         frame = sender.next_frame(now)
         for address, receiver in receivers.items():
             for event in receiver.accept(VEHICLE, frame, now) if frame and rng.random() >= 0.4 else []:
-                assert isinstance(event, ContactUpdate)
-                latest[address, event.number] = event
-            report = receiver.report(VEHICLE, now) if receiver.report_is_due(VEHICLE, now) else None
+                assert isinstance(event, ImageUpdate)
+                latest[address, number_of_image(event.image_id)] = event
+            report = receiver.feedback(VEHICLE, now) if receiver.feedback_is_due(VEHICLE, now) else None
             if report is not None and rng.random() >= 0.4:
-                sender.on_report(report, now, receiver=address)
+                sender.on_feedback(report, now, receiver=address)
     assert len(latest) == 60
-    assert all(e.complete and e.stream == stream(e.number, 300) for e in latest.values())
+    assert all(e.complete and e.stream == stream(number_of_image(e.image_id), 300) for e in latest.values())
     assert sender.measured_loss == pytest.approx(0.4, abs=0.2)

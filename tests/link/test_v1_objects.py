@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
+from sonarpost.link.coding.delivery_ledger import LossMeter
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import Feedback, FeedbackRequest, pack_mini, unpack_mini
+from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest, pack_mini, unpack_mini
 from sonarpost.link.frames.v1.layers import Layering, layered_symbols, recover_layer, recover_layering
 from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, StreamPiece, unpack_object
 from sonarpost.link.frames.v1.preview import Preview, contact_link, entry_shape, next_number
-from sonarpost.link.sender_feedback import LossMeter
 
 CONTACT = ContactSummary(lat_deg=44.7, lon_deg=-63.6, confidence=1.0).rounded()
 
@@ -75,10 +75,10 @@ def test_pieces_and_the_layer_above_come_back(
     above = PieceList(
         tuple(StreamPiece(p.number, p.link, p.stop, data.draw(st.binary(max_size=9))) for p in listed), True
     )
-    length = above.overhead_bytes(group) + sum(len(p.data) for p in above.pieces)
-    assert unpack_object(above.pack(length, group), group) == above
+    length = above.overhead_bytes(group.ends) + sum(len(p.data) for p in above.pieces)
+    assert unpack_object(above.pack(length, group.ends), group.ends) == above
     with pytest.raises(FrameError):
-        unpack_object(above.pack(length, group))  # nobody knows of whom
+        unpack_object(above.pack(length, group.ends))  # nobody knows of whom
     with pytest.raises(FrameError, match="at most"):
         group.pack(group.overhead_bytes() + sum(len(p.data) for p in listed) - 1)
 
@@ -194,19 +194,19 @@ def test_thirteen_bits_only() -> None:
 
 
 def test_a_request_comes_back() -> None:
-    assert FeedbackRequest.unpack(FeedbackRequest(9, 700).pack()) == FeedbackRequest(9, 700)
+    assert RefineRequest.unpack(RefineRequest(9, 700).pack()) == RefineRequest(9, 700)
     for data in (b"", b"\0\0\0\5", bytes(5)):
         with pytest.raises(FrameError):
-            FeedbackRequest.unpack(data)
+            RefineRequest.unpack(data)
 
 
 def test_loss_is_measured_between_reports() -> None:
     meter = LossMeter()
-    meter.take(Feedback(0, 65500, ()), 100)
+    meter.update(Feedback(0, 65500, ()), 100)
     assert meter.loss is None
-    meter.take(Feedback(0, 65501, ()), 110)  # too short a stretch
+    meter.update(Feedback(0, 65501, ()), 110)  # too short a stretch
     assert meter.loss is None
-    meter.take(Feedback(0, (65500 + 70) % 65536, ()), 200)
+    meter.update(Feedback(0, (65500 + 70) % 65536, ()), 200)
     assert meter.loss == pytest.approx(0.3)
-    meter.take(Feedback(0, (65500 + 70) % 65536, ()), 300)
+    meter.update(Feedback(0, (65500 + 70) % 65536, ()), 300)
     assert meter.loss == pytest.approx(0.75 * 0.3 + 0.25)

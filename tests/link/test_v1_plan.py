@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from sonarpost.errors import ConfigError, StreamError
-from sonarpost.link.coding.channel_capacity import LossChannel
+from sonarpost.link.coding.channel_capacity import LossChannel, best_rate
 from sonarpost.link.coding.rate_distortion import GroupDistortion, quality_curve
 from sonarpost.link.coding.redundancy_plan import (
     arrivals,
-    best_rate,
     copies,
     plan_layers,
     plan_whole,
@@ -148,5 +147,5 @@ def test_the_rate_that_carries_most() -> None:
     assert best_rate({0: 0.0, 1: 0.1, 5: 0.98}, RATES).number == 1
     assert best_rate({0: 0.1, 1: 0.95, 5: 1.0}, RATES).number == 0
     for measured in ({}, {9: 0.1}, {1: 1.5}):
-        with pytest.raises(ConfigError, match="rate choice"):
+        with pytest.raises(ConfigError, match="rate selection"):
             best_rate(measured, RATES)

@@ -7,23 +7,25 @@ from typing import Any
 import msgpack
 import pytest
 from builders import v1_fuzz
+from builders.link_state import plain_of, with_fields
 from builders.v1_world import VEHICLE, contact, stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.errors import FrameError
+from sonarpost.link.coding.block_decoder import BlockDecoder, SymbolChunk
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import ReceiverConfig, SenderConfig
-from sonarpost.link.events import ContactUpdate, Event, FrameRefused, MessageReceived
-from sonarpost.link.receiver import LinkReceiver
-from sonarpost.link.sender import LinkSender
+from sonarpost.link.downlink.messages import number_of_image
+from sonarpost.link.frames.v1.receiver import AssembledImage, PeerState, V1Receiver, V1ReceiverCounts
+from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.receiver import Event, FrameRejected, ImageUpdate, MessageReceived
 
 
 @st.composite
 def deliveries(draw: st.DrawFn) -> list[tuple[float, bytes]]:
     """Frames of a sender with pictures and messages, some of them, in any order, some twice, some padded or cut."""
     channels = draw(st.sampled_from([(LossChannel(0.0),), (LossChannel(0.3),), (LossChannel(0.05), LossChannel(0.6))]))
-    sender = LinkSender(
+    sender = V1Sender(
         SenderConfig(
             frame_bytes=draw(st.sampled_from([32, 64, 256])),
             channels=channels,
@@ -34,7 +36,7 @@ def deliveries(draw: st.DrawFn) -> list[tuple[float, bytes]]:
         first_block=draw(st.integers(0, 31)),
     )
     for number in range(1, draw(st.integers(1, 9)) + 1):
-        sender.add_picture(number, contact(number), stream(number, draw(st.sampled_from([5, 40, 250]))), 0.0)
+        sender.add_image(number, contact(number), stream(number, draw(st.sampled_from([5, 40, 250]))), 0.0)
     if draw(st.booleans()):
         sender.add_message(b"a message", 0.0, times=1)
     frames: list[bytes] = []
@@ -53,27 +55,28 @@ def deliveries(draw: st.DrawFn) -> list[tuple[float, bytes]]:
 
 def comparable(events: list[Event]) -> list[Any]:
     """Errors have no equality of their own."""
-    return [(e.source, e.at, str(e.reason)) if isinstance(e, FrameRefused) else e for e in events]
+    return [(e.source, e.received_s, str(e.reason)) if isinstance(e, FrameRejected) else e for e in events]
 
 
 @settings(max_examples=40, deadline=None)
 @given(deliveries())
 def test_what_is_shown_was_sent_and_grows(delivery: list[tuple[float, bytes]]) -> None:
-    receiver, known = LinkReceiver(), dict[int, ContactUpdate]()
+    receiver, known = V1Receiver(), dict[int, ImageUpdate]()
     for now, frame in delivery:
         for event in receiver.accept(VEHICLE, frame, now):
             if isinstance(event, MessageReceived):
                 assert event.data == b"a message"
-            elif isinstance(event, ContactUpdate):
-                sent = [stream(event.number, length) for length in (5, 40, 250)]
-                assert event.contact == contact(event.number)
+            elif isinstance(event, ImageUpdate):
+                number = number_of_image(event.image_id)
+                sent = [stream(number, length) for length in (5, 40, 250)]
+                assert event.contact == contact(number)
                 assert any(s.startswith(event.stream) for s in sent)
-                before = known.get(event.number)
+                before = known.get(number)
                 assert event.version == (1 if before is None else before.version + 1)
                 if before is not None:
                     assert event.stream.startswith(before.stream)
                     assert (len(event.stream), event.complete) != (len(before.stream), before.complete)
-                known[event.number] = event
+                known[number] = event
     assert receiver.counts.frames == len(delivery)
 
 
@@ -81,15 +84,15 @@ def test_what_is_shown_was_sent_and_grows(delivery: list[tuple[float, bytes]]) -
 @given(deliveries())
 def test_a_restart_at_every_frame_changes_nothing(delivery: list[tuple[float, bytes]]) -> None:
     config = ReceiverConfig(max_contacts=4, block_memory_s=120.0)
-    steady, restarted = LinkReceiver(config), LinkReceiver(config)
+    steady, restarted = V1Receiver(config), V1Receiver(config)
     for now, frame in delivery:
-        state = msgpack.unpackb(msgpack.packb(restarted.snapshot()))
-        restarted = LinkReceiver(config)
-        restarted.restore(state)
+        parts = restarted.parts()
+        restarted = V1Receiver(config)
+        assert not restarted.restore(parts)
         assert comparable(restarted.accept(VEHICLE, frame, now)) == comparable(steady.accept(VEHICLE, frame, now))
-        assert restarted.report_is_due(VEHICLE, now) == steady.report_is_due(VEHICLE, now)
-        assert restarted.report(VEHICLE, now) == steady.report(VEHICLE, now)
-    assert restarted.snapshot() == steady.snapshot()
+        assert restarted.feedback_is_due(VEHICLE, now) == steady.feedback_is_due(VEHICLE, now)
+        assert restarted.feedback(VEHICLE, now) == steady.feedback(VEHICLE, now)
+    assert restarted.parts() == steady.parts()
     assert restarted.counts == steady.counts
 
 
@@ -105,47 +108,80 @@ def test_a_bounded_run_of_hostile_frames_shows_nothing_wrong() -> None:
     assert counts["shown"] > 400
 
 
-STATE_CHANGES: list[dict[str, object]] = [
-    {"format": 9},
-    {"sources": 5},
-    {"sources": [{}]},
-    {"counts": {"frames": 1}},
-    {"counts": {}},
-]
-
-
-@pytest.mark.parametrize("change", STATE_CHANGES)
-def test_a_state_that_no_receiver_made_is_refused(change: dict[str, object]) -> None:
-    receiver = LinkReceiver()
-    before = receiver.snapshot()
-    with pytest.raises(FrameError, match="receiver state"):
-        receiver.restore({**before, **change})
-    assert receiver.snapshot() == before
-
-
-@settings(max_examples=70, deadline=None)
-@given(st.data())
-def test_any_part_of_a_state_replaced_is_refused_or_taken_never_another_error(data: st.DataObject) -> None:
-    sender, receiver = LinkSender(SenderConfig(channels=(LossChannel(0.05), LossChannel(0.6)))), LinkReceiver()
+def busy_receiver() -> tuple[V1Sender, V1Receiver]:
+    """A receiver with images, a block with layers in it, and messages, and the sender of more."""
+    sender, receiver = V1Sender(SenderConfig(channels=(LossChannel(0.05), LossChannel(0.6)))), V1Receiver()
     for number in (1, 2, 3):
-        sender.add_picture(number, contact(number), stream(number, 300), 0.0)
-    for _ in range(9):
+        sender.add_image(number, contact(number), stream(number, 300), 0.0)
+    sender.add_message(b"a message", 0.0)
+    for _ in range(12):
         receiver.accept(VEHICLE, sender.next_frame(0.0) or b"", 0.0)
-    state: Any = msgpack.unpackb(msgpack.packb(receiver.snapshot()))
-    place: Any = state
+    return sender, receiver
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("counts", {"format version": 1}),
+        ("counts", {"frames": -1}),
+        ("counts", {"frames": True}),
+        ("peer/3", {"newest_block": 32}),
+        ("peer/3", {"recent_messages": [[1, 2]]}),
+        ("image/3/1", {"contact": bytes(24)}),
+        ("image/3/1", {"stream": b""}),
+        ("image/3/1", {"reported": [1]}),
+        ("block/3/1", {"kind": 2}),
+        ("block/3/1", {"count": 3}),
+        ("block/3/1", {"layering": bytes(3)}),
+        ("block-symbols/3/1/00", {"symbols": [[255, bytes(59), 0]]}),
+        ("block-symbols/3/1/00", {"symbols": [[0, bytes(58), 0]]}),
+    ],
+    ids=str,
+)
+def test_a_malformed_part_is_reported_and_the_others_are_restored(name: str, change: dict[str, object]) -> None:
+    _, receiver = busy_receiver()
+    parts = receiver.parts()
+    assert name in parts
+    restored = V1Receiver()
+    kinds = {"counts": V1ReceiverCounts, "peer": PeerState, "image": AssembledImage, "block": BlockDecoder}
+    errors = restored.restore(with_fields(parts, name, kinds.get(name.partition("/")[0], SymbolChunk), change))
+    assert list(errors) == [name]
+    assert str(errors[name]).startswith(f"v1 receiver state: {name}: ")
+    skipped = ("block/", "block-symbols/") if name.startswith("block") else ("block", name) if "peer" in name else ()
+    expected = {part: data for part, data in parts.items() if part != name and not part.startswith(skipped)}
+    assert {part: data for part, data in restored.parts().items() if part in expected} == expected
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_a_replaced_value_in_a_state_is_reported_or_accepted_and_raises_nothing(data: st.DataObject) -> None:
+    sender, receiver = busy_receiver()
+    parts = receiver.parts()
+    name = data.draw(st.sampled_from(sorted(parts)))
+    plain = plain_of(parts, name)
+    place: Any = plain
     while True:
         keys = list(place) if isinstance(place, dict) else list(range(len(place)))
         key = data.draw(st.sampled_from(keys))
         if isinstance(place[key], dict | list) and place[key] and data.draw(st.booleans()):
             place = place[key]
             continue
-        place[key] = data.draw(st.sampled_from([None, -1, 3, 2.5, float("nan"), b"", b"xx", "x", [], {}, True, 10**30]))
+        place[key] = data.draw(
+            st.sampled_from([None, -1, 3, 2.5, float("nan"), b"", b"xx", "x", [], {}, True, 2**63, b"\x92\x05\xc3"])
+        )
         break
-    fresh = LinkReceiver()
-    try:
-        fresh.restore(state)
-    except FrameError:
-        return
+    fresh = V1Receiver()
+    errors = fresh.restore({**parts, name: msgpack.packb(plain)})
+    assert all(part == name or ("block" in name and part.startswith("block-symbols/")) for part in errors)
     for _ in range(30):
         fresh.accept(VEHICLE, sender.next_frame(1.0) or b"", 1.0)
-    fresh.report(VEHICLE, 1.0)
+    fresh.feedback(VEHICLE, 1.0)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.dictionaries(st.sampled_from(["counts", "peer/3", "image/3/1", "block/3/1", "x", "image/a/b"]), st.binary()))
+def test_any_bytes_as_parts_raise_nothing(parts: dict[str, bytes]) -> None:
+    receiver = V1Receiver()
+    errors = receiver.restore(parts)
+    assert set(errors) <= set(parts)
+    assert receiver.sources == ()

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import msgpack
 import numpy as np
 import pytest
-from builders.v1_world import VEHICLE, contact, stream
+from builders.v1_world import VEHICLE, contact, stream, take_packet
 
 from sonarpost.link.coding.byte_ranges import count_positions
-from sonarpost.link.events import ContactUpdate, MessageReceived
-from sonarpost.link.queue.state import export_queue, restore_queue
-from sonarpost.link.queue.transmit_queue import ImageName, QueueConfig, TransmitQueue
-from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.config import QueueConfig
+from sonarpost.link.downlink.messages import image_of_number, number_of_image
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.queue.transmit_queue import TransmitQueue
+from sonarpost.link.receiver import ImageUpdate, MessageReceived
+from sonarpost.link.sender import ImageToSend
 from sonarpost.modem.micromodem import RATES
 
 VESSEL = 1
@@ -27,40 +28,41 @@ class Exchange:
         self.lost: Callable[[], bool] = lambda: bool(rng.random() < loss)
         self.config = QueueConfig(expected_loss=max(loss, 0.05), **config)
         self.queue = TransmitQueue(self.config)
-        self.receiver = LinkReceiver()
+        self.receiver = V1Receiver()
         self.streams: dict[int, bytes] = {}
         self.shown: dict[int, bytes] = {}
         self.now = 0.0
 
     def add(self, number: int, length: int = 300) -> None:
         self.streams[number] = stream(number, length)
-        name = ImageName(f"{number:04d}", f"c{number}")
-        self.queue.add_picture(number, name, contact(number), self.streams[number], self.now)
+        image = ImageToSend(image_of_number(number), f"c{number}", contact(number), self.streams[number])
+        self.queue.add_image(image, self.now)
 
     def run(self, seconds: float, *, reports: bool, water: bool = True) -> None:
         """Send for so long, or until there is nothing to send."""
         end = self.now + seconds
         while self.now < end:
-            packet = self.queue.next_packet(self.now)
+            frames = take_packet(self.queue, self.now)
             self.now += RATES[self.queue.rate].airtime_s
-            for frame in packet:
+            for frame in frames:
                 if not water or self.lost():
                     continue
                 for event in self.receiver.accept(VEHICLE, frame, self.now):
                     if isinstance(event, MessageReceived):
                         continue
-                    assert isinstance(event, ContactUpdate)
-                    assert self.streams[event.number].startswith(event.stream)
-                    self.shown[event.number] = event.stream
-            if reports and self.receiver.report_is_due(VEHICLE, self.now):
-                report = self.receiver.report(VEHICLE, self.now)
+                    assert isinstance(event, ImageUpdate)
+                    number = number_of_image(event.image_id)
+                    assert self.streams[number].startswith(event.stream)
+                    self.shown[number] = event.stream
+            if reports and self.receiver.feedback_is_due(VEHICLE, self.now):
+                report = self.receiver.feedback(VEHICLE, self.now)
                 if report is not None and not self.lost():
-                    self.queue.on_report(report, self.now, VESSEL)
+                    self.queue.on_feedback(report, self.now, VESSEL)
 
     def restart(self) -> None:
-        parts = {name: msgpack.packb(part) for name, part in export_queue(self.queue).items()}
+        parts = self.queue.parts()
         self.queue = TransmitQueue(self.config)
-        restore_queue(self.queue, {n: msgpack.unpackb(p, strict_map_key=False) for n, p in parts.items()})
+        assert not self.queue.restore(parts)
 
     @property
     def whole(self) -> list[int]:
@@ -69,7 +71,7 @@ class Exchange:
 
 def settled(exchange: Exchange) -> bool:
     kept = exchange.queue.sender.kept
-    return all(count_positions(kept[n].settled) == len(data) for n, data in exchange.streams.items())
+    return all(count_positions(kept[n].delivered) == len(data) for n, data in exchange.streams.items())
 
 
 def test_pictures_cut_while_nobody_reported_become_whole_when_reports_come() -> None:
@@ -115,7 +117,7 @@ def test_what_receivers_have_of_a_block_sent_before_they_reported_is_not_sent_ag
         exchange.add(number)
         exchange.run(60.0, reports=False)
     first = exchange.queue.sender.frames_sent
-    assert len(exchange.queue.sender.past) == 14
+    assert len(exchange.queue.sender.retired) == 14
     there = sum(len(data) for data in exchange.shown.values())
     exchange.add(8)
     exchange.run(7200.0, reports=True)
@@ -152,7 +154,7 @@ def test_a_break_in_the_reports_and_another_frame_length_cost_no_picture() -> No
 
 
 def test_pictures_beyond_the_limit_are_forgotten_settled_ones_first() -> None:
-    exchange = Exchange(loss=0.0, kept_pictures=8)
+    exchange = Exchange(loss=0.0, kept_images=8)
     for number in range(1, 5):
         exchange.add(number)
     exchange.run(3600.0, reports=True)
@@ -162,23 +164,6 @@ def test_pictures_beyond_the_limit_are_forgotten_settled_ones_first() -> None:
         exchange.add(number)
         exchange.run(2000.0, reports=False, water=False)
     assert set(exchange.queue.sender.kept) == set(range(5, 13)), "what may still have to be sent is kept"
-
-
-def test_a_state_of_before_there_were_repairs_is_taken_up() -> None:
-    exchange = Exchange()
-    for number in range(1, 4):
-        exchange.add(number)
-    exchange.run(60.0, reports=False)
-    parts = {name: dict(part) for name, part in export_queue(exchange.queue).items()}
-    core = parts["core"]
-    del core["past"]
-    core["sent"] = [entry[:2] for entry in core["sent"]]  # type: ignore[attr-defined]
-    for name in [n for n in parts if n.startswith("block/")]:
-        parts[name].pop("spans")
-    exchange.queue = TransmitQueue(exchange.config)
-    restore_queue(exchange.queue, parts)
-    exchange.run(2 * 3600.0, reports=True)
-    assert len(exchange.whole) == 3
 
 
 def test_a_refinement_asked_for_before_reports_came_is_sent_and_repaired() -> None:

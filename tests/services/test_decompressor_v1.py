@@ -22,7 +22,7 @@ from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
 from sonarpost.link.frames.v1.preview import ENTRY_HEAD_BYTES, Preview
-from sonarpost.link.sender import LinkSender
+from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.messages import AcousticFrame, ReconstructedImage
 from sonarpost.runtime.service import UnitOfWork
 from sonarpost.security.acoustic_key import read_key
@@ -81,9 +81,9 @@ def frame(data, source=3, at_utc_s=None):
 
 def sent(streams, config=LOSS_30, first=1, seal=None):
     """All frames of these pictures, in the order they are sent."""
-    sender = LinkSender(config, seal=seal)
+    sender = V1Sender(config, protection=seal)
     for number, stream in enumerate(streams, start=first):
-        sender.add_picture(number, replace(CONTACT, time_utc_s=1_475_568_000.0 + number), stream, 0.0)
+        sender.add_image(number, replace(CONTACT, time_utc_s=1_475_568_000.0 + number), stream, 0.0)
     frames = []
     while (data := sender.next_frame(0.0)) is not None:
         frames.append(data)

@@ -16,11 +16,11 @@ from sonarpost.link.auth.key import Direction
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink import messages as dl
-from sonarpost.link.events import FeedbackReceived, MessageReceived
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
-from sonarpost.link.receiver import LinkReceiver
-from sonarpost.link.sender import LinkSender
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.receiver import FeedbackReceived, MessageReceived
 from sonarpost.messages import AcousticFrame, Command, Decision, DownlinkState, ReceivedMessage
 from sonarpost.modem.micromodem import FrameReceived, MicroModem, MicroModemConfig, PacketReceived
 from sonarpost.runtime.modem_runner import ModemRunner
@@ -106,8 +106,10 @@ class Vehicle:
         if key is not None:
             seal = FrameAuthenticator(key, 3, Direction.FROM_VEHICLE)
             seal.grant(10_000)
-        self.receiver = LinkReceiver(seal=seal)
-        self.sender = LinkSender(SenderConfig(frame_bytes=64, channels=(LossChannel(0.1),), feedback=True), seal=seal)
+        self.receiver = V1Receiver(protection=seal)
+        self.sender = V1Sender(
+            SenderConfig(frame_bytes=64, channels=(LossChannel(0.1),), feedback=True), protection=seal
+        )
         link = SerialPort(port, 19200)
         self.modem = ModemRunner(MicroModem(MicroModemConfig(3), port), link, self.on_event)
 
@@ -117,14 +119,14 @@ class Vehicle:
         for frame in event.frames:
             for found in self.receiver.accept(frame.src, frame.data, time.time()):
                 if isinstance(found, FeedbackReceived):
-                    self.reports.append(found.report)
+                    self.reports.append(found.feedback)
                 elif isinstance(found, MessageReceived):
                     self.take(dl.unpack(found.data))
 
     def take(self, order):
         self.orders.append(order)
         if len(self.orders) > self.silent:
-            answer = dl.ConfirmationMessage(((order.token, dl.CommandOutcome.TAKEN),))
+            answer = dl.ConfirmationMessage(((order.token, dl.CommandOutcome.ACCEPTED),))
             self.sender.add_message(dl.pack(answer), time.time(), times=1)
             self.send()
 
@@ -151,7 +153,7 @@ def packet(*frames, dest=1, src=3):
     return PacketReceived(heard, 0, len(frames), src, dest, 1, None, True)
 
 
-def confirmation_of(record_id, kind="command", outcome=dl.CommandOutcome.TAKEN):
+def confirmation_of(record_id, kind="command", outcome=dl.CommandOutcome.ACCEPTED):
     answer = dl.pack(dl.ConfirmationMessage(((dl.token_of(record_id, kind), outcome),)))
     return pack_segments([Segment(SegmentKind.MESSAGE, b"\x01" + answer)], 32)
 
@@ -266,7 +268,7 @@ def test_reports_tell_the_vehicle_what_is_lacking(modem_pair, begin, vehicle, ru
     eventually(lambda: far.modem.ready and service.modem.ready)
     contact = ContactSummary(height_px=40, width_px=60, time_utc_s=1.0)
     for number in range(1, 5):
-        far.sender.add_picture(number, contact, bytes([0x20]) + bytes(range(150)), time.time())
+        far.sender.add_image(number, contact, bytes([0x20]) + bytes(range(150)), time.time())
     far.sender.next_packet(2, time.time())  # lost
     far.send()
     eventually(lambda: len(far.reports) >= 1, timeout_s=60)

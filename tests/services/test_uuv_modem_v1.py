@@ -25,14 +25,15 @@ from sonarpost.link.downlink.messages import (
     RefineMessage,
     ResendMessage,
     RevisitMessage,
+    number_of_image,
     pack,
     unpack,
 )
-from sonarpost.link.events import ContactUpdate, FrameRefused, MessageReceived
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.link.frames.v1.frame import checksum
-from sonarpost.link.receiver import LinkReceiver
-from sonarpost.link.sender import LinkSender
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.receiver import FrameRejected, ImageUpdate, MessageReceived
 from sonarpost.messages import (
     AcousticFrame,
     Command,
@@ -102,14 +103,14 @@ class Vessel:
         self.service = runner.start(
             OpModemService(platform("vessel-1"), OpModemConfig(port=modem_pair.port(modem_pair.VESSEL)))
         )
-        self.sender = LinkSender(SenderConfig(frame_bytes=RATES[0].frame_bytes))
+        self.sender = V1Sender(SenderConfig(frame_bytes=RATES[0].frame_bytes))
 
     @property
     def frames(self) -> list[AcousticFrame]:
         return self._hearer.received
 
     def events(self, seal=None):
-        receiver = LinkReceiver(seal=seal)
+        receiver = V1Receiver(protection=seal)
         return [e for n, f in enumerate(self.frames) for e in receiver.accept(f.source, f.data, float(n))]
 
     def messages(self, seal=None) -> list[object]:
@@ -118,8 +119,9 @@ class Vessel:
     def streams(self) -> dict[int, bytes]:
         found: dict[int, bytes] = {}
         for event in self.events():
-            if isinstance(event, ContactUpdate):
-                found[event.number] = max(found.get(event.number, b""), event.stream, key=len)
+            if isinstance(event, ImageUpdate):
+                number = number_of_image(event.image_id)
+                found[number] = max(found.get(number, b""), event.stream, key=len)
         return found
 
     def say(self, *contents, until, times: int = 20) -> None:
@@ -165,7 +167,7 @@ def sent(service) -> int:
 
 
 def idle(service) -> bool:
-    return service._line.queue.is_idle and service._line.under_way is None and not service._line.accepted()
+    return service._line.queue.is_idle and service._line.queue.in_flight is None and not service._line.accepted()
 
 
 def test_pictures_arrive_with_the_preview_of_each_before_the_detail_of_any(vessel, begin, programs):
@@ -178,8 +180,8 @@ def test_pictures_arrive_with_the_preview_of_each_before_the_detail_of_any(vesse
         assert images[number - 1].stream.startswith(stream)
     seen, first_detail = set(), None
     for event in vessel.events():
-        if isinstance(event, ContactUpdate):
-            seen.add(event.number)
+        if isinstance(event, ImageUpdate):
+            seen.add(event.image_id)
             if len(event.stream) > 60 and first_detail is None:
                 first_detail = len(seen)
     assert first_detail == 8
@@ -266,7 +268,7 @@ def test_messages_beyond_the_limit_stay_with_their_program(begin, programs, runn
     eventually(lambda: service.health().gauges["messages_waiting"] == 3)
     autonomy.send(OUT, "uuv_modem", message("m3"))
     programs.send(IN, "uuv_modem", image(1))
-    eventually(lambda: [e.name.image_id for e in service._line.queue.expected(0.0)] == ["0001"])
+    eventually(lambda: [e.image_id for e in service._line.queue.expected(0.0)] == ["0001"])
     eventually(lambda: programs.store.outbox_depth() == 0)
     assert autonomy.store.outbox_depth() == 1
     assert service.health().gauges["messages_waiting"] == 3
@@ -293,10 +295,10 @@ def test_orders_by_sound_are_handed_on_once_and_confirmed_each_time(vessel, begi
         return [o for m in vessel.messages() if isinstance(m, ConfirmationMessage) for o in m.outcomes]
 
     vessel.say(*orders, until=lambda: {token for token, _ in told()} == {1, 2, 3, 4, 5})
-    before = told().count((1, CommandOutcome.TAKEN))
-    vessel.say(orders[0], until=lambda: told().count((1, CommandOutcome.TAKEN)) > before)
+    before = told().count((1, CommandOutcome.ACCEPTED))
+    vessel.say(orders[0], until=lambda: told().count((1, CommandOutcome.ACCEPTED)) > before)
     eventually(lambda: len(compressor.received) == 3 and len(autonomy.received) == 2)
-    assert {outcome for _, outcome in told()} == {CommandOutcome.TAKEN}
+    assert {outcome for _, outcome in told()} == {CommandOutcome.ACCEPTED}
     assert {(c.kind, c.image_id) for c in compressor.received} == {
         ("refine", "0002"),
         ("resend", "0003"),
@@ -321,10 +323,10 @@ def test_what_a_report_lacks_is_sent(vessel, begin, programs):
     eventually(lambda: len(vessel.frames) > 10)
 
     def report() -> bool:
-        receiver = LinkReceiver()
+        receiver = V1Receiver()
         for number, frame in enumerate(vessel.frames):
             receiver.accept(3, frame.data, float(number))
-        vessel.sender.add_report(receiver.report(3, 1e3))
+        vessel.sender.add_feedback(receiver.feedback(3, 1e3))
         vessel.send(vessel.sender.next_frame(0.0))
         return soon(lambda: service.health().counters.get("reports_received", 0) > 0)
 
@@ -365,8 +367,8 @@ def test_with_a_key_only_sealed_frames_count_and_a_restart_uses_no_counter_twice
     service = begin(place)
     eventually(lambda: service.modem.ready)
     seal = FrameAuthenticator(key, 1, Direction.TO_VEHICLE)
-    seal.grant(seal.wanted_limit)
-    sealed = LinkSender(SenderConfig(frame_bytes=32), seal=seal)
+    seal.grant(seal.requested_limit)
+    sealed = V1Sender(SenderConfig(frame_bytes=32), protection=seal)
     sealed.add_message(pack(ResendMessage(1, 1000, 3)), 0.0, times=1)
     frame = sealed.next_frame(0.0)
     counters = lambda: service.health().counters  # noqa: E731
@@ -382,8 +384,8 @@ def test_with_a_key_only_sealed_frames_count_and_a_restart_uses_no_counter_twice
     runner.stop(service)
     again = begin(place)
     eventually(lambda: idle(again))
-    eventually(lambda: len({e.number for e in vessel.events(ears_of(key)) if isinstance(e, ContactUpdate)}) == 8)
-    refused = [e for e in vessel.events(ears_of(key)) if isinstance(e, FrameRefused)]
+    eventually(lambda: len({e.image_id for e in vessel.events(ears_of(key)) if isinstance(e, ImageUpdate)}) == 8)
+    refused = [e for e in vessel.events(ears_of(key)) if isinstance(e, FrameRejected)]
     repeated = len(vessel.frames) - len({f.data for f in vessel.frames})
     assert len(refused) == repeated <= 3, "the packet that was under way, word for word"
     assert {e.reason.field for e in refused} <= {"counter"}
@@ -414,23 +416,23 @@ def test_of_a_state_that_cannot_be_read_pictures_and_messages_are_queued_anew(
     service = begin(group_delay_s=3600.0)  # the pictures wait
     programs.send(IN, "uuv_modem", *[image(n) for n in range(1, 4)])
     programs.send(OUT, "uuv_modem", message("kept", priority=6))
-    eventually(lambda: len(service._line.queue.names) == 3 and not service._line.accepted())
+    eventually(lambda: len(service._line.queue.sender.kept) == 3 and not service._line.accepted())
     eventually(lambda: programs.store.outbox_depth() == 0)
     runner.stop(service)
     store = Store(service.platform.state_dir / "uuv_modem.db")
     with store.transaction() as tx:
-        tx.put_state("v1/queue/core", spoilt)
+        tx.put_state("v1/queue/sender", spoilt)
         tx.put_state("v1/orders", b"\x01")
-        tx.put_state("v1/queue/picture/2", msgpack.packb({"number": 2}))
+        tx.put_state("v1/queue/image/2", msgpack.packb({"number": 2}))
     store.close()
     again = begin()
     eventually(lambda: again.health().counters.get("states_discarded") == 1)
-    assert {n: name.contact_id for n, name in again._line.queue.names.items()} == {1: "c1", 3: "c3"}
+    assert {n: image.contact_id for n, image in again._line.queue.sender.kept.items()} == {1: "c1", 3: "c3"}
     # The second had been announced, no more.
     eventually(lambda: min(len(vessel.streams().get(n, b"")) for n in (1, 3)) > 100, 60)
     assert len(vessel.streams().get(2, b"")) < 60
     apart = {key for key, _ in refused(again)}
-    assert {"state v1/queue/core", "state v1/orders", "state v1/queue/picture/2"} <= apart
+    assert {"state v1/queue/sender", "state v1/orders", "state v1/queue/image/2"} <= apart
     programs.send(IN, "uuv_modem", image(4))
     eventually(lambda: 4 in vessel.streams(), 60)
 

@@ -1,42 +1,44 @@
-"""How the v1 sender and receiver behave."""
+"""Configuration of the link: sender and receiver of `v1`, and the transmit queue."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 from sonarpost.errors import ConfigError
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.frames.v1.feedback import WINDOW
 from sonarpost.link.frames.v1.frame import MAX_FRAME_BYTES, MIN_FRAME_BYTES
 
-_WHERE = "acoustic link v1"
-_GROUP_FRAMES = 144
-_MOST_GROUP = 60
-_FEEDBACK_GROUP = 24
+_LINK: Final = "acoustic link v1"
+_QUEUE: Final = "acoustic queue"
+_GROUP_FRAMES: Final = 144
+_MAX_GROUP: Final = 60
+_FEEDBACK_GROUP: Final = 24
 
 
 @dataclass(frozen=True, slots=True)
 class SenderConfig:
-    """How the sender behaves.
+    """Configuration of the sender of `v1`.
 
     Attributes:
-        frame_bytes: Bytes in a frame, 32..256.
-        channels: What frames meet, as measured: one for each receiver, equally important.
-        uncertainty: How far off a measured loss may be, as a share of it: detail is planned for losses that much
-            smaller and greater too. 0.15 costs less than 0.01 dB where the measure is right.
-        feedback: Whether a receiver reports what it lacks. Without, each block is sent once, with layers.
-        frames_per_image: Frames a picture may cost on average, previews included; of use without feedback.
-        stream_bytes: Most bytes of a stream that are planned at first; of use with feedback.
-        group_pictures: Most pictures in a group; 0 for so many that a group has about 144 frames (`group_size`).
-        depth: Groups under way at a time: their frames are interleaved, against bursts.
-        group_delay_s: How long a picture waits for others to make a group with.
-        max_defer_s: With feedback, how long without a report before a few more symbols are sent.
-        receiver_memory_s: How long after its last report a receiver counts.
-        block_symbols: With feedback, most source symbols of a block.
-        caution: See `v1_plan.symbols_to_send`.
-        kept_pictures: Pictures kept after they were sent, to refine them when asked.
-        announce: Whether contacts whose group has to wait are sent once, before the detail of others.
+        frame_bytes: Length of a frame, 32..256.
+        channels: Measured channel to each receiver; all receivers are equally important.
+        uncertainty: Relative error of a measured loss: detail is planned for losses that much smaller and greater too.
+            0.15 costs less than 0.01 dB if the measurement is right.
+        feedback: Whether receivers send feedback. Without it each block is sent once, with layers.
+        frames_per_image: Average number of frames for an image, previews included; only without feedback.
+        stream_bytes: Bytes of a stream that are planned at first; only with feedback.
+        group_images: Maximum number of images in a group; 0 for as many as fill about 144 frames (`group_size`).
+        depth: Groups that are sent at a time; their frames are interleaved against bursts.
+        group_delay_s: How long an image waits for others of its group.
+        max_defer_s: With feedback, how long without one until a few more symbols are sent.
+        receiver_memory_s: How long after its last feedback a receiver counts.
+        block_symbols: With feedback, maximum number of source symbols of a block.
+        caution: See `redundancy_plan.symbols_to_send`.
+        kept_images: Images to keep after they were sent, to refine them on request.
+        announce: Whether contacts whose group waits are sent once before the detail of others.
 
     Raises:
         ConfigError: A value out of range.
@@ -48,30 +50,30 @@ class SenderConfig:
     feedback: bool = False
     frames_per_image: float = 6.0
     stream_bytes: int = 512
-    group_pictures: int = 0
+    group_images: int = 0
     depth: int = 2
     group_delay_s: float = 0.0
     max_defer_s: float = 600.0
     receiver_memory_s: float = 3600.0
     block_symbols: int = 96
     caution: float = 1.5
-    kept_pictures: int = 256
+    kept_images: int = 256
     announce: bool = False
 
     def __post_init__(self) -> None:
-        _check("frame_bytes", self.frame_bytes, MIN_FRAME_BYTES, MAX_FRAME_BYTES)
-        _check("channels", len(self.channels), 1, 64)
-        _check("uncertainty", self.uncertainty, 0, 0.9)
-        _check("frames_per_image", self.frames_per_image, 1, 255)
-        _check("stream_bytes", self.stream_bytes, 16, 65535)
-        _check("group_pictures", self.group_pictures, 0, 120)
-        _check("depth", self.depth, 1, WINDOW // 4)
-        _check("group_delay_s", self.group_delay_s, 0, 86400)
-        _check("max_defer_s", self.max_defer_s, 0.001, 86400)
-        _check("receiver_memory_s", self.receiver_memory_s, 0.001, 1e9)
-        _check("block_symbols", self.block_symbols, 1, 200)
-        _check("caution", self.caution, 0, 10)
-        _check("kept_pictures", self.kept_pictures, 1, 65535)
+        _check(_LINK, "frame_bytes", self.frame_bytes, MIN_FRAME_BYTES, MAX_FRAME_BYTES)
+        _check(_LINK, "channels", len(self.channels), 1, 64)
+        _check(_LINK, "uncertainty", self.uncertainty, 0, 0.9)
+        _check(_LINK, "frames_per_image", self.frames_per_image, 1, 255)
+        _check(_LINK, "stream_bytes", self.stream_bytes, 16, 65535)
+        _check(_LINK, "group_images", self.group_images, 0, 120)
+        _check(_LINK, "depth", self.depth, 1, WINDOW // 4)
+        _check(_LINK, "group_delay_s", self.group_delay_s, 0, 86400)
+        _check(_LINK, "max_defer_s", self.max_defer_s, 0.001, 86400)
+        _check(_LINK, "receiver_memory_s", self.receiver_memory_s, 0.001, 1e9)
+        _check(_LINK, "block_symbols", self.block_symbols, 1, 200)
+        _check(_LINK, "caution", self.caution, 0, 10)
+        _check(_LINK, "kept_images", self.kept_images, 1, 65535)
 
     @property
     def planned_channels(self) -> tuple[LossChannel, ...]:
@@ -81,31 +83,34 @@ class SenderConfig:
 
     @property
     def group_size(self) -> int:
-        """Most pictures in a group: enough frames for luck to even out, few enough to wait for."""
-        if self.group_pictures:
-            return self.group_pictures
-        return (
-            _FEEDBACK_GROUP if self.feedback else min(_MOST_GROUP, max(1, round(_GROUP_FRAMES / self.frames_per_image)))
-        )
+        """Maximum number of images in a group.
+
+        A large group averages out the random number of frames that arrive of each image; a small one waits less.
+        """
+        if self.group_images:
+            return self.group_images
+        if self.feedback:
+            return _FEEDBACK_GROUP
+        return min(_MAX_GROUP, max(1, round(_GROUP_FRAMES / self.frames_per_image)))
 
     @property
     def worst(self) -> LossChannel:
-        """The worst receiver's."""
+        """The channel with the greatest loss."""
         return max(self.channels, key=lambda c: (c.loss, c.burst))
 
 
 @dataclass(frozen=True, slots=True)
 class ReceiverConfig:
-    """Bounds of the receiver's memory, and when it reports.
+    """Configuration of the receiver of `v1`: bounds of its memory, and when feedback is due.
 
     Attributes:
-        max_sources: Vehicles remembered; the least recently heard is forgotten first.
-        max_contacts: Contacts remembered of each.
-        block_memory_s: A block is forgotten after this long without a symbol of it.
-        contact_memory_s: A contact, after this long without news of it.
-        feedback_interval_frames: A report is due after so many frames ...
-        feedback_interval_s: ... or this long without one, while something is lacking.
-        presence_s: While frames come, a report goes after this long even where nothing is lacking.
+        max_sources: Vehicles to keep; the one whose last frame is oldest is deleted first.
+        max_contacts: Contacts to keep of each vehicle.
+        block_memory_s: Time after its last symbol at which a block is deleted.
+        contact_memory_s: Time after its last frame at which a contact is deleted.
+        feedback_interval_frames: Feedback is due after this many frames ...
+        feedback_interval_s: ... or this long after the last one, while something is missing.
+        presence_s: While frames arrive, feedback is due this long after the last one even if nothing is missing.
 
     Raises:
         ConfigError: A value out of range.
@@ -120,13 +125,66 @@ class ReceiverConfig:
     presence_s: float = 600.0
 
     def __post_init__(self) -> None:
-        _check("max_sources", self.max_sources, 1, 128)
-        _check("max_contacts", self.max_contacts, 1, 65535)
+        _check(_LINK, "max_sources", self.max_sources, 1, 128)
+        _check(_LINK, "max_contacts", self.max_contacts, 1, 65535)
         for name in ("block_memory_s", "contact_memory_s", "feedback_interval_s", "presence_s"):
-            _check(name, getattr(self, name), 0.001, 1e9)
-        _check("feedback_interval_frames", self.feedback_interval_frames, 1, 65535)
+            _check(_LINK, name, getattr(self, name), 0.001, 1e9)
+        _check(_LINK, "feedback_interval_frames", self.feedback_interval_frames, 1, 65535)
 
 
-def _check(name: str, value: float, low: float, high: float) -> None:
+@dataclass(frozen=True, slots=True)
+class QueueConfig:
+    """Configuration of the transmit queue.
+
+    Attributes:
+        rates: Numbers of the allowed rates; the measured loss determines which one is used.
+        first_rate: The rate at the start.
+        expected_loss: Share of frames lost until it is measured.
+        burst_frames: Mean number of frames lost in a row.
+        feedback: "never", or "auto": with feedback as long as it arrives.
+        feedback_memory_s: How long after the last feedback another one is expected, while frames are sent.
+        max_defer_s: How long without feedback until a few more symbols are sent, in case all were lost.
+        image_airtime_share: Share of frames for images, however many messages wait.
+        aging_s: Waiting time that makes a message one level more urgent.
+        message_missed: Acceptable probability that a message is lost; the number of copies follows from it.
+        max_messages: Maximum number of waiting messages.
+        frames_per_image: See `SenderConfig`.
+        stream_bytes: See `SenderConfig`.
+        group_delay_s: How long an announced image waits for others of its group.
+        kept_images: See `SenderConfig`.
+
+    Raises:
+        ConfigError: A value out of range.
+    """
+
+    rates: tuple[int, ...] = (1,)
+    first_rate: int = 1
+    expected_loss: float = 0.2
+    burst_frames: float = 1.0
+    feedback: str = "auto"
+    feedback_memory_s: float = 900.0
+    max_defer_s: float = 120.0
+    image_airtime_share: float = 0.25
+    aging_s: float = 600.0
+    message_missed: float = 0.01
+    max_messages: int = 2000
+    frames_per_image: float = 6.0
+    stream_bytes: int = 512
+    group_delay_s: float = 0.0
+    kept_images: int = 256
+
+    def __post_init__(self) -> None:
+        _check(_QUEUE, "expected_loss", self.expected_loss, 0.0, 0.95)
+        _check(_QUEUE, "burst_frames", self.burst_frames, 1.0, 1000.0)
+        _check(_QUEUE, "feedback_memory_s", self.feedback_memory_s, 0.001, 86400.0)
+        _check(_QUEUE, "image_airtime_share", self.image_airtime_share, 0.0, 1.0)
+        _check(_QUEUE, "aging_s", self.aging_s, 0.001, 86400.0)
+        _check(_QUEUE, "message_missed", self.message_missed, 1e-6, 0.5)
+        _check(_QUEUE, "max_messages", self.max_messages, 1, 100_000)
+        if self.feedback not in ("auto", "never"):
+            raise ConfigError(_QUEUE, "feedback", self.feedback, "auto, never")
+
+
+def _check(where: str, name: str, value: float, low: float, high: float) -> None:
     if not (math.isfinite(value) and low <= value <= high):
-        raise ConfigError(_WHERE, name, value, f"{low}..{high}")
+        raise ConfigError(where, name, value, f"{low}..{high}")

@@ -1,187 +1,218 @@
-"""The receiver of the v1 format: frames in, contacts, pictures and messages out, and what it lacks.
+"""Interface of the link's receivers: frames in, events out, the same for every wire format.
 
-Pure: bytes and `now` in, events out. `now` is in seconds on a clock that goes on over a restart (UTC), because the
-state can be saved and taken up by another process.
+A receiver does no I/O. `now` is in seconds on a clock that continues over a restart (UTC), because another process can
+restore the state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
 
-from sonarpost.errors import BadInputError, FrameError
-from sonarpost.link.config import ReceiverConfig
-from sonarpost.link.events import ContactUpdate, Event, FeedbackReceived, FrameRefused, MessageReceived
-from sonarpost.link.frames.v1.feedback import Feedback, FeedbackRequest, pack_mini
-from sonarpost.link.frames.v1.frame import FrameProtection, Segment, SegmentKind, Symbol, parse_frame, parse_symbol
-from sonarpost.link.frames.v1.payload_objects import MessageObject
-from sonarpost.link.frames.v1.preview import Preview
-from sonarpost.link.peer_state import PeerState
-from sonarpost.link.receiver_state import export_source, import_source, read_list, read_map
+import numpy as np
 
-_STATE_FORMAT = 1
+from sonarpost.codec.interface import Mask, StreamHeader
+from sonarpost.errors import FrameError, StreamError
+from sonarpost.link.coding.byte_ranges import Ranges, covered_within, gaps_within
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import HalfName, half_bounds, parse_frame
+from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest
+
+WireFormat = Literal["v1", "paper"]
 
 
 @dataclass(frozen=True, slots=True)
-class ReceiverCounts:
-    """Counters since the beginning, restarts included.
+class ImageUpdate:
+    """All that is known of an image, after more of it arrived or the wait for more ended.
 
     Attributes:
-        frames: Frames handed to `accept`.
-        refused: Of these, damaged or not of this format, as a whole or in part.
-        updates: `ContactUpdate` events.
-        complete: Of these, complete.
-        messages: `MessageReceived` events.
-        reports: `FeedbackReceived` events.
-        forgotten_sources: Senders forgotten because `max_sources` was reached.
+        source: Modem address of the vehicle.
+        image_id: Four characters 0-9A-Z.
+        version: 1 for the first update of an image, then one more each time.
+        contact: The contact record, None until it arrives.
+        stream: The codec's stream, header first, with zeros in the ranges `missing`. Empty until a header arrives.
+        missing: Ranges [start, stop) of `stream` that have not arrived, sorted and disjoint.
+        complete: Whether all arrived that the vehicle has planned to send so far.
+        received_bytes: Bytes of the image that arrived. The `paper` format does not count the stream header.
+        total_bytes: Length of the image in the same count, 0 while it is unknown.
+        frames: Frames that contributed. Always 0 with `v1`, where a frame can serve several images.
+        conflicts: Frames that contradict others of the image. The modem passed damaged data, or the vehicle used an
+            identifier twice.
+        first_frame_s: Time of the image's first frame.
+        last_frame_s: Time of the last frame that contributed.
     """
 
-    frames: int = 0
-    refused: int = 0
-    updates: int = 0
-    complete: int = 0
-    messages: int = 0
-    reports: int = 0
-    forgotten_sources: int = 0
-
-
-class LinkReceiver:
-    """Receives from any number of senders.
-
-    Memory: at most `max_sources` senders; of each at most 32 blocks of 255 symbols, `max_contacts` contacts of 64 KiB.
-
-    Args:
-        config: Bounds and times.
-        seal: Authenticates frames.
-    """
-
-    def __init__(self, config: ReceiverConfig | None = None, *, seal: FrameProtection | None = None) -> None:
-        self.config = config or ReceiverConfig()
-        self._seal = seal
-        self._sources: dict[int, PeerState] = {}  # least recently heard first
-        self._counts = ReceiverCounts()
+    source: int
+    image_id: str
+    version: int
+    contact: ContactSummary | None
+    stream: bytes
+    missing: Ranges
+    complete: bool
+    received_bytes: int
+    total_bytes: int
+    frames: int
+    conflicts: int
+    first_frame_s: float
+    last_frame_s: float
 
     @property
-    def counts(self) -> ReceiverCounts:
-        """The counters."""
-        return self._counts
-
-    @property
-    def sources(self) -> tuple[int, ...]:
-        """Modem addresses of the senders that are remembered, the least recently heard first."""
-        return tuple(self._sources)
-
-    def accept(self, source: int, frame: bytes, now: float) -> list[Event]:
-        """Take a frame; return what follows from it.
-
-        Never raises because of `frame`: what does not parse becomes a `FrameRefused`.
-        """
-        now = float(now)
-        self._count(frames=1)
-        where = f"acoustic frame from modem {source}"
+    def has_header(self) -> bool:
+        """Whether the stream has a header, so that a codec can decode it."""
         try:
-            content = parse_frame(frame, source, self._seal, where)
-        except FrameError as reason:
-            self._count(refused=1)
-            return [FrameRefused(source, reason, now)]
-        sender = self._sender(source, now)
-        events: list[Event] = []
-        for item in [content] if isinstance(content, Symbol) else content:
-            try:
-                events += self._take(sender, item, now, where)
-            except BadInputError as error:
-                told = error if isinstance(error, FrameError) else _as_frame_error(error, where)
-                self._count(refused=1)
-                events.append(FrameRefused(source, told, now))
-        self._count_events(events)
-        return events
+            StreamHeader.unpack(self.stream)
+        except StreamError:
+            # Too short so far, or invalid: `MAX_SIZE` bytes always hold a header, valid or not.
+            return len(self.stream) >= StreamHeader.MAX_SIZE
+        return True
 
-    def _take(self, sender: PeerState, item: Symbol | Segment, now: float, where: str) -> list[Event]:
-        if isinstance(item, Symbol):
-            return sender.add_symbol(item, now, self.config)
-        match item.kind:
-            case SegmentKind.SYMBOL:
-                return sender.add_symbol(parse_symbol(item.data, where), now, self.config)
-            case SegmentKind.MESSAGE if len(item.data) > 1:
-                return sender.add_message(MessageObject(item.data[0], item.data[1:]), now)
-            case SegmentKind.CONTACT | SegmentKind.PREVIEW:
-                return sender.add_found(Preview.unpack(item.data, where), now, self.config)
-            case SegmentKind.FEEDBACK:
-                return [FeedbackReceived(sender.address, Feedback.unpack(item.data, where), now)]
-            case SegmentKind.REQUEST:
-                return [FeedbackReceived(sender.address, FeedbackRequest.unpack(item.data, where), now)]
-            case _:
-                raise FrameError(where, "segment kind", item.kind, "1..6, a message not empty")
-
-    def _sender(self, source: int, now: float) -> PeerState:
-        found = self._sources.pop(source, None)
-        if found is None:
-            while len(self._sources) >= self.config.max_sources:
-                del self._sources[next(iter(self._sources))]
-                self._count(forgotten_sources=1)
-            found = PeerState(source, now, reported_at=now)
-        self._sources[source] = found
-        found.heard_at = now
-        found.frames += 1
-        found.reported_at = min(found.reported_at, now)
-        found.forget_old(now, self.config)
-        return found
-
-    def report(self, source: int, now: float) -> Feedback | None:
-        """Return what to tell a sender of what is lacking, None while nothing of it was heard."""
-        found = self._sources.get(source)
-        return None if found is None else found.report(float(now))
-
-    def report_is_due(self, source: int, now: float) -> bool:
-        """Whether a report would be of use now."""
-        found = self._sources.get(source)
-        return found is not None and found.report_is_due(now, self.config)
-
-    def mini_report(self, source: int) -> int | None:
-        """Return 13 bits for a mini-packet: the oldest block that lacks something; None when none does."""
-        found = self._sources.get(source)
-        if found is None or not found.is_lacking:
-            return None
-        report = Feedback(found.newest, 0, found.needs)
-        back = max(i for i, need in enumerate(report.needs) if need)
-        return pack_mini((report.newest - back) % 32, report.needs[back])
-
-    def snapshot(self) -> dict[str, object]:
-        """Return the whole state as maps, lists, numbers, strings and bytes (msgpack can hold it)."""
-        return {
-            "format": _STATE_FORMAT,
-            "sources": [export_source(source) for source in self._sources.values()],
-            "counts": asdict(self._counts),
-        }
-
-    def restore(self, state: Mapping[str, object]) -> None:
-        """Replace the whole state by one that `snapshot` returned; the settings stay those of this receiver.
-
-        Raises:
-            FrameError: The state is not one that `snapshot` made; the receiver is then as before.
-        """
-        if state.get("format") != _STATE_FORMAT:
-            raise FrameError("receiver state", "format", state.get("format"), str(_STATE_FORMAT))
-        sources = [import_source(entry) for entry in read_list(state, "sources")]
-        counts = read_map(state, "counts")
-        if set(counts) != set(asdict(self._counts)) or not all(type(n) is int and n >= 0 for n in counts.values()):
-            raise FrameError("receiver state", "counts", dict(counts), f"numbers for {sorted(asdict(self._counts))}")
-        self._sources = {source.address: source for source in sources}
-        self._counts = replace(ReceiverCounts(), **{name: n for name, n in counts.items() if isinstance(n, int)})
-
-    def _count_events(self, events: list[Event]) -> None:
-        updates = [e for e in events if isinstance(e, ContactUpdate)]
-        self._count(
-            updates=len(updates),
-            complete=sum(e.complete for e in updates),
-            messages=sum(isinstance(e, MessageReceived) for e in events),
-            reports=sum(isinstance(e, FeedbackReceived) for e in events),
+    @property
+    def missing_halves(self) -> tuple[HalfName, ...]:
+        """The halves of the image, as the `paper` format divides it, of which no byte arrived."""
+        if not self.has_header:
+            return "top", "bottom"
+        if not self.missing:
+            return ()
+        header_bytes = StreamHeader.unpack(self.stream).size
+        received = gaps_within(self.missing, header_bytes, len(self.stream))
+        halves: tuple[HalfName, ...] = ("top", "bottom")
+        bounds = {half: half_bounds(len(self.stream) - header_bytes, half) for half in halves}
+        return tuple(
+            half
+            for half, (start, stop) in bounds.items()
+            if start < stop and not covered_within(received, start + header_bytes, stop + header_bytes)
         )
 
-    def _count(self, **more: int) -> None:
-        added = {name: getattr(self._counts, name) + number for name, number in more.items()}
-        self._counts = replace(self._counts, **added)
+    def received_mask(self) -> Mask:
+        """Return shape (bytes of the body,), True where a byte arrived: the argument `received` of `Codec.decode`.
+
+        Raises:
+            StreamError: The stream has no valid header.
+        """
+        received = np.ones(len(self.stream), dtype=np.bool_)
+        for start, stop in self.missing:
+            received[start:stop] = False
+        return received[StreamHeader.unpack(self.stream).size :]
 
 
-def _as_frame_error(error: BadInputError, where: str) -> FrameError:
-    return FrameError(where, error.field, error.value, error.expected)
+@dataclass(frozen=True, slots=True)
+class MessageReceived:
+    """A message of the other station.
+
+    Attributes:
+        source: Its modem address.
+        number: 0..255, the same in repetitions of a message.
+        data: The bytes.
+        received_s: Time of the frame.
+    """
+
+    source: int
+    number: int
+    data: bytes
+    received_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class FeedbackReceived:
+    """Feedback or a request of a receiver, for the sender of this station.
+
+    Attributes:
+        source: Modem address of the receiver.
+        feedback: The content.
+        received_s: Time of the frame.
+    """
+
+    source: int
+    feedback: Feedback | RefineRequest
+    received_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRejected:
+    """A frame, or a part of one, that is not of the wire format or contradicts earlier frames.
+
+    Attributes:
+        source: Modem address.
+        reason: The parser's error.
+        received_s: Time of the frame.
+    """
+
+    source: int
+    reason: FrameError
+    received_s: float
+
+
+Event = ImageUpdate | MessageReceived | FeedbackReceived | FrameRejected
+
+
+class FrameReceiver(Protocol):
+    """A receiver of one or several wire formats, for any number of sources."""
+
+    def accept(self, source: int, frame: bytes, now: float) -> list[Event]:
+        """Process a frame, after whatever `poll(now)` does; return the events that follow.
+
+        Never raises because of `frame`: it reports one it cannot use as `FrameRejected`.
+
+        Args:
+            source: Modem address of the sender.
+            frame: The frame as the modem delivered it.
+            now: Seconds.
+        """
+
+    def poll(self, now: float) -> list[Event]:
+        """Return the events that are due without a frame, for example the end of a wait."""
+
+    def next_deadline(self) -> float | None:
+        """Return when `poll` has the next event, None when no wait is in progress."""
+
+
+class CombinedReceiver:
+    """Receives both wire formats and decides for every frame which of them it has.
+
+    A frame is of `v1` if `v1` accepts its checksum, and otherwise of `paper` if its fields are valid there. A frame of
+    one format is mistaken for the other once in 2^16 or less.
+
+    Args:
+        v1: Receiver of `v1`, None to reject this format.
+        paper: Receiver of `paper`, None to reject this format.
+    """
+
+    def __init__(self, v1: FrameReceiver | None, paper: FrameReceiver | None) -> None:
+        self.v1 = v1
+        self.paper = paper
+
+    def accept(self, source: int, frame: bytes, now: float) -> list[Event]:
+        """Process a frame; see `FrameReceiver.accept`."""
+        events: list[Event] = []
+        if self.v1 is not None:
+            events = self.v1.accept(source, frame, now)
+            if self.paper is None or not _is_foreign(events) or not _is_of_paper(frame):
+                return events
+        return self.paper.accept(source, frame, now) if self.paper is not None else events
+
+    def poll(self, now: float) -> list[Event]:
+        """Return the events that are due without a frame."""
+        return [event for receiver in self._receivers for event in receiver.poll(now)]
+
+    def next_deadline(self) -> float | None:
+        """Return when `poll` has the next event, None when no wait is in progress."""
+        deadlines = [receiver.next_deadline() for receiver in self._receivers]
+        return min((deadline for deadline in deadlines if deadline is not None), default=None)
+
+    @property
+    def _receivers(self) -> list[FrameReceiver]:
+        return [receiver for receiver in (self.v1, self.paper) if receiver is not None]
+
+
+def _is_foreign(events: Sequence[Event]) -> bool:
+    """Whether the receiver rejected the frame as a whole: this gives exactly one event."""
+    return len(events) == 1 and isinstance(events[0], FrameRejected)
+
+
+def _is_of_paper(frame: bytes) -> bool:
+    try:
+        parse_frame(frame)
+    except FrameError:
+        return False
+    return True

@@ -85,7 +85,7 @@ def test_expand_of_a_detection_shows_twice_the_ground(start_service, runner, atd
     outcome, handed = ReceivedCommands("uuv-1", UuvModemConfig(port="unused")).take(
         1, dl.unpack(downlink_bytes), first.image_id
     )
-    assert (outcome, handed.consumers) == (dl.CommandOutcome.TAKEN, ("compressor",))
+    assert (outcome, handed.consumers) == (dl.CommandOutcome.ACCEPTED, ("compressor",))
     runner.peer("uuv-1", "vehicle_commands").send(handed.key, "compressor", handed.record)
     eventually(lambda: len(modem.received) == 2)
     expanded = modem.received[1]

@@ -11,14 +11,14 @@ from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.sender import plan_packets
-from sonarpost.link.sender import LinkSender
+from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.services.op_modem.frame_images import image_ids_of_frame
 
 
 def frames(frame_bytes: int, *numbers: int, seal: FrameAuthenticator | None = None) -> list[bytes]:
-    sender = LinkSender(SenderConfig(frame_bytes=frame_bytes, group_delay_s=0.0), seal=seal)
+    sender = V1Sender(SenderConfig(frame_bytes=frame_bytes, group_delay_s=0.0), protection=seal)
     for number in numbers:
-        sender.add_picture(number, ContactSummary(80, 80), np.random.default_rng(number).bytes(300), 0.0)
+        sender.add_image(number, ContactSummary(80, 80), np.random.default_rng(number).bytes(300), 0.0)
     found = []
     while (frame := sender.next_frame(0.0)) is not None:
         found.append(frame)
@@ -45,15 +45,15 @@ def test_several_images_of_a_frame_are_in_their_order() -> None:
 
 
 def test_announced_contact_is_named() -> None:
-    sender = LinkSender(SenderConfig(frame_bytes=64, group_delay_s=60.0, announce=True))
-    sender.add_picture(5, ContactSummary(80, 80), b"a stream of some bytes, and more of it than that", 0.0)
+    sender = V1Sender(SenderConfig(frame_bytes=64, group_delay_s=60.0, announce=True))
+    sender.add_image(5, ContactSummary(80, 80), b"a stream of some bytes, and more of it than that", 0.0)
     frame = sender.next_frame(0.0)
     assert frame is not None
     assert image_ids_of_frame(frame) == "0005"
 
 
 def test_detail_and_message_frames_name_no_image() -> None:
-    sender = LinkSender(SenderConfig())
+    sender = V1Sender(SenderConfig())
     sender.add_message(b"a message", 0.0)
     message = sender.next_frame(0.0)
     assert message is not None
@@ -69,6 +69,6 @@ def test_damaged_frames_name_no_image(cut: int) -> None:
 
 def test_authenticated_frames_name_no_image() -> None:
     seal = FrameAuthenticator(AcousticKey(bytes(range(32))), 3, Direction.FROM_VEHICLE)
-    assert seal.wanted_limit is not None
-    seal.grant(seal.wanted_limit)
+    assert seal.requested_limit is not None
+    seal.grant(seal.requested_limit)
     assert image_ids_of_frame(frames(64, 9, seal=seal)[0]) is None

@@ -10,10 +10,9 @@ from pathlib import Path
 
 from sonarpost.cli.demo.settings import UUV_ADDRESS, ChainSettings
 from sonarpost.errors import FrameError
-from sonarpost.link.downlink.messages import image_of_number
-from sonarpost.link.events import ContactUpdate
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, parse_frame
-from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.receiver import ImageUpdate
 
 
 @dataclass
@@ -36,7 +35,7 @@ class ChannelAccount:
     acoustic_s: float = 0.0
     images_through: set[str] = field(default_factory=set)
     frames_through: Counter[tuple[str, str]] = field(default_factory=Counter)
-    _v1: LinkReceiver = field(default_factory=LinkReceiver)
+    _v1: V1Receiver = field(default_factory=V1Receiver)
 
     def add_frame(self, content: bytes, *, heard: bool) -> None:
         """Count one frame; `content` is what the receiver got."""
@@ -45,8 +44,8 @@ class ChannelAccount:
             self.frames_lost += 1
             return
         for event in self._v1.accept(UUV_ADDRESS, content, 0.0):
-            if isinstance(event, ContactUpdate):
-                self.images_through.add(image_of_number(event.number))
+            if isinstance(event, ImageUpdate):
+                self.images_through.add(event.image_id)
         try:
             frame = parse_frame(content)
         except FrameError:

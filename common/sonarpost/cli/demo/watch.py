@@ -15,11 +15,11 @@ from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
 from sonarpost.errors import FrameError, PayloadError, PortError
 from sonarpost.link.downlink.messages import image_of_number, number_of_image
-from sonarpost.link.events import ContactUpdate
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import parse_frame
 from sonarpost.link.frames.paper.sender import plan_packets
-from sonarpost.link.receiver import LinkReceiver
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.receiver import ImageUpdate
 from sonarpost.messages import AcousticFrame, EncodedImage, Health, QueueState, ReconstructedImage, Record, Snippet
 from sonarpost.modem.micromodem import RATES
 
@@ -61,7 +61,7 @@ class Watcher:
         self.accepted: set[str] = set()
         self.health: dict[str, Health] = {}
         self.queue: QueueState | None = None
-        self._v1 = LinkReceiver()
+        self._v1 = V1Receiver()
         self.packets_sent = 0
         self.changes = 0
         self._packets: set[tuple[float, int]] = set()
@@ -134,8 +134,8 @@ class Watcher:
     def _on_heard(self, frame: AcousticFrame) -> None:
         if self.settings.link == "v1":
             for event in self._v1.accept(frame.source, frame.data, frame.time_utc_s):
-                if isinstance(event, ContactUpdate):
-                    self.accepted.add(image_of_number(event.number))
+                if isinstance(event, ImageUpdate):
+                    self.accepted.add(event.image_id)
             return
         try:
             self.accepted.add(parse_frame(frame.data).image_id)

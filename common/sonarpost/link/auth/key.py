@@ -1,8 +1,8 @@
 """The pre-shared key that authenticates acoustic frames, and the keys derived from it.
 
-One key of 32 random bytes serves a vehicle and a vessel, or a fleet. It is never used itself: HKDF-SHA256 (RFC 5869)
-derives one AES-256 key for every transmitter, direction and way of sealing, so that a frame of one vehicle cannot be
-passed off as another's, as its own echo from the other end, or as one sealed in another way.
+One key of 32 random bytes serves a vehicle and a vessel, or a fleet. It is never used directly: HKDF-SHA256 (RFC 5869)
+derives one AES-256 key for every transmitter, direction and combination of settings. So a frame of one vehicle cannot
+pass as another's, as a reply to itself, or as a frame with other settings.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ _HEX_KEY: Final = re.compile(rf"[0-9A-Fa-f]{{{2 * KEY_BYTES}}}")
 
 
 class Direction(IntEnum):
-    """Who sends a frame. The number goes into the derivation of keys."""
+    """Direction of a frame. Its number is an input of the key derivation."""
 
     FROM_VEHICLE = 0
     TO_VEHICLE = 1
 
     @property
     def opposite(self) -> Direction:
-        """The other one."""
+        """The other direction."""
         return Direction(1 - self)
 
 
 @dataclass(frozen=True, slots=True)
 class AuthenticationSettings:
-    """What both ends must agree on besides the key.
+    """Settings that both stations must share, in addition to the key.
 
     Attributes:
-        counter_bytes: Low bytes of the counter in a frame, 1 or 2. With 1, a key is good for 2^20 frames of each
-            transmitter and 192 lost frames in a row cost nothing; with 2, for 2^28 frames and 65,472.
+        counter_bytes: Low bytes of the counter in a frame, 1 or 2. With 1, a key lasts for 2^20 frames of each
+            transmitter, and a receiver bridges 192 lost frames; with 2, 2^28 frames and 65,472 lost ones.
         tag_bytes: 4, 6 or 8; one forged frame in 2^(8 x tag_bytes) passes.
-        encrypt: Whether frames are encrypted too. It costs no byte.
+        encrypt: Whether frames are also encrypted. This adds no byte.
 
     Raises:
-        ConfigError: Another number.
+        ConfigError: Another number of bytes.
     """
 
     counter_bytes: int = 1
@@ -64,27 +64,27 @@ class AuthenticationSettings:
             ("tag_bytes", self.tag_bytes, TAG_BYTES),
         ):
             if value not in allowed:
-                raise ConfigError("acoustic seal", name, value, " or ".join(map(str, allowed)))
+                raise ConfigError("acoustic authentication", name, value, " or ".join(map(str, allowed)))
 
     @property
-    def size(self) -> int:
-        """Bytes that a seal adds to a frame."""
+    def overhead_bytes(self) -> int:
+        """Bytes that protection adds to a frame."""
         return self.counter_bytes + self.tag_bytes
 
     @property
     def counter_step(self) -> int:
-        """How many counters there are until the bytes on the wire repeat."""
+        """Number of counters after which the bytes in the frame repeat."""
         return 1 << 8 * self.counter_bytes
 
     @property
     def lifetime_frames(self) -> int:
-        """How many frames one transmitter may seal with one key: what a receiver can search through."""
+        """Number of frames that a transmitter can protect with one key; a receiver can search all of them."""
         return self.counter_step << 12
 
 
 @dataclass(frozen=True, slots=True)
 class AcousticKey:
-    """A pre-shared key. It is not shown when printed.
+    """A pre-shared key. Its `repr` does not contain the secret.
 
     Attributes:
         secret: 32 bytes.
@@ -101,7 +101,7 @@ class AcousticKey:
 
     @property
     def fingerprint(self) -> str:
-        """Eight hexadecimal digits by which people compare keys; the key does not follow from them."""
+        """Eight hexadecimal digits to compare keys; they do not reveal the key."""
         return self._derive(b"fingerprint", 4).hex()
 
     def cipher(self, source: int, direction: Direction, settings: AuthenticationSettings) -> AESCCM:
@@ -109,25 +109,25 @@ class AcousticKey:
 
         Args:
             source: The transmitter's modem address, 0..127.
-            direction: Who sends.
-            settings: Of the seal.
+            direction: Direction of its frames.
+            settings: The settings.
         """
-        way = (direction, source, settings.counter_bytes, settings.tag_bytes, settings.encrypt)
-        return AESCCM(self._derive(b"seal" + bytes(way), KEY_BYTES), tag_length=settings.tag_bytes)
+        inputs = (direction, source, settings.counter_bytes, settings.tag_bytes, settings.encrypt)
+        return AESCCM(self._derive(b"seal" + bytes(inputs), KEY_BYTES), tag_length=settings.tag_bytes)
 
     def _derive(self, purpose: bytes, length: int) -> bytes:
         return HKDF(algorithm=SHA256(), length=length, salt=None, info=_LABEL + purpose).derive(self.secret)
 
 
 def parse_key(text: str, where: str) -> AcousticKey:
-    """Read a key: 64 hexadecimal digits, with or without a line end.
+    """Parse a key: 64 hexadecimal digits, with or without a line end.
 
     Args:
-        text: What a key file holds.
-        where: Names it in errors. The value never appears there.
+        text: Content of a key file.
+        where: Name of the file in errors. The key never appears there.
 
     Raises:
-        ConfigError: Something else, or a key that nobody has drawn by chance.
+        ConfigError: Invalid text, or a key that is not random.
     """
     written = text.strip()
     if not _HEX_KEY.fullmatch(written):
@@ -135,6 +135,6 @@ def parse_key(text: str, where: str) -> AcousticKey:
     secret = bytes.fromhex(written)
     different = len(set(secret))
     if different < _LEAST_DIFFERENT_BYTES:
-        # 32 bytes drawn by chance have fewer than this once in 10^16 keys.
+        # Only one of 10^16 random keys has fewer different bytes than this.
         raise ConfigError(where, "key", f"{different} different bytes", "32 random bytes (openssl rand -hex 32)")
     return AcousticKey(secret)

@@ -1,62 +1,82 @@
-"""A block on the receiver's side: symbols in, what they give out."""
+"""Receiver's side of a block: symbols in, decoded objects out."""
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Annotated, Final
 
 import numpy as np
 
 from sonarpost.errors import FrameError
-from sonarpost.link.coding import erasure_code as fec
-from sonarpost.link.frames.v1.frame import Symbol, SymbolKind
+from sonarpost.link.coding import erasure_code
+from sonarpost.link.frames.v1.frame import BLOCKS, MAX_INDEX, Symbol, SymbolKind
 from sonarpost.link.frames.v1.layers import DESCRIPTOR_SYMBOLS, Layering, recover_layer, recover_layering
-from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, unpack_object
+from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceEnd, PieceList, unpack_object
 from sonarpost.link.frames.v1.preview import Preview, entry_shape
+from sonarpost.link.state import SEPARATE, Bounds, Byte, Count
 
 DecodedObject = Preview | PieceList | MessageObject
+
+_DIGEST_BYTES: Final = 4
+_CHUNK_SYMBOLS: Final = 16
+
+
+@dataclass(frozen=True, slots=True)
+class SymbolChunk:
+    """Symbols of a block as one part of the saved state; a new symbol changes one chunk only.
+
+    Attributes:
+        symbols: Index, data (or its digest) and descriptor symbol of each, in the order of arrival.
+    """
+
+    symbols: tuple[tuple[Annotated[int, Bounds(0, MAX_INDEX)], bytes, Byte], ...]
 
 
 @dataclass(eq=False)
 class BlockDecoder:
-    """A block under way.
+    """A block that is being received.
 
     Attributes:
-        kind: What it holds.
+        kind: Content of the block.
         number: 0..31.
         symbol_bytes: Length of its symbols.
-        count: k; 0 for a layered block.
-        last_at: Time of the last symbol.
-        symbols: By index, the latest to arrive last. When all is recovered, a digest of each: a later block with the
-            same number is told from this one by them.
-        told: A layered block's descriptor symbols, by index.
-        layering: When it is known.
-        layers: Pieces of the layers recovered so far.
-        complete: Whether all is recovered.
-        mixed: How often symbols turned out not to be of one block.
+        count: Number of source symbols k; 0 for a layered block.
+        last_symbol_s: Time of the last symbol, or earlier after the clock was set back.
+        symbols: By index, in the order of arrival. In a complete block only a digest of each: it distinguishes a later
+            block with the same number.
+        descriptor: Descriptor symbols of a layered block, by index.
+        layering: The layers, None until they are known.
+        layers: Layers recovered so far.
+        layer_ends: Ends of the pieces in the highest layer recovered so far.
+        complete: Whether everything is recovered.
     """
 
     kind: SymbolKind
-    number: int
-    symbol_bytes: int
-    count: int
-    last_at: float
-    symbols: dict[int, bytes] = field(default_factory=dict)
-    told: dict[int, int] = field(default_factory=dict)
+    number: Annotated[int, Bounds(0, BLOCKS - 1)]
+    symbol_bytes: Annotated[int, Bounds(1, 65535)]
+    count: Byte
+    last_symbol_s: float
+    symbols: dict[int, bytes] = field(default_factory=dict, metadata=SEPARATE)
+    descriptor: dict[int, int] = field(default_factory=dict, metadata=SEPARATE)
     layering: Layering | None = None
-    layers: list[PieceList] = field(default_factory=list)
+    layers: Count = 0
+    layer_ends: tuple[PieceEnd, ...] = ()
     complete: bool = False
-    mixed: int = 0
+
+    def __post_init__(self) -> None:
+        if (self.count == 0) != (self.kind == SymbolKind.LAYERED):
+            raise FrameError("block", "count", self.count, "0 for a layered block, 1..255 for others")
 
     @classmethod
     def of(cls, symbol: Symbol, now: float) -> BlockDecoder:
-        """Begin a block with its first symbol (which is still to be added)."""
+        """Return an empty block for a symbol, which the caller adds next."""
         count = 0 if symbol.kind == SymbolKind.LAYERED else symbol.parameter
         return cls(symbol.kind, symbol.block, len(symbol.data), count, now)
 
-    def takes(self, symbol: Symbol) -> bool:
-        """Whether a symbol can be of this block, and not of a later one with its number."""
+    def matches(self, symbol: Symbol) -> bool:
+        """Whether a symbol can belong to this block, and not to a later one with the same number."""
         same = (self.kind, self.symbol_bytes) == (symbol.kind, len(symbol.data))
         known = self.symbols.get(symbol.index)
         data = _digest(symbol.data) if self.complete else symbol.data
@@ -67,23 +87,23 @@ class BlockDecoder:
         )
 
     @property
-    def need(self) -> int:
-        """Symbols that are still lacking for all of it."""
+    def missing_symbols(self) -> int:
+        """Number of symbols that are still required to recover everything."""
         if self.complete:
             return 0
         if self.kind == SymbolKind.LAYERED:
-            wanted = DESCRIPTOR_SYMBOLS if self.layering is None else self.layering.needs[-1]
+            required = DESCRIPTOR_SYMBOLS if self.layering is None else self.layering.needs[-1]
         else:
-            wanted = self.count
-        return max(1, wanted - len(self.symbols))
+            required = self.count
+        return max(1, required - len(self.symbols))
 
     def add(self, symbol: Symbol, now: float) -> list[DecodedObject]:
-        """Take a symbol; return what became known by it.
+        """Add a symbol; return the objects that it completes.
 
         Raises:
-            FrameError: Enough symbols are there but they are not of one block. The older half of them is forgotten.
+            FrameError: The symbols are not all of one block. The older half of them is deleted.
         """
-        self.last_at = now
+        self.last_symbol_s = now
         if self.complete or symbol.index in self.symbols:
             return []
         self.symbols[symbol.index] = symbol.data
@@ -91,24 +111,24 @@ class BlockDecoder:
             if self.kind == SymbolKind.PREVIEW:
                 return list(self._previews(symbol))
             if self.kind == SymbolKind.LAYERED:
-                self.told[symbol.index] = symbol.parameter
-                return list(self._more_layers())
-            return self._object()
+                self.descriptor[symbol.index] = symbol.parameter
+                return list(self._recovered_layers())
+            return self._recovered_object()
         except FrameError:
-            self._forget_older_half()
+            self._delete_older_half()
             raise
 
-    def _object(self) -> list[DecodedObject]:
+    def _recovered_object(self) -> list[DecodedObject]:
         if len(self.symbols) < self.count:
             return []
         found = unpack_object(self._source().tobytes(), where=f"block {self.number}")
         self._finish()
         return [found]
 
-    def _source(self) -> fec.Bytes:
+    def _source(self) -> erasure_code.Bytes:
         indices = list(self.symbols)[-self.count :]
         rows = np.array([np.frombuffer(self.symbols[i], np.uint8) for i in indices], np.uint8)
-        return fec.recover(self.count, indices, rows)
+        return erasure_code.recover(self.count, indices, rows)
 
     def _previews(self, symbol: Symbol) -> Iterator[Preview]:
         shape = entry_shape(self.symbol_bytes)
@@ -124,47 +144,65 @@ class BlockDecoder:
                 data = b"".join(p for p in parts if p is not None)
                 yield from _entries(data, shape.entries, len(data), shape.entry_bytes)
 
-    def _more_layers(self) -> Iterator[PieceList]:
-        if self.layering is None and len(self.told) >= DESCRIPTOR_SYMBOLS:
-            self.layering = recover_layering(self.told)
+    def _recovered_layers(self) -> Iterator[PieceList]:
+        if self.layering is None and len(self.descriptor) >= DESCRIPTOR_SYMBOLS:
+            self.layering = recover_layering(self.descriptor)
         found: list[PieceList] = []
-        while self.layering is not None and len(self.layers) < len(self.layering.needs):
-            layer = len(self.layers)
-            if len(self.symbols) < self.layering.needs[layer]:
+        while self.layering is not None and self.layers < len(self.layering.needs):
+            if len(self.symbols) < self.layering.needs[self.layers]:
                 break
-            below = self.layers[-1] if self.layers else None
-            data = recover_layer(self.layering, layer, self.symbols)
-            pieces = unpack_object(data, below, f"block {self.number}, layer {layer}")
+            data = recover_layer(self.layering, self.layers, self.symbols)
+            below = self.layer_ends if self.layers else None
+            pieces = unpack_object(data, below, f"block {self.number}, layer {self.layers}")
             if not isinstance(pieces, PieceList):
-                raise FrameError(f"block {self.number}", "layer", "a message", "pieces of pictures")
-            self.layers.append(pieces)
+                raise FrameError(f"block {self.number}", "layer", "a message", "pieces of images")
+            self.layers += 1
+            self.layer_ends = pieces.ends
             found.append(pieces)
-        if self.layering is not None and len(self.layers) == len(self.layering.needs):
+        if self.layering is not None and self.layers == len(self.layering.needs):
             self._finish()
         yield from found
 
     def _finish(self) -> None:
         self.complete = True
         self.symbols = {index: _digest(data) for index, data in self.symbols.items()}
-        self.told.clear()
-        self.layers.clear()
+        self.descriptor.clear()
+        self.layers, self.layer_ends = 0, ()
 
-    def _forget_older_half(self) -> None:
-        self.mixed += 1
+    def _delete_older_half(self) -> None:
         for index in list(self.symbols)[: (len(self.symbols) + 1) // 2]:
             del self.symbols[index]
-            self.told.pop(index, None)
-        # What the descriptor said may have come from another block.
+            self.descriptor.pop(index, None)
+        # The descriptor may have come from another block.
         self.layering = None
-        self.layers.clear()
+        self.layers, self.layer_ends = 0, ()
+
+    def symbol_chunks(self) -> list[SymbolChunk]:
+        """Return the symbols as chunks to save."""
+        symbols = [(index, data, self.descriptor.get(index, 0)) for index, data in self.symbols.items()]
+        return [SymbolChunk(tuple(symbols[at : at + _CHUNK_SYMBOLS])) for at in range(0, len(symbols), _CHUNK_SYMBOLS)]
+
+    def restore_chunk(self, chunk: SymbolChunk) -> None:
+        """Add the symbols of a saved chunk.
+
+        Raises:
+            FrameError: A symbol does not have the length of this block's symbols or digests.
+        """
+        length = _DIGEST_BYTES if self.complete else self.symbol_bytes
+        for index, data, descriptor in chunk.symbols:
+            if len(data) != length:
+                raise FrameError(f"block {self.number}", "symbols", f"{len(data)} bytes", f"{length} bytes")
+            self.symbols[index] = data
+            if self.kind == SymbolKind.LAYERED and not self.complete:
+                self.descriptor[index] = descriptor
 
 
 def _digest(data: bytes) -> bytes:
-    return zlib.crc32(data).to_bytes(4, "big")
+    return zlib.crc32(data).to_bytes(_DIGEST_BYTES, "big")
 
 
 def _entries(source: bytes, entries: int, span: int, entry_bytes: int) -> Iterator[Preview]:
-    """Yield the previews in source symbols; spans of zeros are unused places."""
+    """Yield the previews in source symbols; a span of zeros is an unused place."""
     for base in range(0, len(source), span):
         for place in range(entries):
             entry = source[base + place * entry_bytes : base + (place + 1) * entry_bytes]

@@ -1,54 +1,92 @@
-"""Blocks of the v1 sender: made from pictures, read symbol by symbol, saved and restored."""
+"""Sender's side of blocks: a group of images becomes a preview block, then blocks of detail, with or without layers."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Annotated, Final
 
 import numpy as np
 
 from sonarpost.errors import FrameError
-from sonarpost.link.coding import erasure_code as fec
+from sonarpost.link.coding import erasure_code
 from sonarpost.link.coding.byte_ranges import Ranges
-from sonarpost.link.coding.rate_distortion import Values
+from sonarpost.link.coding.rate_distortion import GroupDistortion, Values
+from sonarpost.link.coding.redundancy_plan import arrivals, plan_layers, plan_whole, preview_frames, symbols_to_send
+from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.frame import Symbol, SymbolKind
+from sonarpost.link.frames.v1.frame import BLOCKS, Symbol, SymbolKind
 from sonarpost.link.frames.v1.layers import Layering, layered_symbols
-from sonarpost.link.frames.v1.payload_objects import PieceList, StreamPiece
-from sonarpost.link.frames.v1.preview import Preview, contact_link, entry_shape
+from sonarpost.link.frames.v1.payload_objects import (
+    CHECK_BYTES,
+    MAX_STREAM_BYTES,
+    PieceEnd,
+    PieceList,
+    StreamPiece,
+)
+from sonarpost.link.frames.v1.preview import MAX_NUMBER, Preview, contact_link, entry_shape
+from sonarpost.link.state import PROGRESS, SEPARATE, Bounds, Byte, Count
 
-StreamSpan = tuple[int, int, int, int]
-"""Number and link of a picture, and a part of its stream `[start, stop)`."""
-_AHEAD = 32
-"""Symbols are made so many at a time: a matrix product of several costs little more than one."""
+ImageNumber = Annotated[int, Bounds(1, MAX_NUMBER)]
+StreamPosition = Annotated[int, Bounds(0, MAX_STREAM_BYTES)]
+StreamSpan = tuple[ImageNumber, Byte, StreamPosition, StreamPosition]
+"""Number and link of an image, and a part of its stream, [start, stop)."""
+TakeNumber = Callable[[], int]
+
+_AHEAD: Final = 32
+"""Symbols to compute at a time: a matrix product of several costs little more than one."""
+_PREVIEW_URGENCY: Final = 2.0
+_MAX_GROUP: Final = 60
+_PREVIEW_SHARE: Final = 0.6
+"""Greatest share of a group's frames for previews."""
 
 
 @dataclass(eq=False)
 class OutgoingImage:
-    """A picture to send.
+    """An image to send.
 
     Attributes:
-        number: Of its contact, 1..65535.
-        contact: The contact's record.
-        stream: The codec's stream; all of it may be sent, and what is worth most is sent first.
-        curve: PSNR by bytes, see `v1_gain.quality_curve`.
-        added_at: When it was handed over.
+        number: Number of its contact.
+        contact: The contact record.
+        stream: The codec's stream. All of it may be sent; its most valuable bytes go first.
+        curve: PSNR in dB by the number of bytes, see `quality_curve`.
+        added_s: Time when it was added.
+        image_id: Identifier on the vehicle.
+        contact_id: Identifier of the contact on the vehicle.
+        order: Rises with every image that is added.
         sent: Bytes of the stream that blocks hold so far.
-        goal: Up to where the stream is to be sent, where that was asked for; 0 as configured.
-        settled: Parts of the stream that receivers are known to have; from 0 on, with the record.
+        goal: Bytes of the stream to send, if they were requested; 0 for the configured number.
+        delivered: Ranges of the stream that all receivers have. A range from 0 on includes the record.
+        announced: Whether the record was sent ahead of the image's group.
     """
 
-    number: int
+    number: ImageNumber
     contact: ContactSummary
     stream: bytes
     curve: Values
-    added_at: float
-    sent: int = 0
-    goal: int = 0
-    settled: Ranges = ()
+    added_s: float
+    image_id: str = "0000"
+    contact_id: str = "?"
+    order: Count = 0
+    sent: StreamPosition = field(default=0, metadata=PROGRESS)
+    goal: StreamPosition = field(default=0, metadata=PROGRESS)
+    delivered: Ranges = field(default=(), metadata=PROGRESS)
+    announced: bool = field(default=False, metadata=PROGRESS)
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.stream) <= MAX_STREAM_BYTES or self.curve.shape != (len(self.stream) + 1,):
+            expected = f"1..{MAX_STREAM_BYTES} bytes, and a curve with a value for each length"
+            raise FrameError("outgoing image", "stream", f"{len(self.stream)} bytes", expected)
+        position = 0
+        for start, stop in self.delivered:
+            if not position <= start < stop <= len(self.stream):
+                raise FrameError("outgoing image", "delivered", self.delivered, f"ranges within {len(self.stream)}")
+            position = stop + 1
+        self.sent = min(self.sent, len(self.stream))
 
     def goal_bytes(self, usual: int) -> int:
-        """Return up to where the stream is to be sent, where `usual` bytes are unless more were asked for."""
+        """Return how many bytes of the stream to send: `usual`, unless more were requested."""
         return min(len(self.stream), max(self.goal or usual, self.sent))
 
     @property
@@ -57,11 +95,11 @@ class OutgoingImage:
         return contact_link(self.number, self.contact.pack())
 
     def preview(self, prefix_bytes: int) -> Preview:
-        """Return the preview with so much of the stream."""
+        """Return the preview with the first bytes of the stream."""
         return Preview(self.number, self.contact, self.stream[:prefix_bytes], ended=len(self.stream) < prefix_bytes)
 
     def span(self, start: int, stop: int) -> StreamSpan:
-        """Return what a block notes of a part of the stream that it holds."""
+        """Return a part of the stream as a block lists it."""
         return self.number, self.link, start, stop
 
     def piece(self, start: int, stop: int) -> StreamPiece:
@@ -71,132 +109,337 @@ class OutgoingImage:
 
 @dataclass(eq=False)
 class SendBlock:
-    """A block under way.
+    """A block that is being sent.
 
     Attributes:
-        kind: What it holds.
+        kind: Content of the block.
         number: 0..31.
         symbol_bytes: Length of a symbol.
-        objects: One object, or one a layer.
-        layering: Of a layered block.
-        contacts: Contacts it is about.
-        urgency: How much earlier than others it is sent: progress counts divided by this.
-        planned: Symbols to send, by the plan so far.
+        objects: One object, or one for each layer.
+        layering: The layers of a layered block.
+        contacts: Numbers of its images.
+        urgency: Divides the progress of the block; the block with the least progress goes next.
+        spans: Part of the stream of each image in it. A part from 0 on includes the record.
+        planned: Symbols to send according to the current plan.
         sent: Symbols sent.
-        reported: Whether feedback has told of it.
-        asked_at: When it was last sent or asked for.
-        needs: Symbols lacking, by receiver, as last reported.
-        spans: Of every picture in it number, link, and the part of the stream; from 0 on, its record too.
+        reported: Whether feedback has mentioned the block.
+        asked_s: Time of its last symbol or feedback.
+        needs: Missing symbols by receiver, from the latest feedback.
+        retired: Whether it was sent without feedback, and only feedback can continue it.
     """
 
     kind: SymbolKind
-    number: int
-    symbol_bytes: int
+    number: Annotated[int, Bounds(0, BLOCKS - 1)]
+    symbol_bytes: Byte
     objects: tuple[bytes, ...]
     layering: Layering | None
-    contacts: tuple[int, ...]
-    urgency: float
-    planned: int
-    sent: int = 0
-    reported: bool = False
-    asked_at: float = 0.0
-    needs: dict[int, int] = field(default_factory=dict)
+    contacts: tuple[ImageNumber, ...]
+    urgency: Annotated[float, Bounds(1e-3, 1e3)]
     spans: tuple[StreamSpan, ...] = ()
-    _made: dict[int, Symbol] = field(default_factory=dict)
+    planned: Count = field(default=0, metadata=PROGRESS)
+    sent: Count = field(default=0, metadata=PROGRESS)
+    reported: bool = field(default=False, metadata=PROGRESS)
+    asked_s: float = field(default=0.0, metadata=PROGRESS)
+    needs: dict[int, Byte] = field(default_factory=dict, metadata=PROGRESS)
+    retired: bool = field(default=False, metadata=PROGRESS)
+    _symbols: dict[int, Symbol] = field(default_factory=dict, metadata=SEPARATE)
+
+    def __post_init__(self) -> None:
+        lengths = tuple(len(data) for data in self.objects)
+        if self.layering is not None:
+            fits = self.kind == SymbolKind.LAYERED and lengths == self.layering.lengths(self.symbol_bytes)
+        else:
+            count, rest = divmod(sum(lengths), self.symbol_bytes or 1)
+            fits = self.kind != SymbolKind.LAYERED and len(lengths) == 1 and not rest
+            fits = fits and 1 <= count <= erasure_code.MAX_SYMBOLS and self.symbol_bytes > 0
+        if not fits:
+            raise FrameError("block", "objects", lengths, "whole symbols of one object, or the object of each layer")
 
     @property
     def source_symbols(self) -> int:
-        """Symbols that give all of it."""
+        """Number of symbols from which the whole block can be recovered."""
         return self.layering.needs[-1] if self.layering else len(self.objects[0]) // self.symbol_bytes
 
     @property
-    def lacks(self) -> int:
+    def left(self) -> int:
         """Symbols still to send."""
         return self.planned - self.sent
 
     @property
     def progress(self) -> float:
-        """How far it is, by its urgency."""
+        """Share of the plan that is sent, over the urgency."""
         return (self.sent + 0.5) / (max(self.planned, 1) * self.urgency)
 
     @property
     def is_fresh_preview(self) -> bool:
-        """Whether contacts of it have not been sent once."""
+        """Whether some contacts of a preview block have not been sent once."""
         return self.kind == SymbolKind.PREVIEW and self.sent < self.source_symbols
 
     def next_symbol(self) -> Symbol:
-        """Return the next symbol. After all 255 they come again."""
-        index = self.sent % fec.MAX_SYMBOLS
+        """Return the next symbol; the 256th is the first again."""
+        index = self.sent % erasure_code.MAX_SYMBOLS
         self.sent += 1
-        if index not in self._made:
-            self._make(range(index, min(index + _AHEAD, fec.MAX_SYMBOLS)))
-        return self._made.pop(index)
+        if index not in self._symbols:
+            self._compute(range(index, min(index + _AHEAD, erasure_code.MAX_SYMBOLS)))
+        return self._symbols.pop(index)
 
-    def _make(self, indices: Sequence[int]) -> None:
+    def _compute(self, indices: Sequence[int]) -> None:
         if self.layering is not None:
-            for index, (told, data) in zip(indices, layered_symbols(self.layering, self.objects, indices), strict=True):
-                self._made[index] = Symbol(self.kind, self.number, index, told, data)
+            made = layered_symbols(self.layering, self.objects, indices)
+            for index, (descriptor, data) in zip(indices, made, strict=True):
+                self._symbols[index] = Symbol(self.kind, self.number, index, descriptor, data)
             return
         source = np.frombuffer(self.objects[0], np.uint8).reshape(-1, self.symbol_bytes)
-        for index, row in zip(indices, fec.encode(source, indices), strict=True):
-            self._made[index] = Symbol(self.kind, self.number, index, source.shape[0], row.tobytes())
+        for index, row in zip(indices, erasure_code.encode(source, indices), strict=True):
+            self._symbols[index] = Symbol(self.kind, self.number, index, source.shape[0], row.tobytes())
 
 
-def preview_object(pictures: Sequence[OutgoingImage], symbol_bytes: int) -> bytes:
+@lru_cache(maxsize=64)
+def group_limit(config: SenderConfig, symbol_bytes: int) -> int:
+    """Return how many images a group may have so that no block needs more than 255 symbols."""
+    shape = entry_shape(symbol_bytes)
+    limit = config.group_size
+    if config.feedback and not config.group_images:
+        # Long frames hold more: at the fast rates a small group would fill the window with small blocks.
+        limit = max(limit, min(_MAX_GROUP, config.block_symbols * symbol_bytes // config.stream_bytes))
+    while limit > 1 and (
+        _planned_previews(config, shape.source_symbols(limit), limit) >= erasure_code.MAX_SYMBOLS
+        or (not config.feedback and limit * config.frames_per_image > erasure_code.MAX_SYMBOLS)
+    ):
+        limit -= 1
+    return limit
+
+
+def numbers_needed(images: Sequence[OutgoingImage], config: SenderConfig, symbol_bytes: int) -> int:
+    """Return the greatest number of blocks that a group needs."""
+    if not config.feedback:
+        return 2
+    total = sum(image.goal_bytes(config.stream_bytes) + 8 for image in images)
+    return 3 + total // (config.block_symbols * symbol_bytes)
+
+
+def _planned_previews(config: SenderConfig, source: int, images: int) -> int:
+    if config.feedback:
+        return symbols_to_send(source, config.worst, config.caution)
+    limit = round(_PREVIEW_SHARE * config.frames_per_image * images)
+    return max(preview_frames(source, channel.spread(config.depth + 1), limit=limit) for channel in config.channels)
+
+
+def make_group(
+    images: Sequence[OutgoingImage], config: SenderConfig, symbol_bytes: int, take_number: TakeNumber, now: float
+) -> list[SendBlock]:
+    """Return the blocks of a group, previews first."""
+    shape = entry_shape(symbol_bytes)
+    planned = min(_planned_previews(config, shape.source_symbols(len(images)), len(images)), erasure_code.MAX_SYMBOLS)
+    for image in images:
+        image.sent = min(shape.prefix_bytes, len(image.stream))
+    previews = SendBlock(
+        kind=SymbolKind.PREVIEW,
+        number=take_number(),
+        symbol_bytes=symbol_bytes,
+        objects=(_preview_object(images, symbol_bytes),),
+        layering=None,
+        contacts=tuple(image.number for image in images),
+        urgency=_PREVIEW_URGENCY,
+        spans=tuple(image.span(0, image.sent) for image in images),
+        planned=planned,
+        asked_s=now,
+    )
+    for image in images:
+        if image.sent == shape.prefix_bytes == image.goal_bytes(config.stream_bytes):
+            image.sent -= 1  # a full entry cannot say that the stream ends; a piece of one byte does
+    if config.feedback:
+        return [previews, *whole_blocks(images, config, symbol_bytes, take_number, now)]
+    frames = min(round(config.frames_per_image * len(images)) - planned, erasure_code.MAX_SYMBOLS)
+    return [previews, *_layered(images, config, symbol_bytes, frames, take_number, now)]
+
+
+def _preview_object(images: Sequence[OutgoingImage], symbol_bytes: int) -> bytes:
     """Return the source symbols of a preview block as one object."""
     shape = entry_shape(symbol_bytes)
-    entries = [picture.preview(shape.prefix_bytes).pack(shape.entry_bytes) for picture in pictures]
+    entries = [image.preview(shape.prefix_bytes).pack(shape.entry_bytes) for image in images]
     groups = [b"".join(entries[i : i + shape.entries]) for i in range(0, len(entries), shape.entries)]
     return b"".join(group.ljust(symbol_bytes * shape.symbols, b"\0") for group in groups)
 
 
-def layer_objects(
-    pictures: Sequence[OutgoingImage],
+def _layered(
+    images: Sequence[OutgoingImage],
+    config: SenderConfig,
+    symbol_bytes: int,
+    frames: int,
+    take_number: TakeNumber,
+    now: float,
+) -> Iterator[SendBlock]:
+    starts = [image.sent for image in images]
+    distortion = GroupDistortion.of([image.curve for image in images], starts)
+    if frames < 1 or distortion.total_bytes == 0:
+        return
+    # Lengths of 128 bytes and more take two bytes; most pieces are shorter or longer together.
+    guess = _pieces(images, starts, [min(s + 128, len(i.stream)) for i, s in zip(images, starts, strict=True)])
+    first, later = guess.overhead_bytes(), 1 + len(images) + CHECK_BYTES
+    arrive = arrivals(frames, config.planned_channels, config.depth)
+    plan = plan_layers(distortion, symbol_bytes, arrive, first, later)
+    whole = plan_whole(distortion, symbol_bytes, arrive, first)
+    if plan is None or (whole is not None and whole[1] >= plan.expected_db):
+        if whole is not None:
+            room = whole[0] * symbol_bytes
+            stops = _fitted_stops(images, starts, distortion.stops(room - first), room, None)
+            yield _whole_block(images, stops, whole[0], symbol_bytes, take_number(), frames, now, final=True)
+        return
+    if plan.expected_db <= 0:
+        return
+    layers = _layers(images, starts, distortion, plan.layering, symbol_bytes, first, later)
+    stops = [piece.stop for piece in layers[-1].pieces]
+    objects: list[bytes] = []
+    below: Sequence[PieceEnd] | None = None
+    for layer, length in zip(layers, plan.layering.lengths(symbol_bytes), strict=True):
+        objects.append(layer.pack(length, below))
+        below = layer.ends
+    yield SendBlock(
+        kind=SymbolKind.LAYERED,
+        number=take_number(),
+        symbol_bytes=symbol_bytes,
+        objects=tuple(objects),
+        layering=plan.layering,
+        contacts=tuple(image.number for image in images),
+        urgency=1.0,
+        spans=tuple(image.span(a, b) for image, a, b in zip(images, starts, stops, strict=True)),
+        planned=frames,
+        asked_s=now,
+    )
+    for image, stop in zip(images, stops, strict=True):
+        image.sent = stop
+
+
+def _layers(
+    images: Sequence[OutgoingImage],
+    starts: Sequence[int],
+    distortion: GroupDistortion,
     layering: Layering,
     symbol_bytes: int,
+    first: int,
+    later: int,
+) -> list[PieceList]:
+    """Return the pieces of each layer, the lowest first."""
+    layers: list[PieceList] = []
+    begins, total = list(starts), 0
+    lengths = layering.lengths(symbol_bytes)
+    for number, length in enumerate(lengths):
+        total += length - (later if layers else first)
+        below = layers[-1].ends if layers else None
+        stops = _fitted_stops(images, begins, distortion.stops(total), length, below)
+        layers.append(_pieces(images, begins, stops, final=number == len(lengths) - 1))
+        begins = stops
+    return layers
+
+
+def whole_blocks(
+    images: Sequence[OutgoingImage],
+    config: SenderConfig,
+    symbol_bytes: int,
+    take_number: TakeNumber,
+    now: float,
+) -> Iterator[SendBlock]:
+    """Yield blocks without layers that continue each image from `sent` to its goal."""
+    goals = {image.number: image.goal_bytes(config.stream_bytes) for image in images}
+    rest = [image for image in images if image.sent < goals[image.number]]
+    while rest:
+        run, room = _run_that_fits(rest, goals, config.block_symbols * symbol_bytes)
+        starts = [image.sent for image in run]
+        stops = [goals[image.number] for image in run]
+        if len(run) == 1:
+            # Shortened to what a block holds, not extended: bytes beyond the goal only fill the last symbol.
+            limits = _fitted_stops(run, starts, stops, min(room, config.block_symbols * symbol_bytes), None)
+            stops = [min(a, b) for a, b in zip(limits, stops, strict=True)]
+        size = _pieces(run, starts, stops).overhead_bytes() + sum(stops) - sum(starts)
+        source = -(-size // symbol_bytes)
+        stops = _fitted_stops(run, starts, stops, source * symbol_bytes, None)
+        final = all(stop >= goals[image.number] for image, stop in zip(run, stops, strict=True))
+        planned = symbols_to_send(source, config.worst, config.caution)
+        yield _whole_block(run, stops, source, symbol_bytes, take_number(), planned, now, final=final)
+        rest = [image for image in rest if image.sent < goals[image.number]]
+
+
+def _whole_block(
+    run: Sequence[OutgoingImage],
+    stops: Sequence[int],
+    source: int,
+    symbol_bytes: int,
+    number: int,
+    planned: int,
+    now: float,
+    *,
+    final: bool,
+) -> SendBlock:
+    """Return a block without layers that continues images to their stops, and update `sent` of the images."""
+    starts = [image.sent for image in run]
+    for image, stop in zip(run, stops, strict=True):
+        image.sent = stop
+    return SendBlock(
+        kind=SymbolKind.OBJECT,
+        number=number,
+        symbol_bytes=symbol_bytes,
+        objects=(_pieces(run, starts, stops, final=final).pack(source * symbol_bytes),),
+        layering=None,
+        contacts=tuple(image.number for image in run),
+        urgency=1.0,
+        spans=tuple(image.span(a, b) for image, a, b in zip(run, starts, stops, strict=True)),
+        planned=planned,
+        asked_s=now,
+    )
+
+
+def _pieces(
+    images: Sequence[OutgoingImage], starts: Sequence[int], stops: Sequence[int], *, final: bool = True
+) -> PieceList:
+    return PieceList(tuple(image.piece(a, b) for image, a, b in zip(images, starts, stops, strict=True)), final)
+
+
+def _run_that_fits(
+    rest: Sequence[OutgoingImage], goals: Mapping[int, int], room: int
+) -> tuple[list[OutgoingImage], int]:
+    """Return images from the front whose rest fits one block (at least one), so that blocks become equally large."""
+    sizes = [goals[image.number] - image.sent + 5 for image in rest]
+    blocks = -(-(sum(sizes) + 16) // room)
+    share = min(room, -(-sum(sizes) // blocks) + 16)
+    run, used = [rest[0]], sizes[0] + 16
+    for image, size in zip(rest[1:], sizes[1:], strict=True):
+        if used + size > share + size // 2 or used + size > room:
+            break
+        run.append(image)
+        used += size
+    return run, room
+
+
+def _fitted_stops(
+    images: Sequence[OutgoingImage],
     starts: Sequence[int],
-    layer_stops: list[list[int]],
-) -> tuple[bytes, ...]:
-    """Return the objects of a layered block, given up to where each layer goes in each stream."""
-    objects: list[bytes] = []
-    below: PieceList | None = None
-    begins = list(starts)
-    for layer, (length, stops) in enumerate(zip(layering.lengths(symbol_bytes), layer_stops, strict=True)):
-        pieces = tuple(p.piece(a, b) for p, a, b in zip(pictures, begins, stops, strict=True))
-        group = PieceList(pieces, final=layer == len(layer_stops) - 1)
-        objects.append(group.pack(length, below))
-        below, begins = group, stops
-    return tuple(objects)
-
-
-def fitted_stops(
-    pictures: Sequence[OutgoingImage], starts: Sequence[int], stops: list[int], room: int, below: PieceList | None
+    stops: list[int],
+    room: int,
+    below: Sequence[PieceEnd] | None,
 ) -> list[int]:
-    """Return `stops`, drawn back or pushed on until the object fills `room` bytes as well as it can.
+    """Return `stops`, decreased or increased until the object fills `room` bytes as well as possible.
 
-    What lengths cost depends on the lengths, so the plan can be a few bytes off either way.
+    The encoded lengths depend on the lengths, so the plan can be wrong by a few bytes in both directions.
 
     Raises:
         FrameError: Not even empty pieces fit.
     """
-
-    def overhead(ends: Sequence[int]) -> int:
-        found = tuple(p.piece(a, b) for p, a, b in zip(pictures, starts, ends, strict=True))
-        return PieceList(found, final=True).overhead_bytes(below)
-
     ends = [max(a, b) for a, b in zip(starts, stops, strict=True)]
-    spare = room - overhead(ends) - sum(ends) + sum(starts)
-    while spare < 0:
+
+    def spare_bytes() -> int:
+        return room - _pieces(images, starts, ends).overhead_bytes(below) - sum(ends) + sum(starts)
+
+    while (spare := spare_bytes()) < 0:
         longest = max(range(len(ends)), key=lambda i: ends[i] - starts[i])
         if ends[longest] == starts[longest]:
-            raise FrameError("picture group", "room", f"{room} bytes", f"at least {overhead(ends)}")
+            raise FrameError("image group", "room", f"{room} bytes", f"at least {room - spare}")
         ends[longest] -= min(-spare, ends[longest] - starts[longest])
-        spare = room - overhead(ends) - sum(ends) + sum(starts)
-    for i, picture in enumerate(pictures):
+    for i, image in enumerate(images):
         if spare < 3:  # a longer length may take a byte more itself
             break
-        more = min(spare - 2, len(picture.stream) - ends[i])
+        more = min(spare - 2, len(image.stream) - ends[i])
         if more > 0:
             ends[i] += more
-            spare = room - overhead(ends) - sum(ends) + sum(starts)
+            spare = spare_bytes()
     return ends

@@ -1,68 +1,148 @@
-"""What of every picture is known to have arrived, and what is therefore owed: the memory behind repairs. Pure.
+"""What receivers have, according to their feedback: complete blocks, missing parts of images, and the loss.
 
-A block that receivers report complete settles the parts of pictures that it held. Blocks that were given up (sent while
-nobody reported, pushed out of the window, of another frame length) settle nothing: what they held is owed until
-another block has brought it.
+A complete block means that its parts of images are delivered. A block that the sender gave up delivers nothing: it was
+sent without feedback, left the window, or has another frame length. Its parts are missing until another block delivers
+them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Final
 
 from sonarpost.link.coding.blocks import OutgoingImage, SendBlock
 from sonarpost.link.coding.byte_ranges import Ranges, add_range, gaps_within
+from sonarpost.link.coding.redundancy_plan import symbols_to_send
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.v1.feedback import NEVER_RECEIVED, WINDOW, Feedback
 from sonarpost.link.frames.v1.frame import BLOCKS
+from sonarpost.link.state import Bounds, Count
+
+_MIN_FRAMES_TO_MEASURE: Final = 16
 
 
-def record_delivered(pictures: Mapping[int, OutgoingImage], done: Iterable[SendBlock]) -> None:
-    """Note that receivers have all of these blocks."""
+@dataclass(eq=False)
+class LossMeter:
+    """Measures the loss from the frames sent and received between two feedback messages.
+
+    Attributes:
+        loss: Share of frames lost, None before the second feedback.
+        last_counts: Frames sent and frames received at the last feedback that was used.
+    """
+
+    loss: Annotated[float, Bounds(0, 1)] | None = None
+    last_counts: tuple[Count, Count] | None = None
+
+    def update(self, feedback: Feedback, frames_sent: int) -> None:
+        """Add a feedback with a weight of a quarter. Intervals of fewer than 16 frames are joined."""
+        if self.last_counts is not None:
+            sent = frames_sent - self.last_counts[0]
+            if sent < _MIN_FRAMES_TO_MEASURE:
+                return
+            received = (feedback.frames - self.last_counts[1]) % 65536
+            loss = min(max(1.0 - received / sent, 0.0), 1.0)
+            self.loss = loss if self.loss is None else 0.75 * self.loss + 0.25 * loss
+        self.last_counts = (frames_sent, feedback.frames)
+
+
+@dataclass(eq=False)
+class FeedbackTracker:
+    """The receivers that send feedback.
+
+    Attributes:
+        receivers: Time of the last feedback, by modem address.
+        meters: Loss to each, by modem address.
+    """
+
+    receivers: dict[int, float] = field(default_factory=dict)
+    meters: dict[int, LossMeter] = field(default_factory=dict)
+
+    @property
+    def loss(self) -> float | None:
+        """Share of frames lost to the worst receiver; None before the second feedback of any."""
+        known = [m.loss for r, m in self.meters.items() if m.loss is not None and r in self.receivers]
+        return max(known, default=None)
+
+    def measure(self, feedback: Feedback, receiver: int, frames_sent: int) -> None:
+        """Update the loss to a receiver."""
+        self.meters.setdefault(receiver, LossMeter()).update(feedback, frames_sent)
+
+    def apply(
+        self, feedback: Feedback, blocks: Sequence[SendBlock], config: SenderConfig, now: float, receiver: int
+    ) -> tuple[list[SendBlock], list[SendBlock]]:
+        """Plan the blocks according to a feedback; return the blocks to continue, and those that all receivers have."""
+        self.receivers[receiver] = now
+        self.receivers = {r: at for r, at in self.receivers.items() if at + config.receiver_memory_s >= now}
+        self.meters = {r: meter for r, meter in self.meters.items() if r in self.receivers}
+        done = [block for block in blocks if self._is_done(block, feedback, config, now, receiver)]
+        return [block for block in blocks if block not in done], done
+
+    def _is_done(self, block: SendBlock, feedback: Feedback, config: SenderConfig, now: float, receiver: int) -> bool:
+        need = feedback.need_of(block.number)
+        if need is None:
+            behind = (feedback.newest - block.number) % BLOCKS
+            if behind >= WINDOW or block.reported or len(feedback.needs) < 2:
+                return False  # newer than all received blocks, reported before, or feedback on one block only
+            need = NEVER_RECEIVED
+        block.reported = block.reported or need != NEVER_RECEIVED
+        block.asked_s = now
+        block.needs[receiver] = block.source_symbols if need == NEVER_RECEIVED else need
+        if max(block.needs.get(known, block.source_symbols) for known in self.receivers) == 0:
+            return True
+        if need > 0:
+            more = symbols_to_send(block.needs[receiver], config.worst, config.caution)
+            block.planned = max(block.sent + more, block.planned if len(self.receivers) > 1 else 0)
+        return False
+
+
+def record_delivered(images: Mapping[int, OutgoingImage], done: Iterable[SendBlock]) -> None:
+    """Record that receivers have all of these blocks."""
     for block in done:
         for number, link, start, stop in block.spans:
-            picture = pictures.get(number)
-            if picture is not None and picture.link == link:
-                picture.settled = add_range(picture.settled, start, min(stop, len(picture.stream)))
+            image = images.get(number)
+            if image is not None and image.link == link:
+                image.delivered = add_range(image.delivered, start, min(stop, len(image.stream)))
 
 
-def missing_start(picture: OutgoingImage, config: SenderConfig, blocks: Sequence[SendBlock]) -> int | None:
-    """Return the first byte of a picture that nobody is known to have and no block holds, None where there is none."""
-    covered: Ranges = picture.settled
+def missing_start(image: OutgoingImage, config: SenderConfig, blocks: Sequence[SendBlock]) -> int | None:
+    """Return the first byte of an image that is neither delivered nor in a block, None if there is none."""
+    covered: Ranges = image.delivered
     for block in blocks:
         for number, link, start, stop in block.spans:
-            if number == picture.number and link == picture.link:
+            if number == image.number and link == image.link:
                 covered = add_range(covered, start, stop)
-    gaps = gaps_within(covered, 0, picture.goal_bytes(config.stream_bytes))
+    gaps = gaps_within(covered, 0, image.goal_bytes(config.stream_bytes))
     return gaps[0][0] if gaps else None
 
 
-def missing(
-    pictures: Mapping[int, OutgoingImage], config: SenderConfig, blocks: Sequence[SendBlock], most: int
+def missing_images(
+    images: Iterable[OutgoingImage], config: SenderConfig, blocks: Sequence[SendBlock], limit: int
 ) -> list[tuple[OutgoingImage, int]]:
-    """Return pictures, at most `most`, the oldest first, of which something is owed, and from which byte on.
+    """Return images with missing parts, at most `limit`, the oldest first, and the first missing byte of each.
 
-    Pictures whose record is owed do not mix with those of which only detail is: they are those of the first kind, or
-    where there are none of the second.
+    Images without a delivered record do not mix with those that lack only detail: if there are any, all are of the
+    first kind.
     """
-    found = [(p, at) for p in pictures.values() if (at := missing_start(p, config, blocks)) is not None]
-    anew = [(p, at) for p, at in found if at == 0]
-    return (anew or found)[:most]
+    found = [(image, start) for image in images if (start := missing_start(image, config, blocks)) is not None]
+    without_record = [(image, start) for image, start in found if start == 0]
+    return (without_record or found)[:limit]
 
 
-def forgettable(pictures: Mapping[int, OutgoingImage], config: SenderConfig, needed: Iterable[int]) -> list[int]:
-    """Return the numbers of pictures that are not needed in the order in which to forget them: what is owed last."""
+def deletion_order(images: Mapping[int, OutgoingImage], config: SenderConfig, needed: Iterable[int]) -> list[int]:
+    """Return the numbers of the images that are not needed, those that are completely delivered first."""
     keep = set(needed)
-    free = [p for n, p in pictures.items() if n not in keep]
-    return [p.number for p in sorted(free, key=lambda p: missing_start(p, config, ()) is not None)]
+    free = [image for number, image in images.items() if number not in keep]
+    return [image.number for image in sorted(free, key=lambda i: missing_start(i, config, ()) is not None)]
 
 
-def revived(past: list[SendBlock], report: Feedback) -> list[SendBlock]:
-    """Take from `past` the blocks that a report tells of, and return those of which the receiver has something."""
-    told = [block for block in past if report.need_of(block.number) is not None]
-    past[:] = [block for block in past if block not in told]
-    return [block for block in told if report.need_of(block.number) != NEVER_RECEIVED]
+def take_reported(retired: list[SendBlock], feedback: Feedback) -> list[SendBlock]:
+    """Remove the blocks in a feedback from `retired`; return those of which the receiver has symbols."""
+    reported = [block for block in retired if feedback.need_of(block.number) is not None]
+    retired[:] = [block for block in retired if block not in reported]
+    return [block for block in reported if feedback.need_of(block.number) != NEVER_RECEIVED]
 
 
-def within_window(past: list[SendBlock], next_block: int) -> list[SendBlock]:
-    """Return the blocks of `past` that reports may still tell of, where `next_block` is the next number."""
-    return [block for block in past if (next_block - block.number - 1) % BLOCKS < WINDOW]
+def within_window(retired: Iterable[SendBlock], next_block: int) -> list[SendBlock]:
+    """Return the blocks that feedback can still mention, if `next_block` is the next number."""
+    return [block for block in retired if (next_block - block.number - 1) % BLOCKS < WINDOW]

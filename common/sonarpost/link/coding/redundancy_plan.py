@@ -7,7 +7,7 @@ sender may plan otherwise and every receiver will understand it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations
@@ -16,12 +16,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.errors import ConfigError
-from sonarpost.link.coding.channel_capacity import LossChannel, Values, frames_for, goodput_bps, received_distribution
+from sonarpost.link.coding.channel_capacity import LossChannel, Values, frames_for, received_distribution
 from sonarpost.link.coding.rate_distortion import GroupDistortion
-from sonarpost.link.frames.v1.frame import HEADER_BYTES
 from sonarpost.link.frames.v1.layers import DESCRIPTOR_SYMBOLS, MAX_LAYERS, MAX_STEP, SHARES, Layering
-from sonarpost.modem.micromodem import Rate
 
 PREVIEWS_UNSEEN: Final = 0.004
 """Share of previews that may stay unseen at the loss that is planned for."""
@@ -52,7 +49,7 @@ def _compositions(layers: int) -> npt.NDArray[np.int64]:
 
 
 def plan_layers(
-    gain: GroupDistortion, symbol_bytes: int, arrive: Values, first_overhead: int, next_overhead: int
+    distortion: GroupDistortion, symbol_bytes: int, arrive: Values, first_overhead: int, next_overhead: int
 ) -> LayerPlan | None:
     """Return the layers with the greatest expected gain, None where the frames are too few for any.
 
@@ -61,7 +58,7 @@ def plan_layers(
     (gain(bytes up to l) - gain(bytes up to l - 1)) P(at least k_l frames arrive)` the greatest wins.
 
     Args:
-        gain: Of the group's bytes.
+        distortion: Of the group's images.
         symbol_bytes: Of a symbol.
         arrive: Shape (frames + 1,), at most 255 frames: the probability that 0, 1, ... of them arrive. For several
             receivers, or a loss that is not well known, the mean of several `received_distribution`.
@@ -82,18 +79,22 @@ def plan_layers(
                 if step > MAX_STEP or first + (layers - 1) * step > high:
                     break
                 needs = first + step * np.arange(layers)
-                value, place = _best_shares(gain, symbol_bytes, needs, at_least[needs], first_overhead, next_overhead)
+                value, place = _best_shares(
+                    distortion, symbol_bytes, needs, at_least[needs], first_overhead, next_overhead
+                )
                 if best is None or value > best[0]:
                     shares = tuple(int(s) for s in _compositions(layers)[place])
                     best = value, Layering(first, step, shares)
     return None if best is None else LayerPlan(best[1], best[0])
 
 
-def plan_whole(gain: GroupDistortion, symbol_bytes: int, arrive: Values, overhead: int) -> tuple[int, float] | None:
+def plan_whole(
+    distortion: GroupDistortion, symbol_bytes: int, arrive: Values, overhead: int
+) -> tuple[int, float] | None:
     """Return k and the expected gain of a block without layers (for groups too small for any), or None.
 
     Args:
-        gain: Of the group's bytes.
+        distortion: Of the group's images.
         symbol_bytes: Of a symbol.
         arrive: See `plan_layers`.
         overhead: Bytes of the object that are not picture.
@@ -101,7 +102,7 @@ def plan_whole(gain: GroupDistortion, symbol_bytes: int, arrive: Values, overhea
     needs = np.arange(1, arrive.size)
     at_least = np.cumsum(arrive[::-1])[::-1][1:]
     room = needs * symbol_bytes - overhead
-    expected = np.where(room > 0, gain.gains(np.maximum(room, 0)) * at_least, 0.0)
+    expected = np.where(room > 0, distortion.gains(np.maximum(room, 0)) * at_least, 0.0)
     if not expected.size or expected.max() <= 0:
         return None
     best = int(np.argmax(expected))
@@ -109,7 +110,7 @@ def plan_whole(gain: GroupDistortion, symbol_bytes: int, arrive: Values, overhea
 
 
 def _best_shares(
-    gain: GroupDistortion,
+    distortion: GroupDistortion,
     symbol_bytes: int,
     needs: npt.NDArray[np.int64],
     reached: Values,
@@ -121,7 +122,7 @@ def _best_shares(
     overhead = np.where(np.arange(needs.size) == 0, first_overhead, next_overhead)
     room = np.diff(edges // SHARES, axis=1) * needs - overhead
     # A layer without room for its own head cannot be made.
-    values = gain.gains(np.cumsum(np.maximum(room, 0), axis=1))
+    values = distortion.gains(np.cumsum(np.maximum(room, 0), axis=1))
     steps = np.diff(values, axis=1, prepend=0.0)
     expected = np.where((room > 0).all(axis=1), steps @ reached, -1.0)
     place = int(np.argmax(expected))
@@ -173,24 +174,3 @@ def symbols_to_send(needed: int, channel: LossChannel, caution: float) -> int:
     widening = (1 + memory) / (1 - memory)
     deviation = math.sqrt(needed * channel.loss * widening) / passed
     return max(needed, math.ceil(needed / passed - caution * deviation))
-
-
-def best_rate(measured_loss: Mapping[int, float], rates: Mapping[int, Rate]) -> Rate:
-    """Return the rate that carries most: what gets through of its frames, over the packet's time.
-
-    Args:
-        measured_loss: Share of frames lost by rate number, of the rates that are open to choice.
-        rates: What a packet of each holds and costs.
-
-    Raises:
-        ConfigError: No rate, an unknown one, or a loss outside 0..1.
-    """
-    if not measured_loss:
-        raise ConfigError("rate choice", "measured_loss", {}, "at least one rate")
-    for number, loss in measured_loss.items():
-        if number not in rates or not 0.0 <= loss <= 1.0:
-            raise ConfigError("rate choice", f"rate {number}", loss, f"one of {sorted(rates)}, loss 0..1")
-    return max(
-        (rates[number] for number in measured_loss),
-        key=lambda r: goodput_bps(r.frame_bytes, r.frames, r.airtime_s, measured_loss[r.number], HEADER_BYTES),
-    )

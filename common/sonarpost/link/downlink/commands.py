@@ -1,29 +1,28 @@
-"""Orders of the vessel to its vehicles: each is repeated until the vehicle has confirmed it, or it expires.
+"""Commands of the vessel: each is repeated until its vehicle confirms it, or it expires.
 
-Pure: `now` in seconds UTC, because orders outlive the process; the state can be saved and taken up by another one.
+`now` is UTC in seconds, because commands outlive the process.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Final
+from typing import Annotated, Final
 
 from sonarpost.errors import FrameError
 from sonarpost.link.downlink.messages import CommandOutcome, token_of
-from sonarpost.link.receiver_state import read_field, read_list, read_number, read_time
+from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
 
 MAX_PENDING: Final = 500
-"""Orders that may be open at a time."""
+"""Maximum number of open commands."""
 _REMEMBERED: Final = 1000
-_SLOWEST: Final = 8
-_WHERE: Final = "orders"
-_STATE_FORMAT: Final = 1
+_MAX_RETRY_FACTOR: Final = 8
+_WHERE: Final = "commands"
 
 
 class CommandState(StrEnum):
-    """How far an order has come. `CONFIRMED`, `REFUSED` and `EXPIRED` are final."""
+    """State of a command. `CONFIRMED`, `REFUSED` and `EXPIRED` are final."""
 
     ASKED = "asked"
     SENT = "sent"
@@ -33,177 +32,158 @@ class CommandState(StrEnum):
 
     @property
     def is_open(self) -> bool:
-        """Whether it is still to be sent or confirmed."""
+        """Whether the command is still to be sent or confirmed."""
         return self in (CommandState.ASKED, CommandState.SENT)
 
 
 @dataclass(frozen=True, slots=True)
 class PendingCommand:
-    """An order and what became of it.
+    """A command and its state.
 
     Attributes:
         kind: `refine`, `resend`, `revisit`, `wider` or `decision`.
-        record_id: Identifier of the record it comes from.
+        record_id: Identifier of its record.
         vehicle: Name of the vehicle.
-        address: Its modem's.
+        address: Modem address of the vehicle.
         token: As in the message.
-        message: The bytes that are sent.
-        asked_at: When it was asked.
-        expires_at: When it is worth nothing any more.
-        state: How far it has come.
-        times_sent: How often it has gone into the water.
-        due_at: When it is to be sent next.
-        reason: Of a refusal, the vehicle's.
+        message: The bytes to send.
+        added_s: Time when it was added.
+        expires_s: Time when it becomes useless.
+        state: The state.
+        times_sent: Number of transmissions.
+        due_s: Time of the next transmission.
+        reason: The vehicle's reason to refuse it.
+        order: Rises with every command.
     """
 
     kind: str
     record_id: str
     vehicle: str
-    address: int
-    token: int
+    address: Annotated[int, Bounds(0, 127)]
+    token: Annotated[int, Bounds(0, 2**32 - 1)]
     message: bytes
-    asked_at: float
-    expires_at: float
+    added_s: float
+    expires_s: float
     state: CommandState = CommandState.ASKED
-    times_sent: int = 0
-    due_at: float = 0.0
+    times_sent: Count = 0
+    due_s: float = 0.0
     reason: str = ""
+    order: Count = 0
 
 
 @dataclass
 class CommandTracker:
-    """All orders that are open, and the last 1000 that are not.
+    """All open commands, and the last 1000 closed ones.
 
     Attributes:
-        retry_s: Wait before an order is sent again; doubled each time, up to eight times as long.
+        retry_s: Wait before a command is sent again; doubled each time, up to eight times as long.
     """
 
     retry_s: float
-    _orders: dict[int, PendingCommand] = field(default_factory=dict)
+    _commands: dict[int, PendingCommand] = field(default_factory=dict)
 
     @property
-    def open_orders(self) -> tuple[PendingCommand, ...]:
-        """What is not confirmed, refused or expired, the oldest first."""
-        # A copy first, made in one go: others may ask how many there are while one is added.
-        return tuple(order for order in list(self._orders.values()) if order.state.is_open)
+    def open_commands(self) -> tuple[PendingCommand, ...]:
+        """The commands that are not confirmed, refused or expired, the oldest first."""
+        # `list` copies in one step: other threads call this while a command is added.
+        return tuple(command for command in list(self._commands.values()) if command.state.is_open)
 
-    def known(self, kind: str, record_id: str) -> PendingCommand | None:
-        """Return the order that a record has led to, None for a new one."""
-        same = (o for o in self._orders.values() if (o.kind, o.record_id) == (kind, record_id))
+    def find(self, kind: str, record_id: str) -> PendingCommand | None:
+        """Return the command of a record, None for a new record."""
+        same = (c for c in self._commands.values() if (c.kind, c.record_id) == (kind, record_id))
         return next(same, None)
 
     def free_token(self, kind: str, record_id: str) -> int:
-        """Return the token for a new record: the first of `downlink.token_of` that no other order has."""
+        """Return the token for a new record: the first of `token_of` that no other command has."""
         attempt = 0
-        while (token := token_of(record_id, "decision" if kind == "decision" else "command", attempt)) in self._orders:
+        while (
+            token := token_of(record_id, "decision" if kind == "decision" else "command", attempt)
+        ) in self._commands:
             attempt += 1
         return token
 
-    def ask(self, order: PendingCommand, now: float) -> PendingCommand:
-        """Take an order with a `free_token`; return it as it is now: late ones are expired at once.
+    def add(self, command: PendingCommand, now: float) -> PendingCommand:
+        """Add a command with a `free_token`; return it with its state. A late command expires at once.
 
         Raises:
-            FrameError: As many as are allowed are open, or the token is taken.
+            FrameError: Too many commands are open, or the token is in use.
         """
-        if len(self.open_orders) >= MAX_PENDING:
+        if len(self.open_commands) >= MAX_PENDING:
             raise FrameError(_WHERE, "open", MAX_PENDING, f"at most {MAX_PENDING}")
-        if order.token in self._orders:
-            raise FrameError(_WHERE, "token", order.token, "one that is free")
-        state = CommandState.EXPIRED if order.expires_at <= now else CommandState.ASKED
-        self._orders[order.token] = taken = replace(order, state=state, due_at=now)
-        closed = [token for token, each in self._orders.items() if not each.state.is_open]
+        if command.token in self._commands:
+            raise FrameError(_WHERE, "token", command.token, "one that is free")
+        state = CommandState.EXPIRED if command.expires_s <= now else CommandState.ASKED
+        order = 1 + max((c.order for c in self._commands.values()), default=0)
+        added = replace(command, state=state, due_s=float(now), order=order)
+        self._commands[command.token] = added
+        closed = [token for token, each in self._commands.items() if not each.state.is_open]
         for token in closed[: max(0, len(closed) - _REMEMBERED)]:
-            del self._orders[token]
-        return taken
+            del self._commands[token]
+        return added
 
     def due(self, now: float) -> tuple[PendingCommand, ...]:
-        """Return what is to be sent now, what waits longest first."""
-        waiting = [order for order in self.open_orders if order.due_at <= now < order.expires_at]
-        return tuple(sorted(waiting, key=lambda order: order.due_at))
+        """Return the commands to send now, the longest due first."""
+        waiting = [command for command in self.open_commands if command.due_s <= now < command.expires_s]
+        return tuple(sorted(waiting, key=lambda command: command.due_s))
 
     def sent(self, tokens: Iterable[int], now: float) -> tuple[PendingCommand, ...]:
-        """Note that these have gone into the water; return them as they are now."""
+        """Record that commands have been sent; return those that changed."""
 
-        def after(order: PendingCommand) -> PendingCommand:
-            wait_s = self.retry_s * min(2**order.times_sent, _SLOWEST)
-            return replace(order, state=CommandState.SENT, times_sent=order.times_sent + 1, due_at=now + wait_s)
+        def after(command: PendingCommand) -> PendingCommand:
+            if not command.state.is_open:
+                return command
+            wait_s = self.retry_s * min(2**command.times_sent, _MAX_RETRY_FACTOR)
+            return replace(
+                command, state=CommandState.SENT, times_sent=command.times_sent + 1, due_s=float(now + wait_s)
+            )
 
-        return self._change(tokens, lambda order: after(order) if order.state.is_open else order)
+        return self._change(tokens, after)
 
     def confirm(self, address: int, outcomes: Iterable[tuple[int, CommandOutcome]]) -> tuple[PendingCommand, ...]:
-        """Take what a vehicle says of its orders; return those that are closed by it.
+        """Process the outcomes that a vehicle reports; return the commands that it closes.
 
-        An order that expired here and was taken there all the same is confirmed: that is what happened.
+        A command that expired here but was accepted by the vehicle becomes confirmed.
         """
         changed: list[PendingCommand] = []
         for token, outcome in outcomes:
-            order = self._orders.get(token)
+            command = self._commands.get(token)
             if (
-                order is None
-                or order.address != address
-                or order.state in (CommandState.CONFIRMED, CommandState.REFUSED)
+                command is None
+                or command.address != address
+                or command.state in (CommandState.CONFIRMED, CommandState.REFUSED)
             ):
                 continue
-            if outcome is CommandOutcome.TAKEN:
-                closed = replace(order, state=CommandState.CONFIRMED)
+            if outcome is CommandOutcome.ACCEPTED:
+                closed = replace(command, state=CommandState.CONFIRMED)
             else:
-                closed = replace(order, state=CommandState.REFUSED, reason=outcome.name.lower().replace("_", " "))
-            self._orders[token] = closed
+                closed = replace(command, state=CommandState.REFUSED, reason=outcome.name.lower().replace("_", " "))
+            self._commands[token] = closed
             changed.append(closed)
         return tuple(changed)
 
     def expire(self, now: float) -> tuple[PendingCommand, ...]:
-        """Close what is too old; return it."""
-        late = [order.token for order in self.open_orders if order.expires_at <= now]
-        return self._change(late, lambda order: replace(order, state=CommandState.EXPIRED))
+        """Close and return the commands that have expired."""
+        late = [command.token for command in self.open_commands if command.expires_s <= now]
+        return self._change(late, lambda command: replace(command, state=CommandState.EXPIRED))
 
     def _change(
         self, tokens: Iterable[int], change: Callable[[PendingCommand], PendingCommand]
     ) -> tuple[PendingCommand, ...]:
         changed: list[PendingCommand] = []
         for token in tokens:
-            before = self._orders.get(token)
+            before = self._commands.get(token)
             if before is not None and (after := change(before)) != before:
-                self._orders[token] = after
+                self._commands[token] = after
                 changed.append(after)
         return tuple(changed)
 
-    def snapshot(self) -> dict[str, object]:
-        """Return the state as maps, lists, numbers, strings and bytes (msgpack can hold it)."""
-        return {"format": _STATE_FORMAT, "orders": [_export(order) for order in self._orders.values()]}
+    def parts(self) -> dict[str, bytes]:
+        """Return the state to save, see `sonarpost.link.state`: a part for each command."""
+        return {f"command/{token}": pack_part(command) for token, command in self._commands.items()}
 
-    def restore(self, state: Mapping[str, object]) -> None:
-        """Take up a state that `snapshot` returned.
-
-        Raises:
-            FrameError: It did not return this; the book is then as before.
-        """
-        if state.get("format") != _STATE_FORMAT:
-            raise FrameError(_WHERE, "format", state.get("format"), str(_STATE_FORMAT))
-        orders = [_import(entry) for entry in read_list(state, "orders")]
-        self._orders = {order.token: order for order in orders}
-
-
-def _export(order: PendingCommand) -> dict[str, object]:
-    fields: dict[str, object] = {name: getattr(order, name) for name in PendingCommand.__dataclass_fields__}
-    return fields | {"state": str(order.state)}
-
-
-def _import(entry: object) -> PendingCommand:
-    state = read_field(entry, "state", str)
-    if state not in tuple(CommandState):
-        raise FrameError(_WHERE, "state", state, ", ".join(CommandState))
-    return PendingCommand(
-        kind=read_field(entry, "kind", str),
-        record_id=read_field(entry, "record_id", str),
-        vehicle=read_field(entry, "vehicle", str),
-        address=read_number(entry, "address", 0, 127),
-        token=read_number(entry, "token", 0, 2**32 - 1),
-        message=read_field(entry, "message", bytes),
-        asked_at=read_time(entry, "asked_at"),
-        expires_at=read_time(entry, "expires_at"),
-        state=CommandState(state),
-        times_sent=read_number(entry, "times_sent", 0, 2**62),
-        due_at=read_time(entry, "due_at"),
-        reason=read_field(entry, "reason", str),
-    )
+    def restore(self, parts: Parts) -> Errors:
+        """Replace the state by saved parts; return why parts were skipped."""
+        reader = PartReader(parts, "command state")
+        commands = sorted(reader.read_group("command", PendingCommand), key=lambda command: command.order)
+        self._commands = {command.token: command for command in commands}
+        return reader.errors

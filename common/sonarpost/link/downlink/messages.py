@@ -1,10 +1,10 @@
-"""What commands, decisions, their confirmations and other traffic look like inside messages of the v1 link.
+"""Contents of `v1` messages: commands, decisions, their confirmations, and data of the vehicle's programs.
 
-A v1 message is bytes to the link; its first byte says what they are. Everything but free data fits the 27 bytes that a
-message has in a frame of 32. docs/specifications/acoustic-v1.md, "Inside messages", gives the tables.
+The first byte of a message is its kind. Everything but data fits the 27 bytes that a message has in a frame of 32.
+docs/specifications/acoustic-v1.md specifies the bytes.
 
-An order (a command or a decision) has a token of 32 bits. The vehicle knows a repeated order by its token and content,
-and confirms every copy of it: the order or its confirmation may be lost, the outcome is the same.
+A command (or decision) has a token of 32 bits. The vehicle deduplicates commands by token and content, and confirms
+every copy. So a lost command or confirmation does not change the outcome.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from sonarpost.link.frames.v1.preview import MAX_NUMBER
 from sonarpost.messages import Verdict
 
 SMALLEST_ROOM_BYTES: Final = 27
-"""Bytes of a message in a frame of 32 bytes without a tag."""
-EVERYTHING: Final = 0
-"""As `Refine.stream_bytes`: as much of the picture as the vehicle has."""
+"""Length of a message in a frame of 32 bytes without a tag."""
+ALL_BYTES: Final = 0
+"""Value of `RefineMessage.stream_bytes`: as much of the image as the vehicle has."""
 
 _WHERE: Final = "acoustic message"
 _MAX_U32: Final = 2**32 - 1
 _DEGREE_STEPS: Final = 10_000_000
 _CONFIDENCE_STEPS: Final = 254
 _NO_CONFIDENCE: Final = 255
-_MOST_VERSION: Final = 255
+_MAX_VERSION: Final = 255
 
 _HEAD = struct.Struct(">BII")
 _REFINE = struct.Struct(">HH")
@@ -49,29 +49,29 @@ class MessageKind(IntEnum):
     RESEND = 0x02
     REVISIT = 0x03
     DECISION = 0x04
-    WIDER = 0x05
+    EXPAND = 0x05
     CONFIRMATION = 0x08
     DATA = 0x10
 
 
-_ORDERS: Final = (
+_COMMANDS: Final = (
     MessageKind.REFINE,
     MessageKind.RESEND,
     MessageKind.REVISIT,
     MessageKind.DECISION,
-    MessageKind.WIDER,
+    MessageKind.EXPAND,
 )
 
 
 class CommandOutcome(IntEnum):
-    """What became of an order on the vehicle.
+    """The vehicle's answer to a command.
 
-    TAKEN: it is on the vehicle's disk, and its consumers get it.
-    UNKNOWN_IMAGE: the vehicle no longer has this image.
-    UNSUPPORTED: nobody on the vehicle takes such orders.
+    ACCEPTED: it is stored on the vehicle, and its consumers receive it.
+    UNKNOWN_IMAGE: the vehicle does not have this image any more.
+    UNSUPPORTED: the vehicle has no consumer for such commands.
     """
 
-    TAKEN = 0
+    ACCEPTED = 0
     UNKNOWN_IMAGE = 1
     UNSUPPORTED = 2
 
@@ -82,14 +82,14 @@ _VERDICTS: Final[tuple[Verdict, ...]] = ("mine_like", "not_mine_like", "unsure")
 
 @dataclass(frozen=True, slots=True)
 class CommandMessage:
-    """Base of what the vessel asks or tells.
+    """Base of all commands.
 
     Attributes:
         token: 0..2^32-1, see `token_of`.
         issued_utc_s: When it was issued, whole seconds since 1970-01-01 UTC, to 2106.
 
     Raises:
-        FrameError: A value out of range (so do the others).
+        FrameError: A value out of range (also in the derived classes).
     """
 
     token: int
@@ -102,15 +102,15 @@ class CommandMessage:
 
 @dataclass(frozen=True, slots=True)
 class RefineMessage(CommandMessage):
-    """More detail of a picture.
+    """Send more detail of an image.
 
     Attributes:
-        number: Of the contact, 1..65535.
-        stream_bytes: So many bytes of its stream, 1..65535; `EVERYTHING` for all.
+        number: Number of the contact, 1..65535.
+        stream_bytes: Length of its stream to send, 1..65535; `ALL_BYTES` for all.
     """
 
     number: int
-    stream_bytes: int = EVERYTHING
+    stream_bytes: int = ALL_BYTES
 
     def __post_init__(self) -> None:
         CommandMessage.__post_init__(self)
@@ -120,7 +120,7 @@ class RefineMessage(CommandMessage):
 
 @dataclass(frozen=True, slots=True)
 class ResendMessage(CommandMessage):
-    """A picture again, from its beginning. `number`: of the contact, 1..65535."""
+    """Send an image again, from its beginning. `number`: of the contact, 1..65535."""
 
     number: int
 
@@ -131,7 +131,7 @@ class ResendMessage(CommandMessage):
 
 @dataclass(frozen=True, slots=True)
 class ExpandMessage(CommandMessage):
-    """More of the seabed around a contact, as a picture of its own. `number`: of the contact, 1..65535."""
+    """Send more of the seabed around a contact, as a new image. `number`: of the contact, 1..65535."""
 
     number: int
 
@@ -142,10 +142,10 @@ class ExpandMessage(CommandMessage):
 
 @dataclass(frozen=True, slots=True)
 class RevisitMessage(CommandMessage):
-    """Go there again.
+    """Survey a position again.
 
     Attributes:
-        lat_deg: WGS 84, -90..90; travels in steps of 1e-7 degree.
+        lat_deg: WGS 84, -90..90; sent in steps of 1e-7 degree.
         lon_deg: WGS 84, -180..180; the same.
     """
 
@@ -160,14 +160,14 @@ class RevisitMessage(CommandMessage):
 
 @dataclass(frozen=True, slots=True)
 class DecisionMessage(CommandMessage):
-    """What an operator decided about a picture. The remark and the operator's name do not travel.
+    """An operator's verdict on a contact. The comment and the operator's name are not sent.
 
     Attributes:
-        number: Of the contact, 1..65535.
-        version: Of the picture, from 1; beyond 254 travels as 255.
+        number: Number of the contact, 1..65535.
+        version: Version of the image, from 1; sent as 255 if above 254.
         verdict: The verdict.
         confidence: 0..1 in steps of 1/254, None if not given.
-        mlo_class: Class of mine-like object; cut off between characters where the frame ends. Empty if not classified.
+        mlo_class: Class of mine-like object, empty if not classified. Cut between characters if it does not fit.
     """
 
     number: int
@@ -188,7 +188,7 @@ class DecisionMessage(CommandMessage):
 
 @dataclass(frozen=True, slots=True)
 class ConfirmationMessage:
-    """What became of orders. `outcomes`: token and outcome of each, at least one."""
+    """Outcomes of commands. `outcomes`: token and outcome of each, at least one."""
 
     outcomes: tuple[tuple[int, CommandOutcome], ...]
 
@@ -200,7 +200,7 @@ class ConfirmationMessage:
 
 @dataclass(frozen=True, slots=True)
 class DataMessage:
-    """Any other traffic. `data`: at least one byte."""
+    """Data of a program. `data`: at least one byte."""
 
     data: bytes
 
@@ -216,8 +216,8 @@ def pack(content: Content, room_bytes: int = SMALLEST_ROOM_BYTES) -> bytes:
     """Return the bytes of a message.
 
     Args:
-        content: What it says.
-        room_bytes: Longest that is wanted; only a judgement's class is cut to it.
+        content: The content.
+        room_bytes: Maximum length; the class in a decision is cut to it.
 
     Raises:
         FrameError: It does not fit.
@@ -237,7 +237,7 @@ def _packed(content: Content, room_bytes: int) -> bytes:
         case RefineMessage():
             return _head(MessageKind.REFINE, content) + _REFINE.pack(content.number, content.stream_bytes)
         case ResendMessage() | ExpandMessage():
-            kind = MessageKind.RESEND if isinstance(content, ResendMessage) else MessageKind.WIDER
+            kind = MessageKind.RESEND if isinstance(content, ResendMessage) else MessageKind.EXPAND
             return _head(kind, content) + _NUMBER.pack(content.number)
         case RevisitMessage():
             degrees = (round(value * _DEGREE_STEPS) for value in (content.lat_deg, content.lon_deg))
@@ -245,17 +245,17 @@ def _packed(content: Content, room_bytes: int) -> bytes:
         case DecisionMessage():
             confidence = _NO_CONFIDENCE if content.confidence is None else round(content.confidence * _CONFIDENCE_STEPS)
             fixed = _head(MessageKind.DECISION, content) + _DECISION.pack(
-                content.number, min(content.version, _MOST_VERSION), _VERDICTS.index(content.verdict), confidence
+                content.number, min(content.version, _MAX_VERSION), _VERDICTS.index(content.verdict), confidence
             )
             return fixed + _shortened(content.mlo_class, room_bytes - len(fixed))
 
 
-def _head(kind: MessageKind, order: CommandMessage) -> bytes:
-    return _HEAD.pack(kind, order.token, order.issued_utc_s)
+def _head(kind: MessageKind, command: CommandMessage) -> bytes:
+    return _HEAD.pack(kind, command.token, command.issued_utc_s)
 
 
-def _shortened(text: str, most_bytes: int) -> bytes:
-    return text.encode()[: max(0, most_bytes)].decode(errors="ignore").encode()
+def _shortened(text: str, max_bytes: int) -> bytes:
+    return text.encode()[: max(0, max_bytes)].decode(errors="ignore").encode()
 
 
 def unpack(data: bytes, where: str = _WHERE) -> Content:
@@ -266,23 +266,23 @@ def unpack(data: bytes, where: str = _WHERE) -> Content:
     """
     kind = data[0] if data else -1
     if kind == MessageKind.DATA:
-        return _made(where, lambda: DataMessage(data[1:]))
+        return _with_where(where, lambda: DataMessage(data[1:]))
     if kind == MessageKind.CONFIRMATION:
         return _confirmation(data[1:], where)
-    if kind not in _ORDERS:
+    if kind not in _COMMANDS:
         raise FrameError(where, "kind", kind, ", ".join(f"{int(known):#04x}" for known in MessageKind))
     if len(data) < _HEAD.size:
         raise FrameError(where, "length", len(data), f"at least {_HEAD.size} bytes")
     _, token, issued = _HEAD.unpack_from(data)
     body = data[_HEAD.size :]
-    return _made(where, lambda: _order(MessageKind(kind), token, issued, body))
+    return _with_where(where, lambda: _command(MessageKind(kind), token, issued, body))
 
 
-def _order(kind: MessageKind, token: int, issued: int, body: bytes) -> DownlinkCommand:
+def _command(kind: MessageKind, token: int, issued: int, body: bytes) -> DownlinkCommand:
     if kind == MessageKind.REFINE:
         number, stream_bytes = _fields(_REFINE, body)
         return RefineMessage(token, issued, number, stream_bytes)
-    if kind in (MessageKind.RESEND, MessageKind.WIDER):
+    if kind in (MessageKind.RESEND, MessageKind.EXPAND):
         (number,) = _fields(_NUMBER, body)
         return (ResendMessage if kind == MessageKind.RESEND else ExpandMessage)(token, issued, number)
     if kind == MessageKind.REVISIT:
@@ -291,12 +291,12 @@ def _order(kind: MessageKind, token: int, issued: int, body: bytes) -> DownlinkC
     number, version, verdict, confidence = _fields(_DECISION, body[: _DECISION.size])
     if verdict >= len(_VERDICTS):
         raise FrameError(_WHERE, "verdict", verdict, f"0..{len(_VERDICTS) - 1}")
-    sure = None if confidence == _NO_CONFIDENCE else confidence / _CONFIDENCE_STEPS
+    probability = None if confidence == _NO_CONFIDENCE else confidence / _CONFIDENCE_STEPS
     try:
         text = body[_DECISION.size :].decode()
     except UnicodeDecodeError as error:
         raise FrameError(_WHERE, "mlo_class", body[_DECISION.size :], "UTF-8") from error
-    return DecisionMessage(token, issued, number, version, _VERDICTS[verdict], sure, text)
+    return DecisionMessage(token, issued, number, version, _VERDICTS[verdict], probability, text)
 
 
 def _fields(layout: struct.Struct, body: bytes) -> tuple[int, ...]:
@@ -313,11 +313,11 @@ def _confirmation(body: bytes, where: str) -> ConfirmationMessage:
         if outcome not in tuple(CommandOutcome):
             raise FrameError(where, "outcome", outcome, "0..2")
         found.append((token, CommandOutcome(outcome)))
-    return _made(where, lambda: ConfirmationMessage(tuple(found)))
+    return _with_where(where, lambda: ConfirmationMessage(tuple(found)))
 
 
-def _made(where: str, make: Callable[[], _T]) -> _T:
-    """Return what `make` makes; its errors name `where`."""
+def _with_where(where: str, make: Callable[[], _T]) -> _T:
+    """Return `make()`; its errors name `where`."""
     try:
         return make()
     except FrameError as error:
@@ -327,36 +327,36 @@ def _made(where: str, make: Callable[[], _T]) -> _T:
 def confirmations(
     outcomes: Sequence[tuple[int, CommandOutcome]], room_bytes: int = SMALLEST_ROOM_BYTES
 ) -> tuple[ConfirmationMessage, ...]:
-    """Return outcomes as few messages of at most `room_bytes` each."""
+    """Return outcomes as messages of at most `room_bytes` each, as few as possible."""
     each = max(1, (room_bytes - 1) // _OUTCOME.size)
     return tuple(ConfirmationMessage(tuple(outcomes[at : at + each])) for at in range(0, len(outcomes), each))
 
 
 def token_of(record_id: str, kind: Literal["command", "decision"], attempt: int = 0) -> int:
-    """Return the token of a record: the same each time, so that a record asked twice is one order.
+    """Return the token of a record: always the same, so that a repeated record is one command.
 
     Args:
         record_id: Its `command_id` or `decision_id`.
         kind: Which of them.
-        attempt: Counted up by a sender that finds the token taken by another record.
+        attempt: Incremented by a sender if another record has the token.
     """
     digest = hashlib.sha256(f"{kind}\0{record_id}\0{attempt}".encode()).digest()
     return int.from_bytes(digest[:4], "big")
 
 
 def record_id_of(source: int, token: int) -> str:
-    """Return the identifier that an order has on the vehicle: the modem it came from and its token."""
+    """Return the identifier of a command on the vehicle: the sender's modem address and the token."""
     return f"a{source}-{token:08x}"
 
 
 def number_of_image(image_id: str) -> int:
     """Return the contact number, 1..65535, of an image identifier.
 
-    Identifiers count to 36^4, contact numbers to 65535, one by one both. `image_of_number` gives the identifier back
-    where the vehicle counts from 0001 to 1EKF.
+    Identifiers count to 36^4, contact numbers to 65535. `image_of_number` is the inverse for identifiers from 0001 to
+    1EKF.
 
     Raises:
-        FrameError: It is no identifier.
+        FrameError: Not a valid identifier.
     """
     if len(image_id) != 4 or not all(c in "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ" for c in image_id):
         raise FrameError(_WHERE, "image_id", image_id, "four of 0-9 and A-Z")
@@ -364,10 +364,10 @@ def number_of_image(image_id: str) -> int:
 
 
 def image_of_number(number: int) -> str:
-    """Return the identifier of a contact number: four digits to the base 36, 0001 to 1EKF.
+    """Return the image identifier of a contact number: four digits to the base 36, 0001 to 1EKF.
 
     Raises:
-        FrameError: It is not 1..65535.
+        FrameError: Not 1..65535.
     """
     _check("number", number, 1, MAX_NUMBER)
     return format_image_id(number)

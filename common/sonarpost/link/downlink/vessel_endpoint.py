@@ -1,12 +1,12 @@
-"""The vessel's end of the v1 link: what it hears of its vehicles, and what it has to say to them.
+"""The vessel's end of the link: receives frames of its vehicles, and sends them commands and feedback.
 
-Pure: frames and `now` (UTC) in, what follows and packets out; the state can be saved and taken up by another process.
-One packet carries all that is due for one vehicle, as far as there is room: orders, then the report of what is lacking.
+One packet carries everything that is due for one vehicle, as far as it fits: commands first, then feedback. `now` is
+UTC in seconds, because another process can restore the state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,230 +14,272 @@ from sonarpost.errors import FrameError
 from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.downlink.commands import CommandTracker, PendingCommand
 from sonarpost.link.downlink.messages import ConfirmationMessage, DataMessage, unpack
-from sonarpost.link.events import FrameRefused, MessageReceived
+from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.v1.feedback import Feedback
 from sonarpost.link.frames.v1.frame import FrameProtection, Segment, SegmentKind, pack_segments, segments_room
-from sonarpost.link.receiver import LinkReceiver
-from sonarpost.link.receiver_state import read_map, read_number
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.receiver import (
+    CombinedReceiver,
+    Event,
+    FeedbackReceived,
+    FrameRejected,
+    ImageUpdate,
+    MessageReceived,
+    WireFormat,
+)
+from sonarpost.link.state import Byte, Errors, PartReader, Parts, below, pack_part, prefixed
 
-_STATE_FORMAT: Final = 1
-_MOST_SILENT: Final = 6
-"""Reports into silence come at twice the interval each time, so many times."""
+_MAX_UNANSWERED: Final = 6
+"""Feedback without an answer is repeated so many times, after twice the interval each time."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReceivedContent:
-    """What a frame has led to.
+    """What followed from a frame.
 
     Attributes:
-        data: Other traffic of the vehicle, message by message.
-        orders: Those whose state it has changed.
-        refused: Why the frame, or a part of it, is of no use.
+        images: Updates of images.
+        messages: Messages of the vehicle's programs.
+        commands: Commands whose state changed.
+        rejected: Why the frame, or a part of it, was rejected.
     """
 
-    data: tuple[bytes, ...] = ()
-    orders: tuple[PendingCommand, ...] = ()
-    refused: tuple[FrameError, ...] = ()
+    images: tuple[ImageUpdate, ...] = ()
+    messages: tuple[bytes, ...] = ()
+    commands: tuple[PendingCommand, ...] = ()
+    rejected: tuple[FrameError, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class DownlinkPacket:
-    """What is to be sent now.
+    """A packet to send.
 
     Attributes:
-        address: To which modem.
+        address: Modem address of the vehicle.
         frames: The frames.
-        tokens: Of the orders in it.
-        reports: Whether a report is in it.
+        tokens: Tokens of the commands in it.
+        has_feedback: Whether feedback is in it.
     """
 
     address: int
     frames: tuple[bytes, ...]
     tokens: tuple[int, ...]
-    reports: bool
+    has_feedback: bool
+
+
+@dataclass(frozen=True, slots=True)
+class EndpointState:
+    """Saved state of the endpoint itself. `message_number`: of the next message."""
+
+    message_number: Byte = 0
 
 
 class VesselEndpoint:
-    """Hears all vehicles and speaks to them.
+    """Receives from all vehicles and sends to them.
 
     Args:
-        book: The orders.
-        config: When reports are due, and bounds.
-        seal: Authenticates frames.
-        feedback: Whether reports are sent.
+        commands: The commands.
+        config: Configuration of the receiver of `v1`.
+        protection: Authenticates frames. With it the `paper` format is rejected: it has no authentication.
+        feedback: Whether feedback is sent.
+        wire_formats: Formats to receive.
+        pairing_timeout_s: See `PaperReceiver`.
     """
 
     def __init__(
         self,
-        book: CommandTracker,
+        commands: CommandTracker,
         config: ReceiverConfig | None = None,
         *,
-        seal: FrameProtection | None = None,
+        protection: FrameProtection | None = None,
         feedback: bool = True,
+        wire_formats: Sequence[WireFormat] = ("v1",),
+        pairing_timeout_s: float = 60.0,
     ) -> None:
-        self.book = book
-        self.receiver = LinkReceiver(config, seal=seal)
-        self._seal = seal
+        self.commands = commands
+        self.v1 = V1Receiver(config, protection=protection)
+        memory_s = max(self.v1.config.contact_memory_s, pairing_timeout_s)
+        self.paper = PaperReceiver(pairing_timeout_s, memory_s=memory_s)
+        self._receiver = CombinedReceiver(
+            self.v1 if "v1" in wire_formats else None,
+            self.paper if "paper" in wire_formats and protection is None else None,
+        )
+        self._protection = protection
         self._feedback = feedback
         self._message_number = 0
-        self._silent: dict[int, int] = {}
-        self._reported_at: dict[int, float] = {}
-        self._again: set[int] = set()
+        self._unanswered: dict[int, int] = {}
+        self._feedback_s: dict[int, float] = {}
+        self._feedback_failed: set[int] = set()
 
-    def hear(self, source: int, frame: bytes, now: float) -> ReceivedContent:
-        """Take a frame that was addressed to this vessel or to everybody. Never raises because of `frame`."""
-        self._silent.pop(source, None)
-        data: list[bytes] = []
-        orders: list[PendingCommand] = []
-        refused: list[FrameError] = []
-        for event in self.receiver.accept(source, frame, now):
-            if isinstance(event, FrameRefused):
-                refused.append(event.reason)
-            elif isinstance(event, MessageReceived):
-                try:
-                    content = unpack(event.data, f"message from modem {source}")
-                except FrameError as error:
-                    refused.append(error)
-                    continue
-                if isinstance(content, DataMessage):
-                    data.append(content.data)
-                elif isinstance(content, ConfirmationMessage):
-                    orders += self.book.confirm(source, content.outcomes)
-                # Orders are for vehicles: this one was another vessel's.
-        return ReceivedContent(tuple(data), tuple(orders), tuple(refused))
+    def accept(self, source: int, frame: bytes, now: float) -> ReceivedContent:
+        """Process a frame to this vessel or to all stations. Never raises because of `frame`."""
+        self._unanswered.pop(source, None)
+        return self._content(self._receiver.accept(source, frame, now))
 
-    def wants_to_send(self, now: float) -> int | None:
-        """Return the modem address that something is due for, None for none."""
-        orders = self.book.due(now)
-        if orders:
-            return orders[0].address
-        reports = [source for source in self.receiver.sources if self._report_is_due(source, now)]
-        return min(reports, key=lambda source: self._reported_at.get(source, 0.0), default=None)
+    def poll(self, now: float) -> tuple[ImageUpdate, ...]:
+        """Return the images that are due without a frame."""
+        return self._content(self._receiver.poll(now)).images
 
-    def packet(self, frames: int, frame_bytes: int, now: float) -> DownlinkPacket | None:
-        """Return the packet to send now, None when nothing is due.
+    def next_deadline(self) -> float | None:
+        """Return when `poll` has the next image, None if no image waits."""
+        return self._receiver.next_deadline()
 
-        Follow it with `sent` or `failed`.
+    def _content(self, events: Sequence[Event]) -> ReceivedContent:
+        images: list[ImageUpdate] = []
+        messages: list[bytes] = []
+        commands: list[PendingCommand] = []
+        rejected: list[FrameError] = []
+        for event in events:
+            match event:
+                case ImageUpdate():
+                    images.append(event)
+                case FrameRejected():
+                    rejected.append(event.reason)
+                case FeedbackReceived():
+                    pass  # another vessel's, to its vehicle
+                case MessageReceived():
+                    try:
+                        content = unpack(event.data, f"message from modem {event.source}")
+                    except FrameError as error:
+                        rejected.append(error)
+                        continue
+                    if isinstance(content, DataMessage):
+                        messages.append(content.data)
+                    elif isinstance(content, ConfirmationMessage):
+                        commands += self.commands.confirm(event.source, content.outcomes)
+                    # Other contents are commands of another vessel.
+        return ReceivedContent(tuple(images), tuple(messages), tuple(commands), tuple(rejected))
+
+    def due_address(self, now: float) -> int | None:
+        """Return the modem address of the vehicle that something is due for, None for none."""
+        commands = self.commands.due(now)
+        if commands:
+            return commands[0].address
+        sources = [source for source in self.v1.sources if self._feedback_is_due(source, now)]
+        return min(sources, key=lambda source: self._feedback_s.get(source, 0.0), default=None)
+
+    def next_packet(self, max_frames: int, frame_bytes: int, now: float) -> DownlinkPacket | None:
+        """Return the packet to send now, None if nothing is due; call `sent` or `failed` next.
 
         Args:
-            frames: Most frames in it.
-            frame_bytes: Length of each.
-            now: Seconds UTC.
+            max_frames: Maximum number of frames in it.
+            frame_bytes: Length of each frame.
+            now: UTC in seconds.
 
         Raises:
-            FrameError: Frames cannot be sealed any more, or an order does not fit a frame. All of it is still due.
+            FrameError: Frames cannot be protected any more, or a command does not fit a frame. All content stays due.
         """
-        address = self.wants_to_send(now)
+        address = self.due_address(now)
         if address is None:
             return None
-        filling = _FramePacker(frames, segments_room(frame_bytes, self._seal))
+        packer = _FramePacker(max_frames, segments_room(frame_bytes, self._protection))
         number = self._message_number
         tokens: list[int] = []
-        for order in self.book.due(now):
-            if order.address == address:
-                # A number of its own each time: to the link, the same message again would be a repetition, and the
-                # vehicle would not hear that its confirmation was lost.
-                segment = Segment(SegmentKind.MESSAGE, bytes([number]) + order.message)
-                if filling.add(segment):
-                    tokens.append(order.token)
+        for command in self.commands.due(now):
+            if command.address == address:
+                # A new number for every copy: with the same number, the vehicle's link would drop it as a repetition,
+                # and the vehicle could not repeat a lost confirmation.
+                segment = Segment(SegmentKind.MESSAGE, bytes([number]) + command.message)
+                if packer.add(segment):
+                    tokens.append(command.token)
                     number = (number + 1) % 256
-        report = self._report(address, now, filling)
-        if not filling.frames:
-            room = segments_room(frame_bytes, self._seal)
-            raise FrameError("downlink", "frame", f"{room} bytes of room", "room for an order: a higher rate")
+        has_feedback = self._add_feedback(address, now, packer)
+        if not packer.frames:
+            room = segments_room(frame_bytes, self._protection)
+            raise FrameError("downlink", "frame", f"{room} bytes of room", "room for a command: a higher rate")
         try:
-            packed = tuple(pack_segments(each, frame_bytes, self._seal) for each in filling.frames)
+            packed = tuple(pack_segments(each, frame_bytes, self._protection) for each in packer.frames)
         except FrameError:
-            self._again |= {address} if report else set()
+            self._feedback_failed |= {address} if has_feedback else set()
             raise
         self._message_number = number
-        if report:
-            self._silent[address] = self._silent.get(address, -1) + 1
-            self._reported_at[address] = now
-            self._again.discard(address)
-        return DownlinkPacket(address, packed, tuple(tokens), report)
+        if has_feedback:
+            self._unanswered[address] = self._unanswered.get(address, -1) + 1
+            self._feedback_s[address] = now
+            self._feedback_failed.discard(address)
+        return DownlinkPacket(address, packed, tuple(tokens), has_feedback)
 
-    def _report(self, address: int, now: float, filling: _FramePacker) -> bool:
-        """Add the report for a vehicle, where there is one and room for it."""
-        if not self._feedback or not (self._report_is_due(address, now) or self.receiver.mini_report(address)):
+    def _add_feedback(self, address: int, now: float, packer: _FramePacker) -> bool:
+        """Add the feedback for a vehicle, if there is some and it fits."""
+        if not self._feedback or not (self._feedback_is_due(address, now) or self.v1.mini_feedback(address)):
             return False
-        longest = Segment(SegmentKind.FEEDBACK, bytes(Feedback(0, 0, (0,) * 16).pack()))
-        if not filling.fits(longest):
+        longest = Segment(SegmentKind.FEEDBACK, Feedback(0, 0, (0,) * 16).pack())
+        if not packer.fits(longest):
             return False
-        found = self.receiver.report(address, now)
-        return found is not None and filling.add(Segment(SegmentKind.FEEDBACK, found.pack()))
+        feedback = self.v1.feedback(address, now)
+        return feedback is not None and packer.add(Segment(SegmentKind.FEEDBACK, feedback.pack()))
 
-    def _report_is_due(self, source: int, now: float) -> bool:
+    def _feedback_is_due(self, source: int, now: float) -> bool:
         if not self._feedback:
             return False
-        if source in self._again:
+        if source in self._feedback_failed:
             return True
-        silent = self._silent.get(source, -1)
-        if silent >= 0:
-            wait_s = self.receiver.config.feedback_interval_s * 2**silent
-            last = self._reported_at.get(source, 0.0)
-            if silent >= _MOST_SILENT or now - last < wait_s:
+        unanswered = self._unanswered.get(source, -1)
+        if unanswered >= 0:
+            wait_s = self.v1.config.feedback_interval_s * 2**unanswered
+            if unanswered >= _MAX_UNANSWERED or now - self._feedback_s.get(source, 0.0) < wait_s:
                 return False
-        return self.receiver.report_is_due(source, now)
+        return self.v1.feedback_is_due(source, now)
 
     def sent(self, packet: DownlinkPacket, now: float) -> tuple[PendingCommand, ...]:
-        """Note that a packet has gone into the water; return the orders that were in it."""
-        return self.book.sent(packet.tokens, now)
+        """Record that a packet has been sent; return the commands that changed."""
+        return self.commands.sent(packet.tokens, now)
 
     def failed(self, packet: DownlinkPacket) -> None:
-        """Note that a packet has not gone: what was in it is still due."""
-        if packet.reports:
-            self._again.add(packet.address)
+        """Record that a packet has not been sent: its content is due again."""
+        if packet.has_feedback:
+            self._feedback_failed.add(packet.address)
 
-    def snapshot(self) -> dict[str, object]:
-        """Return the state as maps, lists, numbers, strings and bytes (msgpack can hold it).
+    def parts(self) -> dict[str, bytes]:
+        """Return the state to save, see `sonarpost.link.state`.
 
-        When reports were sent is not in it: after a restart they may come a little early.
+        The times of feedback are not saved: after a restart feedback can be a little early.
         """
         return {
-            "format": _STATE_FORMAT,
-            "receiver": self.receiver.snapshot(),
-            "orders": self.book.snapshot(),
-            "message_number": self._message_number,
+            "endpoint": pack_part(EndpointState(self._message_number)),
+            **prefixed("v1/", self.v1.parts()),
+            **prefixed("paper/", self.paper.parts()),
+            **prefixed("commands/", self.commands.parts()),
         }
 
-    def restore(self, state: Mapping[str, object]) -> None:
-        """Take up a state that `snapshot` returned.
-
-        Raises:
-            FrameError: It did not return this.
-        """
-        if state.get("format") != _STATE_FORMAT:
-            raise FrameError("vessel's link", "format", state.get("format"), str(_STATE_FORMAT))
-        number = read_number(state, "message_number", 0, 255)
-        self.receiver.restore(read_map(state, "receiver"))
-        self.book.restore(read_map(state, "orders"))
-        self._message_number = number
+    def restore(self, parts: Parts) -> Errors:
+        """Replace the state by saved parts; return why parts were skipped."""
+        reader = PartReader(parts, "vessel endpoint state")
+        state = reader.read("endpoint", EndpointState) or EndpointState()
+        self._message_number = state.message_number
+        errors = dict(reader.errors)
+        for prefix, restore in (
+            ("v1/", self.v1.restore),
+            ("paper/", self.paper.restore),
+            ("commands/", self.commands.restore),
+        ):
+            errors |= {prefix + name: error for name, error in restore(below(prefix, parts)).items()}
+        return errors
 
 
 class _FramePacker:
-    """Segments put into as few frames as they fit, in their order."""
+    """Puts segments into as few frames as possible, in their order."""
 
-    def __init__(self, most_frames: int, room_bytes: int) -> None:
+    def __init__(self, max_frames: int, room_bytes: int) -> None:
         self.frames: list[list[Segment]] = []
-        self._left: list[int] = []
-        self._most = most_frames
+        self._room: list[int] = []
+        self._max_frames = max_frames
         self._room_bytes = room_bytes
 
     def fits(self, segment: Segment) -> bool:
         """Whether there is room for a segment."""
-        new = len(self.frames) < self._most and segment.size <= self._room_bytes
-        return new or any(segment.size <= left for left in self._left)
+        new = len(self.frames) < self._max_frames and segment.size <= self._room_bytes
+        return new or any(segment.size <= room for room in self._room)
 
     def add(self, segment: Segment) -> bool:
-        """Put a segment where there is room; tell whether there was."""
+        """Add a segment if there is room; return whether there was."""
         if not self.fits(segment):
             return False
-        place = next((n for n, left in enumerate(self._left) if segment.size <= left), None)
+        place = next((n for n, room in enumerate(self._room) if segment.size <= room), None)
         if place is None:
             place = len(self.frames)
             self.frames.append([])
-            self._left.append(self._room_bytes)
+            self._room.append(self._room_bytes)
         self.frames[place].append(segment)
-        self._left[place] -= segment.size
+        self._room[place] -= segment.size
         return True

@@ -1,111 +1,213 @@
-"""Messages of several programs that wait for the water: by priority, by age, and evenly among programs. Pure."""
+"""Messages to send: the programs' messages by priority, age and fairness, and the copies of those in transmission."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Annotated, Final
+
+from sonarpost.errors import FrameError
+from sonarpost.link.frames.v1.frame import Segment, SegmentKind
+from sonarpost.link.state import Bounds, Byte, Count
 
 LOWEST_PRIORITY: Final = 7
-FILLS_FROM: Final = 6
-"""From this priority on a message goes only where frames have room, until it has aged."""
+FILLER_PRIORITY: Final = 6
+"""From this priority on a message only fills the rest of frames, until it has aged."""
+MAX_MESSAGE_BYTES: Final = 4096
 _IDS_REMEMBERED: Final = 1024
+_MAX_SEGMENT_DATA_BYTES: Final = 254
 
 
 @dataclass(frozen=True, slots=True)
 class QueuedMessage:
-    """A message of a program.
+    """A message of a program that waits.
 
     Attributes:
-        key: Number in the queue, the order of arrival.
-        message_id: The program's name for it.
-        source: The program.
+        key: Position in the order of arrival.
+        message_id: Identifier, unique in the program.
+        source: Name of the program.
         priority: 1 first to 7 last.
-        added_at: When it was queued, UTC in seconds.
-        expires_at: When it is worth nothing any more.
-        data: What goes through the water.
+        added_s: Time of arrival, UTC in seconds.
+        expires_s: Time when the message becomes useless.
+        data: Content.
     """
 
-    key: int
+    key: Count
     message_id: str
     source: str
-    priority: int
-    added_at: float
-    expires_at: float
+    priority: Annotated[int, Bounds(1, LOWEST_PRIORITY)]
+    added_s: float
+    expires_s: float
     data: bytes
 
     def level(self, now: float, aging_s: float) -> int:
-        """Return the priority it has by now: one level more urgent for each `aging_s`, to 2 at most."""
-        aged = self.priority - int(max(0.0, now - self.added_at) / aging_s)
+        """Return the priority after aging: one level more urgent every `aging_s`, up to 2."""
+        aged = self.priority - int(max(0.0, now - self.added_s) / aging_s)
         return max(min(self.priority, 2), aged)
 
 
+@dataclass(frozen=True, slots=True)
+class MessageIdentifier:
+    """Identifier of a message that was accepted.
+
+    Attributes:
+        order: Rises with every message.
+        name: Program and identifier.
+    """
+
+    order: Count
+    name: str
+
+
 @dataclass(eq=False)
-class WaitingMessages:
+class MessageQueue:
     """The messages that wait.
 
     Attributes:
         waiting: By key.
-        next_key: Of the next message.
-        served: Bytes sent for each program, a program that has just come begins where the others are.
-        known: Identifiers of late, so that a message given twice is sent once.
-        expired: How many were dropped because their time was over.
+        next_key: Key of the next message.
+        served: Bytes sent for each program. A program without waiting messages starts at the least value of the others.
+        known: Order of the recently accepted identifiers, to reject a message that arrives twice.
+        expired: Number of messages that expired.
     """
 
     waiting: dict[int, QueuedMessage] = field(default_factory=dict)
     next_key: int = 0
     served: Counter[str] = field(default_factory=Counter)
-    known: dict[str, None] = field(default_factory=dict)
+    known: dict[str, int] = field(default_factory=dict)
     expired: int = 0
 
     @property
     def waiting_bytes(self) -> int:
-        """Bytes that wait."""
+        """Total length of the waiting messages."""
         return sum(len(message.data) for message in self.waiting.values())
 
     def add(
-        self, message_id: str, source: str, priority: int, data: bytes, *, added_at: float, expires_at: float
+        self, message_id: str, source: str, priority: int, data: bytes, *, added_s: float, expires_s: float
     ) -> bool:
-        """Take a message; False when this identifier of this program is known."""
+        """Add a message; return False if the program has used the identifier before."""
         name = f"{source}\0{message_id}"
         if name in self.known:
             return False
-        self.known[name] = None
+        self.known[name] = self.next_key
         while len(self.known) > _IDS_REMEMBERED:
             del self.known[next(iter(self.known))]
-        busy = {m.source for m in self.waiting.values()}
-        if source not in busy:
-            # Silence earns no credit: whoever was silent could otherwise keep everybody else out for as long.
-            floor = min((self.served[name] for name in busy), default=0)
+        active = {m.source for m in self.waiting.values()}
+        if source not in active:
+            # A silent program gets no credit: otherwise it could block all others for as long.
+            floor = min((self.served[name] for name in active), default=0)
             self.served[source] = max(self.served[source], floor)
-        message = QueuedMessage(self.next_key, message_id, source, priority, added_at, expires_at, data)
+        message = QueuedMessage(self.next_key, message_id, source, priority, added_s, expires_s, data)
         self.waiting[message.key] = message
         self.next_key += 1
         return True
 
     def prune(self, now: float) -> None:
-        """Drop what has expired, and what is remembered of programs that have nothing waiting."""
-        for message in [m for m in self.waiting.values() if m.expires_at <= now]:
+        """Delete expired messages, and the counters of `served` when nothing waits."""
+        for message in [m for m in self.waiting.values() if m.expires_s <= now]:
             del self.waiting[message.key]
             self.expired += 1
         if not self.waiting:
             self.served.clear()
 
-    def next(self, now: float, aging_s: float, *, among: Iterable[int] | None = None) -> QueuedMessage | None:
-        """Return the message to send next: of the most urgent, the least served program's oldest.
+    def next(self, now: float, aging_s: float) -> QueuedMessage | None:
+        """Return the message to send next: most urgent level, then least served program, then oldest."""
+        return min(
+            self.waiting.values(), key=lambda m: (m.level(now, aging_s), self.served[m.source], m.key), default=None
+        )
 
-        Args:
-            now: UTC in seconds.
-            aging_s: See `QueuedMessage.level`.
-            among: Keys to choose from, all if not given.
-        """
-        open_ones = [m for k, m in self.waiting.items()] if among is None else [self.waiting[k] for k in among]
-        if not open_ones:
-            return None
-        return min(open_ones, key=lambda m: (m.level(now, aging_s), self.served[m.source], m.key))
-
-    def take(self, message: QueuedMessage) -> None:
-        """Note that a message is on its way."""
+    def remove(self, message: QueuedMessage) -> None:
+        """Remove a message that is being sent, and count its bytes for the program."""
         del self.waiting[message.key]
         self.served[message.source] += len(message.data)
+
+
+@dataclass(eq=False)
+class MessageCopies:
+    """A message in transmission: the copies still to send.
+
+    Attributes:
+        number: 0..255.
+        data: Content.
+        priority: The greater goes first. From 0 on before images, below 0 only in the rest of frames.
+        expires_s: Time when the message becomes useless.
+        copies: Copies still to send.
+        after_frame: Number of the first frame for the next copy, so that one burst does not destroy all copies.
+        rises_s: Time when a priority below 0 becomes 0, None for never.
+        extra: Additional copies for the case that copies follow one another and one burst can destroy several.
+    """
+
+    number: Byte
+    data: bytes
+    priority: int
+    expires_s: float
+    copies: int
+    after_frame: int = 0
+    rises_s: float | None = None
+    extra: Annotated[int, Bounds(0, 9)] = 2
+
+
+@dataclass(eq=False)
+class MessageSender:
+    """The messages in transmission.
+
+    Attributes:
+        waiting: Those with copies to send, the most urgent first.
+        next_number: Number of the next message.
+    """
+
+    waiting: list[MessageCopies] = field(default_factory=list)
+    next_number: Byte = 0
+
+    def add(self, data: bytes, priority: int, expires_s: float, copies: int, rises_s: float | None = None) -> int:
+        """Add a message; return its number.
+
+        Raises:
+            FrameError: It is empty or longer than 4096 bytes.
+        """
+        if not 1 <= len(data) <= MAX_MESSAGE_BYTES:
+            raise FrameError("acoustic link v1", "message", f"{len(data)} bytes", f"1..{MAX_MESSAGE_BYTES}")
+        number = self.next_number
+        self.next_number = (number + 1) % 256
+        self.waiting.append(MessageCopies(number, data, priority, expires_s, copies, 0, rises_s))
+        self.waiting.sort(key=lambda m: -m.priority)
+        return number
+
+    def prune(self, now: float) -> None:
+        """Delete messages without copies to send and expired ones; raise the priority of those that are due."""
+        self.waiting = [m for m in self.waiting if m.copies > 0 and m.expires_s > now]
+        for message in self.waiting:
+            if message.priority < 0 and message.rises_s is not None and message.rises_s <= now:
+                message.priority = 0
+        self.waiting.sort(key=lambda m: -m.priority)
+
+    def take_long(self, room: int) -> MessageCopies | None:
+        """Remove and return a message that is longer than a segment of `room` bytes can hold, None if there is none."""
+        found = next((m for m in self.waiting if len(m.data) > min(room, _MAX_SEGMENT_DATA_BYTES)), None)
+        if found is not None:
+            self.waiting.remove(found)
+        return found
+
+    def release(self, frame: int) -> None:
+        """Allow copies from frame number `frame` on that keep a distance from earlier ones: nothing else is left."""
+        for message in self.waiting:
+            if message.after_frame > frame:
+                message.after_frame = frame
+                message.copies += message.extra > 0
+                message.extra = max(0, message.extra - 1)
+
+    def has_ready(self, min_priority: int, frame: int) -> bool:
+        """Whether a message of at least a priority may go into frame number `frame`."""
+        return any(m.priority >= min_priority and m.after_frame <= frame for m in self.waiting)
+
+    def segments(self, room: int, frame: int, spacing: int) -> list[Segment]:
+        """Return the most urgent messages that fit into `room` bytes; their next copies wait `spacing` frames."""
+        found: list[Segment] = []
+        for message in self.waiting:
+            segment = Segment(SegmentKind.MESSAGE, bytes([message.number]) + message.data)
+            if message.after_frame <= frame and segment.size <= room and message.copies > 0:
+                found.append(segment)
+                room -= segment.size
+                message.copies -= 1
+                message.after_frame = frame + 1 + spacing
+        return found

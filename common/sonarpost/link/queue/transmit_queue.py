@@ -1,142 +1,100 @@
-"""The vehicle's acoustic queue: pictures and other traffic in, packets out, in the order of their value.
+"""Transmit queue of a vehicle with the `v1` format: an `ImageSender`.
 
-Pure: `now` in (UTC in seconds), packets out. It stands before the v1 `LinkSender`, which plans pictures, and adds what
-makes it a queue of a vehicle: messages of several programs by priority, lifetime and fairness, a share of the water
-that no flood of messages can take from pictures, redundancy and rate by the measured loss, and when everything is
-expected to have gone. Packets are chosen one at a time, so that whatever is more urgent waits for one packet at most.
+It adds to `V1Sender`, which plans images: messages of several programs with priority, lifetime and fairness; a share of
+the airtime for images; redundancy and rate by the measured loss; expected delivery times. It selects one packet at a
+time, so that urgent content waits for one packet at most.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Final
 
-from sonarpost.errors import ConfigError
 from sonarpost.link.coding.blocks import OutgoingImage
-from sonarpost.link.coding.channel_capacity import LossChannel
+from sonarpost.link.coding.channel_capacity import LossChannel, RateSelector
 from sonarpost.link.coding.rate_distortion import quality_curve
 from sonarpost.link.coding.redundancy_plan import copies
-from sonarpost.link.config import SenderConfig
-from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import Feedback, FeedbackRequest
+from sonarpost.link.config import QueueConfig, SenderConfig
+from sonarpost.link.downlink.messages import number_of_image
+from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest
 from sonarpost.link.frames.v1.frame import FrameProtection
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
-from sonarpost.link.queue.messages import FILLS_FROM, WaitingMessages
-from sonarpost.link.queue.rate_choice import RateSelector
-from sonarpost.link.sender import LinkSender
+from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.queue.messages import FILLER_PRIORITY, MessageIdentifier, MessageQueue, QueuedMessage
+from sonarpost.link.sender import ExpectedDelivery, ImageToSend, OutgoingPacket
+from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
 from sonarpost.modem.micromodem import RATES
 
 _SEGMENTS: Final = 2
-_LEAST_CHANGE: Final = 0.02
+_MIN_LOSS_CHANGE: Final = 0.02
 _SMOOTHING: Final = 0.2
-_SILENT_FRAMES: Final = 64
-"""Without a report of so many frames, and for long, there is nobody who reports; a silent vehicle gets none."""
+_FRAMES_WITHOUT_FEEDBACK: Final = 64
+"""After so many frames and a long time without feedback, no receiver is assumed to send any."""
 _URGENT: Final = 2
-"""To this priority messages may be lost with a tenth of the usual probability."""
+"""Messages up to this priority may be lost with a tenth of the usual probability."""
 _FRAMES_LOADED: Final = 8
-"""Messages for so many frames are given to the sender at a time: what is behind them may still be overtaken."""
+"""Messages for so many frames are passed to the sender at a time; more urgent ones can still overtake the rest."""
+_MAX_LOSS: Final = 0.95
 
 
 @dataclass(frozen=True, slots=True)
-class QueueConfig:
-    """How the queue behaves.
+class QueueState:
+    """The small state of the queue, which changes with every packet.
 
     Attributes:
-        rates: Numbers of the rates that may be used; the loss decides which.
-        first_rate: The one to begin with.
-        expected_loss: Share of frames lost, until it is measured.
-        burst_frames: Mean length of a run of lost frames.
-        feedback: "never", or "auto": with feedback as long as reports come.
-        feedback_memory_s: How long after the last report another is expected, while frames are sent.
-        max_defer_s: How long without a report before a few more symbols are sent, should all before be lost.
-        image_airtime_share: Share of frames that pictures get however many messages wait.
-        aging_s: A message becomes one level more urgent for each such time that it waits.
-        message_missed: With what probability a message may be lost: it is sent as often as the loss demands.
-        max_messages: Most that wait.
-        frames_per_image: See `SenderConfig`.
-        stream_bytes: See `SenderConfig`.
-        group_delay_s: How long a picture, once announced, waits for others to be coded with.
-        kept_pictures: See `SenderConfig`.
-
-    Raises:
-        ConfigError: A value out of range.
+        next_key: See `MessageQueue`.
+        served: See `MessageQueue`.
+        expired: See `MessageQueue`.
+        rate: The rate in use.
+        losses: See `RateSelector`.
+        packet_interval_s: Smoothed time from one packet to the next.
+        image_credit: Frames that images may send before messages.
+        last_feedback_s: Time of the last feedback, None before the first or after a long time without.
+        frames_at_feedback: Frames sent at the last feedback.
+        feedback: Whether feedback is expected.
+        planned_loss: Loss that plans use.
     """
 
-    rates: tuple[int, ...] = (1,)
-    first_rate: int = 1
-    expected_loss: float = 0.2
-    burst_frames: float = 1.0
-    feedback: str = "auto"
-    feedback_memory_s: float = 900.0
-    max_defer_s: float = 120.0
-    image_airtime_share: float = 0.25
-    aging_s: float = 600.0
-    message_missed: float = 0.01
-    max_messages: int = 2000
-    frames_per_image: float = 6.0
-    stream_bytes: int = 512
-    group_delay_s: float = 0.0
-    kept_pictures: int = 256
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("expected_loss", 0.0, 0.95),
-            ("burst_frames", 1.0, 1000.0),
-            ("feedback_memory_s", 0.001, 86400.0),
-            ("image_airtime_share", 0.0, 1.0),
-            ("aging_s", 0.001, 86400.0),
-            ("message_missed", 1e-6, 0.5),
-            ("max_messages", 1, 100_000),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ConfigError("acoustic queue", name, value, f"{low}..{high}")
-        if self.feedback not in ("auto", "never"):
-            raise ConfigError("acoustic queue", "feedback", self.feedback, "auto, never")
+    next_key: Count
+    served: dict[str, int]
+    expired: Count
+    rate: Annotated[int, Bounds(min(RATES), max(RATES))]
+    losses: dict[Annotated[int, Bounds(min(RATES), max(RATES))], tuple[Annotated[float, Bounds(0, 1)], float]]
+    packet_interval_s: Annotated[float, Bounds(0, 1e9)]
+    image_credit: float
+    last_feedback_s: float | None
+    frames_at_feedback: Count
+    feedback: bool
+    planned_loss: Annotated[float, Bounds(0, _MAX_LOSS)]
 
 
 @dataclass(frozen=True, slots=True)
-class ImageName:
-    """Which picture of the vehicle has a number on the link."""
+class InFlight:
+    """The packet that is being sent. `packet`: None between packets."""
 
-    image_id: str
-    contact_id: str
-
-
-@dataclass(frozen=True, slots=True)
-class ExpectedDelivery:
-    """When a picture is expected to have gone.
-
-    Attributes:
-        name: The picture.
-        bytes_left: Of frames still to be sent for it.
-        preview_at: When its record and coarse picture have gone, None where they have.
-        done_at: When all that is planned has.
-    """
-
-    name: ImageName
-    bytes_left: int
-    preview_at: float | None
-    done_at: float
+    packet: OutgoingPacket | None = None
 
 
 class TransmitQueue:
-    """The queue of one vehicle.
+    """The queue of one vehicle; see `ImageSender`.
 
     Args:
-        config: How it behaves.
-        first_block: See `LinkSender`.
-        seal: See `LinkSender`.
+        config: The configuration.
+        first_block: See `V1Sender`.
+        protection: See `V1Sender`.
 
     Raises:
-        ConfigError: A rate that there is not.
+        ConfigError: An unknown rate.
     """
 
-    def __init__(self, config: QueueConfig, *, first_block: int = 0, seal: FrameProtection | None = None) -> None:
+    carries_messages = True
+
+    def __init__(self, config: QueueConfig, *, first_block: int = 0, protection: FrameProtection | None = None) -> None:
         self.config = config
-        self.rate_choice = RateSelector(config.rates, config.first_rate)
-        self.sender = LinkSender(
+        self.rate_selector = RateSelector(config.rates, config.first_rate)
+        self.sender = V1Sender(
             SenderConfig(
                 frame_bytes=RATES[config.first_rate].frame_bytes,
                 channels=(LossChannel(config.expected_loss, config.burst_frames),),
@@ -144,88 +102,110 @@ class TransmitQueue:
                 stream_bytes=config.stream_bytes,
                 group_delay_s=config.group_delay_s,
                 max_defer_s=config.max_defer_s,
-                kept_pictures=config.kept_pictures,
+                kept_images=config.kept_images,
                 announce=True,
             ),
             first_block=first_block,
-            seal=seal,
+            protection=protection,
         )
-        self.messages = WaitingMessages()
-        self.names: dict[int, ImageName] = {}
+        self.messages = MessageQueue()
         self.packet_interval_s = RATES[config.first_rate].airtime_s
-        self.last_report_at: float | None = None
-        self.picture_credit = 0.0
-        self.frames_at_report = 0
+        self.last_feedback_s: float | None = None
+        self._frames_at_feedback = 0
+        self._image_credit = 0.0
+        self._packet: OutgoingPacket | None = None
+        self._open_before_packet: set[int] = set()
 
     @property
     def rate(self) -> int:
         """Number of the rate in use."""
-        return self.rate_choice.current
+        return self.rate_selector.current
 
     @property
-    def loss(self) -> float | None:
-        """Share of frames lost, as reports tell."""
+    def measured_loss(self) -> float | None:
+        """Share of frames lost according to feedback."""
         return self.sender.measured_loss
 
     @property
-    def has_room(self) -> bool:
-        """Whether another message may be taken."""
+    def planned_loss(self) -> float:
+        """Share of frames lost that plans use."""
+        return self.sender.config.worst.loss
+
+    @property
+    def accepts_messages(self) -> bool:
+        """Whether the queue has room for another message."""
         return len(self.messages.waiting) < self.config.max_messages
 
     @property
+    def messages_waiting(self) -> int:
+        """Number of waiting messages."""
+        return len(self.messages.waiting)
+
+    @property
+    def message_bytes(self) -> int:
+        """Total length of the waiting messages."""
+        return self.messages.waiting_bytes
+
+    @property
     def is_idle(self) -> bool:
-        """Whether there is nothing to send and nothing that a report may ask for."""
-        return self.sender.is_idle and not self.messages.waiting
+        """Whether there is nothing to send, and nothing that feedback can request."""
+        return self.sender.is_idle and not self.messages.waiting and self._packet is None
 
-    def add_picture(
-        self,
-        number: int,
-        name: ImageName,
-        contact: ContactSummary,
-        stream: bytes,
-        now: float,
-        mean_square_error: Sequence[float] | None = None,
-    ) -> bool:
-        """Take a picture; False where nothing is to be done.
+    @property
+    def in_flight(self) -> OutgoingPacket | None:
+        """The packet that is being sent."""
+        return self._packet
 
-        A picture that is known is sent again from its beginning, unless it still waits. Where its stream has become
-        longer and begins with what was sent, only what is new is sent; where it does not, nothing.
+    def gauges(self) -> Mapping[str, float]:
+        """Return figures for the health record."""
+        return {
+            "messages_waiting": float(len(self.messages.waiting)),
+            "messages_expired": float(self.messages.expired),
+            "rate": float(self.rate),
+            "frame_loss": self.planned_loss,
+        }
 
-        Args:
-            number: See `Sender.add_picture`.
-            name: Which picture it is.
-            contact: Its record.
-            stream: The codec's stream.
-            now: UTC in seconds.
-            mean_square_error: See `Sender.add_picture`.
+    def add_image(self, image: ImageToSend, now: float) -> bool:
+        """Add an image; return False if nothing has to be sent for it.
+
+        A known image is sent again from its beginning, unless it still waits. If its stream has become longer and
+        begins with what was sent, only the new part is sent; if it does not begin so, nothing.
 
         Raises:
-            FrameError: The number is out of range, or another picture that waits has it.
-            StreamError: See `Sender.add_picture`.
+            FrameError: The identifier is invalid, or another image that waits has its number.
+            StreamError: See `V1Sender.add_image`.
         """
+        number = number_of_image(image.image_id)
         known = self.sender.kept.get(number)
-        if known is not None and known.contact == contact.rounded():
-            if len(stream) > len(known.stream) and known.sent:
-                # Receivers keep what they have: what does not continue it would show a wrong picture.
-                continues = stream[: known.sent] == known.stream[: known.sent]
-                return continues and self._extend(known, stream, now, mean_square_error)
-            if stream == known.stream and self._is_open(number):
+        if known is not None and known.contact == image.contact.rounded():
+            if len(image.stream) > len(known.stream) and known.sent:
+                # Receivers keep what they have: another beginning would give them a wrong image.
+                return image.stream[: known.sent] == known.stream[: known.sent] and self._extend(known, image, now)
+            if image.stream == known.stream and number in self.open_numbers():
                 return False
-        self.sender.add_picture(number, contact, stream, now, mean_square_error)
-        self.names[number] = name
-        for forgotten in [n for n in self.names if n not in self.sender.kept]:
-            del self.names[forgotten]
+        self.sender.add_image(
+            number,
+            image.contact,
+            image.stream,
+            now,
+            image.mean_square_error,
+            image_id=image.image_id,
+            contact_id=image.contact_id,
+        )
         return True
 
-    def _extend(
-        self, picture: OutgoingImage, stream: bytes, now: float, mean_square_error: Sequence[float] | None
-    ) -> bool:
-        picture.curve = quality_curve(len(stream), mean_square_error)
-        picture.stream = stream
-        return self.sender.refine(FeedbackRequest(picture.number, min(len(stream), MAX_STREAM_BYTES)), now)
+    def _extend(self, known: OutgoingImage, image: ImageToSend, now: float) -> bool:
+        known.curve = quality_curve(len(image.stream), image.mean_square_error)
+        known.stream = image.stream
+        return self.sender.refine(RefineRequest(known.number, min(len(image.stream), MAX_STREAM_BYTES)), now)
+
+    def image_id_of(self, number: int) -> str | None:
+        """Return the identifier of the image with a contact number, None if the queue does not have it."""
+        image = self.sender.kept.get(number)
+        return None if image is None else image.image_id
 
     def refine(self, number: int, stream_bytes: int, now: float) -> bool:
-        """Send more of a picture, up to a length of its stream (0: all of it); False where no more of it is here.
+        """Send more of an image, up to a length of its stream (0: all); return False if the queue has no more of it.
 
         Raises:
             FrameError: A value out of range.
@@ -233,79 +213,64 @@ class TransmitQueue:
         known = self.sender.kept.get(number)
         if known is None:
             return False
-        wanted = stream_bytes or min(len(known.stream), MAX_STREAM_BYTES)
-        if not known.sent < wanted <= len(known.stream):
+        goal = stream_bytes or min(len(known.stream), MAX_STREAM_BYTES)
+        if not known.sent < goal <= len(known.stream):
             return False
-        return self.sender.refine(FeedbackRequest(number, wanted), now)
-
-    def _is_open(self, number: int) -> bool:
-        return number in self.open_numbers()
+        return self.sender.refine(RefineRequest(number, goal), now)
 
     def add_message(
         self, message_id: str, source: str, data: bytes, now: float, *, priority: int = 4, lifetime_s: float = 3600.0
     ) -> bool:
-        """Take a message; False where it is known, or has expired already.
-
-        Args:
-            message_id: The program's name for it.
-            source: The program.
-            data: 1..1025 bytes.
-            now: UTC in seconds.
-            priority: 1 first to 7 last.
-            lifetime_s: How long from `now` on it is worth sending.
-        """
+        """Add a message; see `ImageSender.add_message`."""
         if lifetime_s <= 0:
             self.messages.expired += 1
             return False
-        return self.messages.add(message_id, source, priority, data, added_at=now, expires_at=now + lifetime_s)
+        return self.messages.add(
+            message_id, source, priority, data, added_s=float(now), expires_s=float(now + lifetime_s)
+        )
 
-    def on_report(self, report: Feedback | FeedbackRequest, now: float, receiver: int) -> None:
-        """Take a receiver's report or request.
+    def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int) -> None:
+        """Process feedback or a request of a receiver.
 
         Raises:
-            FrameError: A request for a picture that is not remembered.
+            FrameError: A request for an image that is not kept.
         """
-        if isinstance(report, FeedbackRequest):
-            self.sender.refine(report, now)
-            return
-        self._reported(now)
-        self.sender.on_feedback(report, now, receiver)
-        loss = self.loss
-        if loss is not None:
-            self.rate_choice.measured(loss, now)
-            self._plan_for(loss)
+        if isinstance(feedback, Feedback):
+            self._feedback_arrived(now)
+        self.sender.on_feedback(feedback, now, receiver)
+        loss = self.measured_loss
+        if isinstance(feedback, Feedback) and loss is not None:
+            self.rate_selector.record_loss(loss, now)
+            if abs(self.planned_loss - loss) >= _MIN_LOSS_CHANGE:
+                self.sender.plan_for((LossChannel(min(loss, _MAX_LOSS), self.config.burst_frames),))
 
-    def on_mini(self, block: int, needed: int, now: float, receiver: int) -> None:
-        """Take the least form of a report, from a mini-packet."""
-        self._reported(now)
-        self.sender.on_mini(block, needed, now, receiver)
+    def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int) -> None:
+        """Process the feedback of a mini-packet."""
+        self._feedback_arrived(now)
+        self.sender.on_mini_feedback(block_number, missing_symbols, now, receiver)
 
-    def _reported(self, now: float) -> None:
-        self.last_report_at = now
-        self.frames_at_report = self.sender.frames_sent
+    def _feedback_arrived(self, now: float) -> None:
+        self.last_feedback_s = now
+        self._frames_at_feedback = self.sender.frames_sent
         if self.config.feedback == "auto":
             self.sender.expect_feedback(expected=True)
 
-    def _plan_for(self, loss: float) -> None:
-        planned = self.sender.config.worst.loss
-        if abs(planned - loss) >= _LEAST_CHANGE:
-            self.sender.plan_for((LossChannel(min(loss, 0.95), self.config.burst_frames),))
+    def next_packet(self, now: float) -> OutgoingPacket | None:
+        """Return the packet to send, see `ImageSender.next_packet`."""
+        if self._packet is None:
+            self._open_before_packet = self.open_numbers()
+            frames = self._select_frames(now)
+            self._packet = OutgoingPacket(self.rate, frames) if frames else None
+        return self._packet
 
-    def next_packet(self, now: float, most_frames: int | None = None) -> tuple[bytes, ...]:
-        """Return the frames of the next packet at `rate`, none when there is nothing to send.
-
-        Args:
-            now: UTC in seconds.
-            most_frames: Fewer than the rate has, where whoever polls wants no more.
-        """
-        self._keep_up(now)
-        rate = RATES[self.rate]
+    def _select_frames(self, now: float) -> tuple[bytes, ...]:
+        self._update(now)
         frames: list[bytes] = []
-        while len(frames) < min(rate.frames, most_frames or rate.frames):
+        while len(frames) < RATES[self.rate].frames:
             self._load_messages(now)
             frame = self._next_frame(now)
             if frame is None and not frames and self.sender.messages.waiting:
-                # There is nothing to send between two copies of a message but time.
+                # There is nothing to send between two copies of a message.
                 self.sender.messages.release(self.sender.frames_sent)
                 frame = self._next_frame(now)
             if frame is None:
@@ -314,104 +279,177 @@ class TransmitQueue:
         return tuple(frames)
 
     def _next_frame(self, now: float) -> bytes | None:
-        pictures_wait = self.sender.pictures_are_due(now)
-        due = pictures_wait and self.picture_credit >= 1.0
-        frame = self.sender.next_frame(now, pictures_first=due)
-        if frame is not None and pictures_wait:
-            is_messages = frame[2] >> 5 & 3 == _SEGMENTS and not due
-            self.picture_credit = (
-                min(4.0, self.picture_credit + self.config.image_airtime_share) if is_messages else 0.0
-            )
+        images_due = self.sender.images_are_due(now)
+        images_first = images_due and self._image_credit >= 1.0
+        frame = self.sender.next_frame(now, images_first=images_first)
+        if frame is not None and images_due:
+            has_messages = frame[2] >> 5 & 3 == _SEGMENTS and not images_first
+            share = self.config.image_airtime_share
+            self._image_credit = min(4.0, self._image_credit + share) if has_messages else 0.0
         return frame
 
-    def _keep_up(self, now: float) -> None:
-        """Act on the time: what has expired, reports that no longer come, another rate."""
+    def _update(self, now: float) -> None:
+        """Delete expired messages, stop to expect feedback that does not arrive, and select the rate."""
         self.messages.prune(now)
-        heard = self.last_report_at
+        last_s = self.last_feedback_s
         if not self.sender.blocks:
-            self.frames_at_report = self.sender.frames_sent  # there is nothing to report of
-        unheard = self.sender.frames_sent - self.frames_at_report
-        late = heard is not None and not 0 <= now - heard <= self.config.feedback_memory_s
-        if late and unheard >= _SILENT_FRAMES:
-            self.last_report_at = None
+            self._frames_at_feedback = self.sender.frames_sent  # receivers have nothing to report
+        frames = self.sender.frames_sent - self._frames_at_feedback
+        late = last_s is not None and not 0 <= now - last_s <= self.config.feedback_memory_s
+        if late and frames >= _FRAMES_WITHOUT_FEEDBACK:
+            self.last_feedback_s = None
             self.sender.expect_feedback(expected=False)
-            # Nothing gets through, or the way back is broken: the slowest rate reaches farthest.
-            self.rate_choice.measured(1.0, now)
+            # No frame arrives, or the downlink is broken: the slowest rate has the greatest range.
+            self.rate_selector.record_loss(1.0, now)
         before = self.rate
-        if self.rate_choice.choose(now) != before:
-            self.sender.book.meters.clear()
+        if self.rate_selector.select(now) != before:
+            self.sender.tracker.meters.clear()
             self.sender.resize(RATES[self.rate].frame_bytes)
 
     def _load_messages(self, now: float) -> None:
-        """Give the sender the next messages; the rest waits here, where it can be overtaken."""
+        """Pass the next messages to the sender; the others wait here, where more urgent ones can overtake them."""
         room = _FRAMES_LOADED * self.sender.symbol_bytes
         loaded = sum(len(m.data) for m in self.sender.messages.waiting)
         worst, missed = self.sender.config.worst, self.config.message_missed
-        while loaded < room and (chosen := self.messages.next(now, self.config.aging_s)) is not None:
-            level = chosen.level(now, self.config.aging_s)
-            self.messages.take(chosen)
-            priority = -level if level >= FILLS_FROM else FILLS_FROM - level
+        while loaded < room and (message := self.messages.next(now, self.config.aging_s)) is not None:
+            level = message.level(now, self.config.aging_s)
+            self.messages.remove(message)
             self.sender.add_message(
-                chosen.data,
+                message.data,
                 now,
-                priority=priority,
-                lifetime_s=chosen.expires_at - now,
-                times=copies(worst, missed / 10 if chosen.priority <= _URGENT else missed),
-                rises_at=chosen.added_at + (chosen.priority - FILLS_FROM + 1) * self.config.aging_s,
+                priority=-level if level >= FILLER_PRIORITY else FILLER_PRIORITY - level,
+                lifetime_s=message.expires_s - now,
+                times=copies(worst, missed / 10 if message.priority <= _URGENT else missed),
+                rises_s=message.added_s + (message.priority - FILLER_PRIORITY + 1) * self.config.aging_s,
             )
-            loaded += len(chosen.data)
+            loaded += len(message.data)
 
-    def sent(self, interval_s: float) -> None:
-        """Note how long one packet took from the one before, or from its beginning after a silence."""
+    def sent(self, frames: Sequence[bytes], interval_s: float) -> tuple[str, ...]:
+        """Record that frames of the packet have been sent, see `ImageSender.sent`."""
         self.packet_interval_s += _SMOOTHING * (interval_s - self.packet_interval_s)
+        if self._packet is None:
+            return ()
+        self._packet = self._packet.without(frames)
+        if self._packet is not None:
+            return ()
+        ended = self._open_before_packet - self.open_numbers()
+        return tuple(image_id for number in sorted(ended) if (image_id := self.image_id_of(number)) is not None)
 
     def open_numbers(self) -> set[int]:
-        """Return the numbers of pictures of which something is still to be sent."""
-        waiting = {picture.number for picture in self.sender.waiting}
-        return waiting | {n for block in self.sender.blocks if block.lacks > 0 for n in block.contacts}
+        """Return the contact numbers of the images of which something is still to be sent."""
+        waiting = {image.number for image in self.sender.waiting}
+        return waiting | {n for block in self.sender.blocks if block.left > 0 for n in block.contacts}
 
     def expected(self, now: float) -> list[ExpectedDelivery]:
-        """Return when each picture is expected to have gone, the first to be finished first.
+        """Return when each image is expected to be sent, the first to end first.
 
-        Detail of the blocks under way is sent in turns, so all of it is finished at about the same time; groups follow
-        one another. Messages that come meanwhile are not foreseen.
+        Detail of the blocks in transmission is sent in turns, so all of it ends at about the same time; groups follow
+        one another. Messages that arrive later are not included.
         """
         frame_s = self.packet_interval_s / RATES[self.rate].frames
         frames_of = dict.fromkeys(self.open_numbers(), 0.0)
         previews: dict[int, float] = {}
         ahead = len(self.sender.messages.waiting) / 2
-        fresh = [b for b in self.sender.blocks if b.is_fresh_preview and b.lacks > 0]
-        for block in fresh:
+        for block in [b for b in self.sender.blocks if b.is_fresh_preview and b.left > 0]:
             ahead += block.source_symbols - block.sent
             previews.update(dict.fromkeys(block.contacts, now + ahead * frame_s))
-        for picture in self.sender.waiting:
-            if picture.number not in self.sender.announced:
-                ahead += 1
-            previews[picture.number] = now + ahead * frame_s
-        open_blocks = [b for b in self.sender.blocks if b.lacks > 0]
+        for image in self.sender.waiting:
+            ahead += not image.announced
+            previews[image.number] = now + ahead * frame_s
+        open_blocks = [b for b in self.sender.blocks if b.left > 0]
         for block in open_blocks:
             for number in block.contacts:
-                frames_of[number] += block.lacks / len(block.contacts)
-        done = {n: now + (ahead + sum(b.lacks for b in open_blocks)) * frame_s for n in frames_of}
-        total = ahead + sum(b.lacks for b in open_blocks)
-        for picture in self.sender.waiting:
-            frames_of[picture.number] = self._planned_frames(len(picture.stream))
-            total += frames_of[picture.number]
-            done[picture.number] = now + total * frame_s
-        found = [
-            ExpectedDelivery(
-                self.names.get(n, ImageName("0000", "?")),
-                round(frames_of[n] * self.sender.config.frame_bytes),
-                None if n in self.sender.announced else previews.get(n),
-                done[n],
+                frames_of[number] += block.left / len(block.contacts)
+        total = ahead + sum(b.left for b in open_blocks)
+        done = dict.fromkeys(frames_of, now + total * frame_s)
+        announced = {image.number for image in self.sender.waiting if image.announced}
+        for image in self.sender.waiting:
+            frames_of[image.number] = self._planned_frames(len(image.stream))
+            total += frames_of[image.number]
+            done[image.number] = now + total * frame_s
+        found: list[ExpectedDelivery] = []
+        for number, frames in frames_of.items():
+            kept = self.sender.kept.get(number)
+            found.append(
+                ExpectedDelivery(
+                    "0000" if kept is None else kept.image_id,
+                    "?" if kept is None else kept.contact_id,
+                    round(frames * self.sender.config.frame_bytes),
+                    None if number in announced else previews.get(number),
+                    done[number],
+                )
             )
-            for n in frames_of
-        ]
-        return sorted(found, key=lambda e: (e.done_at, e.name.image_id))
+        return sorted(found, key=lambda e: (e.done_s, e.image_id))
 
     def _planned_frames(self, stream_bytes: int) -> float:
         config = self.sender.config
         if not config.feedback:
             return config.frames_per_image
-        wanted = min(stream_bytes, config.stream_bytes) + 32
-        return wanted / self.sender.symbol_bytes / (1 - min(config.worst.loss, 0.9))
+        planned_bytes = min(stream_bytes, config.stream_bytes) + 32
+        return planned_bytes / self.sender.symbol_bytes / (1 - min(config.worst.loss, 0.9))
+
+    def parts(self) -> dict[str, bytes]:
+        """Return the state to save, see `sonarpost.link.state`."""
+        state = QueueState(
+            next_key=self.messages.next_key,
+            served=dict(self.messages.served),
+            expired=self.messages.expired,
+            rate=self.rate,
+            losses=self.rate_selector.losses,
+            packet_interval_s=self.packet_interval_s,
+            image_credit=self._image_credit,
+            last_feedback_s=self.last_feedback_s,
+            frames_at_feedback=self._frames_at_feedback,
+            feedback=self.sender.config.feedback,
+            planned_loss=min(self.planned_loss, _MAX_LOSS),
+        )
+        messages = {f"message/{key}": pack_part(message) for key, message in self.messages.waiting.items()}
+        known = {
+            f"message-id/{order}": pack_part(MessageIdentifier(order, name))
+            for name, order in self.messages.known.items()
+        }
+        own = {"queue": pack_part(state), "packet": pack_part(InFlight(self._packet))}
+        return {**self.sender.parts(), **messages, **known, **own}
+
+    def restore(self, parts: Parts) -> Errors:
+        """Replace the state of a new queue by saved parts; the configuration stays.
+
+        If the rate in use is not configured any more, the queue continues with the first rate.
+
+        Returns:
+            Why parts were skipped.
+        """
+        reader = PartReader(parts, "queue state")
+        messages = reader.read_group("message", QueuedMessage)
+        known = reader.read_group("message-id", MessageIdentifier)
+        packet = reader.read("packet", InFlight)
+        state = reader.read("queue", QueueState)
+        self.messages = MessageQueue(
+            waiting={m.key: m for m in sorted(messages, key=lambda m: m.key)},
+            next_key=1 + max((m.key for m in messages), default=-1) if state is None else state.next_key,
+            served=Counter({} if state is None else state.served),
+            known={m.name: m.order for m in sorted(known, key=lambda m: m.order)},
+            expired=0 if state is None else state.expired,
+        )
+        self._packet = None if packet is None else packet.packet
+        if state is not None:
+            self._restore_plan(state)
+        errors = {**reader.errors, **self.sender.restore(parts)}
+        if state is not None and state.rate not in self.config.rates:
+            self.sender.resize(RATES[self.rate].frame_bytes)
+        return errors
+
+    def _restore_plan(self, state: QueueState) -> None:
+        channel = LossChannel(state.planned_loss, self.config.burst_frames)
+        self.sender.config = replace(
+            self.sender.config,
+            frame_bytes=RATES[state.rate].frame_bytes,
+            feedback=state.feedback,
+            channels=(channel,),
+        )
+        self.rate_selector.losses = dict(state.losses)
+        if state.rate in self.config.rates:
+            self.rate_selector.current = state.rate
+        self.packet_interval_s = state.packet_interval_s
+        self._image_credit = state.image_credit
+        self.last_feedback_s, self._frames_at_feedback = state.last_feedback_s, state.frames_at_feedback

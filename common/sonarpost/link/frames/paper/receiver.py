@@ -1,76 +1,229 @@
-"""The receiver of the `paper` wire format: pairs halves, gives out images, remembers the recent ones.
+"""Receiver of the `paper` wire format: assembles images from half frames and contact frames of any order.
 
-Pure: bytes and `now` in, events out. `now` is in seconds on a clock that goes on over a restart (UTC), because the
-state can be saved and taken up by another process. docs/specifications/acoustic-paper.md gives the rules and their
-reasons.
+docs/specifications/acoustic-paper.md gives the rules and their reasons.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Final
 
+from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import FrameError
-from sonarpost.link.frames.paper.events import ContactOnly, Event, ImageReady, PaperFrameRejected
-from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, parse_frame
-from sonarpost.link.frames.paper.pending_image import MAX_CANDIDATES, FrameOutcome, PendingImage
-from sonarpost.link.frames.paper.state import export_image, import_image, read_field, read_list
+from sonarpost.link.coding.byte_ranges import PartialBytes, gaps_within
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, is_image_id, parse_frame
+from sonarpost.link.receiver import Event, FrameRejected, ImageUpdate
+from sonarpost.link.state import Count, Errors, PartReader, Parts, pack_part
 
-__all__ = ["ContactOnly", "Event", "ImageReady", "PaperFrameRejected", "PaperReceiver", "PaperReceiverCounts"]
+MAX_CANDIDATES: Final = 3
+"""Different stream headers or body lengths that an image keeps."""
 
-_STATE_FORMAT = 1
-_Key = tuple[int, str]
+ReportedState = tuple[int, int, bool]
+"""Index of the best candidate, bytes of its body, whether there is a contact record."""
+
+
+class FrameOutcome(Enum):
+    """Effect of a frame on its image."""
+
+    ADDED = "added"
+    DUPLICATE = "duplicate"
+    REJECTED = "rejected"
+
+
+@dataclass(slots=True)
+class ImageCandidate:
+    """The body according to the frames that agree on one stream header and body length.
+
+    Attributes:
+        header: The stream header.
+        body: The body, with its full length.
+        frames: Frames that added a byte, and the first frame.
+    """
+
+    header: StreamHeader
+    body: PartialBytes
+    frames: Count = 1
+
+    @property
+    def complete(self) -> bool:
+        """Whether the whole body has arrived."""
+        return self.body.received_bytes == len(self.body.data)
+
+
+@dataclass(slots=True)
+class PendingImage:
+    """One image of one source.
+
+    Frames with different stream headers or body lengths form separate candidates, at most `MAX_CANDIDATES`.
+
+    Attributes:
+        source: Modem address.
+        image_id: Four characters 0-9A-Z.
+        first_frame_s: Time of the first frame.
+        last_frame_s: Time of the last frame that added something.
+        wait_from_s: Start of the wait for more: `last_frame_s`, or earlier after the clock was set back.
+        last_seen_s: Time of the last frame of any kind, or earlier after the clock was set back.
+        candidates: In the order of their first frame.
+        contact: The first contact record that arrived.
+        conflicts: Frames that contradict others.
+        version: Of the last update, 0 before the first.
+        reported: State at the last update, None before the first.
+        order: Rises with every frame of any image.
+    """
+
+    source: int
+    image_id: str
+    first_frame_s: float
+    last_frame_s: float
+    wait_from_s: float
+    last_seen_s: float
+    candidates: list[ImageCandidate] = field(default_factory=list)
+    contact: ContactSummary | None = None
+    conflicts: Count = 0
+    version: Count = 0
+    reported: ReportedState | None = None
+    order: Count = 0
+
+    @property
+    def best(self) -> ImageCandidate | None:
+        """The candidate to report, None before the first half frame.
+
+        The criteria, in this order: it has the size of the contact record (which has a checksum); most frames; most
+        bytes; first to arrive.
+        """
+        return max(self.candidates, key=self._rank, default=None)
+
+    def _rank(self, candidate: ImageCandidate) -> tuple[bool, int, int]:
+        header, contact = candidate.header, self.contact
+        agrees = contact is not None and (contact.height_px, contact.width_px) == (header.height_px, header.width_px)
+        return agrees, candidate.frames, candidate.body.received_bytes
+
+    @property
+    def complete(self) -> bool:
+        """Whether the whole body of the best candidate has arrived."""
+        best = self.best
+        return best is not None and best.complete
+
+    @property
+    def open(self) -> bool:
+        """Whether more is known than the last update reported."""
+        return self._state() != self.reported
+
+    def _state(self) -> ReportedState:
+        best = self.best
+        if best is None:
+            return -1, 0, self.contact is not None
+        index = next(i for i, candidate in enumerate(self.candidates) if candidate is best)
+        return index, best.body.received_bytes, self.contact is not None
+
+    def add_half(self, frame: HalfFrame, now: float) -> FrameOutcome:
+        """Add a half frame."""
+        self.last_seen_s = now
+        agreeing = (c for c in self.candidates if c.header == frame.header and len(c.body.data) == frame.body_length)
+        candidate = next(agreeing, None)
+        if candidate is not self.best:
+            self.conflicts += 1
+        if candidate is None:
+            if len(self.candidates) >= MAX_CANDIDATES:
+                return FrameOutcome.REJECTED
+            candidate = ImageCandidate(frame.header, PartialBytes(bytearray(frame.body_length)))
+            candidate.body.write(frame.offset, frame.payload)
+            self.candidates.append(candidate)
+            self.last_frame_s = self.wait_from_s = now
+            return FrameOutcome.ADDED
+        added, conflict = candidate.body.write(frame.offset, frame.payload)
+        self.conflicts += conflict
+        if not added:
+            return FrameOutcome.DUPLICATE
+        candidate.frames += 1
+        self.last_frame_s = self.wait_from_s = now
+        return FrameOutcome.ADDED
+
+    def add_contact(self, contact: ContactSummary, now: float) -> FrameOutcome:
+        """Add a contact record; the image keeps the first one."""
+        self.last_seen_s = now
+        if self.contact is not None:
+            self.conflicts += contact != self.contact
+            return FrameOutcome.DUPLICATE
+        self.contact = contact
+        self.last_frame_s = self.wait_from_s = now
+        return FrameOutcome.ADDED
+
+    def next_update(self) -> ImageUpdate:
+        """Return all that is known, as the next version."""
+        self.version += 1
+        self.reported = self._state()
+        best = self.best
+        header = b"" if best is None else best.header.pack()
+        body = PartialBytes() if best is None else best.body
+        gaps = gaps_within(body.received, 0, len(body.data))
+        return ImageUpdate(
+            source=self.source,
+            image_id=self.image_id,
+            version=self.version,
+            contact=self.contact,
+            stream=header + bytes(body.data),
+            missing=tuple((start + len(header), stop + len(header)) for start, stop in gaps),
+            complete=self.complete,
+            received_bytes=body.received_bytes,
+            total_bytes=len(body.data),
+            frames=0 if best is None else best.frames,
+            conflicts=self.conflicts,
+            first_frame_s=self.first_frame_s,
+            last_frame_s=self.last_frame_s,
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class PaperReceiverCounts:
-    """Counters since the beginning, restarts included.
+    """Counters since the first start; they continue over restarts.
 
     Attributes:
-        frames: Frames handed to `accept`.
-        rejected: Of these, not of the wire format or refused by their image.
-        duplicates: Of these, without anything new.
-        conflicts: Of these, in disagreement with other frames of their image.
-        images: `ImageReady` events.
+        frames: Frames passed to `accept`.
+        rejected: Of these, not of the wire format or rejected by their image.
+        duplicates: Of these, without new content.
+        conflicts: Contradictions between frames of an image.
+        images: Updates with image data.
         complete_images: Of these, complete.
-        contacts_only: `ContactOnly` events.
-        evicted: Images forgotten early because `max_images` was reached.
+        contacts_only: Updates with a contact record only.
+        evicted: Images deleted because `max_images` was reached.
     """
 
-    frames: int = 0
-    rejected: int = 0
-    duplicates: int = 0
-    conflicts: int = 0
-    images: int = 0
-    complete_images: int = 0
-    contacts_only: int = 0
-    evicted: int = 0
+    frames: Count = 0
+    rejected: Count = 0
+    duplicates: Count = 0
+    conflicts: Count = 0
+    images: Count = 0
+    complete_images: Count = 0
+    contacts_only: Count = 0
+    evicted: Count = 0
 
 
 class PaperReceiver:
-    """Puts images together from frames of any number of sources.
+    """A `FrameReceiver` of the `paper` format.
 
-    An image that holds something not yet given out is *open*. It is given out
+    An image is *open* while more of it is known than the last update reported. The receiver reports an open image
 
-    - at once when its whole body is there;
-    - when the first half frame of another image arrives from the same source (the paper's rule), if it has a half
-      frame itself; a contact frame of another image does not do this, because contact records may be sent ahead of
-      all pictures;
-    - after `timeout_s` without a frame that adds anything;
-    - when it must make room because `max_images` are remembered.
+    - immediately when its whole body has arrived;
+    - when the first half frame of another image arrives from the same source (the rule of the paper), if the open image
+      has a half frame itself. A contact frame does not trigger this: contact records can precede all images;
+    - after `timeout_s` without a frame that adds something;
+    - before it is deleted because `max_images` are stored.
 
-    An image that was given out is remembered, so that repetitions are known as such and late frames complete it:
-    frames that add something open it again and lead to the next version. Late frames do not push out the image that
-    is waiting.
+    A reported image stays stored. Repeated frames are then duplicates, and a late frame that adds something opens the
+    image again and leads to its next version. A late frame does not trigger a report of another image.
 
-    Memory: at most `max_images` images of at most three stream headers and 64 KiB each. The least recently heard are
-    forgotten first, those without anything to give out before the others.
+    Memory: at most `max_images` images, each with at most three bodies of 64 KiB. The image that was least recently
+    seen is deleted first, images that are not open before the others.
 
     Args:
-        timeout_s: How long an open image waits for more.
-        max_images: How many images, given out or not, are remembered.
-        memory_s: How long an image is remembered after its last frame; an identifier used again after that is a
-            new image.
+        timeout_s: Wait for more of an open image.
+        max_images: Images to store, reported or not.
+        memory_s: Time after its last frame at which an image is deleted. An identifier used again after that is a new
+            image.
 
     Raises:
         ValueError: A time is not positive, `memory_s` is below `timeout_s`, or `max_images` is below 1.
@@ -85,7 +238,7 @@ class PaperReceiver:
         self._timeout_s = timeout_s
         self._max_images = max_images
         self._memory_s = memory_s
-        self._images: dict[_Key, PendingImage] = {}  # least recently heard first
+        self._images: dict[tuple[int, str], PendingImage] = {}  # the least recently seen first
         self._counts = PaperReceiverCounts()
 
     @property
@@ -94,10 +247,7 @@ class PaperReceiver:
         return self._counts
 
     def accept(self, source: int, frame: bytes, now: float) -> list[Event]:
-        """Take one frame; return what follows from it, after what `poll(now)` would have returned.
-
-        Never raises because of `frame`: one that does not parse becomes a `PaperFrameRejected`.
-        """
+        """Process a frame; see `FrameReceiver.accept`."""
         now = float(now)
         events = self.poll(now)
         self._count(frames=1)
@@ -105,99 +255,108 @@ class PaperReceiver:
             parsed = parse_frame(frame, f"acoustic frame from modem {source}")
         except FrameError as reason:
             self._count(rejected=1)
-            return [*events, PaperFrameRejected(source, reason, now)]
-        return events + self._take(source, parsed, now)
+            return [*events, FrameRejected(source, reason, now)]
+        return events + self._add(source, parsed, now)
 
     def poll(self, now: float) -> list[Event]:
-        """Give out the images whose time is up at `now`, the longest waiting first.
+        """Return an update of every image whose wait has ended, the longest wait first.
 
-        A clock that was set back does not make an image wait longer than `timeout_s` from then on.
+        After the clock was set back, no image waits longer than `timeout_s` from the new time.
         """
-        now = float(now)  # a whole number would come back from a saved state as another type
+        now = float(now)
         for image in self._images.values():
-            image.news_at = min(image.news_at, now)
-            image.heard_at = min(image.heard_at, now)
-        due = [i for i in self._images.values() if i.open and i.news_at + self._timeout_s <= now]
-        events = self._give_out(sorted(due, key=lambda image: image.news_at))
+            image.wait_from_s = min(image.wait_from_s, now)
+            image.last_seen_s = min(image.last_seen_s, now)
+        due = [i for i in self._images.values() if i.open and i.wait_from_s + self._timeout_s <= now]
+        events = self._report(sorted(due, key=lambda image: image.wait_from_s))
         for key, image in list(self._images.items()):
-            if not image.open and image.heard_at + self._memory_s < now:
+            if not image.open and image.last_seen_s + self._memory_s < now:
                 del self._images[key]
         return events
 
     def next_deadline(self) -> float | None:
-        """Return when `poll` will next have something to give out, None when nothing waits."""
-        return min((i.news_at + self._timeout_s for i in self._images.values() if i.open), default=None)
+        """Return when the next wait ends, None when no image is open."""
+        return min((i.wait_from_s + self._timeout_s for i in self._images.values() if i.open), default=None)
 
-    def snapshot(self) -> dict[str, object]:
-        """Return the whole state as maps, lists, numbers, strings and bytes (msgpack can hold it)."""
-        return {
-            "format": _STATE_FORMAT,
-            "images": [export_image(image) for image in self._images.values()],
-            "counts": asdict(self._counts),
-        }
+    def parts(self) -> dict[str, bytes]:
+        """Return the state to save, see `sonarpost.link.state`: counters and images."""
+        images = {f"image/{image.source}/{image.image_id}": pack_part(image) for image in self._images.values()}
+        return {"counts": pack_part(self._counts), **images}
 
-    def restore(self, state: Mapping[str, object]) -> None:
-        """Replace the whole state by one that `snapshot` returned; the settings stay those of this receiver.
+    def restore(self, parts: Parts) -> Errors:
+        """Replace the state by saved parts; the settings stay.
 
-        Raises:
-            FrameError: The state is not one that `snapshot` made; the receiver is then as before.
+        Returns:
+            Why parts were skipped.
         """
-        if state.get("format") != _STATE_FORMAT:
-            raise FrameError("receiver state", "format", state.get("format"), str(_STATE_FORMAT))
-        images = [import_image(entry) for entry in read_list(state, "images")]
-        counts = read_field(state, "counts", dict)
-        restored = PaperReceiverCounts(**{name: read_field(counts, name, int) for name in asdict(self._counts)})
-        self._images = {(image.source, image.image_id): image for image in images}
-        self._counts = restored
+        reader = PartReader(parts, "paper receiver state")
+        self._counts = reader.read("counts", PaperReceiverCounts) or PaperReceiverCounts()
+        images = [
+            image for group in reader.groups("image") for image in reader.read_group(group, PendingImage, apply=_check)
+        ]
+        self._images = {(i.source, i.image_id): i for i in sorted(images, key=lambda image: image.order)}
+        return reader.errors
 
-    def _take(self, source: int, frame: HalfFrame | ContactFrame, now: float) -> list[Event]:
+    def _add(self, source: int, frame: HalfFrame | ContactFrame, now: float) -> list[Event]:
         key = (source, frame.image_id)
         image = self._images.pop(key, None)
         events: list[Event] = []
         if isinstance(frame, HalfFrame) and (image is None or not image.candidates):
-            events += self._give_out(i for i in self._images.values() if i.source == source and i.open and i.candidates)
+            events += self._report(i for i in self._images.values() if i.source == source and i.open and i.candidates)
         if image is None:
             events += self._make_room()
             image = PendingImage(source, frame.image_id, now, now, now, now)
-        self._images[key] = image  # last, as the most recently heard
-        known_conflicts = image.conflicts
+        self._images[key] = image
+        image.order = self._counts.frames
+        earlier_conflicts = image.conflicts
         outcome = image.add_half(frame, now) if isinstance(frame, HalfFrame) else image.add_contact(frame.contact, now)
-        self._count(conflicts=image.conflicts - known_conflicts, duplicates=int(outcome is FrameOutcome.DUPLICATE))
-        if outcome is FrameOutcome.REFUSED:
+        self._count(conflicts=image.conflicts - earlier_conflicts, duplicates=int(outcome is FrameOutcome.DUPLICATE))
+        if outcome is FrameOutcome.REJECTED:
             self._count(rejected=1)
             reason = FrameError(
                 f"acoustic frame from modem {source}",
                 "stream header",
                 f"another one for image {frame.image_id}",
-                f"one of the {MAX_CANDIDATES} different ones it came with so far",
+                f"one of the {MAX_CANDIDATES} different ones of its earlier frames",
             )
-            events.append(PaperFrameRejected(source, reason, now))
+            events.append(FrameRejected(source, reason, now))
         if image.open and image.complete:
-            events += self._give_out([image])
+            events += self._report([image])
         return events
 
     def _make_room(self) -> list[Event]:
         events: list[Event] = []
         while len(self._images) >= self._max_images:
-            key = min(self._images, key=lambda k: self._images[k].open)  # min is stable: the oldest not open, or oldest
+            # `min` is stable: the least recently seen image that is not open, or else the least recently seen one.
+            key = min(self._images, key=lambda k: self._images[k].open)
             image = self._images[key]
             if image.open:
-                events += self._give_out([image])
+                events += self._report([image])
             del self._images[key]
             self._count(evicted=1)
         return events
 
-    def _give_out(self, images: Iterable[PendingImage]) -> list[Event]:
+    def _report(self, images: Iterable[PendingImage]) -> list[Event]:
         events: list[Event] = []
         for image in list(images):
-            event = image.give_out()
-            if isinstance(event, ImageReady):
-                self._count(images=1, complete_images=int(event.complete))
-            else:
-                self._count(contacts_only=1)
-            events.append(event)
+            update = image.next_update()
+            self._count(
+                images=bool(update.stream),
+                complete_images=bool(update.stream) and update.complete,
+                contacts_only=not update.stream,
+            )
+            events.append(update)
         return events
 
-    def _count(self, **more: int) -> None:
-        added = {name: getattr(self._counts, name) + number for name, number in more.items()}
-        self._counts = replace(self._counts, **added)
+    def _count(self, **increments: int) -> None:
+        self._counts = replace(
+            self._counts, **{name: getattr(self._counts, name) + n for name, n in increments.items()}
+        )
+
+
+def _check(image: PendingImage) -> None:
+    """Raise FrameError if no frames can lead to this image."""
+    if not is_image_id(image.image_id):
+        raise FrameError("image", "image_id", image.image_id, "four characters 0-9A-Z")
+    if len(image.candidates) > MAX_CANDIDATES or (not image.candidates and image.contact is None):
+        raise FrameError("image", "candidates", len(image.candidates), f"0..{MAX_CANDIDATES}, or a contact record")

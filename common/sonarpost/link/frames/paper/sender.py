@@ -1,20 +1,24 @@
-"""From an encoded picture to acoustic packets of the `paper` wire format.
+"""Sender of the `paper` wire format: images in, packets out in a fixed order.
 
-Rules, in the order in which they bind:
+Rules for the packets of an image, earlier ones first:
 
-1. One half a packet, as in the paper: when each half fits one packet, the first packet carries the top half and the
-   second the bottom half, and nothing of the other.
-2. A half that does not fit is spread over several packets. The halves then share a packet when, and only when, that
-   saves one: a packet costs its whole air time however little is in it.
-3. The contact record fills every frame left free, which costs no air time. It leads each group of packets that has a
-   free frame, because where and how sure matters before what it looks like; further copies come last.
-4. When no packet of the image has a free frame (always so at one frame a packet), the contact record goes first, in
-   a packet of its own.
+1. One half per packet, as in the paper: if each half fits one packet, the first packet carries the top half and the
+   second the bottom half.
+2. A half that does not fit is divided over several packets. The halves then share a packet if, and only if, that saves
+   one: a packet costs its whole airtime, however little it carries.
+3. The contact record fills every free frame, which costs no airtime. It goes first in each group of packets that has a
+   free frame, because position and confidence matter before the image; further copies go last.
+4. If no packet of the image has a free frame (always so at one frame per packet), the contact record goes first, in a
+   packet of its own.
 
-The top half always goes before the bottom half: embedded codecs put the coarse picture first.
+The top half always precedes the bottom half: embedded codecs put the coarse image first.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final
 
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import FrameError, StreamError
@@ -28,10 +32,200 @@ from sonarpost.link.frames.paper.frame import (
     HalfName,
     half_bounds,
 )
+from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest
+from sonarpost.link.sender import ExpectedDelivery, ImageToSend, OutgoingPacket
+from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
+from sonarpost.modem.micromodem import RATES
 
 Packet = tuple[bytes, ...]
 
-_MAX_BODY_BYTES = 0xFFFF
+_MAX_BODY_BYTES: Final = 0xFFFF
+_SMOOTHING: Final = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingImage:
+    """An image of which packets are still to be sent.
+
+    Attributes:
+        order: Position in the order of arrival.
+        image_id: Four characters 0-9A-Z.
+        contact_id: Identifier of its contact on the vehicle.
+        contact: The contact record.
+        stream: The codec's stream.
+    """
+
+    order: Count
+    image_id: str
+    contact_id: str
+    contact: ContactSummary
+    stream: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class PaperProgress:
+    """Progress of the first image.
+
+    Attributes:
+        order: Its `WaitingImage.order`.
+        rate: Number of the rate that its packets were planned for.
+        packets_sent: Number of its packets that have been sent.
+        packet_interval_s: Smoothed time from one packet to the next.
+    """
+
+    order: Count
+    rate: Count
+    packets_sent: Count
+    packet_interval_s: Annotated[float, Bounds(0, 1e9)]
+
+
+class PaperSender:
+    """Transmit queue of the `paper` format: an `ImageSender` without messages and feedback.
+
+    Each image's packets are sent once, images in the order of arrival.
+
+    Args:
+        rate: Number of the modem's rate.
+    """
+
+    carries_messages = False
+    accepts_messages = False
+    measured_loss = None
+    messages_waiting = 0
+    message_bytes = 0
+
+    def __init__(self, rate: int) -> None:
+        self.rate = rate
+        self.packet_interval_s = RATES[rate].airtime_s
+        self._images: list[WaitingImage] = []
+        self._next_order = 1
+        self._packets: tuple[Packet, ...] = ()
+        self._packets_sent = 0
+        self._packet: OutgoingPacket | None = None
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether there is nothing to send."""
+        return not self._images
+
+    @property
+    def in_flight(self) -> OutgoingPacket | None:
+        """The packet that `next_packet` returned last, without the frames that have been sent."""
+        return self._packet
+
+    def gauges(self) -> Mapping[str, float]:
+        """Return figures for the health record."""
+        return {"rate": float(self.rate)}
+
+    def add_image(self, image: ImageToSend, now: float) -> bool:
+        """Add an image; always return True: an image that arrives again is sent again.
+
+        Raises:
+            FrameError: The identifier is invalid.
+            StreamError: The stream is invalid or too long.
+        """
+        self._plan(image.image_id, image.stream, image.contact)
+        added = WaitingImage(self._next_order, image.image_id, image.contact_id, image.contact.rounded(), image.stream)
+        self._images.append(added)
+        self._next_order += 1
+        return True
+
+    def _plan(self, image_id: str, stream: bytes, contact: ContactSummary) -> tuple[Packet, ...]:
+        rate = RATES[self.rate]
+        return plan_packets(image_id, stream, contact, rate.frames, rate.frame_bytes)
+
+    def add_message(
+        self, message_id: str, source: str, data: bytes, now: float, *, priority: int = 4, lifetime_s: float = 3600.0
+    ) -> bool:
+        """Raise FrameError: this format has no messages."""
+        raise FrameError("paper format", "message", message_id, "none: this format carries images only")
+
+    def image_id_of(self, number: int) -> str | None:
+        """Return None: this format has no contact numbers."""
+        return None
+
+    def refine(self, number: int, stream_bytes: int, now: float) -> bool:
+        """Return False: this format sends each stream completely."""
+        return False
+
+    def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int) -> None:
+        """Do nothing: this format has no feedback."""
+
+    def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int) -> None:
+        """Do nothing: this format has no feedback."""
+
+    def next_packet(self, now: float) -> OutgoingPacket | None:
+        """Return the packet to send, see `ImageSender.next_packet`."""
+        if self._packet is None and self._images:
+            first = self._images[0]
+            self._packets = self._packets or self._plan(first.image_id, first.stream, first.contact)
+            self._packet = OutgoingPacket(self.rate, self._packets[self._packets_sent])
+        return self._packet
+
+    def sent(self, frames: Sequence[bytes], interval_s: float) -> tuple[str, ...]:
+        """Record that frames of the packet have been sent; return the identifier of the image that this completes."""
+        self.packet_interval_s += _SMOOTHING * (interval_s - self.packet_interval_s)
+        if self._packet is None:
+            return ()
+        self._packet = self._packet.without(frames)
+        if self._packet is not None:
+            return ()
+        self._packets_sent += 1
+        if self._packets_sent < len(self._packets):
+            return ()
+        self._packets, self._packets_sent = (), 0
+        return (self._images.pop(0).image_id,)
+
+    def _check(self, image: WaitingImage) -> None:
+        """Raise BadInputError if an image cannot be sent."""
+        self._plan(image.image_id, image.stream, image.contact)
+
+    def expected(self, now: float) -> list[ExpectedDelivery]:
+        """Return when each image is expected to be sent, in the order of sending."""
+        found: list[ExpectedDelivery] = []
+        packets_before = 0
+        for place, image in enumerate(self._images):
+            packets = self._plan(image.image_id, image.stream, image.contact)
+            left = packets[self._packets_sent :] if place == 0 else packets
+            begun = len(left) < len(packets)
+            found.append(
+                ExpectedDelivery(
+                    image.image_id,
+                    image.contact_id,
+                    sum(len(frame) for packet in left for frame in packet),
+                    None if begun else now + (packets_before + 1) * self.packet_interval_s,
+                    now + (packets_before + len(left)) * self.packet_interval_s,
+                )
+            )
+            packets_before += len(left)
+        return found
+
+    def parts(self) -> dict[str, bytes]:
+        """Return the state to save, see `sonarpost.link.state`: the images, and the progress of the first."""
+        parts = {f"image/{image.order}": pack_part(image) for image in self._images}
+        order = self._images[0].order if self._images else self._next_order
+        parts["progress"] = pack_part(PaperProgress(order, self.rate, self._packets_sent, self.packet_interval_s))
+        return parts
+
+    def restore(self, parts: Parts) -> Errors:
+        """Replace the state by saved parts. An image that was planned for another rate is sent from its beginning.
+
+        Returns:
+            Why parts were skipped.
+        """
+        reader = PartReader(parts, "paper sender state")
+        self._images = sorted(
+            reader.read_group("image", WaitingImage, apply=self._check), key=lambda image: image.order
+        )
+        progress = reader.read("progress", PaperProgress) or PaperProgress(1, self.rate, 0, self.packet_interval_s)
+        self._next_order = max([progress.order, *(image.order + 1 for image in self._images)])
+        self._packets, self._packets_sent, self._packet = (), 0, None
+        self.packet_interval_s = progress.packet_interval_s
+        if self._images and (progress.order, progress.rate) == (self._images[0].order, self.rate):
+            first = self._images[0]
+            self._packets = self._plan(first.image_id, first.stream, first.contact)
+            self._packets_sent = min(progress.packets_sent, len(self._packets) - 1)
+        return reader.errors
 
 
 def plan_packets(
@@ -41,22 +235,22 @@ def plan_packets(
     frames_per_packet: int,
     frame_bytes: int,
 ) -> tuple[Packet, ...]:
-    """Return the packets of one image in the order of sending.
+    """Return the packets of an image in the order of sending.
 
     Args:
         image_id: Four characters 0-9A-Z.
         stream: The codec's stream, header and the whole body.
-        contact: The contact record to send along, or None.
-        frames_per_packet: Most frames in a packet at the rate in use (1 to 8 on a Micro-Modem).
-        frame_bytes: Most bytes in a frame at that rate (32, 64 or 256).
+        contact: The contact record, or None to send none.
+        frames_per_packet: Frames in a packet at the rate in use (1 to 8 on a Micro-Modem).
+        frame_bytes: Length of a frame at that rate (32, 64 or 256).
 
     Returns:
         Packets, each a tuple of one to `frames_per_packet` frames, none longer than `frame_bytes`.
 
     Raises:
-        FrameError: The identifier is wrong, or the frames are too few or too small for the longest header and one
+        FrameError: The identifier is invalid, or the frames are too few or too small for the longest header and one
             byte (or for the contact record).
-        StreamError: The stream's header is wrong or its body too long.
+        StreamError: The stream's header is invalid or its body too long.
     """
     _check_sizes(frames_per_packet, frame_bytes, with_contact=contact is not None)
     header = StreamHeader.unpack(stream)
@@ -81,17 +275,17 @@ def body_capacity_bytes(
 ) -> int:
     """Return the longest stream body of which each half fits one packet.
 
-    With a contact record, one frame of each packet is kept for it, unless a packet has only one frame: then the
-    record travels in a packet of its own and takes nothing from the body.
+    With a contact record, one frame of each packet is reserved for it, unless a packet has only one frame: then the
+    record has a packet of its own and uses nothing of the body's frames.
 
     Args:
-        frames_per_packet: Most frames in a packet.
-        frame_bytes: Most bytes in a frame.
-        with_contact: Whether a contact record goes along.
-        header_bytes: The `size` of the stream's header; left out, what fits whatever codec and picture size.
+        frames_per_packet: Frames in a packet.
+        frame_bytes: Length of a frame.
+        with_contact: Whether a contact record is sent.
+        header_bytes: `StreamHeader.size`; by default the longest, so that every codec and image size fits.
 
     Raises:
-        FrameError: As for `plan_packets`, or no stream header has this length.
+        FrameError: As `plan_packets`, or no stream header has this length.
     """
     if not 2 <= header_bytes <= StreamHeader.MAX_SIZE:
         raise FrameError("packet plan", "header_bytes", header_bytes, f"2..{StreamHeader.MAX_SIZE}")
@@ -111,7 +305,7 @@ def _check_sizes(frames_per_packet: int, frame_bytes: int, *, with_contact: bool
 def _half_frames(half: HalfName, image_id: str, header: StreamHeader, body: bytes, frame_bytes: int) -> Packet:
     start, stop = half_bounds(len(body), half)
     step = frame_bytes - HALF_PREFIX_SIZE - header.size
-    # An empty half still needs its start in the list: a picture with an empty body travels as one bare header.
+    # An empty body is sent as one frame with a header only.
     offsets = range(start, stop, step) or (start,)
     return tuple(
         HalfFrame(half, image_id, offset, len(body), header, body[offset : min(offset + step, stop)]).pack()
@@ -120,14 +314,14 @@ def _half_frames(half: HalfName, image_id: str, header: StreamHeader, body: byte
 
 
 def _group(top: Packet, bottom: Packet, frames_per_packet: int, *, with_contact: bool) -> tuple[Packet, ...]:
-    """Return the frames as groups; a group starts a packet and fills as many as it needs."""
-    apart = tuple(half for half in (top, bottom) if half)
+    """Return the frames in groups; a group starts a new packet and fills as many as it needs."""
+    separate = tuple(half for half in (top, bottom) if half)
     if max(len(top), len(bottom)) <= frames_per_packet:
-        return apart
-    packets_apart = sum(_packets(len(half), frames_per_packet) for half in apart)
-    # The contact record's frame counts here: where it alone would fill a packet, apart is no worse.
+        return separate
+    separate_packets = sum(_packets(len(half), frames_per_packet) for half in separate)
+    # The frame of the contact record counts: if it alone needs a packet, separate halves are no worse.
     together = _packets(len(top) + len(bottom) + (1 if with_contact else 0), frames_per_packet)
-    return (top + bottom,) if together < packets_apart else apart
+    return (top + bottom,) if together < separate_packets else separate
 
 
 def _place_contact(groups: tuple[Packet, ...], record: bytes, frames_per_packet: int) -> tuple[Packet, ...]:

@@ -52,7 +52,7 @@ class Feedback:
 
 
 @dataclass(frozen=True, slots=True)
-class FeedbackRequest:
+class RefineRequest:
     """A wish for more detail of a contact than was planned.
 
     Attributes:
@@ -68,7 +68,7 @@ class FeedbackRequest:
         return self.number.to_bytes(2, "big") + self.stream_bytes.to_bytes(2, "big")
 
     @classmethod
-    def unpack(cls, data: bytes, where: str = "request") -> FeedbackRequest:
+    def unpack(cls, data: bytes, where: str = "request") -> RefineRequest:
         """Parse the data of a REQUEST segment.
 
         Raises:

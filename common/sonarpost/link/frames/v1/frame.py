@@ -1,7 +1,7 @@
 """Frames of the acoustic wire format v1: five bytes of header, then a symbol of a block or a list of segments.
 
-docs/specifications/acoustic-v1.md specifies this byte by byte. A frame stands by itself: the checksum covers it alone,
-the vehicle is known from the modem's source address, and padding that drivers add is recognised.
+docs/specifications/acoustic-v1.md specifies every byte. Each frame can be decoded alone: it has its own checksum, the
+modem's source address identifies the vehicle, and padding that drivers append is detected.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sonarpost.errors import FrameError
 MIN_FRAME_BYTES: Final = 32
 MAX_FRAME_BYTES: Final = 256
 PADDED_LENGTHS: Final = (256, 192, 128, 96, 64, 48, 32)
-"""Lengths that are tried, longest first, where a frame came longer than it was sent. Part of the format."""
+"""Lengths to try, longest first, for a frame with padding. Part of the format."""
 HEADER_BYTES: Final = 5
 BLOCKS: Final = 32
 MAX_INDEX: Final = 254
@@ -27,7 +27,7 @@ _TAG_BIT: Final = 0x80
 
 
 class SymbolKind(IntEnum):
-    """What a symbol is of. The number is in the frame's header."""
+    """Content of a block. The number is in the header of its frames."""
 
     OBJECT = 0
     LAYERED = 1
@@ -38,7 +38,7 @@ _SEGMENTS: Final = 2
 
 
 class SegmentKind(IntEnum):
-    """What a segment is. From 16 on any kind may be added: all but CONTACT say how long they are."""
+    """Content of a segment. Kinds from 16 on can be added: all but CONTACT have a length field."""
 
     END = 0
     MESSAGE = 1
@@ -54,23 +54,23 @@ MAX_SEGMENT_BYTES: Final = 255
 
 
 class FrameProtection(Protocol):
-    """Authenticates frames and may encrypt them; implemented by `sonarpost.link.auth.authentication`."""
+    """Authenticates and can encrypt frames; implemented by `sonarpost.link.auth.authentication`."""
 
     @property
-    def size(self) -> int:
-        """How many bytes it adds."""
+    def overhead_bytes(self) -> int:
+        """Bytes that it adds to a frame."""
 
-    def seal(self, covered: bytes) -> bytes:
-        """Return what is sent instead of `covered`, the frame after its checksum: `size` bytes longer.
+    def protect(self, covered: bytes) -> bytes:
+        """Return what to send instead of `covered`, the frame after its checksum: `overhead_bytes` longer.
 
-        The first byte stays as it is. Nothing is consumed when it raises.
+        The first byte is unchanged. If this raises, no counter was used.
         """
 
-    def open(self, source: int, sealed: bytes, where: str) -> bytes:
-        """Return what was sealed; the hook may keep state (counters against replay).
+    def verify(self, source: int, protected: bytes, where: str) -> bytes:
+        """Return what the sender passed to `protect`; may change state (counters against replay).
 
         Raises:
-            FrameError: It was not sealed by this source with the common key (field `tag`), or not now (`counter`).
+            FrameError: The source did not send it with the common key (field `tag`), or it is a replay (`counter`).
         """
 
 
@@ -79,10 +79,10 @@ class Symbol:
     """A symbol of a block.
 
     Attributes:
-        kind: What the block holds.
+        kind: Content of the block.
         block: Number of the block, 0..31.
-        index: Which symbol, 0..254.
-        parameter: k, 1..255, the number of source symbols; of a layered block a symbol of its descriptor, 0..255.
+        index: Index of the symbol, 0..254.
+        parameter: Number of source symbols k, 1..255; in a layered block a symbol of its descriptor, 0..255.
         data: The symbol.
     """
 
@@ -99,11 +99,11 @@ class Symbol:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """One item of a frame that carries several.
+    """One item of a frame with several.
 
     Attributes:
-        kind: A `SegmentKind`, or another number below 32 that a later version defines.
-        data: At most 255 bytes; of a CONTACT exactly 29.
+        kind: A `SegmentKind`, or another number below 32 of a later version.
+        data: At most 255 bytes; exactly 29 for CONTACT.
     """
 
     kind: int
@@ -111,47 +111,48 @@ class Segment:
 
     @property
     def size(self) -> int:
-        """Bytes it takes in a frame."""
+        """Length in a frame, in bytes."""
         return (1 if self.kind == SegmentKind.CONTACT else 2) + len(self.data)
 
 
 Content = Symbol | tuple[Segment, ...]
 
 
-def pack_symbol(symbol: Symbol, seal: FrameProtection | None = None) -> bytes:
+def pack_symbol(symbol: Symbol, protection: FrameProtection | None = None) -> bytes:
     """Return the frame of one symbol, 5 bytes longer than the symbol (and its tag)."""
-    return _sealed(symbol.head() + symbol.data, seal)
+    return _protected(symbol.head() + symbol.data, protection)
 
 
-def segments_room(frame_bytes: int, seal: FrameProtection | None = None) -> int:
-    """Return how many bytes of segments (by `Segment.size`) fit a frame."""
-    return frame_bytes - _CRC_BYTES - (0 if seal is None else seal.size)
+def segments_room(frame_bytes: int, protection: FrameProtection | None = None) -> int:
+    """Return how many bytes of segments (see `Segment.size`) a frame holds."""
+    return frame_bytes - _CRC_BYTES - (0 if protection is None else protection.overhead_bytes)
 
 
-def pack_segments(segments: Iterable[Segment], frame_bytes: int, seal: FrameProtection | None = None) -> bytes:
+def pack_segments(segments: Iterable[Segment], frame_bytes: int, protection: FrameProtection | None = None) -> bytes:
     """Return a frame of segments, padded with zeros to `frame_bytes`.
 
     Raises:
-        FrameError: There is none, one has another length than its kind allows, or they do not fit.
+        FrameError: There are no segments, one has an invalid kind or length, or they do not fit.
     """
     listed = tuple(segments)
     if not listed:
         raise FrameError("acoustic frame", "segments", 0, "at least one")
     body = bytearray()
     for segment in listed:
-        _check_segment(segment)
+        check_segment(segment)
         body.append(segment.kind)
         if segment.kind != SegmentKind.CONTACT:
             body.append(len(segment.data))
         body += segment.data
-    room = segments_room(frame_bytes, seal)
+    room = segments_room(frame_bytes, protection)
     if len(body) > room:
         raise FrameError("acoustic frame", "segments", f"{len(body)} bytes", f"at most {room} bytes")
     body[0] |= _SEGMENTS << 5
-    return _sealed(bytes(body.ljust(room, b"\0")), seal)
+    return _protected(bytes(body.ljust(room, b"\0")), protection)
 
 
-def _check_segment(segment: Segment) -> None:
+def check_segment(segment: Segment) -> None:
+    """Raise FrameError if the kind or the length of a segment is invalid."""
     if not 1 <= segment.kind < 32:
         raise FrameError("acoustic frame", "segment kind", segment.kind, "1..31")
     fits = len(segment.data) <= MAX_SEGMENT_BYTES
@@ -162,9 +163,9 @@ def _check_segment(segment: Segment) -> None:
         raise FrameError("acoustic frame", "segment", f"{len(segment.data)} bytes", expected)
 
 
-def _sealed(covered: bytes, seal: FrameProtection | None) -> bytes:
-    if seal is not None:
-        covered = seal.seal(bytes([covered[0] | _TAG_BIT]) + covered[1:])
+def _protected(covered: bytes, protection: FrameProtection | None) -> bytes:
+    if protection is not None:
+        covered = protection.protect(bytes([covered[0] | _TAG_BIT]) + covered[1:])
     return checksum(covered).to_bytes(_CRC_BYTES, "big") + covered
 
 
@@ -174,25 +175,25 @@ def checksum(covered: bytes) -> int:
 
 
 def parse_frame(
-    frame: bytes, source: int = 0, seal: FrameProtection | None = None, where: str = "acoustic frame"
+    frame: bytes, source: int = 0, protection: FrameProtection | None = None, where: str = "acoustic frame"
 ) -> Content:
-    """Parse a frame as it came from a modem.
+    """Parse a frame from a modem.
 
     Args:
-        frame: As received; zeros that a driver or modem appended are recognised.
-        source: Modem address it came from, for `seal`.
-        seal: When given, frames without a right tag are refused; without it, frames with a tag are.
-        where: Names the frame in errors.
+        frame: As received; zeros that a driver or modem appended are detected.
+        source: Modem address of the sender, for `protection`.
+        protection: With it, frames without a correct tag are rejected; without it, frames with a tag.
+        where: Name of the frame in errors.
 
     Raises:
-        FrameError: Wrong checksum, a field without meaning, or a wrong or unexpected tag.
+        FrameError: Wrong checksum, an invalid field, or a wrong or unexpected tag.
     """
     covered = _undamaged(frame, where)
     has_tag = bool(covered[0] & _TAG_BIT)
-    if has_tag != (seal is not None):
-        raise FrameError(where, "tag", has_tag, "none" if seal is None else "a tag in every frame")
-    if seal is not None:
-        covered = seal.open(source, covered, where)
+    if has_tag != (protection is not None):
+        raise FrameError(where, "tag", has_tag, "none" if protection is None else "a tag in every frame")
+    if protection is not None:
+        covered = protection.verify(source, covered, where)
     if (covered[0] >> 5) & 3 == _SEGMENTS:
         return _parse_segments(bytes([covered[0] & 31]) + covered[1:], where)
     return parse_symbol(bytes([covered[0] & 0x7F]) + covered[1:], where)
@@ -202,7 +203,7 @@ def parse_symbol(data: bytes, where: str = "acoustic frame") -> Symbol:
     """Parse three bytes of head and a symbol.
 
     Raises:
-        FrameError: Too short, or a field without meaning.
+        FrameError: Too short, or an invalid field.
     """
     if len(data) < 4 or data[0] >> 5 not in tuple(SymbolKind):
         raise FrameError(where, "symbol", data[:4], "three bytes of head with a known kind, and data")

@@ -82,6 +82,8 @@ class Layering:
         Raises:
             FrameError: A wrong check, or values out of range.
         """
+        if len(data) != 4:
+            raise FrameError("layered block", "descriptor", data, "4 bytes")
         body = [*data[:3], data[3] & 0xF0]
         if _nibble_sum(body) != data[3] & 0x0F:
             raise FrameError("layered block", "descriptor", data, "a check that fits")

@@ -7,17 +7,22 @@ docs/specifications/acoustic-v1.md specifies the bytes.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 from sonarpost.errors import FrameError
 from sonarpost.link.frames.v1.preview import MAX_NUMBER, number_after
+from sonarpost.link.state import Bounds, Byte
 
 CHECK_BYTES: Final = 4
 MAX_STREAM_BYTES: Final = 0xFFFF
 MAX_PIECES: Final = 255
 _PIECES, _MESSAGE = 0x10, 0x20
 _FINAL, _FOLLOWS, _COMMON_START, _CONSECUTIVE = 1, 2, 4, 8
+
+PieceEnd = tuple[Annotated[int, Bounds(1, MAX_NUMBER)], Byte, Annotated[int, Bounds(0, MAX_STREAM_BYTES)]]
+"""Number and link of an image, and the position after a piece of its stream."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +59,17 @@ class PieceList:
     pieces: tuple[StreamPiece, ...]
     final: bool
 
-    def pack(self, length: int, below: PieceList | None = None) -> bytes:
+    @property
+    def ends(self) -> tuple[PieceEnd, ...]:
+        """Where the pieces end: what the layer above continues."""
+        return tuple((p.number, p.link, p.stop) for p in self.pieces)
+
+    def pack(self, length: int, below: Sequence[PieceEnd] | None = None) -> bytes:
         """Return an object of a length.
 
         Args:
             length: Of the object, check included; the rest is zeros.
-            below: The pieces of the layer below in the same block, which these continue.
+            below: Ends of the pieces in the layer below in the same block, which these continue.
 
         Raises:
             FrameError: They do not fit, or do not continue `below`.
@@ -70,11 +80,11 @@ class PieceList:
         body += b"".join(piece.data for piece in self.pieces)
         return _checked(bytes(body), length)
 
-    def _head(self, below: PieceList | None) -> bytearray:
+    def _head(self, below: Sequence[PieceEnd] | None) -> bytearray:
         flags = _FINAL if self.final else 0
         if below is not None:
             same = [(p.number, p.link, p.start) for p in self.pieces]
-            if same != [(p.number, p.link, p.stop) for p in below.pieces]:
+            if same != list(below):
                 raise FrameError("pieces", "layer", same, "pieces that go on where the layer below ends")
             return bytearray([_PIECES | flags | _FOLLOWS])
         if not 1 <= len(self.pieces) <= MAX_PIECES:
@@ -94,7 +104,7 @@ class PieceList:
                 head += _varint(piece.start)
         return head
 
-    def overhead_bytes(self, below: PieceList | None = None) -> int:
+    def overhead_bytes(self, below: Sequence[PieceEnd] | None = None) -> int:
         """Return how many bytes of an object are not picture, for pieces of these lengths."""
         return len(self._head(below)) + sum(len(_varint(len(p.data))) for p in self.pieces) + CHECK_BYTES
 
@@ -123,12 +133,14 @@ class MessageObject:
 MESSAGE_OVERHEAD_BYTES: Final = 4 + CHECK_BYTES
 
 
-def unpack_object(data: bytes, below: PieceList | None = None, where: str = "object") -> PieceList | MessageObject:
+def unpack_object(
+    data: bytes, below: Sequence[PieceEnd] | None = None, where: str = "object"
+) -> PieceList | MessageObject:
     """Parse an object.
 
     Args:
         data: The whole object.
-        below: Of a layer that is not the lowest, the pieces of the one below.
+        below: Ends of the pieces in the layer below, None for the lowest layer.
         where: Names it in errors.
 
     Raises:
@@ -146,11 +158,11 @@ def unpack_object(data: bytes, below: PieceList | None = None, where: str = "obj
     raise FrameError(where, "kind", kind, "0x10..0x1F or 0x20")
 
 
-def _read_pieces(reader: _Reader, flags: int, below: PieceList | None) -> PieceList:
+def _read_pieces(reader: _Reader, flags: int, below: Sequence[PieceEnd] | None) -> PieceList:
     if flags & _FOLLOWS:
         if below is None or flags & (_COMMON_START | _CONSECUTIVE):
             raise FrameError(reader.where, "flags", flags, "a layer below, and no other way to say what goes on")
-        begun = [(p.number, p.link, p.stop) for p in below.pieces]
+        begun = list(below)
     else:
         begun = _read_begun(reader, flags)
     lengths = [reader.varint() for _ in begun]

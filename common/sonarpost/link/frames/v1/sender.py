@@ -1,0 +1,570 @@
+"""Sender of the `v1` wire format: images and messages in, frames out, the most valuable content first.
+
+Previews of all contacts precede the detail of any image. Messages share frames with each other and with contact
+records.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Final
+
+from sonarpost.errors import FrameError, StreamError
+from sonarpost.link.coding.blocks import (
+    ImageNumber,
+    OutgoingImage,
+    SendBlock,
+    group_limit,
+    make_group,
+    numbers_needed,
+    whole_blocks,
+)
+from sonarpost.link.coding.channel_capacity import LossChannel
+from sonarpost.link.coding.delivery_ledger import (
+    FeedbackTracker,
+    LossMeter,
+    deletion_order,
+    missing_images,
+    record_delivered,
+    take_reported,
+    within_window,
+)
+from sonarpost.link.coding.rate_distortion import Values, quality_curve
+from sonarpost.link.coding.redundancy_plan import copies, symbols_to_send
+from sonarpost.link.config import SenderConfig
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.v1.feedback import WINDOW, Feedback, RefineRequest
+from sonarpost.link.frames.v1.frame import (
+    BLOCKS,
+    HEADER_BYTES,
+    FrameProtection,
+    Segment,
+    SegmentKind,
+    Symbol,
+    SymbolKind,
+    check_segment,
+    pack_segments,
+    pack_symbol,
+    segments_room,
+)
+from sonarpost.link.frames.v1.payload_objects import MESSAGE_OVERHEAD_BYTES, MessageObject
+from sonarpost.link.frames.v1.preview import ENTRY_HEAD_BYTES, MAX_NUMBER
+from sonarpost.link.queue.messages import MessageCopies, MessageSender
+from sonarpost.link.state import Bounds, Byte, Count, Errors, PartReader, Parts, pack_part
+
+_MIN_PREFIX_BYTES: Final = 16
+_MAX_SYMBOL_FACTOR: Final = 4
+"""Limit of the symbols sent of a block without feedback while other images wait, in its source symbols."""
+_MESSAGE_URGENCY: Final = 8.0
+_NO_FEEDBACK_CAUTION: Final = -2.5
+"""Argument `caution` of `symbols_to_send` for a block without feedback: 2.5 standard deviations above the average."""
+_ANY_PRIORITY: Final = -(2**31)
+
+
+@dataclass(eq=False)
+class SenderState:
+    """The small state of a sender, which changes with every frame.
+
+    Attributes:
+        next_block: Number of the next block.
+        frames_sent: Frames sent since the first start.
+        messages: Messages in transmission.
+        next_message: Number of the next message.
+        feedback: Feedback and requests to send.
+        receivers: See `FeedbackTracker`.
+        meters: See `FeedbackTracker`.
+    """
+
+    next_block: Annotated[int, Bounds(0, BLOCKS - 1)]
+    frames_sent: Count
+    messages: list[MessageCopies]
+    next_message: Byte
+    feedback: list[Segment]
+    receivers: dict[int, float]
+    meters: dict[int, LossMeter]
+
+    def __post_init__(self) -> None:
+        for segment in self.feedback:
+            check_segment(segment)
+        if not all(message.data for message in self.messages):
+            raise FrameError("sender", "messages", b"", "at least one byte each")
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingImages:
+    """Numbers of the images that no block holds yet, in the order of sending."""
+
+    numbers: list[ImageNumber] = field(default_factory=list)
+
+
+class V1Sender:
+    """Sends contacts, their images and messages.
+
+    With feedback, an image is delivered when feedback has confirmed all of its blocks. The sender repairs, when nothing
+    new is due, what it sent without feedback and what it gave up. It can do so as long as the image is kept.
+
+    Attributes:
+        waiting: Images that no block holds yet.
+        blocks: Blocks that are being sent, the oldest first.
+        retired: Blocks that were sent without feedback, and that feedback can still mention.
+        kept: Images by number, the oldest first, including those that wait.
+        may_repair: Whether some images may lack a part that no block holds.
+
+    Args:
+        config: The configuration.
+        first_block: Number of the first block, 0..31. A vehicle that has lost its state should draw it at random.
+        protection: Authenticates frames.
+    """
+
+    def __init__(
+        self, config: SenderConfig, *, first_block: int = 0, protection: FrameProtection | None = None
+    ) -> None:
+        self.config = config
+        self._protection = protection
+        self.waiting: list[OutgoingImage] = []
+        self.blocks: list[SendBlock] = []
+        self.retired: list[SendBlock] = []
+        self.may_repair = True
+        self.messages = MessageSender()
+        self.kept: dict[int, OutgoingImage] = {}
+        self.next_block = first_block % BLOCKS
+        self.frames_sent = 0
+        self.tracker = FeedbackTracker()
+        self.feedback: list[Segment] = []
+
+    @property
+    def symbol_bytes(self) -> int:
+        """Length of a symbol that fills a frame."""
+        overhead = 0 if self._protection is None else self._protection.overhead_bytes
+        return self.config.frame_bytes - HEADER_BYTES - overhead
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether there is nothing to send, and nothing that feedback can request."""
+        return not (self.waiting or self.blocks or self.messages.waiting or self.feedback)
+
+    @property
+    def measured_loss(self) -> float | None:
+        """Share of frames lost according to the feedback of the worst receiver; None before the second feedback."""
+        return self.tracker.loss
+
+    def add_image(
+        self,
+        number: int,
+        contact: ContactSummary,
+        stream: bytes,
+        now: float,
+        mean_square_error: Sequence[float] | Values | None = None,
+        *,
+        image_id: str = "0000",
+        contact_id: str = "?",
+    ) -> None:
+        """Add a contact and its image.
+
+        Args:
+            number: Number of the contact, 1..65535; consecutive for consecutive contacts (`next_number`).
+            contact: The contact record.
+            stream: Header and body, as much as may ever be sent.
+            now: Seconds.
+            mean_square_error: See `quality_curve`.
+            image_id: Identifier on the vehicle.
+            contact_id: Identifier of the contact on the vehicle.
+
+        Raises:
+            FrameError: The number is out of range, or an image that waits has it.
+            StreamError: As `quality_curve`, or the stream is empty.
+        """
+        if not 1 <= number <= MAX_NUMBER or any(image.number == number for image in self.waiting):
+            raise FrameError("acoustic link v1", "contact number", number, f"1..{MAX_NUMBER}, not one that waits")
+        if not stream:
+            raise StreamError("image", "stream", stream, "at least one byte")
+        order = 1 + max((image.order for image in self.kept.values()), default=0)
+        curve = quality_curve(len(stream), mean_square_error)
+        image = OutgoingImage(number, contact.rounded(), stream, curve, float(now), image_id, contact_id, order)
+        self.waiting.append(image)
+        self.kept.pop(number, None)
+        self.kept[number] = image
+        self._delete_excess_images()
+
+    def _delete_excess_images(self) -> None:
+        """Delete images beyond the limit, completely delivered ones first; none that is still to be sent."""
+        excess = len(self.kept) - self.config.kept_images
+        if excess > 0:
+            needed = {image.number for image in self.waiting} | {n for block in self.blocks for n in block.contacts}
+            for number in deletion_order(self.kept, self.config, needed)[:excess]:
+                del self.kept[number]
+
+    def add_message(
+        self,
+        data: bytes,
+        now: float,
+        *,
+        priority: int = 0,
+        lifetime_s: float = 3600.0,
+        times: int | None = None,
+        rises_s: float | None = None,
+    ) -> int:
+        """Add a message; return its number.
+
+        Args:
+            data: 1..4096 bytes. A message that is longer than a frame becomes a block of its own.
+            now: Seconds.
+            priority: See `MessageCopies`.
+            lifetime_s: Time after which it is not sent any more.
+            times: Number of copies; by default computed from the measured loss.
+            rises_s: See `MessageCopies`.
+
+        Raises:
+            FrameError: Empty or too long.
+        """
+        times = copies(self.config.worst) if times is None else max(1, times)
+        return self.messages.add(data, priority, float(now + lifetime_s), times, rises_s)
+
+    def add_feedback(self, feedback: Feedback | RefineRequest) -> None:
+        """Send feedback or a request in the next frame (a receiver's feedback goes through its own sender)."""
+        kind = SegmentKind.FEEDBACK if isinstance(feedback, Feedback) else SegmentKind.REQUEST
+        self.feedback.append(Segment(int(kind), feedback.pack()))
+
+    def plan_for(self, channels: tuple[LossChannel, ...]) -> None:
+        """Use another measured loss for future plans; existing plans stay."""
+        self.config = replace(self.config, channels=channels)
+
+    def expect_feedback(self, *, expected: bool) -> None:
+        """Plan for receivers that send feedback, or that do not; blocks that are being sent are completed."""
+        if expected == self.config.feedback:
+            return
+        self.config = replace(self.config, feedback=expected)
+        self.may_repair = True
+        if not expected:
+            for block in [b for b in self.blocks if b.left <= 0]:
+                self._retire(block)
+
+    def _retire(self, block: SendBlock) -> None:
+        self.blocks.remove(block)
+        block.retired = True
+        self.retired += [block] if block.spans else []
+        self.may_repair = True
+
+    def resize(self, frame_bytes: int) -> None:
+        """Use another frame length.
+
+        Blocks with symbols that are too long for it are given up; their images wait again.
+        """
+        self.config = replace(self.config, frame_bytes=frame_bytes)
+        room = segments_room(frame_bytes, self._protection)
+        lost = [b for b in self.blocks if b.symbol_bytes != self.symbol_bytes and b.symbol_bytes + 5 > room]
+        self.blocks = [b for b in self.blocks if b not in lost]
+        self.retired = [b for b in self.retired if b.symbol_bytes == self.symbol_bytes or b.symbol_bytes + 5 <= room]
+        self.may_repair = True
+        waiting = {image.number for image in self.waiting}
+        again = {number for block in lost for number in block.contacts} - waiting
+        self.waiting = [image for number, image in self.kept.items() if number in again] + self.waiting
+
+    def next_packet(self, frames: int, now: float) -> tuple[bytes, ...]:
+        """Return up to `frames` frames, none if there is nothing to send."""
+        packet: list[bytes] = []
+        while len(packet) < frames and (frame := self.next_frame(now)) is not None:
+            packet.append(frame)
+        return tuple(packet)
+
+    def next_frame(self, now: float, *, images_first: bool = False) -> bytes | None:
+        """Return the next frame, None if there is nothing to send.
+
+        Args:
+            now: Seconds.
+            images_first: Whether images precede messages, so that many messages cannot block them.
+        """
+        self._begin_groups(now)
+        self._begin_repairs(now)
+        self.messages.prune(now)
+        self._begin_long_messages(now)
+        frame = self._images_frame(now) if images_first else self._segments_frame(now, min_priority=0)
+        frame = frame or self._images_frame(now) or self._segments_frame(now, min_priority=_ANY_PRIORITY)
+        if frame is not None:
+            self.frames_sent += 1
+        return frame
+
+    def _images_frame(self, now: float) -> bytes | None:
+        if self.config.announce and not any(b.is_fresh_preview and b.left > 0 for b in self.blocks):
+            # Contacts whose group waits precede the detail of others.
+            announced = self._announcements(segments_room(self.config.frame_bytes, self._protection))
+            if announced:
+                return pack_segments(announced, self.config.frame_bytes, self._protection)
+        return self._symbol_frame(now)
+
+    def _begin_groups(self, now: float) -> None:
+        symbol_bytes = self.symbol_bytes
+        while self.waiting:
+            limit = group_limit(self.config, symbol_bytes)
+            due = len(self.waiting) >= limit or now - self.waiting[0].added_s >= self.config.group_delay_s
+            group = self.waiting[:limit]
+            if not due or not self._may_begin(group):
+                return
+            self.waiting = self.waiting[limit:]
+            for image in group:
+                image.announced = False
+            self.blocks += make_group(group, self.config, symbol_bytes, self._take_number, now)
+
+    def _may_begin(self, group: Sequence[OutgoingImage]) -> bool:
+        previews = sum(1 for b in self.blocks if b.kind == SymbolKind.PREVIEW and b.left > 0)
+        details = sum(1 for b in self.blocks if b.kind != SymbolKind.PREVIEW and b.left > 0)
+        if max(previews, details) >= self.config.depth:
+            return False
+        # A group that does not even fit an empty window need not wait.
+        return not self.blocks or self._free_numbers() >= numbers_needed(group, self.config, self.symbol_bytes)
+
+    def _begin_repairs(self, now: float) -> None:
+        """With feedback, send missing parts again when no new group is due."""
+        if not (self.config.feedback and self.may_repair):
+            return
+        waiting = {image.number for image in self.waiting}
+        kept = [image for number, image in self.kept.items() if number not in waiting]
+        found = missing_images(kept, self.config, self.blocks, group_limit(self.config, self.symbol_bytes))
+        if not found:
+            self.may_repair = False
+            return
+        group = [image for image, _ in found]
+        if not self._may_begin(group):
+            return
+        for image, start in found:
+            image.goal, image.sent = image.goal_bytes(self.config.stream_bytes), start
+        make = make_group if found[0][1] == 0 else whole_blocks
+        self.blocks += make(group, self.config, self.symbol_bytes, self._take_number, now)
+
+    def _free_numbers(self) -> int:
+        if not self.blocks:
+            return WINDOW
+        return WINDOW - (self.next_block - self.blocks[0].number) % BLOCKS
+
+    def _take_number(self) -> int:
+        # A block beyond the window replaces the oldest: receivers delete it too.
+        while self._free_numbers() < 1:
+            self.blocks.pop(0)
+            self.may_repair = True
+        number = self.next_block
+        self.next_block = (number + 1) % BLOCKS
+        # A new block must never be mistaken for a retired one with the same number.
+        self.retired = within_window(self.retired, self.next_block)
+        return number
+
+    def _begin_long_messages(self, now: float) -> None:
+        room = segments_room(self.config.frame_bytes, self._protection) - 2
+        while self._free_numbers() >= 1 and (message := self.messages.take_long(room)) is not None:
+            size = self.symbol_bytes
+            source = -(-(len(message.data) + MESSAGE_OVERHEAD_BYTES) // size)
+            block = SendBlock(
+                kind=SymbolKind.OBJECT,
+                number=self._take_number(),
+                symbol_bytes=size,
+                objects=(MessageObject(message.number, message.data).pack(source * size),),
+                layering=None,
+                contacts=(),
+                urgency=_MESSAGE_URGENCY,
+                planned=min(255, symbols_to_send(source, self.config.worst, _NO_FEEDBACK_CAUTION)),
+                asked_s=now,
+            )
+            self.blocks.append(block)
+
+    def _segments_frame(self, now: float, min_priority: int) -> bytes | None:
+        """Return a frame of feedback and messages of at least a priority, filled up; None if there are none."""
+        room = segments_room(self.config.frame_bytes, self._protection)
+        chosen: list[Segment] = []
+        while self.feedback and self.feedback[0].size <= room:
+            chosen.append(self.feedback.pop(0))
+            room -= chosen[-1].size
+        if not chosen and not self.messages.has_ready(min_priority, self.frames_sent):
+            return None
+        messages = self.messages.segments(room, self.frames_sent, spacing=round(4 * self.config.worst.burst))
+        room -= sum(segment.size for segment in messages)
+        chosen += messages
+        if not chosen:
+            return None
+        return pack_segments([*chosen, *self._fillers(room)], self.config.frame_bytes, self._protection)
+
+    def _fillers(self, room: int) -> list[Segment]:
+        """Return segments for the rest of a frame: symbols, then contacts that wait."""
+        found: list[Segment] = []
+        while room > 0 and (symbol := self._next_symbol(max_bytes=room - 5)) is not None:
+            found.append(Segment(SegmentKind.SYMBOL, symbol.head() + symbol.data))
+            room -= found[-1].size
+        return found + self._announcements(room)
+
+    def _announcements(self, room: int) -> list[Segment]:
+        """Return as many contacts as fit of those that wait and are not announced yet."""
+        found: list[Segment] = []
+        for image in self.waiting:
+            if room < ENTRY_HEAD_BYTES + 1:
+                break
+            if image.announced:
+                continue
+            image.announced = True
+            prefix = min(room - 2 - ENTRY_HEAD_BYTES, 255 - ENTRY_HEAD_BYTES)
+            if prefix >= _MIN_PREFIX_BYTES:
+                preview = image.preview(min(prefix, len(image.stream)))
+                found.append(Segment(SegmentKind.PREVIEW, preview.pack(ENTRY_HEAD_BYTES + len(preview.prefix))))
+            else:
+                found.append(Segment(SegmentKind.CONTACT, image.preview(0).pack(ENTRY_HEAD_BYTES)))
+            room -= found[-1].size
+        return found
+
+    def _symbol_frame(self, now: float) -> bytes | None:
+        symbol = self._next_symbol(max_bytes=self.symbol_bytes)
+        if symbol is None:
+            self._send_reminders(now)
+            self._extend_unconfirmed_block()
+            symbol = self._next_symbol(max_bytes=self.symbol_bytes)
+        if symbol is None:
+            return None
+        if len(symbol.data) == self.symbol_bytes:
+            return pack_symbol(symbol, self._protection)
+        first = Segment(SegmentKind.SYMBOL, symbol.head() + symbol.data)
+        room = segments_room(self.config.frame_bytes, self._protection) - first.size
+        return pack_segments([first, *self._fillers(room)], self.config.frame_bytes, self._protection)
+
+    def _next_symbol(self, max_bytes: int) -> Symbol | None:
+        """Return the most valuable symbol that fits."""
+        open_blocks = [b for b in self.blocks if b.left > 0 and b.symbol_bytes <= max_bytes]
+        if not open_blocks:
+            return None
+        # Requested symbols complete something, so they precede the others; the oldest block goes first.
+        block = min(
+            open_blocks, key=lambda b: (not b.is_fresh_preview, not b.reported, 0.0 if b.reported else b.progress)
+        )
+        symbol = block.next_symbol()
+        if block.left <= 0 and not self.config.feedback:
+            self._retire(block)
+        return symbol
+
+    def _send_reminders(self, now: float) -> None:
+        """With feedback, send a few symbols more of blocks without feedback for long: they trigger feedback."""
+        for block in self._overdue_blocks(now):
+            block.asked_s = now
+            block.planned += max(1, block.source_symbols // 16)
+
+    def _overdue_blocks(self, now: float) -> list[SendBlock]:
+        return [b for b in self.blocks if b.left <= 0 and now - b.asked_s >= self.config.max_defer_s]
+
+    def images_are_due(self, now: float) -> bool:
+        """Whether there is something to send of images, including reminders."""
+        return bool(self.waiting) or any(b.left > 0 for b in self.blocks) or bool(self._overdue_blocks(now))
+
+    def _extend_unconfirmed_block(self) -> None:
+        """With feedback, while the next group waits for block numbers, send more of the least redundant block.
+
+        Plans stay below the expected need, so these symbols are rarely useless; silence always is.
+        """
+        if not self.waiting or any(b.left > 0 for b in self.blocks) or not self.config.feedback:
+            return
+        candidates = [b for b in self.blocks if b.sent < _MAX_SYMBOL_FACTOR * b.source_symbols]
+        if self._free_numbers() < WINDOW and candidates:
+            min(candidates, key=lambda b: b.sent / b.source_symbols).planned += 1
+
+    def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int = 0) -> None:
+        """Process feedback or a request.
+
+        A block is done when all receivers with recent feedback have all of it.
+
+        Args:
+            feedback: The content.
+            now: Seconds.
+            receiver: Modem address of the receiver.
+
+        Raises:
+            FrameError: A request for an image that is not kept.
+        """
+        if isinstance(feedback, RefineRequest):
+            self.refine(feedback, now)
+            return
+        self._resume_retired(feedback)
+        self.tracker.measure(feedback, receiver, self.frames_sent)
+        self._apply(feedback, now, receiver)
+
+    def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int = 0) -> None:
+        """Process the feedback of a mini-packet, on one block."""
+        feedback = Feedback(block_number, 0, (missing_symbols,))
+        self._resume_retired(feedback)
+        self._apply(feedback, now, receiver)
+
+    def _apply(self, feedback: Feedback, now: float, receiver: int) -> None:
+        self.blocks, done = self.tracker.apply(feedback, self.blocks, self.config, now, receiver)
+        record_delivered(self.kept, done)
+
+    def _resume_retired(self, feedback: Feedback) -> None:
+        """Continue blocks that were sent before the first feedback, if a receiver has some of their symbols."""
+        if self.config.feedback and (found := take_reported(self.retired, feedback)):
+            for block in found:
+                block.retired = False
+            self.blocks = sorted([*self.blocks, *found], key=lambda b: (b.number - self.next_block) % BLOCKS)
+
+    def refine(self, request: RefineRequest, now: float) -> bool:
+        """Send more detail of an image than was planned; return whether there is any.
+
+        Raises:
+            FrameError: The image is not kept.
+        """
+        image = self.kept.get(request.number)
+        if image is None:
+            raise FrameError("acoustic link v1", "contact number", request.number, "a contact that was sent recently")
+        image.goal = max(image.goal, image.sent, min(request.stream_bytes, len(image.stream)))
+        if any(waiting.number == image.number for waiting in self.waiting):
+            return True
+        made = list(whole_blocks([image], self.config, self.symbol_bytes, self._take_number, now))
+        for block in made:
+            if not self.config.feedback:
+                block.planned = min(255, symbols_to_send(block.source_symbols, self.config.worst, _NO_FEEDBACK_CAUTION))
+        self.blocks += made
+        return bool(made)
+
+    def parts(self) -> dict[str, bytes]:
+        """Return the state to save, see `sonarpost.link.state`."""
+        state = SenderState(
+            self.next_block,
+            self.frames_sent,
+            self.messages.waiting,
+            self.messages.next_number,
+            self.feedback,
+            self.tracker.receivers,
+            self.tracker.meters,
+        )
+        parts = {"sender": pack_part(state), "waiting": pack_part(WaitingImages([i.number for i in self.waiting]))}
+        for image in {image.number: image for image in (*self.kept.values(), *self.waiting)}.values():
+            parts[f"image/{image.number}"] = pack_part(image)
+            parts[f"image-progress/{image.number}"] = pack_part(image, "progress")
+        for block in (*self.blocks, *self.retired):
+            parts[f"block/{block.number}"] = pack_part(block)
+            parts[f"block-progress/{block.number}"] = pack_part(block, "progress")
+        return parts
+
+    def restore(self, parts: Parts) -> Errors:
+        """Replace the state by saved parts; the configuration stays.
+
+        If a part other than an image cannot be read, the progress is unknown: the sender then starts again with all
+        images that are not delivered.
+
+        Returns:
+            Why parts were skipped.
+        """
+        reader = PartReader(parts, "sender state")
+        images = reader.read_group("image", OutgoingImage, progress="image-progress")
+        blocks = reader.read_group("block", SendBlock, progress="block-progress")
+        waiting = reader.read("waiting", WaitingImages) or WaitingImages()
+        state = reader.read("sender", SenderState) or SenderState(self.next_block, 0, [], 0, [], {}, {})
+        self.kept = {image.number: image for image in sorted(images, key=lambda image: image.order)}
+        self.waiting = [self.kept[number] for number in waiting.numbers if number in self.kept]
+        if "sender" not in reader or any(not name.startswith("image/") for name in reader.errors):
+            # Receivers must not take new blocks for those that they have: half the numbers away they do not.
+            state.next_block = (blocks[0].number + WINDOW) % BLOCKS if blocks else state.next_block
+            blocks = []
+            self.waiting = [image for image in self.kept.values() if missing_images([image], self.config, (), 1)]
+            for image in self.waiting:
+                image.sent = 0
+        blocks.sort(key=lambda b: (b.number - state.next_block) % BLOCKS)
+        self.blocks = [block for block in blocks if not block.retired]
+        self.retired = [block for block in blocks if block.retired]
+        self.next_block, self.frames_sent = state.next_block, state.frames_sent
+        self.messages = MessageSender(state.messages, state.next_message)
+        self.feedback = state.feedback
+        self.tracker = FeedbackTracker(state.receivers, state.meters)
+        self.may_repair = True
+        return reader.errors

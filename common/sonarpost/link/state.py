@@ -1,0 +1,338 @@
+"""Saved state of the link: dataclasses as named parts of msgpack bytes, and back with validation.
+
+A service saves every part that changed and restores all of them after a restart. A part is small, so that the cost of a
+frame does not grow with the number of contacts. A part that cannot be read is reported and skipped.
+
+A part is a list: the format version, then the fields of one dataclass in the order of their definition. A new field is
+appended and has a default. The annotations of the fields are the schema. Supported are numbers (with `Bounds`), text,
+bytes, enumerations, tuples, lists, dictionaries, optional values, float64 arrays, dataclasses, and classes with the
+methods `pack` and `unpack`, which are saved as bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
+from typing import Annotated, Final, NamedTuple, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+import msgpack
+import numpy as np
+
+from sonarpost.errors import BadInputError, FrameError
+
+FORMAT_VERSION: Final = 2
+"""Version of all parts. Version 1 was the state of sonarpost 0.1, see `sonarpost.link.migration`."""
+
+Parts = Mapping[str, bytes]
+Errors = Mapping[str, FrameError]
+"""Why parts could not be read, by their names."""
+
+SEPARATE: Final = {"part": "separate"}
+"""Metadata of a dataclass field that is not in the part of its dataclass."""
+PROGRESS: Final = {"part": "progress"}
+"""Metadata of a dataclass field that changes often: it is saved in a part of its own."""
+
+_T = TypeVar("_T")
+
+
+class Bounds(NamedTuple):
+    """Least and greatest value of a number, as an annotation."""
+
+    low: float
+    high: float
+
+
+Count = Annotated[int, Bounds(0, 2**62)]
+Byte = Annotated[int, Bounds(0, 255)]
+
+
+def pack_part(value: object, part: str = "") -> bytes:
+    """Return a dataclass as the bytes of a part.
+
+    Args:
+        value: The dataclass.
+        part: "progress" for the fields with the metadata `PROGRESS`; otherwise the fields without metadata.
+    """
+    fields = [to_plain(getattr(value, name)) for name in _schema(type(value)).names[part]]
+    packed: bytes = msgpack.packb([FORMAT_VERSION, *fields])
+    return packed
+
+
+def unpack_plain(kind: type[_T], data: bytes, where: str) -> _T:
+    """Return the value that msgpack bytes hold.
+
+    Raises:
+        FrameError: `data` is not msgpack, or not a `kind` (list or dict).
+    """
+    try:
+        plain = msgpack.unpackb(data, strict_map_key=False)
+    except (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException) as error:
+        raise FrameError(where, "", data, f"msgpack ({error or type(error).__name__})") from error
+    if not isinstance(plain, kind):
+        raise FrameError(where, "", plain, f"a {kind.__name__}")
+    return plain
+
+
+def prefixed(prefix: str, parts: Parts) -> dict[str, bytes]:
+    """Return the parts with `prefix` before their names."""
+    return {prefix + name: data for name, data in parts.items()}
+
+
+def below(prefix: str, parts: Mapping[str, _T]) -> dict[str, _T]:
+    """Return the parts whose names begin with `prefix`, without it."""
+    return {name.removeprefix(prefix): part for name, part in parts.items() if name.startswith(prefix)}
+
+
+class SavedParts:
+    """The parts that are on the disk, to write only what changed.
+
+    Args:
+        saved: The parts on the disk.
+    """
+
+    def __init__(self, saved: Parts) -> None:
+        self._saved = dict(saved)
+
+    def changes(self, parts: Parts) -> dict[str, bytes | None]:
+        """Return the parts to write, and None for those to delete; call `commit` after they are written."""
+        changed: dict[str, bytes | None] = {n: data for n, data in parts.items() if self._saved.get(n) != data}
+        return changed | dict.fromkeys(self._saved.keys() - parts.keys())
+
+    def commit(self, parts: Parts) -> None:
+        """Record that the disk holds these parts."""
+        self._saved = dict(parts)
+
+
+class PartReader:
+    """Reads parts and collects why others cannot be read.
+
+    Attributes:
+        errors: By the name of the part.
+
+    Args:
+        parts: The saved parts.
+        where: Name of the state in errors.
+    """
+
+    def __init__(self, parts: Parts, where: str) -> None:
+        self.errors: dict[str, FrameError] = {}
+        self._where = where
+        self._groups: dict[str, dict[str, bytes]] = {}
+        for name, data in parts.items():
+            group, _, rest = name.rpartition("/")
+            self._groups.setdefault(group, {})[rest] = data
+
+    def groups(self, first: str) -> list[str]:
+        """Return the names of the groups below `first`: for example image/3 of image/3/7."""
+        return sorted(group for group in self._groups if group.startswith(f"{first}/"))
+
+    def read(self, name: str, kind: type[_T]) -> _T | None:
+        """Return the part `name`, None if there is none or it cannot be read."""
+        return self._read(name, kind) if name in self else None
+
+    def read_group(
+        self, group: str, kind: type[_T], *, progress: str = "", apply: Callable[[_T], None] | None = None
+    ) -> list[_T]:
+        """Return the parts `group`/..., in the order of their names.
+
+        Args:
+            group: The name up to the last slash.
+            kind: Type of the parts.
+            progress: The group of the parts with the `PROGRESS` fields, if there are any. These fields have their
+                defaults where such a part is missing or cannot be read.
+            apply: Receives each part; raises BadInputError to reject it.
+        """
+        found: list[_T] = []
+        for rest in sorted(self._groups.get(group, {})):
+            name = f"{group}/{rest}"
+            part = None
+            if progress and f"{progress}/{rest}" in self:
+                part = self._read(f"{progress}/{rest}", kind, apply, main=name)
+            part = part or self._read(name, kind, apply)
+            found += [] if part is None else [part]
+        return found
+
+    def __contains__(self, name: str) -> bool:
+        group, _, rest = name.rpartition("/")
+        return rest in self._groups.get(group, {})
+
+    def _plain(self, name: str, kind: type, part: str) -> dict[str, object]:
+        """Return the fields in a part by name."""
+        group, _, rest = name.rpartition("/")
+        version, *values = unpack_plain(list, self._groups[group][rest], self._where) or [None]
+        if type(version) is not int or version != FORMAT_VERSION:
+            raise FrameError(self._where, "format version", version, str(FORMAT_VERSION))
+        return _by_name(_schema(kind).names[part], values, self._where)
+
+    def _read(self, name: str, kind: type[_T], apply: Callable[[_T], None] | None = None, main: str = "") -> _T | None:
+        """Return a part (with `main`, both together), None if it cannot be read."""
+        try:
+            plain = self._plain(name, kind, "progress" if main else "")
+            if main:
+                try:
+                    plain |= self._plain(main, kind, "")
+                except FrameError:
+                    return None  # the caller reads `main` alone next, and rejects it
+            part = from_plain(kind, plain, self._where)
+            if apply is not None:
+                apply(part)
+        except BadInputError as error:
+            self.errors[name] = FrameError(f"{self._where}: {name}", error.field, error.value, error.expected)
+            return None
+        return part
+
+
+def to_plain(value: object) -> object:  # noqa: PLR0911 one return a kind
+    """Return a value as msgpack can hold it."""
+    if isinstance(value, Enum):
+        return value.value
+    if value is None or isinstance(value, (bool, int, float, str, bytes)):
+        return value
+    if isinstance(value, (tuple, list)):
+        return [to_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {to_plain(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return value.astype("<f8").tobytes()
+    if hasattr(value, "unpack"):
+        return value.pack()  # type: ignore[attr-defined]
+    return [to_plain(getattr(value, name)) for name in _schema(type(value)).names[""]]
+
+
+def from_plain(kind: type[_T], plain: object, where: str, field: str = "") -> _T:
+    """Return the value of type `kind` that `to_plain` turned into `plain`; a dataclass may also be a map of its fields.
+
+    Raises:
+        FrameError: `plain` does not fit `kind`. `field` is the path of the value in the error.
+    """
+    return cast("_T", _Reader(where).read(kind, plain, field))
+
+
+class _Field(NamedTuple):
+    kind: object
+    required: bool
+    part: str
+
+
+class _Schema(NamedTuple):
+    fields: Mapping[str, _Field]
+    names: Mapping[str, tuple[str, ...]]
+    """Names of the fields, by part."""
+
+
+_SCHEMAS: Final[dict[type, _Schema]] = {}
+
+
+def _schema(kind: type) -> _Schema:
+    if kind not in _SCHEMAS:
+        if not is_dataclass(kind):
+            raise TypeError(f"{kind.__name__} cannot be saved")
+        hints = get_type_hints(kind, include_extras=True)
+        found = {
+            f.name: _Field(
+                hints[f.name], f.default is MISSING and f.default_factory is MISSING, f.metadata.get("part", "")
+            )
+            for f in fields(kind)
+        }
+        names = {part: tuple(n for n, f in found.items() if f.part == part) for part in ("", "progress")}
+        _SCHEMAS[kind] = _Schema({n: f for n, f in found.items() if f.part != "separate"}, names)
+    return _SCHEMAS[kind]
+
+
+def _by_name(names: tuple[str, ...], values: list[object], where: str, path: str = "") -> dict[str, object]:
+    if len(values) > len(names):
+        raise FrameError(where, path, f"{len(values)} fields", f"at most {len(names)}")
+    return dict(zip(names, values, strict=False))
+
+
+class _Reader(NamedTuple):
+    where: str
+
+    def read(self, kind: object, plain: object, field: str) -> object:
+        origin, args = get_origin(kind), get_args(kind)
+        if origin is Annotated:
+            return self._bounded(self.read(args[0], plain, field), args[1], field)
+        if origin in (Union, types.UnionType):
+            (some,) = (arg for arg in args if arg is not types.NoneType)
+            return None if plain is None else self.read(some, plain, field)
+        if origin in (tuple, list):
+            return self._sequence(origin, args, plain, field)
+        if origin is dict:
+            if not isinstance(plain, dict):
+                raise FrameError(self.where, field, plain, "a map")
+            return {
+                self.read(args[0], key, field): self.read(args[1], item, f"{field}[{key!r}]")
+                for key, item in plain.items()
+            }
+        if origin is np.ndarray:
+            return self._array(plain, field)
+        assert isinstance(kind, type), f"{kind} cannot be saved"
+        return self._scalar(kind, plain, field)
+
+    def _bounded(self, value: object, bounds: object, field: str) -> object:
+        if isinstance(bounds, Bounds) and not (isinstance(value, int | float) and bounds.low <= value <= bounds.high):
+            raise FrameError(self.where, field, value, f"{bounds.low}..{bounds.high}")
+        return value
+
+    def _sequence(self, origin: type, args: tuple[object, ...], plain: object, field: str) -> object:
+        if not isinstance(plain, list | tuple):
+            raise FrameError(self.where, field, plain, "a list")
+        kinds: tuple[object, ...] = (args[0],) * len(plain) if origin is not tuple or args[-1] is ... else args
+        if len(kinds) != len(plain):
+            raise FrameError(self.where, field, plain, f"a list of {len(kinds)}")
+        items = [self.read(k, item, f"{field}[{n}]") for n, (k, item) in enumerate(zip(kinds, plain, strict=True))]
+        return origin(items)
+
+    def _array(self, plain: object, field: str) -> object:
+        if not isinstance(plain, bytes) or len(plain) % 8:
+            raise FrameError(self.where, field, plain, "bytes of float64 values")
+        values = np.frombuffer(plain, "<f8").astype(np.float64)
+        if not np.isfinite(values).all():
+            raise FrameError(self.where, field, "not finite", "finite values")
+        return values
+
+    def _scalar(self, kind: type, plain: object, field: str) -> object:
+        if kind in (bool, int, str, bytes):
+            if type(plain) is not kind:
+                raise FrameError(self.where, field, plain, kind.__name__)
+            return plain
+        if kind is float:
+            if type(plain) not in (int, float) or not math.isfinite(cast("float", plain)):
+                raise FrameError(self.where, field, plain, "a finite number")
+            return float(cast("float", plain))
+        try:
+            return self._object(kind, plain, field)
+        except BadInputError as error:
+            if isinstance(error, FrameError) and error.where == self.where:
+                raise
+            path = ".".join(filter(None, (field, error.field)))
+            raise FrameError(self.where, path, error.value, error.expected) from error
+
+    def _object(self, kind: type, plain: object, field: str) -> object:
+        if issubclass(kind, Enum):
+            known = [member.value for member in kind]
+            if not any(type(plain) is type(value) and plain == value for value in known):
+                raise FrameError(self.where, field, plain, ", ".join(map(str, known)))
+            return kind(plain)
+        if hasattr(kind, "unpack"):
+            if type(plain) is not bytes:
+                raise FrameError(self.where, field, plain, "bytes")
+            value = kind.unpack(plain)
+            if value.pack() != plain:
+                raise FrameError(self.where, field, plain, f"{len(value.pack())} bytes")
+            return value
+        if isinstance(plain, list):
+            plain = _by_name(_schema(kind).names[""], plain, self.where, field)
+        if not isinstance(plain, dict):
+            raise FrameError(self.where, field, plain, "a list of fields")
+        values: dict[str, object] = {}
+        for name, (field_kind, required, _) in _schema(kind).fields.items():
+            path = f"{field}.{name}" if field else name
+            if name in plain:
+                values[name] = self.read(field_kind, plain[name], path)
+            elif required:
+                raise FrameError(self.where, path, "nothing", "a value")
+        return kind(**values)

@@ -1,0 +1,256 @@
+"""State of sonarpost 0.1: golden examples restore to the same behaviour, malformed ones raise FrameError only.
+
+The examples in tests/golden/link-state-0.1 were saved by version 0.1, with what that version did next.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import msgpack
+import pytest
+from builders.common import GOLDEN_FOLDER
+from builders.paper_images import received_of
+from builders.v1_world import take_packet
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonarpost.errors import FrameError
+from sonarpost.link import migration
+from sonarpost.link.auth.authentication import AuthenticationCounts, FrameAuthenticator
+from sonarpost.link.auth.key import Direction, parse_key
+from sonarpost.link.config import QueueConfig, ReceiverConfig
+from sonarpost.link.downlink.commands import CommandTracker
+from sonarpost.link.downlink.messages import number_of_image
+from sonarpost.link.downlink.vessel_endpoint import VesselEndpoint
+from sonarpost.link.frames.paper.receiver import PaperReceiver, PaperReceiverCounts
+from sonarpost.link.frames.v1.feedback import Feedback
+from sonarpost.link.frames.v1.receiver import V1Receiver, V1ReceiverCounts
+from sonarpost.link.queue.transmit_queue import TransmitQueue
+from sonarpost.link.receiver import Event, FeedbackReceived, FrameRejected, ImageUpdate, MessageReceived
+
+QUEUES = ["queue_broadcast", "queue_feedback"]
+
+
+def golden(name: str) -> Any:
+    return json.loads((GOLDEN_FOLDER / "link-state-0.1" / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def describe_v1(event: Event) -> dict[str, Any]:
+    match event:
+        case ImageUpdate():
+            assert event.contact is not None
+            return {
+                "image": number_of_image(event.image_id),
+                "version": event.version,
+                "contact": event.contact.pack().hex(),
+                "stream": event.stream.hex(),
+                "complete": event.complete,
+                "first": event.first_frame_s,
+                "last": event.last_frame_s,
+            }
+        case MessageReceived():
+            return {"message": event.number, "data": event.data.hex()}
+        case FeedbackReceived():
+            return {"feedback": event.feedback.pack().hex()}
+        case FrameRejected():
+            return {"rejected": event.reason.field}
+
+
+def describe_paper(event: Event) -> dict[str, Any]:
+    if isinstance(event, FrameRejected):
+        return {"rejected": event.reason.field}
+    assert isinstance(event, ImageUpdate)
+    described: dict[str, Any] = {
+        "image_id": event.image_id,
+        "version": event.version,
+        "contact": None if event.contact is None else event.contact.pack().hex(),
+        "conflicts": event.conflicts,
+        "first": event.first_frame_s,
+        "last": event.last_frame_s,
+    }
+    if event.stream:
+        described |= {
+            "stream": event.stream.hex(),
+            "received": [list(r) for r in received_of(event)],
+            "missing_halves": list(event.missing_halves),
+            "complete": event.complete,
+            "frames": event.frames,
+        }
+    return described
+
+
+def test_v1_receiver() -> None:
+    case = golden("v1_receiver")
+    receiver = V1Receiver(ReceiverConfig(max_contacts=20))
+    assert receiver.restore(migration.v1_receiver_parts(bytes.fromhex(case["state"]))) == {}
+    for step in case["steps"]:
+        events = receiver.accept(step["source"], bytes.fromhex(step["frame"]), step["at"])
+        assert [describe_v1(e) for e in events] == step["events"]
+    now = case["steps"][-1]["at"]
+    for address, expected in case["feedback"].items():
+        source = int(address)
+        assert receiver.feedback_is_due(source, now) == expected["due"]
+        assert receiver.mini_feedback(source) == expected["mini"]
+        feedback = receiver.feedback(source, now)
+        assert feedback is not None
+        assert feedback.pack().hex() == expected["feedback"]
+    assert receiver.counts == V1ReceiverCounts(*case["counts"])
+
+
+def test_paper_receiver() -> None:
+    case = golden("paper_receiver")
+    receiver = PaperReceiver(60.0, max_images=5)
+    assert receiver.restore(migration.paper_receiver_parts(bytes.fromhex(case["state"]))) == {}
+    assert receiver.next_deadline() == case["next_deadline"]
+    for step in case["steps"]:
+        if "frame" in step:
+            events = receiver.accept(step["source"], bytes.fromhex(step["frame"]), step["at"])
+        else:
+            events = receiver.poll(step["at"])
+        assert [describe_paper(e) for e in events] == step["events"]
+    assert receiver.counts == PaperReceiverCounts(*case["counts"])
+
+
+def restored_queue(case: Any, parts: dict[str, bytes]) -> TransmitQueue:
+    settings = case["config"]
+    queue = TransmitQueue(
+        QueueConfig(tuple(settings["rates"]), settings["first_rate"], settings["expected_loss"]), first_block=5
+    )
+    converted, errors = migration.queue_parts(parts)
+    assert errors == {}
+    assert queue.restore(converted) == {}
+    return queue
+
+
+def old_parts(case: Any) -> dict[str, bytes]:
+    return {name: bytes.fromhex(data) for name, data in case["parts"].items()}
+
+
+@pytest.mark.parametrize("name", QUEUES)
+def test_transmit_queue(name: str) -> None:
+    case = golden(name)
+    queue = restored_queue(case, old_parts(case))
+    assert queue.messages_waiting == case["messages_waiting"]
+    found = [
+        [e.image_id, e.contact_id, e.bytes_left, e.preview_s, e.done_s] for e in queue.expected(case["expected_at"])
+    ]
+    assert found == [[*texts, b, pytest.approx(p), pytest.approx(d)] for *texts, b, p, d in case["expected"]]
+    packet = queue.next_packet(case["steps"][0]["at"])
+    assert packet is not None
+    assert (packet.rate, [f.hex() for f in packet.frames]) == (case["packet"]["rate"], case["packet"]["frames"])
+    queue.sent(packet.frames, 6.1)
+    for step in case["steps"]:
+        frames = take_packet(queue, step["at"])
+        assert (queue.rate, [f.hex() for f in frames]) == (step["rate"], step["frames"])
+        if "feedback" in step:
+            queue.on_feedback(Feedback.unpack(bytes.fromhex(step["feedback"])), step["at"], 1)
+    assert queue.add_message("m11", "b", b"x", 0.0) is not case["known"]
+
+
+def test_a_queue_saved_before_there_were_repairs() -> None:
+    """Programs before version 0.1 saved no retired blocks, no delivered ranges and no spans."""
+    case = golden("queue_broadcast")
+    parts = old_parts(case)
+    core = msgpack.unpackb(parts["core"], strict_map_key=False)
+    del core["past"], core["planned_loss"]
+    core["sent"] = [entry[:2] for entry in core["sent"]]
+    core["sender"]["messages"] = [entry[:7] for entry in core["sender"]["messages"]]
+    parts["core"] = msgpack.packb(core)
+    for name in [n for n in parts if n.startswith("block/")]:
+        block = msgpack.unpackb(parts[name], strict_map_key=False)
+        del block["spans"]
+        parts[name] = msgpack.packb(block)
+    queue = restored_queue(case, parts)
+    receiver, now, images = V1Receiver(), case["expected_at"], set[str]()
+    for _ in range(1500):
+        now += 6.1
+        for frame in take_packet(queue, now):
+            images |= {e.image_id for e in receiver.accept(3, frame, now) if isinstance(e, ImageUpdate) and e.complete}
+        if receiver.feedback_is_due(3, now) and (feedback := receiver.feedback(3, now)):
+            queue.on_feedback(feedback, now, 1)
+    assert images == {image.image_id for image in queue.sender.kept.values()}
+    assert len(images) == 13
+
+
+@pytest.mark.parametrize("core", [None, b"\xc1 no msgpack", msgpack.packb({"format": 99})])
+def test_without_the_core_all_images_and_messages_are_sent_again(core: bytes | None) -> None:
+    case = golden("queue_broadcast")
+    parts = {name: data for name, data in old_parts(case).items() if name != "core"}
+    parts |= {} if core is None else {"core": core}
+    parts["picture/2"] = msgpack.packb({"number": 2})
+    converted, errors = migration.queue_parts(parts)
+    assert set(errors) == {"picture/2"} | ({"core"} if core else set())
+    queue = TransmitQueue(QueueConfig(expected_loss=0.0))
+    assert queue.restore(converted) == {}
+    assert queue.messages_waiting == case["messages_waiting"]
+    assert {(i.image_id, i.contact_id) for i in queue.sender.waiting} == {
+        (e.image_id, e.contact_id) for e in queue.expected(0.0)
+    }
+    assert sorted(i.number for i in queue.sender.waiting) == [1, *range(3, 13), 50]
+
+
+def test_authentication() -> None:
+    case = golden("authentication")
+    key = parse_key(case["key"], "golden")
+    vessel = FrameAuthenticator(key, 1, Direction.TO_VEHICLE)
+    parts = migration.authentication_parts(bytes.fromhex(case["state"]))
+    assert vessel.restore(parts) == {}
+    for step in case["steps"]:
+        frame = bytes.fromhex(step["frame"])
+        if "plain" in step:
+            assert vessel.verify(step["source"], frame).hex() == step["plain"]
+        else:
+            with pytest.raises(FrameError) as caught:
+                vessel.verify(step["source"], frame)
+            assert caught.value.field == step["rejected"]
+    assert vessel.counts == AuthenticationCounts(*case["counts"])
+    again = FrameAuthenticator(key, 1, Direction.TO_VEHICLE)
+    again.restore(parts)
+    assert again.requested_limit == case["limit"]
+    again.grant(case["limit"])
+    assert again.protect(b"\x80next").hex() == case["protected"]
+
+
+def test_vessel_endpoint() -> None:
+    case = golden("endpoint")
+    endpoint = VesselEndpoint(CommandTracker(60.0))
+    assert endpoint.restore(migration.endpoint_parts(bytes.fromhex(case["state"]))) == {}
+    for step in case["steps"]:
+        packet = endpoint.next_packet(2, 32, step["at"])
+        assert (packet and packet.address) == step["address"]
+        assert [f.hex() for f in packet.frames] if packet else step["frames"] == []
+        if packet is not None:
+            assert list(packet.tokens) == step["tokens"]
+            endpoint.sent(packet, step["at"])
+    found = [endpoint.commands.find(kind, record_id) for kind, record_id, *_ in case["commands"]]
+    assert [[c.kind, c.record_id, str(c.state), c.times_sent, c.due_s] for c in found if c] == case["commands"]
+    assert [c.record_id for c in endpoint.commands.expire(1e9)] == case["expired"]
+
+
+CONVERSIONS: dict[str, Callable[[bytes], object]] = {
+    "v1_receiver": migration.v1_receiver_parts,
+    "paper_receiver": migration.paper_receiver_parts,
+    "authentication": migration.authentication_parts,
+    "endpoint": migration.endpoint_parts,
+}
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data(), st.sampled_from(sorted(CONVERSIONS)))
+def test_a_malformed_state_raises_a_frame_error_or_converts(data: st.DataObject, name: str) -> None:
+    state = msgpack.unpackb(bytes.fromhex(golden(name)["state"]), strict_map_key=False)
+    place: Any = state
+    while True:
+        keys = list(place) if isinstance(place, dict) else list(range(len(place)))
+        key = data.draw(st.sampled_from(keys))
+        if isinstance(place[key], dict | list) and place[key] and data.draw(st.booleans()):
+            place = place[key]
+            continue
+        place[key] = data.draw(st.sampled_from([None, -1, 3, 2.5, b"", b"xx", "x", [], {}, True, 2**63]))
+        break
+    with suppress(FrameError):
+        CONVERSIONS[name](msgpack.packb(state))
