@@ -19,47 +19,47 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from sonarpost.messages import Advice
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.state import Board
-from sonarpost.services.console.store.contacts import Filter
-from sonarpost.services.console.store.database import Database, OnScreen
+from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.store.contacts import ContactFilter
+from sonarpost.services.console.store.database import Database, DisplayedImage
 from sonarpost.services.console.store.decisions import DecisionInput
 from sonarpost.services.console.store.serialisers import Json
 from sonarpost.services.console.store.users import Actor, Users
-from sonarpost.services.console.training.simulator import VESSEL, Training
+from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "explanation" / "console"
 SMALL, LARGE = (1366, 768), (1920, 1080)
 BOB = Actor("bob", "operator", "127.0.0.1")
-BEFORE, IN_ALL = 34, 60
-MOST_BYTES = 300_000
+BACKLOG, CONTACTS = 34, 60
+MAX_BYTES = 300_000
 
 
 class Scene:
-    """A training console whose contacts have been reviewed in part."""
+    """A training console whose contacts are partly reviewed."""
 
-    def __init__(self, board: Board, users: Users, address: str, browser: Browser) -> None:
-        self.board, self.address, self._browser = board, address, browser
-        self._token = users.begin("anna").token
-        rows = board.contacts(Filter(limit=200, sort="confidence"))["items"]
+    def __init__(self, state: ConsoleState, users: Users, address: str, browser: Browser) -> None:
+        self.state, self.address, self._browser = state, address, browser
+        self._token = users.start_session("anna").token
+        rows = state.list_contacts(ContactFilter(limit=200, sort="confidence"))["items"]
         self.rows: list[Json] = [row for row in rows if row["has_picture"]]
 
-    def contact(self, *, complete: bool, of: int = 0) -> str:
-        """Return one of the contacts about which the detector is surest."""
+    def contact(self, *, complete: bool, index: int = 0) -> str:
+        """Return one of the contacts with the highest confidence of the detector."""
         found = [row["id"] for row in self.rows if row["complete"] == complete and row["range_m"] > 6]
-        return str(found[of])
+        return str(found[index])
 
-    def judge(self, contact_id: str, verdict: str, confidence: float, mlo_class: str | None, remark: str) -> None:
+    def decide(self, contact_id: str, verdict: str, confidence: float, mlo_class: str | None, remark: str) -> None:
         """Decide as another operator."""
-        whole = self.board.contact(contact_id)
-        version = whole["versions"][-1]
-        screen = OnScreen(version["version"], version["sha256"], "raw")
-        revision = whole["contact"]["revision"]
-        self.board.decide(contact_id, DecisionInput(revision, screen, verdict, confidence, mlo_class, remark), BOB)  # type: ignore[arg-type]
+        detail = self.state.contact_detail(contact_id)
+        version = detail["versions"][-1]
+        displayed = DisplayedImage(version["version"], version["sha256"], "raw")
+        revision = detail["contact"]["revision"]
+        self.state.decide(contact_id, DecisionInput(revision, displayed, verdict, confidence, mlo_class, remark), BOB)  # type: ignore[arg-type]
 
     @contextmanager
     def page(self, size: tuple[int, int], theme: str, contact_id: str = "") -> Iterator[Page]:
-        """Open the page in a theme, at a contact."""
+        """Open the page at a contact."""
         width, height = size
         context = self._browser.new_context(
             viewport={"width": width, "height": height},
@@ -81,20 +81,20 @@ def press(page: Page, *keys: str) -> None:
         page.keyboard.press(key)
 
 
-def shoot(page: Page, name: str) -> None:
-    """Save what is on the screen, in at most 256 colours."""
+def save(page: Page, name: str) -> None:
+    """Save a screenshot with at most 256 colours."""
     path = OUT / f"{name}.png"
     page.wait_for_function("() => [...document.images].every(one => one.complete || !one.checkVisibility())")
     page.screenshot(path=path)
     with Image.open(path) as shot:
         shot.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
-    if path.stat().st_size > MOST_BYTES:
-        raise SystemExit(f"{path}: {path.stat().st_size} bytes, at most {MOST_BYTES} wanted")
+    if path.stat().st_size > MAX_BYTES:
+        raise SystemExit(f"{path}: {path.stat().st_size} bytes, expected at most {MAX_BYTES}")
     print(f"{path.relative_to(OUT.parents[1])}: {path.stat().st_size} bytes")
 
 
-def review_part(scene: Scene) -> None:
-    """Let others have been at work."""
+def add_decisions(scene: Scene) -> None:
+    """Store decisions of another operator."""
     verdicts = [
         ("mine_like", 0.9, "manta", "clear edge, long shadow"),
         ("not_mine_like", 0.8, None, "rock"),
@@ -102,31 +102,31 @@ def review_part(scene: Scene) -> None:
         ("unsure", 0.4, None, "want another look"),
     ]
     for number, (verdict, confidence, mlo_class, remark) in enumerate(verdicts):
-        scene.judge(str(scene.rows[3 + 2 * number]["id"]), verdict, confidence, mlo_class, remark)
+        scene.decide(str(scene.rows[3 + 2 * number]["id"]), verdict, confidence, mlo_class, remark)
 
 
-def measured(scene: Scene) -> None:
-    """By day, small: the shadow of a contact is measured."""
-    contact_id = scene.contact(complete=True, of=0)
+def measurement(scene: Scene) -> None:
+    """Day theme, small: a measured shadow."""
+    contact_id = scene.contact(complete=True, index=0)
     with scene.page(SMALL, "day", contact_id) as page:
-        shadow(page)
+        measure_shadow(page)
         press(page, "Enter")
         page.wait_for_selector('details[data-name="measurements"]')
         page.focus("#queue")
         page.wait_for_selector("#toasts p", state="detached")
-        shoot(page, "review-day-1366")
+        save(page, "review-day-1366")
 
 
-def shadow(page: Page) -> None:
-    """Measure the shadow, which begins left of the picture's middle."""
+def measure_shadow(page: Page) -> None:
+    """Measure the shadow, which begins left of the centre of the image."""
     press(page, "m", "m", "m", *["Shift+ArrowLeft"] * 4, "Enter", *["Shift+ArrowRight"] * 3, "Enter")
     page.wait_for_selector(".hint >> text=Enter keeps it")
 
 
-def decided(scene: Scene) -> None:
-    """By night, large: decided, with advice from the shore, delivered."""
-    contact_id = scene.contact(complete=True, of=0)
-    row = scene.board.contact(contact_id)["contact"]
+def decision(scene: Scene) -> None:
+    """Night theme, large: a delivered decision and a comment from the shore site."""
+    contact_id = scene.contact(complete=True, index=0)
+    row = scene.state.contact_detail(contact_id)["contact"]
     advice = Advice(
         advice_id="advice-1",
         vessel_id=VESSEL,
@@ -138,65 +138,65 @@ def decided(scene: Scene) -> None:
         mlo_class="manta",
         remark="same outline as last week's",
         author="eva",
-        advised_utc_s=scene.board.clock() - 40.0,
+        advised_utc_s=scene.state.clock() - 40.0,
     )
-    scene.board.take_advice(advice)
+    scene.state.store_advice(advice)
     with scene.page(LARGE, "night", contact_id) as page:
         press(page, "1", "g", "ArrowRight", *["ArrowRight"] * 5, "w")
         page.keyboard.type("highlight and shadow agree")
         page.keyboard.press("Control+Enter")
         page.wait_for_selector(".progress >> text=on the vehicle")
-        page.wait_for_selector('.progress >> text="ashore"')
+        page.wait_for_selector('.progress >> text="at the shore site"')
         press(page, "s")
         page.wait_for_selector("#toasts p", state="detached")
-        shoot(page, "decision-night-1920")
+        save(page, "decision-night-1920")
 
 
-def partly_there(scene: Scene) -> None:
-    """By night, small: a picture of which half is missing."""
+def partial_image(scene: Scene) -> None:
+    """Night theme, small: an image whose half is missing."""
     halves = [row["id"] for row in scene.rows if 30 < row["percent_received"] < 70]
     with scene.page(SMALL, "night", str(halves[0])) as page:
         press(page, "c", "c", "c")
-        shoot(page, "partial-night-1366")
+        save(page, "partial-night-1366")
 
 
-def asked(scene: Scene) -> None:
-    """By day, small: what asking for more would cost."""
-    with scene.page(SMALL, "day", scene.contact(complete=False, of=1)) as page:
+def request(scene: Scene) -> None:
+    """Day theme, small: the costs of requests."""
+    with scene.page(SMALL, "day", scene.contact(complete=False, index=1)) as page:
         press(page, "r")
         page.wait_for_selector("dialog .costs")
-        shoot(page, "ask-day-1366")
+        save(page, "ask-day-1366")
 
 
 def conflict(scene: Scene) -> None:
-    """By day, large: another operator was faster."""
-    contact_id = scene.contact(complete=True, of=4)
+    """Day theme, large: a conflict with another operator."""
+    contact_id = scene.contact(complete=True, index=4)
     with scene.page(LARGE, "day", contact_id) as page:
         press(page, "1")
-        scene.judge(contact_id, "not_mine_like", 0.8, None, "a boulder; no man-made edge")
+        scene.decide(contact_id, "not_mine_like", 0.8, None, "a boulder; no man-made edge")
         page.wait_for_selector(".now >> text=changed since you chose")
         press(page, "Enter")
         page.wait_for_selector("dialog .versus")
-        shoot(page, "conflict-day-1920")
+        save(page, "conflict-day-1920")
 
 
-def around(scene: Scene) -> None:
-    """The map by day and the link by night, small and large."""
-    contact_id = scene.contact(complete=True, of=0)
+def map_and_link(scene: Scene) -> None:
+    """Small: the map in the day theme, the link view in the night theme."""
+    contact_id = scene.contact(complete=True, index=0)
     with scene.page(SMALL, "day", contact_id) as page:
         press(page, "p")
         page.wait_for_function("() => document.querySelector('.map canvas').width > 300")
         press(page, *["j"] * 8)
         page.wait_for_selector(".map .card")
-        shoot(page, "map-day-1366")
+        save(page, "map-day-1366")
     with scene.page(SMALL, "night", contact_id) as page:
         press(page, "f")
         page.wait_for_selector(".heard li")
-        shoot(page, "link-night-1366")
+        save(page, "link-night-1366")
 
 
 def main() -> None:
-    """Make all of them."""
+    """Write all screenshots."""
     chromium = os.environ.get("SONARPOST_CHROMIUM") or shutil.which("chromium")
     if chromium is None:
         raise SystemExit("no Chromium: apt-get install chromium, or set SONARPOST_CHROMIUM")
@@ -206,24 +206,24 @@ def main() -> None:
         config = ConsoleConfig(port=0, vessel_lat_deg=56.4495, vessel_lon_deg=-5.6012)
         database, users = Database(folder / "review.db"), Users(folder / "users.db")
         users.add("anna", "operator", "correct horse battery")
-        board = Board(config, database)
-        app = ConsoleApp(board, users, VESSEL, training=True)
+        state = ConsoleState(config, database)
+        app = ConsoleApp(state, users, VESSEL, training=True)
         server = WebServer(app.asgi, config.host, config.port)
-        training = Training(board, IN_ALL, seed=7, interval_s=2.0)
-        training.backlog(BEFORE)
+        simulator = TrainingSimulator(state, CONTACTS, seed=7, interval_s=2.0)
+        simulator.load_backlog(BACKLOG)
         server.start()
-        training.start()
+        simulator.start()
         arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
         browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
         try:
-            scene = Scene(board, users, server.address, browser)
-            review_part(scene)
-            for make in (measured, decided, partly_there, asked, conflict, around):
-                make(scene)
+            scene = Scene(state, users, server.address, browser)
+            add_decisions(scene)
+            for take in (measurement, decision, partial_image, request, conflict, map_and_link):
+                take(scene)
         finally:
             browser.close()
-            training.stop()
-            app.end()
+            simulator.stop()
+            app.stop()
             server.stop()
             users.close()
             database.close()

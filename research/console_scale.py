@@ -29,7 +29,7 @@ from sonarpost.config import PlatformConfig
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
 from sonarpost.services.console.training.contacts import simulated_contacts
-from sonarpost.services.console.training.simulator import VESSEL, Training
+from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator
 
 PASSWORD = "a password for the bench"
 LISTS = (
@@ -62,7 +62,7 @@ def measure(endpoint: str, folder: Path, contacts: int, versions: int) -> None:
         service._users.add("bench", "operator", PASSWORD)  # noqa: SLF001
         empty_mb = resident_mb()
         begun = time.perf_counter()
-        Training(service.board, contacts).backlog(contacts)
+        TrainingSimulator(service.state, contacts).load_backlog(contacts)
         print(f"{contacts} contacts in {time.perf_counter() - begun:.0f} s")
         print(f"memory: {empty_mb:.0f} MB empty, {resident_mb():.0f} MB filled (codecs and simulation included)")
         browser = Browser(service.address)

@@ -29,7 +29,7 @@ from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
 from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.training.contacts import simulated_contacts
-from sonarpost.services.console.training.simulator import VESSEL, Training
+from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator
 
 # When the first row was drawn, in ms since the navigation began; and when a wanted change was, in ms since 1970.
 WATCH = """() => {
@@ -73,11 +73,11 @@ def main() -> None:
             raise SystemExit("the service did not start")
         users = Users(Path(folder) / FILE_NAME)
         users.add("bench", "operator", "a password for the bench")
-        Training(service.board, parsed.contacts).backlog(parsed.contacts)
+        TrainingSimulator(service.state, parsed.contacts).load_backlog(parsed.contacts)
         arguments = ["--enable-precise-memory-info", *(["--no-sandbox"] if os.geteuid() == 0 else [])]
         browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
         context = browser.new_context(viewport={"width": 1366, "height": 768})
-        token = users.begin("bench").token
+        token = users.start_session("bench").token
         context.add_cookies([{"name": "sonarpost_session", "value": token, "url": service.address}])
         page = context.new_page()
         page.add_init_script(f"({WATCH})()")

@@ -15,15 +15,23 @@ from typing import Annotated, Final
 from pydantic import Field
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
-from starlette.responses import RedirectResponse, Response
+from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from research.user_study.trials import NONE_OF_THEM, Answer, Decoded, Trial, results, trials_for
 from sonarpost.errors import ConfigError, DeliveryError
 from sonarpost.review import rendering
-from sonarpost.services.console.web.access import Body, Call, Endpoint, Gate, Guard, Handler, RefusedError, json_answer
-from sonarpost.services.console.web.server import STATIC, not_routed, page_file, static_routes
+from sonarpost.services.console.web.access import (
+    AccessControl,
+    ApiError,
+    Call,
+    Endpoint,
+    Handler,
+    RequestBody,
+    SecurityMiddleware,
+)
+from sonarpost.services.console.web.server import STATIC, routing_error, static_file, static_routes
 from sonarpost.sonar.image_files import read_image
 
 OWN_STATIC: Final = Path(__file__).parent / "static"
@@ -146,11 +154,11 @@ class Answers:
             self._db.close()
 
 
-class _Start(Body):
+class _Start(RequestBody):
     name: Annotated[str, Field(pattern=r"^[^\x00-\x1f]{1,60}$")]
 
 
-class _Answered(Body):
+class _Answered(RequestBody):
     number: Annotated[int, Field(ge=1, le=100_000)]
     choice: Annotated[int, Field(ge=NONE_OF_THEM, le=100)]
     sure: Annotated[float, Field(ge=0, le=1)] | None = None
@@ -198,15 +206,15 @@ class PanelApp:
         # Wrong choices are told before anybody sits down.
         trials_for("", self._seed, tuple(folders.originals), folders.decoded, self._choices)
         self._static = static
-        gate = Gate(None, "vessel", behind_proxy=False)
+        access = AccessControl(None, "vessel", behind_proxy=False)
 
         def let(handler: Handler) -> Endpoint:
-            return gate.open(handler, needs_session=False)
+            return access.endpoint(handler, needs_session=False)
 
         routes = [
             Route("/", lambda _: RedirectResponse("/panel", 303)),
-            Route("/panel", lambda _: page_file(OWN_STATIC, "panel.html")),
-            Route("/panel/{path:path}", lambda request: page_file(OWN_STATIC, str(request.path_params["path"]))),
+            Route("/panel", lambda _: static_file(OWN_STATIC, "panel.html")),
+            Route("/panel/{path:path}", lambda request: static_file(OWN_STATIC, str(request.path_params["path"]))),
             Route("/api/panel", let(self._info)),
             Route("/api/panel/start", let(self._start), methods=["POST"]),
             Route("/api/panel/next", let(self._next)),
@@ -215,41 +223,41 @@ class PanelApp:
             Route("/api/panel/pictures/{token}.png", let(self._picture)),
             *static_routes(static),
         ]
-        app = Starlette(routes=routes, exception_handlers={HTTPException: not_routed})
-        self.asgi: ASGIApp = Guard(app, (host,), tls=False)
+        app = Starlette(routes=routes, exception_handlers={HTTPException: routing_error})
+        self.asgi: ASGIApp = SecurityMiddleware(app, (host,), tls=False)
 
     def _info(self, _call: Call) -> Response:
-        return json_answer({"title": self._title, "trials": len(self._folders.decoded), "choices": self._choices})
+        return JSONResponse({"title": self._title, "trials": len(self._folders.decoded), "choices": self._choices})
 
     def _start(self, call: Call) -> Response:
-        name = call.parsed(_Start).name.strip()
+        name = call.parse_body(_Start).name.strip()
         if not name:
-            raise RefusedError(400, "bad_request", "a name", "name")
+            raise ApiError(400, "bad_request", "a name", "name")
         token = self._signed(f"person {name}")
         trials = trials_for(name, self._seed, tuple(self._folders.originals), self._folders.decoded, self._choices)
         with self._lock:
             self._people.setdefault(token, _Person(name, trials))
-        return json_answer({"panel": token, "answered": self._answers.answered(name)}, 201)
+        return JSONResponse({"panel": token, "answered": self._answers.answered(name)}, 201)
 
     def _person(self, call: Call) -> _Person:
         with self._lock:
             person = self._people.get(call.request.headers.get("x-panel", ""))
         if person is None:
-            raise RefusedError(401, "no_session", "start with a name first")
+            raise ApiError(401, "no_session", "start with a name first")
         return person
 
     def _next(self, call: Call) -> Response:
         person = self._person(call)
         answered = self._answers.answered(person.name)
         if answered >= len(person.trials):
-            return json_answer({"done": True, "answered": answered})
+            return JSONResponse({"done": True, "answered": answered})
         trial = person.trials[answered]
         shown = self._address(person, answered, "shown", self._folders.decoded[trial.shown])
         choices = [
             self._address(person, answered, f"choice {number}", self._folders.originals[name])
             for number, name in enumerate(trial.choices)
         ]
-        return json_answer(
+        return JSONResponse(
             {
                 "number": answered + 1,
                 "of": len(person.trials),
@@ -271,27 +279,27 @@ class PanelApp:
         with self._lock:
             paths = [person.pictures[token] for person in self._people.values() if token in person.pictures]
         if not paths:
-            raise RefusedError(404, "not_found", "no such picture")
+            raise ApiError(404, "not_found", "no such picture")
         # Drawn anew: a file's own remarks and dates stay here.
-        data = rendering.png(rendering.eight_bits(read_image(paths[0])))
+        data = rendering.encode_png(rendering.eight_bits(read_image(paths[0])))
         return Response(data, media_type="image/png")
 
     def _answer(self, call: Call) -> Response:
-        person, given = self._person(call), call.parsed(_Answered)
+        person, given = self._person(call), call.parse_body(_Answered)
         answered = self._answers.answered(person.name)
         if given.choice >= self._choices:
-            raise RefusedError(400, "bad_request", f"-1 to {self._choices - 1}", "choice")
+            raise ApiError(400, "bad_request", f"-1 to {self._choices - 1}", "choice")
         if given.number > len(person.trials) or given.number > answered + 1:
-            raise RefusedError(400, "bad_request", f"{answered + 1}, the next question", "number")
+            raise ApiError(400, "bad_request", f"{answered + 1}, the next question", "number")
         trial = person.trials[given.number - 1]
         if not self._answers.add(person.name, given.number, trial, given.choice, given.sure, given.seconds):
-            raise RefusedError(409, "conflict", "this question has been answered", "number")
-        return json_answer({"answered": self._answers.answered(person.name)}, 201)
+            raise ApiError(409, "conflict", "this question has been answered", "number")
+        return JSONResponse({"answered": self._answers.answered(person.name)}, 201)
 
     def _results(self, call: Call) -> Response:
         if call.address not in ("127.0.0.1", "::1"):
-            raise RefusedError(403, "forbidden", "results are shown on this host only")
-        return json_answer(results(self._answers.all(), self._choices))
+            raise ApiError(403, "forbidden", "results are shown on this host only")
+        return JSONResponse(results(self._answers.all(), self._choices))
 
     def _signed(self, text: str) -> str:
         return hmac.new(self._secret, text.encode("utf-8", "surrogatepass"), hashlib.sha256).hexdigest()[:32]

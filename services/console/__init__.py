@@ -1,1 +1,1 @@
-"""The operator's console: see it, decide, ask for more."""
+"""The operator's console: a web page to review contacts, decide, and request more data."""

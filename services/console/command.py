@@ -1,4 +1,4 @@
-"""What `sonarpost console` does: users, and a console to learn on."""
+"""Options and actions of `sonarpost console`: users, and the training console."""
 
 from __future__ import annotations
 
@@ -9,20 +9,18 @@ import signal
 import sys
 import tempfile
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from sonarpost.config import load
 from sonarpost.errors import ConfigError
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.state import Board
+from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.database import Database
 from sonarpost.services.console.store.users import FILE_NAME, ROLES, Users
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
-
-if TYPE_CHECKING:
-    from sonarpost.services.console.training.simulator import Training
 
 DATABASE_NAME = "console-review.db"
 TRAINING_USERS = (("watch", "observer"), ("op", "operator"), ("expert", "expert"))
@@ -30,115 +28,97 @@ TRAINING_USERS = (("watch", "observer"), ("op", "operator"), ("expert", "expert"
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options and actions of `sonarpost console`."""
-    parser.add_argument("--training", type=int, metavar="N", help="serve a page with N simulated contacts to learn on")
-    parser.add_argument("--port", type=int, default=8470, help="of the training page (default: 8470; 0: any)")
-    parser.add_argument("--state", type=Path, metavar="DIR", help="where training is kept (default: nowhere)")
-    parser.add_argument("--seed", type=int, default=1, help="of the simulation (default: 1)")
-    parser.add_argument("--interval", type=float, default=6.0, metavar="S", help="between packets (default: 6)")
-    parser.add_argument("--password", help="of all training users (default: drawn by lot)")
+    parser.add_argument("--training", type=int, metavar="N", help="serve a training console with N simulated contacts")
+    parser.add_argument("--port", type=int, default=8470, help="port of the training console (default: 8470; 0: any)")
+    parser.add_argument("--state", type=Path, metavar="DIR", help="folder for the training data (default: none)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the simulation (default: 1)")
+    parser.add_argument("--interval", type=float, default=6.0, metavar="S", help="time between packets (default: 6)")
+    parser.add_argument("--password", help="password of all training users (default: random)")
     actions = parser.add_subparsers(metavar="ACTION", required=False)
-    user = actions.add_parser("user", help="who may log in")
-    what = user.add_subparsers(metavar="ACTION", required=True)
-    for name, summary in (
-        ("add", "add a user, or change one's role"),
-        ("passwd", "change a password"),
-        ("rm", "remove"),
+    user = actions.add_parser("user", help="manage the users of a console")
+    user_actions = user.add_subparsers(metavar="ACTION", required=True)
+    for name, run_action, summary in (
+        ("add", _add, "add a user, or change the role of a user"),
+        ("passwd", _set_password, "change a password"),
+        ("rm", _remove, "remove a user"),
+        ("ls", _list, "list the users"),
     ):
-        action = what.add_parser(name, help=summary)
-        action.add_argument("name", metavar="NAME", help="name of the user")
+        action = user_actions.add_parser(name, help=summary)
+        if name != "ls":
+            action.add_argument("name", metavar="NAME", help="name of the user")
         if name == "add":
-            action.add_argument("--role", choices=ROLES, default="observer", help="what the user may do")
-        if name != "rm":
+            action.add_argument("--role", choices=ROLES, default="observer", help="role of the user")
+        if name in ("add", "passwd"):
             action.add_argument("--password-stdin", action="store_true", help="read the password from standard input")
-        _add_state(action)
-        action.set_defaults(act={"add": _add, "passwd": _passwd, "rm": _remove}[name])
-    shown = what.add_parser("ls", help="show who may log in")
-    _add_state(shown)
-    shown.set_defaults(act=_ls)
-
-
-def _add_state(parser: argparse.ArgumentParser) -> None:
-    where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument("--config", type=Path, metavar="FILE", help="TOML file of the platform")
-    where.add_argument("--state-dir", type=Path, metavar="DIR", help="folder of the services' stores")
+        where = action.add_mutually_exclusive_group(required=True)
+        where.add_argument("--config", type=Path, metavar="FILE", help="TOML file of the platform")
+        where.add_argument("--state-dir", type=Path, metavar="DIR", help="state folder of the services")
+        action.set_defaults(run_action=run_action)
 
 
 def run(parsed: argparse.Namespace) -> int:
     """Run `sonarpost console`; return the exit status.
 
     Raises:
-        ConfigError: Nothing is asked for.
-        BadInputError: A user's name or password is not allowed.
-        PortError: The address cannot be listened on.
+        ConfigError: No action is requested, or an option is invalid.
+        BadInputError: The name or password of a user is invalid.
+        PortError: The address cannot be bound.
     """
-    if hasattr(parsed, "act"):
-        status: int = parsed.act(parsed)
-        return status
+    if hasattr(parsed, "run_action"):
+        with _open_users(parsed) as users:
+            parsed.run_action(parsed, users)
+        return 0
     if parsed.training is None:
-        raise ConfigError("console", "", "nothing", "`user …` or --training N; the service: `sonarpost run console`")
+        raise ConfigError("console", "", "no action", "`user …` or --training N; the service: `sonarpost run console`")
     if not 1 <= parsed.training <= 100_000:
         raise ConfigError("console", "--training", parsed.training, "1 to 100000")
-    return _train(parsed)
+    return _run_training(parsed)
 
 
-def _users(parsed: argparse.Namespace) -> Users:
+@contextmanager
+def _open_users(parsed: argparse.Namespace) -> Iterator[Users]:
     folder: Path = parsed.state_dir or load(parsed.config, "console", ConsoleConfig, {})[0].state_dir
-    return Users(folder / FILE_NAME)
+    users = Users(folder / FILE_NAME)
+    try:
+        yield users
+    finally:
+        users.close()
 
 
-def _password(parsed: argparse.Namespace) -> str:
+def _read_password(parsed: argparse.Namespace) -> str:
     if parsed.password_stdin:
         return sys.stdin.readline().rstrip("\n")
-    first = getpass.getpass(f"Password of {parsed.name}: ")
-    if getpass.getpass("Again: ") != first:
+    password = getpass.getpass(f"Password of {parsed.name}: ")
+    if getpass.getpass("Again: ") != password:
         raise ConfigError("console", "password", "two different ones", "the same one twice")
-    return first
+    return password
 
 
-def _add(parsed: argparse.Namespace) -> int:
-    users = _users(parsed)
-    try:
-        users.add(parsed.name, parsed.role, _password(parsed))
-    finally:
-        users.close()
-    print(f"{parsed.name} may log in as {parsed.role}")
-    return 0
+def _add(parsed: argparse.Namespace, users: Users) -> None:
+    users.add(parsed.name, parsed.role, _read_password(parsed))
+    print(f"user {parsed.name} added with the role {parsed.role}")
 
 
-def _passwd(parsed: argparse.Namespace) -> int:
-    users = _users(parsed)
-    try:
-        users.set_password(parsed.name, _password(parsed))
-    finally:
-        users.close()
+def _set_password(parsed: argparse.Namespace, users: Users) -> None:
+    users.set_password(parsed.name, _read_password(parsed))
     print(f"password of {parsed.name} changed")
-    return 0
 
 
-def _remove(parsed: argparse.Namespace) -> int:
-    users = _users(parsed)
-    try:
-        if not users.remove(parsed.name):
-            raise ConfigError("console", "name", parsed.name, "a user; `sonarpost console user ls` shows them")
-    finally:
-        users.close()
-    print(f"{parsed.name} may not log in any more")
-    return 0
+def _remove(parsed: argparse.Namespace, users: Users) -> None:
+    if not users.remove(parsed.name):
+        raise ConfigError("console", "name", parsed.name, "a user; `sonarpost console user ls` lists them")
+    print(f"user {parsed.name} removed")
 
 
-def _ls(parsed: argparse.Namespace) -> int:
-    users = _users(parsed)
-    try:
-        for user in users.all():
-            changed = datetime.fromtimestamp(user.changed_utc_s, UTC)
-            print(f"{user.name:<24} {user.role:<10} password of {changed:%Y-%m-%d}")
-    finally:
-        users.close()
-    return 0
+def _list(_parsed: argparse.Namespace, users: Users) -> None:
+    for user in users.all():
+        changed = datetime.fromtimestamp(user.changed_utc_s, UTC)
+        print(f"{user.name:<24} {user.role:<10} password of {changed:%Y-%m-%d}")
 
 
-def _train(parsed: argparse.Namespace) -> int:
-    from sonarpost.services.console.training.simulator import VESSEL, Training  # noqa: PLC0415  it brings codecs and their compiler
+def _run_training(parsed: argparse.Namespace) -> int:
+    # Imported here because it loads the codecs and their compiler.
+    from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory(prefix="sonarpost-training-") as scratch:
         folder: Path = parsed.state or Path(scratch)
@@ -148,31 +128,27 @@ def _train(parsed: argparse.Namespace) -> int:
             password = parsed.password or secrets.token_urlsafe(9)
             for name, role in TRAINING_USERS:
                 users.add(name, role, password)
-            board = Board(config, database)
-            app = ConsoleApp(board, users, VESSEL, training=True)
+            state = ConsoleState(config, database)
+            app = ConsoleApp(state, users, VESSEL, training=True)
             server = WebServer(app.asgi, config.host, config.port)
-            training = Training(board, parsed.training, parsed.seed, parsed.interval)
+            simulator = TrainingSimulator(state, parsed.training, parsed.seed, parsed.interval)
             print(f"{server.address}  users {', '.join(name for name, _ in TRAINING_USERS)}  password {password}")
-            print("Contacts are simulated. Ctrl-C ends it.", flush=True)
-            _serve(app, server, training, parsed.training * 2 // 3)
+            print("All contacts are simulated. Ctrl-C ends the training.", flush=True)
+            stop = threading.Event()
+            if threading.current_thread() is threading.main_thread():
+                for number in (signal.SIGINT, signal.SIGTERM):
+                    signal.signal(number, lambda *_: stop.set())
+            server.start()
+            try:
+                simulator.load_backlog(parsed.training * 2 // 3)
+                simulator.start()
+                while server.running and not stop.wait(0.5):
+                    pass
+            finally:
+                simulator.stop()
+                app.stop()
+                server.stop()
         finally:
             users.close()
             database.close()
     return 0
-
-
-def _serve(app: ConsoleApp, server: WebServer, training: Training, before: int) -> None:
-    ended = threading.Event()
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: ended.set())
-    server.start()
-    try:
-        training.backlog(before)
-        training.start()
-        while server.running and not ended.wait(0.5):
-            pass
-    finally:
-        training.stop()
-        app.end()
-        server.stop()

@@ -13,36 +13,36 @@ from sonarpost.messages import Latitude, Longitude, PlatformId
 
 ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 HostName = Annotated[str, Field(pattern=r"^[A-Za-z0-9.:\[\]_-]{1,253}$")]
-LOCAL = ("127.0.0.1", "localhost", "::1")
+LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 
 
 class ConsoleConfig(ServiceConfig):
-    """Where the page is served, to whom what is sent, and when what is shown is old.
+    """The `[console]` table.
 
     Attributes:
-        role: On a vessel operators decide; ashore experts advise.
-        site: Ashore: name of the c2's site in keys.
-        host: Address that is listened on; other than the host's own only with TLS, or with `insecure`.
-        port: TCP port.
-        names: Names by which browsers reach it, besides `host` and the host's own.
-        tls: Serve by TLS, with the platform's certificate.
-        insecure: Serve other hosts without TLS: for a container whose port is published on its own host only.
-        behind_proxy: Take the address of a browser from `X-Forwarded-For`.
-        decision_consumers: On a vessel: services that are owed decisions.
-        command_consumers: On a vessel: services that are owed requests.
-        vehicles: Names of the vehicles by the modem addresses they send from, as in `[op_modem]`.
-        out_dir: Ashore: c2's folder, for what was accepted while the console was away; none by default.
-        downlink_rate: Micro-Modem rate of the vessel, as in `[op_modem]`; for the cost of requests.
-        assumed_rate: Rate of vehicles that were not heard yet.
-        group_radius_m: How near looks at one object lie where positions are well known.
-        session_s: A session ends after so long without use ...
-        session_max_s: ... and in any case after so long.
-        vehicle_stale_s: A vehicle not heard for so long is shown as stale.
-        classes: Classes of mine-like objects that are offered.
-        vessel_lat_deg: Where the vessel lies, together with `vessel_lon_deg`, for the map; not known by default.
-        vessel_lon_deg: Where the vessel lies.
+        role: `vessel`: operators decide. `shore`: experts comment.
+        site: At a shore site: name of the site in key expressions.
+        host: Address to listen on. Addresses other than the local host need `tls` or `insecure`.
+        port: TCP port; 0 for any free port.
+        names: Host names of the console in addition to `host` and the local host.
+        tls: Serve HTTPS with the certificate of the platform.
+        insecure: Permit other hosts without TLS, for a container whose port is published on the local host only.
+        behind_proxy: Read the browser's address from `X-Forwarded-For`.
+        decision_consumers: On a vessel: services to which decisions are sent.
+        command_consumers: On a vessel: services to which requests are sent.
+        vehicles: Vehicle name for each modem address, as in `[op_modem]`.
+        out_dir: At a shore site: folder of c2, read at the start for records accepted in the meantime.
+        downlink_rate: Micro-Modem rate of the vessel, as in `[op_modem]`; for cost estimates.
+        assumed_rate: Rate of vehicles before their first frame; for cost estimates.
+        group_radius_m: Distance limit of looks at one object, for accurate positions.
+        session_s: A session ends after this time without use.
+        session_max_s: Maximum duration of a session.
+        vehicle_stale_s: A vehicle is stale after this time without a frame.
+        classes: Proposed classes of mine-like objects.
+        vessel_lat_deg: Latitude of the vessel for the map, together with `vessel_lon_deg`.
+        vessel_lon_deg: Longitude of the vessel.
         ring_m: Radii of the range rings on the map.
-        tiles_dir: Folder of map tiles, `{z}/{x}/{y}.png`; none by default.
+        tiles_dir: Folder of map tiles, `{z}/{x}/{y}.png`.
     """
 
     role: Literal["vessel", "shore"] = "vessel"
@@ -70,13 +70,13 @@ class ConsoleConfig(ServiceConfig):
     tiles_dir: Path | None = None
 
     @model_validator(mode="after")
-    def _is_safe(self) -> ConsoleConfig:
-        if self.host not in LOCAL and not (self.tls or self.insecure):
-            raise ValueError(f"tls = true for host {self.host}: passwords go over this connection")
+    def _is_consistent(self) -> ConsoleConfig:
+        if self.host not in LOCAL_HOSTS and not (self.tls or self.insecure):
+            raise ValueError(f"tls = true for host {self.host}: passwords are sent over this connection")
         if (self.vessel_lat_deg is None) != (self.vessel_lon_deg is None):
             raise ValueError("vessel_lat_deg and vessel_lon_deg together")
         return self
 
-    def name_of(self, address: int) -> str:
+    def vehicle_name(self, address: int) -> str:
         """Return the name of the vehicle with a modem address."""
         return self.vehicles.get(str(address), f"modem-{address}")

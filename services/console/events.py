@@ -1,4 +1,4 @@
-"""Events for the pages that are open: numbered, kept for a while, so that a page that was cut off misses nothing."""
+"""Events for open pages: numbered and buffered, so that a page receives the events of an interruption afterwards."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-Json = dict[str, object]
+from sonarpost.services.console.store.serialisers import Json
 
-KEPT = 2000
+BUFFERED_EVENTS = 2000
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One event as it goes to a page.
+    """One event of the HTTP interface.
 
     Attributes:
-        number: Of this run of the server, from 1.
-        name: As in the interface's description.
+        number: Number within one run of the server, from 1.
+        name: Type of the event.
         data: JSON text.
     """
 
@@ -30,89 +30,90 @@ class Event:
     data: str
 
 
-class Hub:
-    """Gives events to whoever listens, from any thread.
+class EventHub:
+    """Distributes events to subscribers, from any thread.
 
-    Events are numbered within one run; an identifier of another run is not known here, and its page loads anew.
+    Events are numbered within one run. A page with an event identifier of another run reloads all data.
+
+    Args:
+        buffered: Number of buffered events.
     """
 
-    def __init__(self, kept: int = KEPT) -> None:
+    def __init__(self, buffered: int = BUFFERED_EVENTS) -> None:
         self.run = uuid.uuid4().hex[:8]
         self._lock = threading.Lock()
-        self._events: deque[Event] = deque(maxlen=kept)
+        self._events: deque[Event] = deque(maxlen=buffered)
         self._last = 0
-        self._listeners: dict[int, Callable[[], None]] = {}
-        self._next_listener = 0
+        self._subscribers: dict[int, Callable[[], None]] = {}
+        self._next_subscriber = 0
 
     def publish(self, name: str, data: Json) -> None:
-        """Add an event and wake the listeners."""
+        """Add an event and notify the subscribers."""
         text = json.dumps(data, allow_nan=False, separators=(",", ":"))
         with self._lock:
             self._last += 1
             self._events.append(Event(self._last, name, text))
-            listeners = tuple(self._listeners.values())
-        for wake in listeners:
-            wake()
+        self.notify_all()
 
-    def listen(self, wake: Callable[[], None]) -> int:
-        """Call `wake`, from any thread and without delay, at every event; return a number for `leave`."""
+    def subscribe(self, notify: Callable[[], None]) -> int:
+        """Call `notify` at every event, from any thread; it must not block. Return a number for `unsubscribe`."""
         with self._lock:
-            self._next_listener += 1
-            self._listeners[self._next_listener] = wake
-            return self._next_listener
+            self._next_subscriber += 1
+            self._subscribers[self._next_subscriber] = notify
+            return self._next_subscriber
 
-    def leave(self, listener: int) -> None:
-        """Wake a listener no more."""
+    def unsubscribe(self, subscriber: int) -> None:
+        """Remove a subscriber."""
         with self._lock:
-            self._listeners.pop(listener, None)
+            self._subscribers.pop(subscriber, None)
 
-    def wake_all(self) -> None:
-        """Wake the listeners without an event, for the end."""
+    def notify_all(self) -> None:
+        """Notify the subscribers, also without an event, for example when the server stops."""
         with self._lock:
-            listeners = tuple(self._listeners.values())
-        for wake in listeners:
-            wake()
+            subscribers = tuple(self._subscribers.values())
+        for notify in subscribers:
+            notify()
 
     @property
-    def listeners(self) -> int:
-        """How many pages listen."""
+    def subscriber_count(self) -> int:
+        """Number of subscribers."""
         with self._lock:
-            return len(self._listeners)
+            return len(self._subscribers)
 
     @property
     def last(self) -> int:
-        """Number of the last event, 0 before the first."""
+        """Number of the last event, 0 before the first one."""
         with self._lock:
             return self._last
 
-    def since(self, number: int) -> tuple[Event, ...] | None:
-        """Return the events after a number; None where some of them are not kept any more."""
+    def events_after(self, number: int) -> tuple[Event, ...] | None:
+        """Return the events after a number; None if some of them are no longer buffered."""
         with self._lock:
             if number > self._last or (self._events and number < self._events[0].number - 1):
                 return None
             return tuple(event for event in self._events if event.number > number)
 
-    def identifier(self, number: int) -> str:
-        """Return an event's identifier, which a page gives back as `Last-Event-ID`."""
+    def event_id(self, number: int) -> str:
+        """Return the identifier of an event, which a page returns as `Last-Event-ID`."""
         return f"{self.run}-{number}"
 
-    def number_of(self, identifier: str) -> int | None:
-        """Return the number in an identifier of this run, None for another's."""
+    def parse_event_id(self, identifier: str) -> int | None:
+        """Return the number in an event identifier; None if it is of another run."""
         run, _, number = identifier.partition("-")
         return int(number) if run == self.run and number.isdecimal() and len(number) < 16 else None
 
 
-class Pace:
-    """Lets something happen so often and no more, for each of several names."""
+class RateLimiter:
+    """Limits how often something happens, separately for each name."""
 
-    def __init__(self, every_s: float) -> None:
-        self._every_s = every_s
-        self._last: dict[str, float] = {}
+    def __init__(self, interval_s: float) -> None:
+        self._interval_s = interval_s
+        self._last_s: dict[str, float] = {}
 
     def allows(self, name: str, now_s: float | None = None) -> bool:
-        """Tell whether it is time again for a name, and if so begin its time anew."""
+        """Return whether the interval since the last permitted call for this name has passed; `now_s` is monotonic."""
         now = time.monotonic() if now_s is None else now_s
-        if now - self._last.get(name, -self._every_s) < self._every_s:
+        if now - self._last_s.get(name, -self._interval_s) < self._interval_s:
             return False
-        self._last[name] = now
+        self._last_s[name] = now
         return True

@@ -1,163 +1,204 @@
-"""What is known of vehicles and services at this moment; kept in memory, as it is worth nothing later."""
+"""Present state of vehicles and services. It is kept in memory and not stored."""
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 import time
 from collections import deque
 from dataclasses import dataclass, field
 
-from sonarpost.messages import AcousticFrame, Health, QueueState
+from sonarpost.messages import AcousticFrame, QueueState
 from sonarpost.monitoring.fleet import FleetTracker, ServiceStatus
+from sonarpost.review.local_frame import distance_m
+from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.serialisers import Json
 
 PACKETS_KEPT = 20
-MOST_VEHICLES = 200
-SILENT_S = 15.0
+MAX_VEHICLES = 200
+SERVICE_STALE_S = 15.0
 
 
 @dataclass
-class _Heard:
-    """What was heard of one vehicle; `at_s` of the monotonic clock."""
+class _Link:
+    """Received frames of one vehicle; times of the monotonic clock. Packets: (number, frames, bad frames)."""
 
     frame: AcousticFrame
-    at_s: float
+    received_s: float
     packets: deque[tuple[int, int, int]] = field(default_factory=lambda: deque(maxlen=PACKETS_KEPT))
     frames_at_s: deque[float] = field(default_factory=lambda: deque(maxlen=500))
 
+    def loss(self) -> float | None:
+        """Return the fraction of bad frames of the last packets; None if unknown."""
+        frames = sum(packet[1] for packet in self.packets)
+        return round(sum(packet[2] for packet in self.packets) / frames, 3) if frames else None
 
-@dataclass
-class _Queue:
-    state: QueueState
-    at_s: float
 
-
-class FleetPanel:
-    """Collects frames, queues and health, from any thread.
+class FleetMonitor:
+    """Collects acoustic frames, transmit queues and health, from any thread.
 
     Args:
-        stale_s: A vehicle not heard for so long is stale.
+        stale_s: Time without a frame after which a vehicle is stale.
     """
 
     def __init__(self, stale_s: float) -> None:
         self.services = FleetTracker()
         self._stale_s = stale_s
         self._lock = threading.Lock()
-        self._heard: dict[str, _Heard] = {}
-        self._queues: dict[str, _Queue] = {}
+        self._links: dict[str, _Link] = {}
+        self._queues: dict[str, tuple[QueueState, float]] = {}
 
-    def hear(self, vehicle_id: str, frame: AcousticFrame, now_s: float | None = None) -> None:
-        """Take a frame of a vehicle that came out of the water; `now_s` is monotonic."""
+    def add_frame(self, vehicle_id: str, frame: AcousticFrame, now_s: float | None = None) -> None:
+        """Add a frame received from a vehicle; `now_s` is monotonic."""
         now = time.monotonic() if now_s is None else now_s
         with self._lock:
-            if vehicle_id not in self._heard and len(self._heard) >= MOST_VEHICLES:
+            if vehicle_id not in self._links and len(self._links) >= MAX_VEHICLES:
                 return
-            heard = self._heard.setdefault(vehicle_id, _Heard(frame, now))
-            heard.frame, heard.at_s = frame, now
-            heard.frames_at_s.append(now)
+            link = self._links.setdefault(vehicle_id, _Link(frame, now))
+            link.frame, link.received_s = frame, now
+            link.frames_at_s.append(now)
             quality = frame.quality
             frames = (quality.frames if quality else None) or frame.frame_count or 1
             bad = (quality.bad_frames if quality else None) or 0
-            packet = (frame.packet, frames, bad)
-            if not heard.packets or heard.packets[-1][0] != frame.packet:
-                heard.packets.append(packet)
-            else:
-                heard.packets[-1] = packet
+            if link.packets and link.packets[-1][0] == frame.packet:
+                link.packets.pop()
+            link.packets.append((frame.packet, frames, bad))
 
-    def take_queue(self, state: QueueState, now_s: float | None = None) -> None:
-        """Take what a vehicle says of its queue."""
+    def set_queue(self, state: QueueState, now_s: float | None = None) -> None:
+        """Store the state of a vehicle's transmit queue; `now_s` is monotonic."""
         with self._lock:
-            if state.platform_id in self._queues or len(self._queues) < MOST_VEHICLES:
-                self._queues[state.platform_id] = _Queue(state, time.monotonic() if now_s is None else now_s)
+            if state.platform_id in self._queues or len(self._queues) < MAX_VEHICLES:
+                self._queues[state.platform_id] = (state, time.monotonic() if now_s is None else now_s)
 
-    def rate_of(self, vehicle_id: str, assumed: int | None) -> int | None:
-        """Return the rate at which a vehicle was heard last, `assumed` where it was not."""
+    def uplink_rate(self, vehicle_id: str, default: int | None) -> int | None:
+        """Return the latest Micro-Modem rate of a vehicle, or `default` if unknown."""
         with self._lock:
-            heard = self._heard.get(vehicle_id)
-            rate = None if heard is None else heard.frame.rate
-            return assumed if rate is None else rate
+            link = self._links.get(vehicle_id)
+            rate = None if link is None else link.frame.rate
+            return default if rate is None else rate
 
-    def loss_of(self, vehicle_id: str) -> float | None:
-        """Return the share of frames lost lately, None where it is not known."""
+    def frame_loss(self, vehicle_id: str) -> float | None:
+        """Return the fraction of recently lost frames, 0 to 1; None if unknown."""
         with self._lock:
-            heard = self._heard.get(vehicle_id)
-            return None if heard is None else _loss(heard)
+            link = self._links.get(vehicle_id)
+            return None if link is None else link.loss()
 
-    def wait_s(self, vehicle_id: str, now_utc_s: float) -> float | None:
-        """Return how long the vehicle's queue takes from now on, None where it is not seen."""
+    def queue_wait_s(self, vehicle_id: str, now_utc_s: float) -> float | None:
+        """Return the time that the vehicle needs to send its present queue; None if unknown."""
         with self._lock:
-            queue = self._queues.get(vehicle_id)
-            if queue is None:
+            if vehicle_id not in self._queues:
                 return None
-            return max((image.expected_utc_s - now_utc_s for image in queue.state.images), default=0.0)
+            state, _ = self._queues[vehicle_id]
+            return max((image.expected_utc_s - now_utc_s for image in state.images), default=0.0)
 
-    def link(self, now_s: float | None = None) -> list[Json]:
-        """Return what is known of every vehicle's link, by name."""
+    def vehicles(self, now_s: float | None = None) -> dict[str, Json]:
+        """Return the link and queue state of all vehicles by name."""
         now = time.monotonic() if now_s is None else now_s
         with self._lock:
-            return [self._vehicle(name, now) for name in sorted({*self._heard, *self._queues})]
+            return {name: self._vehicle_json(name, now) for name in sorted({*self._links, *self._queues})}
 
-    def _vehicle(self, name: str, now: float) -> Json:
-        heard, queue = self._heard.get(name), self._queues.get(name)
-        age_s = None if heard is None else round(max(0.0, now - heard.at_s), 1)
-        quality = heard.frame.quality if heard else None
+    def _vehicle_json(self, name: str, now: float) -> Json:
+        link = self._links.get(name)
+        if link is None:
+            return {**unknown_vehicle_json(name), "queue": self._queue_json(name, now)}
+        age_s = round(max(0.0, now - link.received_s), 1)
         return {
-            "vehicle_id": name,
-            "last_heard_utc_s": heard and heard.frame.time_utc_s,
+            **_frame_quality(name, link.frame),
+            "last_heard_utc_s": link.frame.time_utc_s,
             "age_s": age_s,
-            "stale": age_s is None or age_s > self._stale_s,
-            "rate": heard and heard.frame.rate,
-            "snr_in_db": quality and quality.snr_in_db,
-            "snr_out_db": quality and quality.snr_out_db,
-            "frames": sum(packet[1] for packet in heard.packets) if heard else 0,
-            "bad_frames": sum(packet[2] for packet in heard.packets) if heard else 0,
-            "loss": _loss(heard) if heard else None,
-            "frames_per_minute": sum(now - at_s < 60 for at_s in heard.frames_at_s) if heard else 0,
-            "queue": None if queue is None else _queue(queue, now, self._stale_s),
+            "stale": age_s > self._stale_s,
+            "frames": sum(packet[1] for packet in link.packets),
+            "bad_frames": sum(packet[2] for packet in link.packets),
+            "loss": link.loss(),
+            "frames_per_minute": sum(now - at_s < 60 for at_s in link.frames_at_s),
+            "queue": self._queue_json(name, now),
         }
 
+    def _queue_json(self, name: str, now: float) -> Json | None:
+        if name not in self._queues:
+            return None
+        state, received_s = self._queues[name]
+        age_s = round(max(0.0, now - received_s), 1)
+        body = state.model_dump(exclude={"platform_id", "images"})
+        images = [image.model_dump() for image in state.images]
+        return {**body, "age_s": age_s, "stale": age_s > self._stale_s, "images": images}
+
     def service_list(self, now_s: float | None = None) -> list[Json]:
-        """Return what is known of every service."""
+        """Return the state of all services."""
         now = time.monotonic() if now_s is None else now_s
-        return [_service(seen) for seen in self.services.state(now).services]
+        return [_service_json(status) for status in self.services.state(now).services]
+
+
+def unknown_vehicle_json(name: str) -> Json:
+    """Return the state of a vehicle without received frames."""
+    unknown = ("last_heard_utc_s", "age_s", "rate", "snr_in_db", "snr_out_db", "loss", "queue")
+    zero = ("frames", "bad_frames", "frames_per_minute")
+    return {"vehicle_id": name, **dict.fromkeys(unknown), **dict.fromkeys(zero, 0), "stale": True}
 
 
 def frame_event(vehicle_id: str, frame: AcousticFrame) -> Json:
-    """Return what pages hear of a frame of a vehicle."""
+    """Return the event of a received frame."""
+    return {**_frame_quality(vehicle_id, frame), "utc_s": frame.time_utc_s, "bytes": len(frame.data)}
+
+
+def _frame_quality(vehicle_id: str, frame: AcousticFrame) -> Json:
     quality = frame.quality
     return {
         "vehicle_id": vehicle_id,
-        "utc_s": frame.time_utc_s,
         "rate": frame.rate,
         "snr_in_db": quality and quality.snr_in_db,
         "snr_out_db": quality and quality.snr_out_db,
-        "bytes": len(frame.data),
     }
 
 
-def _loss(heard: _Heard) -> float | None:
-    frames = sum(packet[1] for packet in heard.packets)
-    return round(sum(packet[2] for packet in heard.packets) / frames, 3) if frames else None
-
-
-def _queue(queue: _Queue, now_s: float, stale_s: float) -> Json:
-    state = queue.state
-    age_s = round(max(0.0, now_s - queue.at_s), 1)
-    body = state.model_dump(exclude={"platform_id", "images"})
-    images = [image.model_dump() for image in state.images]
-    return {**body, "age_s": age_s, "stale": age_s > stale_s, "images": images}
-
-
-def _service(seen: ServiceStatus) -> Json:
-    health: Health | None = seen.health
-    stale = seen.age_s is None or seen.age_s > SILENT_S
+def _service_json(status: ServiceStatus) -> Json:
+    health = status.health
+    stale = status.age_s is None or status.age_s > SERVICE_STALE_S
     state = "silent" if health is None or (stale and health.state != "stopping") else health.state
     return {
-        "platform_id": seen.platform,
-        "service": seen.service,
+        "platform_id": status.platform,
+        "service": status.service,
         "state": state,
         "detail": health.detail if health else "",
         "time_utc_s": health and health.time_utc_s,
-        "age_s": None if seen.age_s is None else round(seen.age_s, 1),
+        "age_s": None if status.age_s is None else round(status.age_s, 1),
         "stale": stale,
     }
+
+
+def fleet_json(monitor: FleetMonitor, db: sqlite3.Connection, config: ConsoleConfig, now_utc_s: float) -> Json:
+    """Return the state of services and vehicles, with the position of each vehicle at its last contact."""
+    positions = {
+        row["vehicle_id"]: row
+        for row in db.execute(
+            "SELECT vehicle_id, vehicle_lat_deg, vehicle_lon_deg,"
+            " MAX(COALESCE(seen_utc_s, first_frame_utc_s)) AS seen_utc_s"
+            " FROM contact WHERE vehicle_lat_deg IS NOT NULL GROUP BY vehicle_id"
+        )
+    }
+    open_requests = dict(
+        db.execute(
+            "SELECT c.vehicle_id, COUNT(*) FROM request r JOIN contact c ON c.id = r.contact_id"
+            " WHERE r.state IN ('waiting', 'asked', 'sent') GROUP BY c.vehicle_id"
+        ).fetchall()
+    )
+    known = monitor.vehicles()
+    vehicles: list[Json] = []
+    for name in sorted({*known, *positions}):
+        row = positions.get(name)
+        range_m = None
+        if row is not None and config.vessel_lat_deg is not None and config.vessel_lon_deg is not None:
+            vehicle = (row["vehicle_lat_deg"], row["vehicle_lon_deg"])
+            range_m = round(distance_m(config.vessel_lat_deg, config.vessel_lon_deg, *vehicle), 1)
+        vehicles.append(
+            {
+                **(known.get(name) or unknown_vehicle_json(name)),
+                "range_m": range_m,
+                "range_utc_s": row["seen_utc_s"] if row is not None and range_m is not None else None,
+                "lat_deg": row and row["vehicle_lat_deg"],
+                "lon_deg": row and row["vehicle_lon_deg"],
+                "position_utc_s": row and row["seen_utc_s"],
+                "open_orders": open_requests.get(name, 0),
+            }
+        )
+    return {"now_utc_s": now_utc_s, "services": [*monitor.service_list()], "vehicles": [*vehicles]}

@@ -1,14 +1,16 @@
-"""The operator's console as a service: pictures in, decisions, requests and advice out, a page in between."""
+"""The console service: receives images, sends decisions, requests and comments, and serves the web page."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import islice
+from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
 import zenoh
 
 from sonarpost import keys, wire
@@ -16,6 +18,7 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError, PayloadError
+from sonarpost.export.contacts import SideCar, read_stored_records
 from sonarpost.logs import kv
 from sonarpost.messages import (
     AcousticFrame,
@@ -24,6 +27,7 @@ from sonarpost.messages import (
     Decision,
     DownlinkState,
     Health,
+    Pixels,
     QueueState,
     ReconstructedImage,
     Record,
@@ -31,15 +35,14 @@ from sonarpost.messages import (
 )
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.events import Pace
+from sonarpost.services.console.events import RateLimiter
 from sonarpost.services.console.fleet import frame_event
-from sonarpost.services.console.shore_import import kept_in
-from sonarpost.services.console.state import Board, Unsent
+from sonarpost.services.console.state import ConsoleState, UnsentRecord
 from sonarpost.services.console.store.database import Database
 from sonarpost.services.console.store.requests import Table
 from sonarpost.services.console.store.users import FILE_NAME, Users
-from sonarpost.services.console.web.map_routes import fleet
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
+from sonarpost.sonar.image_files import read_image
 
 log = logging.getLogger(__name__)
 
@@ -48,25 +51,25 @@ COMMAND_PRIORITY = 1
 ADVICE_PRIORITY = 2
 DECISION_PRIORITY = 2
 C2 = "c2"
-TICK_S = 1.0
-CATCH_UP_AT_ONCE = 50
-FRAMES_EVERY_S = 0.2
-_SETTLED = "settled/"
-# The relay's health is as of a moment before it was sent.
-ASHORE_MARGIN_S = 2.0
+UPDATE_INTERVAL_S = 1.0
+FRAME_EVENT_INTERVAL_S = 0.2
+CATCH_UP_BATCH = 50
+SHORE_DELIVERY_MARGIN_S = 2.0
+"""Age that a decision must have before the relay's health proves its delivery: health is older than its arrival."""
+_ACKNOWLEDGED = "settled/"
+"""Prefix of the store's state entries: {prefix}{table}/{consumer}/{record_id} -> reason of a refusal, or empty."""
 
 R = TypeVar("R", bound=Record)
 
 
 class ConsoleService(Service[ConsoleConfig]):
-    """Shows people what arrives and carries what they say.
+    """Serves the page for operators and experts.
 
-    What people do is written down first and owed to its consumers afterwards, under the same identifier however often:
-    they take it once.
+    Operators' actions are first stored in the console's database and then queued in the outbox. After a crash in
+    between they are queued again with the same identifier, and consumers ignore the repetition.
 
     Raises:
-        ConfigError: TLS is wanted and the platform has no certificate.
-        PortError: The address cannot be listened on.
+        ConfigError: `tls` is set, and the platform has no certificate.
         DeliveryError: A database cannot be opened.
     """
 
@@ -78,17 +81,17 @@ class ConsoleService(Service[ConsoleConfig]):
         super().__init__(platform, config)
         self._database = Database(platform.state_dir / DATABASE_NAME)
         self._users = Users(platform.state_dir / FILE_NAME, config.session_s, config.session_max_s)
-        self.board = Board(config, self._database)
-        self._app = ConsoleApp(self.board, self._users, platform.id)
+        self.state = ConsoleState(config, self._database)
+        self._app = ConsoleApp(self.state, self._users, platform.id)
         self._server: WebServer | None = None
         self._wake = threading.Event()
-        self.board.on_unsent = self._wake.set
-        self._pace = Pace(FRAMES_EVERY_S)
-        self._send_problem = ""
+        self.state.on_unsent = self._wake.set
+        self._frame_events = RateLimiter(FRAME_EVENT_INTERVAL_S)
+        self._send_error = ""
 
     @property
     def address(self) -> str:
-        """Where a browser finds the page; empty before the start."""
+        """URL of the page; empty before the start."""
         return "" if self._server is None else self._server.address
 
     @property
@@ -96,7 +99,7 @@ class ConsoleService(Service[ConsoleConfig]):
         return self.config.role == "vessel"
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """On a vessel its pictures and the shore's advice; ashore what c2 shows."""
+        """On a vessel: its images and comments. At a shore site: images and decisions published by c2."""
         if self._on_vessel:
             vessel = self.platform.id
             return {keys.image_reconstructed(vessel): ReconstructedImage, keys.advice(vessel): Advice}
@@ -104,7 +107,7 @@ class ConsoleService(Service[ConsoleConfig]):
         return {keys.shore_image_all(site): ReconstructedImage, keys.shore_decision_all(site): Decision}
 
     def validate(self, key: str, record: Record) -> None:
-        """Refuse what speaks for another vessel, while its sender can be told."""
+        """Refuse a record of another vessel."""
         if self._on_vessel and isinstance(record, (ReconstructedImage, Advice)):
             if record.vessel_id != self.platform.id:
                 raise PayloadError(key, "vessel_id", record.vessel_id, self.platform.id)
@@ -115,33 +118,33 @@ class ConsoleService(Service[ConsoleConfig]):
                 raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """Keep what has come; a second time it changes nothing."""
+        """Store a record. A repeated record changes nothing."""
         if isinstance(record, ReconstructedImage):
-            effects.count("images_taken" if self.board.take_image(record) else "images_repeated")
+            effects.count("images_taken" if self.state.store_image(record) else "images_repeated")
         elif isinstance(record, Decision):
-            effects.count("decisions_taken" if self.board.take_decision(record) else "decisions_repeated")
+            effects.count("decisions_taken" if self.state.store_decision(record) else "decisions_repeated")
         else:
             assert isinstance(record, Advice)
-            self.board.take_advice(record)
+            self.state.store_advice(record)
             effects.count("advice_taken")
 
-    # Out
+    # Sending
 
-    def _send_unsent(self) -> None:
-        """Owe what people did to those who take it, as soon as it is written down."""
+    def _send_loop(self) -> None:
+        """Queue the records of operators' actions in the outbox, and apply acknowledgements."""
         while not self.stopping.is_set():
             self._wake.clear()
             try:
-                self._apply_settled()
-                for item in self.board.unsent():
+                self._apply_acknowledgements()
+                for item in self.state.unsent_records():
                     self._send(item)
-                self._send_problem = ""
+                self._send_error = ""
             except (OSError, DeliveryError) as error:
-                self._send_problem = f"{type(error).__name__}: {error}"
-                log.error("Not handed on, trying again", extra=kv(reason=str(error)))
-            self._wake.wait(TICK_S)
+                self._send_error = f"{type(error).__name__}: {error}"
+                log.error("Records not queued, trying again", extra=kv(reason=str(error)))
+            self._wake.wait(UPDATE_INTERVAL_S)
 
-    def _send(self, item: Unsent) -> None:
+    def _send(self, item: UnsentRecord) -> None:
         effects = UnitOfWork()
         record, vessel, site = item.record, item.vessel_id, self.config.site
         if isinstance(record, Decision):
@@ -159,66 +162,67 @@ class ConsoleService(Service[ConsoleConfig]):
             effects.send(keys.tasking_command(vessel, site), C2, record, priority=COMMAND_PRIORITY)
             effects.count("requests_made")
         self.commit(effects)
-        # Killed in between, it is owed once more, and its consumers know it by its identifier.
-        self.board.mark_sent(item)
+        # After a crash here the record is queued again. Its consumers recognise its identifier.
+        self.state.mark_sent(item)
 
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
-        """Remember that a consumer has taken a record or refused it; the board is told outside of this transaction."""
-        table, record_id = _what(item)
-        tx.put_state(f"{_SETTLED}{table}/{item.queue}/{record_id}", b"" if reason is None else reason.encode())
+        """Store an acknowledgement. The send loop applies it to the console's database after this transaction."""
+        table, record_id = _table_and_id(item)
+        tx.put_state(f"{_ACKNOWLEDGED}{table}/{item.queue}/{record_id}", b"" if reason is None else reason.encode())
         self._wake.set()
 
-    def _apply_settled(self) -> None:
-        for name in self.store.state_names(_SETTLED):
+    def _apply_acknowledgements(self) -> None:
+        tables: Mapping[str, Table] = {"decision": "decision", "request": "request", "advice": "advice"}
+        for name in self.store.state_names(_ACKNOWLEDGED):
             value = self.store.get_state(name)
-            table, consumer, record_id = name.removeprefix(_SETTLED).split("/", 2)
+            table, consumer, record_id = name.removeprefix(_ACKNOWLEDGED).split("/", 2)
             if value is not None:
-                # A reason, or nothing: refusals always have one.
-                tables: Mapping[str, Table] = {"decision": "decision", "request": "request", "advice": "advice"}
-                self.board.settled(tables[table], record_id, consumer, value.decode() or None)
+                # A refusal always has a reason.
+                self.state.apply_acknowledgement(tables[table], record_id, consumer, value.decode() or None)
             with self.store.transaction() as tx:
                 tx.delete_state(name)
 
-    # Watching
+    # Subscriptions
 
     def on_start(self) -> None:
-        """Serve the page, watch, and take what came ashore meanwhile.
+        """Start the web server, the subscriptions and the threads.
 
         Raises:
-            PortError: The address cannot be listened on.
+            PortError: The address cannot be bound.
+            ConfigError: The certificate cannot be used.
         """
         tls = self.platform.tls if self.config.tls else None
         self._server = WebServer(self._app.asgi, self.config.host, self.config.port, tls)
         if not self._users.all():
-            log.warning("Nobody may log in yet: `sonarpost console user add NAME --role operator --config FILE`")
+            log.warning("No users: add one with `sonarpost console user add NAME --role operator --config FILE`")
         if self._on_vessel:
             vessel = self.platform.id
-            self._watch(keys.acoustic_rx(vessel), AcousticFrame, self._on_frame)
-            self._watch(keys.acoustic_downlink(vessel), DownlinkState, self.board.take_downlink)
-            self._watch(keys.contact_decision(vessel), Decision, self._on_decision)
-            self._watch(keys.acoustic_queue_everywhere(), QueueState, self.board.fleet.take_queue)
+            self._subscribe(keys.acoustic_rx(vessel), AcousticFrame, self._on_frame)
+            self._subscribe(keys.acoustic_downlink(vessel), DownlinkState, self.state.apply_downlink_state)
+            self._subscribe(keys.contact_decision(vessel), Decision, self._on_decision)
+            self._subscribe(keys.acoustic_queue_everywhere(), QueueState, self.state.fleet.set_queue)
         else:
-            self._watch(keys.tasking_state_all(self.config.site), TaskingState, self.board.take_tasking)
-        # Ashore only the site's own: the health of every service of every vessel would load their radios for ever.
+            self._subscribe(keys.tasking_state_all(self.config.site), TaskingState, self.state.apply_tasking_state)
+        # A shore site subscribes to its own health only: the health of all vessels would load their radio links.
         health = keys.health_everywhere() if self._on_vessel else keys.health_all(self.platform.id)
         self.session.declare_subscriber(health, self._on_health)
         self._server.start()
-        self.start_thread(self._send_unsent, "send")
-        self.start_thread(self._tick, "tick")
+        self.start_thread(self._send_loop, "send")
+        self.start_thread(self._update_loop, "update")
         if not self._on_vessel and self.config.out_dir is not None:
             self.start_thread(self._catch_up, "catch-up")
 
-    def _watch(self, key: str, record_type: type[R], take: Callable[[R], object]) -> None:
+    def _subscribe(self, key: str, record_type: type[R], apply: Callable[[R], object]) -> None:
         def on_sample(sample: zenoh.Sample) -> None:
             if sample.kind != zenoh.SampleKind.PUT:
                 return
             try:
-                take(wire.decode(record_type, sample.payload.to_bytes(), str(sample.key_expr)))
+                apply(wire.decode(record_type, sample.payload.to_bytes(), str(sample.key_expr)))
             except BadInputError as error:
                 self.count("records_ignored")
-                log.warning("Record ignored", extra=kv(reason=str(error)))
+                log.warning("Invalid record ignored", extra=kv(reason=str(error)))
             except DeliveryError as error:
-                log.error("Record not kept", extra=kv(reason=str(error)))
+                log.error("Record not stored", extra=kv(reason=str(error)))
 
         self.session.declare_subscriber(key, on_sample)
 
@@ -226,100 +230,126 @@ class ConsoleService(Service[ConsoleConfig]):
         if sample.kind != zenoh.SampleKind.PUT:
             return
         key, payload = str(sample.key_expr), sample.payload.to_bytes()
-        self.board.fleet.services.take(key, payload, time.monotonic())
+        self.state.fleet.services.take(key, payload, time.monotonic())
         if self._on_vessel and key == keys.health(self.platform.id, "relay"):
             try:
-                self._on_relay(wire.decode(Health, payload, key))
+                self._on_relay_health(wire.decode(Health, payload, key))
             except (BadInputError, DeliveryError) as error:
-                log.warning("Relay's health not used", extra=kv(reason=str(error)))
+                log.warning("Health record of the relay ignored", extra=kv(reason=str(error)))
 
-    def _on_relay(self, health: Health) -> None:
-        """Learn that decisions are ashore: none waits in the relay, and nothing that it has not looked at."""
-        waiting = health.gauges.get("decisions_waiting")
-        if waiting == 0 and health.gauges.get("inbox") == 0:
-            # By the earlier of both clocks: neither may make a record out that came since.
-            self.board.all_ashore_before(min(health.time_utc_s, time.time()) - ASHORE_MARGIN_S)
+    def _on_relay_health(self, health: Health) -> None:
+        """Mark decisions as delivered to shore if the relay has no decision in its inbox and outbox."""
+        if health.gauges.get("decisions_waiting") == 0 and health.gauges.get("inbox") == 0:
+            # The earlier one of both clocks, so that a wrong clock does not include newer decisions.
+            self.state.mark_delivered_to_shore(min(health.time_utc_s, time.time()) - SHORE_DELIVERY_MARGIN_S)
 
     def _on_frame(self, frame: AcousticFrame) -> None:
         if frame.direction != "rx":
             return
-        vehicle = self.config.name_of(frame.source)
-        self.board.fleet.hear(vehicle, frame)
-        if self._pace.allows(vehicle):
-            self.board.hub.publish("frame", frame_event(vehicle, frame))
+        vehicle = self.config.vehicle_name(frame.source)
+        self.state.fleet.add_frame(vehicle, frame)
+        if self._frame_events.allows(vehicle):
+            self.state.events.publish("frame", frame_event(vehicle, frame))
 
     def _on_decision(self, record: Decision) -> None:
         if record.vessel_id != self.platform.id:
             raise PayloadError(keys.contact_decision(self.platform.id), "vessel_id", record.vessel_id, self.platform.id)
-        self.board.take_decision(record)
+        self.state.store_decision(record)
 
-    def _tick(self) -> None:
-        """Tell the pages once a second how everything is, and let the service end where the page's server has."""
-        while not self.stopping.wait(TICK_S):
+    def _update_loop(self) -> None:
+        """Publish the fleet state once a second, and fail if the web server has stopped."""
+        while not self.stopping.wait(UPDATE_INTERVAL_S):
             if self._server is not None and not self._server.running:
-                raise RuntimeError("the web server has ended")
-            # Tokens are not asked for here: what has been silent for long is forgotten by its age.
-            self.board.fleet.services.set_alive(None, time.monotonic())
+                raise RuntimeError("the web server has stopped")
+            # The console does not read liveliness tokens: silent services are removed by their age.
+            self.state.fleet.services.set_alive(None, time.monotonic())
             try:
-                self.board.hub.publish("fleet", fleet(self.board))
+                self.state.events.publish("fleet", self.state.fleet_state())
             except DeliveryError as error:
-                log.error("Fleet not told", extra=kv(reason=str(error)))
+                log.error("Fleet state not published", extra=kv(reason=str(error)))
 
     def _catch_up(self) -> None:
+        """Store the records that c2 accepted while the console was stopped."""
         assert self.config.out_dir is not None
-        kept = kept_in(self.config.out_dir)
+        records = stored_records(self.config.out_dir)
         try:
-            while not self.stopping.is_set() and (some := list(islice(kept, CATCH_UP_AT_ONCE))):
-                new = self.board.take_images([record for record in some if isinstance(record, ReconstructedImage)])
-                new += sum(self.board.take_decision(record) for record in some if isinstance(record, Decision))
+            while not self.stopping.is_set() and (batch := list(islice(records, CATCH_UP_BATCH))):
+                new = self.state.store_images([record for record in batch if isinstance(record, ReconstructedImage)])
+                new += sum(self.state.store_decision(record) for record in batch if isinstance(record, Decision))
                 self.count("records_caught_up", new)
         except DeliveryError as error:
-            log.error("What c2 keeps is not taken, the next start tries again", extra=kv(reason=str(error)))
+            log.error("Records of c2 not stored, trying again at the next start", extra=kv(reason=str(error)))
 
-    # Life
+    # Stop and health
 
     def on_stop(self) -> None:
-        """End the page."""
+        """Stop the web server."""
         self._wake.set()
-        self._app.end()
+        self._app.stop()
         if self._server is not None:
             self._server.stop()
 
     def stop(self) -> None:
-        """Stop, and close the databases when nothing uses them any more."""
+        """Stop the service, and close the databases afterwards."""
         super().stop()
         self._database.close()
         self._users.close()
 
     def degraded_reason(self) -> str:
-        """Return what keeps decisions from being handed on."""
-        return self._send_problem
+        """Return why records cannot be queued; empty if they can."""
+        return self._send_error
 
     def warning(self) -> str:
-        """Say that nobody may log in."""
-        return "" if self._users.all() else "nobody may log in yet"
+        """Return a warning if there are no users."""
+        return "" if self._users.all() else "no users"
 
     def gauges(self) -> Mapping[str, float]:
-        """Return how many contacts there are, and how many wait for a decision."""
-        counts = self.board.counts()
+        """Return the number of contacts, of contacts without a decision, and of open pages."""
+        counts = self.state.counts()
         return {
             "contacts": float(counts.total),
             "contacts_unreviewed": float(counts.unreviewed),
-            "pages_open": float(self.board.hub.listeners),
+            "pages_open": float(self.state.events.subscriber_count),
         }
 
 
-def _what(item: OutboxItem) -> tuple[Table, str]:
-    """Return of which kind a record in the outbox is, and its identifier."""
-    types: Mapping[Table, type[Decision] | type[Command] | type[Advice]] = {
-        "decision": Decision,
-        "request": Command,
-        "advice": Advice,
-    }
-    for table, record_type in types.items():
-        if item.encoding == wire.encoding_of(record_type):
-            record = wire.decode(record_type, item.payload, item.key)
-            if isinstance(record, Decision):
-                return table, record.decision_id
-            return table, record.command_id if isinstance(record, Command) else record.advice_id
-    raise BadInputError(item.key, "encoding", item.encoding, "a decision, a command or advice")
+def _table_and_id(item: OutboxItem) -> tuple[Table, str]:
+    """Return the table and identifier of a record in the outbox."""
+    if item.encoding == wire.encoding_of(Decision):
+        return "decision", wire.decode(Decision, item.payload, item.key).decision_id
+    if item.encoding == wire.encoding_of(Command):
+        return "request", wire.decode(Command, item.payload, item.key).command_id
+    return "advice", wire.decode(Advice, item.payload, item.key).advice_id
+
+
+def stored_records(out_dir: Path) -> Iterator[ReconstructedImage | Decision]:
+    """Yield the images and decisions in the folder of c2, images first. Invalid files are logged and skipped.
+
+    The side-car states rows with missing pixels, not the pixels. Whole rows are marked as missing.
+
+    Args:
+        out_dir: Folder of c2, with one folder for each vessel.
+    """
+    try:
+        stored = read_stored_records(out_dir)
+    except BadInputError as error:
+        log.error("Folder of c2 not readable", extra=kv(reason=str(error)))
+        return
+    for problem in stored.problems:
+        log.warning("Stored file skipped", extra=kv(reason=str(problem)))
+    for side_car, path in stored.images:
+        try:
+            yield _stored_image(side_car, path)
+        except (BadInputError, OSError) as error:
+            log.warning("Stored image skipped", extra=kv(file=path, reason=str(error)))
+    yield from stored.decisions
+
+
+def _stored_image(side_car: SideCar, path: Path) -> ReconstructedImage:
+    picture = Pixels.from_array(read_image(path.with_suffix(".tiff")))
+    mask = np.zeros((picture.height_px, picture.width_px), np.bool_)
+    if side_car.missing_rows:
+        mask[side_car.missing_rows[0] : side_car.missing_rows[-1]] = True
+    fields = side_car.model_dump(exclude={"type", "v", "height_px", "width_px", "contact", "missing_rows"})
+    missing_mask = np.packbits(mask).tobytes() if mask.any() else b""
+    return ReconstructedImage(**fields, contact=side_car.contact, picture=picture, missing_mask=missing_mask)

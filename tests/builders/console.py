@@ -1,4 +1,4 @@
-"""A console without a network: its board, users, and a browser's way of asking."""
+"""A console without a network, its users, and clients like a browser."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from starlette.testclient import TestClient
 
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.state import Board
+from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.database import Database
 from sonarpost.services.console.store.users import Users
 from sonarpost.services.console.web.server import ConsoleApp
 
 PASSWORD = "correct horse battery"
-PEOPLE = {"watch": "observer", "anna": "operator", "bo": "operator", "eva": "expert"}
+ROLES_OF_USERS = {"watch": "observer", "anna": "operator", "bo": "operator", "eva": "expert"}
 FIRST_UTC_S = 1_700_000_000.0
 
 
-def picture_record(
+def image_record(
     image_id: str = "00A7",
     version: int = 1,
     *,
@@ -33,11 +33,11 @@ def picture_record(
     missing_rows: int = 0,
     total: int = 200,
     seed: int = 0,
-    place: tuple[float, float] | None = (56.0, -5.0),
+    position: tuple[float, float] | None = (56.0, -5.0),
     first_utc_s: float = FIRST_UTC_S,
-    **known: Any,
+    **contact_fields: Any,
 ) -> ReconstructedImage:
-    """A version of a picture of 40 x 60 px, the last rows missing."""
+    """A version of an image of 40 x 60 px whose last rows are missing."""
     pixels = np.random.default_rng(seed + version).integers(0, 256, (40, 60), dtype=np.uint8)
     mask = np.zeros(pixels.shape, np.bool_)
     if missing_rows:
@@ -54,9 +54,9 @@ def picture_record(
         "atd_confidence": 1.2,
         "time_utc_s": first_utc_s - 100,
     }
-    lat, lon = place or (None, None)
+    lat, lon = position or (None, None)
     contact = Contact(
-        contact_id=f"{vehicle}/{image_id}", vehicle_id=vehicle, lat_deg=lat, lon_deg=lon, **{**fields, **known}
+        contact_id=f"{vehicle}/{image_id}", vehicle_id=vehicle, lat_deg=lat, lon_deg=lon, **{**fields, **contact_fields}
     )
     received = total if not missing_rows else total * (40 - missing_rows) // 40
     return ReconstructedImage(
@@ -83,7 +83,7 @@ def picture_record(
 
 @dataclass
 class Browser:
-    """Somebody's browser, logged in or not."""
+    """A browser, with or without a session."""
 
     client: TestClient
     csrf: str = ""
@@ -104,24 +104,24 @@ class Browser:
 
 @dataclass
 class Console:
-    """A console and those who use it."""
+    """A console with its users."""
 
-    board: Board
+    state: ConsoleState
     users: Users
     app: ConsoleApp
 
     def browser(self, user: str = "") -> Browser:
-        found = Browser(TestClient(self.app.asgi, base_url="http://127.0.0.1:8470"))
+        browser = Browser(TestClient(self.app.asgi, base_url="http://127.0.0.1:8470"))
         if user:
-            assert found.login(user).status_code == 200
-        return found
+            assert browser.login(user).status_code == 200
+        return browser
 
     def decide(self, browser: Browser, contact_id: str, **changes: Any) -> Any:
-        """Decide on what the browser sees at this moment."""
-        whole = browser.get(f"/api/contacts/{contact_id}").json()
-        version = whole["versions"][-1]
+        """Decide on the newest version of a contact's image."""
+        detail = browser.get(f"/api/contacts/{contact_id}").json()
+        version = detail["versions"][-1]
         body = {
-            "revision": whole["contact"]["revision"],
+            "revision": detail["contact"]["revision"],
             "version": version["version"],
             "sha256": version["sha256"],
             "layer": "raw",
@@ -137,19 +137,19 @@ ConsoleMaker = Callable[..., Console]
 
 
 @pytest.fixture(autouse=True)
-def cheap_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hashing costs time on purpose; how much of it is no matter here."""
-    monkeypatch.setattr("sonarpost.services.console.store.users.COST", 2**4)
+def fast_password_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reduce the cost of password hashes."""
+    monkeypatch.setattr("sonarpost.services.console.store.users.SCRYPT_COST", 2**4)
 
 
 @pytest.fixture(scope="session")
 def users_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The file of those who may log in, made once."""
+    """The file of users, made once for all tests."""
     path = tmp_path_factory.mktemp("users") / "console-users.db"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sonarpost.services.console.store.users.COST", 2**4)
+        patch.setattr("sonarpost.services.console.store.users.SCRYPT_COST", 2**4)
         users = Users(path)
-        for name, role in PEOPLE.items():
+        for name, role in ROLES_OF_USERS.items():
             users.add(name, role, PASSWORD)
         users.close()
     return path
@@ -157,21 +157,21 @@ def users_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def make_console(tmp_path: Path, users_file: Path) -> Iterator[ConsoleMaker]:
-    made: list[Console] = []
+    consoles: list[Console] = []
 
     def make(**options: Any) -> Console:
-        folder = tmp_path / str(len(made))
+        folder = tmp_path / str(len(consoles))
         folder.mkdir()
         shutil.copy(users_file, folder)
         config = ConsoleConfig(**options)
         users = Users(folder / users_file.name, config.session_s, config.session_max_s)
-        board = Board(config, Database(folder / "console-review.db"))
-        made.append(Console(board, users, ConsoleApp(board, users, "vessel-1")))
-        return made[-1]
+        state = ConsoleState(config, Database(folder / "console-review.db"))
+        consoles.append(Console(state, users, ConsoleApp(state, users, "vessel-1")))
+        return consoles[-1]
 
     yield make
-    for console in made:
-        console.board.database.close()
+    for console in consoles:
+        console.state.database.close()
         console.users.close()
 
 

@@ -278,9 +278,9 @@ class ModemPair:
     def port(self, modem: int) -> str:
         return str(self.folder / f"modem-{modem}")
 
-    def start(self, **channel: Any) -> ChannelEmulator:
+    def start(self, *, time_scale: float = 150.0, **channel: Any) -> ChannelEmulator:
         sites = (ModemSite(1), ModemSite(3, LocalPosition(150.0)))
-        config = EmulatorConfig(sites, ChannelParameters(**channel), pty_dir=self.folder, time_scale=150.0)
+        config = EmulatorConfig(sites, ChannelParameters(**channel), pty_dir=self.folder, time_scale=time_scale)
         self._channel = ChannelEmulator(config)
         self._channel.start()
         return self._channel

@@ -12,6 +12,7 @@ from PIL.PngImagePlugin import PngInfo
 from starlette.testclient import TestClient
 
 from research.user_study.__main__ import main
+from research.user_study.intervals import clopper_pearson, wilson
 from research.user_study.server import Answers, Folders, PanelApp
 from research.user_study.trials import Decoded, trials_for
 from sonarpost.errors import ConfigError
@@ -149,3 +150,12 @@ def test_results_are_for_this_host(folders, tmp_path):
     with TestClient(app.asgi, base_url="http://127.0.0.1", client=("10.0.0.7", 1)) as client:
         assert client.get("/api/panel/results").status_code == 403
     answers.close()
+
+
+def test_confidence_intervals():
+    # Published values for 18 of 20 at 95 %.
+    assert wilson(18, 20) == (pytest.approx(0.699, abs=1e-3), pytest.approx(0.972, abs=1e-3))
+    assert clopper_pearson(18, 20) == (pytest.approx(0.683, abs=1e-3), pytest.approx(0.988, abs=1e-3))
+    assert wilson(0, 0) == clopper_pearson(0, 0) == (0.0, 1.0)
+    assert clopper_pearson(20, 20)[1] == 1.0
+    assert wilson(0, 5)[0] == 0.0

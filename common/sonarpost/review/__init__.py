@@ -1,1 +1,1 @@
-"""What an operator's review needs besides the records: grouping, measuring, costs, pictures for the eye. Pure."""
+"""Functions for an operator's review: grouping, measurement, cost of requests, rendering. No input or output."""

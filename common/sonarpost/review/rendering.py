@@ -1,4 +1,4 @@
-"""Pictures for the eye: layers, colour maps, masks, thumbnails. What is treated says so and is not measured on."""
+"""Rendering of images for display: layers, colour maps, thumbnails."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _HATCH_PX: Final = 6
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """One way of showing a picture.
+    """A form in which an image is displayed.
 
     Attributes:
-        name: In addresses.
-        measurable: Whether lengths may be taken on it.
-        synthesised: Whether it shows what was not received.
-        reason: Why it is not measured on.
+        name: Name in URLs.
+        measurable: Whether lengths may be measured on it.
+        synthesised: Whether its pixels differ from the received ones.
+        reason: Why it is not measurable.
     """
 
     name: str
@@ -42,11 +42,11 @@ LAYERS: Final = (
         "enhanced",
         measurable=False,
         synthesised=True,
-        reason="speckle is smoothed and contrast stretched for the eye: edges lie elsewhere than in what arrived",
+        reason="speckle is smoothed and contrast is stretched; edges are displaced",
     ),
 )
 
-# Anchors of grey 0, 64, 128, 192, 255 as red, green, blue; in between it is linear.
+# RGB values at grey levels 0, 64, 128, 192 and 255; linear in between.
 _ANCHORS: Final = MappingProxyType(
     {
         "inverse": ((255, 255, 255), (191, 191, 191), (127, 127, 127), (63, 63, 63), (0, 0, 0)),
@@ -59,43 +59,46 @@ MAPS: Final = ("grey", *_ANCHORS)
 
 
 def eight_bits(pixels: Pixels) -> Grey:
-    """Return a picture with its most significant 8 bits, same shape."""
+    """Return the most significant 8 bits of each pixel, same shape."""
     return pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)  # type: ignore[return-value]
 
 
-def enhanced(picture: Grey, missing: npt.NDArray[np.bool_]) -> Grey:
-    """Return a picture with speckle smoothed and contrast stretched between its 1st and 99th percentile.
+def enhance(image: Grey, missing: npt.NDArray[np.bool_]) -> Grey:
+    """Smooth speckle, and stretch the contrast between the 1st and 99th percentile.
 
     Args:
-        picture: Shape (height_px, width_px).
-        missing: The same shape; pixels that stay black and do not count.
+        image: Shape (height_px, width_px).
+        missing: Same shape; pixels that stay black and are excluded from the percentiles.
     """
     if missing.all():
-        return picture.copy()
-    smooth = median_filter(picture, size=3, mode="nearest").astype(np.float64)
+        return image.copy()
+    smooth = median_filter(image, size=3, mode="nearest").astype(np.float64)
     low, high = np.percentile(smooth[~missing], (1, 99))
     stretched = (smooth - low) / max(high - low, 1.0) * 255.0
     stretched[missing] = 0
-    treated: Grey = stretched.clip(0, 255).round().astype(np.uint8)
-    return treated
+    result: Grey = stretched.clip(0, 255).round().astype(np.uint8)
+    return result
 
 
-def shown(
-    picture: Grey, colour_map: str = "grey", low_percent: float = 0.0, high_percent: float = 100.0, gamma: float = 1.0
+def render(
+    image: Grey, colour_map: str = "grey", low_percent: float = 0.0, high_percent: float = 100.0, gamma: float = 1.0
 ) -> npt.NDArray[np.uint8]:
-    """Return a picture as it is shown: shape (height_px, width_px) for `grey`, else (height_px, width_px, 3).
+    """Apply gain and colour map.
 
     Args:
-        picture: Shape (height_px, width_px).
+        image: Shape (height_px, width_px).
         colour_map: One of `MAPS`.
-        low_percent: Grey level, in percent of full scale, that is shown black.
-        high_percent: That is shown white; more than `low_percent`.
-        gamma: Exponent, below 1 brightens.
+        low_percent: Black point in percent of full scale.
+        high_percent: White point in percent of full scale; above `low_percent`.
+        gamma: Exponent; values below 1 brighten.
+
+    Returns:
+        Shape (height_px, width_px) for `grey`, else (height_px, width_px, 3).
     """
     levels = np.linspace(0.0, 100.0, 256)
     curve = ((levels - low_percent) / (high_percent - low_percent)).clip(0, 1) ** gamma
     table = (255 * curve).round().astype(np.uint8)
-    grey = table[picture]
+    grey = table[image]
     if colour_map == "grey":
         return grey
     anchors = np.array(_ANCHORS[colour_map], np.float64)
@@ -105,17 +108,17 @@ def shown(
     return coloured
 
 
-def thumbnail(picture: Grey, missing: npt.NDArray[np.bool_]) -> Grey:
-    """Return a small picture, at most 96 px a side, with a hatch where nothing was received."""
-    rows, columns = np.indices(picture.shape)
+def thumbnail(image: Grey, missing: npt.NDArray[np.bool_]) -> Grey:
+    """Return a thumbnail of at most 96 px a side, with missing areas hatched."""
+    rows, columns = np.indices(image.shape)
     hatch = np.where((rows + columns) % _HATCH_PX < _HATCH_PX // 2, 160, 70).astype(np.uint8)
-    image = Image.fromarray(np.where(missing, hatch, picture).astype(np.uint8))
-    image.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX), Image.Resampling.BILINEAR)
-    return np.asarray(image, dtype=np.uint8)
+    small = Image.fromarray(np.where(missing, hatch, image).astype(np.uint8))
+    small.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX), Image.Resampling.BILINEAR)
+    return np.asarray(small, dtype=np.uint8)
 
 
-def png(pixels: npt.NDArray[np.uint8]) -> bytes:
-    """Return a PNG of a picture, shape (height_px, width_px) or (height_px, width_px, 3)."""
+def encode_png(pixels: npt.NDArray[np.uint8]) -> bytes:
+    """Encode an image of shape (height_px, width_px) or (height_px, width_px, 3) as PNG."""
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, format="PNG", compress_level=4)
     return buffer.getvalue()

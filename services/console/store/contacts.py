@@ -1,4 +1,4 @@
-"""Contacts in the database: taken as pictures arrive and refine, listed, grouped by position."""
+"""Contacts and their image versions in the database: insertion, queries, grouping by position."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from typing import Final
 
 from sonarpost import wire
 from sonarpost.messages import ReconstructedImage
-from sonarpost.review.grouping import Place, nearest_group
-from sonarpost.review.local import vehicle_position
-from sonarpost.services.console.store.serialisers import CONTACT, Json, contact_row, percent_of
+from sonarpost.review.grouping import Look, nearest_group
+from sonarpost.review.local_frame import vehicle_position
+from sonarpost.services.console.store.database import insert_row
+from sonarpost.services.console.store.serialisers import CONTACT_QUERY, Json, contact_json, percent_received
 
-SORTS: Final[Mapping[str, str]] = {
+SORT_COLUMNS: Final[Mapping[str, str]] = {
     "arrived": "arrived_utc_s",
     "updated": "updated_utc_s",
     "confidence": "atd_confidence",
@@ -24,17 +25,26 @@ SORTS: Final[Mapping[str, str]] = {
     "name": "name",
     "range": "range_m",
 }
-REVIEWS: Final = ("unreviewed", "mine_like", "not_mine_like", "unsure", "reviewed")
+REVIEW_FILTERS: Final = ("unreviewed", "mine_like", "not_mine_like", "unsure", "reviewed")
 _METRES_PER_DEGREE: Final = 111_000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Filter:
-    """Which contacts are wanted, and in which order.
+class ContactFilter:
+    """Filter, order and page of a contact list.
 
     Attributes:
-        text: Part of a name, a class or a remark.
-        sort: A key of `SORTS`.
+        review: One of `REVIEW_FILTERS`; None for all.
+        vehicle: Name of the vehicle; None for all.
+        vessel: Name of the vessel; None for all.
+        min_confidence: Minimum confidence of the detector, 0 to 2; None for all.
+        complete: Whether the image is complete; None for both.
+        group: Name of a group; None for all.
+        text: Part of a name, class or remark; None for all.
+        sort: A key of `SORT_COLUMNS`.
+        descending: Order.
+        offset: Number of contacts to skip.
+        limit: Maximum number of contacts.
     """
 
     review: str | None = None
@@ -50,48 +60,58 @@ class Filter:
     limit: int = 100
 
     def where(self) -> tuple[str, list[object]]:
-        """Return the condition in SQL, of constants only, and its values."""
-        parts: list[tuple[str, list[object]]] = []
+        """Return the SQL condition, which contains only constants, and its parameters."""
+        conditions: list[str] = []
+        values: list[object] = []
         if self.review == "reviewed":
-            parts.append(("c.review <> 'unreviewed'", []))
-        elif self.review is not None:
-            parts.append(("c.review = ?", [self.review]))
-        for column, value in (("vehicle_id", self.vehicle), ("vessel_id", self.vessel), ("group_id", self.group)):
+            conditions.append("c.review <> 'unreviewed'")
+        for condition, value in (
+            ("c.review = ?", None if self.review == "reviewed" else self.review),
+            ("c.vehicle_id = ?", self.vehicle),
+            ("c.vessel_id = ?", self.vessel),
+            ("c.group_id = ?", self.group),
+            ("c.atd_confidence >= ?", self.min_confidence),
+            ("c.complete = ?", None if self.complete is None else int(self.complete)),
+        ):
             if value is not None:
-                parts.append((f"c.{column} = ?", [value]))
-        if self.min_confidence is not None:
-            parts.append(("c.atd_confidence >= ?", [self.min_confidence]))
-        if self.complete is not None:
-            parts.append(("c.complete = ?", [int(self.complete)]))
+                conditions.append(condition)
+                values.append(value)
         if self.text:
-            like = "%" + self.text.replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_") + "%"
+            pattern = "%" + self.text.replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_") + "%"
             columns = ("name", "mlo_class", "atd_class", "remark")
-            some = " OR ".join(f"c.{column} LIKE ? ESCAPE '\\'" for column in columns)
-            parts.append((f"({some})", [like] * len(columns)))
-        values = [value for _, given in parts for value in given]
-        return " AND ".join(text for text, _ in parts) or "1", values
+            conditions.append("(" + " OR ".join(f"c.{column} LIKE ? ESCAPE '\\'" for column in columns) + ")")
+            values += [pattern] * len(columns)
+        return " AND ".join(conditions) or "1", values
+
+
+@dataclass(frozen=True, slots=True)
+class ContactCounts:
+    """Number of contacts, and of contacts without a decision."""
+
+    total: int
+    unreviewed: int
 
 
 def contact_id_of(image: ReconstructedImage) -> str:
-    """Return a contact's identifier, the one that exports use: the second of the first frame keeps missions apart."""
+    """Return the contact identifier, equal to the `uid` of exports. Its time makes it unique over all missions."""
     first = datetime.fromtimestamp(int(image.first_frame_utc_s), UTC).strftime("%Y%m%dT%H%M%SZ")
     return f"sonarpost.{image.vessel_id}.{image.vehicle_id}.{first}.{image.image_id}"
 
 
-def take_image(
+def store_image(
     db: sqlite3.Connection, image: ReconstructedImage, rate: int | None, now_utc_s: float, radius_m: float
 ) -> tuple[str, bool] | None:
-    """Keep a version of a picture and bring its contact up to date.
+    """Store an image version and update its contact.
 
     Args:
-        db: In a transaction.
+        db: Connection in a transaction.
         image: The record.
-        rate: Micro-Modem rate at which its vehicle was heard last; None where it is not known.
+        rate: Latest Micro-Modem rate of the vehicle; None if unknown.
         now_utc_s: Time of arrival.
-        radius_m: For grouping; see `review.grouping.reach_m`.
+        radius_m: Distance limit for grouping; see `review.grouping.group_distance_limit_m`.
 
     Returns:
-        The contact's identifier and whether it is new; None where this version was known already.
+        The contact identifier, and whether the contact is new; None if the version is already stored.
     """
     contact_id = contact_id_of(image)
     added = db.execute(
@@ -102,21 +122,30 @@ def take_image(
         return None
     known = db.execute("SELECT version FROM contact WHERE id = ?", (contact_id,)).fetchone()
     if known is None or known["version"] <= image.version:
-        _put(db, contact_id, image, now_utc_s)
-        _group(db, contact_id, radius_m)
+        _update_contact(db, contact_id, image, now_utc_s)
+        _assign_group(db, contact_id, radius_m)
     db.execute("UPDATE contact SET versions = versions + 1 WHERE id = ?", (contact_id,))
     return contact_id, known is None
 
 
-def _put(db: sqlite3.Connection, contact_id: str, image: ReconstructedImage, now_utc_s: float) -> None:
-    """Write what the newest version says; what people said of the contact stays."""
+def _update_contact(db: sqlite3.Connection, contact_id: str, image: ReconstructedImage, now_utc_s: float) -> None:
+    """Insert a contact, or update the columns that depend on the newest image version."""
     record = image.contact
     vehicle = None
     if record is not None:
         vehicle = vehicle_position(
             record.lat_deg, record.lon_deg, record.heading_deg, record.channel, record.ground_range_m
         )
-    values: dict[str, object] = {
+    constant = {
+        "id": contact_id,
+        "vessel_id": image.vessel_id,
+        "vehicle_id": image.vehicle_id,
+        "image_id": image.image_id,
+        "first_s": int(image.first_frame_utc_s),
+        "name": f"{image.vehicle_id}/{image.image_id}",
+        "arrived_utc_s": now_utc_s,
+    }
+    variable = {
         "version": image.version,
         "atd_class": record and record.atd_class,
         "atd_confidence": record and record.atd_confidence,
@@ -131,7 +160,7 @@ def _put(db: sqlite3.Connection, contact_id: str, image: ReconstructedImage, now
         "last_frame_utc_s": image.last_frame_utc_s,
         "updated_utc_s": now_utc_s,
         "complete": int(image.complete),
-        "percent": percent_of(image),
+        "percent": percent_received(image),
         "bytes_received": image.bytes_received,
         "bytes_total": image.bytes_total,
         "codec": image.codec,
@@ -139,110 +168,86 @@ def _put(db: sqlite3.Connection, contact_id: str, image: ReconstructedImage, now
         "height_px": image.picture.height_px,
         "width_px": image.picture.width_px,
     }
-    names = {
-        "id": contact_id,
-        "vessel_id": image.vessel_id,
-        "vehicle_id": image.vehicle_id,
-        "image_id": image.image_id,
-        "first_s": int(image.first_frame_utc_s),
-        "name": f"{image.vehicle_id}/{image.image_id}",
-        "arrived_utc_s": now_utc_s,
-    }
-    columns = ", ".join((*names, *values))
-    places = ", ".join("?" * (len(names) + len(values)))
-    updates = ", ".join(f"{name} = excluded.{name}" for name in values)
+    columns = ", ".join((*constant, *variable))
+    marks = ", ".join("?" * (len(constant) + len(variable)))
+    updates = ", ".join(f"{name} = excluded.{name}" for name in variable)
     db.execute(
-        f"INSERT INTO contact ({columns}) VALUES ({places}) ON CONFLICT (id) DO UPDATE SET {updates}",  # noqa: S608
-        (*names.values(), *values.values()),
+        f"INSERT INTO contact ({columns}) VALUES ({marks}) ON CONFLICT (id) DO UPDATE SET {updates}",  # noqa: S608
+        (*constant.values(), *variable.values()),
     )
 
 
-def _group(db: sqlite3.Connection, contact_id: str, radius_m: float) -> None:
-    """Put a contact whose position is known, and that has no group yet, into the nearest group or one of its own."""
+def _assign_group(db: sqlite3.Connection, contact_id: str, radius_m: float) -> None:
+    """Assign a contact with a position and without a group to the nearest group, or to a new one."""
     row = db.execute(
         "SELECT group_id, lat_deg, lon_deg, position_sigma_m, vehicle_id, seen_utc_s FROM contact WHERE id = ?",
         (contact_id,),
     ).fetchone()
     if row["group_id"] is not None or row["lat_deg"] is None or row["lon_deg"] is None:
         return
-    look = Place("", *tuple(row)[1:])
-    # Every group within reach lies in this band; degrees of longitude shrink towards the poles.
-    reach_deg = 4.0 * radius_m / _METRES_PER_DEGREE
-    near = db.execute(
+    look = Look("", *tuple(row)[1:])
+    # The index on latitude limits the search. Degrees of longitude depend on the latitude.
+    limit_deg = 4.0 * radius_m / _METRES_PER_DEGREE
+    nearby = db.execute(
         "SELECT 'g' || id, lat_deg, lon_deg, sigma_m, vehicle_id, seen_utc_s FROM look_group"
         " WHERE lat_deg BETWEEN ? AND ?",
-        (look.lat_deg - reach_deg, look.lat_deg + reach_deg),
+        (look.lat_deg - limit_deg, look.lat_deg + limit_deg),
     )
-    group = nearest_group(look, (Place(*place) for place in near), radius_m)
+    group = nearest_group(look, (Look(*first) for first in nearby), radius_m)
     if group is None:
-        inserted = db.execute(
-            "INSERT INTO look_group (lat_deg, lon_deg, sigma_m, vehicle_id, seen_utc_s) VALUES (?, ?, ?, ?, ?)",
-            (look.lat_deg, look.lon_deg, look.sigma_m, look.vehicle_id, look.seen_utc_s),
-        )
-        group = f"g{inserted.lastrowid}"
+        values = {name: value for name, value in asdict(look).items() if name != "group"}
+        group = f"g{insert_row(db, 'look_group', values)}"
     db.execute("UPDATE contact SET group_id = ? WHERE id = ?", (group, contact_id))
 
 
-def list_contacts(db: sqlite3.Connection, wanted: Filter) -> Json:
-    """Return a page of the contacts, with how many there are."""
-    condition, values = wanted.where()
-    order = "DESC" if wanted.descending else "ASC"
-    column = SORTS[wanted.sort]
-    # The page is found on the index first; what is counted for each row is counted for those alone.
-    page = (
-        f"SELECT c.id FROM contact c WHERE {condition} "  # noqa: S608  constants only
-        f"ORDER BY c.{column} {order}, c.id {order} LIMIT ? OFFSET ?"
-    )
-    rows = db.execute(
-        f"{CONTACT} WHERE c.id IN ({page}) ORDER BY c.{column} {order}, c.id {order}",
-        (*values, wanted.limit, wanted.offset),
-    ).fetchall()
+def list_contacts(db: sqlite3.Connection, query: ContactFilter) -> Json:
+    """Return a page of the contacts, and the counts of all contacts."""
+    condition, values = query.where()
+    direction = "DESC" if query.descending else "ASC"
+    order = f"ORDER BY c.{SORT_COLUMNS[query.sort]} {direction}, c.id {direction}"
+    # The inner query finds the page in an index, so that the sub-queries of the outer one run for these rows only.
+    page = f"SELECT c.id FROM contact c WHERE {condition} {order} LIMIT ? OFFSET ?"  # noqa: S608  constants only
+    rows = db.execute(f"{CONTACT_QUERY} WHERE c.id IN ({page}) {order}", (*values, query.limit, query.offset))
+    items = [contact_json(row) for row in rows.fetchall()]
     matching = db.execute(f"SELECT COUNT(*) FROM contact c WHERE {condition}", values).fetchone()[0]  # noqa: S608
     vehicles = [row[0] for row in db.execute("SELECT DISTINCT vehicle_id FROM contact ORDER BY vehicle_id")]
     return {
-        **asdict(counts(db)),
+        **asdict(count_contacts(db)),
         "matching": matching,
         "vehicles": vehicles,
-        "offset": wanted.offset,
-        "items": [contact_row(row) for row in rows],
+        "offset": query.offset,
+        "items": items,
     }
 
 
-@dataclass(frozen=True, slots=True)
-class Counts:
-    """How many contacts there are, and how many nobody has decided on."""
-
-    total: int
-    unreviewed: int
-
-
-def counts(db: sqlite3.Connection) -> Counts:
+def count_contacts(db: sqlite3.Connection) -> ContactCounts:
     """Count the contacts."""
     total = db.execute("SELECT COUNT(*) FROM contact").fetchone()[0]
     unreviewed = db.execute("SELECT COUNT(*) FROM contact WHERE review = 'unreviewed'").fetchone()[0]
-    return Counts(total, unreviewed)
+    return ContactCounts(total, unreviewed)
 
 
-def find_row(db: sqlite3.Connection, contact_id: str) -> sqlite3.Row | None:
-    """Return a contact's row for `contact_row`, None where there is no such contact."""
-    row: sqlite3.Row | None = db.execute(f"{CONTACT} WHERE c.id = ?", (contact_id,)).fetchone()
+def find_contact(db: sqlite3.Connection, contact_id: str) -> sqlite3.Row | None:
+    """Return the row of a contact, for `contact_json`; None if there is none."""
+    row: sqlite3.Row | None = db.execute(f"{CONTACT_QUERY} WHERE c.id = ?", (contact_id,)).fetchone()
     return row
 
 
 def find_version(db: sqlite3.Connection, contact_id: str, version: int) -> sqlite3.Row | None:
-    """Return a version's row, None where there is no such version."""
+    """Return the row of an image version; None if there is none."""
     row: sqlite3.Row | None = db.execute(
         "SELECT * FROM version WHERE contact_id = ? AND version = ?", (contact_id, version)
     ).fetchone()
     return row
 
 
-def contact_of_picture(
+def find_contact_of_image(
     db: sqlite3.Connection, vessel_id: str, vehicle_id: str, image_id: str, utc_s: float
 ) -> str | None:
-    """Return the contact that a record about a picture means: the last that had begun to arrive by then.
+    """Return the identifier of the contact that a record refers to; None if none matches.
 
-    With one candidate it is that one, whatever the clocks say; None where there is none.
+    If the image identifier occurs several times, it is the last contact that began to arrive before `utc_s`. A single
+    candidate always matches, because platform clocks differ.
     """
     rows = db.execute(
         "SELECT id, first_s FROM contact WHERE vessel_id = ? AND vehicle_id = ? AND image_id = ? ORDER BY first_s DESC",

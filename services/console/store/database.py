@@ -1,7 +1,7 @@
-"""The console's database: contacts, versions of their pictures, what people decided, and who did what.
+"""Database of the console: contacts, image versions, decisions, requests, comments, measurements and the audit.
 
-One SQLite file beside the service's store. What people do is never overwritten: an undone decision is a record more,
-and the audit refuses to be changed by the database's own rules.
+It is one SQLite file beside the service's store. Operators' actions are never overwritten: undoing a decision adds a
+record, and triggers reject changes to the audit.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from sonarpost.errors import DeliveryError
 from sonarpost.services.console.store.users import Actor
 
-VERSION = 1
+SCHEMA_VERSION = 1
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS contact (
@@ -92,10 +92,10 @@ CREATE TRIGGER IF NOT EXISTS audit_is_not_deleted BEFORE DELETE ON audit
 
 
 class Database:
-    """The file, for several threads; one transaction at a time.
+    """The database file, shared by several threads, with one transaction at a time.
 
     Raises:
-        DeliveryError: The file cannot be opened, or is of another version.
+        DeliveryError: The file cannot be opened, or has another schema version.
     """
 
     def __init__(self, path: Path) -> None:
@@ -108,17 +108,17 @@ class Database:
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=FULL")
             version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
-            if version not in (0, VERSION):
+            if version not in (0, SCHEMA_VERSION):
                 self._db.close()
-                raise DeliveryError(f"{path}: console database of version {version}, expected {VERSION}")
+                raise DeliveryError(f"{path}: console database of version {version}, expected {SCHEMA_VERSION}")
             if version == 0:
-                self._db.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version={VERSION}; COMMIT;")
+                self._db.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version={SCHEMA_VERSION}; COMMIT;")
         except (OSError, sqlite3.Error) as error:
-            raise DeliveryError(f"{path}: cannot be opened as the console's database: {error}") from error
+            raise DeliveryError(f"{path}: cannot be opened as the database of the console: {error}") from error
 
     @contextmanager
-    def reading(self) -> Iterator[sqlite3.Connection]:
-        """Open the connection for reading.
+    def read(self) -> Iterator[sqlite3.Connection]:
+        """Return the connection for reading.
 
         Raises:
             DeliveryError: The database cannot be read.
@@ -130,11 +130,11 @@ class Database:
                 raise DeliveryError(f"{self.path}: {error}") from error
 
     @contextmanager
-    def writing(self) -> Iterator[sqlite3.Connection]:
-        """Open a transaction: on the disk when the block ends, rolled back when it raises.
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """Run the block in a transaction: committed to disk at its end, rolled back after an exception.
 
         Raises:
-            DeliveryError: The database refused (a full disk); nothing of the block was kept.
+            DeliveryError: The transaction failed, for example because of a full disk, and was rolled back.
         """
         with self._lock:
             try:
@@ -154,14 +154,21 @@ class Database:
             self._db.close()
 
 
+def insert_row(db: sqlite3.Connection, table: str, values: Mapping[str, object]) -> int:
+    """Insert a row; return its rowid."""
+    columns, marks = ", ".join(values), ", ".join("?" * len(values))
+    inserted = db.execute(f"INSERT INTO {table} ({columns}) VALUES ({marks})", tuple(values.values()))  # noqa: S608
+    return inserted.lastrowid or 0
+
+
 @dataclass(frozen=True, slots=True)
-class OnScreen:
-    """What somebody was looking at.
+class DisplayedImage:
+    """Image on the screen during an action.
 
     Attributes:
-        version: Of the picture.
-        sha256: Of its pixels.
-        layer: How it was shown.
+        version: Version of the image.
+        sha256: SHA-256 of its pixels.
+        layer: Displayed layer.
     """
 
     version: int | None = None
@@ -169,29 +176,26 @@ class OnScreen:
     layer: str | None = None
 
 
-def write(
+def add_audit_entry(
     db: sqlite3.Connection,
     contact_id: str,
     actor: Actor,
     action: str,
     utc_s: float,
-    screen: OnScreen,
+    displayed: DisplayedImage,
     detail: Mapping[str, object],
 ) -> None:
-    """Add an entry, within the transaction of what it tells of."""
-    db.execute(
-        "INSERT INTO audit (contact_id, utc_s, user, role, address, action, version, sha256, layer, detail)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (
-            contact_id,
-            utc_s,
-            actor.user,
-            actor.role,
-            actor.address,
-            action,
-            screen.version,
-            screen.sha256,
-            screen.layer,
-            json.dumps(dict(detail)),
-        ),
-    )
+    """Add an entry to the audit, in the transaction of the action."""
+    values = {
+        "contact_id": contact_id,
+        "utc_s": utc_s,
+        "user": actor.user,
+        "role": actor.role,
+        "address": actor.address,
+        "action": action,
+        "version": displayed.version,
+        "sha256": displayed.sha256,
+        "layer": displayed.layer,
+        "detail": json.dumps(dict(detail)),
+    }
+    insert_row(db, "audit", values)

@@ -1,4 +1,4 @@
-"""Decisions in the database: made on what was on the screen, never overwritten, undone by a record more."""
+"""Decisions in the database: insertion, undo, and their delivery to shore site and vehicle."""
 
 from __future__ import annotations
 
@@ -9,183 +9,204 @@ from dataclasses import dataclass
 from sonarpost import wire
 from sonarpost.errors import BadInputError, SonarpostError
 from sonarpost.messages import Decision, DownlinkState, Verdict
-from sonarpost.services.console.store import database
-from sonarpost.services.console.store.contacts import contact_of_picture, find_row
-from sonarpost.services.console.store.database import OnScreen
-from sonarpost.services.console.store.requests import is_news
-from sonarpost.services.console.store.serialisers import Json, contact_row, decision_of, image_of
+from sonarpost.services.console.store.contacts import find_contact, find_contact_of_image, find_version
+from sonarpost.services.console.store.database import DisplayedImage, add_audit_entry, insert_row
+from sonarpost.services.console.store.requests import is_later_state
+from sonarpost.services.console.store.serialisers import Json, contact_json, decision_json, decode_image
 from sonarpost.services.console.store.users import Actor
 
 
 class ConflictError(SonarpostError):
-    """Somebody was faster: the contact is not as it was on the screen.
+    """The contact has changed since it was displayed.
 
     Attributes:
-        contact: As it is now.
-        decision: The last one about it, None where there is none.
+        contact: The contact at present.
+        decision: Its last decision; None if there is none.
     """
 
     def __init__(self, contact: Json, decision: Json | None) -> None:
-        super().__init__("the contact has been decided on meanwhile")
+        super().__init__("another operator has decided on this contact")
         self.contact = contact
         self.decision = decision
 
 
 @dataclass(frozen=True, slots=True)
 class DecisionInput:
-    """What somebody decides, and on what.
+    """A decision as an operator enters it.
 
     Attributes:
-        revision: The contact's, as it was on the screen.
-        screen: The picture that was.
+        revision: Revision of the displayed contact.
+        displayed: Displayed image.
+        verdict: Verdict.
+        confidence: Confidence of the operator, 0 to 1; None if not stated.
+        mlo_class: Class of mine-like object; None if not stated.
+        remark: Free text.
     """
 
     revision: int
-    screen: OnScreen
+    displayed: DisplayedImage
     verdict: Verdict
     confidence: float | None
     mlo_class: str | None
     remark: str
 
 
-def decide(
+@dataclass(frozen=True, slots=True)
+class DeliveryStates:
+    """Initial delivery state of a decision.
+
+    Attributes:
+        shore: `waiting`, `relay` or `delivered`; `none` if no consumer is configured.
+        vehicle: `waiting`; `none` if no consumer is configured.
+    """
+
+    shore: str
+    vehicle: str
+
+
+def add_decision(
     db: sqlite3.Connection,
     contact_id: str,
-    judgement: DecisionInput,
+    entered: DecisionInput,
     actor: Actor,
     now_utc_s: float,
-    ends: tuple[str, str],
+    delivery: DeliveryStates,
 ) -> str:
-    """Write a decision down, to be sent; return its identifier.
+    """Store a decision of this console; return its identifier.
 
     Args:
-        db: In a transaction.
-        contact_id: Of a contact that exists.
-        judgement: The decision.
-        actor: Who makes it.
-        now_utc_s: When.
-        ends: State of delivery to begin with, ashore and on the vehicle: `waiting`, or `none` where nobody takes it.
+        db: Connection in a transaction.
+        contact_id: Identifier of an existing contact.
+        entered: The decision.
+        actor: The operator.
+        now_utc_s: Time of the decision.
+        delivery: Initial delivery state.
 
     Raises:
-        ConflictError: Somebody else has decided since.
-        BadInputError: The picture named is not a version of this contact.
+        ConflictError: Another decision was stored after the contact was displayed.
+        BadInputError: The displayed image is not a version of this contact.
     """
-    row = _unchanged(db, contact_id, judgement.revision)
-    _check_screen(db, contact_id, judgement.screen)
+    row = _check_revision(db, contact_id, entered.revision)
+    _check_displayed_image(db, contact_id, entered.displayed)
     record = Decision(
         decision_id=f"d-{uuid.uuid4().hex}",
         vessel_id=row["vessel_id"],
         vehicle_id=row["vehicle_id"],
         image_id=row["image_id"],
-        image_version=judgement.screen.version or row["version"],
-        verdict=judgement.verdict,
-        confidence=judgement.confidence,
-        mlo_class=judgement.mlo_class,
-        remark=judgement.remark,
+        image_version=entered.displayed.version or row["version"],
+        verdict=entered.verdict,
+        confidence=entered.confidence,
+        mlo_class=entered.mlo_class,
+        remark=entered.remark,
         operator=actor.user,
         decided_utc_s=now_utc_s,
     )
-    _insert(db, contact_id, record, judgement.screen, None, now_utc_s, ends)
-    _settle_contact(db, contact_id, now_utc_s)
+    _insert(db, contact_id, record, entered.displayed, now_utc_s, delivery)
+    _update_contact(db, contact_id, now_utc_s)
     detail = record.model_dump(include={"decision_id", "verdict", "confidence", "mlo_class", "remark"})
-    database.write(
-        db, contact_id, actor, "decide", now_utc_s, judgement.screen, {**detail, "revision": row["revision"]}
-    )
+    detail["revision"] = row["revision"]
+    add_audit_entry(db, contact_id, actor, "decide", now_utc_s, entered.displayed, detail)
     return record.decision_id
 
 
-def undo(
+def undo_decision(
     db: sqlite3.Connection,
     contact_id: str,
     decision_id: str,
     revision: int,
     actor: Actor,
     now_utc_s: float,
-    ends: tuple[str, str],
+    delivery: DeliveryStates,
 ) -> str:
-    """Undo the decision that counts, by a record that puts back the one before; return the new one's identifier.
+    """Undo the valid decision with a new one, which restores the verdict before it; return the new identifier.
+
+    If there was no decision before, the new record has the verdict `unsure`: records have no verdict `unreviewed`.
 
     Raises:
-        ConflictError: Somebody else has decided since.
-        BadInputError: It is not the decision that counts.
+        ConflictError: Another decision was stored after the contact was displayed.
+        BadInputError: `decision_id` is not the valid decision.
     """
-    row = _unchanged(db, contact_id, revision)
+    row = _check_revision(db, contact_id, revision)
     if row["effective"] != decision_id:
-        raise BadInputError("undo", "decision_id", decision_id, f"the decision that counts, {row['effective']}")
-    undone = db.execute("SELECT * FROM decision WHERE decision_id = ?", (decision_id,)).fetchone()
+        raise BadInputError("undo", "decision_id", decision_id, f"the valid decision, {row['effective']}")
+    undone = find_decision(db, decision_id)
+    assert undone is not None
     db.execute("UPDATE decision SET undone = 1 WHERE decision_id = ?", (decision_id,))
-    before = _effective(db, contact_id)
+    previous = _valid_decision(db, contact_id)
     record = Decision(
         decision_id=f"d-{uuid.uuid4().hex}",
         vessel_id=row["vessel_id"],
         vehicle_id=row["vehicle_id"],
         image_id=row["image_id"],
         image_version=undone["version"],
-        verdict="unsure" if before is None else before["verdict"],
-        confidence=None if before is None else before["confidence"],
-        mlo_class=None if before is None else before["mlo_class"],
+        verdict="unsure" if previous is None else previous["verdict"],
+        confidence=None if previous is None else previous["confidence"],
+        mlo_class=None if previous is None else previous["mlo_class"],
         remark=f"withdraws decision {decision_id}",
         operator=actor.user,
         decided_utc_s=now_utc_s,
     )
-    screen = OnScreen(undone["version"], undone["sha256"], undone["layer"])
-    _insert(db, contact_id, record, screen, decision_id, now_utc_s, ends)
-    _settle_contact(db, contact_id, now_utc_s)
+    displayed = DisplayedImage(undone["version"], undone["sha256"], undone["layer"])
+    _insert(db, contact_id, record, displayed, now_utc_s, delivery, undoes=decision_id)
+    _update_contact(db, contact_id, now_utc_s)
     detail = {"decision_id": record.decision_id, "undoes": decision_id, "verdict": record.verdict, "revision": revision}
-    database.write(db, contact_id, actor, "undo", now_utc_s, screen, detail)
+    add_audit_entry(db, contact_id, actor, "undo", now_utc_s, displayed, detail)
     return record.decision_id
 
 
-def take(db: sqlite3.Connection, record: Decision, now_utc_s: float, *, ashore: bool) -> str | None:
-    """Keep a decision that was made elsewhere; return its contact, None where it is known or its picture is not here.
+def store_received_decision(
+    db: sqlite3.Connection, record: Decision, now_utc_s: float, *, at_shore: bool
+) -> str | None:
+    """Store a decision of another program or console. A decision without its image is kept until the image arrives.
 
-    It may come before its picture: then it waits for that.
+    Returns:
+        The contact identifier; None if the decision is already stored or its image is not.
     """
-    if db.execute("SELECT 1 FROM decision WHERE decision_id = ?", (record.decision_id,)).fetchone():
+    if find_decision(db, record.decision_id) is not None:
         return None
-    at = record.decided_utc_s
-    contact_id = contact_of_picture(db, record.vessel_id, record.vehicle_id, record.image_id, at)
-    shore, vehicle = ("delivered", "none") if ashore else ("relay", "waiting")
-    _insert(db, contact_id or "", record, OnScreen(record.image_version), None, now_utc_s, (shore, vehicle), sent=True)
+    contact_id = find_contact_of_image(db, record.vessel_id, record.vehicle_id, record.image_id, record.decided_utc_s)
+    delivery = DeliveryStates("delivered", "none") if at_shore else DeliveryStates("relay", "waiting")
+    displayed = DisplayedImage(record.image_version)
+    _insert(db, contact_id or "", record, displayed, now_utc_s, delivery, received=True)
     if contact_id is not None:
-        _settle_contact(db, contact_id, now_utc_s)
+        _update_contact(db, contact_id, now_utc_s)
     return contact_id
 
 
-def adopt(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> None:
-    """Give a new contact the decisions and the advice that came before it."""
+def attach_waiting_records(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> None:
+    """Assign decisions and comments that arrived before their image to the new contact."""
     row = db.execute("SELECT vessel_id, vehicle_id, image_id FROM contact WHERE id = ?", (contact_id,)).fetchone()
-    found = 0
+    attached = 0
     for table in ("decision", "advice"):
-        found += db.execute(
+        attached += db.execute(
             f"UPDATE {table} SET contact_id = ? WHERE contact_id = ''"  # noqa: S608  constants only
             " AND vessel_id = ? AND vehicle_id = ? AND image_id = ?",
             (contact_id, *row),
         ).rowcount
-    if found:
+    if attached:
         db.execute(
             "UPDATE contact SET advised = EXISTS (SELECT 1 FROM advice WHERE contact_id = ?1) WHERE id = ?1",
             (contact_id,),
         )
-        _settle_contact(db, contact_id, now_utc_s)
+        _update_contact(db, contact_id, now_utc_s)
 
 
-def find(db: sqlite3.Connection, decision_id: str) -> sqlite3.Row | None:
-    """Return a decision's row, None where it is not known."""
+def find_decision(db: sqlite3.Connection, decision_id: str) -> sqlite3.Row | None:
+    """Return the row of a decision; None if there is none."""
     row: sqlite3.Row | None = db.execute("SELECT * FROM decision WHERE decision_id = ?", (decision_id,)).fetchone()
     return row
 
 
-def of_contact(db: sqlite3.Connection, contact_id: str) -> list[Json]:
-    """Return the decisions about a contact, the last first."""
+def list_decisions(db: sqlite3.Connection, contact_id: str) -> list[Json]:
+    """Return the decisions about a contact, newest first."""
     rows = db.execute("SELECT * FROM decision WHERE contact_id = ? ORDER BY seq DESC", (contact_id,))
-    return [decision_of(row) for row in rows]
+    return [decision_json(row) for row in rows]
 
 
-def downlink(db: sqlite3.Connection, state: DownlinkState) -> bool:
-    """Note how far a decision has come on its way to the vehicle; tell whether that was news."""
-    row = find(db, state.record_id)
-    if row is None or not is_news(row["vehicle"], row["times_sent"], state.state, state.times_sent):
+def apply_downlink_state(db: sqlite3.Connection, state: DownlinkState) -> bool:
+    """Update the delivery of a decision to the vehicle; return whether it has changed."""
+    row = find_decision(db, state.record_id)
+    if row is None or not is_later_state(row["vehicle"], row["times_sent"], state.state, state.times_sent):
         return False
     db.execute(
         "UPDATE decision SET vehicle = ?, reason = ?, times_sent = ?, changed_utc_s = MAX(changed_utc_s, ?)"
@@ -195,90 +216,90 @@ def downlink(db: sqlite3.Connection, state: DownlinkState) -> bool:
     return True
 
 
-def handed(db: sqlite3.Connection, decision_id: str, consumer: str, reason: str | None, now_utc_s: float) -> bool:
-    """Note that a consumer on the vessel has a decision on its disk, or refused it; tell whether that was news."""
-    row = find(db, decision_id)
-    column = "shore" if consumer == "relay" else "vehicle"
+def apply_acknowledgement(
+    db: sqlite3.Connection, decision_id: str, consumer: str, reason: str | None, now_utc_s: float
+) -> bool:
+    """Update a decision after a consumer on the vessel stored or refused it; return whether it has changed.
+
+    Args:
+        db: Connection in a transaction.
+        decision_id: Identifier of the decision.
+        consumer: `relay` for the way to the shore site; any other for the way to the vehicle.
+        reason: Reason of the refusal; None if the consumer has stored the decision.
+        now_utc_s: Time of the acknowledgement.
+    """
+    row = find_decision(db, decision_id)
+    column, stored = ("shore", "relay") if consumer == "relay" else ("vehicle", "asked")
     if row is None or row[column] != "waiting":
         return False
-    taken = "relay" if column == "shore" else "asked"
     db.execute(
         f"UPDATE decision SET {column} = ?, reason = ?, changed_utc_s = ? WHERE decision_id = ?",  # noqa: S608
-        (taken if reason is None else "refused", reason or row["reason"], now_utc_s, decision_id),
+        (stored if reason is None else "refused", reason or row["reason"], now_utc_s, decision_id),
     )
     if column == "shore" and reason is None:
         db.execute("UPDATE decision SET relayed_utc_s = ? WHERE decision_id = ?", (now_utc_s, decision_id))
     return True
 
 
-def ashore_before(db: sqlite3.Connection, utc_s: float) -> list[str]:
-    """Note that whatever the relay had before a time is ashore; return those decisions."""
-    found = [
-        str(row["decision_id"])
-        for row in db.execute(
-            "SELECT decision_id FROM decision WHERE shore = 'relay' AND COALESCE(relayed_utc_s, changed_utc_s) < ?",
-            (utc_s,),
-        )
-    ]
-    for decision_id in found:
-        db.execute(
-            "UPDATE decision SET shore = 'delivered', changed_utc_s = MAX(changed_utc_s, ?) WHERE decision_id = ?",
-            (utc_s, decision_id),
-        )
-    return found
+def mark_delivered_to_shore(db: sqlite3.Connection, before_utc_s: float) -> list[str]:
+    """Mark decisions that the relay stored before a time as delivered to shore; return their identifiers."""
+    rows = db.execute(
+        "UPDATE decision SET shore = 'delivered', changed_utc_s = MAX(changed_utc_s, ?1)"
+        " WHERE shore = 'relay' AND COALESCE(relayed_utc_s, changed_utc_s) < ?1 RETURNING decision_id",
+        (before_utc_s,),
+    )
+    return [str(row["decision_id"]) for row in rows.fetchall()]
 
 
-def _unchanged(db: sqlite3.Connection, contact_id: str, revision: int) -> sqlite3.Row:
-    row = find_row(db, contact_id)
-    assert row is not None  # whoever calls has looked
+def _check_revision(db: sqlite3.Connection, contact_id: str, revision: int) -> sqlite3.Row:
+    """Return the row of a contact if it still has the displayed revision."""
+    row = find_contact(db, contact_id)
+    assert row is not None  # The caller has checked that the contact exists.
     if row["revision"] != revision:
-        last = None if row["last_decision"] is None else find(db, row["last_decision"])
-        raise ConflictError(contact_row(row), None if last is None else decision_of(last))
+        last = None if row["last_decision"] is None else find_decision(db, row["last_decision"])
+        raise ConflictError(contact_json(row), None if last is None else decision_json(last))
     return row
 
 
-def _check_screen(db: sqlite3.Connection, contact_id: str, screen: OnScreen) -> None:
-    """Refuse a decision on a picture that is not this contact's: the audit must be able to show it again."""
-    row = db.execute(
-        "SELECT payload, contact_id FROM version WHERE contact_id = ? AND version = ?", (contact_id, screen.version)
-    ).fetchone()
+def _check_displayed_image(db: sqlite3.Connection, contact_id: str, displayed: DisplayedImage) -> None:
+    """Check that the displayed image belongs to the contact, so that the audit can show it again."""
+    row = None if displayed.version is None else find_version(db, contact_id, displayed.version)
     if row is None:
-        raise BadInputError("decision", "version", screen.version, "a version of this contact's picture")
-    sha256 = image_of(row).picture_sha256
-    if sha256 != screen.sha256:
-        raise BadInputError("decision", "sha256", screen.sha256, f"that of version {screen.version}")
+        raise BadInputError("decision", "version", displayed.version, "a version of this contact's image")
+    if decode_image(row).picture_sha256 != displayed.sha256:
+        raise BadInputError("decision", "sha256", displayed.sha256, f"that of version {displayed.version}")
 
 
 def _insert(
     db: sqlite3.Connection,
     contact_id: str,
     record: Decision,
-    screen: OnScreen,
-    undoes: str | None,
+    displayed: DisplayedImage,
     now_utc_s: float,
-    ends: tuple[str, str],
+    delivery: DeliveryStates,
     *,
-    sent: bool = False,
+    undoes: str | None = None,
+    received: bool = False,
 ) -> None:
     values: Json = {
         **record.model_dump(exclude={"image_version"}),
         "contact_id": contact_id,
         "version": record.image_version,
-        "sha256": screen.sha256,
-        "layer": screen.layer,
+        "sha256": displayed.sha256,
+        "layer": displayed.layer,
         "undoes": undoes,
-        "elsewhere": int(sent),
-        "shore": ends[0],
-        "vehicle": ends[1],
+        "elsewhere": int(received),
+        "shore": delivery.shore,
+        "vehicle": delivery.vehicle,
         "changed_utc_s": now_utc_s,
         "payload": wire.encode(record),
-        "sent": int(sent or ends == ("none", "none")),
+        "sent": int(received or delivery == DeliveryStates("none", "none")),
     }
-    names, places = ", ".join(values), ", ".join("?" * len(values))
-    db.execute(f"INSERT INTO decision ({names}) VALUES ({places})", tuple(values.values()))  # noqa: S608
+    insert_row(db, "decision", values)
 
 
-def _effective(db: sqlite3.Connection, contact_id: str) -> sqlite3.Row | None:
+def _valid_decision(db: sqlite3.Connection, contact_id: str) -> sqlite3.Row | None:
+    """Return the latest decision that is not undone and does not undo another."""
     row: sqlite3.Row | None = db.execute(
         "SELECT * FROM decision WHERE contact_id = ? AND undone = 0 AND undoes IS NULL"
         " ORDER BY decided_utc_s DESC, seq DESC LIMIT 1",
@@ -287,9 +308,9 @@ def _effective(db: sqlite3.Connection, contact_id: str) -> sqlite3.Row | None:
     return row
 
 
-def _settle_contact(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> None:
-    """Bring a contact in line with its decisions."""
-    now = _effective(db, contact_id)
+def _update_contact(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> None:
+    """Update the columns of a contact that depend on its decisions."""
+    valid = _valid_decision(db, contact_id)
     last = db.execute(
         "SELECT decision_id, COUNT(*) OVER () AS number FROM decision WHERE contact_id = ? ORDER BY seq DESC LIMIT 1",
         (contact_id,),
@@ -298,13 +319,13 @@ def _settle_contact(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -
         "UPDATE contact SET review = ?, mlo_class = ?, confidence = ?, decided_by = ?, decided_utc_s = ?,"
         " effective = ?, remark = ?, last_decision = ?, revision = ?, updated_utc_s = ? WHERE id = ?",
         (
-            "unreviewed" if now is None else now["verdict"],
-            now and now["mlo_class"],
-            now and now["confidence"],
-            now and now["operator"],
-            now and now["decided_utc_s"],
-            now and now["decision_id"],
-            "" if now is None else now["remark"],
+            "unreviewed" if valid is None else valid["verdict"],
+            valid and valid["mlo_class"],
+            valid and valid["confidence"],
+            valid and valid["operator"],
+            valid and valid["decided_utc_s"],
+            valid and valid["decision_id"],
+            "" if valid is None else valid["remark"],
             last and last["decision_id"],
             last["number"] if last else 0,
             now_utc_s,

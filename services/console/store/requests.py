@@ -1,4 +1,4 @@
-"""Requests to vehicles and advice to vessels in the database, with what they cost and how far they have come."""
+"""Requests to vehicles and comments from the shore site in the database, and their delivery."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from sonarpost import wire
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Advice, Command, CommandKind, DownlinkState, TaskingState
-from sonarpost.services.console.store import database
-from sonarpost.services.console.store.contacts import contact_of_picture, find_row
-from sonarpost.services.console.store.database import OnScreen
-from sonarpost.services.console.store.serialisers import Json, advice_of, request_of
+from sonarpost.services.console.store.contacts import find_contact, find_contact_of_image
+from sonarpost.services.console.store.database import DisplayedImage, add_audit_entry, insert_row
+from sonarpost.services.console.store.serialisers import Json, advice_json, request_json
 from sonarpost.services.console.store.users import Actor
 
-KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider")
-_RANK: Final = {
+REQUEST_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider")
+"""Kinds in the order of the page. `wider` is displayed as "expand"."""
+
+_STATE_ORDER: Final = {
     "none": 0,
     "waiting": 0,
     "asked": 1,
@@ -32,18 +33,18 @@ Table = Literal["decision", "request", "advice"]
 ID_COLUMN: Final[dict[Table, str]] = {"decision": "decision_id", "request": "command_id", "advice": "advice_id"}
 
 
-def why_not(row: sqlite3.Row, kind: str) -> str:
-    """Return why a contact's picture cannot be asked for in this way; empty where it can."""
+def unavailable_reason(row: sqlite3.Row, kind: str) -> str:
+    """Return why a kind of request is not possible for a contact; empty if it is."""
     if kind == "revisit" and (row["lat_deg"] is None or row["lon_deg"] is None):
-        return "the contact's position is not known"
+        return "the position of the contact is unknown"
     if kind == "resend" and row["complete"]:
-        return "all of the picture that the vehicle announced is here"
+        return "the image is complete"
     if kind == "refine" and not default_registry().is_embedded(row["codec"]):
-        return f"the codec {row['codec']} makes no longer stream" if row["codec"] else "nothing of its picture is here"
+        return f"the codec {row['codec']} cannot add detail" if row["codec"] else "no part of the image was received"
     return ""
 
 
-def ask(
+def add_request(
     db: sqlite3.Connection,
     contact_id: str,
     kind: CommandKind,
@@ -51,83 +52,81 @@ def ask(
     actor: Actor,
     now_utc_s: float,
 ) -> str:
-    """Write a request down, to be sent; return its identifier.
+    """Store a request; return its identifier.
 
     Args:
-        db: In a transaction.
-        contact_id: Of a contact that exists.
-        kind: What is asked.
-        airtime_s: What it costs, as it was shown.
-        actor: Who asks.
-        now_utc_s: When.
+        db: Connection in a transaction.
+        contact_id: Identifier of an existing contact.
+        kind: Kind of the request.
+        airtime_s: Displayed estimate of the air time.
+        actor: The user.
+        now_utc_s: Time of the request.
 
     Raises:
-        BadInputError: It cannot be asked of this contact.
+        BadInputError: The request is not possible, or one of this kind is in progress.
     """
-    row = find_row(db, contact_id)
-    assert row is not None  # whoever calls has looked
-    if reason := why_not(row, kind):
+    row = find_contact(db, contact_id)
+    assert row is not None  # The caller has checked that the contact exists.
+    if reason := unavailable_reason(row, kind):
         raise BadInputError("request", "kind", kind, f"another kind: {reason}")
-    # A refused or expired one may be asked again; one under way is not doubled.
-    open_one = db.execute(
+    in_progress = db.execute(
         "SELECT 1 FROM request WHERE contact_id = ? AND kind = ? AND state IN ('waiting', 'asked', 'sent')",
         (contact_id, kind),
     ).fetchone()
-    if open_one is not None:
-        raise BadInputError("request", "kind", kind, "one that is not under way already")
-    place = kind == "revisit"
+    if in_progress is not None:
+        raise BadInputError("request", "kind", kind, "a kind without a request in progress")
+    has_position = kind == "revisit"
     record = Command(
         command_id=f"c-{uuid.uuid4().hex}",
         kind=kind,
         vehicle_id=row["vehicle_id"],
         image_id=row["image_id"],
-        lat_deg=row["lat_deg"] if place else None,
-        lon_deg=row["lon_deg"] if place else None,
+        lat_deg=row["lat_deg"] if has_position else None,
+        lon_deg=row["lon_deg"] if has_position else None,
         issued_by=actor.user,
         issued_utc_s=now_utc_s,
     )
-    db.execute(
-        "INSERT INTO request (command_id, contact_id, vessel_id, kind, user, asked_utc_s, airtime_s, state,"
-        " changed_utc_s, payload, sent) VALUES (?, ?, ?, ?, ?, ?, ?, 'waiting', ?, ?, 0)",
-        (
-            record.command_id,
-            contact_id,
-            row["vessel_id"],
-            kind,
-            actor.user,
-            now_utc_s,
-            airtime_s,
-            now_utc_s,
-            wire.encode(record),
-        ),
-    )
+    values: Json = {
+        "command_id": record.command_id,
+        "contact_id": contact_id,
+        "vessel_id": row["vessel_id"],
+        "kind": kind,
+        "user": actor.user,
+        "asked_utc_s": now_utc_s,
+        "airtime_s": airtime_s,
+        "state": "waiting",
+        "changed_utc_s": now_utc_s,
+        "payload": wire.encode(record),
+        "sent": 0,
+    }
+    insert_row(db, "request", values)
     detail = {"command_id": record.command_id, "kind": kind, "airtime_s": airtime_s}
-    database.write(db, contact_id, actor, "request", now_utc_s, OnScreen(row["version"]), detail)
+    add_audit_entry(db, contact_id, actor, "request", now_utc_s, DisplayedImage(row["version"]), detail)
     return record.command_id
 
 
-def requests_of(db: sqlite3.Connection, contact_id: str) -> list[Json]:
-    """Return the requests about a contact, the last first."""
+def list_requests(db: sqlite3.Connection, contact_id: str) -> list[Json]:
+    """Return the requests about a contact, newest first."""
     rows = db.execute("SELECT * FROM request WHERE contact_id = ? ORDER BY seq DESC", (contact_id,))
-    return [request_of(row) for row in rows]
+    return [request_json(row) for row in rows]
 
 
-def is_news(was: str, was_sent: int, state: str, times_sent: int | None) -> bool:
-    """Tell whether a state is farther on than what is known.
+def is_later_state(known: str, known_times_sent: int, state: str, times_sent: int | None) -> bool:
+    """Return whether a delivery state is later than the known one.
 
-    Not by its time: clocks of hosts differ, and a receipt may come after the first report.
+    Times are not compared: clocks of hosts differ, and an acknowledgement may arrive after the first state record.
     """
-    if was == state:
-        return state == "sent" and times_sent is not None and times_sent > was_sent
-    return _RANK[state] > _RANK[was]
+    if known == state:
+        return state == "sent" and times_sent is not None and times_sent > known_times_sent
+    return _STATE_ORDER[state] > _STATE_ORDER[known]
 
 
-def request_state(
+def update_request_state(
     db: sqlite3.Connection, command_id: str, state: str, reason: str, times_sent: int | None, utc_s: float
 ) -> str | None:
-    """Note how far a request has come; return its contact, None where that is no news."""
+    """Update the delivery state of a request; return the contact identifier, None if nothing has changed."""
     row = db.execute("SELECT * FROM request WHERE command_id = ?", (command_id,)).fetchone()
-    if row is None or not is_news(row["state"], row["times_sent"], state, times_sent):
+    if row is None or not is_later_state(row["state"], row["times_sent"], state, times_sent):
         return None
     db.execute(
         "UPDATE request SET state = ?, reason = ?, times_sent = ?, changed_utc_s = ? WHERE command_id = ?",
@@ -136,27 +135,60 @@ def request_state(
     return str(row["contact_id"])
 
 
-def downlink(db: sqlite3.Connection, state: DownlinkState) -> str | None:
-    """Note how far a request has come on its way to the vehicle; return its contact, None where that is no news."""
-    return request_state(db, state.record_id, state.state, state.reason, state.times_sent, state.changed_utc_s)
+def apply_downlink_state(db: sqlite3.Connection, state: DownlinkState) -> str | None:
+    """Update the delivery of a request to the vehicle; return the contact identifier, None if nothing has changed."""
+    return update_request_state(db, state.record_id, state.state, state.reason, state.times_sent, state.changed_utc_s)
 
 
-def advise(db: sqlite3.Connection, contact_id: str, record: Advice, actor: Actor) -> None:
-    """Write advice down, to be sent."""
+def apply_tasking_state(db: sqlite3.Connection, state: TaskingState) -> tuple[Table, str] | None:
+    """Update the delivery of a request or comment to the vessel; return its table and contact if it has changed."""
+    if state.kind == "command":
+        contact_id = update_request_state(db, state.record_id, state.state, state.reason, None, state.changed_utc_s)
+        return None if contact_id is None else ("request", contact_id)
+    row = db.execute("SELECT * FROM advice WHERE advice_id = ?", (state.record_id,)).fetchone()
+    if row is None or row["state"] in (None, "delivered", "refused") or row["state"] == state.state:
+        return None
+    db.execute(
+        "UPDATE advice SET state = ?, reason = ? WHERE advice_id = ?", (state.state, state.reason, state.record_id)
+    )
+    return "advice", str(row["contact_id"])
+
+
+def refuse_advice(db: sqlite3.Connection, advice_id: str, reason: str) -> str | None:
+    """Mark a comment as refused by c2; return the contact identifier, None if it is unknown."""
+    db.execute(
+        "UPDATE advice SET state = 'refused', reason = ? WHERE advice_id = ? AND state = 'waiting'",
+        (reason, advice_id),
+    )
+    row = db.execute("SELECT contact_id FROM advice WHERE advice_id = ?", (advice_id,)).fetchone()
+    return None if row is None else str(row["contact_id"])
+
+
+def add_advice(db: sqlite3.Connection, contact_id: str, record: Advice, actor: Actor) -> None:
+    """Store a comment of this console."""
     _insert_advice(db, contact_id, record, "waiting")
     detail = record.model_dump(include={"advice_id", "verdict", "confidence", "mlo_class", "remark"})
-    screen = OnScreen(record.image_version)
-    database.write(db, contact_id, actor, "advise", record.advised_utc_s, screen, detail)
+    displayed = DisplayedImage(record.image_version)
+    add_audit_entry(db, contact_id, actor, "advise", record.advised_utc_s, displayed, detail)
 
 
-def take_advice(db: sqlite3.Connection, record: Advice) -> str | None:
-    """Keep advice from ashore; return its contact, None where it is known or its picture is not here yet."""
+def store_received_advice(db: sqlite3.Connection, record: Advice) -> str | None:
+    """Store a comment from the shore site. A comment without its image is kept until the image arrives.
+
+    Returns:
+        The contact identifier; None if the comment is already stored or its image is not.
+    """
     if db.execute("SELECT 1 FROM advice WHERE advice_id = ?", (record.advice_id,)).fetchone():
         return None
-    at = record.advised_utc_s
-    contact_id = contact_of_picture(db, record.vessel_id, record.vehicle_id, record.image_id, at)
+    contact_id = find_contact_of_image(db, record.vessel_id, record.vehicle_id, record.image_id, record.advised_utc_s)
     _insert_advice(db, contact_id or "", record, None)
     return contact_id
+
+
+def list_advice(db: sqlite3.Connection, contact_id: str) -> list[Json]:
+    """Return the comments on a contact, newest first."""
+    rows = db.execute("SELECT * FROM advice WHERE contact_id = ? ORDER BY seq DESC", (contact_id,))
+    return [advice_json(row) for row in rows]
 
 
 def _insert_advice(db: sqlite3.Connection, contact_id: str, record: Advice, state: str | None) -> None:
@@ -168,26 +200,5 @@ def _insert_advice(db: sqlite3.Connection, contact_id: str, record: Advice, stat
         "payload": wire.encode(record),
         "sent": int(state is None),
     }
-    names, places = ", ".join(values), ", ".join("?" * len(values))
-    db.execute(f"INSERT INTO advice ({names}) VALUES ({places})", tuple(values.values()))  # noqa: S608
+    insert_row(db, "advice", values)
     db.execute("UPDATE contact SET advised = 1 WHERE id = ?", (contact_id,))
-
-
-def advice_for(db: sqlite3.Connection, contact_id: str) -> list[Json]:
-    """Return the advice about a contact, the last first."""
-    rows = db.execute("SELECT * FROM advice WHERE contact_id = ? ORDER BY seq DESC", (contact_id,))
-    return [advice_of(row) for row in rows]
-
-
-def tasking(db: sqlite3.Connection, state: TaskingState) -> tuple[Table, str] | None:
-    """Note how far advice or a command has come on its way to the vessel; return which table and contact changed."""
-    if state.kind == "command":
-        contact_id = request_state(db, state.record_id, state.state, state.reason, None, state.changed_utc_s)
-        return None if contact_id is None else ("request", contact_id)
-    row = db.execute("SELECT * FROM advice WHERE advice_id = ?", (state.record_id,)).fetchone()
-    if row is None or row["state"] in (None, "delivered", "refused") or row["state"] == state.state:
-        return None
-    db.execute(
-        "UPDATE advice SET state = ?, reason = ? WHERE advice_id = ?", (state.state, state.reason, state.record_id)
-    )
-    return "advice", str(row["contact_id"])

@@ -1,9 +1,10 @@
-"""From rows of the database to what the interface says."""
+"""JSON objects of the HTTP interface, made from database rows and records."""
 
 from __future__ import annotations
 
 import json
 import sqlite3
+from dataclasses import asdict
 from typing import Final
 
 from sonarpost import wire
@@ -13,21 +14,21 @@ from sonarpost.review.rendering import LAYERS
 
 Json = dict[str, object]
 
-CONTACT: Final = """
+CONTACT_QUERY: Final = """
 SELECT c.*, d.shore AS d_shore, d.vehicle AS d_vehicle, d.reason AS d_reason, d.times_sent AS d_times_sent,
     d.changed_utc_s AS d_changed_utc_s,
     (SELECT COUNT(*) FROM contact g WHERE g.group_id = c.group_id) AS looks,
     (SELECT COUNT(*) FROM request r WHERE r.contact_id = c.id AND r.state IN ('waiting', 'asked', 'sent')) AS asking
 FROM contact c LEFT JOIN decision d ON d.decision_id = c.last_decision
 """
-"""The start of every query whose rows `contact_row` takes."""
+"""Start of every query for rows of `contact_json`."""
 
-_PLAIN: Final = (
+_CONTACT_COLUMNS: Final = [
     "id",
-    "name",
     "vessel_id",
     "vehicle_id",
     "image_id",
+    "name",
     "revision",
     "version",
     "review",
@@ -49,64 +50,103 @@ _PLAIN: Final = (
     "bytes_total",
     "height_px",
     "width_px",
-)
+]
+_DELIVERY_COLUMNS: Final = ("shore", "vehicle", "reason", "times_sent", "changed_utc_s")
+_DECISION_COLUMNS: Final = [
+    "decision_id",
+    "verdict",
+    "confidence",
+    "mlo_class",
+    "remark",
+    "operator",
+    "decided_utc_s",
+    "version",
+    "sha256",
+    "layer",
+    "undoes",
+]
+_REQUEST_COLUMNS: Final = [
+    "command_id",
+    "kind",
+    "user",
+    "asked_utc_s",
+    "airtime_s",
+    "state",
+    "times_sent",
+    "reason",
+    "changed_utc_s",
+]
+_ADVICE_COLUMNS: Final = [
+    "advice_id",
+    "version",
+    "verdict",
+    "confidence",
+    "mlo_class",
+    "remark",
+    "author",
+    "advised_utc_s",
+]
+_AUDIT_COLUMNS: Final = ["seq", "utc_s", "user", "role", "address", "action", "version", "sha256", "layer"]
+_VERSION_FIELDS: Final = [
+    "version",
+    "codec",
+    "model",
+    "complete",
+    "missing_fraction",
+    "bytes_received",
+    "bytes_total",
+    "frames_received",
+    "first_frame_utc_s",
+    "last_frame_utc_s",
+]
 
 
-def contact_row(row: sqlite3.Row) -> Json:
-    """Return a contact as lists show it."""
-    several = (row["looks"] or 0) > 1
+def contact_json(row: sqlite3.Row) -> Json:
+    """Return a contact as in lists."""
+    grouped = (row["looks"] or 0) > 1
     return {
-        **{name: row[name] for name in _PLAIN},
+        **{name: row[name] for name in _CONTACT_COLUMNS},
         "complete": bool(row["complete"]),
         "percent_received": row["percent"],
         "has_picture": bool(row["has_picture"]),
         "thumbnail": f"/api/contacts/{row['id']}/versions/{row['version']}/thumbnail.png",
-        "group": row["group_id"] if several else None,
-        "looks": row["looks"] if several else 1,
+        "group": row["group_id"] if grouped else None,
+        "looks": row["looks"] if grouped else 1,
         "advised": bool(row["advised"]),
-        "delivery": None if row["d_shore"] is None else _delivery(row, "d_"),
+        "delivery": None if row["d_shore"] is None else {name: row[f"d_{name}"] for name in _DELIVERY_COLUMNS},
         "open_requests": row["asking"],
     }
 
 
-def _delivery(row: sqlite3.Row, prefix: str = "") -> Json:
-    names = ("shore", "vehicle", "reason", "times_sent", "changed_utc_s")
-    return {name: row[prefix + name] for name in names}
-
-
-def decision_of(row: sqlite3.Row) -> Json:
+def decision_json(row: sqlite3.Row) -> Json:
     """Return a decision."""
-    names = ("decision_id", "verdict", "confidence", "mlo_class", "remark", "operator", "decided_utc_s", "version")
     return {
-        **{name: row[name] for name in (*names, "sha256", "layer", "undoes")},
+        **{name: row[name] for name in _DECISION_COLUMNS},
         "undone": bool(row["undone"]),
         "elsewhere": bool(row["elsewhere"]),
-        "delivery": _delivery(row),
+        "delivery": {name: row[name] for name in _DELIVERY_COLUMNS},
     }
 
 
-def request_of(row: sqlite3.Row) -> Json:
+def request_json(row: sqlite3.Row) -> Json:
     """Return a request."""
-    names = ("command_id", "kind", "user", "asked_utc_s", "airtime_s", "state", "times_sent", "reason", "changed_utc_s")
-    return {name: row[name] for name in names}
+    return {name: row[name] for name in _REQUEST_COLUMNS}
 
 
-def advice_of(row: sqlite3.Row) -> Json:
-    """Return advice."""
-    names = ("advice_id", "version", "verdict", "confidence", "mlo_class", "remark", "author", "advised_utc_s")
-    state = None if row["state"] is None else {"state": row["state"], "reason": row["reason"]}
-    return {**{name: row[name] for name in names}, "delivery": state}
+def advice_json(row: sqlite3.Row) -> Json:
+    """Return a comment."""
+    delivery = None if row["state"] is None else {"state": row["state"], "reason": row["reason"]}
+    return {**{name: row[name] for name in _ADVICE_COLUMNS}, "delivery": delivery}
 
 
-def audit_of(row: sqlite3.Row) -> Json:
+def audit_json(row: sqlite3.Row) -> Json:
     """Return an entry of the audit."""
-    names = ("seq", "utc_s", "user", "role", "address", "action", "version", "sha256", "layer")
     detail: Json = json.loads(row["detail"])
-    return {**{name: row[name] for name in names}, "detail": detail}
+    return {**{name: row[name] for name in _AUDIT_COLUMNS}, "detail": detail}
 
 
-def percent_of(image: ReconstructedImage) -> float:
-    """Return how much of what was announced has arrived, in percent."""
+def percent_received(image: ReconstructedImage) -> float:
+    """Return the received part of the announced stream in percent."""
     if image.complete:
         return 100.0
     if image.bytes_total:
@@ -114,35 +154,24 @@ def percent_of(image: ReconstructedImage) -> float:
     return 0.0
 
 
-def image_of(row: sqlite3.Row) -> ReconstructedImage:
-    """Return the record of a version."""
+def decode_image(row: sqlite3.Row) -> ReconstructedImage:
+    """Return the record of an image version."""
     return wire.decode(ReconstructedImage, bytes(row["payload"]), f"contact {row['contact_id']}")
 
 
-def version_of(row: sqlite3.Row) -> Json:
-    """Return a version of a picture."""
-    image, rate = image_of(row), row["rate"]
+def version_json(row: sqlite3.Row) -> Json:
+    """Return an image version."""
+    image, rate = decode_image(row), row["rate"]
     contact = image.contact
     airtime_s = None if rate is None else airtime_of_frames(image.frames_received, int(rate))
-    layers: list[Json] = [
-        {
-            "name": layer.name,
-            "measurable": layer.measurable,
-            "synthesised": layer.synthesised,
-            "reason": layer.reason,
-        }
-        for layer in LAYERS
-    ]
-    plain = ("version", "codec", "model", "complete", "missing_fraction", "bytes_received", "bytes_total")
-    times = ("frames_received", "first_frame_utc_s", "last_frame_utc_s")
     return {
-        **{name: getattr(image, name) for name in (*plain, *times)},
+        **{name: getattr(image, name) for name in _VERSION_FIELDS},
         "received_utc_s": row["received_utc_s"],
         "height_px": image.picture.height_px,
         "width_px": image.picture.width_px,
         "bits": image.picture.bits,
         "sha256": image.picture_sha256,
-        "percent_received": percent_of(image),
+        "percent_received": percent_received(image),
         "missing_halves": list(image.missing_halves),
         "airtime_s": airtime_s,
         "airtime_is": None if airtime_s is None else "estimated",
@@ -150,13 +179,13 @@ def version_of(row: sqlite3.Row) -> Json:
         "pixel_across_m": contact.pixel_across_m if contact else None,
         "notes": list(image.notes),
         "guessed_fraction": 0.0,
-        "layers": layers,
+        "layers": [asdict(layer) for layer in LAYERS],
     }
 
 
-def record_of(image: ReconstructedImage) -> Json | None:
-    """Return the contact record of a picture, with the side of the nadir; None where none arrived."""
+def contact_record_json(image: ReconstructedImage) -> Json | None:
+    """Return the contact record with the side of the nadir; None if no contact record was received."""
     if image.contact is None:
         return None
-    # Pictures are turned before they are sent so that the nadir is to the left, where the side is known.
+    # If the channel is known, the vehicle mirrors images so that the nadir is on the left.
     return {**image.contact.model_dump(), "nadir_side": "left" if image.contact.channel else None}

@@ -1,4 +1,4 @@
-"""Who may log in: names, roles, hashed passwords; sessions that end. A file of its own beside the database."""
+"""Users and sessions of the console: roles, permissions, password hashes, log-in limits. One SQLite file."""
 
 from __future__ import annotations
 
@@ -15,50 +15,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from cryptography.exceptions import InvalidKey
 from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
 
 from sonarpost.errors import BadInputError, DeliveryError
 
 Role = Literal["observer", "operator", "expert"]
 Side = Literal["vessel", "shore"]
-Act = Literal["decide", "measure", "request", "advise"]
+Permission = Literal["decide", "measure", "request", "advise"]
 
 ROLES: Final[tuple[Role, ...]] = ("observer", "operator", "expert")
-
-
-@dataclass(frozen=True, slots=True)
-class Actor:
-    """Somebody who is logged in.
-
-    Attributes:
-        user: Name.
-        role: Of the user.
-        address: From where.
-    """
-
-    user: str
-    role: Role
-    address: str
-
-    def may(self, act: Act, side: Side) -> bool:
-        """Tell whether this person may do something on this side of the water.
-
-        Decisions are made where the vehicle can be told at once: on a vessel. Ashore experts advise and ask.
-        """
-        if act == "advise":
-            return side == "shore" and self.role == "expert"
-        if act == "decide":
-            return side == "vessel" and self.role != "observer"
-        if act == "request" and side == "shore":
-            return self.role == "expert"
-        return self.role != "observer"
-
+PERMISSIONS: Final[tuple[Permission, ...]] = ("decide", "measure", "request", "advise")
 
 FILE_NAME = "console-users.db"
-COST = 2**15
-"""scrypt's n with r = 8: 32 MiB for each attempt, one attempt at a time."""
+SCRYPT_COST = 2**15
+"""Parameter n of scrypt with r = 8: 32 MiB for each attempt. Attempts run one at a time."""
 MIN_PASSWORD, MAX_PASSWORD = 10, 200
+
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}")
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS user (
@@ -71,8 +43,31 @@ CREATE TABLE IF NOT EXISTS session (
 
 
 @dataclass(frozen=True, slots=True)
+class Actor:
+    """A user who is logged in, with the network address of the browser."""
+
+    user: str
+    role: Role
+    address: str
+
+    def may(self, permission: Permission, side: Side) -> bool:
+        """Return whether the user has a permission on a vessel or at a shore site.
+
+        Decisions are made on the vessel, which can send them to the vehicle at once. Experts at the shore site comment
+        and send requests.
+        """
+        if permission == "advise":
+            return side == "shore" and self.role == "expert"
+        if permission == "decide":
+            return side == "vessel" and self.role != "observer"
+        if permission == "request" and side == "shore":
+            return self.role == "expert"
+        return self.role != "observer"
+
+
+@dataclass(frozen=True, slots=True)
 class User:
-    """Somebody who may log in."""
+    """A user of the console."""
 
     name: str
     role: Role
@@ -81,12 +76,14 @@ class User:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Somebody who has.
+    """A log-in session.
 
     Attributes:
-        token: What the browser's cookie holds; only its hash is kept.
-        csrf: What its page sends with everything that changes something.
-        expires_utc_s: When it ends if it is not used.
+        token: Value of the browser's cookie. Only its hash is stored.
+        name: Name of the user.
+        role: Role of the user.
+        csrf: Token that the page sends with each POST request.
+        expires_utc_s: Time at which an unused session ends.
     """
 
     token: str
@@ -97,12 +94,12 @@ class Session:
 
 
 class Users:
-    """The file of users and sessions, for several threads and processes.
+    """The file of users and sessions, shared by several threads and processes.
 
     Args:
         path: The file.
-        session_s: A session ends after so long without use ...
-        session_max_s: ... and in any case after so long.
+        session_s: Maximum time between two requests of a session.
+        session_max_s: Maximum duration of a session.
         clock: UTC seconds.
 
     Raises:
@@ -118,10 +115,10 @@ class Users:
     ) -> None:
         self.path = path
         self._session_s = session_s
-        self._session_most_s = session_max_s
+        self._session_max_s = session_max_s
         self._clock = clock
         self._lock = threading.RLock()
-        self._hashing = threading.Lock()
+        self._hash_lock = threading.Lock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch(mode=0o600)
@@ -130,10 +127,10 @@ class Users:
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.executescript(f"BEGIN; {_SCHEMA} COMMIT;")
         except (OSError, sqlite3.Error) as error:
-            raise DeliveryError(f"{path}: cannot be opened as the console's users: {error}") from error
+            raise DeliveryError(f"{path}: cannot be opened as the user file of the console: {error}") from error
 
     @contextmanager
-    def _access(self) -> Iterator[sqlite3.Connection]:
+    def _connection(self) -> Iterator[sqlite3.Connection]:
         with self._lock:
             try:
                 yield self._db
@@ -148,10 +145,10 @@ class Users:
     # Users
 
     def add(self, name: str, role: str, password: str) -> None:
-        """Add a user, or give one another role and password; sessions of that user end.
+        """Add a user, or replace role and password of a user and end the user's sessions.
 
         Raises:
-            BadInputError: Name, role or password is not allowed.
+            BadInputError: Name, role or password is invalid.
         """
         if not _NAME.fullmatch(name):
             raise BadInputError("user", "name", name, "1 to 40 letters, digits, '.', '_' and '-'")
@@ -160,14 +157,14 @@ class Users:
         self._put(name, role, password)
 
     def set_password(self, name: str, password: str, keep: str | None = None) -> None:
-        """Give a user another password; the user's sessions end, but for the one with the token `keep`.
+        """Change a user's password, and end the user's sessions except the one with the token `keep`.
 
         Raises:
-            BadInputError: There is no such user, or the password is not allowed.
+            BadInputError: The user does not exist, or the password is invalid.
         """
         user = self.find(name)
         if user is None:
-            raise BadInputError("user", "name", name, "a user; `sonarpost console user ls` shows them")
+            raise BadInputError("user", "name", name, "a user; `sonarpost console user ls` lists them")
         self._put(name, user.role, password, keep)
 
     def _put(self, name: str, role: str, password: str, keep: str | None = None) -> None:
@@ -175,145 +172,134 @@ class Users:
             expected = f"{MIN_PASSWORD} to {MAX_PASSWORD} characters"
             raise BadInputError("user", "password", f"{len(password)} characters", expected)
         salt = secrets.token_bytes(16)
-        hashed = self._hash(password, salt, COST)
-        with self._access() as db:
+        hashed = self._hash(password, salt, SCRYPT_COST)
+        with self._connection() as db:
             db.execute(
                 "INSERT OR REPLACE INTO user VALUES (?, ?, ?, ?, ?, ?)",
-                (name, role, salt, hashed, COST, self._clock()),
+                (name, role, salt, hashed, SCRYPT_COST, self._clock()),
             )
-            db.execute(
-                "DELETE FROM session WHERE name = ? AND token_sha256 <> ?", (name, b"" if keep is None else _key(keep))
-            )
+            kept = b"" if keep is None else _token_hash(keep)
+            db.execute("DELETE FROM session WHERE name = ? AND token_sha256 <> ?", (name, kept))
 
     def remove(self, name: str) -> bool:
-        """Remove a user with the user's sessions; tell whether there was one."""
-        with self._access() as db:
+        """Remove a user and the user's sessions; return whether the user existed."""
+        with self._connection() as db:
             db.execute("DELETE FROM session WHERE name = ?", (name,))
             return db.execute("DELETE FROM user WHERE name = ?", (name,)).rowcount > 0
 
     def find(self, name: str) -> User | None:
-        """Return a user, None where there is none of that name."""
-        with self._access() as db:
-            row = db.execute("SELECT name, role, changed_utc_s FROM user WHERE name = ?", (name,)).fetchone()
-        return None if row is None else User(*row)
+        """Return a user; None if there is none."""
+        return next((user for user in self.all() if user.name == name), None)
 
     def all(self) -> list[User]:
         """Return all users by name."""
-        with self._access() as db:
+        with self._connection() as db:
             return [User(*row) for row in db.execute("SELECT name, role, changed_utc_s FROM user ORDER BY name")]
 
-    def right(self, name: str, password: str) -> bool:
-        """Tell whether this is the user's password; takes as long where there is no such user."""
-        with self._access() as db:
+    def verify_password(self, name: str, password: str) -> bool:
+        """Return whether a password is correct. The duration is the same for an unknown user."""
+        with self._connection() as db:
             row = db.execute("SELECT salt, hash, cost FROM user WHERE name = ?", (name,)).fetchone()
-        if row is None:
-            self._hash(password[:MAX_PASSWORD], bytes(16), COST)
-            return False
-        with self._hashing:
-            kdf = Scrypt(salt=bytes(row["salt"]), length=32, n=int(row["cost"]), r=8, p=1)
-            try:
-                kdf.verify(password[:MAX_PASSWORD].encode("utf-8", "surrogatepass"), bytes(row["hash"]))
-            except InvalidKey:
-                return False
-            return True
+        salt, cost = (bytes(16), SCRYPT_COST) if row is None else (bytes(row["salt"]), int(row["cost"]))
+        hashed = self._hash(password[:MAX_PASSWORD], salt, cost)
+        return row is not None and hmac.compare_digest(hashed, bytes(row["hash"]))
 
     def _hash(self, password: str, salt: bytes, cost: int) -> bytes:
-        with self._hashing:
+        with self._hash_lock:
             return Scrypt(salt=salt, length=32, n=cost, r=8, p=1).derive(password.encode("utf-8", "surrogatepass"))
 
     # Sessions
 
-    def begin(self, name: str) -> Session:
-        """Begin a session of a user who exists."""
+    def start_session(self, name: str) -> Session:
+        """Start a session of an existing user."""
         token, csrf, now = secrets.token_urlsafe(32), secrets.token_urlsafe(24), self._clock()
-        with self._access() as db:
-            db.execute("DELETE FROM session WHERE used_utc_s < ? OR begun_utc_s < ?", self._oldest(now))
-            db.execute("INSERT INTO session VALUES (?, ?, ?, ?, ?)", (_key(token), name, csrf, now, now))
-        session = self.session(token)
+        with self._connection() as db:
+            db.execute("DELETE FROM session WHERE used_utc_s < ? OR begun_utc_s < ?", self._limits(now))
+            db.execute("INSERT INTO session VALUES (?, ?, ?, ?, ?)", (_token_hash(token), name, csrf, now, now))
+        session = self.find_session(token)
         assert session is not None
         return session
 
-    def session(self, token: str, *, use: bool = True) -> Session | None:
-        """Return a session that has not ended, None for any other token.
+    def find_session(self, token: str, *, is_use: bool = True) -> Session | None:
+        """Return a session that has not ended; None for any other token.
 
         Args:
-            token: Of the session.
-            use: Whether somebody does something: a page that is merely open does not keep its session alive.
+            token: Token of the session.
+            is_use: Whether this extends the session. An open page alone does not.
         """
         now = self._clock()
-        used, begun = self._oldest(now)
-        with self._access() as db:
+        with self._connection() as db:
             row = db.execute(
                 "SELECT s.*, u.role FROM session s JOIN user u USING (name)"
                 " WHERE token_sha256 = ? AND used_utc_s >= ? AND begun_utc_s >= ?",
-                (_key(token), used, begun),
+                (_token_hash(token), *self._limits(now)),
             ).fetchone()
             if row is None:
                 return None
-            # Not at every request: a write for each would wear the disk for nothing.
-            if use and now - row["used_utc_s"] > min(60.0, self._session_s / 10):
-                db.execute("UPDATE session SET used_utc_s = ? WHERE token_sha256 = ?", (now, _key(token)))
-        ends = min((now if use else row["used_utc_s"]) + self._session_s, row["begun_utc_s"] + self._session_most_s)
-        return Session(token, row["name"], row["role"], row["csrf"], ends)
+            # The time is not updated at every request, to save disk writes.
+            if is_use and now - row["used_utc_s"] > min(60.0, self._session_s / 10):
+                db.execute("UPDATE session SET used_utc_s = ? WHERE token_sha256 = ?", (now, _token_hash(token)))
+        used_utc_s = now if is_use else row["used_utc_s"]
+        expires_utc_s = min(used_utc_s + self._session_s, row["begun_utc_s"] + self._session_max_s)
+        return Session(token, row["name"], row["role"], row["csrf"], expires_utc_s)
 
-    def end(self, token: str) -> None:
+    def end_session(self, token: str) -> None:
         """End a session."""
-        with self._access() as db:
-            db.execute("DELETE FROM session WHERE token_sha256 = ?", (_key(token),))
+        with self._connection() as db:
+            db.execute("DELETE FROM session WHERE token_sha256 = ?", (_token_hash(token),))
 
-    def _oldest(self, now: float) -> tuple[float, float]:
-        return now - self._session_s, now - self._session_most_s
+    def _limits(self, now: float) -> tuple[float, float]:
+        """Return the earliest times of last use and of start of a valid session."""
+        return now - self._session_s, now - self._session_max_s
 
 
-def _key(token: str) -> bytes:
+def _token_hash(token: str) -> bytes:
     return hashlib.sha256(token.encode("utf-8", "surrogatepass")).digest()
 
 
-def same(given: str, expected: str) -> bool:
-    """Compare two secrets in a time that tells nothing of them."""
+def is_equal_secret(given: str, expected: str) -> bool:
+    """Compare two secrets in constant time."""
     return hmac.compare_digest(given.encode("utf-8", "surrogatepass"), expected.encode())
 
 
-class Attempts:
-    """Counts failed log-ins: so many of a user and so many from an address within a while, and no more.
+class LoginLimiter:
+    """Limits failed log-in attempts of one user and from one address.
 
-    Attributes:
-        most_of_user: Of one user.
-        most_from: From one address.
-        within_s: The while.
+    Args:
+        max_of_user: Failed attempts of one user in `window_s`.
+        max_from_address: Failed attempts from one address in `window_s`.
+        window_s: Duration of the window.
     """
 
-    def __init__(self, most_of_user: int = 5, most_from: int = 20, within_s: float = 300.0) -> None:
-        self.most_of_user = most_of_user
-        self.most_from = most_from
-        self.within_s = within_s
+    def __init__(self, max_of_user: int = 5, max_from_address: int = 20, window_s: float = 300.0) -> None:
+        self._max_of_user = max_of_user
+        self._max_from_address = max_from_address
+        self._window_s = window_s
         self._lock = threading.Lock()
-        self._failed: dict[str, list[float]] = {}
+        self._failures: dict[str, list[float]] = {}
 
     def wait_s(self, user: str, address: str, now_s: float) -> float:
-        """Return how long to wait before another attempt, 0 for not at all; `now_s` is monotonic."""
+        """Return the time until the next permitted attempt, 0 if one is permitted now; `now_s` is monotonic."""
         with self._lock:
-            # Names that nobody tries any more are forgotten, so that invented ones do not fill the memory.
-            for name, times in list(self._failed.items()):
-                recent = [at for at in times if now_s - at < self.within_s]
-                if recent:
-                    self._failed[name] = recent
-                else:
-                    del self._failed[name]
+            # Old entries are deleted for all names, so that invented names do not fill the memory.
+            recent = {
+                name: [at for at in times if now_s - at < self._window_s] for name, times in self._failures.items()
+            }
+            self._failures = {name: times for name, times in recent.items() if times}
             waits = [0.0]
-            for name, most in ((f"user {user}", self.most_of_user), (f"from {address}", self.most_from)):
-                times = self._failed.get(name, [])
-                if len(times) >= most:
-                    waits.append(times[-most] + self.within_s - now_s)
+            for name, limit in ((f"user {user}", self._max_of_user), (f"from {address}", self._max_from_address)):
+                times = self._failures.get(name, [])
+                if len(times) >= limit:
+                    waits.append(times[-limit] + self._window_s - now_s)
             return max(waits)
 
-    def failed(self, user: str, address: str, now_s: float) -> None:
-        """Count a failure."""
+    def add_failure(self, user: str, address: str, now_s: float) -> None:
+        """Count a failed attempt."""
         with self._lock:
             for name in (f"user {user}", f"from {address}"):
-                self._failed.setdefault(name, []).append(now_s)
+                self._failures.setdefault(name, []).append(now_s)
 
-    def succeeded(self, user: str) -> None:
-        """Forget a user's failures."""
+    def clear(self, user: str) -> None:
+        """Delete a user's failed attempts after a successful one."""
         with self._lock:
-            self._failed.pop(f"user {user}", None)
+            self._failures.pop(f"user {user}", None)

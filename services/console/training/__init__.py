@@ -1,1 +1,1 @@
-"""Training mode: simulated contacts."""
+"""Training mode: simulated contacts, vehicles and shore site."""

@@ -1,11 +1,11 @@
-"""Simulated contacts to learn the console on: a simulated survey's objects, sent through a real codec."""
+"""Simulated contacts for training: objects of a simulated survey, encoded with the real codecs."""
 
 from __future__ import annotations
 
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,92 +15,96 @@ from sonarpost.codec.interface import Codec, DecodedImage, StreamHeader
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.codec import VqCodec
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
-from sonarpost.review.local import moved
+from sonarpost.review.local_frame import destination
 from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Survey
 
 HEIGHT_PX, WIDTH_PX = 80, 140
 VEHICLES: Final = ("uuv-1", "uuv-2")
-_BYTES: Final = 192
-_STEPS: Final = (24, 64, 128, _BYTES)
-"""After how many bytes a picture of the embedded codec is shown anew."""
+_STREAM_BYTES: Final = 192
+_VERSION_BYTES: Final = (24, 64, 128, _STREAM_BYTES)
+"""Received bytes of the versions of an image with the codec emb."""
 _LINES: Final = 5
-"""Simulated in full; what comes after them is of the same pictures."""
+"""Simulated survey lines. Later contacts reuse their images at other positions."""
 _ALPHABET: Final = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+
+Snippet = npt.NDArray[np.uint8]
+
+
+class ImageVersion(NamedTuple):
+    """One received state of an image."""
+
+    bytes_received: int
+    bytes_total: int
+    frames: int
+    decoded: DecodedImage
 
 
 @dataclass(frozen=True, slots=True)
-class Simulated:
-    """A contact that may be sent.
+class SimulatedContact:
+    """A contact with the versions of its image.
 
     Attributes:
-        contact: Its record.
-        image_id: Name on the acoustic link.
-        versions: What of its picture is known after each packet: bytes received, of how many, frames, the picture.
-        codec: That made it.
-        model: Of that codec.
-        original: What the vehicle has, shape (80, 140).
-        wide: The same around twice the ground in each direction; None where it shows that already.
+        contact: Contact record.
+        image_id: Identifier of the image.
+        versions: Received states of the image, in the order of arrival.
+        codec: Codec of the image.
+        snippet: Original pixels, shape (80, 140).
+        expanded_snippet: Pixels of twice the ground in each direction, same shape; None for an expanded image.
     """
 
     contact: Contact
     image_id: str
-    versions: tuple[tuple[int, int, int, DecodedImage], ...]
-    codec: str
-    model: str
-    original: npt.NDArray[np.uint8]
-    wide: npt.NDArray[np.uint8] | None = None
+    versions: tuple[ImageVersion, ...]
+    codec: Codec
+    snippet: Snippet
+    expanded_snippet: Snippet | None = None
 
-    def wider(self, image_id: str) -> Simulated | None:
-        """Return more of the seabed around it as a picture of its own, None where the vehicle has no more.
+    def expanded(self, image_id: str) -> SimulatedContact | None:
+        """Return an image of more seabed around the contact; None if this image is already expanded.
 
         Args:
-            image_id: Of the new picture.
+            image_id: Identifier of the new image.
         """
-        if self.wide is None:
+        if self.expanded_snippet is None:
             return None
-        codec = self._codec()
-        sizes = {
-            name: None if pixel_m is None else 2 * pixel_m
+        pixel_sizes = {
+            name: None if (size_m := getattr(self.contact, name)) is None else 2 * size_m
             for name in ("pixel_along_m", "pixel_across_m")
-            for pixel_m in [getattr(self.contact, name)]
         }
         return replace(
             self,
-            contact=self.contact.model_copy(update=sizes),
+            contact=self.contact.model_copy(update=pixel_sizes),
             image_id=image_id,
-            versions=_versions(codec, self.wide, lacking=False),
-            original=self.wide,
-            wide=None,
+            versions=_versions(self.codec, self.expanded_snippet, incomplete=False),
+            snippet=self.expanded_snippet,
+            expanded_snippet=None,
         )
 
-    def _codec(self) -> Codec:
-        return EmbCodec() if self.codec == EmbCodec().name else VqCodec(open_codebook("nominal-10").tiles)
+    def with_next_version(self, *, refine: bool) -> SimulatedContact:
+        """Return the contact with one more, complete version; with `refine`, of a stream of twice the length."""
+        last = self.versions[-1]
+        budget = None
+        if isinstance(self.codec, EmbCodec):
+            budget = 2 * last.bytes_total if refine else last.bytes_total
+        stream = self.codec.encode(self.snippet, budget)
+        version = ImageVersion(len(stream), len(stream), last.frames + 1, self.codec.decode(stream))
+        return replace(self, versions=(*self.versions, version))
 
-    def more(self, *, refine: bool) -> Simulated:
-        """Return it with one version more: what was lacking, or to refine a stream of twice the length."""
-        total = self.versions[-1][1]
-        codec = self._codec()
-        stream = codec.encode(self.original, 2 * total if refine and isinstance(codec, EmbCodec) else None)
-        if isinstance(codec, EmbCodec) and not refine:
-            stream = codec.encode(self.original, total)
-        last = (len(stream), len(stream), self.versions[-1][2] + 1, codec.decode(stream))
-        return replace(self, versions=(*self.versions, last))
-
-    def record(self, vessel_id: str, step: int, first_utc_s: float, now_utc_s: float) -> ReconstructedImage:
-        """Return the record of a version, from 0, as a decompressor would give it out."""
-        received, total, frames, decoded = self.versions[step]
+    def record(self, vessel_id: str, index: int, first_utc_s: float, now_utc_s: float) -> ReconstructedImage:
+        """Return the record of the version with an index, from 0."""
+        received, total, frames, decoded = self.versions[index]
         picture = Pixels.from_array(decoded.image)
         missing = decoded.missing
         return ReconstructedImage(
             vessel_id=vessel_id,
             vehicle_id=self.contact.vehicle_id,
             image_id=self.image_id,
-            version=step + 1,
+            version=index + 1,
             contact=self.contact,
-            codec=self.codec,
-            model=self.model,
+            codec=self.codec.name,
+            model=self.codec.model_hash,
             picture=picture,
             picture_sha256=picture.sha256,
             complete=received == total and not missing.any(),
@@ -116,106 +120,103 @@ class Simulated:
         )
 
 
-def simulated_contacts(seed: int, first_utc_s: float) -> Iterator[Simulated]:
-    """Yield contacts without end; the same seed gives the same ones.
+def simulated_contacts(seed: int, first_utc_s: float) -> Iterator[SimulatedContact]:
+    """Yield an endless sequence of contacts; equal seeds give equal contacts.
 
-    Two vehicles run lines to and fro over the same ground, so that some objects are seen twice.
+    Two vehicles survey the same lines, so that some objects are seen twice.
 
     Args:
-        seed: Source of every chance.
+        seed: Seed of all random draws.
         first_utc_s: Time of the first ping.
     """
-    chance = random.Random(seed)  # noqa: S311  nothing secret comes of it
+    draws = random.Random(seed)  # noqa: S311  not used for secrets
     codecs: tuple[Codec, Codec] = (EmbCodec(), VqCodec(open_codebook("nominal-10").tiles))
-    line = number = 0
-    made: list[Simulated] = []
-    while line < _LINES:
+    made: list[SimulatedContact] = []
+    for line in range(_LINES):
         seabed = (SeabedKind.SAND, SeabedKind.RIPPLES, SeabedKind.MIXED)[line % 3]
-        simulated = simulate_survey(_spec(seed, line, seabed, first_utc_s))
-        for thing in simulated.truth:
-            # Every fourth by the paper's codec and format, of which halves may be lacking.
-            codec = codecs[number % 4 == 3]
-            for look in range(2 if chance.random() < 0.25 else 1):
+        simulated = simulate_survey(_survey_spec(seed, line, seabed, first_utc_s))
+        for target in simulated.truth:
+            # Every fourth target uses the codec and wire format of the paper, where a half of the image may be missing.
+            codec = codecs[len(made) % 4 == 3]
+            for look in range(2 if draws.random() < 0.25 else 1):
                 vehicle = VEHICLES[(line + look) % len(VEHICLES)]
-                contact = _contact(simulated.survey, thing, vehicle, chance, number)
-                image_id = _image_id(number)
-                original, wide = (chip(simulated.survey, thing, look, times) for times in (1, 2))
-                versions = _versions(codec, original, lacking=chance.random() < 0.5)
-                made.append(Simulated(contact, image_id, versions, codec.name, codec.model_hash, original, wide))
+                contact = _contact(simulated.survey, target, vehicle, draws, len(made))
+                snippet, expanded = (cut_snippet(simulated.survey, target, look, scale) for scale in (1, 2))
+                versions = _versions(codec, snippet, incomplete=draws.random() < 0.5)
+                made.append(SimulatedContact(contact, _image_id(len(made)), versions, codec, snippet, expanded))
                 yield made[-1]
-                number += 1
-        line += 1
-    yield from _more(made, number, chance)
+    yield from _repeated_contacts(made, draws)
 
 
-def _more(made: list[Simulated], number: int, chance: random.Random) -> Iterator[Simulated]:
-    """Yield the same pictures at other places, as fast as they are wanted."""
+def _repeated_contacts(made: list[SimulatedContact], draws: random.Random) -> Iterator[SimulatedContact]:
+    """Yield the same images at other positions."""
+    number = len(made)
     while True:
-        field, place = divmod(number, len(made))
-        known = made[place]
+        field, index = divmod(number, len(made))
+        known = made[index]
         contact = known.contact
         assert contact.lat_deg is not None
         assert contact.lon_deg is not None
-        # Fields of 300 m side by side, ten in a row.
-        lat, lon = moved(contact.lat_deg, contact.lon_deg, 0.0, 300.0 * (field // 10))
-        lat, lon = moved(lat, lon, 90.0, 300.0 * (field % 10))
-        sure = round(min(2.0, max(0.1, (contact.atd_confidence or 1.0) + chance.gauss(0, 0.1))), 2)
-        changes = {"contact_id": f"training-{number}", "lat_deg": lat, "lon_deg": lon, "atd_confidence": sure}
-        copied = contact.model_copy(update=changes)
-        yield replace(known, contact=copied, image_id=_image_id(number), versions=known.versions[-1:])
+        # Fields of 300 m x 300 m, ten in each row.
+        lat, lon = destination(contact.lat_deg, contact.lon_deg, 0.0, 300.0 * (field // 10))
+        lat, lon = destination(lat, lon, 90.0, 300.0 * (field % 10))
+        confidence = round(min(2.0, max(0.1, (contact.atd_confidence or 1.0) + draws.gauss(0, 0.1))), 2)
+        changes = {"contact_id": f"training-{number}", "lat_deg": lat, "lon_deg": lon, "atd_confidence": confidence}
+        moved = contact.model_copy(update=changes)
+        yield replace(known, contact=moved, image_id=_image_id(number), versions=known.versions[-1:])
         number += 1
 
 
-def _spec(seed: int, line: int, seabed: SeabedKind, first_utc_s: float) -> SurveySpec:
+def _survey_spec(seed: int, line: int, seabed: SeabedKind, first_utc_s: float) -> SurveySpec:
     spec = SurveySpec(seed=seed * 1000 + line, pings=900, samples=512, seabed=seabed, targets=5, clutter=5)
-    # Lines 25 m apart, every second one back.
-    lat, lon = moved(spec.start_lat_deg, spec.start_lon_deg, spec.heading_deg + 90.0, 25.0 * line)
-    back = line % 2 == 1
-    if back:
-        lat, lon = moved(lat, lon, spec.heading_deg, spec.ping_spacing_m * spec.pings)
-    heading = (spec.heading_deg + 180.0) % 360 if back else spec.heading_deg
+    # Lines are 25 m apart and alternate in direction.
+    lat, lon = destination(spec.start_lat_deg, spec.start_lon_deg, spec.heading_deg + 90.0, 25.0 * line)
+    reverse = line % 2 == 1
+    if reverse:
+        lat, lon = destination(lat, lon, spec.heading_deg, spec.ping_spacing_m * spec.pings)
+    heading = (spec.heading_deg + 180.0) % 360 if reverse else spec.heading_deg
     time_s = first_utc_s + 90.0 * line
     return replace(spec, start_lat_deg=lat, start_lon_deg=lon, heading_deg=heading, start_time_utc_s=time_s)
 
 
-def chip(survey: Survey, thing: TruthObject, look: int = 0, times: int = 1) -> npt.NDArray[np.uint8]:
-    """Return the picture of an object, shape (80, 140), nadir to the left.
+def cut_snippet(survey: Survey, target: TruthObject, look: int = 0, scale: int = 1) -> Snippet:
+    """Return the snippet of an object, shape (80, 140), nadir on the left.
 
     Args:
         survey: The simulated survey.
-        thing: The object.
-        look: Another look is shifted a little.
-        times: So many times the ground in each direction, around the same middle; pixels are means.
+        target: The object.
+        look: Number of the look; later looks are shifted along the track.
+        scale: Ground per pixel in units of the survey's; pixels are means.
     """
-    height, width = times * HEIGHT_PX, times * WIDTH_PX
-    centre = min(max(thing.ping + 7 * look, height // 2), len(survey.pings) - height // 2)
-    middle = thing.sample_index - WIDTH_PX // 3 + WIDTH_PX // 2
+    height, width = scale * HEIGHT_PX, scale * WIDTH_PX
+    centre = min(max(target.ping + 7 * look, height // 2), len(survey.pings) - height // 2)
+    middle = target.sample_index - WIDTH_PX // 3 + WIDTH_PX // 2
     rows = []
     for ping in survey.pings[centre - height // 2 : centre + height // 2]:
-        channel = ping.channel(thing.side)
-        assert channel is not None  # every simulated ping has both
+        channel = ping.channel(target.side)
+        assert channel is not None  # Every simulated ping has both channels.
         left = min(max(middle - width // 2, 0), channel.samples.shape[0] - width)
         rows.append(channel.samples[left : left + width])
-    amplitude = np.stack(rows).astype(np.float64).reshape(HEIGHT_PX, times, WIDTH_PX, times).mean(axis=(1, 3))
+    amplitude = np.stack(rows).astype(np.float64).reshape(HEIGHT_PX, scale, WIDTH_PX, scale).mean(axis=(1, 3))
     root = np.sqrt(amplitude)
     low, high = np.percentile(root, (0.5, 99.5))
-    grey: npt.NDArray[np.uint8] = np.clip(255 * (root - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
+    grey: Snippet = np.clip(255 * (root - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
     return grey
 
 
-def _contact(survey: Survey, thing: TruthObject, vehicle: str, chance: random.Random, number: int) -> Contact:
-    ping = survey.pings[thing.ping]
-    lat, lon = moved(thing.lat_deg, thing.lon_deg, chance.uniform(0, 360), abs(chance.gauss(0, 1.2)))
-    sure = chance.gauss(1.35 if thing.is_mine_like else 0.8, 0.3)
+def _contact(survey: Survey, target: TruthObject, vehicle: str, draws: random.Random, number: int) -> Contact:
+    ping = survey.pings[target.ping]
+    lat, lon = destination(target.lat_deg, target.lon_deg, draws.uniform(0, 360), abs(draws.gauss(0, 1.2)))
+    confidence = draws.gauss(1.35 if target.is_mine_like else 0.8, 0.3)
     shadow_m = None
-    if ping.altitude_m is not None and ping.altitude_m > thing.height_m:
-        shadow_m = thing.height_m * thing.ground_range_m / (ping.altitude_m - thing.height_m)
+    if ping.altitude_m is not None and ping.altitude_m > target.height_m:
+        shadow_m = target.height_m * target.ground_range_m / (ping.altitude_m - target.height_m)
     return Contact(
         contact_id=f"training-{number}",
         vehicle_id=vehicle,
         sonar_id="simulated",
-        ping_number=thing.ping,
-        channel="port" if str(thing.side) == "port" else "starboard",
+        ping_number=target.ping,
+        channel="port" if str(target.side) == "port" else "starboard",
         time_utc_s=ping.time_utc_s,
         lat_deg=lat,
         lon_deg=lon,
@@ -224,35 +225,36 @@ def _contact(survey: Survey, thing: TruthObject, vehicle: str, chance: random.Ra
         altitude_m=ping.altitude_m,
         heading_deg=ping.heading_deg,
         speed_mps=ping.speed_mps,
-        ground_range_m=thing.ground_range_m,
-        atd_confidence=round(min(2.0, max(0.1, sure)), 2),
-        length_m=round(thing.length_m, 2),
-        width_m=round(thing.width_m, 2),
+        ground_range_m=target.ground_range_m,
+        atd_confidence=round(min(2.0, max(0.1, confidence)), 2),
+        length_m=round(target.length_m, 2),
+        width_m=round(target.width_m, 2),
         shadow_m=shadow_m,
-        height_m=round(thing.height_m, 2),
+        height_m=round(target.height_m, 2),
         pixel_along_m=0.1,
         pixel_across_m=30.0 / 512,
     )
 
 
-def _versions(
-    codec: Codec, picture: npt.NDArray[np.uint8], *, lacking: bool
-) -> tuple[tuple[int, int, int, DecodedImage], ...]:
+def _versions(codec: Codec, snippet: Snippet, *, incomplete: bool) -> tuple[ImageVersion, ...]:
+    """Return the versions of an image; with `incomplete`, without the last one."""
     if isinstance(codec, EmbCodec):
-        stream = codec.encode(picture, _BYTES)
-        # A picture that is refined with every packet; a few never get the last one.
-        steps = [step for step in _STEPS if step < len(stream)] + ([] if lacking else [len(stream)])
-        return tuple((step, len(stream), number + 1, codec.decode(stream[:step])) for number, step in enumerate(steps))
-    stream = codec.encode(picture)
-    half = np.zeros(len(stream) - StreamHeader.unpack(stream).size, np.bool_)
-    half[: half.size // 2] = True
-    first = (len(stream) // 2, len(stream), 2, codec.decode(stream, half))
-    whole = (len(stream), len(stream), 4, codec.decode(stream))
-    return (first,) if lacking else (first, whole)
+        stream = codec.encode(snippet, _STREAM_BYTES)
+        sizes = [size for size in _VERSION_BYTES if size < len(stream)] + ([] if incomplete else [len(stream)])
+        return tuple(
+            ImageVersion(size, len(stream), number + 1, codec.decode(stream[:size]))
+            for number, size in enumerate(sizes)
+        )
+    stream = codec.encode(snippet)
+    first_half = np.zeros(len(stream) - StreamHeader.unpack(stream).size, np.bool_)
+    first_half[: first_half.size // 2] = True
+    half = ImageVersion(len(stream) // 2, len(stream), 2, codec.decode(stream, first_half))
+    whole = ImageVersion(len(stream), len(stream), 4, codec.decode(stream))
+    return (half,) if incomplete else (half, whole)
 
 
-def wider_image_id(count: int) -> str:
-    """Return the identifier of a wider picture, counted from 0: from the last one down, as contacts count upwards."""
+def expanded_image_id(count: int) -> str:
+    """Return the identifier of an expanded image, counted from 0. They count down, those of contacts count up."""
     return _image_id(len(_ALPHABET) ** 4 - 1 - count)
 
 

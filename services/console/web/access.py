@@ -1,8 +1,7 @@
-"""The frame of every request: who asks, whether they may, what goes wrong in which words."""
+"""Access control of the HTTP interface: sessions, CSRF tokens, roles, host names, security headers, errors."""
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
@@ -16,11 +15,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.logs import kv
-from sonarpost.review.measuring import NotMeasurableError
-from sonarpost.services.console.state import NoSuchError
+from sonarpost.review.measurement import NotMeasurableError
+from sonarpost.services.console.state import NotFoundError
 from sonarpost.services.console.store.decisions import ConflictError
 from sonarpost.services.console.store.serialisers import Json
-from sonarpost.services.console.store.users import Act, Actor, Session, Side, Users, same
+from sonarpost.services.console.store.users import Actor, Permission, Session, Side, Users, is_equal_secret
 from sonarpost.wire import expected_text
 
 log = logging.getLogger(__name__)
@@ -37,18 +36,18 @@ SECURITY_HEADERS: Final[Mapping[str, str]] = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
 }
-_LOCAL: Final = ("127.0.0.1", "localhost", "[::1]")
+_LOCAL_NAMES: Final = ("127.0.0.1", "localhost", "[::1]")
 
 
-class RefusedError(Exception):
-    """A request is refused.
+class ApiError(Exception):
+    """An error response of the HTTP interface.
 
     Args:
-        status: Of HTTP.
-        code: As in the interface's description.
-        message: For people.
-        field: What of the request is wrong.
-        headers: Of the answer.
+        status: HTTP status.
+        code: Code of the error; see docs/specifications/console-api.md.
+        message: Text for the user.
+        field: Invalid field of the request.
+        headers: Additional HTTP headers.
     """
 
     def __init__(
@@ -61,24 +60,24 @@ class RefusedError(Exception):
         self.headers = dict(headers or {})
 
 
-class Body(BaseModel):
-    """Base of every body: strictly typed, nothing unknown."""
+class RequestBody(BaseModel):
+    """Base class of request bodies: strict types, no unknown fields."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
 
-B = TypeVar("B", bound=Body)
+B = TypeVar("B", bound=RequestBody)
 
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One request, let in.
+    """One permitted request.
 
     Attributes:
-        request: As Starlette has it.
-        body: Its bytes, empty unless it is a POST.
-        session: Whose it is; None for what needs none.
-        address: Where it comes from.
+        request: The Starlette request.
+        body: Body of a POST request, otherwise empty.
+        session: Session of the user; None for requests without a log-in.
+        address: Network address of the browser.
     """
 
     request: Request
@@ -88,35 +87,35 @@ class Call:
 
     @property
     def actor(self) -> Actor:
-        """Who asks; for what needs a session."""
+        """The user; only for requests that need a session."""
         assert self.session is not None
         return Actor(self.session.name, self.session.role, self.address)
 
-    def parsed(self, model: type[B]) -> B:
-        """Return the body.
+    def parse_body(self, model: type[B]) -> B:
+        """Return the validated body.
 
         Raises:
-            RefusedError: It is no JSON, or not what is expected; names the field.
+            ApiError: The body is invalid; names the field.
         """
         try:
             return model.model_validate_json(self.body)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             field = ".".join(str(part) for part in first["loc"]) or None
-            raise RefusedError(400, "bad_request", expected_text(first["type"], first["msg"]), field) from error
+            raise ApiError(400, "bad_request", expected_text(first["type"], first["msg"]), field) from error
 
 
 Handler = Callable[[Call], Response]
 Endpoint = Callable[[Request], Awaitable[Response]]
 
 
-class Gate:
-    """Lets requests in.
+class AccessControl:
+    """Checks session, CSRF token and role of requests.
 
     Args:
-        users: Who may log in; None where nobody does.
-        side: Which side of the water this is.
-        behind_proxy: Whether `X-Forwarded-For` says where a request comes from.
+        users: Users and sessions; None for a server without log-in.
+        side: Whether the console is on a vessel or at a shore site.
+        behind_proxy: Whether a proxy sets `X-Forwarded-For`.
     """
 
     def __init__(self, users: Users | None, side: Side, *, behind_proxy: bool) -> None:
@@ -124,132 +123,140 @@ class Gate:
         self._side = side
         self._behind_proxy = behind_proxy
 
-    def session_of(self, request: Request, *, use: bool = True) -> Session | None:
-        """Return the session that a request belongs to, None where it has none; see `Users.session`."""
+    def session_of(self, request: Request, *, is_use: bool = True) -> Session | None:
+        """Return the session of a request; None if it has none. See `Users.find_session`."""
         token = request.cookies.get(COOKIE, "")
-        if self._users is None:
+        if self._users is None or not 0 < len(token) < 200:
             return None
-        return self._users.session(token, use=use) if 0 < len(token) < 200 else None
+        return self._users.find_session(token, is_use=is_use)
 
     def address_of(self, request: Request) -> str:
-        """Return where a request comes from."""
+        """Return the network address of the browser."""
         forwarded = request.headers.get("x-forwarded-for", "") if self._behind_proxy else ""
-        # The last one is what the proxy itself has seen; those before it anybody may have written.
-        nearest = forwarded.rpartition(",")[2].strip()
-        return (nearest or (request.client.host if request.client else "?"))[:100]
+        # The proxy appends the last entry. A client can forge the entries before it.
+        last = forwarded.rpartition(",")[2].strip()
+        return (last or (request.client.host if request.client else "?"))[:100]
 
-    def open(self, handler: Handler, *, act: Act | None = None, needs_session: bool = True) -> Endpoint:
-        """Return an endpoint that checks session, token and role, and calls the handler in a thread.
+    def endpoint(
+        self, handler: Handler, *, permission: Permission | None = None, needs_session: bool = True
+    ) -> Endpoint:
+        """Return an endpoint that checks a request, and calls the handler in a thread.
 
         Args:
-            handler: Does the work; may block.
-            act: What the user must be allowed to do.
-            needs_session: Whether one must be logged in.
+            handler: Handler of the request; it may block.
+            permission: Permission that the user needs; None for every user.
+            needs_session: Whether the user must be logged in.
         """
 
-        async def endpoint(request: Request) -> Response:
-            try:
-                body = await _body_of(request) if request.method == "POST" else b""
-                return await run_in_threadpool(self._call, request, body, handler, act, needs_session)
-            except RefusedError as refused:
-                return answer(refused)
-
-        return endpoint
-
-    def _call(self, request: Request, body: bytes, handler: Handler, act: Act | None, needs_session: bool) -> Response:  # noqa: FBT001
-        try:
+        def call(request: Request, body: bytes) -> Response:
             session = self.session_of(request)
             if needs_session:
-                self._check(request, session, act)
+                self._check(request, session, permission)
             return handler(Call(request, body, session, self.address_of(request)))
-        except RefusedError:
-            raise
-        except ConflictError as error:
-            body_: Json = {"contact": error.contact, "decision": error.decision}
-            return JSONResponse({**_error("conflict", str(error), None), **body_}, 409)
-        except NotMeasurableError as error:
-            extra: Json = {"measurable": False, "reason": str(error)}
-            return JSONResponse({**_error("not_measurable", str(error), error.field), **extra}, 409)
-        except NoSuchError as error:
-            raise RefusedError(404, "not_found", str(error), error.field) from error
-        except BadInputError as error:
-            raise RefusedError(400, "bad_request", str(error), error.field) from error
-        except (DeliveryError, OSError) as error:
-            log.error("Request not served", extra=kv(path=request.url.path, reason=str(error)))
-            raise RefusedError(503, "not_now", "the console cannot write or read its disk at the moment") from error
-        except Exception as error:
-            log.exception("Defect while serving a request", extra=kv(path=request.url.path))
-            raise RefusedError(500, "defect", "something is wrong in the console: its log says what") from error
 
-    def _check(self, request: Request, session: Session | None, act: Act | None) -> None:
+        async def serve(request: Request) -> Response:
+            try:
+                body = await _read_body(request) if request.method == "POST" else b""
+                return await run_in_threadpool(_with_error_responses, call, request, body)
+            except ApiError as error:
+                return error_response(error)
+
+        return serve
+
+    def _check(self, request: Request, session: Session | None, permission: Permission | None) -> None:
         if session is None:
-            raise RefusedError(401, "no_session", "log in first")
-        if request.method == "POST" and not same(request.headers.get("x-csrf-token", ""), session.csrf):
-            raise RefusedError(403, "csrf", "the token of this page is not that of the session: load it again")
-        if act is not None and not Actor(session.name, session.role, "").may(act, self._side):
-            raise RefusedError(403, "forbidden", f"the role {session.role} may not {act} on this {self._side}")
+            raise ApiError(401, "no_session", "log in first")
+        if request.method == "POST" and not is_equal_secret(request.headers.get("x-csrf-token", ""), session.csrf):
+            raise ApiError(403, "csrf", "the page has an invalid session token: reload it")
+        if permission is not None and not Actor(session.name, session.role, "").may(permission, self._side):
+            site = "vessel" if self._side == "vessel" else "shore site"
+            raise ApiError(403, "forbidden", f"the role {session.role} may not {permission} on this {site}")
 
 
-async def _body_of(request: Request) -> bytes:
-    found = bytearray()
+def _with_error_responses(call: Callable[[Request, bytes], Response], request: Request, body: bytes) -> Response:
+    """Call a handler, and convert its exceptions to error responses."""
+    try:
+        return call(request, body)
+    except ApiError:
+        raise
+    except ConflictError as error:
+        conflict: Json = {"contact": error.contact, "decision": error.decision}
+        return JSONResponse({**_error_json("conflict", str(error), None), **conflict}, 409)
+    except NotMeasurableError as error:
+        extra: Json = {"measurable": False, "reason": str(error)}
+        return JSONResponse({**_error_json("not_measurable", str(error), error.field), **extra}, 409)
+    except NotFoundError as error:
+        raise ApiError(404, "not_found", str(error), error.field) from error
+    except BadInputError as error:
+        raise ApiError(400, "bad_request", str(error), error.field) from error
+    except (DeliveryError, OSError) as error:
+        log.error("Request failed", extra=kv(path=request.url.path, reason=str(error)))
+        raise ApiError(503, "not_now", "the console cannot read or write its disk at present") from error
+    except Exception as error:
+        log.exception("Unhandled exception in a request", extra=kv(path=request.url.path))
+        raise ApiError(500, "defect", "internal error: see the log of the console") from error
+
+
+async def _read_body(request: Request) -> bytes:
+    body = bytearray()
     async for chunk in request.stream():
-        found += chunk
-        if len(found) > MAX_BODY_BYTES:
-            raise RefusedError(413, "too_large", f"more than {MAX_BODY_BYTES} bytes", headers={"Connection": "close"})
-    return bytes(found)
+        body += chunk
+        if len(body) > MAX_BODY_BYTES:
+            raise ApiError(413, "too_large", f"more than {MAX_BODY_BYTES} bytes", headers={"Connection": "close"})
+    return bytes(body)
 
 
-def _error(code: str, message: str, field: str | None) -> Json:
+def _error_json(code: str, message: str, field: str | None) -> Json:
     return {"error": {"code": code, "message": message, "field": field}}
 
 
-def answer(refused: RefusedError) -> Response:
-    """Return the answer to a refused request."""
-    return JSONResponse(_error(refused.code, str(refused), refused.field), refused.status, refused.headers)
+def error_response(error: ApiError) -> Response:
+    """Return the response of an error."""
+    return JSONResponse(_error_json(error.code, str(error), error.field), error.status, error.headers)
 
 
-class Guard:
-    """Around everything: which host names are ours, where a page may come from, headers of every answer.
+class SecurityMiddleware:
+    """Checks host name and origin of requests, and adds security headers to responses.
 
-    A page of another site that makes a browser ask us by a name of its own (DNS rebinding) is stopped here.
+    The check of the host name prevents DNS rebinding.
 
     Args:
-        app: What is guarded.
-        names: Host names that are ours, besides the host's own.
-        tls: Whether browsers must come back by TLS.
+        app: The application.
+        names: Permitted host names, in addition to those of the local host.
+        tls: Whether browsers must use TLS (HSTS).
     """
 
     def __init__(self, app: ASGIApp, names: tuple[str, ...], *, tls: bool) -> None:
         self._app = app
-        self._names = frozenset(name.lower() for name in (*names, *_LOCAL))
+        self._names = frozenset(name.lower() for name in (*names, *_LOCAL_NAMES))
         self._headers = [(name.lower().encode(), value.encode()) for name, value in SECURITY_HEADERS.items()]
         if tls:
             self._headers.append((b"strict-transport-security", b"max-age=31536000"))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
+        """Handle one request."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                there = {name for name, _ in message["headers"]}
-                message["headers"] = [*message["headers"], *(h for h in self._headers if h[0] not in there)]
-                if b"cache-control" not in there:
+                present = {name for name, _ in message["headers"]}
+                message["headers"] = [*message["headers"], *(h for h in self._headers if h[0] not in present)]
+                if b"cache-control" not in present:
                     message["headers"].append((b"cache-control", b"no-store"))
             await send(message)
 
-        refused = self._refused(Request(scope))
-        await (self._app if refused is None else answer(refused))(scope, receive, send_with_headers)
+        error = self._check(Request(scope))
+        await (self._app if error is None else error_response(error))(scope, receive, send_with_headers)
 
-    def _refused(self, request: Request) -> RefusedError | None:
+    def _check(self, request: Request) -> ApiError | None:
         host = request.headers.get("host", "").lower()
         if _without_port(host) not in self._names:
-            return RefusedError(400, "bad_host", "this name is not one of the console's: see `names` in [console]")
+            return ApiError(400, "bad_host", "unknown host name: see `names` in [console]")
         origin = request.headers.get("origin")
         if request.method != "GET" and origin is not None and origin.lower().partition("://")[2] != host:
-            return RefusedError(403, "bad_origin", "this page is not the console's")
+            return ApiError(403, "bad_origin", "the request comes from a page of another site")
         return None
 
 
@@ -257,10 +264,3 @@ def _without_port(host: str) -> str:
     if host.startswith("["):
         return host.partition("]")[0] + "]"
     return host.partition(":")[0]
-
-
-def json_answer(body: Json | list[Json], status: int = 200) -> Response:
-    """Return JSON."""
-    # Not Starlette's own: a number that is none must never reach a page as one.
-    text = json.dumps(body, allow_nan=False, separators=(",", ":"))
-    return Response(text, status, media_type="application/json")

@@ -1,4 +1,4 @@
-"""The stream of events to a page that is open."""
+"""Stream of server-sent events to an open page."""
 
 from __future__ import annotations
 
@@ -13,93 +13,91 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from sonarpost.services.console.events import Event
-from sonarpost.services.console.state import Board
-from sonarpost.services.console.web.access import Gate, RefusedError, answer
+from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.web.access import AccessControl, ApiError, error_response
 
 KEEP_ALIVE_S = 5.0
-MOST_OF_A_SESSION = 4
+MAX_STREAMS_OF_SESSION = 4
 
 
-class Stream:
-    """The route of events.
+class EventStream:
+    """Route of the event stream.
 
     Args:
-        board: The console's state.
-        training: Whether contacts are simulated.
+        state: State of the console.
+        training: Whether the contacts are simulated.
     """
 
-    def __init__(self, board: Board, *, training: bool) -> None:
-        self._board = board
+    def __init__(self, state: ConsoleState, *, training: bool) -> None:
+        self._state = state
         self._training = training
         self._open: Counter[str] = Counter()
-        self._ended = False
+        self._stopped = False
 
-    def routes(self, gate: Gate) -> list[Route]:
+    def routes(self, access: AccessControl) -> list[Route]:
         """Return the route."""
 
         async def endpoint(request: Request) -> Response:
-            session = await asyncio.to_thread(gate.session_of, request)
+            session = await asyncio.to_thread(access.session_of, request)
             if session is None:
-                return answer(RefusedError(401, "no_session", "log in first"))
-            if self._open[session.csrf] >= MOST_OF_A_SESSION:
-                headers = {"Retry-After": "5"}
-                return answer(RefusedError(429, "too_many", "too many pages of one session are open", headers=headers))
+                return error_response(ApiError(401, "no_session", "log in first"))
+            if self._open[session.csrf] >= MAX_STREAMS_OF_SESSION:
+                message = "too many pages of this session are open"
+                return error_response(ApiError(429, "too_many", message, headers={"Retry-After": "5"}))
             last_id = request.headers.get("last-event-id") or request.query_params.get("last", "")
-            events = self._events(request, gate, session.csrf, last_id)
+            events = self._events(request, access, session.csrf, last_id)
             headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
             return StreamingResponse(events, media_type="text/event-stream", headers=headers)
 
         return [Route("/events", endpoint)]
 
-    def end(self) -> None:
-        """End every stream, for the server's end."""
-        self._ended = True
-        self._board.hub.wake_all()
+    def stop(self) -> None:
+        """End all streams, so that the server can stop."""
+        self._stopped = True
+        self._state.events.notify_all()
 
-    async def _events(self, request: Request, gate: Gate, who: str, last_id: str) -> AsyncIterator[str]:
-        hub, loop, woken = self._board.hub, asyncio.get_running_loop(), asyncio.Event()
+    async def _events(
+        self, request: Request, access: AccessControl, session_key: str, last_id: str
+    ) -> AsyncIterator[str]:
+        hub, loop, notified = self._state.events, asyncio.get_running_loop(), asyncio.Event()
 
-        def wake() -> None:
-            loop.call_soon_threadsafe(woken.set)
+        def notify() -> None:
+            loop.call_soon_threadsafe(notified.set)
 
-        listener = hub.listen(wake)
-        self._open[who] += 1
+        subscriber = hub.subscribe(notify)
+        self._open[session_key] += 1
         try:
-            at = hub.last if not last_id else hub.number_of(last_id)
-            hello = {"now_utc_s": self._board.clock(), "training": self._training}
-            yield _text("hello", json.dumps(hello), hub.identifier(hub.last if at is None else at))
-            checked_s = told_s = time.monotonic()
-            while not self._ended:
-                if time.monotonic() - checked_s >= KEEP_ALIVE_S:
-                    checked_s = time.monotonic()
-                    if await asyncio.to_thread(gate.session_of, request, use=False) is None:
-                        yield _text("session", json.dumps({"ends": "the session has ended"}), None)
+            number = hub.parse_event_id(last_id) if last_id else hub.last
+            hello = {"now_utc_s": self._state.clock(), "training": self._training}
+            yield _event_text("hello", json.dumps(hello), hub.event_id(hub.last if number is None else number))
+            session_checked_s = clock_sent_s = time.monotonic()
+            while not self._stopped:
+                if time.monotonic() - session_checked_s >= KEEP_ALIVE_S:
+                    session_checked_s = time.monotonic()
+                    if await asyncio.to_thread(access.session_of, request, is_use=False) is None:
+                        yield _event_text("session", json.dumps({"ends": "the session has ended"}), None)
                         return
-                woken.clear()
-                events = None if at is None else hub.since(at)
+                notified.clear()
+                events = None if number is None else hub.events_after(number)
                 if events is None:
-                    at = hub.last
-                    yield _text("reset", "{}", hub.identifier(at))
+                    number = hub.last
+                    yield _event_text("reset", "{}", hub.event_id(number))
                     continue
                 for event in events:
-                    at = event.number
-                    yield self._one(event)
-                if time.monotonic() - told_s >= KEEP_ALIVE_S:
-                    told_s = time.monotonic()
-                    yield _text("clock", json.dumps({"now_utc_s": self._board.clock()}), None)
+                    number = event.number
+                    yield _event_text(event.name, event.data, hub.event_id(number))
+                if time.monotonic() - clock_sent_s >= KEEP_ALIVE_S:
+                    clock_sent_s = time.monotonic()
+                    yield _event_text("clock", json.dumps({"now_utc_s": self._state.clock()}), None)
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(woken.wait(), KEEP_ALIVE_S)
+                    await asyncio.wait_for(notified.wait(), KEEP_ALIVE_S)
         finally:
-            hub.leave(listener)
-            self._open[who] -= 1
-            if self._open[who] <= 0:
-                del self._open[who]
-
-    def _one(self, event: Event) -> str:
-        return _text(event.name, event.data, self._board.hub.identifier(event.number))
+            hub.unsubscribe(subscriber)
+            self._open[session_key] -= 1
+            if self._open[session_key] <= 0:
+                del self._open[session_key]
 
 
-def _text(name: str, data: str, identifier: str | None) -> str:
-    head = "" if identifier is None else f"id: {identifier}\n"
+def _event_text(name: str, data: str, event_id: str | None) -> str:
+    head = "" if event_id is None else f"id: {event_id}\n"
     return f"{head}event: {name}\ndata: {data}\n\n"

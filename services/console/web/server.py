@@ -1,4 +1,4 @@
-"""All routes together."""
+"""The console's web application, and the server that runs it in a thread."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import FileResponse, RedirectResponse, Response
+from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
@@ -22,18 +22,31 @@ from sonarpost.config import TlsConfig
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.logs import kv
 from sonarpost.review.rendering import MAPS
-from sonarpost.services.console.state import Board
-from sonarpost.services.console.store.requests import KINDS
+from sonarpost.services.console.fleet import SERVICE_STALE_S
+from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.store.requests import REQUEST_KINDS
 from sonarpost.services.console.store.users import MAX_PASSWORD, MIN_PASSWORD, Users
-from sonarpost.services.console.web.access import Call, Endpoint, Gate, Guard, RefusedError, answer, json_answer
+from sonarpost.services.console.web.access import (
+    AccessControl,
+    ApiError,
+    Call,
+    Endpoint,
+    SecurityMiddleware,
+    error_response,
+)
 from sonarpost.services.console.web.contact_routes import ContactRoutes
-from sonarpost.services.console.web.event_stream import Stream
+from sonarpost.services.console.web.event_stream import EventStream
 from sonarpost.services.console.web.export_routes import ExportRoutes
-from sonarpost.services.console.web.map_routes import PlaceRoutes
+from sonarpost.services.console.web.map_routes import MapRoutes
 from sonarpost.services.console.web.session_routes import SessionRoutes
 
+log = logging.getLogger(__name__)
+
 STATIC: Final = Path(__file__).parents[1] / "static"
-_MEDIA: Final = {
+CONTACT_STALE_S: Final = 600.0
+STOP_S: Final = 1.0
+MAX_CONNECTIONS: Final = 200
+_MEDIA_TYPES: Final = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -43,132 +56,110 @@ _MEDIA: Final = {
     ".woff2": "font/woff2",
     ".json": "application/json",
 }
-SERVICE_STALE_S: Final = 15.0
-CONTACT_STALE_S: Final = 600.0
 
 
 class ConsoleApp:
-    """The console as a web application.
+    """The console's web application.
 
     Args:
-        board: The console's state.
-        users: Who may log in.
-        platform_id: Where this is.
-        training: Whether contacts are simulated.
-        static: Folder of the page.
+        state: State of the console.
+        users: Users and sessions.
+        platform_id: Name of the platform.
+        training: Whether the contacts are simulated.
     """
 
-    def __init__(
-        self, board: Board, users: Users, platform_id: str, *, training: bool = False, static: Path = STATIC
-    ) -> None:
-        config = board.config
-        self._static = static
-        self._board = board
+    def __init__(self, state: ConsoleState, users: Users, platform_id: str, *, training: bool = False) -> None:
+        config = state.config
+        self._state = state
         self._platform_id = platform_id
         self._training = training
-        self._gate = Gate(users, config.role, behind_proxy=config.behind_proxy)
-        self._places = PlaceRoutes(board)
-        self._stream = Stream(board, training=training)
-        sessions = SessionRoutes(users, config.role, tls=config.tls, most_s=config.session_max_s)
+        self._map = MapRoutes(state)
+        self._stream = EventStream(state, training=training)
+        access = AccessControl(users, config.role, behind_proxy=config.behind_proxy)
+        sessions = SessionRoutes(users, config.role, tls=config.tls, max_age_s=config.session_max_s)
         routes = [
-            Route("/api/info", self._gate.open(self._info)),
-            *sessions.routes(self._gate),
-            *ContactRoutes(board).routes(self._gate),
-            *self._places.routes(self._gate),
-            *ExportRoutes(board).routes(self._gate),
-            *self._stream.routes(self._gate),
-            Route("/", self._page("index.html")),
-            Route("/password", self._page("password.html")),
-            Route("/login", lambda _: page_file(static, "login.html")),
-            *static_routes(static),
+            Route("/api/info", access.endpoint(self._info)),
+            *sessions.routes(access),
+            *ContactRoutes(state).routes(access),
+            *self._map.routes(access),
+            *ExportRoutes(state).routes(access),
+            *self._stream.routes(access),
+            Route("/", _page_endpoint(access, "index.html")),
+            Route("/password", _page_endpoint(access, "password.html")),
+            Route("/login", lambda _: static_file(STATIC, "login.html")),
+            *static_routes(STATIC),
         ]
-        app = Starlette(routes=routes, exception_handlers={HTTPException: not_routed})
-        self.asgi: ASGIApp = Guard(app, (config.host, *config.names), tls=config.tls)
+        app = Starlette(routes=routes, exception_handlers={HTTPException: routing_error})
+        self.asgi: ASGIApp = SecurityMiddleware(app, (config.host, *config.names), tls=config.tls)
 
-    def end(self) -> None:
-        """End the streams of events, so that the server can end."""
-        self._stream.end()
-
-    def _page(self, name: str) -> Endpoint:
-        """Return the endpoint of a page for those who are logged in; others are sent to the log-in."""
-
-        def serve(call: Call) -> Response:
-            return RedirectResponse("/login", 303) if call.session is None else page_file(self._static, name)
-
-        return self._gate.open(serve, needs_session=False)
+    def stop(self) -> None:
+        """End the event streams, so that the server can stop."""
+        self._stream.stop()
 
     def _info(self, _call: Call) -> Response:
-        config = self._board.config
-        return json_answer(
+        config = self._state.config
+        return JSONResponse(
             {
                 "side": config.role,
                 "platform_id": self._platform_id,
                 "version": version("sonarpost"),
                 "training": self._training,
-                "now_utc_s": self._board.clock(),
+                "now_utc_s": self._state.clock(),
                 "classes": list(config.classes),
                 "maps": list(MAPS),
-                "requests": list(KINDS),
+                "requests": list(REQUEST_KINDS),
                 "password_characters": [MIN_PASSWORD, MAX_PASSWORD],
                 "stale_after_s": {
                     "service": SERVICE_STALE_S,
                     "vehicle": config.vehicle_stale_s,
                     "contact": CONTACT_STALE_S,
                 },
-                "tiles": self._places.tiles(),
+                "tiles": self._map.tiles(),
             }
         )
 
 
-def static_files(folder: Path) -> dict[str, Path]:
-    """Return the files of a page by their addresses below `/static/`; nothing else is ever served from there."""
-    if not folder.is_dir():
-        return {}
-    paths = (path for path in folder.rglob("*") if path.is_file() and path.suffix in _MEDIA)
-    return {path.relative_to(folder).as_posix(): path for path in paths}
+def _page_endpoint(access: AccessControl, name: str) -> Endpoint:
+    """Return the endpoint of a page, which redirects to the log-in page without a session."""
+
+    def serve(call: Call) -> Response:
+        return RedirectResponse("/login", 303) if call.session is None else static_file(STATIC, name)
+
+    return access.endpoint(serve, needs_session=False)
 
 
 def static_routes(folder: Path) -> list[Route]:
-    """Return the route of a page's own files."""
-
-    def serve(request: Request) -> Response:
-        return page_file(folder, str(request.path_params["path"]))
-
-    return [Route("/static/{path:path}", serve)]
+    """Return the route of a folder of static files."""
+    return [Route("/static/{path:path}", lambda request: static_file(folder, str(request.path_params["path"])))]
 
 
-def page_file(folder: Path, name: str) -> Response:
-    """Return one of a page's files; 404 for every other name."""
-    path = static_files(folder).get(name)
-    if path is None:
-        return answer(RefusedError(404, "not_found", "no such file"))
-    return FileResponse(path, media_type=_MEDIA[path.suffix], headers={"Cache-Control": "no-cache"})
+def static_file(folder: Path, name: str) -> Response:
+    """Return a static file, or 404. Only paths from a listing of the folder are served."""
+    files = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
+    path = files.get(name)
+    if path is None or path.suffix not in _MEDIA_TYPES:
+        return error_response(ApiError(404, "not_found", "no such file"))
+    return FileResponse(path, media_type=_MEDIA_TYPES[path.suffix], headers={"Cache-Control": "no-cache"})
 
 
-async def not_routed(_request: Request, error: Exception) -> Response:
-    """Answer a request that no route takes, in the words of all errors."""
-    status = error.status_code if isinstance(error, HTTPException) else 500
-    code = "not_found" if status == 404 else "bad_request"
-    return answer(RefusedError(status, code, "no such route" if status == 404 else "this route takes no such request"))
-
-
-log = logging.getLogger(__name__)
-
-STOP_S = 1.0
-MOST_CONNECTIONS = 200
+async def routing_error(_request: Request, error: Exception) -> Response:
+    """Return the response to a request without a matching route."""
+    if isinstance(error, HTTPException) and error.status_code != 404:
+        return error_response(ApiError(error.status_code, "bad_request", "this route does not accept the method"))
+    return error_response(ApiError(404, "not_found", "no such route"))
 
 
 class WebServer:
-    """Serves an application on one address.
+    """Runs an application on one address, in a thread.
 
     Args:
-        app: What is served.
+        app: The application.
         host: Address to listen on.
-        port: TCP port; 0 for any that is free.
-        tls: Certificate, for TLS; plain HTTP without.
+        port: TCP port; 0 for any free port.
+        tls: Certificate for HTTPS; None for HTTP.
 
     Raises:
-        PortError: The address cannot be listened on.
+        PortError: The address cannot be bound.
         ConfigError: The certificate cannot be used.
     """
 
@@ -178,8 +169,8 @@ class WebServer:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._socket.bind((host, port))
-            # From here on browsers wait instead of being turned away; they are served when the thread runs.
-            self._socket.listen(MOST_CONNECTIONS)
+            # Connections are accepted after `start`; until then they wait in the backlog.
+            self._socket.listen(MAX_CONNECTIONS)
             config = uvicorn.Config(
                 app,
                 log_config=None,
@@ -189,7 +180,7 @@ class WebServer:
                 server_header=False,
                 proxy_headers=False,
                 timeout_graceful_shutdown=1,
-                limit_concurrency=MOST_CONNECTIONS,
+                limit_concurrency=MAX_CONNECTIONS,
                 ssl_certfile=None if tls is None else tls.certificate,
                 ssl_keyfile=None if tls is None else tls.key,
             )
@@ -199,7 +190,7 @@ class WebServer:
             raise ConfigError("[platform.tls]", "certificate", str(error), "a certificate and its key (PEM)") from error
         except OSError as error:
             self._socket.close()
-            raise PortError(f"{host}:{port}: cannot be listened on: {error}") from error
+            raise PortError(f"{host}:{port}: cannot be bound: {error}") from error
         self.host = host
         self.port = int(self._socket.getsockname()[1])
         self._tls = tls is not None
@@ -208,22 +199,22 @@ class WebServer:
 
     @property
     def address(self) -> str:
-        """Where a browser finds it."""
+        """URL of the server."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'https' if self._tls else 'http'}://{host}:{self.port}/"
 
     @property
     def running(self) -> bool:
-        """Whether it serves."""
+        """Whether the server runs."""
         return self._thread.is_alive()
 
     def start(self) -> None:
-        """Begin to serve."""
+        """Start to serve."""
         self._thread.start()
-        log.info("Page served", extra=kv(address=self.address))
+        log.info("Web server started", extra=kv(address=self.address))
 
     def stop(self) -> None:
-        """Stop serving, within a second or so."""
+        """Stop the server, within about two seconds."""
         self._server.should_exit = True
         if self._thread.ident is not None:
             self._thread.join(timeout=STOP_S)

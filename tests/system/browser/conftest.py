@@ -1,4 +1,4 @@
-"""A real browser in front of a console: Debian's Chromium, driven by Playwright. Nothing outside may be reached."""
+"""A console page in Chromium, driven by Playwright. Requests to other hosts fail the test."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from builders.console import cheap_hashes, console, make_console, users_file
+from builders.console import console, fast_password_hashes, make_console, users_file
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, sync_playwright
 
 from sonarpost.services.console.store.users import Users
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
-__all__ = ["cheap_hashes", "console", "make_console", "users_file"]
+__all__ = ["console", "fast_password_hashes", "make_console", "users_file"]
 
 SMALL = {"width": 1366, "height": 768}
-PATIENCE_MS = 20_000
+TIMEOUT_MS = 20_000
 
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Browser]:
-    """The browser, one for the tests of a file."""
+    """Chromium, one for the tests of a file."""
     path = os.environ.get("SONARPOST_CHROMIUM") or shutil.which("chromium")
     if path is None:
         pytest.skip("no Chromium: apt-get install chromium, or set SONARPOST_CHROMIUM")
-    # Chromium's own sandbox refuses to run as root, as containers often do; nothing but the console is opened.
+    # Chromium's sandbox does not run as root, for example in containers.
     arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
-    # No name but this host's is ever found.
+    # Only the local host can be resolved.
     arguments += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=arguments)
@@ -38,32 +38,32 @@ def chromium() -> Iterator[Browser]:
 
 
 class Visit:
-    """Somebody's page, of which everything that goes wrong is written down."""
+    """An open page. It records script errors and requests to other hosts."""
 
     def __init__(self, context: BrowserContext, address: str) -> None:
         self.address = address
-        self.outside: list[str] = []
+        self.foreign_requests: list[str] = []
         self.errors: list[str] = []
-        self.allowed: tuple[str, ...] = ()
+        self.expected_errors: tuple[str, ...] = ()
         self.page: Page = context.new_page()
-        self.page.set_default_timeout(PATIENCE_MS)
+        self.page.set_default_timeout(TIMEOUT_MS)
         self.page.on("pageerror", lambda error: self.errors.append(f"script: {error}"))
-        self.page.on("console", self._says)
-        self.page.on("request", self._asks)
+        self.page.on("console", self._on_console)
+        self.page.on("request", self._on_request)
 
-    def _says(self, message: ConsoleMessage) -> None:
+    def _on_console(self, message: ConsoleMessage) -> None:
         if message.type in ("error", "warning"):
             self.errors.append(f"{message.text} ({message.location.get('url', '')})")
 
-    def _asks(self, request: Request) -> None:
+    def _on_request(self, request: Request) -> None:
         if urlsplit(request.url).netloc != urlsplit(self.address).netloc and not request.url.startswith(
             ("blob:", "data:")
         ):
-            self.outside.append(request.url)
+            self.foreign_requests.append(request.url)
 
-    def may_say(self, *parts: str) -> None:
-        """Expect errors on the browser's console with one of these parts: refusals that the test provokes."""
-        self.allowed += parts
+    def expect_errors(self, *parts: str) -> None:
+        """Accept errors on the browser's console that contain one of these texts."""
+        self.expected_errors += parts
 
     def press(self, *keys: str) -> None:
         for key in keys:
@@ -76,16 +76,16 @@ class Visit:
         return self.page.wait_for_selector(selector, **options)
 
     def until(self, expression: str, argument: Any = None) -> None:
-        """Wait until an expression of the page's JavaScript holds."""
+        """Wait until a JavaScript expression is true."""
         self.page.wait_for_function(expression, arg=argument)
 
-    def shows(self, image_id: str) -> None:
-        """Wait until a contact and its picture are on the screen."""
+    def wait_for_contact(self, image_id: str) -> None:
+        """Wait until a contact and its image are displayed."""
         self.until("id => document.querySelector('.heading h2')?.textContent.endsWith(id)", image_id)
         self.until("id => document.querySelector('canvas').dataset.shows?.includes(`.${id} `)", image_id)
 
     def pixels(self, selector: str = ".stage canvas") -> int:
-        """How many of a canvas' pixels differ from its first: whether anything is drawn."""
+        """Return how many pixels of a canvas differ from its first one."""
         return int(
             self.page.evaluate(
                 """selector => {
@@ -99,10 +99,10 @@ class Visit:
         )
 
     def check(self) -> None:
-        """Nothing went wrong, and nothing outside was asked for."""
-        unexpected = [error for error in self.errors if not any(part in error for part in self.allowed)]
+        """Fail after an unexpected error, or a request to another host."""
+        unexpected = [error for error in self.errors if not any(part in error for part in self.expected_errors)]
         assert unexpected == []
-        assert self.outside == []
+        assert self.foreign_requests == []
 
 
 Visitor = Callable[..., Visit]
@@ -110,20 +110,20 @@ Visitor = Callable[..., Visit]
 
 @pytest.fixture
 def visit(chromium: Browser) -> Iterator[Callable[..., Visit]]:
-    """Opens pages of a console: `visit(address, token)`; at the end each must have been without errors."""
+    """Opens pages of a console with `visit(address, token)`, and checks them after the test."""
     contexts: list[BrowserContext] = []
     visits: list[Visit] = []
 
     def open_page(address: str, token: str = "", path: str = "", **options: Any) -> Visit:
-        usual: dict[str, Any] = {"viewport": SMALL, "reduced_motion": "reduce", "color_scheme": "light"}
-        context = chromium.new_context(**(usual | options))
+        defaults: dict[str, Any] = {"viewport": SMALL, "reduced_motion": "reduce", "color_scheme": "light"}
+        context = chromium.new_context(**(defaults | options))
         contexts.append(context)
         if token:
             context.add_cookies([{"name": "sonarpost_session", "value": token, "url": address}])
         visits.append(Visit(context, address))
         visits[-1].page.goto(address + path)
         if token and not path:
-            # Keys count from the moment at which the page has loaded its list.
+            # The page accepts keys after it has loaded the list.
             visits[-1].until("() => /of/.test(document.querySelector('.filters .sum')?.textContent)")
         return visits[-1]
 
@@ -135,11 +135,11 @@ def visit(chromium: Browser) -> Iterator[Callable[..., Visit]]:
 
 
 class Served:
-    """A console's page on a port, without Zenoh: what arrives is put onto its board by the test."""
+    """A web server with a console, without Zenoh. Tests store records in its state."""
 
     def __init__(self, console: Any, visit: Callable[..., Visit]) -> None:
         self.console = console
-        self.board = console.board
+        self.state = console.state
         self.users: Users = console.users
         self._visit = visit
         self._app = console.app
@@ -148,25 +148,25 @@ class Served:
         self.address = self._server.address
 
     def visit(self, user: str = "anna", **options: Any) -> Visit:
-        """Open the page as somebody who has logged in."""
-        return self._visit(self.address, self.users.begin(user).token if user else "", **options)
+        """Open the page with a session of a user; without a session for an empty name."""
+        return self._visit(self.address, self.users.start_session(user).token if user else "", **options)
 
     def stop(self) -> None:
-        self._app.end()
+        self._app.stop()
         self._server.stop()
 
-    def start_again(self) -> None:
-        """Serve on the same port as before."""
+    def restart(self) -> None:
+        """Start a new server on the same port."""
         port = urlsplit(self.address).port
         assert port is not None
-        self._app = ConsoleApp(self.board, self.users, "vessel-1")
+        self._app = ConsoleApp(self.state, self.users, "vessel-1")
         self._server = WebServer(self._app.asgi, "127.0.0.1", port)
         self._server.start()
 
 
 @pytest.fixture
 def serve(make_console: Callable[..., Any], visit: Callable[..., Visit]) -> Iterator[Callable[..., Served]]:
-    """Serves consoles."""
+    """Starts web servers with consoles."""
     served: list[Served] = []
 
     def start(**options: Any) -> Served:

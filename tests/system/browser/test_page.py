@@ -1,10 +1,10 @@
-"""The console's page in a real browser: reviewed by keyboard alone, by two at once, cut off, and with hostile text."""
+"""The page in a real browser: keyboard review, two operators, lost connection, hostile text, accessibility."""
 
 from __future__ import annotations
 
 import pytest
 from builders.common import REPOSITORY, eventually
-from builders.console import PASSWORD, picture_record
+from builders.console import PASSWORD, image_record
 
 CONTRAST = """() => {
   const channel = c => { const v = c / 255; return v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4; };
@@ -35,56 +35,56 @@ CONTRAST = """() => {
   return [seen, found];
 }"""
 
-DRAWN = "() => document.querySelector('.map canvas').width > 300"
+MAP_DRAWN = "() => document.querySelector('.map canvas').width > 300"
 
-UNNAMED = """() => [...document.querySelectorAll('button, input, select, textarea, canvas, a, [role=option], img')]
+WITHOUT_NAME = """() => [...document.querySelectorAll('button, input, select, textarea, canvas, a, [role=option], img')]
   .filter(e => e.checkVisibility() && !e.closest('[aria-hidden=true]'))
   .filter(e => !(e.ariaLabel || e.getAttribute('alt') !== null || e.innerText?.trim()))
   .filter(e => !(e.labels?.length && e.labels[0].innerText.trim()))
   .map(e => e.outerHTML.slice(0, 120))"""
 
 
-def few(served, count=6):
+def add_contacts(served, count=6):
     for number in range(count):
-        served.board.take_image(
-            picture_record(
-                f"000{number}", seed=10 * number, place=(56.0 + 0.001 * number, -5.0), atd_confidence=0.3 * number
+        served.state.store_image(
+            image_record(
+                f"000{number}", seed=10 * number, position=(56.0 + 0.001 * number, -5.0), atd_confidence=0.3 * number
             )
         )
 
 
 def contact_ids(served):
-    from sonarpost.services.console.store.contacts import Filter
+    from sonarpost.services.console.store.contacts import ContactFilter
 
-    return {row["image_id"]: row["id"] for row in served.board.contacts(Filter(limit=500))["items"]}
+    return {row["image_id"]: row["id"] for row in served.state.contacts(ContactFilter(limit=500))["items"]}
 
 
 def decisions(served, image_id):
-    return served.board.contact(contact_ids(served)[image_id])["decisions"]
+    return served.state.contact(contact_ids(served)[image_id])["decisions"]
 
 
 def row(image_id):
     return f'.row[data-id*=".{image_id}"]'
 
 
-def test_a_whole_review_by_keys_alone(served):
-    few(served)
-    there = served.visit("", path="login")
-    there.page.keyboard.type("anna")
-    there.press("Tab")
-    there.page.keyboard.type(PASSWORD)
-    there.press("Enter")
-    there.shows("0005")
-    assert there.text("#unreviewed").startswith("6 ")
-    there.press("j")
-    there.shows("0004")
-    there.press("k", "e")
-    there.shows("0005")
-    # Verdict, how sure, remark, send.
-    there.press("1", "g", "End", "w")
-    there.page.keyboard.type("1 clear edge, long shadow")
-    there.press("Control+Enter")
-    there.wait(".now .badge.mine_like")
+def test_complete_review_with_the_keyboard(served):
+    add_contacts(served)
+    visit = served.visit("", path="login")
+    visit.page.keyboard.type("anna")
+    visit.press("Tab")
+    visit.page.keyboard.type(PASSWORD)
+    visit.press("Enter")
+    visit.wait_for_contact("0005")
+    assert visit.text("#unreviewed").startswith("6 ")
+    visit.press("j")
+    visit.wait_for_contact("0004")
+    visit.press("k", "e")
+    visit.wait_for_contact("0005")
+    # Verdict, confidence, remark, send.
+    visit.press("1", "g", "End", "w")
+    visit.page.keyboard.type("1 clear edge, long shadow")
+    visit.press("Control+Enter")
+    visit.wait(".now .badge.mine_like")
     [decision] = decisions(served, "0005")
     assert (decision["verdict"], decision["confidence"], decision["remark"]) == (
         "mine_like",
@@ -92,121 +92,121 @@ def test_a_whole_review_by_keys_alone(served):
         "1 clear edge, long shadow",
     )
     assert decision["operator"] == "anna"
-    there.page.locator(row("0005")).wait_for(state="detached")  # decided: it leaves the list of what is to do
-    # What it says was on the screen was.
-    entry = served.board.contact(contact_ids(served)["0005"])["audit"][-1]
+    visit.page.locator(row("0005")).wait_for(state="detached")  # decided contacts leave the list "to do"
+    # The audit contains the displayed version.
+    entry = served.state.contact(contact_ids(served)["0005"])["audit"][-1]
     assert (entry["action"], entry["user"], entry["version"]) == ("decide", "anna", 1)
-    there.press("u")
-    there.wait(".now .badge.unreviewed")
+    visit.press("u")
+    visit.wait(".now .badge.unreviewed")
     assert [d["undoes"] for d in decisions(served, "0005")] == [decision["decision_id"], None]
-    # Ask for more: the cost first, then the order.
-    there.press("r")
-    there.wait("dialog .costs")
-    assert "air time" in there.text("dialog .costs")
-    assert there.page.locator("dialog .costs input[value=wider]:not([disabled])").count() == 1
-    there.press("ArrowDown", "Enter")
-    there.wait('details[data-name="requests"] >> text=/resend|revisit/')
+    # A request: first its cost, then the command.
+    visit.press("r")
+    visit.wait("dialog .costs")
+    assert "air time" in visit.text("dialog .costs")
+    assert visit.page.locator("dialog .costs input[value=wider]:not([disabled])").count() == 1
+    visit.press("ArrowDown", "Enter")
+    visit.wait('details[data-name="requests"] >> text=/resend|revisit/')
     # The other views, and back.
-    there.press("n", "p")
-    there.until(DRAWN)
-    there.press("j", "Enter")
-    there.shows("0000")
-    there.press("f", "q", "t", "z", "?")
-    there.wait("dialog .keys")
-    there.press("Escape")
-    there.press("x")
-    there.wait("dialog .exports a")
-    there.press("Escape")
-    assert there.page.evaluate("document.documentElement.dataset.theme") == "night"
+    visit.press("n", "p")
+    visit.until(MAP_DRAWN)
+    visit.press("j", "Enter")
+    visit.wait_for_contact("0000")
+    visit.press("f", "q", "t", "z", "?")
+    visit.wait("dialog .keys")
+    visit.press("Escape")
+    visit.press("x")
+    visit.wait("dialog .exports a")
+    visit.press("Escape")
+    assert visit.page.evaluate("document.documentElement.dataset.theme") == "night"
 
 
-def test_measuring_by_keys_and_its_lock_on_what_is_made_up(served):
-    # The last quarter of the picture was never received.
-    served.board.take_image(picture_record("00A7", missing_rows=10))
-    there = served.visit()
-    there.shows("00A7")
-    assert there.pixels() > 1000
-    there.press("m", "m", "m")
-    there.wait(".hint >> text=shadow")
-    there.press("Enter", *["Shift+ArrowRight"] * 3, "Enter")
-    there.wait(".hint >> text=Enter keeps it")
-    there.press("Enter")
-    there.wait('details[data-name="measurements"] >> text=/shadow 0.75/')
-    [kept] = served.board.contact(contact_ids(served)["00A7"])["measurements"]
-    assert kept["value_m"] == pytest.approx(0.75)
-    assert kept["height_m"] == pytest.approx(0.75 * 5.0 / (13.0 + 0.75), rel=0.02)
-    assert f"height {kept['height_m']:.2f} ± {kept['height_sigma_m']:.2f}" in there.text(
+def test_measurement_with_the_keyboard_and_its_lock_on_the_enhanced_layer(served):
+    # The last quarter of the image is missing.
+    served.state.store_image(image_record("00A7", missing_rows=10))
+    visit = served.visit()
+    visit.wait_for_contact("00A7")
+    assert visit.pixels() > 1000
+    visit.press("m", "m", "m")
+    visit.wait(".hint >> text=shadow")
+    visit.press("Enter", *["Shift+ArrowRight"] * 3, "Enter")
+    visit.wait(".hint >> text=Enter keeps it")
+    visit.press("Enter")
+    visit.wait('details[data-name="measurements"] >> text=/shadow 0.75/')
+    [stored] = served.state.contact(contact_ids(served)["00A7"])["measurements"]
+    assert stored["value_m"] == pytest.approx(0.75)
+    assert stored["height_m"] == pytest.approx(0.75 * 5.0 / (13.0 + 0.75), rel=0.02)
+    assert f"height {stored['height_m']:.2f} ± {stored['height_sigma_m']:.2f}" in visit.text(
         'details[data-name="measurements"]'
     )
-    # Across the gap it is refused, and nothing is kept.
-    there.may_say("409")
-    there.press("m", "Enter", *["Shift+ArrowDown"] * 3, "Enter")
-    there.wait("#toasts .bad")
-    there.press("Escape")
-    assert len(served.board.contact(contact_ids(served)["00A7"])["measurements"]) == 1
-    # On the enhanced layer it is locked, and the strip says why.
-    there.press("e")
-    there.wait(".strip .made >> text=not a measurement")
-    there.press("m")
-    there.wait("#toasts >> text=Measuring is locked")
-    assert there.page.locator(".hint").count() == 0
-    assert there.page.locator('[data-tool="measure"]').get_attribute("aria-disabled") == "true"
+    # A line across missing pixels is rejected.
+    visit.expect_errors("409")
+    visit.press("m", "Enter", *["Shift+ArrowDown"] * 3, "Enter")
+    visit.wait("#toasts .bad")
+    visit.press("Escape")
+    assert len(served.state.contact(contact_ids(served)["00A7"])["measurements"]) == 1
+    # The enhanced layer is not measurable, and the page shows the reason.
+    visit.press("e")
+    visit.wait(".strip .made >> text=not a measurement")
+    visit.press("m")
+    visit.wait("#toasts >> text=Measuring is locked")
+    assert visit.page.locator(".hint").count() == 0
+    assert visit.page.locator('[data-tool="measure"]').get_attribute("aria-disabled") == "true"
 
 
-def test_the_strip_says_what_came_and_what_did_not(served):
-    served.board.take_image(picture_record("00A7", missing_rows=10))
-    there = served.visit()
-    there.shows("00A7")
-    strip = there.text(".strip")
+def test_integrity_strip_shows_received_and_missing_parts(served):
+    served.state.store_image(image_record("00A7", missing_rows=10))
+    visit = served.visit()
+    visit.wait_for_contact("00A7")
+    strip = visit.text(".strip")
     assert "emb" in strip
     assert "150 of 200" in strip
     assert "75" in strip
     assert "25" in strip
     assert "never received" in strip
-    with_hatch = there.page.locator("canvas").first.screenshot()
-    there.press("h")
-    there.until("() => document.querySelector('[data-tool=hatch]').ariaPressed === 'false'")
-    assert there.page.locator("canvas").first.screenshot() != with_hatch
+    with_hatch = visit.page.locator("canvas").first.screenshot()
+    visit.press("h")
+    visit.until("() => document.querySelector('[data-tool=hatch]').ariaPressed === 'false'")
+    assert visit.page.locator("canvas").first.screenshot() != with_hatch
 
 
-def test_a_contact_is_refined_while_it_is_looked_at(served):
-    served.board.take_image(picture_record("00A7", 1, missing_rows=20))
-    there = served.visit()
-    there.shows("00A7")
-    assert "50" in there.text(row("00A7"))
-    served.board.take_image(picture_record("00A7", 2))
-    there.until("() => document.querySelector('canvas').dataset.shows.endsWith(' 2 raw')")
-    there.wait(f"{row('00A7')} >> text=100")
-    # An older version stays where it was put.
-    there.press("[")
-    there.until("() => document.querySelector('canvas').dataset.shows.endsWith(' 1 raw')")
-    served.board.take_image(picture_record("00A7", 3))
-    there.wait(".versions >> text=Version 3 is newer")
-    assert there.page.evaluate("document.querySelector('canvas').dataset.shows").endswith(" 1 raw")
-    # And a picture does not change below a measurement.
-    there.press("]", "]")
-    there.until("() => document.querySelector('canvas').dataset.shows.endsWith(' 3 raw')")
-    there.press("m", "Enter")
-    served.board.take_image(picture_record("00A7", 4))
-    there.wait(".versions >> text=Version 4 is newer")
-    assert there.page.evaluate("document.querySelector('canvas').dataset.shows").endswith(" 3 raw")
-    there.press("s")
-    there.until("() => !document.querySelectorAll('canvas')[1].classList.contains('hidden')")
+def test_displayed_image_is_updated_by_new_versions(served):
+    served.state.store_image(image_record("00A7", 1, missing_rows=20))
+    visit = served.visit()
+    visit.wait_for_contact("00A7")
+    assert "50" in visit.text(row("00A7"))
+    served.state.store_image(image_record("00A7", 2))
+    visit.until("() => document.querySelector('canvas').dataset.shows.endsWith(' 2 raw')")
+    visit.wait(f"{row('00A7')} >> text=100")
+    # A chosen older version stays displayed.
+    visit.press("[")
+    visit.until("() => document.querySelector('canvas').dataset.shows.endsWith(' 1 raw')")
+    served.state.store_image(image_record("00A7", 3))
+    visit.wait(".versions >> text=Version 3 is newer")
+    assert visit.page.evaluate("document.querySelector('canvas').dataset.shows").endswith(" 1 raw")
+    # The image does not change during a measurement.
+    visit.press("]", "]")
+    visit.until("() => document.querySelector('canvas').dataset.shows.endsWith(' 3 raw')")
+    visit.press("m", "Enter")
+    served.state.store_image(image_record("00A7", 4))
+    visit.wait(".versions >> text=Version 4 is newer")
+    assert visit.page.evaluate("document.querySelector('canvas').dataset.shows").endswith(" 3 raw")
+    visit.press("s")
+    visit.until("() => !document.querySelectorAll('canvas')[1].classList.contains('hidden')")
 
 
-def test_two_operators_at_once(served):
-    few(served, 2)
+def test_conflict_of_two_operators(served):
+    add_contacts(served, 2)
     anna, bo = served.visit("anna"), served.visit("bo")
-    anna.shows("0001")
-    bo.shows("0001")
+    anna.wait_for_contact("0001")
+    bo.wait_for_contact("0001")
     anna.press("1")
     anna.wait("#send:enabled")
     bo.press("2", "w")
     bo.page.keyboard.type("a rock")
     bo.press("Control+Enter")
-    # Anna's page shows it, and asks before hers replaces it.
+    # Anna's page shows the other decision, and asks before it is replaced.
     anna.wait(".now .badge.not_mine_like")
-    anna.may_say("409")
+    anna.expect_errors("409")
     anna.press("Enter")
     anna.wait("dialog >> text=somebody was faster")
     assert "a rock" in anna.text("dialog")
@@ -217,89 +217,89 @@ def test_two_operators_at_once(served):
     assert [d["operator"] for d in decisions(served, "0001")] == ["anna", "bo"]
 
 
-def test_a_dropped_connection_recovers(served):
-    few(served, 2)
-    there = served.visit()
-    there.may_say("Failed to load resource", "ERR_", "500", "net::")
-    there.shows("0001")
+def test_lost_connection_recovers(served):
+    add_contacts(served, 2)
+    visit = served.visit()
+    visit.expect_errors("Failed to load resource", "ERR_", "500", "net::")
+    visit.wait_for_contact("0001")
     served.stop()
-    there.wait("#offline")
-    assert "old" in there.text("#offline")
-    assert there.text("#live") == "not live"
-    # What happens meanwhile is there afterwards.
-    served.board.take_image(picture_record("00ZZ", seed=99))
-    served.start_again()
-    there.wait(row("00ZZ"))
-    there.until("() => !document.getElementById('offline')")
-    served.board.take_image(picture_record("00ZY", seed=98))
-    there.wait(row("00ZY"))
-    assert there.text("#live") == "live"
+    visit.wait("#offline")
+    assert "old" in visit.text("#offline")
+    assert visit.text("#live") == "not live"
+    # Contacts that arrive in between are displayed afterwards.
+    served.state.store_image(image_record("00ZZ", seed=99))
+    served.restart()
+    visit.wait(row("00ZZ"))
+    visit.until("() => !document.getElementById('offline')")
+    served.state.store_image(image_record("00ZY", seed=98))
+    visit.wait(row("00ZY"))
+    assert visit.text("#live") == "live"
 
 
-HOSTILE = '<img src=x onerror="window.hurt=1"><script>window.hurt=2</script>'
+HOSTILE = '<img src=x onerror="window.injected=1"><script>window.injected=2</script>'
 
 
-def test_hostile_text_is_text(served):
-    served.board.take_image(picture_record("00A7", atd_class=HOSTILE[:60], line_name=HOSTILE, sonar_id=HOSTILE))
-    there = served.visit()
-    there.shows("00A7")
-    there.press("1", "w")
-    there.page.keyboard.type(HOSTILE)
-    there.press("Control+Enter")
-    there.wait(".now .remark")
-    assert HOSTILE in there.text(".now .remark")
-    # Somebody else sees it, with the class that an expert made up, in every place that shows it.
-    with_record = served.visit("bo")
-    with_record.press("l")
-    with_record.shows("00A7")
-    for summary in with_record.page.locator("summary").all():
+def test_hostile_text_is_displayed_as_text(served):
+    served.state.store_image(image_record("00A7", atd_class=HOSTILE[:60], line_name=HOSTILE, sonar_id=HOSTILE))
+    visit = served.visit()
+    visit.wait_for_contact("00A7")
+    visit.press("1", "w")
+    visit.page.keyboard.type(HOSTILE)
+    visit.press("Control+Enter")
+    visit.wait(".now .remark")
+    assert HOSTILE in visit.text(".now .remark")
+    # Another operator opens all views that show the text.
+    other = served.visit("bo")
+    other.press("l")
+    other.wait_for_contact("00A7")
+    for summary in other.page.locator("summary").all():
         summary.click()
-    with_record.press("p")
-    with_record.until(DRAWN)
-    with_record.press("j")
-    with_record.wait(".map .card")
-    with_record.press("f", "q")
-    for page in (there.page, with_record.page):
-        assert page.evaluate("window.hurt") is None
+    other.press("p")
+    other.until(MAP_DRAWN)
+    other.press("j")
+    other.wait(".map .card")
+    other.press("f", "q")
+    for page in (visit.page, other.page):
+        assert page.evaluate("window.injected") is None
         assert page.locator("main img[src='x'], main script").count() == 0
     report = served.visit("bo", path=f"report/{contact_ids(served)['00A7']}")
     assert HOSTILE in report.page.inner_text("body")
-    assert report.page.evaluate("window.hurt") is None
+    assert report.page.evaluate("window.injected") is None
 
 
-def test_who_may_only_look(served):
-    few(served, 1)
-    there = served.visit("watch")
-    there.shows("0000")
-    there.press("1")
-    there.wait("#toasts >> text=may look")
-    assert there.page.locator("#send").is_disabled()
-    there.press("m")
-    there.wait("#toasts >> text=Measuring is locked")
+def test_observer_cannot_decide_or_measure(served):
+    add_contacts(served, 1)
+    visit = served.visit("watch")
+    visit.wait_for_contact("0000")
+    visit.press("1")
+    visit.wait("#toasts >> text=may look")
+    assert visit.page.locator("#send").is_disabled()
+    visit.press("m")
+    visit.wait("#toasts >> text=Measuring is locked")
     assert decisions(served, "0000") == []
 
 
-def test_without_a_session_there_is_the_log_in_page(served):
-    there = served.visit("")
-    there.wait("#login")
-    there.may_say("401")
-    there.page.fill("#user", "anna")
-    there.page.fill("#password", "not the password")
-    there.press("Enter")
-    there.until("() => document.getElementById('problem').textContent !== ''")
+def test_log_in_page_without_a_session(served):
+    visit = served.visit("")
+    visit.wait("#login")
+    visit.expect_errors("401")
+    visit.page.fill("#user", "anna")
+    visit.page.fill("#password", "not the password")
+    visit.press("Enter")
+    visit.until("() => document.getElementById('problem').textContent !== ''")
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_contrast_and_names(served, theme):
-    few(served)
-    served.board.take_image(picture_record("00A7", missing_rows=10))
-    there = served.visit(color_scheme=theme)
-    there.shows("00A7")
-    there.press("2", "Enter")
-    there.wait("#toasts p")
-    there.press("l", "e", "1")
-    there.wait(".strip .made")
-    assert there.page.evaluate("document.documentElement.dataset.theme") == ("night" if theme == "dark" else "day")
+def test_contrast_and_accessible_names(served, theme):
+    add_contacts(served)
+    served.state.store_image(image_record("00A7", missing_rows=10))
+    visit = served.visit(color_scheme=theme)
+    visit.wait_for_contact("00A7")
+    visit.press("2", "Enter")
+    visit.wait("#toasts p")
+    visit.press("l", "e", "1")
+    visit.wait(".strip .made")
+    assert visit.page.evaluate("document.documentElement.dataset.theme") == ("night" if theme == "dark" else "day")
     views = {
         "review": [],
         "ask": ["r"],
@@ -311,63 +311,63 @@ def test_contrast_and_names(served, theme):
     marks = {"ask": "dialog .costs", "keys": "dialog .keys", "exports": "dialog .exports", "map": ".map .card"}
     for name, keys in views.items():
         for key in keys:
-            there.press(key)
+            visit.press(key)
             if key == "p":
-                there.until(DRAWN)
+                visit.until(MAP_DRAWN)
         if name in marks:
-            there.wait(marks[name])
-        seen, low = there.page.evaluate(CONTRAST)
+            visit.wait(marks[name])
+        seen, low = visit.page.evaluate(CONTRAST)
         assert seen > 10, name
         assert low == [], name
-        assert there.page.evaluate(UNNAMED) == [], name
-    # The page for one's password has the same theme, with everything wrong.
-    there.page.goto(served.address + "password")
-    there.wait("button[type=submit]:enabled")
-    assert there.page.evaluate("document.documentElement.dataset.theme") == ("night" if theme == "dark" else "day")
-    there.page.fill("#again", "another")
-    there.press("Enter")
-    there.wait("#again-problem:has-text('differ')")
-    seen, low = there.page.evaluate(CONTRAST)
-    assert (seen > 10, low, there.page.evaluate(UNNAMED)) == (True, [], [])
-    there.page.fill("#old", PASSWORD)
-    there.page.fill("#new", "another fine one")
-    there.page.fill("#again", "another fine one")
-    there.press("Enter")
-    there.wait("#done:has-text('changed')")
-    assert there.page.evaluate(CONTRAST)[1] == []
+        assert visit.page.evaluate(WITHOUT_NAME) == [], name
+    # The password page, with all errors displayed.
+    visit.page.goto(served.address + "password")
+    visit.wait("button[type=submit]:enabled")
+    assert visit.page.evaluate("document.documentElement.dataset.theme") == ("night" if theme == "dark" else "day")
+    visit.page.fill("#again", "another")
+    visit.press("Enter")
+    visit.wait("#again-problem:has-text('differ')")
+    seen, low = visit.page.evaluate(CONTRAST)
+    assert (seen > 10, low, visit.page.evaluate(WITHOUT_NAME)) == (True, [], [])
+    visit.page.fill("#old", PASSWORD)
+    visit.page.fill("#new", "another fine one")
+    visit.page.fill("#again", "another fine one")
+    visit.press("Enter")
+    visit.wait("#done:has-text('changed')")
+    assert visit.page.evaluate(CONTRAST)[1] == []
 
 
-def test_thousands_of_contacts(served):
+def test_list_of_thousands_of_contacts(served):
     from sonarpost.services.console.store import contacts
 
-    with served.board.database.writing() as db:
+    with served.state.database.transaction() as db:
         for number in range(5000):
-            record = picture_record(f"{number:04d}", seed=number % 7, place=None, atd_confidence=number / 2500)
-            contacts.take_image(db, record, None, 1_700_000_000.0 + number, 8.0)
-    there = served.visit()
-    there.shows("4999")
-    assert there.text("#unreviewed") == "5000 to review of 5000"
-    # A list of 5,000 whose rows exist only where they are seen.
-    assert there.page.locator(".row").count() < 40
-    assert there.page.locator(".row").first.get_attribute("aria-setsize") == "5000"
-    there.page.evaluate("document.getElementById('queue').scrollTop = 1e9")
-    there.wait(row("0000"))
-    assert there.page.locator(".row").count() < 40
-    there.press("/")
-    there.page.keyboard.type("4321")
-    there.wait(".filters .sum >> text=1 of 5000 shown")
-    there.press("Escape", "j")
-    there.shows("4321")
+            record = image_record(f"{number:04d}", seed=number % 7, position=None, atd_confidence=number / 2500)
+            contacts.store_image(db, record, None, 1_700_000_000.0 + number, 8.0)
+    visit = served.visit()
+    visit.wait_for_contact("4999")
+    assert visit.text("#unreviewed") == "5000 to review of 5000"
+    # Only visible rows have elements.
+    assert visit.page.locator(".row").count() < 40
+    assert visit.page.locator(".row").first.get_attribute("aria-setsize") == "5000"
+    visit.page.evaluate("document.getElementById('queue').scrollTop = 1e9")
+    visit.wait(row("0000"))
+    assert visit.page.locator(".row").count() < 40
+    visit.press("/")
+    visit.page.keyboard.type("4321")
+    visit.wait(".filters .sum >> text=1 of 5000 shown")
+    visit.press("Escape", "j")
+    visit.wait_for_contact("4321")
 
 
-def test_expert_advice_appears_beside_the_picture(serve):
+def test_comment_of_an_expert_is_displayed(serve):
     from sonarpost.messages import Advice
-    from sonarpost.services.console.store.contacts import Filter
+    from sonarpost.services.console.store.contacts import ContactFilter
 
     vessel = serve()
-    few(vessel, 1)
-    there = vessel.visit()
-    there.shows("0000")
+    add_contacts(vessel, 1)
+    visit = vessel.visit()
+    visit.wait_for_contact("0000")
     advice = Advice(
         advice_id="a-1",
         vessel_id="vessel-1",
@@ -381,29 +381,29 @@ def test_expert_advice_appears_beside_the_picture(serve):
         author="eva",
         advised_utc_s=1_700_000_100.0,
     )
-    vessel.board.take_advice(advice)
-    there.wait(".advice >> text=seen before, mark 3")
-    # Ashore the same page lets an expert give it.
+    vessel.state.store_advice(advice)
+    visit.wait(".advice >> text=seen before, mark 3")
+    # At the shore site, an expert writes a comment.
     shore = serve(role="shore")
-    few(shore, 1)
+    add_contacts(shore, 1)
     expert = shore.visit("eva")
-    expert.shows("0000")
-    assert "advice" in expert.text("legend").lower()
+    expert.wait_for_contact("0000")
+    assert "comment" in expert.text("legend").lower()
     expert.press("1", "w")
     expert.page.keyboard.type("have a second look")
     expert.press("Control+Enter")
-    contact_id = shore.board.contacts(Filter())["items"][0]["id"]
-    eventually(lambda: len(shore.board.contact(contact_id)["advice"]) == 1, what="the advice")
+    contact_id = shore.state.contacts(ContactFilter())["items"][0]["id"]
+    eventually(lambda: len(shore.state.contact(contact_id)["advice"]) == 1, what="the comment")
     expert.wait(".advice >> text=have a second look")
 
 
-def test_every_key_is_in_the_documents(served):
-    few(served, 1)
-    there = served.visit()
-    there.press("?")
-    there.wait("dialog .keys")
+def test_all_keys_are_documented(served):
+    add_contacts(served, 1)
+    visit = served.visit()
+    visit.press("?")
+    visit.wait("dialog .keys")
     page = REPOSITORY / "docs" / "explanation" / "console.md"
     section = page.read_text("utf-8").split("## Screens and keys")[1].split("\n## ")[0]
-    keys = set(there.page.locator("dialog .keys kbd").all_inner_texts())
+    keys = set(visit.page.locator("dialog .keys kbd").all_inner_texts())
     assert len(keys) > 25
     assert {key for key in keys if f"`{key}`" not in section} == {"arrows"}

@@ -1,37 +1,37 @@
-"""The page for one's own password in a real browser: by keys alone, with everything that can be wrong."""
+"""The password page in a real browser: keyboard operation and all errors."""
 
 from __future__ import annotations
 
-from builders.console import PASSWORD, picture_record
+from builders.console import PASSWORD, image_record
 
 NEW = "another fine one"
 FOCUSED = "() => document.activeElement.id"
 
 
-def fill(there, *values):
-    """Type into the three fields, from the first one on, and send."""
-    there.page.focus("#old")
+def fill(visit, *values):
+    """Fill the three fields and submit."""
+    visit.page.focus("#old")
     for number, value in enumerate(values):
-        there.press(*["Tab"] if number else [], "Control+a", "Delete")
-        there.page.keyboard.type(value)
-    there.press("Enter")
+        visit.press(*["Tab"] if number else [], "Control+a", "Delete")
+        visit.page.keyboard.type(value)
+    visit.press("Enter")
 
 
-def test_from_the_header_to_a_new_password_by_keys_alone(served):
-    served.board.take_image(picture_record("00A7"))
-    there, elsewhere, another = served.visit("anna"), served.visit("anna"), served.visit("bo")
-    there.shows("00A7")
-    # A remark that is not sent yet is there still: the page opens beside this one.
-    there.press("1", "w")
-    there.page.keyboard.type("half a remark")
-    there.press("Escape")
-    there.page.focus("#bar nav button:last-child")
+def test_password_change_with_the_keyboard(served):
+    served.state.store_image(image_record("00A7"))
+    visit, elsewhere, another = served.visit("anna"), served.visit("anna"), served.visit("bo")
+    visit.wait_for_contact("00A7")
+    # The page opens in a new tab, so that an unsent remark is kept.
+    visit.press("1", "w")
+    visit.page.keyboard.type("half a remark")
+    visit.press("Escape")
+    visit.page.focus("#bar nav button:last-child")
     for _ in range(20):
-        there.press("Tab")
-        if there.page.evaluate(FOCUSED) == "to-password":
+        visit.press("Tab")
+        if visit.page.evaluate(FOCUSED) == "to-password":
             break
-    with there.page.context.expect_page() as opened:
-        there.press("Enter")
+    with visit.page.context.expect_page() as opened:
+        visit.press("Enter")
     page = opened.value
     page.wait_for_selector("button[type=submit]:enabled")
     assert page.url == served.address + "password"
@@ -45,65 +45,65 @@ def test_from_the_header_to_a_new_password_by_keys_alone(served):
     page.wait_for_selector("#done:has-text('Your password is changed')")
     assert page.evaluate(FOCUSED) == "done"
     assert [page.input_value(f"#{name}") for name in ("old", "new", "again")] == ["", "", ""]
-    assert served.users.right("anna", NEW)
-    assert there.page.input_value("#remark") == "half a remark"
-    # Other sessions are led to the log-in, without being touched; this one goes on, and so does another person's.
-    elsewhere.may_say("401")
+    assert served.users.verify_password("anna", NEW)
+    assert visit.page.input_value("#remark") == "half a remark"
+    # The other session of the user ends. This one and the session of another user continue.
+    elsewhere.expect_errors("401")
     elsewhere.wait("#login")
     page.click("nav a")
     page.wait_for_selector("#unreviewed")
-    assert there.page.locator("#unreviewed").count() == another.page.locator("#unreviewed").count() == 1
+    assert visit.page.locator("#unreviewed").count() == another.page.locator("#unreviewed").count() == 1
 
 
-def test_what_is_wrong_is_said_beside_its_field(served):
-    there = served.visit(path="password")
-    there.wait("button[type=submit]:enabled")
-    assert there.text("#new-hint") == "10 to 200 characters"
-    # What the page knows by itself it does not ask for.
-    asked = []
-    there.page.on("request", lambda request: asked.append(request.url))
-    fill(there, "", "short", "shorter")
-    assert "missing" in there.text("#old-problem")
-    assert there.text("#new-problem") == "a password has 10 to 200 characters; this one has 5"
-    assert "differ" in there.text("#again-problem")
-    assert there.page.evaluate(FOCUSED) == "old"
-    assert asked == []
-    fill(there, PASSWORD, NEW, NEW + "s")
-    assert [there.text(f"#{name}-problem") for name in ("old", "new")] == ["", ""]
-    assert there.page.evaluate(FOCUSED) == "again"
-    assert there.page.get_attribute("#again", "aria-invalid") == "true"
-    assert "again-problem" in there.page.get_attribute("#again", "aria-describedby")
-    # The words go when the field is mended.
-    there.press("Backspace")
-    assert there.text("#again-problem") == ""
-    assert there.page.get_attribute("#again", "aria-invalid") is None
-    there.may_say("403", "429")
-    fill(there, "not it at all", NEW, NEW)
-    there.wait("#old-problem:has-text('this is not your present password')")
-    assert there.page.evaluate(FOCUSED) == "old"
-    assert there.page.input_value("#new") == NEW, "what was right need not be typed again"
+def test_error_is_displayed_at_its_field(served):
+    visit = served.visit(path="password")
+    visit.wait("button[type=submit]:enabled")
+    assert visit.text("#new-hint") == "10 to 200 characters"
+    # The page checks these errors without a request.
+    requests = []
+    visit.page.on("request", lambda request: requests.append(request.url))
+    fill(visit, "", "short", "shorter")
+    assert "missing" in visit.text("#old-problem")
+    assert visit.text("#new-problem") == "a password has 10 to 200 characters; this one has 5"
+    assert "differ" in visit.text("#again-problem")
+    assert visit.page.evaluate(FOCUSED) == "old"
+    assert requests == []
+    fill(visit, PASSWORD, NEW, NEW + "s")
+    assert [visit.text(f"#{name}-problem") for name in ("old", "new")] == ["", ""]
+    assert visit.page.evaluate(FOCUSED) == "again"
+    assert visit.page.get_attribute("#again", "aria-invalid") == "true"
+    assert "again-problem" in visit.page.get_attribute("#again", "aria-describedby")
+    # The error disappears when the field is corrected.
+    visit.press("Backspace")
+    assert visit.text("#again-problem") == ""
+    assert visit.page.get_attribute("#again", "aria-invalid") is None
+    visit.expect_errors("403", "429")
+    fill(visit, "not it at all", NEW, NEW)
+    visit.wait("#old-problem:has-text('this is not your present password')")
+    assert visit.page.evaluate(FOCUSED) == "old"
+    assert visit.page.input_value("#new") == NEW, "a valid field keeps its value"
     for _ in range(4):
-        fill(there, "not it at all", NEW, NEW)
-        there.wait("#old-problem:has-text('not your present')")
-    fill(there, PASSWORD, NEW, NEW)
-    there.wait("#problem:has-text('wait')")
-    assert served.users.right("anna", PASSWORD)
+        fill(visit, "not it at all", NEW, NEW)
+        visit.wait("#old-problem:has-text('not your present')")
+    fill(visit, PASSWORD, NEW, NEW)
+    visit.wait("#problem:has-text('wait')")
+    assert served.users.verify_password("anna", PASSWORD)
 
 
-def test_out_by_the_header_of_this_page(served):
-    there = served.visit(path="password")
-    there.page.get_by_role("button", name="anna: log out").click()
-    there.wait("#login")
-    there.page.goto(served.address + "password")
-    there.wait("#login")
+def test_log_out_from_the_password_page(served):
+    visit = served.visit(path="password")
+    visit.page.get_by_role("button", name="anna: log out").click()
+    visit.wait("#login")
+    visit.page.goto(served.address + "password")
+    visit.wait("#login")
 
 
-def test_the_page_fits_in_a_small_window_with_large_type(served):
-    there = served.visit(path="password", viewport={"width": 480, "height": 360})
-    there.page.evaluate("localStorage.setItem('sonarpost.type', 'large')")
-    there.page.reload()
-    there.wait("button[type=submit]:enabled")
-    there.page.focus("button[type=submit]")
-    assert there.page.locator("button[type=submit]").bounding_box()["y"] < 360
-    there.page.focus("#old")
-    assert there.page.locator("label[for=old]").bounding_box()["y"] > 0
+def test_page_fits_a_small_window_with_large_type(served):
+    visit = served.visit(path="password", viewport={"width": 480, "height": 360})
+    visit.page.evaluate("localStorage.setItem('sonarpost.type', 'large')")
+    visit.page.reload()
+    visit.wait("button[type=submit]:enabled")
+    visit.page.focus("button[type=submit]")
+    assert visit.page.locator("button[type=submit]").bounding_box()["y"] < 360
+    visit.page.focus("#old")
+    assert visit.page.locator("label[for=old]").bounding_box()["y"] > 0

@@ -51,7 +51,7 @@ def add_actions(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     for name in RENAMED_ACTIONS:
         # No argument can start with this prefix: every former option is accepted, and the action is refused.
         renamed = actions.add_parser(name, prefix_chars="\0", add_help=False)
-        renamed.add_argument("arguments", nargs="*")
+        renamed.add_argument("arguments", nargs="*", help="ignored")
         renamed.set_defaults(run=refuse_renamed, action=name)
 
 

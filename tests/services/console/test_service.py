@@ -1,4 +1,4 @@
-"""The console between its neighbours: what arrives is shown, what people do reaches those who take it, once."""
+"""The console service with its neighbours: received records, sent records, health."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ VESSEL = "vessel-1"
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 
 
-def picture(version: int = 1, *, complete: bool = True) -> ReconstructedImage:
+def image(version: int = 1, *, complete: bool = True) -> ReconstructedImage:
     pixels = np.full((20, 20), 100 + version, np.uint8)
     raster = Pixels.from_array(pixels)
     mask = np.zeros(pixels.shape, np.bool_)
@@ -69,7 +69,7 @@ def picture(version: int = 1, *, complete: bool = True) -> ReconstructedImage:
 
 
 class Page:
-    """A browser with a session at a running console."""
+    """A browser with a session at a running console service."""
 
     def __init__(self, console: ConsoleService, user: str, role: str) -> None:
         self.base = console.address
@@ -93,13 +93,13 @@ class Page:
         return self.get(f"/api/contacts/{ID}")
 
     def decide(self, **changes: Any) -> Any:
-        whole = self.contact()
-        version = whole["versions"][-1]
-        body = {"revision": whole["contact"]["revision"], "version": version["version"], "sha256": version["sha256"]}
+        detail = self.contact()
+        version = detail["versions"][-1]
+        body = {"revision": detail["contact"]["revision"], "version": version["version"], "sha256": version["sha256"]}
         return self.post(f"/api/contacts/{ID}/decisions", {**body, "verdict": "mine_like", **changes})["decision"]
 
     def events(self) -> tuple[HTTPResponse, list[tuple[str, Any]]]:
-        """Follow the stream of events in a thread, until it is closed."""
+        """Read the event stream in a thread until it is closed."""
         request = urllib.request.Request(self.base + "events", None, self.headers)
         stream, found = urllib.request.urlopen(request, timeout=60), []
 
@@ -120,8 +120,8 @@ class Page:
 
 
 @pytest.fixture(autouse=True)
-def cheap_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sonarpost.services.console.store.users.COST", 2**4)
+def fast_password_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sonarpost.services.console.store.users.SCRYPT_COST", 2**4)
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def put(client: zenoh.Session, key: str, record: Any) -> None:
     publish_once(client, key, wire.encode(record), wire.encoding_of(type(record)))
 
 
-def test_a_picture_is_shown_as_it_refines_and_a_decision_reaches_relay_and_modem(runner, start):
+def test_images_are_published_and_a_decision_is_sent_to_relay_and_modem(runner, start):
     relay = runner.peer(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
     modem = runner.peer(
         VESSEL, "op_modem", {keys.contact_decision(VESSEL): Decision, keys.command_all(VESSEL): Command}
@@ -149,9 +149,9 @@ def test_a_picture_is_shown_as_it_refines_and_a_decision_reaches_relay_and_modem
     stream, events = anna.events()
     eventually(lambda: [name for name, _ in events] == ["hello"], what="stream")
     key = keys.image_reconstructed(VESSEL)
-    decompressor.send(key, "console", picture(1, complete=False))
+    decompressor.send(key, "console", image(1, complete=False))
     eventually(lambda: any(name == "contact" and data["new"] for name, data in events), what="contact")
-    decompressor.send(key, "console", picture(2))
+    decompressor.send(key, "console", image(2))
     eventually(lambda: any(name == "contact" and data["contact"]["complete"] for name, data in events), what="refined")
     decision = anna.decide(remark="clean edge")
     eventually(lambda: len(relay.received) == len(modem.received) == 1, what="decision handed on")
@@ -169,11 +169,11 @@ def test_a_picture_is_shown_as_it_refines_and_a_decision_reaches_relay_and_modem
     stream.close()
 
 
-def test_how_far_a_decision_has_come_is_watched(runner, start, client):
+def test_delivery_state_of_a_decision_is_updated(runner, start, client):
     for name in ("relay", "op_modem"):
         runner.peer(VESSEL, name, {keys.contact_decision(VESSEL): Decision})
     console = start()
-    put(client, keys.image_reconstructed(VESSEL), picture())
+    put(client, keys.image_reconstructed(VESSEL), image())
     anna = Page(console, "anna", "operator")
     eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
     decision = anna.decide()
@@ -193,11 +193,11 @@ def test_how_far_a_decision_has_come_is_watched(runner, start, client):
     eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "relay", what="relay's receipt")
 
 
-def test_a_relay_with_nothing_waiting_means_that_decisions_are_ashore(start, client, runner, monkeypatch):
-    monkeypatch.setattr("sonarpost.services.console.service.ASHORE_MARGIN_S", -1.0)
+def test_empty_relay_means_delivery_to_shore(start, client, runner, monkeypatch):
+    monkeypatch.setattr("sonarpost.services.console.service.SHORE_DELIVERY_MARGIN_S", -1.0)
     relay = runner.peer(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
     console = start(decision_consumers=("relay",))
-    put(client, keys.image_reconstructed(VESSEL), picture())
+    put(client, keys.image_reconstructed(VESSEL), image())
     anna = Page(console, "anna", "operator")
     eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
     anna.decide()
@@ -210,14 +210,14 @@ def test_a_relay_with_nothing_waiting_means_that_decisions_are_ashore(start, cli
         ({"inbox": 0.0, "decisions_waiting": 0.0}, -60, "relay"),
         ({"inbox": 0.0, "decisions_waiting": 0.0}, 60, "delivered"),
     ):
-        console._on_relay(health.model_copy(update={"gauges": gauges, "time_utc_s": time.time() + at}))
+        console._on_relay_health(health.model_copy(update={"gauges": gauges, "time_utc_s": time.time() + at}))
         assert anna.contact()["contact"]["delivery"]["shore"] == ashore
 
 
-def test_requests_go_to_the_modem(runner, start, client):
+def test_request_is_sent_to_the_modem(runner, start, client):
     modem = runner.peer(VESSEL, "op_modem", {keys.command_all(VESSEL): Command})
     console = start(decision_consumers=())
-    put(client, keys.image_reconstructed(VESSEL), picture(1, complete=False))
+    put(client, keys.image_reconstructed(VESSEL), image(1, complete=False))
     anna = Page(console, "anna", "operator")
     eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
     asked = anna.post(f"/api/contacts/{ID}/requests", {"kind": "resend", "airtime_s": 9.3})
@@ -232,9 +232,9 @@ def test_requests_go_to_the_modem(runner, start, client):
     assert (decision["delivery"]["shore"], decision["delivery"]["vehicle"]) == ("none", "none")
 
 
-def test_advice_from_ashore_appears_beside_the_contact(runner, start, client):
+def test_comment_from_the_shore_site_is_shown(runner, start, client):
     console = start()
-    put(client, keys.image_reconstructed(VESSEL), picture())
+    put(client, keys.image_reconstructed(VESSEL), image())
     relay = runner.peer(VESSEL, "relay")
     anna = Page(console, "anna", "operator")
     eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
@@ -245,7 +245,7 @@ def test_advice_from_ashore_appears_beside_the_contact(runner, start, client):
     assert anna.contact()["advice"][0]["remark"] == "look again"
 
 
-def test_frames_are_shown_with_their_vehicle(start, client):
+def test_received_frames_are_assigned_to_their_vehicle(start, client):
     console = start(vehicles={"3": "uuv-1"})
     anna = Page(console, "anna", "observer")
     frame = AcousticFrame(
@@ -268,25 +268,25 @@ def test_frames_are_shown_with_their_vehicle(start, client):
     eventually(lambda: any(s["service"] == "console" for s in anna.get("/api/fleet")["services"]), what="own health")
 
 
-def test_a_record_that_is_none_is_counted_and_the_watch_goes_on(start, client):
+def test_invalid_record_is_counted_and_ignored(start, client):
     console = start()
     publish_once(client, keys.acoustic_downlink(VESSEL), b"\xc1")
     eventually(lambda: console.health().counters.get("records_ignored") == 1, what="ignored record")
 
 
-def test_a_picture_of_another_vessel_is_refused(start, client, refused):
+def test_image_of_another_vessel_is_refused(start, client, refused):
     console = start()
-    other = picture().model_copy(update={"vessel_id": "vessel-2"})
+    other = image().model_copy(update={"vessel_id": "vessel-2"})
     put(client, keys.image_reconstructed(VESSEL), other)
     eventually(lambda: console.health().counters.get("records_refused") == 1, what="refusal")
     assert "vessel_id" in refused(console)[0][1]
-    assert console.board.counts().total == 0
+    assert console.state.counts().total == 0
 
 
-def test_ashore_c2s_pictures_are_shown_and_advice_goes_to_c2(runner, start, client):
+def test_shore_console_shows_images_of_c2_and_sends_comments_to_it(runner, start, client):
     c2 = runner.peer("shore-1", "c2", {keys.tasking_advice_all(): Advice, keys.tasking_command_all(): Command})
     console = start(role="shore")
-    put(client, keys.shore_image(VESSEL), picture())
+    put(client, keys.shore_image(VESSEL), image())
     eva = Page(console, "eva", "expert")
     eventually(lambda: eva.get("/api/contacts")["total"] == 1, what="picture")
     advice = eva.post(f"/api/contacts/{ID}/advice", {"version": 1, "verdict": "unsure", "remark": "shadow too long"})
@@ -304,19 +304,19 @@ def test_ashore_c2s_pictures_are_shown_and_advice_goes_to_c2(runner, start, clie
     assert eva.contact()["decisions"][0]["delivery"]["shore"] == "delivered"
 
 
-def test_ashore_what_came_meanwhile_is_taken_from_c2s_folder(start, tmp_path):
-    write_image(tmp_path / "out" / VESSEL, picture(2, complete=False))
+def test_shore_console_reads_missed_records_from_the_folder_of_c2(start, tmp_path):
+    write_image(tmp_path / "out" / VESSEL, image(2, complete=False))
     (tmp_path / "out" / VESSEL / "broken.json").write_text("{")
     console = start(role="shore", out_dir=tmp_path / "out")
-    eventually(lambda: console.board.counts().total == 1, what="kept picture")
-    kept = console.board.image(ID, 2)
-    assert (kept.missing() == picture(2, complete=False).missing()).all()
-    assert kept.picture == picture(2).picture
+    eventually(lambda: console.state.counts().total == 1, what="kept picture")
+    kept = console.state.image(ID, 2)
+    assert (kept.missing() == image(2, complete=False).missing()).all()
+    assert kept.picture == image(2).picture
 
 
-def test_what_people_did_outlives_the_service(runner, start, client):
+def test_decision_is_sent_after_a_restart(runner, start, client):
     console = start()
-    put(client, keys.image_reconstructed(VESSEL), picture())
+    put(client, keys.image_reconstructed(VESSEL), image())
     anna = Page(console, "anna", "operator")
     eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
     decision = anna.decide()
@@ -330,12 +330,12 @@ def test_what_people_did_outlives_the_service(runner, start, client):
     assert [entry["user"] for entry in bo.contact()["audit"]] == ["anna"]
 
 
-def test_a_decision_that_was_written_and_not_handed_on_goes_after_a_kill(runner, start, client, monkeypatch):
+def test_stored_decision_is_sent_after_a_crash(runner, start, client, monkeypatch):
     console = start()
-    put(client, keys.image_reconstructed(VESSEL), picture())
+    put(client, keys.image_reconstructed(VESSEL), image())
     anna = Page(console, "anna", "operator")
     eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
-    # As if it were killed between the two writes.
+    # Simulates a crash between the two transactions.
     monkeypatch.setattr(console, "_send", lambda _item: console.stopping.wait())
     decision = anna.decide()
     runner.stop(console)
@@ -344,13 +344,13 @@ def test_a_decision_that_was_written_and_not_handed_on_goes_after_a_kill(runner,
     eventually(lambda: [d.decision_id for d in relay.received] == [decision["decision_id"]], what="decision")
 
 
-def test_tls_needs_a_certificate_and_a_port_its_place(platform, start):
+def test_missing_certificate_and_occupied_port_are_errors(platform, start):
     with pytest.raises(ConfigError, match="certificate"):
         ConsoleService(platform("vessel-2"), ConsoleConfig(tls=True))
     first = start()
     port = int(first.address.rstrip("/").rpartition(":")[2])
     second = ConsoleService(platform("vessel-3"), ConsoleConfig(port=port))
-    with pytest.raises(PortError, match="cannot be listened on"):
+    with pytest.raises(PortError, match="cannot be bound"):
         second.start()
     second.stop()
 
@@ -359,17 +359,17 @@ def test_health_token_and_last_word(start, check_monitoring):
     check_monitoring(start())
 
 
-def test_a_wrong_configuration_ends_the_process(tmp_path, capsys):
+def test_invalid_configuration_ends_the_process(tmp_path, capsys):
     path = tmp_path / "vessel.toml"
     path.write_text('[platform]\nid = "vessel-1"\n[console]\nhost = "0.0.0.0"\n')
     assert main(ConsoleService, ConsoleConfig, ["--config", str(path)]) == 2
-    assert "passwords go over this connection" in capsys.readouterr().err
+    assert "passwords are sent over this connection" in capsys.readouterr().err
 
 
-def test_a_decision_is_ashore_when_the_real_relay_has_none_left(runner, start, client, platform):
+def test_delivery_to_shore_with_the_real_relay(runner, start, client, platform):
     relay = runner.start(RelayService(platform(VESSEL), RelayConfig()))
     console = start(decision_consumers=("relay",))
-    put(client, keys.image_reconstructed(VESSEL), picture())
+    put(client, keys.image_reconstructed(VESSEL), image())
     anna = Page(console, "anna", "operator")
     eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
     anna.decide()

@@ -1,4 +1,4 @@
-"""The stream of events over a real connection: what is missed comes again, what is too old is loaded anew."""
+"""The event stream over a real connection, and its buffer."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from typing import Any
 
 import pytest
 from builders.common import eventually
-from builders.console import PASSWORD, picture_record
+from builders.console import PASSWORD, image_record
 
+from sonarpost.services.console.events import EventHub, RateLimiter
 from sonarpost.services.console.web.server import WebServer
 
 
-class Follower:
-    """A page that is open."""
+class EventReader:
+    """Reads the event stream as an open page does."""
 
     def __init__(self, stream: HTTPResponse) -> None:
         self._stream = stream
@@ -37,7 +38,7 @@ class Follower:
                 elif field == "data":
                     self.events.append((name, identifier, json.loads(value)))
         except (OSError, ValueError, AttributeError):
-            pass  # the test has closed it
+            pass  # closed by the test
         self.ended = True
 
     def names(self) -> list[str]:
@@ -53,7 +54,7 @@ def served(console, monkeypatch):
     server = WebServer(console.app.asgi, "127.0.0.1", 0)
     server.start()
     yield server
-    console.app.end()
+    console.app.stop()
     server.stop()
 
 
@@ -66,82 +67,108 @@ def headers(served):
 
 
 @pytest.fixture
-def follow(served, headers):
-    followers: list[Follower] = []
+def open_stream(served, headers):
+    readers: list[EventReader] = []
 
-    def make(query: str = "", **more: str) -> Follower:
+    def make(query: str = "", **more: str) -> EventReader:
         request = urllib.request.Request(served.address + "events" + query, None, {**headers, **more})
-        followers.append(Follower(urllib.request.urlopen(request, timeout=60)))
-        return followers[-1]
+        readers.append(EventReader(urllib.request.urlopen(request, timeout=60)))
+        return readers[-1]
 
     yield make
-    for follower in followers:
-        follower.close()
+    for reader in readers:
+        reader.close()
 
 
-def test_a_page_that_was_cut_off_gets_what_it_missed(console, follow):
-    first = follow()
-    console.board.take_image(picture_record("0001"))
+def test_page_receives_events_of_an_interruption(console, open_stream):
+    first = open_stream()
+    console.state.store_image(image_record("0001"))
     eventually(lambda: "contact" in first.names(), what="event")
     [(_, identifier, data)] = [event for event in first.events if event[0] == "contact"]
     assert data["contact"]["image_id"] == "0001"
     assert (data["new"], data["total"], data["unreviewed"]) == (True, 1, 1)
     first.close()
-    console.board.take_image(picture_record("0002"))
-    console.board.take_image(picture_record("0003"))
-    for again in (follow(**{"Last-Event-ID": identifier}), follow(f"?last={identifier}")):
+    console.state.store_image(image_record("0002"))
+    console.state.store_image(image_record("0003"))
+    for again in (open_stream(**{"Last-Event-ID": identifier}), open_stream(f"?last={identifier}")):
         eventually(lambda page=again: page.names().count("contact") == 2, what="missed events")
         assert [e[2]["contact"]["image_id"] for e in again.events if e[0] == "contact"] == ["0002", "0003"]
         assert "reset" not in again.names()
 
 
-def test_a_page_of_another_run_loads_anew(follow):
-    page = follow(**{"Last-Event-ID": "0000000-5"})
+def test_page_of_another_run_is_reset(open_stream):
+    page = open_stream(**{"Last-Event-ID": "0000000-5"})
     eventually(lambda: page.names()[:2] == ["hello", "reset"], what="reset")
 
 
-def test_a_quiet_stream_tells_the_time(follow):
-    page = follow()
+def test_idle_stream_sends_the_time(open_stream):
+    page = open_stream()
     eventually(lambda: page.names().count("clock") >= 2, what="clock")
 
 
-def test_a_stream_ends_with_its_session(console, served, headers, follow):
-    page = follow()
+def test_stream_ends_with_its_session(console, served, headers, open_stream):
+    page = open_stream()
     eventually(lambda: page.names() != [], what="stream")
     request = urllib.request.Request(served.address + "api/logout", b"{}", headers)
     with urllib.request.urlopen(request, timeout=20) as answer:
         assert answer.status == 204
     eventually(lambda: page.ended, what="end")
     assert page.names()[-1] == "session"
-    eventually(lambda: console.board.hub.listeners == 0, what="listener gone")
+    eventually(lambda: console.state.events.subscriber_count == 0, what="no subscriber")
 
 
-def test_a_session_has_so_many_streams_and_no_more(follow):
-    pages = [follow() for _ in range(4)]
+def test_number_of_streams_of_a_session_is_limited(open_stream):
+    pages = [open_stream() for _ in range(4)]
     eventually(lambda: all(page.names() for page in pages), what="four streams")
     with pytest.raises(urllib.error.HTTPError) as caught:
-        follow()
+        open_stream()
     assert caught.value.code == 429
     caught.value.close()
     pages[0].close()
 
-    def there_is_room() -> bool:
+    def is_accepted() -> bool:
         try:
-            follow()
+            open_stream()
         except urllib.error.HTTPError as error:
             error.close()
             return False
         return True
 
-    eventually(there_is_room, what="room for another")
+    eventually(is_accepted, what="another stream")
 
 
-def test_a_defect_is_logged_and_answered(console, monkeypatch, caplog):
-    def broken(_wanted: object) -> None:
-        raise RuntimeError("a defect")
+def test_unhandled_exception_is_logged_and_answered(console, monkeypatch, caplog):
+    def fail(_query: object) -> None:
+        raise RuntimeError("internal detail")
 
-    monkeypatch.setattr(console.board, "contacts", broken)
+    monkeypatch.setattr(console.state, "list_contacts", fail)
     answer = console.browser("watch").get("/api/contacts")
     assert (answer.status_code, answer.json()["error"]["code"]) == (500, "defect")
-    assert "a defect" in caplog.text
-    assert "a defect" not in answer.text
+    assert "internal detail" in caplog.text
+    assert "internal detail" not in answer.text
+
+
+def test_event_buffer():
+    hub = EventHub(buffered=3)
+    notified = []
+    subscriber = hub.subscribe(lambda: notified.append(1))
+    for number in range(5):
+        hub.publish("contact", {"n": number})
+    hub.unsubscribe(subscriber)
+    hub.publish("contact", {"n": 5})
+    assert len(notified) == 5
+    assert [json.loads(e.data)["n"] for e in hub.events_after(4) or ()] == [4, 5]
+    assert hub.events_after(6) == ()
+    assert hub.events_after(2) is None
+    assert hub.events_after(7) is None
+    assert hub.parse_event_id(hub.event_id(4)) == 4
+    for other in ("", "4", f"{EventHub().run}-4", f"{hub.run}-x", f"{hub.run}-{'9' * 30}"):
+        assert hub.parse_event_id(other) is None
+    with pytest.raises(ValueError, match="Out of range"):
+        hub.publish("contact", {"n": float("nan")})
+
+
+def test_rate_limiter_is_separate_for_each_name():
+    limiter = RateLimiter(1.0)
+    times = [("a", 0.0), ("a", 0.5), ("b", 0.5), ("a", 1.0), ("a", 1.9), ("a", 2.0)]
+    assert [limiter.allows(*at) for at in times] == [True, False, True, True, False, True]

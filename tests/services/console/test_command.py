@@ -1,4 +1,4 @@
-"""`sonarpost console`: users by command; training; the server by TLS."""
+"""`sonarpost console`: users, training, and the web server with TLS."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sonarpost.errors import ConfigError
 from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
 from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.training.contacts import simulated_contacts
-from sonarpost.services.console.training.simulator import VESSEL, Training
+from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator
 from sonarpost.services.console.web.server import WebServer
 
 
@@ -28,27 +28,27 @@ def user(state: Path, *words: str) -> int:
     return main(["console", "user", *words, "--state-dir", str(state)])
 
 
-def test_users_come_and_go(tmp_path, capsys, monkeypatch):
+def test_add_change_and_remove_users(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO(f"{PASSWORD}\n"))
     assert user(tmp_path, "add", "anna", "--role", "operator", "--password-stdin") == 0
     assert user(tmp_path, "ls") == 0
     assert "anna" in capsys.readouterr().out
     users = Users(tmp_path / FILE_NAME)
-    assert users.right("anna", PASSWORD)
-    assert not users.right("anna", PASSWORD + "x")
+    assert users.verify_password("anna", PASSWORD)
+    assert not users.verify_password("anna", PASSWORD + "x")
     monkeypatch.setattr("sys.stdin", io.StringIO("another password\n"))
     assert user(tmp_path, "passwd", "anna", "--password-stdin") == 0
-    assert users.right("anna", "another password")
+    assert users.verify_password("anna", "another password")
     assert user(tmp_path, "rm", "anna") == 0
     assert users.find("anna") is None
     users.close()
     assert user(tmp_path, "rm", "anna") == 2
-    assert "may not log in" in capsys.readouterr().out
+    assert "user anna removed" in capsys.readouterr().out
 
 
-def test_a_password_is_asked_for_twice(tmp_path, capsys, monkeypatch):
-    given = iter([PASSWORD, "another", PASSWORD, PASSWORD, "short", "short"])
-    monkeypatch.setattr("getpass.getpass", lambda _prompt: next(given))
+def test_password_prompt_is_repeated(tmp_path, capsys, monkeypatch):
+    answers = iter([PASSWORD, "another", PASSWORD, PASSWORD, "short", "short"])
+    monkeypatch.setattr("getpass.getpass", lambda _prompt: next(answers))
     config = tmp_path / "vessel.toml"
     config.write_text(f'[platform]\nid = "vessel-1"\nstate_dir = "{tmp_path}/state"\n')
     assert main(["console", "user", "add", "anna", "--config", str(config)]) == 2
@@ -58,60 +58,60 @@ def test_a_password_is_asked_for_twice(tmp_path, capsys, monkeypatch):
     assert "10 to 200 characters" in capsys.readouterr().err
 
 
-def test_what_is_not_asked_for_is_said(capsys):
+def test_missing_action_and_invalid_number_are_errors(capsys):
     assert main(["console"]) == 2
     assert main(["console", "--training", "0"]) == 2
     assert "1 to 100000" in capsys.readouterr().err
 
 
-def test_simulated_contacts_come_bit_by_bit_and_say_what_they_are():
-    seen = list(islice(simulated_contacts(3, 1_700_000_000.0), 8))
-    assert {one.codec for one in seen} == {"emb", "vq"}
-    assert len({one.image_id for one in seen}) == 8
-    for one in seen:
-        records = [one.record(VESSEL, step, 1000.0, 1001.0) for step in range(len(one.versions))]
+def test_simulated_contacts_arrive_in_versions_and_are_marked():
+    contacts = list(islice(simulated_contacts(3, 1_700_000_000.0), 8))
+    assert {contact.codec.name for contact in contacts} == {"emb", "vq"}
+    assert len({contact.image_id for contact in contacts}) == 8
+    for contact in contacts:
+        records = [contact.record(VESSEL, step, 1000.0, 1001.0) for step in range(len(contact.versions))]
         assert [record.version for record in records] == list(range(1, len(records) + 1))
         assert all("simulated, for training" in record.notes for record in records)
         assert records[0].bytes_received < records[0].bytes_total
         received = [record.bytes_received for record in records]
         assert received == sorted(received)
-        # Of the paper's codec half a picture comes first.
-        assert records[0].missing_fraction == pytest.approx(0.5 if one.codec == "vq" else 0.0, abs=0.1)
+        # With the codec of the paper, a half of the image arrives first.
+        assert records[0].missing_fraction == pytest.approx(0.5 if contact.codec.name == "vq" else 0.0, abs=0.1)
 
 
-def test_training_arrives_travels_and_ends(console):
-    training = Training(console.board, contacts=3, interval_s=0.01)
-    training.backlog(2)
-    assert console.board.counts().total == 2
+def test_training_delivers_decisions_and_requests(console):
+    simulator = TrainingSimulator(console.state, contacts=3, interval_s=0.01)
+    simulator.load_backlog(2)
+    assert console.state.counts().total == 2
     anna = console.browser("anna")
     [contact_id] = [row["id"] for row in anna.get("/api/contacts", limit=1).json()["items"]]
     console.decide(anna, contact_id)
     now = time.time()
-    training.send(now)
+    simulator.accept_records(now)
     for later, state in ((0.0, "asked"), (5.0, "sent"), (11.0, "confirmed")):
-        training.travel(now + later)
+        simulator.advance_downlink(now + later)
         delivery = anna.get(f"/api/contacts/{contact_id}").json()["contact"]["delivery"]
         assert delivery["vehicle"] == state
     assert delivery["shore"] == "delivered"
-    whole = anna.get(f"/api/contacts/{contact_id}").json()["contact"]
-    kind = "resend" if not whole["complete"] else "refine"
+    detail = anna.get(f"/api/contacts/{contact_id}").json()["contact"]
+    kind = "resend" if not detail["complete"] else "refine"
     assert anna.post(f"/api/contacts/{contact_id}/requests", {"kind": kind}).status_code == 201
-    training.send(now)
-    training.travel(now + 11.0)
+    simulator.accept_records(now)
+    simulator.advance_downlink(now + 11.0)
     for _ in range(10):
-        training.packet(time.time())
+        simulator.receive_packet(time.time())
     more = anna.get(f"/api/contacts/{contact_id}").json()["contact"]
     assert more["complete"]
-    assert (more["version"], more["bytes_received"] > whole["bytes_received"]) == (whole["version"] + 1, True)
-    assert console.board.counts().total == 3
+    assert (more["version"], more["bytes_received"] > detail["bytes_received"]) == (detail["version"] + 1, True)
+    assert console.state.counts().total == 3
     assert any(row["advised"] for row in anna.get("/api/contacts").json()["items"])
     vehicles = anna.get("/api/fleet").json()["vehicles"]
     assert any(vehicle["snr_in_db"] is not None and vehicle["queue"] for vehicle in vehicles)
 
 
-def test_training_answers_wider_with_a_picture_of_its_own_once(console):
-    training = Training(console.board, contacts=1, interval_s=0.01)
-    training.backlog(1)
+def test_training_sends_an_expanded_image_once(console):
+    simulator = TrainingSimulator(console.state, contacts=1, interval_s=0.01)
+    simulator.load_backlog(1)
     anna = console.browser("anna")
 
     def rows() -> dict[str, dict[str, object]]:
@@ -120,20 +120,20 @@ def test_training_answers_wider_with_a_picture_of_its_own_once(console):
     def ask(image_id: str) -> None:
         assert anna.post(f"/api/contacts/{rows()[image_id]['id']}/requests", {"kind": "wider"}).status_code == 201
         now = time.time()
-        training.send(now)
-        training.travel(now + 11.0)
+        simulator.accept_records(now)
+        simulator.advance_downlink(now + 11.0)
         for _ in range(10):
-            training.packet(time.time())
+            simulator.receive_packet(time.time())
 
     (first,) = rows()
     ask(first)
     assert set(rows()) == {first, "ZZZZ"}
-    near, wide = (console.board.image(str(rows()[name]["id"]), 1) for name in (first, "ZZZZ"))
-    assert wide.contact.pixel_along_m == 2 * near.contact.pixel_along_m
-    assert wide.contact.pixel_across_m == 2 * near.contact.pixel_across_m
+    original, expanded = (console.state.image(str(rows()[name]["id"]), 1) for name in (first, "ZZZZ"))
+    assert expanded.contact.pixel_along_m == 2 * original.contact.pixel_along_m
+    assert expanded.contact.pixel_across_m == 2 * original.contact.pixel_across_m
     assert rows()["ZZZZ"]["complete"]
-    ask(first)  # the same again
-    ask("ZZZZ")  # nothing wider is kept
+    ask(first)  # a repeated request
+    ask("ZZZZ")  # an expanded image cannot be expanded
     assert set(rows()) == {first, "ZZZZ"}
 
 
@@ -143,7 +143,7 @@ def certificate(tmp_path):
     return TlsConfig(ca=folder / CA_CERTIFICATE, certificate=folder / CERTIFICATE, key=folder / KEY)
 
 
-def test_the_page_by_tls_with_the_fleets_certificate(make_console, certificate):
+def test_https_with_the_certificate_of_the_fleet(make_console, certificate):
     console = make_console(tls=True)
     server = WebServer(console.app.asgi, "127.0.0.1", 0, certificate)
     server.start()
@@ -164,7 +164,7 @@ def test_the_page_by_tls_with_the_fleets_certificate(make_console, certificate):
     eventually(lambda: not server.running, what="end of the server")
 
 
-def test_a_certificate_that_is_none_is_named(make_console, certificate, tmp_path):
+def test_invalid_certificate_is_an_error(make_console, certificate, tmp_path):
     (tmp_path / "none.pem").write_text("none")
     wrong = TlsConfig(ca=certificate.ca, certificate=tmp_path / "none.pem", key=certificate.key)
     with pytest.raises(ConfigError, match="certificate"):

@@ -1,4 +1,4 @@
-"""From a picture's arrival to a decision: lists, versions, groups, two people at once, undo, audit."""
+"""Contact lists, image versions, groups, decisions, undo, audit, requests and comments."""
 
 from __future__ import annotations
 
@@ -8,54 +8,54 @@ from dataclasses import replace
 from itertools import count
 
 import pytest
-from builders.console import FIRST_UTC_S, picture_record
+from builders.console import FIRST_UTC_S, image_record
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sonarpost.errors import DeliveryError
 from sonarpost.messages import Advice, Decision, DownlinkState
-from sonarpost.review.grouping import Place, nearest_group
-from sonarpost.services.console.store.contacts import Filter
-from sonarpost.services.console.store.database import OnScreen
+from sonarpost.review.grouping import Look, nearest_group
+from sonarpost.services.console.store.contacts import ContactFilter
+from sonarpost.services.console.store.database import DisplayedImage
 from sonarpost.services.console.store.decisions import ConflictError, DecisionInput
-from sonarpost.services.console.store.requests import is_news
+from sonarpost.services.console.store.requests import is_later_state
 from sonarpost.services.console.store.users import Actor
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 SECONDS = count()
 
 
-def test_a_contact_appears_refines_and_stays_one(console):
+def test_image_versions_belong_to_one_contact(console):
     watch = console.browser("watch")
-    assert console.board.take_image(picture_record(missing_rows=30))
+    assert console.state.store_image(image_record(missing_rows=30))
     [row] = watch.get("/api/contacts").json()["items"]
     assert (row["id"], row["version"], row["percent_received"], row["complete"]) == (ID, 1, 25.0, False)
-    assert console.board.take_image(picture_record(version=2))
-    assert not console.board.take_image(picture_record(version=2))
-    whole = watch.get(f"/api/contacts/{ID}").json()
-    assert [v["version"] for v in whole["versions"]] == [1, 2]
-    assert whole["contact"]["complete"]
-    assert whole["contact"]["percent_received"] == 100.0
-    assert whole["record"]["altitude_m"] == 5.0
-    assert whole["record"]["nadir_side"] == "left"
+    assert console.state.store_image(image_record(version=2))
+    assert not console.state.store_image(image_record(version=2))
+    detail = watch.get(f"/api/contacts/{ID}").json()
+    assert [v["version"] for v in detail["versions"]] == [1, 2]
+    assert detail["contact"]["complete"]
+    assert detail["contact"]["percent_received"] == 100.0
+    assert detail["record"]["altitude_m"] == 5.0
+    assert detail["record"]["nadir_side"] == "left"
 
 
-def test_an_older_version_that_comes_late_does_not_replace_the_newer(console):
-    console.board.take_image(picture_record(version=3))
-    console.board.take_image(picture_record(version=2, missing_rows=10))
-    whole = console.browser("watch").get(f"/api/contacts/{ID}").json()
-    assert whole["contact"]["version"] == 3
-    assert [v["version"] for v in whole["versions"]] == [2, 3]
+def test_late_older_version_does_not_replace_the_newer(console):
+    console.state.store_image(image_record(version=3))
+    console.state.store_image(image_record(version=2, missing_rows=10))
+    detail = console.browser("watch").get(f"/api/contacts/{ID}").json()
+    assert detail["contact"]["version"] == 3
+    assert [v["version"] for v in detail["versions"]] == [2, 3]
 
 
-def test_lists_filter_sort_and_page(console):
+def test_list_filter_sort_and_pages(console):
     for number in range(25):
-        console.board.take_image(
-            picture_record(
+        console.state.store_image(
+            image_record(
                 f"{number:04d}",
                 vehicle=f"uuv-{number % 2 + 1}",
                 atd_confidence=number / 20,
-                place=(56 + number / 100, -5.0),
+                position=(56 + number / 100, -5.0),
                 missing_rows=10 * (number % 2),
             )
         )
@@ -86,59 +86,59 @@ def test_lists_filter_sort_and_page(console):
         ("q", "x" * 81),
     ],
 )
-def test_a_wrong_parameter_is_named(console, parameter, value):
+def test_error_names_the_invalid_parameter(console, parameter, value):
     answer = console.browser("watch").get("/api/contacts", **{parameter: value})
     assert answer.status_code == 400
     assert answer.json()["error"]["field"] == parameter
 
 
-def test_looks_at_one_object_are_grouped_and_neighbours_are_not(console):
+def test_looks_at_one_object_are_grouped(console):
     near, far = (56.0, -5.0), (56.001, -5.0)  # 111 m apart
-    console.board.take_image(picture_record("0001", place=near))
-    console.board.take_image(picture_record("0002", place=(56.00002, -5.0), vehicle="uuv-2"))
-    console.board.take_image(picture_record("0003", place=far))
-    console.board.take_image(picture_record("0004", place=None))
+    console.state.store_image(image_record("0001", position=near))
+    console.state.store_image(image_record("0002", position=(56.00002, -5.0), vehicle="uuv-2"))
+    console.state.store_image(image_record("0003", position=far))
+    console.state.store_image(image_record("0004", position=None))
     watch = console.browser("watch")
     rows = {row["image_id"]: row for row in watch.get("/api/contacts").json()["items"]}
     assert rows["0001"]["group"] == rows["0002"]["group"] is not None
     assert (rows["0001"]["looks"], rows["0003"]["looks"], rows["0003"]["group"]) == (2, 1, None)
-    whole = watch.get(f"/api/contacts/{rows['0001']['id']}").json()
-    assert {row["image_id"] for row in whole["group"]} == {"0001", "0002"}
+    detail = watch.get(f"/api/contacts/{rows['0001']['id']}").json()
+    assert {row["image_id"] for row in detail["group"]} == {"0001", "0002"}
 
 
-def test_what_a_vehicle_sees_on_one_pass_is_several_things_however_badly_it_knows_where():
-    first = Place("g1", 56.0, -5.0, 7.0, "uuv-1", 1000.0)
+def test_looks_of_one_pass_have_a_smaller_distance_limit():
+    first = Look("g1", 56.0, -5.0, 7.0, "uuv-1", 1000.0)
     north_m = 1 / 111_320
-    beside = Place("", 56.0 + 12 * north_m, -5.0, 7.0, "uuv-1", 1010.0)
-    assert nearest_group(beside, [first], 8.0) is None
-    assert nearest_group(replace(beside, seen_utc_s=1500.0), [first], 8.0) == "g1"
-    assert nearest_group(replace(beside, vehicle_id="uuv-2"), [first], 8.0) == "g1"
-    assert nearest_group(replace(beside, lat_deg=56.0 + north_m), [first], 8.0) == "g1"
-    nearer = replace(first, group="g2", lat_deg=56.0 + 10 * north_m)
-    assert nearest_group(replace(beside, seen_utc_s=1500.0), [first, nearer], 8.0) == "g2"
+    other = Look("", 56.0 + 12 * north_m, -5.0, 7.0, "uuv-1", 1010.0)
+    assert nearest_group(other, [first], 8.0) is None
+    assert nearest_group(replace(other, seen_utc_s=1500.0), [first], 8.0) == "g1"
+    assert nearest_group(replace(other, vehicle_id="uuv-2"), [first], 8.0) == "g1"
+    assert nearest_group(replace(other, lat_deg=56.0 + north_m), [first], 8.0) == "g1"
+    closer = replace(first, group="g2", lat_deg=56.0 + 10 * north_m)
+    assert nearest_group(replace(other, seen_utc_s=1500.0), [first, closer], 8.0) == "g2"
     far = replace(first, lat_deg=56.0 + 50 * north_m, sigma_m=500.0, seen_utc_s=None)
-    assert nearest_group(beside, [far], 8.0) is None
+    assert nearest_group(other, [far], 8.0) is None
 
 
-def test_a_decision_is_kept_with_what_was_on_the_screen(console):
-    console.board.take_image(picture_record())
+def test_decision_is_stored_with_the_displayed_image(console):
+    console.state.store_image(image_record())
     anna = console.browser("anna")
     answer = console.decide(anna, ID)
     assert answer.status_code == 201, answer.text
     assert answer.json()["contact"]["review"] == "mine_like"
     assert answer.json()["decision"]["delivery"]["shore"] == "waiting"
-    whole = anna.get(f"/api/contacts/{ID}").json()
-    [entry] = whole["audit"]
+    detail = anna.get(f"/api/contacts/{ID}").json()
+    [entry] = detail["audit"]
     assert (entry["user"], entry["action"], entry["version"]) == ("anna", "decide", 1)
-    assert entry["sha256"] == whole["versions"][0]["sha256"]
+    assert entry["sha256"] == detail["versions"][0]["sha256"]
     assert entry["detail"]["remark"] == "clean edge"
-    [item] = console.board.unsent()
+    [item] = console.state.unsent_records()
     assert isinstance(item.record, Decision)
     assert (item.record.verdict, item.record.operator, item.record.image_version) == ("mine_like", "anna", 1)
 
 
-def test_of_two_people_at_once_the_second_is_told(console):
-    console.board.take_image(picture_record())
+def test_second_of_two_decisions_is_a_conflict(console):
+    console.state.store_image(image_record())
     anna, bo = console.browser("anna"), console.browser("bo")
     assert console.decide(anna, ID, revision=0).status_code == 201
     answer = console.decide(bo, ID, revision=0, verdict="not_mine_like")
@@ -151,14 +151,14 @@ def test_of_two_people_at_once_the_second_is_told(console):
     assert [d["operator"] for d in decided] == ["bo", "anna"]
 
 
-def test_of_many_at_the_same_moment_one_decides(console):
-    console.board.take_image(picture_record())
-    screen = OnScreen(1, console.board.image(ID, 1).picture_sha256, "raw")
+def test_one_of_many_simultaneous_decisions_is_stored(console):
+    console.state.store_image(image_record())
+    displayed = DisplayedImage(1, console.state.image(ID, 1).picture_sha256, "raw")
 
     def decide(name: str) -> bool:
         try:
-            console.board.decide(
-                ID, DecisionInput(0, screen, "unsure", None, None, name), Actor(name, "operator", "here")
+            console.state.decide(
+                ID, DecisionInput(0, displayed, "unsure", None, None, name), Actor(name, "operator", "127.0.0.1")
             )
         except ConflictError as error:
             return error.decision is None
@@ -166,38 +166,38 @@ def test_of_many_at_the_same_moment_one_decides(console):
 
     names = [f"op-{number}" for number in range(12)]
     with ThreadPoolExecutor(12) as pool:
-        made = dict(zip(names, pool.map(decide, names), strict=True))
-    [winner] = [name for name, decided in made.items() if decided]
-    whole = console.browser("watch").get(f"/api/contacts/{ID}").json()
-    assert [decision["operator"] for decision in whole["decisions"]] == [winner]
-    assert (whole["contact"]["decided_by"], whole["contact"]["revision"]) == (winner, 1)
+        results = dict(zip(names, pool.map(decide, names), strict=True))
+    [winner] = [name for name, decided in results.items() if decided]
+    detail = console.browser("watch").get(f"/api/contacts/{ID}").json()
+    assert [decision["operator"] for decision in detail["decisions"]] == [winner]
+    assert (detail["contact"]["decided_by"], detail["contact"]["revision"]) == (winner, 1)
 
 
 @given(
     st.lists(st.text(alphabet="ab%_\\'é", max_size=4), max_size=6), st.text(alphabet="ab%_\\'é", min_size=1, max_size=3)
 )
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_search_finds_what_has_the_text_and_nothing_else(console, remarks, wanted):
-    with console.board.database.writing() as db:
+def test_search_finds_exactly_the_contacts_with_the_text(console, remarks, text):
+    with console.state.database.transaction() as db:
         db.execute("DELETE FROM contact")
     for number, remark in enumerate(remarks):
-        console.board.take_images([picture_record(f"{number:04d}", first_utc_s=FIRST_UTC_S + next(SECONDS))])
-        with console.board.database.writing() as db:
+        console.state.store_images([image_record(f"{number:04d}", first_utc_s=FIRST_UTC_S + next(SECONDS))])
+        with console.state.database.transaction() as db:
             db.execute("UPDATE contact SET remark = ? WHERE image_id = ?", (remark, f"{number:04d}"))
-    found = console.board.contacts(Filter(text=wanted))["items"]
-    # Upper and lower case of ASCII are one, and of other letters two, as SQLite has it.
-    expected = {f"{number:04d}" for number, remark in enumerate(remarks) if wanted in remark or wanted in "uuv-1/"}
+    found = console.state.list_contacts(ContactFilter(text=text))["items"]
+    # SQLite ignores the case of ASCII letters only.
+    expected = {f"{number:04d}" for number, remark in enumerate(remarks) if text in remark or text in "uuv-1/"}
     assert {row["image_id"] for row in found} == expected
 
 
-def test_a_refined_picture_is_no_conflict(console):
-    console.board.take_image(picture_record())
-    console.board.take_image(picture_record(version=2))
+def test_new_image_version_is_no_conflict(console):
+    console.state.store_image(image_record())
+    console.state.store_image(image_record(version=2))
     assert console.decide(console.browser("anna"), ID, revision=0).status_code == 201
 
 
-def test_undo_is_a_record_more_and_puts_back_what_was(console):
-    console.board.take_image(picture_record())
+def test_undo_adds_a_record_and_restores_the_previous_verdict(console):
+    console.state.store_image(image_record())
     anna = console.browser("anna")
     first = console.decide(anna, ID).json()["decision"]
     second = console.decide(anna, ID, verdict="unsure").json()
@@ -206,48 +206,48 @@ def test_undo_is_a_record_more_and_puts_back_what_was(console):
     assert stale.status_code == 409
     wrong = anna.post(path, {"revision": 2, "decision_id": first["decision_id"]})
     assert (wrong.status_code, wrong.json()["error"]["field"]) == (400, "decision_id")
-    back = anna.post(path, {"revision": 2, "decision_id": second["decision"]["decision_id"]}).json()
-    assert back["contact"]["review"] == "mine_like"
-    assert back["decision"]["undoes"] == second["decision"]["decision_id"]
-    none = anna.post(path, {"revision": 3, "decision_id": first["decision_id"]}).json()
-    assert (none["contact"]["review"], none["decision"]["verdict"]) == ("unreviewed", "unsure")
-    whole = anna.get(f"/api/contacts/{ID}").json()
-    assert len(whole["decisions"]) == len(whole["audit"]) == len(console.board.unsent()) == 4
+    undone = anna.post(path, {"revision": 2, "decision_id": second["decision"]["decision_id"]}).json()
+    assert undone["contact"]["review"] == "mine_like"
+    assert undone["decision"]["undoes"] == second["decision"]["decision_id"]
+    first_undone = anna.post(path, {"revision": 3, "decision_id": first["decision_id"]}).json()
+    assert (first_undone["contact"]["review"], first_undone["decision"]["verdict"]) == ("unreviewed", "unsure")
+    detail = anna.get(f"/api/contacts/{ID}").json()
+    assert len(detail["decisions"]) == len(detail["audit"]) == len(console.state.unsent_records()) == 4
 
 
-def test_a_decision_on_another_picture_is_refused(console):
-    console.board.take_image(picture_record())
+def test_decision_on_another_image_is_rejected(console):
+    console.state.store_image(image_record())
     anna = console.browser("anna")
     assert console.decide(anna, ID, sha256="0" * 64).json()["error"]["field"] == "sha256"
     assert console.decide(anna, ID, version=2).json()["error"]["field"] == "version"
-    assert console.board.unsent() == []
+    assert console.state.unsent_records() == []
 
 
-def test_the_audit_cannot_be_changed(console):
-    console.board.take_image(picture_record())
+def test_audit_is_append_only(console):
+    console.state.store_image(image_record())
     console.decide(console.browser("anna"), ID)
     for change in ("UPDATE audit SET user = 'bo'", "DELETE FROM audit"):
-        with pytest.raises(DeliveryError, match="only added to"), console.board.database.writing() as db:
+        with pytest.raises(DeliveryError, match="only added to"), console.state.database.transaction() as db:
             db.execute(change)
-    with console.board.database.reading() as db, pytest.raises(sqlite3.Error, match="only added to"):
+    with console.state.database.read() as db, pytest.raises(sqlite3.Error, match="only added to"):
         db.execute("DELETE FROM audit")
 
 
-def test_a_decision_comes_ashore_and_to_the_vehicle(console):
-    console.board.take_image(picture_record())
+def test_delivery_of_a_decision_to_shore_and_vehicle(console):
+    console.state.store_image(image_record())
     anna = console.browser("anna")
     decision_id = console.decide(anna, ID).json()["decision"]["decision_id"]
 
     def delivery():
         return anna.get(f"/api/contacts/{ID}").json()["contact"]["delivery"]
 
-    console.board.settled("decision", decision_id, "relay", None)
-    console.board.settled("decision", decision_id, "op_modem", None)
+    console.state.apply_acknowledgement("decision", decision_id, "relay", None)
+    console.state.apply_acknowledgement("decision", decision_id, "op_modem", None)
     assert (delivery()["shore"], delivery()["vehicle"]) == ("relay", "asked")
-    now = console.board.clock()
-    # By the clock of a modem's host that is behind.
+    now = console.state.clock()
+    # The clock of the modem's host is slow.
     for number, state in enumerate(("asked", "sent", "confirmed", "sent"), start=-100):
-        console.board.take_downlink(
+        console.state.apply_downlink_state(
             DownlinkState(
                 vessel_id="vessel-1",
                 vehicle_id="uuv-1",
@@ -260,83 +260,83 @@ def test_a_decision_comes_ashore_and_to_the_vehicle(console):
             )
         )
     assert delivery()["vehicle"] == "confirmed"
-    console.board.all_ashore_before(now - 60)
+    console.state.mark_delivered_to_shore(now - 60)
     assert delivery()["shore"] == "relay"
-    console.board.all_ashore_before(now + 60)
+    console.state.mark_delivered_to_shore(now + 60)
     assert delivery()["shore"] == "delivered"
 
 
-def test_a_state_is_news_when_it_is_farther_on():
+def test_order_of_delivery_states():
     states = ("waiting", "asked", "sent", "confirmed")
-    for place, was in enumerate(states):
-        assert [is_news(was, 1, state, 1) for state in states] == [later > place for later in range(4)]
-    assert is_news("sent", 1, "sent", 2)
-    assert not is_news("sent", 2, "sent", 1)
-    assert not is_news("expired", 1, "confirmed", 1)
+    for index, known in enumerate(states):
+        assert [is_later_state(known, 1, state, 1) for state in states] == [later > index for later in range(4)]
+    assert is_later_state("sent", 1, "sent", 2)
+    assert not is_later_state("sent", 2, "sent", 1)
+    assert not is_later_state("expired", 1, "confirmed", 1)
 
 
-def test_a_refused_decision_says_why(console):
-    console.board.take_image(picture_record())
+def test_refused_decision_has_a_reason(console):
+    console.state.store_image(image_record())
     anna = console.browser("anna")
     decision_id = console.decide(anna, ID).json()["decision"]["decision_id"]
-    console.board.settled("decision", decision_id, "op_modem", "no such vehicle")
+    console.state.apply_acknowledgement("decision", decision_id, "op_modem", "no such vehicle")
     delivery = anna.get(f"/api/contacts/{ID}").json()["contact"]["delivery"]
     assert (delivery["vehicle"], delivery["reason"], delivery["shore"]) == ("refused", "no such vehicle", "waiting")
 
 
-def test_what_came_before_its_picture_waits_for_it(make_console):
+def test_records_before_their_image_are_attached_to_it(make_console):
     console = make_console(role="shore")
     at = FIRST_UTC_S + 50
     names = {"vessel_id": "vessel-1", "vehicle_id": "uuv-1", "image_id": "00A7", "image_version": 1}
     decision = Decision(decision_id="d-1", verdict="mine_like", operator="anna", decided_utc_s=at, **names)
-    assert console.board.take_decision(decision)
-    assert not console.board.take_decision(decision)
-    console.board.take_advice(Advice(advice_id="a-1", author="eva", advised_utc_s=at, remark="look again", **names))
-    console.board.take_image(picture_record())
-    whole = console.browser("watch").get(f"/api/contacts/{ID}").json()
-    assert whole["contact"]["review"] == "mine_like"
-    assert whole["contact"]["advised"]
-    assert [d["elsewhere"] for d in whole["decisions"]] == [True]
-    assert [a["remark"] for a in whole["advice"]] == ["look again"]
+    assert console.state.store_decision(decision)
+    assert not console.state.store_decision(decision)
+    console.state.store_advice(Advice(advice_id="a-1", author="eva", advised_utc_s=at, remark="look again", **names))
+    console.state.store_image(image_record())
+    detail = console.browser("watch").get(f"/api/contacts/{ID}").json()
+    assert detail["contact"]["review"] == "mine_like"
+    assert detail["contact"]["advised"]
+    assert [d["elsewhere"] for d in detail["decisions"]] == [True]
+    assert [a["remark"] for a in detail["advice"]] == ["look again"]
 
 
-def test_requests_cost_what_they_cost_and_are_not_doubled(make_console):
+def test_request_costs_and_no_repeated_request(make_console):
     console = make_console(assumed_rate=1)
-    console.board.take_image(picture_record(missing_rows=30))
+    console.state.store_image(image_record(missing_rows=30))
     anna = console.browser("anna")
     costs = {cost["kind"]: cost for cost in anna.get(f"/api/contacts/{ID}/costs").json()["costs"]}
-    # 150 of 200 bytes lack: 3 frames of 64 bytes, one packet of 6.1 s, after one of 3.2 s down.
+    # 150 of 200 bytes are missing: 3 frames of 64 bytes, one packet of 6.1 s, after one of 3.2 s down.
     assert (costs["resend"]["bytes"], costs["resend"]["packets"]) == (150, 1)
     assert costs["resend"]["airtime_s"] == pytest.approx(9.3)
-    # Twice the stream: 350 bytes lack, 7 frames, three packets.
+    # Twice the stream: 350 bytes are missing, 7 frames, three packets.
     assert (costs["refine"]["bytes"], costs["refine"]["packets"]) == (350, 3)
     assert costs["revisit"]["airtime_s"] == pytest.approx(3.2)
-    # A picture of its own, of 200 bytes: 4 frames, two packets.
+    # A new image of 200 bytes: 4 frames, two packets.
     assert (costs["wider"]["bytes"], costs["wider"]["packets"]) == (200, 2)
     assert costs["wider"]["airtime_s"] == pytest.approx(3.2 + 2 * 6.1)
-    assert costs["wider"]["basis"] == "rate 1 as heard last, a new picture of 200 bytes"
+    assert costs["wider"]["basis"] == "latest rate 1, a new image of 200 bytes"
     path = f"/api/contacts/{ID}/requests"
     asked = anna.post(path, {"kind": "resend", "airtime_s": 9.3})
     assert (asked.status_code, asked.json()["state"]) == (201, "waiting")
     assert anna.post(path, {"kind": "resend"}).status_code == 400
-    console.board.settled("request", asked.json()["command_id"], "op_modem", "it only listens")
+    console.state.apply_acknowledgement("request", asked.json()["command_id"], "op_modem", "no transmitter")
     [request] = anna.get(f"/api/contacts/{ID}").json()["requests"]
-    assert (request["state"], request["reason"]) == ("refused", "it only listens")
+    assert (request["state"], request["reason"]) == ("refused", "no transmitter")
     assert anna.post(path, {"kind": "resend"}).status_code == 201
     assert anna.post(path, {"kind": "wider"}).status_code == 201
     assert anna.post(path, {"kind": "larger"}).status_code == 400
 
 
-def test_a_wider_picture_costs_what_this_one_did_before_it_was_refined(make_console):
+def test_expanded_image_costs_as_much_as_the_first_version(make_console):
     console = make_console(assumed_rate=1)
-    console.board.take_image(picture_record())
-    console.board.take_image(picture_record(version=2).model_copy(update={"bytes_received": 400, "bytes_total": 400}))
+    console.state.store_image(image_record())
+    console.state.store_image(image_record(version=2).model_copy(update={"bytes_received": 400, "bytes_total": 400}))
     costs = {cost["kind"]: cost for cost in console.browser("anna").get(f"/api/contacts/{ID}/costs").json()["costs"]}
     assert (costs["refine"]["bytes"], costs["wider"]["bytes"]) == (400, 200)
 
 
-def test_a_cost_that_cannot_be_told_is_not_invented(console):
-    console.board.take_image(picture_record(missing_rows=30))
+def test_unknown_cost_is_none(console):
+    console.state.store_image(image_record(missing_rows=30))
     costs = console.browser("anna").get(f"/api/contacts/{ID}/costs").json()["costs"]
     assert [c["airtime_s"] for c in costs if c["kind"] == "refine"] == [None]
 
@@ -345,16 +345,16 @@ def test_a_cost_that_cannot_be_told_is_not_invented(console):
     ("changes", "possible"),
     [
         ({}, {"refine", "revisit", "wider"}),
-        ({"place": None}, {"refine", "wider"}),
-        ({"place": None, "codec": "vq"}, {"wider"}),
+        ({"position": None}, {"refine", "wider"}),
+        ({"position": None, "codec": "vq"}, {"wider"}),
         ({"missing_rows": 10, "codec": "vq"}, {"resend", "revisit", "wider"}),
         ({"missing_rows": 10}, {"refine", "resend", "revisit", "wider"}),
     ],
 )
-def test_what_leads_to_nothing_is_not_asked(console, changes, possible):
-    rest = {name: value for name, value in changes.items() if name != "codec"}
-    image = picture_record(**rest)
-    console.board.take_image(image.model_copy(update={"codec": changes.get("codec", "emb")}))
+def test_impossible_requests_are_rejected(console, changes, possible):
+    arguments = {name: value for name, value in changes.items() if name != "codec"}
+    image = image_record(**arguments)
+    console.state.store_image(image.model_copy(update={"codec": changes.get("codec", "emb")}))
     anna = console.browser("anna")
     costs = anna.get(f"/api/contacts/{ID}/costs").json()["costs"]
     assert {cost["kind"] for cost in costs if cost["available"]} == possible
@@ -362,12 +362,12 @@ def test_what_leads_to_nothing_is_not_asked(console, changes, possible):
     for kind in ("refine", "resend", "revisit", "wider"):
         answer = anna.post(f"/api/contacts/{ID}/requests", {"kind": kind})
         assert answer.status_code == (201 if kind in possible else 400)
-    assert len(console.board.unsent()) == len(possible)
+    assert len(console.state.unsent_records()) == len(possible)
 
 
-def test_ashore_experts_advise_and_nobody_decides(make_console):
+def test_at_the_shore_site_experts_comment_and_no_role_decides(make_console):
     console = make_console(role="shore")
-    console.board.take_image(picture_record())
+    console.state.store_image(image_record())
     eva, anna = console.browser("eva"), console.browser("anna")
     assert console.decide(eva, ID).status_code == 403
     body = {"version": 1, "verdict": "unsure", "confidence": None, "mlo_class": None, "remark": "shadow too long"}
@@ -375,6 +375,6 @@ def test_ashore_experts_advise_and_nobody_decides(make_console):
     answer = eva.post(f"/api/contacts/{ID}/advice", body)
     assert answer.status_code == 201
     assert answer.json()["delivery"] == {"state": "waiting", "reason": ""}
-    [item] = console.board.unsent()
-    console.board.mark_sent(item)
-    assert (item.vessel_id, console.board.unsent()) == ("vessel-1", [])
+    [item] = console.state.unsent_records()
+    console.state.mark_sent(item)
+    assert (item.vessel_id, console.state.unsent_records()) == ("vessel-1", [])

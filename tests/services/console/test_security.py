@@ -1,20 +1,20 @@
-"""Who gets in, who may what, and what hostile input leads to."""
+"""Sessions, roles, log-in limits, and hostile input."""
 
 from __future__ import annotations
 
 import json
 
 import pytest
-from builders.console import PASSWORD, PEOPLE, Browser, picture_record
+from builders.console import PASSWORD, ROLES_OF_USERS, Browser, image_record
 from starlette.testclient import TestClient
 
 from sonarpost.errors import BadInputError
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.store.users import Attempts, Users
+from sonarpost.services.console.store.users import LoginLimiter, Users
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 ONE = f"/api/contacts/{ID}"
-READ = [
+READ_PATHS = [
     "/api/session",
     "/api/info",
     "/api/contacts",
@@ -30,7 +30,7 @@ READ = [
     f"/report/{ID}",
     "/events",
 ]
-DONE = {
+PERMISSION_OF_PATH = {
     f"{ONE}/decisions": "decide",
     f"{ONE}/undo": "decide",
     f"{ONE}/measure": "measure",
@@ -42,28 +42,28 @@ HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>\"'&"
 
 @pytest.fixture
 def with_contact(console):
-    console.board.take_image(picture_record())
+    console.state.store_image(image_record())
     return console
 
 
-@pytest.mark.parametrize("path", READ)
-def test_nothing_is_shown_without_a_session(with_contact, path):
-    stranger = with_contact.browser()
-    answer = stranger.get(path)
+@pytest.mark.parametrize("path", READ_PATHS)
+def test_reading_needs_a_session(with_contact, path):
+    browser = with_contact.browser()
+    answer = browser.get(path)
     assert answer.status_code == 401
     assert answer.json()["error"]["code"] == "no_session"
-    stranger.client.cookies.set("sonarpost_session", "x" * 43)
-    assert stranger.get(path).status_code == 401
+    browser.client.cookies.set("sonarpost_session", "x" * 43)
+    assert browser.get(path).status_code == 401
 
 
 @pytest.mark.parametrize("path", ["/", "/password"])
-def test_pages_lead_a_stranger_to_the_log_in(console, path):
+def test_page_without_a_session_redirects_to_the_log_in(console, path):
     answer = console.browser().get(path)
     assert (answer.status_code, answer.headers["location"]) == (303, "/login")
 
 
-@pytest.mark.parametrize("path", [*DONE, "/api/logout", "/api/password"])
-def test_nothing_is_done_without_a_session_or_its_token(with_contact, path):
+@pytest.mark.parametrize("path", [*PERMISSION_OF_PATH, "/api/logout", "/api/password"])
+def test_actions_need_a_session_and_its_token(with_contact, path):
     assert with_contact.browser().post(path, {}).status_code == 401
     anna = with_contact.browser("anna")
     for headers in ({}, {"X-CSRF-Token": ""}, {"X-CSRF-Token": with_contact.browser("anna").csrf}):
@@ -71,17 +71,17 @@ def test_nothing_is_done_without_a_session_or_its_token(with_contact, path):
         assert (answer.status_code, answer.json()["error"]["code"]) == (403, "csrf")
 
 
-@pytest.mark.parametrize(("path", "act"), DONE.items())
-def test_a_role_does_what_it_may_and_no_more(with_contact, path, act):
-    for user, role in PEOPLE.items():
+@pytest.mark.parametrize(("path", "permission"), PERMISSION_OF_PATH.items())
+def test_role_permissions(with_contact, path, permission):
+    for user, role in ROLES_OF_USERS.items():
         browser = with_contact.browser(user)
-        allowed = browser.get("/api/session").json()["may"][act]
-        assert allowed == (role != "observer" and act != "advise")
-        # What is let in is wrong, so that nothing is changed by asking.
+        allowed = browser.get("/api/session").json()["may"][permission]
+        assert allowed == (role != "observer" and permission != "advise")
+        # The body is invalid, so that a permitted request changes nothing.
         assert browser.post(path, {"x": 1}).status_code == (400 if allowed else 403)
 
 
-def test_ashore_only_experts_act(make_console):
+def test_at_the_shore_site_only_experts_act(make_console):
     console = make_console(role="shore")
     may = {user: console.browser(user).get("/api/session").json()["may"] for user in ("watch", "anna", "eva")}
     assert not any(may["watch"].values())
@@ -89,7 +89,7 @@ def test_ashore_only_experts_act(make_console):
     assert may["eva"] == {"decide": False, "measure": True, "request": True, "advise": True}
 
 
-def test_the_cookie_is_for_the_browser_alone(console, make_console):
+def test_session_cookie_attributes(console, make_console):
     answer = console.browser().login("anna")
     cookie = answer.headers["set-cookie"]
     assert "HttpOnly" in cookie
@@ -113,21 +113,21 @@ def test_wrong_passwords_are_refused_and_limited(console):
     assert browser.login("bo").status_code == 200
 
 
-def test_attempts_are_counted_by_user_and_by_address():
-    attempts = Attempts(most_of_user=2, most_from=3, within_s=10)
-    attempts.failed("a", "x", 0)
-    attempts.failed("a", "y", 1)
-    assert attempts.wait_s("a", "z", 2) == 8
-    assert attempts.wait_s("b", "x", 2) == 0
-    attempts.failed("b", "x", 2)
-    attempts.failed("c", "x", 2)
-    assert attempts.wait_s("d", "x", 2) == 8
-    attempts.succeeded("a")
-    assert attempts.wait_s("a", "z", 2) == 0
-    assert attempts.wait_s("d", "x", 13) == 0
+def test_failed_log_ins_are_counted_by_user_and_by_address():
+    limiter = LoginLimiter(max_of_user=2, max_from_address=3, window_s=10)
+    limiter.add_failure("a", "x", 0)
+    limiter.add_failure("a", "y", 1)
+    assert limiter.wait_s("a", "z", 2) == 8
+    assert limiter.wait_s("b", "x", 2) == 0
+    limiter.add_failure("b", "x", 2)
+    limiter.add_failure("c", "x", 2)
+    assert limiter.wait_s("d", "x", 2) == 8
+    limiter.clear("a")
+    assert limiter.wait_s("a", "z", 2) == 0
+    assert limiter.wait_s("d", "x", 13) == 0
 
 
-def test_a_session_ends(console, tmp_path):
+def test_session_ends_by_log_out_idle_time_and_maximum_time(console, tmp_path):
     browser = console.browser("anna")
     cookie = browser.client.cookies["sonarpost_session"]
     assert browser.post("/api/logout", {}).status_code == 204
@@ -136,27 +136,27 @@ def test_a_session_ends(console, tmp_path):
     now = [1000.0]
     users = Users(tmp_path / "users.db", session_s=100, session_max_s=250, clock=lambda: now[0])
     users.add("anna", "operator", PASSWORD)
-    token = users.begin("anna").token
-    for now[0], use, there in ((1090, True, True), (1185, True, True), (1240, True, True), (1251, True, False)):
-        assert (users.session(token, use=use) is not None) == there
-    token, now[0] = users.begin("anna").token, 2000.0
-    assert users.session(token) is None
-    token = users.begin("anna").token
-    for now[0], there in ((2060, True), (2099, True), (2101, False)):
-        # A page that is merely open does not keep its session alive.
-        assert (users.session(token, use=False) is not None) == there
+    token = users.start_session("anna").token
+    for now[0], is_use, valid in ((1090, True, True), (1185, True, True), (1240, True, True), (1251, True, False)):
+        assert (users.find_session(token, is_use=is_use) is not None) == valid
+    token, now[0] = users.start_session("anna").token, 2000.0
+    assert users.find_session(token) is None
+    token = users.start_session("anna").token
+    for now[0], valid in ((2060, True), (2099, True), (2101, False)):
+        # An open page alone does not extend its session.
+        assert (users.find_session(token, is_use=False) is not None) == valid
     users.close()
 
 
-def test_passwords_are_not_in_the_file(tmp_path):
+def test_file_has_no_passwords_and_tokens(tmp_path):
     users = Users(tmp_path / "users.db")
     users.add("anna", "operator", PASSWORD)
-    session = users.begin("anna")
+    session = users.start_session("anna")
     users.close()
-    kept = b"".join(path.read_bytes() for path in tmp_path.iterdir())
-    assert b"anna" in kept
-    assert PASSWORD.encode() not in kept
-    assert session.token.encode() not in kept
+    stored = b"".join(path.read_bytes() for path in tmp_path.iterdir())
+    assert b"anna" in stored
+    assert PASSWORD.encode() not in stored
+    assert session.token.encode() not in stored
     assert (tmp_path / "users.db").stat().st_mode & 0o077 == 0
 
 
@@ -164,7 +164,7 @@ def test_passwords_are_not_in_the_file(tmp_path):
     ("name", "role", "password", "field"),
     [("../x", "observer", PASSWORD, "name"), ("x", "admin", PASSWORD, "role"), ("x", "observer", "short", "password")],
 )
-def test_a_wrong_user_is_named(tmp_path, name, role, password, field):
+def test_error_names_the_invalid_field_of_a_user(tmp_path, name, role, password, field):
     users = Users(tmp_path / "users.db")
     with pytest.raises(BadInputError) as caught:
         users.add(name, role, password)
@@ -174,26 +174,26 @@ def test_a_wrong_user_is_named(tmp_path, name, role, password, field):
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:8470", "", "127.0.0.1.evil.example", "[::2]"])
-def test_another_host_name_is_refused(console, host):
+def test_unknown_host_name_is_rejected(console, host):
     answer = console.browser().client.get("/login", headers={"Host": host})
     assert (answer.status_code, answer.json()["error"]["code"]) == (400, "bad_host")
 
 
-def test_a_configured_host_name_is_ours(make_console):
+def test_configured_host_name_is_accepted(make_console):
     console = make_console(names=("bridge.example",))
     browser = Browser(TestClient(console.app.asgi, base_url="http://bridge.example:8470"))
     assert browser.login("anna").status_code == 200
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:9999", "null"])
-def test_another_sites_page_is_refused(with_contact, origin):
+def test_request_from_a_page_of_another_site_is_rejected(with_contact, origin):
     anna = with_contact.browser("anna")
     answer = anna.post(f"{ONE}/decisions", {}, Origin=origin)
     assert (answer.status_code, answer.json()["error"]["code"]) == (403, "bad_origin")
     assert anna.post(f"{ONE}/decisions", {}, Origin="http://127.0.0.1:8470").status_code == 400
 
 
-def test_every_answer_has_the_policy(console):
+def test_all_responses_have_security_headers(console):
     for path in ("/", "/login", "/password", "/api/contacts", "/nothing", "/static/nothing.js"):
         headers = console.browser().get(path).headers
         assert "default-src 'none'; script-src 'self'" in headers["content-security-policy"]
@@ -221,13 +221,13 @@ def test_every_answer_has_the_policy(console):
         "/report/..%2f..%2fetc%2fpasswd",
     ],
 )
-def test_no_path_leads_out(with_contact, path):
+def test_path_traversal_is_rejected(with_contact, path):
     answer = with_contact.browser("anna").get(path)
     assert answer.status_code == 404
     assert answer.json()["error"]["code"] == "not_found"
 
 
-def test_a_tile_comes_from_its_folder_only(make_console, tmp_path):
+def test_tiles_are_served_from_their_folder(make_console, tmp_path):
     tile = tmp_path / "tiles" / "3" / "4" / "5.png"
     tile.parent.mkdir(parents=True)
     tile.write_bytes(b"a tile")
@@ -238,7 +238,7 @@ def test_a_tile_comes_from_its_folder_only(make_console, tmp_path):
     assert watch.get("/api/info").json()["tiles"]["max_zoom"] == 3
 
 
-def test_a_body_that_is_too_large_is_refused(with_contact):
+def test_too_large_body_is_rejected(with_contact):
     anna = with_contact.browser("anna")
     answer = anna.post(f"{ONE}/decisions", {"remark": "x" * 70_000})
     assert (answer.status_code, answer.json()["error"]["code"]) == (413, "too_large")
@@ -246,7 +246,7 @@ def test_a_body_that_is_too_large_is_refused(with_contact):
 
 
 @pytest.mark.parametrize("body", [b"", b"[]", b"{", b'"x"', b"\xff", b'{"revision": 1e999}', b"[" * 5000])
-def test_a_body_that_is_no_request_is_refused(with_contact, body):
+def test_invalid_body_is_rejected(with_contact, body):
     anna = with_contact.browser("anna")
     answer = anna.client.post(f"{ONE}/decisions", content=body, headers={"X-CSRF-Token": anna.csrf})
     assert (answer.status_code, answer.json()["error"]["code"]) == (400, "bad_request")
@@ -261,21 +261,21 @@ def test_a_body_that_is_no_request_is_refused(with_contact, body):
         ({"remark": "x" * 2001}, "remark"),
         ({"mlo_class": ""}, "mlo_class"),
         ({"revision": True}, "revision"),
-        ({"operator": "somebody else"}, "operator"),
+        ({"operator": "another"}, "operator"),
     ],
 )
-def test_a_wrong_field_is_named(with_contact, changes, field):
+def test_error_names_the_invalid_field(with_contact, changes, field):
     answer = with_contact.decide(with_contact.browser("anna"), ID, **changes)
     assert (answer.status_code, answer.json()["error"]["field"]) == (400, field)
-    assert with_contact.board.unsent() == []
+    assert with_contact.state.unsent_records() == []
 
 
-def test_a_hostile_remark_is_kept_as_it_is_and_never_becomes_markup(with_contact):
+def test_hostile_remark_is_stored_unchanged_and_escaped_in_markup(with_contact):
     anna = with_contact.browser("anna")
     assert with_contact.decide(anna, ID, remark=HOSTILE, mlo_class=HOSTILE[:60]).status_code == 201
-    whole = anna.get(ONE)
-    assert whole.headers["content-type"] == "application/json"
-    assert json.loads(whole.text)["decisions"][0]["remark"] == HOSTILE
+    detail = anna.get(ONE)
+    assert detail.headers["content-type"] == "application/json"
+    assert json.loads(detail.text)["decisions"][0]["remark"] == HOSTILE
     report = anna.get(f"/report/{ID}").text
     assert "&lt;script&gt;alert(1)" in report
     assert "<script" not in report
@@ -284,8 +284,8 @@ def test_a_hostile_remark_is_kept_as_it_is_and_never_becomes_markup(with_contact
         assert anna.get(f"/api/export/{name}").status_code == 200
 
 
-def test_a_page_for_others_needs_tls():
-    with pytest.raises(ValueError, match="passwords go over this connection"):
+def test_other_hosts_need_tls():
+    with pytest.raises(ValueError, match="passwords are sent over this connection"):
         ConsoleConfig(host="0.0.0.0")
     assert ConsoleConfig(host="0.0.0.0", tls=True).tls
     assert ConsoleConfig(host="0.0.0.0", insecure=True).insecure

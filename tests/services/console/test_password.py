@@ -1,4 +1,4 @@
-"""One's own password: what the route refuses and ends, what its page is made of; no password is written anywhere."""
+"""Changing the own password: errors, end of other sessions, the page, and no password in files or logs."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import logging
 import re
 
 import pytest
-from builders.console import PASSWORD, PEOPLE
+from builders.console import PASSWORD, ROLES_OF_USERS
 
 from sonarpost.services.console.store.users import MAX_PASSWORD, MIN_PASSWORD
 
 NEW = "another fine one"
 
 
-def test_a_new_password_ends_the_other_sessions_of_its_user_alone(console):
+def test_new_password_ends_only_other_sessions_of_the_user(console):
     here, there, another = console.browser("anna"), console.browser("anna"), console.browser("bo")
     assert here.post("/api/password", {"old": PASSWORD, "new": NEW}).status_code == 204
     assert here.get("/api/session").status_code == 200
@@ -23,8 +23,8 @@ def test_a_new_password_ends_the_other_sessions_of_its_user_alone(console):
     assert console.browser().login("anna", NEW).status_code == 200
 
 
-@pytest.mark.parametrize("user", PEOPLE)
-def test_everybody_may_change_their_own(console, user):
+@pytest.mark.parametrize("user", ROLES_OF_USERS)
+def test_every_role_may_change_the_own_password(console, user):
     browser = console.browser(user)
     assert browser.get("/password").status_code == 200
     assert browser.post("/api/password", {"old": PASSWORD, "new": NEW}).status_code == 204
@@ -40,7 +40,7 @@ def test_everybody_may_change_their_own(console, user):
         (PASSWORD, None, 400, "new"),
     ],
 )
-def test_what_is_wrong_is_named_and_changes_nothing(console, old, new, status, field):
+def test_error_names_the_invalid_field_and_changes_nothing(console, old, new, status, field):
     here, there = console.browser("anna"), console.browser("anna")
     answer = here.post("/api/password", {"old": old, "new": new})
     assert (answer.status_code, answer.json()["error"]["field"]) == (status, field)
@@ -48,17 +48,17 @@ def test_what_is_wrong_is_named_and_changes_nothing(console, old, new, status, f
     assert console.browser().login("anna").status_code == 200
 
 
-def test_guessing_at_a_page_that_was_left_open_is_limited(console):
+def test_wrong_present_passwords_are_limited(console):
     here = console.browser("anna")
     for _ in range(5):
         assert here.post("/api/password", {"old": "not it at all", "new": NEW}).status_code == 403
     limited = here.post("/api/password", {"old": PASSWORD, "new": NEW})
     assert (limited.status_code, limited.json()["error"]["code"]) == (429, "too_many")
-    assert console.users.right("anna", PASSWORD)
+    assert console.users.verify_password("anna", PASSWORD)
 
 
-def test_no_password_is_written_anywhere(console, caplog):
-    guess = "a guess of no use"
+def test_no_password_in_logs_audit_and_files(console, caplog):
+    guess = "a wrong password"
     caplog.set_level(logging.DEBUG)
     here = console.browser("anna")
     answers = [
@@ -66,25 +66,25 @@ def test_no_password_is_written_anywhere(console, caplog):
         for body in ({"old": guess, "new": NEW}, {"old": PASSWORD, "new": "tooshort"}, {"old": PASSWORD, "new": NEW})
     ]
     assert [answer.status_code for answer in answers] == [403, 400, 204]
-    assert {"Change of password refused", "Password changed"} <= {record.getMessage() for record in caplog.records}
+    assert {"Password change refused", "Password changed"} <= {record.getMessage() for record in caplog.records}
     logged = " ".join(str(vars(record)) for record in caplog.records)
-    kept = b"".join(path.read_bytes() for path in console.users.path.parent.iterdir() if path.is_file())
-    with console.board.database.reading() as db:
+    stored = b"".join(path.read_bytes() for path in console.users.path.parent.iterdir() if path.is_file())
+    with console.state.database.read() as db:
         audit = str([tuple(row) for row in db.execute("SELECT * FROM audit")])
     for secret in (PASSWORD, NEW, guess, "tooshort"):
         assert secret not in logged + audit + "".join(answer.text for answer in answers)
-        assert secret.encode() not in kept
+        assert secret.encode() not in stored
 
 
-def test_the_page_has_nothing_from_elsewhere_and_no_script_within(console):
+def test_page_has_no_foreign_links_and_no_inline_script(console):
     page = console.browser("anna").get("/password").text
     links = re.findall(r"(?:src|href|action)=\"([^\"]*)\"", page)
     assert "/static/js/password.js" in links
     assert all(re.fullmatch(r"/(?!/).*", link) for link in links)
     assert not re.search(r"<style|style=|<script(?![^>]* src=)|\son[a-z]+=", page)
-    # Without the page's script a form with GET would put what is typed into the address.
+    # Without JavaScript, a form with GET would put the passwords into the URL.
     assert re.search(r'<form [^>]*method="post"', page)
 
 
-def test_the_page_knows_how_long_a_password_is(console):
+def test_info_contains_the_password_length(console):
     assert console.browser("anna").get("/api/info").json()["password_characters"] == [MIN_PASSWORD, MAX_PASSWORD]
