@@ -261,7 +261,7 @@ def test_invalid_record_is_rejected_before_sending(arguments, text, capsys):
 def test_unreachable_c2_or_router_is_an_error(capsys, router):
     common = ["c2", "comment", "uuv-1/AAAA", "--vessel", "vessel-1", "--timeout", "0.5"]
     assert main([*common, "--router", router]) == 2
-    assert "not handed over to c2 within 0.5 s: nobody answers" in capsys.readouterr().err
+    assert "not delivered to c2 within 0.5 s: no reply" in capsys.readouterr().err
     assert main([*common, "--router", f"tcp/127.0.0.1:{free_port()}"]) == 2
     assert "no router answered within 0.5 s" in capsys.readouterr().err
 
@@ -357,4 +357,4 @@ def test_expand_and_its_former_name_send_the_same_record(kind, capsys, c2, route
     arguments = ["c2", "command", "uuv-1/AAAA", "--vessel", "vessel-1", "--kind", kind, "--router", router]
     assert main(arguments) == 0
     eventually(lambda: c2.gauges()["waiting_for_vessels"] == 1)
-    assert [item.key for item in c2.store.owed("relay@vessel-1", 9)] == [keys.command("vessel-1", "wider")]
+    assert [item.key for item in c2.store.queued("relay@vessel-1", 9)] == [keys.command("vessel-1", "wider")]
