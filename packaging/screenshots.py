@@ -174,7 +174,7 @@ def conflict(scene: Scene) -> None:
     with scene.page(LARGE, "day", contact_id) as page:
         press(page, "1")
         scene.decide(contact_id, "not_mine_like", 0.8, None, "a boulder; no man-made edge")
-        page.wait_for_selector(".now >> text=changed since you chose")
+        page.wait_for_selector(".now >> text=Another decision was made")
         press(page, "Enter")
         page.wait_for_selector("dialog .versus")
         save(page, "conflict-day-1920")
@@ -191,7 +191,7 @@ def map_and_link(scene: Scene) -> None:
         save(page, "map-day-1366")
     with scene.page(SMALL, "night", contact_id) as page:
         press(page, "f")
-        page.wait_for_selector(".heard li")
+        page.wait_for_selector(".frames li")
         save(page, "link-night-1366")
 
 

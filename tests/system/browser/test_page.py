@@ -56,11 +56,11 @@ def add_contacts(served, count=6):
 def contact_ids(served):
     from sonarpost.services.console.store.contacts import ContactFilter
 
-    return {row["image_id"]: row["id"] for row in served.state.contacts(ContactFilter(limit=500))["items"]}
+    return {row["image_id"]: row["id"] for row in served.state.list_contacts(ContactFilter(limit=500))["items"]}
 
 
 def decisions(served, image_id):
-    return served.state.contact(contact_ids(served)[image_id])["decisions"]
+    return served.state.contact_detail(contact_ids(served)[image_id])["decisions"]
 
 
 def row(image_id):
@@ -94,7 +94,7 @@ def test_complete_review_with_the_keyboard(served):
     assert decision["operator"] == "anna"
     visit.page.locator(row("0005")).wait_for(state="detached")  # decided contacts leave the list "to do"
     # The audit contains the displayed version.
-    entry = served.state.contact(contact_ids(served)["0005"])["audit"][-1]
+    entry = served.state.contact_detail(contact_ids(served)["0005"])["audit"][-1]
     assert (entry["action"], entry["user"], entry["version"]) == ("decide", "anna", 1)
     visit.press("u")
     visit.wait(".now .badge.unreviewed")
@@ -132,7 +132,7 @@ def test_measurement_with_the_keyboard_and_its_lock_on_the_enhanced_layer(served
     visit.wait(".hint >> text=Enter keeps it")
     visit.press("Enter")
     visit.wait('details[data-name="measurements"] >> text=/shadow 0.75/')
-    [stored] = served.state.contact(contact_ids(served)["00A7"])["measurements"]
+    [stored] = served.state.contact_detail(contact_ids(served)["00A7"])["measurements"]
     assert stored["value_m"] == pytest.approx(0.75)
     assert stored["height_m"] == pytest.approx(0.75 * 5.0 / (13.0 + 0.75), rel=0.02)
     assert f"height {stored['height_m']:.2f} ± {stored['height_sigma_m']:.2f}" in visit.text(
@@ -143,12 +143,12 @@ def test_measurement_with_the_keyboard_and_its_lock_on_the_enhanced_layer(served
     visit.press("m", "Enter", *["Shift+ArrowDown"] * 3, "Enter")
     visit.wait("#toasts .bad")
     visit.press("Escape")
-    assert len(served.state.contact(contact_ids(served)["00A7"])["measurements"]) == 1
+    assert len(served.state.contact_detail(contact_ids(served)["00A7"])["measurements"]) == 1
     # The enhanced layer is not measurable, and the page shows the reason.
     visit.press("e")
-    visit.wait(".strip .made >> text=not a measurement")
+    visit.wait(".strip .synthesised >> text=not a measurement")
     visit.press("m")
-    visit.wait("#toasts >> text=Measuring is locked")
+    visit.wait("#toasts >> text=Measurement is locked")
     assert visit.page.locator(".hint").count() == 0
     assert visit.page.locator('[data-tool="measure"]').get_attribute("aria-disabled") == "true"
 
@@ -208,7 +208,7 @@ def test_conflict_of_two_operators(served):
     anna.wait(".now .badge.not_mine_like")
     anna.expect_errors("409")
     anna.press("Enter")
-    anna.wait("dialog >> text=somebody was faster")
+    anna.wait("dialog >> text=another operator has decided")
     assert "a rock" in anna.text("dialog")
     assert [d["operator"] for d in decisions(served, "0001")] == ["bo"]
     anna.page.get_by_role("button", name="Replace it").click()
@@ -272,10 +272,10 @@ def test_observer_cannot_decide_or_measure(served):
     visit = served.visit("watch")
     visit.wait_for_contact("0000")
     visit.press("1")
-    visit.wait("#toasts >> text=may look")
+    visit.wait("#toasts >> text=may not decide")
     assert visit.page.locator("#send").is_disabled()
     visit.press("m")
-    visit.wait("#toasts >> text=Measuring is locked")
+    visit.wait("#toasts >> text=Measurement is locked")
     assert decisions(served, "0000") == []
 
 
@@ -298,7 +298,7 @@ def test_contrast_and_accessible_names(served, theme):
     visit.press("2", "Enter")
     visit.wait("#toasts p")
     visit.press("l", "e", "1")
-    visit.wait(".strip .made")
+    visit.wait(".strip .synthesised")
     assert visit.page.evaluate("document.documentElement.dataset.theme") == ("night" if theme == "dark" else "day")
     views = {
         "review": [],
@@ -392,8 +392,8 @@ def test_comment_of_an_expert_is_displayed(serve):
     expert.press("1", "w")
     expert.page.keyboard.type("have a second look")
     expert.press("Control+Enter")
-    contact_id = shore.state.contacts(ContactFilter())["items"][0]["id"]
-    eventually(lambda: len(shore.state.contact(contact_id)["advice"]) == 1, what="the comment")
+    contact_id = shore.state.list_contacts(ContactFilter())["items"][0]["id"]
+    eventually(lambda: len(shore.state.contact_detail(contact_id)["advice"]) == 1, what="the comment")
     expert.wait(".advice >> text=have a second look")
 
 

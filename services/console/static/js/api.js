@@ -1,4 +1,4 @@
-// The server: one function a request. Every failure becomes an ApiError that says what to tell the operator.
+// Requests to the server. Every failure becomes an ApiError whose message is shown to the operator.
 
 export class ApiError extends Error {
   constructor(status, code, message, body = {}) {
@@ -10,7 +10,7 @@ export class ApiError extends Error {
 }
 
 let csrf = "";
-export const useToken = (token) => { csrf = token; };
+export const setToken = (token) => { csrf = token; };
 
 async function request(method, path, body) {
   const headers = { Accept: "application/json" };
@@ -25,18 +25,18 @@ async function request(method, path, body) {
       body: method === "GET" ? undefined : JSON.stringify(body ?? {}), signal: AbortSignal.timeout(15000),
     });
   } catch (error) {
-    throw new ApiError(0, "no_connection", "The console's server does not answer.", { cause: String(error) });
+    throw new ApiError(0, "no_connection", "No response from the console's server.", { cause: String(error) });
   }
   if (response.status === 204) return null;
-  const answer = await response.json().catch(() => ({}));
-  if (response.ok) return answer;
+  const result = await response.json().catch(() => ({}));
+  if (response.ok) return result;
   if (response.status === 401 && path !== "/api/login") location.assign("/login");
-  const { code = "error", message = `The server answered ${response.status}.` } = answer.error ?? {};
-  throw new ApiError(response.status, code, message, answer);
+  const { code = "error", message = `The server returned status ${response.status}.` } = result.error ?? {};
+  throw new ApiError(response.status, code, message, result);
 }
 
-const of = (id) => `/api/contacts/${encodeURIComponent(id)}`;
-const query = (values) => {
+const contactPath = (id) => `/api/contacts/${encodeURIComponent(id)}`;
+const queryString = (values) => {
   const parts = Object.entries(values).filter(([, value]) => value !== "" && value !== null && value !== undefined);
   return new URLSearchParams(parts).toString();
 };
@@ -44,22 +44,22 @@ const query = (values) => {
 export const api = {
   login: (user, password) => request("POST", "/api/login", { user, password }),
   logout: () => request("POST", "/api/logout"),
-  password: (old, fresh) => request("POST", "/api/password", { old, new: fresh }),
+  password: (old, replacement) => request("POST", "/api/password", { old, new: replacement }),
   session: () => request("GET", "/api/session"),
   info: () => request("GET", "/api/info"),
-  contacts: (values) => request("GET", `/api/contacts?${query(values)}`),
-  contact: (id) => request("GET", of(id)),
-  measure: (id, body) => request("POST", `${of(id)}/measure`, body),
-  decide: (id, body) => request("POST", `${of(id)}/decisions`, body),
-  undo: (id, body) => request("POST", `${of(id)}/undo`, body),
-  costs: (id) => request("GET", `${of(id)}/costs`),
-  request: (id, body) => request("POST", `${of(id)}/requests`, body),
-  advise: (id, body) => request("POST", `${of(id)}/advice`, body),
+  contacts: (values) => request("GET", `/api/contacts?${queryString(values)}`),
+  contact: (id) => request("GET", contactPath(id)),
+  measure: (id, body) => request("POST", `${contactPath(id)}/measure`, body),
+  decide: (id, body) => request("POST", `${contactPath(id)}/decisions`, body),
+  undo: (id, body) => request("POST", `${contactPath(id)}/undo`, body),
+  costs: (id) => request("GET", `${contactPath(id)}/costs`),
+  request: (id, body) => request("POST", `${contactPath(id)}/requests`, body),
+  advise: (id, body) => request("POST", `${contactPath(id)}/advice`, body),
   fleet: () => request("GET", "/api/fleet"),
   map: () => request("GET", "/api/map"),
-  exportUrl: (format, filter) => `/api/export/contacts.${format}?${query(filter)}`,
+  exportUrl: (format, filter) => `/api/export/contacts.${format}?${queryString(filter)}`,
   reportUrl: (id) => `/report/${encodeURIComponent(id)}`,
-  pictureUrl: (id, version, layer) => `${of(id)}/versions/${version}/picture.png?${query({ layer, map: "grey" })}`,
-  maskUrl: (id, version, kind, layer) => `${of(id)}/versions/${version}/mask.png?${query({ kind, layer })}`,
-  thumbnailUrl: (id, version) => `${of(id)}/versions/${version}/thumbnail.png`,
+  imageUrl: (id, version, layer) => `${contactPath(id)}/versions/${version}/picture.png?${queryString({ layer, map: "grey" })}`,
+  maskUrl: (id, version, kind, layer) => `${contactPath(id)}/versions/${version}/mask.png?${queryString({ kind, layer })}`,
+  thumbnailUrl: (id, version) => `${contactPath(id)}/versions/${version}/thumbnail.png`,
 };

@@ -1,10 +1,10 @@
-// Making elements without markup: text from outside only ever becomes a text node.
+// Elements without markup: untrusted text always becomes a text node.
 
 /**
- * Make an element.
+ * Create an element.
  *
  * `props`: `class`, `text`, `on` (listeners by event), `data` (data-* attributes), properties of form elements
- * (`value`, `checked`, `disabled`), and attributes by name; null, undefined and false leave one out.
+ * (`value`, `checked`, `disabled`), and attributes by name; null, undefined and false are omitted.
  */
 export function h(tag, props = {}, ...children) {
   const element = document.createElement(tag);
@@ -21,29 +21,29 @@ export function h(tag, props = {}, ...children) {
   return element;
 }
 
-/** Replace everything within an element. */
+/** Replace the content of an element. */
 export function fill(element, ...children) {
   element.replaceChildren(...children.flat(3).filter((child) => child !== null && child !== undefined && child !== false));
   return element;
 }
 
-/** Say something for a few seconds; errors stay longer. */
+/** Show a message for some seconds, an error longer. */
 export function toast(message, { bad = false } = {}) {
-  const place = document.getElementById("toasts");
-  for (const old of place.children) if (old.textContent === message) old.remove();
+  const container = document.getElementById("toasts");
+  for (const old of container.children) if (old.textContent === message) old.remove();
   const note = h("p", { class: bad ? "bad" : "", text: message });
-  place.append(note);
-  while (place.children.length > 4) place.firstElementChild.remove();
+  container.append(note);
+  while (container.children.length > 4) container.firstElementChild.remove();
   setTimeout(() => note.remove(), bad ? 9000 : 4500);
 }
 
 /**
- * Show a modal dialog until one of its actions is chosen; resolves to that action's value, null where it was closed.
+ * Show a modal dialog. Resolves to the value of the chosen action, or null if it was closed.
  *
- * `actions`: [{label, value, primary, disabled}]; the primary one, or what is chosen in the body,
- * has the focus, and Enter in a field of the body is the primary action.
+ * `actions`: [{label, value, primary, disabled}]. The chosen input of the body has the focus, otherwise the primary
+ * action. Enter in a field of the body is the primary action.
  */
-export function ask(title, body, actions) {
+export function showDialog(title, body, actions) {
   return new Promise((resolve) => {
     const dialog = h("dialog", { "aria-labelledby": "dialog-title" });
     const close = (value) => { dialog.close(); dialog.remove(); resolve(value); };
@@ -65,19 +65,19 @@ export function ask(title, body, actions) {
   });
 }
 
-/** A `<label>` around its field, the label's words first. */
-export function labelled(words, field, props = {}) {
-  return h("label", props, h("span", { text: words }), field);
+/** A `<label>` with its text before the field. */
+export function labelled(text, field, props = {}) {
+  return h("label", props, h("span", { text }), field);
 }
 
-/** Let a burst of calls become one, after `wait_ms` of quiet, at the latest after `most_ms`. */
-export function calmly(handler, wait_ms, most_ms = wait_ms) {
+/** Combine repeated calls to one, `wait_ms` after the last call, at the latest `max_ms` after the first. */
+export function debounce(handler, wait_ms, max_ms = wait_ms) {
   let timer = 0;
   let first = 0;
   return () => {
     const now = performance.now();
     if (!timer) first = now;
     clearTimeout(timer);
-    timer = setTimeout(() => { timer = 0; handler(); }, Math.max(0, Math.min(wait_ms, first + most_ms - now)));
+    timer = setTimeout(() => { timer = 0; handler(); }, Math.max(0, Math.min(wait_ms, first + max_ms - now)));
   };
 }

@@ -1,4 +1,4 @@
-// How values are written. What is not known is a dash, never a zero.
+// Text of values. An unknown value is a dash.
 
 export const DASH = "–";
 export const VERDICTS = { mine_like: "mine-like", not_mine_like: "not mine-like", unsure: "unsure", unreviewed: "unreviewed" };
@@ -7,16 +7,18 @@ const SYMBOLS = { mine_like: "▲", not_mine_like: "○", unsure: "?", unreviewe
 const known = (value) => value !== null && value !== undefined && Number.isFinite(value);
 
 export const verdict = (name) => VERDICTS[name] ?? name ?? DASH;
+/** Name of a kind of request for operators. */
+export const requestKind = (kind) => (kind === "wider" ? "expand" : kind);
 export const symbol = (name) => SYMBOLS[name] ?? "·";
 
-/** A number with its unit, a thin space between. */
+/** A number and its unit, separated by a thin space. */
 export function quantity(value, unit = "", digits = 1) {
   return known(value) ? `${value.toFixed(digits)}${unit ? `\u202f${unit}` : ""}` : DASH;
 }
 
 export const percent = (value, digits = 0) => (known(value) ? `${value.toFixed(digits)}\u202f%` : DASH);
 
-/** Percent received: never 100 before it is, never 0 when something is there. */
+/** Percent received; below 100 until the image is complete. */
 export function received(row) {
   if (!known(row.percent_received)) return DASH;
   if (!row.complete) return percent(Math.min(99, Math.max(1, Math.round(row.percent_received))));
@@ -29,14 +31,14 @@ export function withSigma(value, sigma, unit = "m", digits = 2) {
   return `${value.toFixed(digits)}${error}\u202f${unit}`;
 }
 
-/** UTC, always: ship, vehicle and shore share one clock. */
+/** Time in UTC. */
 export function time(utc_s, { date = false } = {}) {
   if (!known(utc_s)) return DASH;
   const text = new Date(utc_s * 1000).toISOString();
   return date ? `${text.slice(0, 10)} ${text.slice(11, 19)} UTC` : `${text.slice(11, 19)}`;
 }
 
-/** A length of time in the two units that matter. */
+/** A duration in its two largest units. */
 export function duration(seconds) {
   if (!known(seconds)) return DASH;
   const s = Math.max(0, seconds);
@@ -55,32 +57,33 @@ function degrees(value, positive, negative, width) {
   return `${String(whole).padStart(width, "0")}° ${(minutes - whole * 60).toFixed(3).padStart(6, "0")}′ ${value < 0 ? negative : positive}`;
 }
 
-/** Degrees and decimal minutes, as a chart has them. */
+/** Degrees and decimal minutes, as on charts. */
 export function position(lat_deg, lon_deg) {
-  if (!known(lat_deg) || !known(lon_deg)) return "position not known";
+  if (!known(lat_deg) || !known(lon_deg)) return "position unknown";
   return `${degrees(lat_deg, "N", "S", 2)}  ${degrees(lon_deg, "E", "W", 3)}`;
 }
 
-/** What a delivery has come to, in words, with `tone` good, bad or empty. */
-export function shoreStep(delivery) {
-  const words = {
-    waiting: ["waiting on this vessel", ""], relay: ["with the relay", ""], delivered: ["ashore", "good"],
-    refused: ["refused by the shore", "bad"], none: ["no shore is configured", ""],
+/** Delivery state to the shore site: [text, CSS class]. */
+export function shoreState(delivery) {
+  const texts = {
+    waiting: ["waiting on this vessel", ""], relay: ["at the relay", ""], delivered: ["at the shore site", "good"],
+    refused: ["refused by the shore site", "bad"], none: ["no shore site configured", ""],
   };
-  return words[delivery?.shore] ?? [DASH, ""];
+  return texts[delivery?.shore] ?? [DASH, ""];
 }
 
-export function vehicleStep(delivery) {
+/** Delivery state to the vehicle: [text, CSS class]. */
+export function vehicleState(delivery) {
   const times = delivery?.times_sent ? `, sent ${delivery.times_sent}×` : "";
-  const words = {
-    waiting: ["waiting on this vessel", ""], asked: ["waiting for the water", ""], sent: [`in the water${times}`, ""],
+  const texts = {
+    waiting: ["waiting on this vessel", ""], asked: ["waiting for the modem", ""], sent: [`not confirmed${times}`, ""],
     confirmed: [`on the vehicle${times}`, "good"], refused: ["refused by the vehicle", "bad"],
-    expired: [`not confirmed in time${times}`, "bad"], none: ["no vehicle is reached", ""],
+    expired: [`not confirmed in time${times}`, "bad"], none: ["no acoustic link configured", ""],
   };
-  return words[delivery?.vehicle] ?? [DASH, ""];
+  return texts[delivery?.vehicle] ?? [DASH, ""];
 }
 
-/** The step that a grid's or an axis's lines should have: 1, 2 or 5 times a power of ten. */
+/** Distance between the lines of a grid or axis: 1, 2 or 5 times a power of ten. */
 export function niceStep(span, lines) {
   const rough = span / Math.max(1, lines);
   const power = 10 ** Math.floor(Math.log10(rough));

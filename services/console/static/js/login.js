@@ -1,9 +1,9 @@
-// The log-in page.
+// Log-in page.
 
 import { api } from "./api.js";
-import { restoreLook } from "./bar.js";
+import { restoreTheme } from "./header.js";
 
-restoreLook();
+restoreTheme();
 const form = document.getElementById("login");
 const problem = document.getElementById("problem");
 

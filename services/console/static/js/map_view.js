@@ -1,30 +1,29 @@
-// The map without internet: contacts, tracks and vehicles in local metres, with scale, north and range rings.
+// Map without internet: contacts, tracks and vehicles in local metres, with scale, north arrow and range rings.
 
 import { api } from "./api.js";
-import { calmly, fill, h } from "./dom.js";
+import { debounce, fill, h } from "./dom.js";
 import { quantity, received, symbol, time, verdict } from "./format.js";
-import { drawContacts, drawFrame, drawTracks, nearest } from "./map_drawing.js";
-import { MapTiles } from "./map_tiles.js";
-import { listen, state, tell } from "./state.js";
+import { MapTiles, drawContacts, drawFrame, drawTracks, nearest } from "./map_drawing.js";
+import { emit, listen, state } from "./state.js";
 
 export class MapView {
   constructor() {
     this.data = null;
     this.centre = { x: 0, y: 0 };
-    this.perMetre = 1; // CSS pixels of a metre
+    this.pixelsPerMetre = 1; // CSS pixels
     this.fitted = false;
     this.chosen = null;
     this.canvas = h("canvas", { tabindex: 0, role: "img", "aria-label": "Map of contacts in local metres" });
-    this.words = h("div", { "aria-live": "polite" });
+    this.card = h("div", { "aria-live": "polite" });
     this.element = h("section", { class: "map hidden", "aria-label": "Map" }, this.canvas, h("aside", { class: "legend" },
       h("h2", { text: "Map" }), h("ul", {}, ["unreviewed", "mine_like", "not_mine_like", "unsure"].map((name) => h("li", {}, h("span", { class: `sample ${name}`, text: symbol(name) }), verdict(name)))),
       h("p", { class: "muted" }, h("kbd", { text: "j" }), " ", h("kbd", { text: "k" }), " next, previous · ", h("kbd", { text: "Enter" }), " review · ", h("kbd", { text: "+" }), " ", h("kbd", { text: "-" }), " ", h("kbd", { text: "0" }), " zoom · arrows move"),
-      this.words));
+      this.card));
     this.tiles = new MapTiles(() => this.draw());
     new ResizeObserver(() => { if (!this.fitted) this.fit(); this.draw(); }).observe(this.canvas);
-    this.#mouse();
-    this.later = calmly(() => this.load(), 300, 1500);
-    for (const name of ["contact", "fleet", "reload"]) listen(name, () => { if (this.visible) this.later(); });
+    this.#startMouse();
+    this.loadSoon = debounce(() => this.load(), 300, 1500);
+    for (const name of ["contact", "fleet", "reload"]) listen(name, () => { if (this.visible) this.loadSoon(); });
     listen("theme", () => this.draw());
   }
 
@@ -36,7 +35,7 @@ export class MapView {
     this.draw();
   }
 
-  /** Look at all there is. */
+  /** Fit the map to all objects. */
   fit() {
     if (!this.data || this.canvas.clientWidth === 0) return;
     const { contacts, vehicles, vessel } = this.data;
@@ -45,32 +44,32 @@ export class MapView {
     const span = (index) => [Math.min(...points.map((one) => one[index])), Math.max(...points.map((one) => one[index]))];
     const [[west, east], [south, north]] = [span(0), span(1)];
     this.centre = { x: (west + east) / 2, y: (south + north) / 2 };
-    this.perMetre = 0.82 * Math.min(this.canvas.clientWidth / Math.max(40, east - west), this.canvas.clientHeight / Math.max(40, north - south));
+    this.pixelsPerMetre = 0.82 * Math.min(this.canvas.clientWidth / Math.max(40, east - west), this.canvas.clientHeight / Math.max(40, north - south));
     this.fitted = true;
     this.draw();
   }
 
   toScreen = (x_m, y_m) => [
-    this.canvas.clientWidth / 2 + (x_m - this.centre.x) * this.perMetre,
-    this.canvas.clientHeight / 2 - (y_m - this.centre.y) * this.perMetre,
+    this.canvas.clientWidth / 2 + (x_m - this.centre.x) * this.pixelsPerMetre,
+    this.canvas.clientHeight / 2 - (y_m - this.centre.y) * this.pixelsPerMetre,
   ];
 
   zoom(factor, x = this.canvas.clientWidth / 2, y = this.canvas.clientHeight / 2) {
-    const dx = (x - this.canvas.clientWidth / 2) / this.perMetre;
-    const dy = (this.canvas.clientHeight / 2 - y) / this.perMetre;
-    const before = this.perMetre;
-    this.perMetre = Math.max(0.0005, Math.min(200, this.perMetre * factor));
-    const kept = 1 - before / this.perMetre;
-    this.centre = { x: this.centre.x + dx * kept, y: this.centre.y + dy * kept };
+    const dx = (x - this.canvas.clientWidth / 2) / this.pixelsPerMetre;
+    const dy = (this.canvas.clientHeight / 2 - y) / this.pixelsPerMetre;
+    const before = this.pixelsPerMetre;
+    this.pixelsPerMetre = Math.max(0.0005, Math.min(200, this.pixelsPerMetre * factor));
+    const factorLeft = 1 - before / this.pixelsPerMetre;
+    this.centre = { x: this.centre.x + dx * factorLeft, y: this.centre.y + dy * factorLeft };
     this.draw();
   }
 
   pan(dx, dy) {
-    this.centre = { x: this.centre.x - dx / this.perMetre, y: this.centre.y + dy / this.perMetre };
+    this.centre = { x: this.centre.x - dx / this.pixelsPerMetre, y: this.centre.y + dy / this.pixelsPerMetre };
     this.draw();
   }
 
-  /** Go to the next contact on the map, from west to east. */
+  /** Select the next contact, from west to east. */
   move(step) {
     const contacts = (this.data?.contacts ?? []).slice().sort((a, b) => a.x_m - b.x_m || a.y_m - b.y_m);
     if (!contacts.length) return;
@@ -86,7 +85,7 @@ export class MapView {
     this.draw();
     const { contact } = await api.contact(id);
     if (this.chosen !== id) return;
-    fill(this.words, h("div", { class: "card" }, h("h3", {}, contact.name, h("span", { class: `badge ${contact.review}`, text: `${symbol(contact.review)} ${verdict(contact.review)}` })),
+    fill(this.card, h("div", { class: "card" }, h("h3", {}, contact.name, h("span", { class: `badge ${contact.review}`, text: `${symbol(contact.review)} ${verdict(contact.review)}` })),
       contact.has_picture ? h("img", { src: contact.thumbnail, alt: "" }) : null,
       h("p", { class: "number", text: `${quantity(one.x_m, "m", 0)} east, ${quantity(one.y_m, "m", 0)} north of the origin, ± ${quantity(one.sigma_m, "m", 0)}` }),
       h("p", { class: "number", text: `ATD ${quantity(contact.atd_confidence, "", 2)} · ${received(contact)} received · ${time(contact.seen_utc_s)}` }),
@@ -95,8 +94,8 @@ export class MapView {
 
   open() {
     if (!this.chosen) return;
-    tell("view", { name: "review" });
-    tell("select", { id: this.chosen });
+    emit("view", { name: "review" });
+    emit("select", { id: this.chosen });
   }
 
   draw() {
@@ -110,7 +109,7 @@ export class MapView {
     const style = getComputedStyle(this.canvas);
     const root = getComputedStyle(document.documentElement);
     const colour = (name) => root.getPropertyValue(`--${name}`).trim();
-    const stage = { context, width, height, toScreen: this.toScreen, perMetre: this.perMetre, colour, centre: this.centre };
+    const stage = { context, width, height, toScreen: this.toScreen, pixelsPerMetre: this.pixelsPerMetre, colour, centre: this.centre };
     context.font = `${0.85 * parseFloat(style.fontSize)}px ${style.fontFamily}`;
     this.tiles.draw(stage, this.data.origin);
     drawFrame(stage, this.data);
@@ -118,22 +117,22 @@ export class MapView {
     drawContacts(stage, this.data.contacts, this.chosen ?? state.selected);
   }
 
-  #mouse() {
-    let held = null;
+  #startMouse() {
+    let dragStart = null;
     let moved = false;
     this.canvas.addEventListener("wheel", (event) => { event.preventDefault(); this.zoom(event.deltaY < 0 ? 1.25 : 0.8, event.offsetX, event.offsetY); }, { passive: false });
-    this.canvas.addEventListener("pointerdown", (event) => { held = [event.clientX, event.clientY]; moved = false; });
+    this.canvas.addEventListener("pointerdown", (event) => { dragStart = [event.clientX, event.clientY]; moved = false; });
     this.canvas.addEventListener("pointermove", (event) => {
-      if (!held) return;
-      const [dx, dy] = [event.clientX - held[0], event.clientY - held[1]];
+      if (!dragStart) return;
+      const [dx, dy] = [event.clientX - dragStart[0], event.clientY - dragStart[1]];
       moved ||= Math.hypot(dx, dy) > 3;
       if (!moved) return;
       this.pan(dx, dy);
-      held = [event.clientX, event.clientY];
+      dragStart = [event.clientX, event.clientY];
     });
     this.canvas.addEventListener("pointerup", (event) => {
-      const found = held && !moved && this.data ? nearest(this.data.contacts, this.toScreen, event.offsetX, event.offsetY) : null;
-      held = null;
+      const found = dragStart && !moved && this.data ? nearest(this.data.contacts, this.toScreen, event.offsetX, event.offsetY) : null;
+      dragStart = null;
       if (found) this.choose(found.id);
     });
   }

@@ -1,57 +1,57 @@
-// The page on which people change their own password. What is typed here goes to the server and nowhere else.
+// Page for changing the own password.
 
-import { api, useToken } from "./api.js";
-import { account, restoreLook } from "./bar.js";
+import { api, setToken } from "./api.js";
+import { accountButtons, restoreTheme } from "./header.js";
 import { state } from "./state.js";
 
 const FIELDS = ["old", "new", "again"];
 
-restoreLook();
+restoreTheme();
 const form = document.getElementById("change");
 const problem = document.getElementById("problem");
 const done = document.getElementById("done");
 const value = (name) => form.elements[name].value;
 
-/** Say beside a field what is wrong with it; no words for nothing. */
-function say(name, words) {
-  document.getElementById(`${name}-problem`).textContent = words;
-  if (words) form.elements[name].setAttribute("aria-invalid", "true");
+/** Show the error of a field; an empty text removes it. */
+function showError(name, text) {
+  document.getElementById(`${name}-problem`).textContent = text;
+  if (text) form.elements[name].setAttribute("aria-invalid", "true");
   else form.elements[name].removeAttribute("aria-invalid");
 }
 
-/** What the server need not be asked for, by field. */
-function wrong() {
-  const [least, most] = state.info.password_characters;
-  const length = [...value("new")].length; // as the server counts: characters, not halves of them
+/** Errors that can be found without the server, by field. */
+function findErrors() {
+  const [min, max] = state.info.password_characters;
+  const length = [...value("new")].length; // code points, as the server counts them
   return {
     old: value("old") ? "" : "your present password is missing",
-    new: length >= least && length <= most ? "" : `a password has ${least} to ${most} characters; this one has ${length}`,
+    new: length >= min && length <= max ? "" : `a password has ${min} to ${max} characters; this one has ${length}`,
     again: value("again") === value("new") ? "" : "the two new passwords differ",
   };
 }
 
-/** Say what is wrong, and go to the first field that is. */
-function refuse(words) {
-  for (const name of FIELDS) say(name, words[name] ?? "");
-  form.elements[FIELDS.find((name) => words[name])]?.focus();
+/** Show all errors, and focus the first invalid field. */
+function showErrors(errors) {
+  for (const name of FIELDS) showError(name, errors[name] ?? "");
+  form.elements[FIELDS.find((name) => errors[name])]?.focus();
 }
 
 let busy = false;
 
 async function change() {
   problem.textContent = done.textContent = "";
-  const words = wrong();
-  refuse(words);
-  if (FIELDS.some((name) => words[name])) return;
+  const errors = findErrors();
+  showErrors(errors);
+  if (FIELDS.some((name) => errors[name])) return;
   busy = true;
   try {
     await api.password(value("old"), value("new"));
     for (const name of FIELDS) form.elements[name].value = "";
-    done.textContent = "Your password is changed. You stay logged in here; your other sessions have ended.";
+    done.textContent = "Your password is changed. This session continues; your other sessions have ended.";
     done.focus();
   } catch (error) {
     const field = error.body?.error?.field;
-    if (FIELDS.includes(field)) refuse({ [field]: error.message });
+    if (FIELDS.includes(field)) showErrors({ [field]: error.message });
     else problem.textContent = error.message;
     if (field === "old") form.elements.old.value = "";
   } finally {
@@ -63,15 +63,15 @@ form.addEventListener("submit", (event) => {
   event.preventDefault();
   if (!busy) change();
 });
-form.addEventListener("input", (event) => say(event.target.name, ""));
+form.addEventListener("input", (event) => showError(event.target.name, ""));
 
 try {
   [state.session, state.info] = await Promise.all([api.session(), api.info()]);
-  useToken(state.session.csrf);
+  setToken(state.session.csrf);
   form.elements.user.value = state.session.user;
   document.getElementById("platform").textContent = state.info.platform_id;
   document.getElementById("new-hint").textContent = `${state.info.password_characters.join(" to ")} characters`;
-  document.getElementById("bar").append(...account());
+  document.getElementById("bar").append(...accountButtons());
   form.querySelector("button").disabled = false;
 } catch (error) {
   problem.textContent = error.message;

@@ -1,33 +1,172 @@
-// The review queue: a list of which only the visible rows exist as elements, however long it is.
+// The review queue. Only visible rows have elements, and only some pages of rows are loaded.
 
 import { api } from "./api.js";
 import { h } from "./dom.js";
-import { queueRow } from "./queue_row.js";
-import { Rows } from "./rows.js";
-import { listen, state, tell } from "./state.js";
+import { DASH, quantity, received, symbol, time, verdict } from "./format.js";
+import { emit, listen, state } from "./state.js";
 
-const SPARE = 6; // rows drawn above and below what is seen
+const MARGIN_ROWS = 6; // rows drawn above and below the visible ones
+const PAGE = 100;
+const MAX_PAGES = 8;
+
+/** Rows of the queue, loaded in pages. */
+class QueuePages {
+  constructor() {
+    this.query = {};
+    this.matching = 0;
+    this.vehicles = [];
+    this.pages = new Map(); // page number → rows, least recently used first
+    this.generation = 0;
+  }
+
+  /** Row at an index; undefined if not loaded. */
+  at(index) {
+    return this.pages.get(Math.floor(index / PAGE))?.[index % PAGE];
+  }
+
+  /** Index of a contact; -1 if not loaded. */
+  indexOf(id) {
+    for (const [number, rows] of this.pages) {
+      const within = rows.findIndex((row) => row.id === id);
+      if (within >= 0) return number * PAGE + within;
+    }
+    return -1;
+  }
+
+  /** Replace the row of a contact; returns whether it was loaded. */
+  replace(row) {
+    const index = this.indexOf(row.id);
+    if (index < 0) return false;
+    this.pages.get(Math.floor(index / PAGE))[index % PAGE] = row;
+    return true;
+  }
+
+  async #load(number) {
+    const generation = this.generation;
+    const response = await api.contacts({ ...this.query, offset: number * PAGE, limit: PAGE });
+    if (generation !== this.generation) return null;
+    return response;
+  }
+
+  #store(number, rows) {
+    this.pages.delete(number);
+    this.pages.set(number, rows);
+    while (this.pages.size > MAX_PAGES) this.pages.delete(this.pages.keys().next().value);
+  }
+
+  /** Load the rows first…last if necessary; returns the last response, null if all were loaded. */
+  async ensure(first, last) {
+    let response = null;
+    for (let number = Math.floor(first / PAGE); number <= Math.floor(last / PAGE); number += 1) {
+      if (this.pages.has(number)) {
+        this.#store(number, this.pages.get(number));
+        continue;
+      }
+      const page = await this.#load(number);
+      if (page === null) return null;
+      this.#store(number, page.items);
+      this.#setCounts(page);
+      response = page;
+    }
+    return response;
+  }
+
+  /** Reload the pages of the rows first…last, and discard all others: their rows may have moved. */
+  async refresh(first, last) {
+    this.generation += 1;
+    const fresh = new Map();
+    let response = null;
+    for (let number = Math.floor(first / PAGE); number <= Math.floor(last / PAGE); number += 1) {
+      response = await this.#load(number);
+      if (response === null) return null;
+      fresh.set(number, response.items);
+      if (number * PAGE >= response.matching) break;
+    }
+    this.pages = fresh;
+    this.#setCounts(response);
+    return response;
+  }
+
+  #setCounts(response) {
+    this.matching = response.matching;
+    this.vehicles = response.vehicles;
+  }
+}
+
+function meter(value_percent, title, tone) {
+  const inner = h("span", {});
+  inner.style.width = `${Math.max(0, Math.min(100, value_percent))}%`;
+  return h("span", { class: `meter ${tone}`, title, "aria-hidden": "true" }, inner);
+}
+
+/** Label of a row for screen readers. */
+function rowLabel(row) {
+  return [
+    row.name, verdict(row.review), row.atd_confidence === null ? "no detector confidence" : `detector ${row.atd_confidence.toFixed(2)} of 2`,
+    row.complete ? "image complete" : `${received(row)} received`, `seen ${time(row.seen_utc_s ?? row.first_frame_utc_s)}`,
+    row.looks > 1 ? `${row.looks} looks at one position` : "", row.advised ? "comment from the shore site" : "",
+  ].filter(Boolean).join(", ");
+}
+
+function marks(row) {
+  const list = [];
+  if (row.looks > 1) list.push(h("span", { class: "mark", title: `${row.looks} looks at one position` }, `×${row.looks}`));
+  if (row.advised) list.push(h("span", { class: "mark", title: "Comment from the shore site" }, "✉"));
+  if (row.open_requests > 0) list.push(h("span", { class: "mark", title: "Request in progress" }, "⟳"));
+  if (row.delivery?.vehicle === "confirmed" && ["delivered", "none"].includes(row.delivery?.shore)) {
+    list.push(h("span", { class: "mark good", title: "The decision is at the shore site and on the vehicle" }, "✓"));
+  }
+  if ([row.delivery?.vehicle, row.delivery?.shore].some((step) => step === "refused" || step === "expired")) {
+    list.push(h("span", { class: "mark bad", title: "The decision was not delivered" }, "!"));
+  }
+  return list;
+}
+
+/** Element of a row; `index` counts from 0, `count` is the length of the list. */
+function queueRow(row, index, count, selected) {
+  const image = row.has_picture
+    ? h("img", { src: row.thumbnail, alt: "", decoding: "async" })
+    : h("span", { class: "nothing", text: "no image yet" });
+  return h("div", {
+    id: `row-${index}`, class: "row", role: "option", "aria-selected": String(selected), "aria-posinset": index + 1, "aria-setsize": count,
+    "aria-label": rowLabel(row), data: { id: row.id, index: String(index), review: row.review },
+  },
+  h("div", { class: "thumb" }, image),
+  h("div", { class: "words" },
+    h("div", { class: "first" },
+      h("b", { text: row.name }),
+      h("span", { class: `badge ${row.review}` }, h("span", { text: symbol(row.review) }), ` ${verdict(row.review)}`)),
+    h("div", { class: "second number" },
+      h("span", { text: `ATD ${row.atd_confidence === null ? DASH : row.atd_confidence.toFixed(2)}` }),
+      meter((row.atd_confidence ?? 0) * 50, "confidence of the detector, 0 to 2", "atd"),
+      h("span", { class: "share", text: received(row) }),
+      meter(row.percent_received ?? 0, "received", row.complete ? "whole" : "part")),
+    h("div", { class: "third muted number" },
+      h("span", { text: time(row.seen_utc_s ?? row.first_frame_utc_s) }),
+      h("span", { text: quantity(row.range_m, "m", 0) }),
+      h("span", { class: "marks" }, marks(row)))));
+}
 
 export class Queue {
   constructor() {
-    this.rows = new Rows();
+    this.rows = new QueuePages();
     this.drawn = new Map(); // index → element
     this.selectedIndex = 0;
-    this.busy = false;
-    this.again = false;
+    this.refreshing = false;
+    this.refreshAgain = false;
     this.space = h("div", { class: "space", role: "presentation" });
     this.list = h("div", {
       id: "queue", class: "list", role: "listbox", tabindex: 0, "aria-label": "Review queue",
       on: { scroll: () => this.draw(), click: (event) => this.#clicked(event) },
     }, this.space);
-    this.empty = h("p", { class: "empty muted", text: "No contact matches. Contacts appear here as their first frame arrives." });
+    this.empty = h("p", { class: "empty muted", text: "No contact matches. A contact appears when its first frame is received." });
     this.element = h("div", { class: "listbox" }, this.list, this.empty);
     new ResizeObserver(() => { this.#measureRow(); this.draw(); }).observe(this.list);
-    listen("contact", ({ contact, new: isNew }) => this.#happened(contact, isNew));
+    listen("contact", ({ contact, new: isNew }) => this.#updateContact(contact, isNew));
     listen("theme", () => { this.#measureRow(); this.draw(); });
   }
 
-  /** Show what a filter finds, from its top. */
+  /** Show the contacts of a filter, from the first one. */
   async show(query) {
     this.rows.query = query;
     this.list.scrollTop = 0;
@@ -35,54 +174,54 @@ export class Queue {
     await this.refresh();
   }
 
-  /** Load anew what is seen; calls while one is under way become one more. */
+  /** Reload the visible rows. Calls during a reload cause one more reload. */
   async refresh() {
-    if (this.busy) {
-      this.again = true;
+    if (this.refreshing) {
+      this.refreshAgain = true;
       return;
     }
-    this.busy = true;
+    this.refreshing = true;
     try {
       do {
-        this.again = false;
+        this.refreshAgain = false;
         await this.#reload();
-      } while (this.again);
+      } while (this.refreshAgain);
     } finally {
-      this.busy = false;
+      this.refreshing = false;
     }
   }
 
   async #reload() {
     const top = this.rows.at(Math.floor(this.list.scrollTop / this.rowHeight));
-    const [first, last] = this.#seen();
-    const answer = await this.rows.refresh(first, last);
-    if (answer === null) return;
-    Object.assign(state, { total: answer.total, unreviewed: answer.unreviewed });
-    tell("counts", answer);
-    if (top && this.list.scrollTop > 0) this.#keepInPlace(top);
+    const [first, last] = this.#visibleRange();
+    const response = await this.rows.refresh(first, last);
+    if (response === null) return;
+    Object.assign(state, { total: response.total, unreviewed: response.unreviewed });
+    emit("counts", response);
+    if (top && this.list.scrollTop > 0) this.#keepScrollPosition(top);
     const index = this.rows.indexOf(state.selected);
     if (index >= 0) this.selectedIndex = index;
     this.#redraw();
   }
 
-  /** New rows above must not push away what the operator reads. */
-  #keepInPlace(top) {
+  /** Keep the visible rows in place when new rows appear above them. */
+  #keepScrollPosition(top) {
     const index = this.rows.indexOf(top.id);
     if (index < 0) return;
     const within = this.list.scrollTop % this.rowHeight;
-    this.#stretch();
+    this.#setHeight();
     this.list.scrollTop = index * this.rowHeight + within;
   }
 
-  #happened(row, isNew) {
-    const fits = !this.rows.query.review || this.rows.query.review === row.review
+  #updateContact(row, isNew) {
+    const matches = !this.rows.query.review || this.rows.query.review === row.review
       || (this.rows.query.review === "reviewed" && row.review !== "unreviewed");
-    const known = this.rows.merge(row);
+    const known = this.rows.replace(row);
     if (known) {
       const element = this.drawn.get(this.rows.indexOf(row.id));
       if (element) this.#replace(this.rows.indexOf(row.id), row, element);
     }
-    if (isNew || known !== fits || !["arrived", "name", "vehicle"].includes(this.rows.query.sort)) this.refresh();
+    if (isNew || known !== matches || !["arrived", "name", "vehicle"].includes(this.rows.query.sort)) this.refresh();
   }
 
   #replace(index, row, element) {
@@ -103,14 +242,14 @@ export class Queue {
     element.style.height = `${this.rowHeight}px`;
   }
 
-  #seen() {
+  #visibleRange() {
     if (!this.rowHeight) this.#measureRow();
-    const first = Math.floor(this.list.scrollTop / this.rowHeight) - SPARE;
-    const count = Math.ceil((this.list.clientHeight || 600) / this.rowHeight) + 2 * SPARE;
+    const first = Math.floor(this.list.scrollTop / this.rowHeight) - MARGIN_ROWS;
+    const count = Math.ceil((this.list.clientHeight || 600) / this.rowHeight) + 2 * MARGIN_ROWS;
     return [Math.max(0, first), Math.max(0, first + count)];
   }
 
-  #stretch() {
+  #setHeight() {
     this.space.style.height = `${this.rows.matching * this.rowHeight}px`;
   }
 
@@ -120,12 +259,12 @@ export class Queue {
     this.draw();
   }
 
-  /** Draw the rows that are seen, and remove the others. */
+  /** Draw the visible rows, and remove the others. */
   draw() {
-    this.#stretch();
+    this.#setHeight();
     this.empty.classList.toggle("hidden", this.rows.matching > 0);
-    const [first, beyond] = this.#seen();
-    const last = Math.min(beyond, this.rows.matching - 1);
+    const [first, end] = this.#visibleRange();
+    const last = Math.min(end, this.rows.matching - 1);
     for (const [index, element] of this.drawn) {
       if (index < first || index > last) {
         element.remove();
@@ -142,22 +281,22 @@ export class Queue {
       this.space.append(element);
       this.drawn.set(index, element);
     }
-    this.#tellActive();
-    if (missing) this.rows.need(first, last).then((answer) => answer && this.draw());
+    this.#updateActiveRow();
+    if (missing) this.rows.ensure(first, last).then((response) => response && this.draw());
   }
 
-  #tellActive() {
+  #updateActiveRow() {
     const active = [...this.drawn.values()].find((element) => element.dataset.id === state.selected);
     if (active) this.list.setAttribute("aria-activedescendant", active.id);
     else this.list.removeAttribute("aria-activedescendant");
   }
 
-  /** Mark the contact that the contact view shows. */
+  /** Mark the displayed contact. */
   mark(id) {
     for (const element of this.drawn.values()) element.setAttribute("aria-selected", String(element.dataset.id === id));
     const index = this.rows.indexOf(id);
     if (index >= 0) this.selectedIndex = index;
-    this.#tellActive();
+    this.#updateActiveRow();
   }
 
   #clicked(event) {
@@ -165,27 +304,27 @@ export class Queue {
     if (element) this.choose(Number(element.dataset.index));
   }
 
-  /** Go `step` rows on. A contact that has left the list makes its successor the next one. */
+  /** Move the selection by `step` rows. If the selected contact has left the list, its successor is the next one. */
   async move(step) {
-    const here = this.rows.indexOf(state.selected);
-    const gone = here < 0 && state.selected !== null;
-    const from = here >= 0 ? here : this.selectedIndex;
-    await this.choose(gone && step > 0 ? from + step - 1 : state.selected === null ? 0 : from + step);
+    const index = this.rows.indexOf(state.selected);
+    const removed = index < 0 && state.selected !== null;
+    const from = index >= 0 ? index : this.selectedIndex;
+    await this.choose(removed && step > 0 ? from + step - 1 : state.selected === null ? 0 : from + step);
   }
 
-  /** Show the contact at an index, scrolling there. */
-  async choose(wanted) {
+  /** Display the contact at an index, and scroll to it. */
+  async choose(requested) {
     if (this.rows.matching === 0) return;
-    const index = Math.max(0, Math.min(this.rows.matching - 1, wanted));
-    await this.rows.need(index, index);
+    const index = Math.max(0, Math.min(this.rows.matching - 1, requested));
+    await this.rows.ensure(index, index);
     const row = this.rows.at(index);
     if (!row) return;
     this.selectedIndex = index;
-    this.#reveal(index);
-    tell("select", { id: row.id });
+    this.#scrollTo(index);
+    emit("select", { id: row.id });
   }
 
-  /** Show the next contact that nobody has decided: of the loaded rows below, else the first of the whole queue. */
+  /** Display the next contact without a decision: of the loaded rows below, else the first one of the queue. */
   async nextUnreviewed() {
     const [first, last] = [this.rows.indexOf(state.selected) + 1, this.rows.matching];
     for (let index = first; index < last && this.rows.at(index); index += 1) {
@@ -199,11 +338,11 @@ export class Queue {
     if (!next) return false;
     const index = this.rows.indexOf(next.id);
     if (index >= 0) await this.choose(index);
-    else tell("select", { id: next.id });
+    else emit("select", { id: next.id });
     return true;
   }
 
-  #reveal(index) {
+  #scrollTo(index) {
     const top = index * this.rowHeight;
     const height = this.list.clientHeight;
     if (top < this.list.scrollTop) this.list.scrollTop = top;

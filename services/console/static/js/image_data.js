@@ -1,8 +1,8 @@
-// Pictures as the server has them, their masks, and what gain and colour map make of grey levels.
+// Images and masks of the server, gain and colour maps.
 
-async function grey(url) {
+async function loadGrey(url) {
   const response = await fetch(url, { credentials: "same-origin" });
-  if (!response.ok) throw new Error(`The picture did not come: the server answered ${response.status}.`);
+  if (!response.ok) throw new Error(`The image was not loaded: the server returned status ${response.status}.`);
   const bitmap = await createImageBitmap(await response.blob(), { colorSpaceConversion: "none", premultiplyAlpha: "none" });
   const canvas = new OffscreenCanvas(bitmap.width, bitmap.height);
   const context = canvas.getContext("2d", { willReadFrequently: true });
@@ -14,19 +14,19 @@ async function grey(url) {
 }
 
 /**
- * Load one layer of one version of a picture; a mask that is empty anyway has no address (null).
+ * Load one layer of an image version. An empty mask has no URL (null).
  *
  * Returns `{width, height, levels, missing, guessed}`: grey levels 0…255 and two masks, rows along-track, columns across-track.
  */
-export async function loadPicture(pictureUrl, missingUrl, guessedUrl) {
-  const [picture, missing, guessed] = await Promise.all([pictureUrl, missingUrl, guessedUrl].map((url) => url && grey(url)));
-  const none = () => new Uint8Array(picture.levels.length);
-  return { ...picture, missing: missing?.levels ?? none(), guessed: guessed?.levels ?? none() };
+export async function loadImage(imageUrl, missingUrl, guessedUrl) {
+  const [image, missing, guessed] = await Promise.all([imageUrl, missingUrl, guessedUrl].map((url) => url && loadGrey(url)));
+  const none = () => new Uint8Array(image.levels.length);
+  return { ...image, missing: missing?.levels ?? none(), guessed: guessed?.levels ?? none() };
 }
 
-const between = (value) => Math.max(0, Math.min(255, Math.round(value)));
+const toByte = (value) => Math.max(0, Math.min(255, Math.round(value)));
 
-// Colour maps of sonar displays: (0…1) → red, green, blue in 0…255. All rise in lightness, so that brighter is stronger, but inverse.
+// Colour maps: (0…1) → red, green, blue in 0…255. Lightness increases monotonically, except for inverse.
 export const MAPS = {
   grey: (v) => [255 * v, 255 * v, 255 * v],
   inverse: (v) => [255 * (1 - v), 255 * (1 - v), 255 * (1 - v)],
@@ -35,35 +35,33 @@ export const MAPS = {
   bone: (v) => [255 * (v < 0.75 ? 0.875 * v : v * 1.375 - 0.375), 255 * (v < 0.375 ? 0.875 * v : 0.83 * v + 0.17 * v * v), 255 * Math.min(1, 0.12 * Math.sin(Math.PI * v) + v)],
 };
 
-/** Table of 256 colours for a map, with black point `low`, white point `high` (percent) and gamma. */
-export function table(map, low, high, gamma) {
+/** Table of 256 colours of a map, with black point `low`, white point `high` (percent) and gamma. */
+export function colourTable(map, low, high, gamma) {
   const colours = new Uint8ClampedArray(256 * 3);
   const black = low * 2.55;
   const span = Math.max(1, (high - low) * 2.55);
   for (let level = 0; level < 256; level += 1) {
     const value = Math.max(0, Math.min(1, (level - black) / span)) ** (1 / gamma);
-    colours.set((MAPS[map] ?? MAPS.grey)(value).map(between), 3 * level);
+    colours.set((MAPS[map] ?? MAPS.grey)(value).map(toByte), 3 * level);
   }
   return colours;
 }
 
-/** Colour a picture; what was never received is black, whatever the map. */
-export function coloured(picture, colours) {
-  const canvas = new OffscreenCanvas(picture.width, picture.height);
-  const image = new ImageData(picture.width, picture.height);
-  for (let i = 0; i < picture.levels.length; i += 1) {
-    const from = 3 * picture.levels[i];
-    const there = picture.missing[i] === 0;
-    image.data[4 * i] = there ? colours[from] : 0;
-    image.data[4 * i + 1] = there ? colours[from + 1] : 0;
-    image.data[4 * i + 2] = there ? colours[from + 2] : 0;
-    image.data[4 * i + 3] = 255;
+/** Apply a colour table to an image. Missing pixels are black with every map. */
+export function colourise(image, colours) {
+  const canvas = new OffscreenCanvas(image.width, image.height);
+  const pixels = new ImageData(image.width, image.height);
+  for (let i = 0; i < image.levels.length; i += 1) {
+    const colour = 3 * image.levels[i];
+    const received = image.missing[i] === 0;
+    for (let c = 0; c < 3; c += 1) pixels.data[4 * i + c] = received ? colours[colour + c] : 0;
+    pixels.data[4 * i + 3] = 255;
   }
-  canvas.getContext("2d").putImageData(image, 0, 0);
+  canvas.getContext("2d").putImageData(pixels, 0, 0);
   return canvas;
 }
 
-/** A mask as a canvas that is opaque where the mask is set; null where it is set nowhere. */
+/** A mask as a canvas with opaque pixels; null for an empty mask. */
 export function maskCanvas(mask, width, height) {
   if (!mask.some((value) => value > 0)) return null;
   const canvas = new OffscreenCanvas(width, height);
@@ -73,13 +71,13 @@ export function maskCanvas(mask, width, height) {
   return canvas;
 }
 
-/** Grey levels between which 98 % of what was received lies, in percent: what "auto" gain takes. */
-export function autoRange(picture) {
+/** Range of grey levels, in percent, with 98 % of the received pixels: the automatic gain. */
+export function autoRange(image) {
   const histogram = new Uint32Array(256);
   let count = 0;
-  for (let i = 0; i < picture.levels.length; i += 1) {
-    if (picture.missing[i] === 0) {
-      histogram[picture.levels[i]] += 1;
+  for (let i = 0; i < image.levels.length; i += 1) {
+    if (image.missing[i] === 0) {
+      histogram[image.levels[i]] += 1;
       count += 1;
     }
   }

@@ -1,4 +1,4 @@
-// The honesty strip: by what a picture came, how much of it, and what of it nobody measured.
+// The data integrity strip: codec, received and missing parts, and whether the displayed layer is measurable.
 
 import { h } from "./dom.js";
 import { bytes, duration, percent, received } from "./format.js";
@@ -7,10 +7,10 @@ function item(name, value, props = {}) {
   return h("div", props, h("dt", { text: name }), h("dd", { class: "number", text: value }));
 }
 
-/** Elements for one version and the layer on the screen; null where there is none. */
-export function honestyStrip(version, layer) {
+/** Elements for a version and the displayed layer; null if there is no version. */
+export function integrityStrip(version, layer) {
   if (!version) return null;
-  const airtime = version.airtime_s === null ? "not known" : `${version.airtime_is === "estimated" ? "≈ " : ""}${duration(version.airtime_s)}`;
+  const airtime = version.airtime_s === null ? "unknown" : `${version.airtime_is === "estimated" ? "≈ " : ""}${duration(version.airtime_s)}`;
   const missing = 100 * version.missing_fraction;
   const guessed = 100 * (version.guessed_fraction ?? 0);
   const facts = h("dl", {},
@@ -20,11 +20,11 @@ export function honestyStrip(version, layer) {
     item("air time", airtime),
     item("received", received(version), { class: version.complete ? "" : "part" }),
     item("missing", percent(missing, missing > 0 && missing < 1 ? 1 : 0), { class: missing > 0 ? "missing" : "" }),
-    item("guessed", layer?.synthesised ? "all of it" : percent(guessed, guessed > 0 && guessed < 1 ? 1 : 0), { class: guessed > 0 || layer?.synthesised ? "guessed" : "" }));
-  const said = version.complete ? "as the codec's stream says, all of it received." : missing > 0 ? "as the codec's stream says; hatched areas were never received." : "as the codec's stream says so far; detail is still to come.";
+    item("synthesised", layer?.synthesised ? "all" : percent(guessed, guessed > 0 && guessed < 1 ? 1 : 0), { class: guessed > 0 || layer?.synthesised ? "guessed" : "" }));
+  const source = version.complete ? "decoded from the complete stream." : missing > 0 ? "decoded from the received part; hatched areas were never received." : "decoded from the received part; more detail follows.";
   const notes = version.notes.length ? h("span", { class: "muted", text: ` ${version.notes.join(" · ")}` }) : null;
-  const truth = layer?.synthesised
-    ? h("p", { class: "made" }, h("b", { text: `✱ ${layer.name}: not a measurement. ` }), layer.reason, notes)
-    : h("p", { class: "measured" }, h("b", { text: `${layer?.name ?? "raw"}: ` }), said, notes);
-  return [facts, truth];
+  const statement = layer?.synthesised
+    ? h("p", { class: "synthesised" }, h("b", { text: `✱ ${layer.name}: not a measurement. ` }), layer.reason, notes)
+    : h("p", {}, h("b", { text: `${layer?.name ?? "raw"}: ` }), source, notes);
+  return [facts, statement];
 }

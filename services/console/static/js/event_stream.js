@@ -1,0 +1,73 @@
+// The event stream of the server, and the state of its connection.
+
+import { emit, setClock, state } from "./state.js";
+
+const NAMES = ["contact", "frame", "decision", "request", "advice", "fleet", "session", "clock"];
+const SILENT_MS = 12000; // the server sends its time every 5 s
+const RETRY_MS = 2000;
+
+let source = null;
+let lastId = "";
+let opened_ms = 0;
+let reload = false;
+
+function received(event) {
+  state.last_event_ms = performance.now();
+  if (event.lastEventId) lastId = event.lastEventId;
+  if (!state.online) {
+    state.online = true;
+    emit("online");
+  }
+}
+
+function lost() {
+  if (!state.online) return;
+  state.online = false;
+  emit("online");
+}
+
+function open() {
+  source?.close();
+  opened_ms = performance.now();
+  source = new EventSource(lastId ? `/events?last=${encodeURIComponent(lastId)}` : "/events");
+  source.addEventListener("hello", (event) => {
+    received(event);
+    setClock(JSON.parse(event.data).now_utc_s);
+    if (reload) emit("reload");
+    reload = false;
+  });
+  source.addEventListener("reset", (event) => { received(event); emit("reload"); });
+  for (const name of NAMES) {
+    source.addEventListener(name, (event) => {
+      received(event);
+      const detail = JSON.parse(event.data);
+      if (name === "clock") setClock(detail.now_utc_s);
+      emit(name, detail);
+    });
+  }
+  source.addEventListener("error", () => {
+    // The browser reconnects unless it received an error response, for example from a proxy.
+    reload = true;
+    lost();
+  });
+}
+
+/** Reopen a stream that is silent or closed. */
+function check() {
+  const now_ms = performance.now();
+  const silent = now_ms - Math.max(state.last_event_ms, opened_ms) > SILENT_MS;
+  const closed = source.readyState === EventSource.CLOSED && now_ms - opened_ms > RETRY_MS;
+  if (silent) lost();
+  if (silent || closed) {
+    reload = true;
+    open();
+  }
+}
+
+export function startEvents() {
+  state.last_event_ms = performance.now();
+  open();
+  setInterval(check, 1000);
+  addEventListener("online", () => { reload = true; open(); });
+  addEventListener("offline", lost);
+}
