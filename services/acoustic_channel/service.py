@@ -30,7 +30,7 @@ class AcousticChannelService(Service[AcousticChannelConfig]):
 
     def __init__(self, platform: PlatformConfig, config: AcousticChannelConfig) -> None:
         super().__init__(platform, config)
-        self._emulator = ChannelEmulator(config.emulator_config())
+        self._emulator = ChannelEmulator(config)
         try:
             self._emulator.start()
         except BaseException:

@@ -21,9 +21,8 @@ from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Contact, Health, Pixels, Record, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
-from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
-from sonarpost.simulation.channel.parameters import ChannelParameters
+from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -279,8 +278,8 @@ class ModemPair:
         return str(self.folder / f"modem-{modem}")
 
     def start(self, *, time_scale: float = 150.0, **channel: Any) -> ChannelEmulator:
-        sites = (ModemSite(1), ModemSite(3, LocalPosition(150.0)))
-        config = EmulatorConfig(sites, ChannelParameters(**channel), pty_dir=self.folder, time_scale=time_scale)
+        modems = (ModemSite(address=1), ModemSite(address=3, east_m=150.0))
+        config = EmulatorConfig(modem=modems, **channel, pty_dir=self.folder, time_scale=time_scale)
         self._channel = ChannelEmulator(config)
         self._channel.start()
         return self._channel

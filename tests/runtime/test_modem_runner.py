@@ -30,8 +30,8 @@ from sonarpost.modem.micromodem import (
 )
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialPort
-from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 
 CONFIG = MicroModemConfig(address=3, settings=())
 
@@ -258,8 +258,8 @@ def test_timers_run_without_a_byte_from_the_port(tmp_path: Path) -> None:
 
 
 def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path: Path) -> None:
-    sites = (ModemSite(1), ModemSite(2, LocalPosition(150.0)))
-    channel = ChannelEmulator(EmulatorConfig(sites, pty_dir=tmp_path / "modems", time_scale=50.0))
+    modems = (ModemSite(address=1), ModemSite(address=2, east_m=150.0))
+    channel = ChannelEmulator(EmulatorConfig(modem=modems, pty_dir=tmp_path / "modems", time_scale=50.0))
     channel.start()
     events: dict[int, list[ModemEvent]] = {1: [], 2: []}
     runners = {

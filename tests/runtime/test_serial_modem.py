@@ -13,14 +13,14 @@ import pytest
 from sonarpost.errors import ConfigError, FrameError, PortError, TransmissionError
 from sonarpost.runtime import serial_modem
 from sonarpost.runtime.serial_modem import SerialModem
-from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 
 
 @pytest.fixture
 def channel(tmp_path: Path) -> Iterator[ChannelEmulator]:
-    sites = (ModemSite(1), ModemSite(3, LocalPosition(150.0)))
-    emulator = ChannelEmulator(EmulatorConfig(sites, pty_dir=tmp_path / "modems", time_scale=50.0))
+    modems = (ModemSite(address=1), ModemSite(address=3, east_m=150.0))
+    emulator = ChannelEmulator(EmulatorConfig(modem=modems, pty_dir=tmp_path / "modems", time_scale=50.0))
     emulator.start()
     yield emulator
     emulator.stop()

@@ -24,8 +24,8 @@ from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService, summary_of
-from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 
 IN, TX, RX = keys.image_encoded("uuv-1"), keys.acoustic_tx("uuv-1"), keys.acoustic_rx("vessel-1")
 CONTACT = Contact(contact_id="c", vehicle_id="uuv-1", lat_deg=56.4, lon_deg=-5.6, atd_confidence=1.5, channel="port")
@@ -318,9 +318,9 @@ def test_the_water_is_kept_busy_at_rate_5(tmp_path, runner, platform, compressor
     images.append(encoded("LAST"))
     assert [len(packet) for packet in planned(images[0], 5)] == [1, 8, 8], "full packets, the hardest to fill"
     log = tmp_path / "water.jsonl"
-    sites = (ModemSite(1), ModemSite(3, LocalPosition(150.0)))
+    modems = (ModemSite(address=1), ModemSite(address=3, east_m=150.0))
     ports = tmp_path / "ports"
-    channel = ChannelEmulator(EmulatorConfig(sites, pty_dir=ports, serial_baud=baud, log_path=log))
+    channel = ChannelEmulator(EmulatorConfig(modem=modems, pty_dir=ports, serial_baud=baud or 0.0, log=log))
     channel.start()
     try:
         service = runner.start(

@@ -11,12 +11,13 @@ import threading
 from pathlib import Path
 from types import FrameType
 
+from pydantic import ValidationError
+
 from sonarpost.errors import ConfigError
 from sonarpost.modem.micromodem import RATES
-from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
-from sonarpost.simulation.channel.parameters import PRESETS, ChannelParameters, build_parameters, read_parameters
-from sonarpost.simulation.modem.settings import EmulatedModemConfig
+from sonarpost.simulation.channel.config import EmulatorConfig
+from sonarpost.simulation.channel.emulator import ChannelEmulator
+from sonarpost.simulation.channel.parameters import PRESETS, build_parameters, config_error, read_parameters
 
 WATCH_S = 0.2
 EXIT_FAILED = 1
@@ -135,26 +136,6 @@ def _config(parsed: argparse.Namespace) -> EmulatorConfig:
         raise ConfigError("command line", "--water", parsed.renamed_water, "its new name, --channel")
     if not 1 <= parsed.modems <= MAX_MODEMS:
         raise ConfigError("command line", "--modems", parsed.modems, f"1..{MAX_MODEMS}")
-    try:
-        airtimes_s = dict(_airtime(text) for text in parsed.airtime)
-        return EmulatorConfig(
-            sites=tuple(ModemSite(n + 1, LocalPosition(east_m=n * parsed.spacing)) for n in range(parsed.modems)),
-            channel=_parameters(parsed),
-            modem=EmulatedModemConfig(address=0, generation=parsed.mm, airtimes_s=airtimes_s),
-            pty_dir=None if parsed.tcp is not None else parsed.pty or Path("modems"),
-            tcp_ports=tuple(parsed.tcp or (0,) * parsed.modems) if parsed.tcp is not None else (),
-            time_scale=parsed.time_scale,
-            serial_baud=parsed.baud,
-            log_path=parsed.log,
-            transponders=dict(_transponder(text) for text in parsed.transponder),
-        )
-    except ValueError as error:
-        name, _, rest = str(error).partition(": ")
-        raise ConfigError("command line", name, rest, "a value within its bounds") from error
-
-
-def _parameters(parsed: argparse.Namespace) -> ChannelParameters:
-    """Return the channel parameters: preset, file, options and `--set`, each overriding the one before."""
     options = {
         "preset": parsed.preset,
         "seed": parsed.seed,
@@ -166,7 +147,25 @@ def _parameters(parsed: argparse.Namespace) -> ChannelParameters:
     }
     given = {name: value for name, value in options.items() if value is not None}
     from_file = read_parameters(parsed.channel) if parsed.channel else {}
-    return build_parameters(from_file | given | dict(_parameter(text) for text in parsed.set), "command line")
+    values = from_file | given | dict(_parameter(text) for text in parsed.set)
+    build_parameters(values, "command line")
+    try:
+        return EmulatorConfig.model_validate(
+            values
+            | {
+                "modem": [{"address": n + 1, "east_m": n * parsed.spacing} for n in range(parsed.modems)],
+                "generation": parsed.mm,
+                "airtime_s": dict(_airtime(text) for text in parsed.airtime),
+                "pty_dir": parsed.pty or Path("modems"),
+                "tcp_ports": (parsed.tcp or (0,) * parsed.modems) if parsed.tcp is not None else (),
+                "time_scale": parsed.time_scale,
+                "serial_baud": parsed.baud or 0.0,
+                "log": parsed.log,
+                "transponder": [_transponder(text) for text in parsed.transponder],
+            }
+        )
+    except ValidationError as error:
+        raise config_error("command line", error) from error
 
 
 def _parameter(text: str) -> tuple[str, float | bool | str]:
@@ -188,10 +187,10 @@ def _airtime(text: str) -> tuple[int, float]:
         raise ConfigError("command line", "--airtime", text, expected) from error
 
 
-def _transponder(text: str) -> tuple[str, LocalPosition]:
+def _transponder(text: str) -> dict[str, str | float]:
     letter, _, place = text.partition("=")
     try:
         east_m, north_m, depth_m = (float(metres) for metres in [*place.split(","), "0", "0"][:3])
-        return letter, LocalPosition(east_m, north_m, depth_m)
     except ValueError as error:
         raise ConfigError("command line", "--transponder", text, "LETTER=EAST[,NORTH[,DEPTH]] in metres") from error
+    return {"letter": letter, "east_m": east_m, "north_m": north_m, "depth_m": depth_m}

@@ -29,11 +29,10 @@ from sonarpost.modem.micromodem import nmea
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.services.acoustic_channel.service import AcousticChannelService
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
-from sonarpost.simulation.channel.parameters import ChannelParameters
-from sonarpost.simulation.modem.settings import EmulatedModemConfig
+from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 
-SITES = (ModemSite(1), ModemSite(2, LocalPosition(150.0)))
+MODEMS = (ModemSite(address=1), ModemSite(address=2, east_m=150.0))
 SCALE = 100.0
 
 
@@ -105,7 +104,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
     running: list[ChannelEmulator] = []
 
     def start(**config: object) -> ChannelEmulator:
-        defaults: dict[str, object] = {"sites": SITES, "time_scale": SCALE, "log_path": tmp_path / "channel.jsonl"}
+        defaults: dict[str, object] = {"modem": MODEMS, "time_scale": SCALE, "log": tmp_path / "channel.jsonl"}
         if "tcp_ports" not in config:
             defaults["pty_dir"] = tmp_path / "ports"
         emulator = ChannelEmulator(EmulatorConfig(**(defaults | config)))  # type: ignore[arg-type]
@@ -130,8 +129,7 @@ def hosts_of(emulator: ChannelEmulator) -> list[Host]:
 
 @pytest.mark.parametrize("tcp", [False, True])
 def test_log_matches_the_received_sentences(make: Make, tmp_path: Path, tcp: bool):
-    parameters = ChannelParameters(seed=3, frame_loss=0.3, tail_damage=0.4)
-    emulator = make(channel=parameters, **({"tcp_ports": (0, 0)} if tcp else {}))
+    emulator = make(seed=3, frame_loss=0.3, tail_damage=0.4, **({"tcp_ports": (0, 0)} if tcp else {}))
     sender, receiver = hosts_of(emulator)
     for n in range(12):
         sender.send(2, 5, [bytes([n, k]) * 20 for k in range(3)] + [b""])
@@ -167,9 +165,11 @@ def test_runs_with_one_seed_have_equal_outcomes(make: Make, tmp_path: Path):
     seen = []
     for run in ("a", "b"):
         emulator = make(
-            channel=ChannelParameters(seed=8, frame_loss=0.5, tail_damage=0.5),
+            seed=8,
+            frame_loss=0.5,
+            tail_damage=0.5,
             pty_dir=tmp_path / run,
-            log_path=tmp_path / f"{run}.jsonl",
+            log=tmp_path / f"{run}.jsonl",
         )
         sender, receiver = hosts_of(emulator)
         for _ in range(5):
@@ -293,7 +293,7 @@ def test_client_that_does_not_read_loses_whole_sentences(make: Make):
 
 
 def test_air_time_is_scaled(make: Make):
-    emulator = make(time_scale=10.0, modem=EmulatedModemConfig(address=0, airtimes_s={1: 5.0}))
+    emulator = make(time_scale=10.0, airtime_s={1: 5.0})
     host = Host(emulator.devices()[0].device)
     host.send_sentence("CCCYC", 0, 1, 2, 1, 0, 1)
     host.expect("CADRQ")
@@ -325,11 +325,11 @@ def test_port_error_names_the_port(make: Make, tmp_path: Path):
         with pytest.raises(PortError, match=str(port)):
             make(tcp_ports=(0, port))
     with pytest.raises(PortError, match="log"):
-        make(log_path=tmp_path, tcp_ports=(0, 0))
+        make(log=tmp_path, tcp_ports=(0, 0))
 
 
 def test_log_that_cannot_be_written_ends_the_emulator(tmp_path: Path):
-    config = EmulatorConfig(sites=SITES, pty_dir=tmp_path / "ports", log_path=Path("/dev/full"))
+    config = EmulatorConfig(modem=MODEMS, pty_dir=tmp_path / "ports", log=Path("/dev/full"))
     emulator = ChannelEmulator(config)
     emulator.start()
     eventually(lambda: emulator.failure is not None, what="failure")
@@ -341,17 +341,18 @@ def test_log_that_cannot_be_written_ends_the_emulator(tmp_path: Path):
 @pytest.mark.parametrize(
     "config",
     [
-        {"sites": ()},
-        {"sites": (ModemSite(1), ModemSite(1))},
-        {"sites": (ModemSite(200),)},
+        {"modem": ()},
+        {"modem": ({"address": 1}, {"address": 1})},
+        {"modem": ({"address": 200},)},
         {"tcp_ports": (1,)},
+        {"transponder": ({"letter": "E"},)},
         {"time_scale": 0.0},
         {"time_scale": float("nan")},
         {"serial_baud": -1.0},
     ],
 )
 def test_invalid_configuration_is_rejected(config: dict[str, object], tmp_path: Path):
-    complete = {"sites": SITES} | ({} if "tcp_ports" in config else {"pty_dir": tmp_path}) | config
+    complete = {"modem": MODEMS, "pty_dir": tmp_path} | config
     with pytest.raises(ValueError, match=next(iter(config))):
         EmulatorConfig(**complete)  # type: ignore[arg-type]
 
@@ -432,13 +433,13 @@ def test_command_continues_when_its_output_is_closed(arguments: tuple[str, ...])
         (("--set", "colour=blue"), "colour"),
         (("--water", "sea.toml"), "--water.*--channel"),
         (("--transponder", "A=far"), "--transponder"),
-        (("--transponder", "E=1"), "transponders"),
+        (("--transponder", "E=1"), "transponder.0.letter"),
         (("--loss", "1.5"), "frame_loss"),
         (("--time-scale", "0"), "time_scale"),
         (("--modems", "3", "--tcp", "1", "2"), "tcp_ports"),
         (("--airtime", "fast"), "--airtime"),
-        (("--airtime", "9=1"), "airtimes_s"),
-        (("--spacing", "nan"), "position"),
+        (("--airtime", "9=1"), "airtime_s"),
+        (("--spacing", "nan"), "east_m"),
     ],
 )
 def test_command_rejects_invalid_options(arguments: tuple[str, ...], named: str):

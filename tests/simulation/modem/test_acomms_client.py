@@ -14,8 +14,8 @@ import pytest
 from builders.common import eventually
 
 from sonarpost.modem.micromodem import RATES
-from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.emulator import ChannelEmulator, EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
+from sonarpost.simulation.channel.emulator import ChannelEmulator
 
 with warnings.catch_warnings():
     # Strings of the package have escapes that Python reports as deprecated when it compiles them.
@@ -75,8 +75,8 @@ class Client:
 
 @pytest.fixture
 def clients(tmp_path: Path) -> Iterator[tuple[Client, Client]]:
-    sites = (ModemSite(1), ModemSite(2, LocalPosition(RANGE_M)))
-    channel = ChannelEmulator(EmulatorConfig(sites, pty_dir=tmp_path / "modems", time_scale=SCALE))
+    modems = (ModemSite(address=1), ModemSite(address=2, east_m=RANGE_M))
+    channel = ChannelEmulator(EmulatorConfig(modem=modems, pty_dir=tmp_path / "modems", time_scale=SCALE))
     channel.start()
     pair = [Client(f"m{d.address}", d.device, tmp_path) for d in channel.devices()]
     yield pair[0], pair[1]

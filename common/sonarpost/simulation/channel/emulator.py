@@ -13,21 +13,17 @@ import select
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from enum import Enum
-from pathlib import Path
-from types import MappingProxyType
 from typing import IO
 
 from sonarpost.errors import PortError
 from sonarpost.simulation.channel.acoustics import LocalPosition
+from sonarpost.simulation.channel.config import EmulatorConfig
 from sonarpost.simulation.channel.host_ports import HostPort, PtyPort, TcpPort
 from sonarpost.simulation.channel.packet_log import PacketLog, PacketTotals
-from sonarpost.simulation.channel.parameters import ChannelParameters
 from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
 from sonarpost.simulation.modem.receiver import HostOutput, PacketReport
-from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
 log = logging.getLogger(__name__)
 
@@ -64,64 +60,6 @@ class TimeScale:
     def wait_s(self, simulated_s: float, real_s: float) -> float:
         """Return the real seconds from the reading `real_s` until `simulated_s`, never below zero."""
         return max(0.0, self.started_s + simulated_s / self.scale - real_s)
-
-
-@dataclass(frozen=True, slots=True)
-class ModemSite:
-    """Address and position of one modem."""
-
-    address: int
-    position: LocalPosition = field(default_factory=LocalPosition)
-
-
-@dataclass(frozen=True, slots=True)
-class EmulatorConfig:
-    """Configuration of a `ChannelEmulator`.
-
-    Attributes:
-        sites: The modems, at least one, with different addresses; numbered from 1 in this order.
-        channel: Parameters of the channel model.
-        modem: Configuration of every modem. The emulator sets address, clock and data timeout. The data timeout is two
-            seconds of real time at time scales above 1.
-        pty_dir: Folder for the links `modem-1`, `modem-2`, …; None for TCP.
-        tcp_ports: Ports to listen on, one for each modem (0 selects a free one), when `pty_dir` is None.
-        tcp_host: Address to listen on.
-        time_scale: Simulated seconds per real second, 0.01..10000.
-        serial_baud: Speed of the serial lines, or None for lines without delay.
-        log_path: File to append the log to, or None.
-        transponders: Positions of the ranging transponders, by their letters A to D.
-
-    Raises:
-        ValueError: A value outside its bounds.
-    """
-
-    sites: tuple[ModemSite, ...]
-    channel: ChannelParameters = field(default_factory=ChannelParameters)
-    modem: EmulatedModemConfig = field(default_factory=lambda: EmulatedModemConfig(address=0))
-    pty_dir: Path | None = None
-    tcp_ports: tuple[int, ...] = ()
-    tcp_host: str = "127.0.0.1"
-    time_scale: float = 1.0
-    serial_baud: float | None = None
-    log_path: Path | None = None
-    transponders: Mapping[str, LocalPosition] = field(default_factory=lambda: MappingProxyType({}))
-
-    def __post_init__(self) -> None:
-        addresses = [site.address for site in self.sites]
-        if not addresses or len(set(addresses)) != len(addresses):
-            raise ValueError(f"sites: got addresses {addresses}, expected at least one, and all different")
-        if not all(0 <= address <= 127 for address in addresses):
-            raise ValueError(f"sites: got addresses {addresses}, expected 0..127")
-        if self.pty_dir is None and len(self.tcp_ports) != len(self.sites):
-            raise ValueError(
-                f"tcp_ports: got {len(self.tcp_ports)}, expected one for each of {len(self.sites)} modems, or pty_dir"
-            )
-        if unknown := set(self.transponders) - set("ABCD"):
-            raise ValueError(f"transponders: got {sorted(unknown)}, expected letters A to D")
-        if not 0.01 <= self.time_scale <= 10_000:
-            raise ValueError(f"time_scale: got {self.time_scale!r}, expected 0.01..10000")
-        if self.serial_baud is not None and not 0 < self.serial_baud < math.inf:
-            raise ValueError(f"serial_baud: got {self.serial_baud!r}, expected bits a second above 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,8 +123,8 @@ class ChannelEmulator:
             raise RuntimeError("a ChannelEmulator can be opened only once")
         self._state = _State.OPEN
         try:
-            self._log = PacketLog(self.config.log_path, self._echo)
-            for number in range(1, len(self.config.sites) + 1):
+            self._log = PacketLog(self.config.log, self._echo)
+            for number in range(1, len(self.config.modem) + 1):
                 self._lines[number] = _HostLine(self._open_port(number))
         except PortError:
             self._state = _State.CLOSED
@@ -223,8 +161,8 @@ class ChannelEmulator:
 
     def devices(self) -> list[Device]:
         """Return the device of every modem, by modem number."""
-        sites = self.config.sites
-        return [Device(number, sites[number - 1].address, line.port.device) for number, line in self._lines.items()]
+        modems = self.config.modem
+        return [Device(number, modems[number - 1].address, line.port.device) for number, line in self._lines.items()]
 
     def totals(self) -> PacketTotals:
         """Return the counts of packets and frames so far."""
@@ -247,28 +185,30 @@ class ChannelEmulator:
             self._write("move", modem=modem, position_m=asdict(position))
 
     def _open_port(self, number: int) -> HostPort:
-        if self.config.pty_dir is not None:
-            return PtyPort(self.config.pty_dir / f"modem-{number}")
-        return TcpPort(self.config.tcp_host, self.config.tcp_ports[number - 1])
+        if self.config.tcp_ports:
+            return TcpPort(self.config.tcp_host, self.config.tcp_ports[number - 1])
+        return PtyPort(self.config.pty_dir / f"modem-{number}")
 
     def _make_simulator(self) -> ChannelSimulator:
-        timeout_s = math.ceil(max(2.0, 2.0 * self.config.time_scale))
-        template = replace(self.config.modem, utc_at_zero_s=time.time(), data_timeout_s=timeout_s)
+        # Two seconds of real time at time scales above 1.
+        data_timeout_s = math.ceil(max(2.0, 2.0 * self.config.time_scale))
+        now_utc_s = time.time()
         modems = {
-            number: PlacedModem(replace(template, address=site.address), site.position)
-            for number, site in enumerate(self.config.sites, start=1)
+            number: PlacedModem(self.config.modem_config(modem, now_utc_s, data_timeout_s), modem.position)
+            for number, modem in enumerate(self.config.modem, start=1)
         }
-        return ChannelSimulator(self.config.channel, modems, self.config.serial_baud, self.config.transponders)
+        transponders = {str(site.letter): site.position for site in self.config.transponder}
+        return ChannelSimulator(self.config.parameters, modems, self.config.serial_baud or None, transponders)
 
     def _settings(self) -> dict[str, object]:
         modems = [
             {"modem": device.modem, "address": device.address, "device": device.device, "position_m": asdict(position)}
-            for device, position in zip(self.devices(), (site.position for site in self.config.sites), strict=True)
+            for device, position in zip(self.devices(), (modem.position for modem in self.config.modem), strict=True)
         ]
         return {
             "time_scale": self.config.time_scale,
-            "serial_baud": self.config.serial_baud,
-            "water": self.config.channel.model_dump(mode="json"),
+            "serial_baud": self.config.serial_baud or None,
+            "water": self.config.parameters.model_dump(mode="json"),
             "modems": modems,
         }
 

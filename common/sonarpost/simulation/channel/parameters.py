@@ -151,8 +151,17 @@ def build_parameters(values: Mapping[str, Value], where: str) -> ChannelParamete
         # As JSON, where strict validation accepts the text of an enumeration.
         return ChannelParameters.model_validate_json(json.dumps(merged, default=str), strict=True)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        expected = expected_text(first["type"], first["msg"])
-        if first["type"] == "extra_forbidden":
-            expected = f"one of {', '.join(['preset', *ChannelParameters.model_fields])}"
-        raise ConfigError(where, str(first["loc"][0]), first["input"], expected) from error
+        raise config_error(where, error) from error
+
+
+def config_error(where: str, error: ValidationError) -> ConfigError:
+    """Return the error that names the first wrong parameter."""
+    first = error.errors(include_url=False)[0]
+    expected = expected_text(first["type"], first["msg"])
+    if first["type"] == "extra_forbidden":
+        expected = f"one of {', '.join(['preset', *ChannelParameters.model_fields])}"
+    if not first["loc"]:  # keys that do not fit together: the text has the form of a ConfigError
+        name, _, rest = expected.partition(": got ")
+        value, _, expected = rest.partition(", expected ")
+        return ConfigError(where, name, value, expected)
+    return ConfigError(where, ".".join(str(part) for part in first["loc"]), first["input"], expected)
