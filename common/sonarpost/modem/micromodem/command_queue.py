@@ -74,12 +74,7 @@ class CommandProgress(Enum):
 
 
 class CommandQueue:
-    """Runs a list of commands. Sentences that answer another command (a configuration dump) have no effect.
-
-    Args:
-        config: Time-outs and tries.
-        send: Sends a sentence.
-    """
+    """Runs a list of commands. Sentences that answer another command (a configuration dump) have no effect."""
 
     def __init__(self, config: MicroModemConfig, send: Callable[[Sentence], None]) -> None:
         self._config = config
@@ -99,12 +94,9 @@ class CommandQueue:
         return self._commands[self._index]
 
     def begin(self, commands: Sequence[ModemCommand], start_s: float, earlier_attempts: int = 0) -> None:
-        """Start a new list at the given time, at the next `poll`.
+        """Start a new list of at least one command at the first `poll` from `start_s` on.
 
-        Args:
-            commands: At least one.
-            start_s: Time at which the first may be sent.
-            earlier_attempts: Attempts of earlier lists, which lengthen the first wait.
+        `earlier_attempts`, those of earlier lists, lengthen the first wait.
         """
         self._commands = tuple(commands)
         self._index = 0

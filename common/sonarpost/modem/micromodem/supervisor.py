@@ -38,12 +38,7 @@ class Phase(Enum):
 
 
 class ModemSupervisor:
-    """Brings the modem to READY, and back to READY after any failure.
-
-    Args:
-        config: Address, settings and time-outs.
-        send: Sends a sentence.
-    """
+    """Brings the modem to READY, and back to READY after any failure."""
 
     def __init__(self, config: MicroModemConfig, send: Callable[[Sentence], None]) -> None:
         self.phase = Phase.CLOSED
@@ -128,12 +123,7 @@ class ModemSupervisor:
         return [UnhandledSentence(sentence)]
 
     def poll(self, now: float, *, may_check: bool) -> list[ModemEvent]:
-        """Do what is due.
-
-        Args:
-            now: Time on the driver's clock.
-            may_check: Whether the modem may be queried (no exchange is in progress).
-        """
+        """Do what is due; query a silent modem only with `may_check` (no exchange is in progress)."""
         if self.phase is Phase.CLOSED:
             return []
         if self.phase is Phase.READY:

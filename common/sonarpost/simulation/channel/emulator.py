@@ -93,7 +93,7 @@ class ChannelEmulator:
     """Emulated modems on pseudo-terminals or TCP ports, with the channel between them.
 
     Args:
-        config: Configuration.
+        config: Modems, ports and channel.
         echo: A second output for every line of the log.
     """
 
@@ -175,11 +175,7 @@ class ChannelEmulator:
             return sum(line.port.connected for line in self._lines.values())
 
     def move(self, modem: int, position: LocalPosition) -> None:
-        """Set a modem's position.
-
-        Raises:
-            KeyError: No modem of that number.
-        """
+        """Set a modem's position."""
         with self._lock:
             self._simulator.channel.move(modem, position)
             self._write("move", modem=modem, position_m=asdict(position))

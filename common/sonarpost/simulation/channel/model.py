@@ -141,12 +141,7 @@ class _ModemState:
 
 
 class ChannelModel:
-    """The acoustic channel shared by any number of modems.
-
-    Args:
-        parameters: Parameters of the model.
-        positions: Position of each modem, by its number.
-    """
+    """The acoustic channel shared by any number of modems, whose positions are given by their numbers."""
 
     def __init__(self, parameters: ChannelParameters, positions: Mapping[int, LocalPosition]) -> None:
         self.parameters = parameters

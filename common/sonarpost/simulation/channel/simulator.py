@@ -120,11 +120,7 @@ class ChannelSimulator:
         self._step(self.now)
 
     def modem(self, number: int) -> EmulatedMicroModem:
-        """Return one modem.
-
-        Raises:
-            KeyError: No modem of that number.
-        """
+        """Return one modem."""
         return self._ports[number].modem
 
     def receive(self, number: int, data: bytes, now: float) -> None:

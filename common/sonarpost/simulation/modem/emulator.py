@@ -44,7 +44,7 @@ class EmulatedMicroModem:
     """One emulated modem.
 
     Args:
-        config: Configuration.
+        config: Initial settings and timing.
         now: Simulated time at which it is switched on; it sends `CAREV,…,INIT`.
         travel_times: One-way travel times to transponders; none by default.
     """

@@ -29,13 +29,7 @@ _OTHER_DESTINATION = "addressed to another modem"
 
 @dataclass(frozen=True, slots=True)
 class PacketReport:
-    """Result of one packet for the host of one modem.
-
-    Attributes:
-        arrival: The packet and its outcome.
-        address: The modem's address at that moment.
-        unreported_reason: Why the host does not receive it; None when it does.
-    """
+    """A packet at one modem, with the modem's address, and why its host does not receive it (None when it does)."""
 
     arrival: ArrivalEnded
     address: int
@@ -55,8 +49,7 @@ class HostReport:
     """Sentences for the host about one packet.
 
     Attributes:
-        lines: The sentences.
-        unreported_reason: Why the received frames are not among them; None when they are.
+        unreported_reason: Why the received frames are not among the lines; None when they are.
         good_frames: Numbers of the frames without CRC error.
         missed: Whether nothing of the packet was received.
     """
@@ -80,13 +73,7 @@ class _ExpectedData:
 
 
 class Receiver:
-    """Receiving half of one modem.
-
-    Args:
-        config: The modem's configuration.
-        settings: The modem's settings.
-        clock: The modem's clock.
-    """
+    """Receiving half of one modem."""
 
     def __init__(self, config: EmulatedModemConfig, settings: ModemSettings, clock: ModemClock) -> None:
         self._config = config

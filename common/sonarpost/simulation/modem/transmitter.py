@@ -73,9 +73,6 @@ class Transmitter:
     `BusyError` while the host's previous command is not over.
 
     Args:
-        config: The modem's configuration.
-        settings: The modem's settings.
-        clock: The modem's clock.
         write: Sends a sentence to the host.
         expect_data: Called with the header of a poll after its transmission: data of another modem should follow.
     """
@@ -299,13 +296,6 @@ class TransponderRanging:
     The ping is a packet on the channel; transponders are not modems. Each replies after the turn-around time `TAT`, and
     counts if its reply arrives within the time-out of the command. At the time-out the modem reports the one-way travel
     times, with the time of the ping.
-
-    Args:
-        settings: The modem's settings.
-        clock: The modem's clock.
-        transmitter: The modem's transmitting half.
-        travel_times: Called at each ping.
-        write: Sends a sentence to the host.
     """
 
     def __init__(

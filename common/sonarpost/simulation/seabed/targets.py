@@ -79,7 +79,7 @@ class SeabedObject:
 
 def random_object(kind: ObjectKind, along_m: float, across_m: float, rng: np.random.Generator) -> SeabedObject:
     """Return an object with random dimensions typical of its kind, random orientation, and slight or no burial."""
-    length_m, width_m, height_m = _SIZES[kind](rng)
+    length_m, width_m, height_m = _random_size(kind, rng)
     return SeabedObject(
         kind=kind,
         along_m=along_m,
@@ -92,47 +92,28 @@ def random_object(kind: ObjectKind, along_m: float, across_m: float, rng: np.ran
     )
 
 
-def _cylinder_size(rng: np.random.Generator) -> tuple[float, float, float]:
-    diameter_m = rng.uniform(0.45, 0.6)
-    return rng.uniform(1.6, 2.6), diameter_m, diameter_m * rng.uniform(0.8, 1.0)
-
-
-def _cone_size(rng: np.random.Generator) -> tuple[float, float, float]:
-    base_m = rng.uniform(0.94, 1.05)
-    return base_m, base_m, 0.45 * base_m * rng.uniform(0.85, 1.0)
-
-
-def _sphere_size(rng: np.random.Generator) -> tuple[float, float, float]:
-    diameter_m = rng.uniform(0.8, 1.0)
-    return diameter_m, diameter_m, diameter_m * rng.uniform(0.75, 0.95)
-
-
-def _wedge_size(rng: np.random.Generator) -> tuple[float, float, float]:
-    return rng.uniform(0.95, 1.1), rng.uniform(0.75, 0.85), 0.38 * rng.uniform(0.9, 1.0)
-
-
-def _boulder_size(rng: np.random.Generator) -> tuple[float, float, float]:
-    length_m = rng.uniform(0.5, 1.6)
-    return length_m, length_m * rng.uniform(0.55, 0.95), length_m * rng.uniform(0.25, 0.6)
-
-
-def _debris_size(rng: np.random.Generator) -> tuple[float, float, float]:
-    return rng.uniform(2.0, 5.0), rng.uniform(0.8, 2.0), rng.uniform(0.12, 0.35)
-
-
-def _ridge_size(rng: np.random.Generator) -> tuple[float, float, float]:
-    return rng.uniform(4.0, 9.0), rng.uniform(0.7, 1.4), rng.uniform(0.18, 0.35)
-
-
-_SIZES: Final[dict[ObjectKind, Callable[[np.random.Generator], tuple[float, float, float]]]] = {
-    ObjectKind.CYLINDER: _cylinder_size,
-    ObjectKind.TRUNCATED_CONE: _cone_size,
-    ObjectKind.SPHERE: _sphere_size,
-    ObjectKind.WEDGE: _wedge_size,
-    ObjectKind.BOULDER: _boulder_size,
-    ObjectKind.DEBRIS: _debris_size,
-    ObjectKind.RIDGE: _ridge_size,
-}
+def _random_size(kind: ObjectKind, rng: np.random.Generator) -> tuple[float, float, float]:
+    """Return length, width and visible height."""
+    match kind:
+        case ObjectKind.CYLINDER:
+            diameter_m = rng.uniform(0.45, 0.6)
+            size = rng.uniform(1.6, 2.6), diameter_m, diameter_m * rng.uniform(0.8, 1.0)
+        case ObjectKind.TRUNCATED_CONE:
+            base_m = rng.uniform(0.94, 1.05)
+            size = base_m, base_m, 0.45 * base_m * rng.uniform(0.85, 1.0)
+        case ObjectKind.SPHERE:
+            diameter_m = rng.uniform(0.8, 1.0)
+            size = diameter_m, diameter_m, diameter_m * rng.uniform(0.75, 0.95)
+        case ObjectKind.WEDGE:
+            size = rng.uniform(0.95, 1.1), rng.uniform(0.75, 0.85), 0.38 * rng.uniform(0.9, 1.0)
+        case ObjectKind.BOULDER:
+            length_m = rng.uniform(0.5, 1.6)
+            size = length_m, length_m * rng.uniform(0.55, 0.95), length_m * rng.uniform(0.25, 0.6)
+        case ObjectKind.DEBRIS:
+            size = rng.uniform(2.0, 5.0), rng.uniform(0.8, 2.0), rng.uniform(0.12, 0.35)
+        case ObjectKind.RIDGE:
+            size = rng.uniform(4.0, 9.0), rng.uniform(0.7, 1.4), rng.uniform(0.18, 0.35)
+    return size
 
 
 def surface_height_m(item: SeabedObject, u_m: FloatMap, v_m: FloatMap) -> FloatMap:
