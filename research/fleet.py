@@ -285,7 +285,7 @@ def rows_ashore(out_dir: Path) -> int:
     """Return how many pictures c2 has in its index, each once."""
     index = ShoreIndex(out_dir, writable=False)
     try:
-        return len(index.pictures())
+        return len(index.images())
     finally:
         index.close()
 

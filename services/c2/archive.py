@@ -1,4 +1,4 @@
-"""What c2 keeps: the files of every picture and decision, their index, and what retention takes away again."""
+"""Stored images and decisions of c2: files, index and retention."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from sonarpost import keys
 from sonarpost.archive.image_files import add_image, image_file_name
 from sonarpost.archive.shore_files import (
-    add_missing,
     decision_file_name,
-    remove_files,
-    remove_unfinished,
-    row_of_image,
-    to_remove,
+    delete_image_files,
+    image_row_of_record,
+    index_missing_files,
+    remove_temporary_files,
+    select_for_removal,
 )
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, TaskingRow
 from sonarpost.errors import PayloadError
@@ -29,11 +29,10 @@ log = logging.getLogger(__name__)
 
 
 class Archive:
-    """The files and the index of one `out_dir`; the index is opened when it is first needed.
+    """Files and index of one `out_dir`; the index is opened when it is first required.
 
-    What is kept is on the disk, and in its place, after `flush`: many records share the waiting for the disk.
-
-    Every method raises OSError where the folder cannot be written at the moment, and may be called again.
+    Stored records are on the disk after `flush`, so that many records share one flush. Every method raises OSError if
+    the folder cannot be written, and can be called again.
     """
 
     def __init__(self, config: C2Config) -> None:
@@ -46,13 +45,13 @@ class Archive:
         self._decisions: list[Decision] = []
 
     def index(self) -> ShoreIndex:
-        """Return the open index, complete with whatever the files have and it had not."""
+        """Return the open index, completed from the files."""
         with self._lock:
             if self._index is None:
                 index = ShoreIndex(self._out_dir)
                 try:
-                    remove_unfinished(self._out_dir)
-                    added = add_missing(self._out_dir, index)
+                    remove_temporary_files(self._out_dir)
+                    added = index_missing_files(self._out_dir, index)
                 except BaseException:
                     index.close()
                     raise
@@ -61,31 +60,31 @@ class Archive:
                     log.info("Index completed from the files", extra=kv(file=index.path, rows=added))
             return self._index
 
-    def keep_image(self, image: ReconstructedImage, relayed_utc_s: float) -> bool:
-        """Write a picture's files, to be flushed, and index it; tell whether it was new."""
+    def store_image(self, image: ReconstructedImage, relayed_utc_s: float) -> bool:
+        """Write and index the files of an image; return whether it is new."""
         index = self.index()
         with self._lock:
             path, new = add_image(self._files, self._out_dir / image.vessel_id, image)
-            if new or not index.has_picture(image.vessel_id, image_file_name(image)):
+            if new or not index.has_image(image.vessel_id, image_file_name(image)):
                 self._images.append((image, relayed_utc_s))
         log.info(
-            "Picture accepted" if new else "Picture known already",
+            "Image stored" if new else "Image already stored",
             extra=kv(
                 vessel=image.vessel_id,
                 vehicle=image.vehicle_id,
                 image_id=image.image_id,
                 version=image.version,
-                on_the_way_s=round(time.time() - relayed_utc_s, 1),
+                transit_s=round(time.time() - relayed_utc_s, 1),
                 file=path,
             ),
         )
         return new
 
-    def keep_decision(self, decision: Decision) -> bool:
-        """Write a decision's file, to be flushed, and index it; tell whether it was new.
+    def store_decision(self, decision: Decision) -> bool:
+        """Write and index the file of a decision; return whether it is new.
 
         Raises:
-            PayloadError: Another decision has this identifier.
+            PayloadError: A different decision has this identifier.
         """
         index = self.index()
         folder = self._out_dir / decision.vessel_id / "decisions"
@@ -93,20 +92,20 @@ class Archive:
         path = folder / decision_file_name(decision.decision_id)
         text = (json.dumps(decision.model_dump(), indent=1) + "\n").encode()
         with self._lock:
-            kept = self._files.text_of(path) or (path.read_bytes() if path.is_file() else None)
-            if kept is not None and kept != text:
+            stored = self._files.text_of(path) or (path.read_bytes() if path.is_file() else None)
+            if stored is not None and stored != text:
                 raise PayloadError(
                     keys.contact_decision(decision.vessel_id),
                     "decision_id",
                     decision.decision_id,
                     f"an identifier that no other decision has ({path})",
                 )
-            if kept is None:
+            if stored is None:
                 self._files.add(path, text, last=True)
-            if kept is None or not index.has_decision(decision.vessel_id, decision.decision_id):
+            if stored is None or not index.has_decision(decision.vessel_id, decision.decision_id):
                 self._decisions.append(decision)
         log.info(
-            "Decision accepted",
+            "Decision stored",
             extra=kv(
                 vessel=decision.vessel_id,
                 vehicle=decision.vehicle_id,
@@ -114,42 +113,42 @@ class Archive:
                 verdict=decision.verdict,
             ),
         )
-        return kept is None
+        return stored is None
 
     def flush(self) -> None:
-        """Bring to the disk, and into the index, what was kept since the last time.
+        """Flush the records stored since the last call to the disk and add them to the index.
 
         Raises:
-            OSError: It cannot be; all of it is to be kept again.
+            OSError: It failed; all of these records have to be stored again.
         """
         with self._lock:
             images, self._images = self._images, []
             decisions, self._decisions = self._decisions, []
             files, self._files = self._files, AtomicFiles()
             files.commit()
-            rows: list[ImageRow | DecisionRow] = [row_of_image(self._out_dir, i, at) for i, at in images]
+            rows: list[ImageRow | DecisionRow] = [image_row_of_record(self._out_dir, i, at) for i, at in images]
             rows += [DecisionRow.of(decision, time.time()) for decision in decisions]
             if rows:
                 self.index().put(rows)
 
-    def keep_tasking(self, rows: Sequence[TaskingRow]) -> None:
+    def store_tasking(self, rows: Sequence[TaskingRow]) -> None:
         """Index advice and commands with their states."""
         self.index().put(rows)
 
     def apply_retention(self, now_utc_s: float) -> list[ImageRow]:
-        """Remove what is too old or too much; return what was removed."""
+        """Remove images by age and total size; return them."""
         if self._config.retain_days is None and self._config.max_bytes is None:
             return []
         with self._lock:
             index = self.index()
-            rows = to_remove(index.pictures(), now_utc_s, self._config.retain_days, self._config.max_bytes)
+            rows = select_for_removal(index.images(), now_utc_s, self._config.retain_days, self._config.max_bytes)
             for row in rows:
-                remove_files(self._out_dir, row)
+                delete_image_files(self._out_dir, row)
             if rows:
                 index.mark("removed_utc_s", rows, now_utc_s)
         for row in rows:
             log.warning(
-                "Picture removed by retention",
+                "Image removed by retention",
                 extra=kv(
                     vessel=row.vessel_id,
                     vehicle=row.vehicle_id,
@@ -161,8 +160,8 @@ class Archive:
             )
         return rows
 
-    def pictures_bytes(self) -> int:
-        """Return how much the kept pictures take, 0 while the index is not open."""
+    def images_bytes(self) -> int:
+        """Return the size of the stored images in bytes, 0 while the index is not open."""
         with self._lock:
             return 0 if self._index is None else self._index.size_bytes()
 

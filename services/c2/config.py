@@ -11,14 +11,14 @@ from sonarpost.messages import PlatformId
 
 
 class C2Config(ServiceConfig):
-    """Where accepted pictures and decisions are kept, and for how long.
+    """The `[c2]` table.
 
     Attributes:
         site: Name of this site in keys; relays name it in their upstreams.
-        out_dir: Folder of the accepted records, one folder a vessel in it, and their index.
-        retain_days: Pictures accepted longer ago are removed; None keeps them.
-        max_bytes: Most that pictures may take; beyond it exported ones are removed first, then the oldest. None for no
-            limit. Decisions are never removed.
+        out_dir: Folder of the stored records, with a folder for each vessel and an index.
+        retain_days: Age above which images are removed; None keeps them.
+        max_bytes: Maximum size of the stored images; above it exported ones are removed first, then the oldest. None
+            for no limit. Decisions are never removed.
     """
 
     site: PlatformId = SHORE

@@ -1,4 +1,4 @@
-"""The shore side: commits what vessels relay, keeps it, shows it, and owes vessels what the shore says to them."""
+"""Shore side of the relay: stores and publishes the records of vessels, and sends advice and commands to vessels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sonarpost import keys, wire
 from sonarpost.archive.shore_files import decision_file_name
 from sonarpost.bus.connectivity import declare_presence
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.records import InboxItem, OutboxItem, queue_of
+from sonarpost.delivery.records import InboxItem, OutboxItem, platform_of, queue_of
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import DeliveryError, PayloadError
 from sonarpost.logs import kv
@@ -32,37 +32,36 @@ log = logging.getLogger(__name__)
 COMMAND_PRIORITY = 1
 ADVICE_PRIORITY = 2
 CONSUMER = "relay"
-RETAIN_EVERY_S = 60.0
+RETENTION_INTERVAL_S = 60.0
 RETRY_S = 1.0
 
 
 class C2Service(Service[C2Config]):
-    """Accepts relayed records, and hands advice and commands down.
+    """Stores and publishes relayed records, and sends advice and commands to vessels.
 
-    A record is acknowledged to the vessel when it is in this service's store (that is the commit), and shown to
-    subscribers when its files are written. Subscribers may see a record again after a restart; they know it by its
-    identifiers.
+    A record is acknowledged to the vessel when it is committed to this service's store, and published to subscribers
+    when its files are written. A restart can publish a record again; subscribers identify it by its identifiers.
     """
 
     NAME = "c2"
     BATCH = 32
-    # What goes down to a vessel is shown there by its relay; a second copy would only load the radio link.
+    # The relay of the vessel publishes advice and commands; a copy from here would only load the radio link.
     PUBLISH = False
 
     def __init__(self, platform: PlatformConfig, config: C2Config) -> None:
         super().__init__(platform, config)
         self._archive = Archive(config)
-        self._retain_now = threading.Event()
+        self._retention_due = threading.Event()
         self._changed = threading.Event()
         self._changed_names: set[str] = set()
         self._changed_lock = threading.Lock()
-        self._background_problem: dict[str, str] = {}
+        self._background_faults: dict[str, str] = {}
         # Of the records that are handled and not committed yet.
-        self._to_show: list[tuple[str, Record]] = []
+        self._to_publish: list[tuple[str, Record]] = []
         self._uncommitted: dict[str, bytes] = {}
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """Whatever vessels relay to this site, and what the shore wants to say to them."""
+        """Relayed records of all vessels, and advice and commands for them."""
         site = self.config.site
         return {
             keys.shore_inbox_all(site): Relayed,
@@ -70,35 +69,35 @@ class C2Service(Service[C2Config]):
             keys.tasking_command_all(site): Command,
         }
 
-    # From the vessels
+    # Records of vessels
 
     def validate(self, key: str, record: Record) -> None:
-        """Refuse what would not be understood later, while its sender can still be told."""
+        """Refuse records that cannot be handled later, so that their senders are informed."""
         if isinstance(record, Relayed):
             if key != keys.shore_inbox(record.vessel_id, self.config.site):
-                # Access control lets a vessel write under its own key only: no vessel speaks for another.
+                # Access control restricts a vessel to its own key, so the key proves the vessel.
                 raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
-            self._open(record)
+            self._unpack(record)
             return
         assert isinstance(record, (Advice, Command))
         vessel = keys.tasking_vessel(key)
         if isinstance(record, Advice) and record.vessel_id != vessel:
             raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
-        self._known(vessel, key, record)
+        self._is_known(vessel, key, record)
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """Keep and show what a vessel relays; owe a vessel what is for it."""
+        """Store the record of a vessel, or queue advice and commands for one."""
         if isinstance(record, Relayed):
-            inner = self._open(record)
+            inner = self._unpack(record)
             if isinstance(inner, ReconstructedImage):
-                self._keep_image(inner, record.relayed_utc_s, effects)
+                self._store_image(inner, record.relayed_utc_s, effects)
             else:
-                self._keep_decision(inner, effects)
+                self._store_decision(inner, effects)
         else:
             assert isinstance(record, (Advice, Command))
-            self._pass_down(keys.tasking_vessel(key), key, record, effects)
+            self._send_to_vessel(keys.tasking_vessel(key), key, record, effects)
 
-    def _open(self, envelope: Relayed) -> ReconstructedImage | Decision:
+    def _unpack(self, envelope: Relayed) -> ReconstructedImage | Decision:
         vessel = envelope.vessel_id
         known: Mapping[str, type[ReconstructedImage] | type[Decision]] = {
             keys.image_reconstructed(vessel): ReconstructedImage,
@@ -112,166 +111,166 @@ class C2Service(Service[C2Config]):
             raise PayloadError(envelope.key, "vessel_id", inner.vessel_id, vessel)
         return inner
 
-    def _keep_image(self, image: ReconstructedImage, relayed_utc_s: float, effects: UnitOfWork) -> None:
-        new = self._archive.keep_image(image, relayed_utc_s)
+    def _store_image(self, image: ReconstructedImage, relayed_utc_s: float, effects: UnitOfWork) -> None:
+        new = self._archive.store_image(image, relayed_utc_s)
         effects.count("images_stored" if new else "images_repeated")
-        self._to_show.append((keys.shore_image(image.vessel_id, self.config.site), image))
+        self._to_publish.append((keys.shore_image(image.vessel_id, self.config.site), image))
 
-    def _keep_decision(self, decision: Decision, effects: UnitOfWork) -> None:
-        new = self._archive.keep_decision(decision)
+    def _store_decision(self, decision: Decision, effects: UnitOfWork) -> None:
+        new = self._archive.store_decision(decision)
         effects.count("decisions_stored" if new else "decisions_repeated")
-        self._to_show.append((keys.shore_decision(decision.vessel_id, self.config.site), decision))
+        self._to_publish.append((keys.shore_decision(decision.vessel_id, self.config.site), decision))
 
     def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
-        """Commit when the files of all are on the disk and have been shown.
+        """Commit after the files of all records are on the disk and published.
 
         Raises:
-            OSError, DeliveryError: They cannot be written now; all are handled again.
+            OSError, DeliveryError: They cannot be written; all records are handled again.
         """
         try:
             self._archive.flush()
-            for key, record in self._to_show:
-                self._show(key, record)
+            for key, record in self._to_publish:
+                self._publish(key, record)
             superseded = super().commit_batch(handled)
         finally:
-            self._to_show.clear()
+            self._to_publish.clear()
             self._uncommitted.clear()
         if self.config.max_bytes is not None and any(effects.counts.get("images_stored") for effects, _ in handled):
-            self._retain_now.set()
+            self._retention_due.set()
         return superseded
 
-    # To the vessels
+    # Records for vessels
 
-    def _known(self, vessel: str, key: str, record: Advice | Command) -> bool:
-        """Tell whether a record was taken before.
+    def _is_known(self, vessel: str, key: str, record: Advice | Command) -> bool:
+        """Return whether a record was accepted before.
 
         Raises:
-            PayloadError: Another one with this identifier was.
+            PayloadError: A different one with this identifier was.
         """
-        name = tasking.name_of(vessel, *tasking.kind_and_id(record))
-        kept = self._uncommitted.get(name) or self.store.get_state(name)
-        if kept is None:
+        name = tasking.state_name(vessel, *tasking.kind_and_id(record))
+        known = self._uncommitted.get(name) or self.store.get_state(name)
+        if known is None:
             return False
-        tasking.refuse_another(Tasking.unpack(kept), record, key)
+        tasking.reject_conflict(Tasking.unpack(known), record, key)
         return True
 
-    def _pass_down(self, vessel: str, key: str, record: Advice | Command, effects: UnitOfWork) -> None:
-        if self._known(vessel, key, record):
+    def _send_to_vessel(self, vessel: str, key: str, record: Advice | Command, effects: UnitOfWork) -> None:
+        if self._is_known(vessel, key, record):
             effects.count("tasking_repeated")
             return
         payload = effects.payload
         kind, record_id = tasking.kind_and_id(record)
         item = Tasking(vessel, kind, payload, changed_utc_s=time.time())
         priority = ADVICE_PRIORITY if isinstance(record, Advice) else COMMAND_PRIORITY
-        # One queue a vessel: one that is away holds no other back.
+        # One queue for each vessel: an unreachable vessel does not delay the others.
         effects.send_payload(item.key, queue_of(CONSUMER, vessel), payload, type(record), priority=priority)
         packed = item.pack()
         effects.put_state(item.name, packed)
         self._uncommitted[item.name] = packed
         effects.count("tasking_accepted")
-        self._tell(item.name)
+        self._mark_changed(item.name)
         log.info(
-            "Accepted for a vessel",
+            "Record queued for a vessel",
             extra=kv(
                 vessel=vessel, kind=kind, record_id=record_id, vehicle=record.vehicle_id, image_id=record.image_id
             ),
         )
 
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
-        """Remember, with the acknowledgement itself, that a vessel has taken or refused a record."""
-        vessel = item.queue.partition("@")[2]
+        """Store that a vessel has accepted or refused a record, in the transaction of its acknowledgement."""
+        vessel = platform_of(item.queue)
         was = tasking.of_payload(vessel, item.key, item.payload)
         now = replace(
             was, state="delivered" if reason is None else "refused", reason=reason or "", changed_utc_s=time.time()
         )
         tx.put_state(now.name, now.pack())
-        self._tell(now.name)
+        self._mark_changed(now.name)
 
-    def _tell(self, name: str) -> None:
+    def _mark_changed(self, name: str) -> None:
         with self._changed_lock:
             self._changed_names.add(name)
         self._changed.set()
 
-    def _show_states(self) -> None:
-        """Show and index the states that have changed, as they are committed; after a start all of them once."""
+    def _publish_states(self) -> None:
+        """Publish and index changed states after their commit; after a start all states once."""
         with self._changed_lock:
             self._changed_names.update(self.store.state_names(tasking.PREFIX))
         while not self.stopping.is_set():
             self._changed.clear()
             try:
-                self._show_changed()
-                self._background_problem.pop("tasking", None)
+                self._publish_changed()
+                self._background_faults.pop("tasking", None)
             except (OSError, DeliveryError) as error:
-                self._background_problem["tasking"] = f"{type(error).__name__}: {error}"
+                self._background_faults["tasking"] = f"{type(error).__name__}: {error}"
             except ServiceStoppingError:
                 return
             self._changed.wait(RETRY_S)
 
-    def _show_changed(self) -> None:
-        # Taken out before they are read: what changes from now on is told again.
+    def _publish_changed(self) -> None:
+        # Cleared before the states are read: later changes are published again.
         with self._changed_lock:
             names, self._changed_names = self._changed_names, set()
         try:
             for name in sorted(names):
-                kept = self.store.get_state(name)
-                if kept is None:
-                    continue  # told before it was committed
-                item = Tasking.unpack(kept)
-                self._archive.keep_tasking([item.row()])
-                self._show(keys.tasking_state(item.vessel_id, self.config.site), item.state_record())
+                packed = self.store.get_state(name)
+                if packed is None:
+                    continue  # not committed yet
+                item = Tasking.unpack(packed)
+                self._archive.store_tasking([item.row()])
+                self._publish(keys.tasking_state(item.vessel_id, self.config.site), item.state_record())
                 names.discard(name)
         finally:
             with self._changed_lock:
                 self._changed_names |= names
 
-    # Life
+    # Start and stop
 
     def on_start(self) -> None:
-        """Begin to remove what is too old, and to show how far advice and commands have come."""
-        self.start_thread(self._retain, "retention")
-        self.start_thread(self._show_states, "tasking")
+        """Start the retention and the publication of delivery states."""
+        self.start_thread(self._run_retention, "retention")
+        self.start_thread(self._publish_states, "tasking")
         declare_presence(self.session, self.platform.id, self.NAME, self.config.site)
 
     def on_stop(self) -> None:
-        """Wake what waits."""
-        self._retain_now.set()
+        """Wake the background threads."""
+        self._retention_due.set()
         self._changed.set()
 
     def stop(self) -> None:
-        """Stop, and close the index when nothing uses it any more."""
+        """Stop, then close the index."""
         super().stop()
         self._archive.close()
 
-    def _retain(self) -> None:
+    def _run_retention(self) -> None:
         while not self.stopping.is_set():
-            self._retain_now.clear()
+            self._retention_due.clear()
             try:
                 removed = self._archive.apply_retention(time.time())
                 if removed:
                     self.count("images_removed", len(removed))
-                self._background_problem.pop("retention", None)
+                self._background_faults.pop("retention", None)
             except OSError as error:
-                self._background_problem["retention"] = f"pictures cannot be removed: {error}"
-                log.error("Retention cannot work", extra=kv(reason=str(error)))
-            self._retain_now.wait(RETAIN_EVERY_S)
+                self._background_faults["retention"] = f"images cannot be removed: {error}"
+                log.error("Retention failed", extra=kv(reason=str(error)))
+            self._retention_due.wait(RETENTION_INTERVAL_S)
 
     def degraded_reason(self) -> str:
-        """Return what keeps the background work from being done."""
-        return "; ".join(tuple(self._background_problem.values()))
+        """Return the faults of the background threads."""
+        return "; ".join(tuple(self._background_faults.values()))
 
     def gauges(self) -> Mapping[str, float]:
-        """Return how much is kept, and how much waits for vessels."""
+        """Return the size of the stored images and the number of records queued for vessels."""
         waiting = [q for q in self.store.queues() if q.startswith(CONSUMER)]
         return {
-            "pictures_bytes": float(self._archive.pictures_bytes()),
+            "pictures_bytes": float(self._archive.images_bytes()),
             "waiting_for_vessels": float(sum(self.store.queue_depth(queue).records for queue in waiting)),
         }
 
-    def _show(self, key: str, record: Record) -> None:
+    def _publish(self, key: str, record: Record) -> None:
         try:
             self.session.put(key, wire.encode(record), encoding=wire.encoding_of(type(record)))
         except zenoh.ZError as error:
             if self.stopping.is_set():
-                # The session closed under us: the record is shown after the next start.
+                # The session was closed: the record is published after the next start.
                 raise ServiceStoppingError from error
-            log.warning("Record not shown to the shore", extra=kv(key=key, error=str(error)))
+            log.warning("Record not published", extra=kv(key=key, error=str(error)))

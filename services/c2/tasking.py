@@ -1,4 +1,4 @@
-"""How far advice and commands for vessels have come: remembered with the hand-off itself, shown afterwards."""
+"""Delivery state of advice and commands for vessels; stored with the delivery itself, published afterwards."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PREFIX = "tasking/"
 
 @dataclass(frozen=True, slots=True)
 class Tasking:
-    """One piece of advice or one command for a vessel, with its state."""
+    """Advice or a command for a vessel, with its delivery state."""
 
     vessel_id: str
     kind: TaskingKind
@@ -39,30 +39,30 @@ class Tasking:
 
     @property
     def name(self) -> str:
-        """Under which the store remembers it."""
-        return name_of(self.vessel_id, self.kind, self.record_id)
+        """Name of its state in the store."""
+        return state_name(self.vessel_id, self.kind, self.record_id)
 
     @property
     def key(self) -> str:
-        """Key on which the vessel's relay takes it."""
+        """Key on which the vessel's relay receives it."""
         record = self.record
         if isinstance(record, Advice):
             return keys.advice(self.vessel_id)
         return keys.command(self.vessel_id, record.kind)
 
     def pack(self) -> bytes:
-        """Return it as bytes for the store."""
+        """Return the bytes for the store."""
         fields = (self.vessel_id, self.kind, self.payload, self.state, self.reason, self.changed_utc_s)
         packed: bytes = msgpack.packb(fields)
         return packed
 
     @classmethod
     def unpack(cls, data: bytes) -> Tasking:
-        """Read what `pack` made."""
+        """Parse the bytes of `pack`."""
         return cls(*msgpack.unpackb(data))
 
     def state_record(self) -> TaskingState:
-        """Return what the shore's subscribers are shown."""
+        """Return the record for the shore's subscribers."""
         return TaskingState(
             vessel_id=self.vessel_id,
             kind=self.kind,
@@ -73,7 +73,7 @@ class Tasking:
         )
 
     def row(self) -> TaskingRow:
-        """Return the index's row."""
+        """Return the row of the index."""
         record = self.record
         if isinstance(record, Advice):
             summary, author, issued_utc_s = _advice_summary(record), record.author, record.advised_utc_s
@@ -94,31 +94,27 @@ class Tasking:
         )
 
 
-def name_of(vessel: str, kind: TaskingKind, record_id: str) -> str:
-    """Return the name under which the store remembers a record for a vessel."""
+def state_name(vessel: str, kind: TaskingKind, record_id: str) -> str:
+    """Return the name of a record's state in the store."""
     return f"{PREFIX}{vessel}/{kind}/{record_id}"
 
 
 def of_payload(vessel: str, key: str, payload: bytes) -> Tasking:
-    """Return the tasking that a record owed to a vessel's relay is.
-
-    Raises:
-        PayloadError: It is none.
-    """
+    """Return the tasking of a record that is queued for a vessel's relay."""
     kind: TaskingKind = "advice" if key == keys.advice(vessel) else "command"
     return Tasking(vessel, kind, payload)
 
 
 def kind_and_id(record: Advice | Command) -> tuple[TaskingKind, str]:
-    """Return what kind of record this is, and its identifier."""
+    """Return kind and identifier of a record."""
     return ("advice", record.advice_id) if isinstance(record, Advice) else ("command", record.command_id)
 
 
-def refuse_another(known: Tasking, record: Advice | Command, key: str) -> None:
-    """Refuse a record whose identifier another one has.
+def reject_conflict(known: Tasking, record: Advice | Command, key: str) -> None:
+    """Reject a record with the identifier of a different one.
 
     Raises:
-        PayloadError: It is another one.
+        PayloadError: The records differ.
     """
     if known.record != record:
         kind, record_id = kind_and_id(record)

@@ -1,1 +1,1 @@
-"""Relay: the vessel to the shore, store and forward."""
+"""Store-and-forward between the vessel and its shore sites."""

@@ -15,15 +15,15 @@ ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 
 
 class UpstreamOptions(ServiceConfig):
-    """One site above the water that is to have everything.
+    """A shore site that receives all images and decisions.
 
     Attributes:
         site: Name of the site, `site` in its c2's table.
-        router: Zenoh endpoints for a session of this upstream's own, tried in turn; by default the site is reached
-            through the platform's router and the links that has.
-        bandwidth_bytes_per_s: Most that is sent to this site, headers included; no limit by default.
-        max_bytes: Most that waits for this site. Beyond it pictures are dropped for this site, later versions before
-            first ones and the oldest first; decisions never. No limit by default.
+        router: Zenoh endpoints of the site's own router, tried in turn. By default the site is reached through the
+            platform's router and its links.
+        bandwidth_bytes_per_s: Bandwidth limit for this site, headers included; no limit by default.
+        max_bytes: Maximum size of this site's queue. Above it images are dropped for this site: later versions before
+            first ones, oldest first. Decisions are never dropped. No limit by default.
     """
 
     site: PlatformId = SHORE
@@ -33,15 +33,15 @@ class UpstreamOptions(ServiceConfig):
 
 
 class RelayConfig(ServiceConfig):
-    """Where records go, and what is done while they cannot.
+    """The `[relay]` table.
 
     Attributes:
-        upstreams: Sites, each with a queue of its own; none means the one site `shore`.
-        supersede: A newer version of a picture takes the place of older ones that no piece of has been sent of.
-        disk_reserve_bytes: Free space below which pictures are left with their senders; decisions are still taken.
-        advice_consumers: Who takes advice on the vessel; without any, advice is refused and the shore is told.
-        command_consumers: Who takes commands on the vessel; without any, commands are refused and the shore is told.
-        drop_removed_upstreams: Forget what waits for a site that is not among the upstreams any more.
+        upstreams: Sites, each with its own queue; empty means the single site `shore`.
+        supersede: A newer version of an image replaces queued older ones whose transfer has not started.
+        disk_reserve_bytes: Free space below which images are not accepted; decisions still are.
+        advice_consumers: Services on the vessel that receive advice; without any, advice is refused.
+        command_consumers: Services on the vessel that receive commands; without any, commands are refused.
+        drop_removed_upstreams: Drop the records queued for sites that are no longer configured.
     """
 
     upstreams: tuple[UpstreamOptions, ...] = ()
@@ -67,5 +67,5 @@ class RelayConfig(ServiceConfig):
         return tuple(dict.fromkeys(names))
 
     def sites(self) -> tuple[UpstreamOptions, ...]:
-        """Return the upstreams, the one site `shore` where none is written."""
+        """Return the upstreams; the single site `shore` if none is configured."""
         return self.upstreams or (UpstreamOptions(),)

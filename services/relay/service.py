@@ -1,4 +1,4 @@
-"""Carries what the vessel knows ashore, and what the shore says down, over links that come and go."""
+"""Store-and-forward between a vessel and its shore sites, over intermittent links."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.bus.connectivity import MonitoredSite, SiteMonitor
 from sonarpost.bus.session import open_with_retry
-from sonarpost.config import PlatformConfig
+from sonarpost.config import PlatformConfig, TlsConfig
 from sonarpost.delivery.outbox import QueuePolicy
-from sonarpost.delivery.records import InboxItem, Topic
+from sonarpost.delivery.records import InboxItem, Topic, consumer_of, queue_of
 from sonarpost.delivery.store import DiskReserve
 from sonarpost.errors import PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
 from sonarpost.runtime.service import Service, UnitOfWork
-from sonarpost.services.relay.config import RelayConfig
-from sonarpost.services.relay.upstreams import Upstream, is_upstream_queue
+from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
 
 log = logging.getLogger(__name__)
 
-# Advice and commands go on as urgently as they came; a decision is a few bytes that somebody waits for; the first
-# version of every picture comes before more detail of any.
+CONSUMER = "c2"
+SESSION_JOIN_S = 0.5
+# Advice and commands keep the urgency with which they arrived. A decision is small and awaited. The first version of
+# every image precedes more detail of any image.
 COMMAND_PRIORITY = 1
 ADVICE_PRIORITY = 2
 DECISION_PRIORITY = 2
@@ -34,10 +35,65 @@ PREVIEW_PRIORITY = 5
 DETAIL_PRIORITY = 6
 
 
-class RelayService(Service[RelayConfig]):
-    """Owes the vessel's records to every site until each has committed them, and the shore's to the vessel.
+class Upstream:
+    """A shore site: its queue, and its session if it has its own router.
 
-    Each site has a queue of its own: one that is away for days holds no other back.
+    Args:
+        options: Configuration of the site.
+        tls: The host's own certificate.
+    """
+
+    def __init__(self, options: UpstreamOptions, tls: TlsConfig | None) -> None:
+        self.options = options
+        # The queue of the default site has the name that it had before several sites were supported.
+        self.queue = CONSUMER if options.site == keys.SHORE else queue_of(CONSUMER, options.site)
+        self._tls = tls
+        self._session: zenoh.Session | None = None
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        self._lock = threading.Lock()
+
+    def queue_policy(self) -> QueuePolicy:
+        """Return the settings of the queue. Records are not published: c2 publishes them at the shore."""
+        session = self.session if self.options.router else None
+        return QueuePolicy(session=session, publish=False, bytes_per_s=self.options.bandwidth_bytes_per_s)
+
+    def session(self) -> zenoh.Session | None:
+        """Return the site's own session, None while it is not open."""
+        return self._session
+
+    def start(self) -> None:
+        """Start to connect to the site's own router, if it has one."""
+        if self.options.router:
+            self._thread = threading.Thread(target=self._open, name=f"upstream-{self.options.site}", daemon=True)
+            self._thread.start()
+
+    def _open(self) -> None:
+        session = open_with_retry(self.options.router, self._stop, self._tls)
+        with self._lock:
+            if session is not None and self._stop.is_set():
+                session.close()
+                return
+            self._session = session
+        if session is not None:
+            router = ", ".join(self.options.router)
+            log.info("Router of a site reached", extra=kv(site=self.options.site, router=router))
+
+    def stop(self) -> None:
+        """Close the session; unacknowledged records stay in the store."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(timeout=SESSION_JOIN_S)
+        with self._lock:
+            if self._session is not None:
+                self._session.close()
+                self._session = None
+
+
+class RelayService(Service[RelayConfig]):
+    """Sends the vessel's images and decisions to every shore site, and the shore's records to the vessel's services.
+
+    Each site has its own queue: an unreachable site does not delay the others.
     """
 
     NAME = "relay"
@@ -45,24 +101,21 @@ class RelayService(Service[RelayConfig]):
 
     def __init__(self, platform: PlatformConfig, config: RelayConfig) -> None:
         super().__init__(platform, config)
-        upstreams = (Upstream(site, self._open_session) for site in config.sites())
+        upstreams = [Upstream(site, platform.tls) for site in config.sites()]
         self._upstreams = {upstream.queue: upstream for upstream in upstreams}
-        # By queue: where the site takes what this vessel sends.
-        self._inboxes = {queue: keys.shore_inbox(platform.id, u.site) for queue, u in self._upstreams.items()}
-        self._watch = SiteMonitor(platform.id, [self._site(u) for u in self._upstreams.values()], platform.tls)
-        self._picture_room = DiskReserve(self.store, config.disk_reserve_bytes, "pictures wait with their senders")
+        sites = [self._monitored(upstream) for upstream in upstreams]
+        self._site_monitor = SiteMonitor(platform.id, sites, platform.tls)
+        self._image_reserve = DiskReserve(self.store, config.disk_reserve_bytes, "senders keep their images")
 
-    def _site(self, upstream: Upstream) -> MonitoredSite:
-        """Return how a site is asked whether it is reached: on the session that leads to it."""
-        if upstream.own_router:
-            return MonitoredSite(upstream.site, lambda: upstream.session, upstream.own_router)
-        return MonitoredSite(upstream.site, lambda: self.session, self.platform.upstream)
-
-    def _open_session(self, endpoints: Sequence[str], stop: threading.Event) -> zenoh.Session | None:
-        return open_with_retry(endpoints, stop, self.platform.tls)
+    def _monitored(self, upstream: Upstream) -> MonitoredSite:
+        """Return the site with the session and the routers that lead to it."""
+        options = upstream.options
+        if options.router:
+            return MonitoredSite(options.site, upstream.session, options.router)
+        return MonitoredSite(options.site, lambda: self.session, self.platform.upstream)
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """Pictures and decisions of this vessel, and what the shore says to it."""
+        """Images and decisions of this vessel, advice and commands for it."""
         vessel = self.platform.id
         return {
             keys.image_reconstructed(vessel): ReconstructedImage,
@@ -72,35 +125,35 @@ class RelayService(Service[RelayConfig]):
         }
 
     def delivery_only_keys(self) -> Collection[str]:
-        """On these keys the vessel's own programs speak to the consumers that this service hands on to."""
+        """Plain publications on these keys are for the consumers on the vessel."""
         return (keys.advice(self.platform.id), keys.command_all(self.platform.id))
 
     def check_capacity(self, key: str) -> None:
-        """Leave pictures with their senders while the disk is as good as full; what is small is taken for longer."""
+        """Reject images below `disk_reserve_bytes`; other records are small and are accepted for longer."""
         super().check_capacity(key)
         if key == keys.image_reconstructed(self.platform.id):
-            self._picture_room.require()
+            self._image_reserve.require()
 
     def validate(self, key: str, record: Record) -> None:
-        """Refuse what c2 or nobody on this vessel would take, while its sender can be told."""
+        """Refuse records of other vessels, and records without a consumer."""
         vessel = self.platform.id
         if isinstance(record, Command):
             if key != keys.command(vessel, record.kind):
                 raise PayloadError(key, "kind", record.kind, "the kind in the key")
-            self._need(self.config.command_consumers, key, "command_consumers")
+            self._require(self.config.command_consumers, key, "command_consumers")
             return
         assert isinstance(record, (ReconstructedImage, Decision, Advice))
         if record.vessel_id != vessel:
             raise PayloadError(record.TYPE, "vessel_id", record.vessel_id, vessel)
         if isinstance(record, Advice):
-            self._need(self.config.advice_consumers, key, "advice_consumers")
+            self._require(self.config.advice_consumers, key, "advice_consumers")
 
-    def _need(self, consumers: Sequence[str], key: str, option: str) -> None:
+    def _require(self, consumers: Sequence[str], key: str, option: str) -> None:
         if not consumers:
-            raise PayloadError(key, "", f"nobody who takes it on {self.platform.id}", f"a name in [relay] {option}")
+            raise PayloadError(key, "", f"no consumer on {self.platform.id}", f"a name in [relay] {option}")
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """Owe the record to every site, or to every consumer on the vessel."""
+        """Queue the record for every site, or for every configured consumer on the vessel."""
         if isinstance(record, Advice):
             for consumer in self.config.advice_consumers:
                 effects.send_payload(key, consumer, effects.payload, Advice, priority=ADVICE_PRIORITY)
@@ -111,9 +164,9 @@ class RelayService(Service[RelayConfig]):
             effects.count("commands_taken")
         else:
             assert isinstance(record, (ReconstructedImage, Decision))
-            self._send_ashore(key, record, effects)
+            self._queue_for_sites(key, record, effects)
 
-    def _send_ashore(self, key: str, record: ReconstructedImage | Decision, effects: UnitOfWork) -> None:
+    def _queue_for_sites(self, key: str, record: ReconstructedImage | Decision, effects: UnitOfWork) -> None:
         vessel = self.platform.id
         envelope = Relayed(vessel_id=vessel, key=key, payload=effects.payload, relayed_utc_s=time.time())
         payload = wire.encode(envelope)
@@ -122,22 +175,23 @@ class RelayService(Service[RelayConfig]):
         else:
             priority = PREVIEW_PRIORITY if record.version == 1 else DETAIL_PRIORITY
             topic = topic_of(record) if self.config.supersede else None
-        for queue, inbox in self._inboxes.items():
+        for queue, upstream in self._upstreams.items():
+            inbox = keys.shore_inbox(vessel, upstream.options.site)
             effects.send_payload(inbox, queue, payload, Relayed, priority=priority, topic=topic)
         effects.count(f"{record.TYPE}s_relayed")
-        log.info("Owed to the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
+        log.info("Record queued for the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
 
     def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
-        """Commit, then keep each site's queue within its quota."""
+        """Commit, then apply the quota of each site's queue."""
         superseded = super().commit_batch(handled)
         if superseded:
             self.count("records_superseded", superseded)
         for upstream in self._upstreams.values():
-            if upstream.max_bytes is not None:
-                self._keep_quota(upstream, upstream.max_bytes)
+            if upstream.options.max_bytes is not None:
+                self._apply_quota(upstream, upstream.options.max_bytes)
         return superseded
 
-    def _keep_quota(self, upstream: Upstream, max_bytes: int) -> None:
+    def _apply_quota(self, upstream: Upstream, max_bytes: int) -> None:
         if self.store.queue_depth(upstream.queue).size_bytes <= max_bytes:
             return
         with self.store.transaction() as tx:
@@ -145,29 +199,28 @@ class RelayService(Service[RelayConfig]):
         if dropped:
             self.count("pictures_dropped", dropped)
             log.warning(
-                "Pictures dropped for a site, its quota is used up",
-                extra=kv(site=upstream.site, pictures=dropped, max_bytes=max_bytes),
+                "Images dropped: quota of a site exceeded",
+                extra=kv(site=upstream.options.site, images=dropped, max_bytes=max_bytes),
             )
 
     def queue_policy(self, queue: str) -> QueuePolicy:
-        """Return how a queue is sent: to a site, or to a consumer on the vessel."""
-        if not is_upstream_queue(queue):
-            wanted = {*self.config.advice_consumers, *self.config.command_consumers}
-            return QueuePolicy(held=queue not in wanted)
+        """Return the settings of the queue of a site or of a consumer on the vessel."""
+        if not _is_site_queue(queue):
+            return QueuePolicy(held=queue not in {*self.config.advice_consumers, *self.config.command_consumers})
         upstream = self._upstreams.get(queue)
         return QueuePolicy(held=True) if upstream is None else upstream.queue_policy()
 
     def on_start(self) -> None:
-        """Look for the sites' own routers; say what waits for sites that are gone."""
+        """Connect to the sites' own routers; drop records of removed sites if configured."""
         for queue in self._removed_queues():
             depth = self.store.queue_depth(queue)
             if self.config.drop_removed_upstreams:
                 with self.store.transaction() as tx:
                     tx.drop_queue(queue)
-                log.warning("Records for a removed site dropped", extra=kv(queue=queue, records=depth.records))
+                log.warning("Records dropped: site removed", extra=kv(queue=queue, records=depth.records))
         for upstream in self._upstreams.values():
             upstream.start()
-        self.start_thread(lambda: self._watch.run(self.stopping), "shore-watch")
+        self.start_thread(lambda: self._site_monitor.run(self.stopping), "site-monitor")
 
     def on_stop(self) -> None:
         """Close the sites' own sessions."""
@@ -175,34 +228,39 @@ class RelayService(Service[RelayConfig]):
             upstream.stop()
 
     def _removed_queues(self) -> list[str]:
-        return [q for q in self.store.queues() if is_upstream_queue(q) and q not in self._upstreams]
+        return [queue for queue in self.store.queues() if _is_site_queue(queue) and queue not in self._upstreams]
 
     def degraded_reason(self) -> str:
-        """Say that pictures wait with their senders for want of space, or that a site does not let this vessel in."""
-        return self._picture_room.degraded_reason() or self._watch.degraded_reason()
+        """Return that no images are accepted, or which site denies this vessel."""
+        return self._image_reserve.degraded_reason() or self._site_monitor.degraded_reason()
 
     def warning(self) -> str:
-        """Say which sites are away."""
-        return self._watch.warning()
+        """Return which sites are not reached."""
+        return self._site_monitor.warning()
 
     def gauges(self) -> Mapping[str, float]:
-        """Return for each site what waits, how old the oldest of it is, and whether the site answers."""
-        found: dict[str, float] = dict(self._watch.gauges())
-        for upstream in self._upstreams.values():
-            depth = self.store.queue_depth(upstream.queue)
+        """Return queue depth, age of the oldest record and responsiveness of each site."""
+        found: dict[str, float] = dict(self._site_monitor.gauges())
+        for queue, upstream in self._upstreams.items():
+            site = upstream.options.site
+            depth = self.store.queue_depth(queue)
             age_s = 0.0 if depth.oldest_utc_s is None else max(0.0, time.time() - depth.oldest_utc_s)
-            found[f"waiting_for_{upstream.site}"] = float(depth.records)
-            found[f"waiting_bytes_for_{upstream.site}"] = float(depth.size_bytes)
-            found[f"oldest_s_for_{upstream.site}"] = age_s
-            found[f"delivered_to_{upstream.site}"] = float(self.acknowledged_count(upstream.queue))
-            found[f"answering_{upstream.site}"] = float(self.is_responding(upstream.queue))
-        # While it is 0, and the inbox too, every decision is ashore: the console tells people by that.
+            found[f"waiting_for_{site}"] = float(depth.records)
+            found[f"waiting_bytes_for_{site}"] = float(depth.size_bytes)
+            found[f"oldest_s_for_{site}"] = age_s
+            found[f"delivered_to_{site}"] = float(self.acknowledged_count(queue))
+            found[f"answering_{site}"] = float(self.is_responding(queue))
+        # The console shows by this gauge and the inbox whether every decision has reached the shore.
         urgent = (self.store.queue_depth(queue, DECISION_PRIORITY).records for queue in self._upstreams)
         found["decisions_waiting"] = float(sum(urgent))
         found["held_for_removed"] = float(sum(self.store.queue_depth(q).records for q in self._removed_queues()))
         return found
 
 
+def _is_site_queue(queue: str) -> bool:
+    return consumer_of(queue) == CONSUMER
+
+
 def topic_of(image: ReconstructedImage) -> Topic:
-    """Return what a picture is a version of; the time keeps pictures apart whose vehicle began its identifiers anew."""
+    """Return the topic of an image's versions; the time distinguishes images after a restart of the identifiers."""
     return Topic(f"{image.vehicle_id}/{image.image_id}/{image.first_frame_utc_s!r}", image.version)

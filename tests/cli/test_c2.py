@@ -69,9 +69,9 @@ def out(tmp_path):
         image("BBBB"),
         image("CCCC", vehicle="uuv-2", vessel="vessel-2"),
     ):
-        archive.keep_image(record, 5.0)
+        archive.store_image(record, 5.0)
         archive.flush()
-    archive.keep_decision(decision())
+    archive.store_decision(decision())
     archive.flush()
     archive.close()
     return folder
@@ -125,14 +125,14 @@ def test_ls_without_an_index_names_the_missing_file(capsys, tmp_path):
 def test_decision_matches_the_image_received_before_it(tmp_path):
     """A vehicle with a new store uses the same image identifiers again."""
     archive = Archive(C2Config(out_dir=tmp_path))
-    archive.keep_image(image("AAAA", first_frame_utc_s=1000.0), 5.0)
+    archive.store_image(image("AAAA", first_frame_utc_s=1000.0), 5.0)
     archive.flush()
-    archive.keep_image(image("AAAA", first_frame_utc_s=2000.0), 5.0)
+    archive.store_image(image("AAAA", first_frame_utc_s=2000.0), 5.0)
     archive.flush()
     for record in (decision("d1", decided_utc_s=1500.0), decision("d2", decided_utc_s=2500.0, verdict="unsure")):
-        archive.keep_decision(record)
+        archive.store_decision(record)
         archive.flush()
-    rows = join_decisions(archive.index().pictures(), archive.index().decisions())
+    rows = join_decisions(archive.index().images(), archive.index().decisions())
     archive.close()
     assert [(r.picture.first_frame_utc_s, r.decision and r.decision.decision_id) for r in rows] == [
         (1000.0, "d1"),
@@ -148,7 +148,7 @@ def test_get_copies_the_newest_version(capsys, out, tmp_path):
     for name in names:
         assert (tmp_path / "here" / name).read_bytes() == (out / "vessel-1" / name).read_bytes()
     assert main(["c2", "get", "uuv-1/ZZZZ", "--out-dir", str(out)]) == 2
-    assert "a picture that `sonarpost c2 ls` shows" in capsys.readouterr().err
+    assert "an image that `sonarpost c2 ls` shows" in capsys.readouterr().err
 
 
 def test_get_copies_nothing_if_a_file_is_unreadable(capsys, out, tmp_path):

@@ -1,4 +1,4 @@
-"""A reconstructed picture on the disk: TIFF, JSON side-car and PNG, the same bytes on every platform."""
+"""Files of a reconstructed image: TIFF, JSON side-car and PNG, with the same bytes on every platform."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from sonarpost.sonar.image_files import png_bytes, tiff_bytes
 def image_file_name(image: ReconstructedImage) -> str:
     """Return the file name without suffix: vehicle, time of the first frame, image identifier, version.
 
-    The time keeps a later mission's picture apart when a vehicle starts its identifiers anew.
+    The time distinguishes images of a later mission, if the vehicle has restarted its identifiers.
     """
     first = datetime.fromtimestamp(image.first_frame_utc_s, UTC).strftime("%Y%m%dT%H%M%SZ")
     return f"{image.vehicle_id}_{first}_{image.image_id}_v{image.version}"
 
 
 def side_car(image: ReconstructedImage) -> dict[str, object]:
-    """Return what the JSON file says: everything but the pixels, missing areas as counts and rectangles of rows."""
+    """Return the content of the JSON file: all fields but the pixels, missing areas as a count and a range of rows."""
     fields = image.model_dump(exclude={"picture", "missing_mask"})
     rows = np.flatnonzero(image.missing().any(axis=1))
     return {
@@ -39,12 +39,15 @@ def side_car(image: ReconstructedImage) -> dict[str, object]:
 
 
 def write_image(folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
-    """Write the three files of a picture; return the TIFF's path and whether it was new.
+    """Write the three files of an image; existing files of the same image are not changed.
 
-    The JSON comes last: where it is, the other two are whole. A picture that is there with the same pixels is left.
+    The JSON file is written last: if it exists, the other two are complete.
+
+    Returns:
+        Path of the TIFF file, and whether the image is new.
 
     Raises:
-        OSError: The folder cannot be written (a full disk).
+        OSError: The folder cannot be written, for example because of a full disk.
     """
     files = AtomicFiles()
     found = add_image(files, folder, image)
@@ -53,19 +56,19 @@ def write_image(folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
 
 
 def add_image(files: AtomicFiles, folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
-    """Add a picture's files to others that are committed together; what is returned is as of `write_image`.
+    """Add the files of an image to others that are committed together; see `write_image`.
 
     Raises:
-        OSError: The folder cannot be written (a full disk); none of the three is added.
+        OSError: The folder cannot be written; none of the three files is added.
     """
     name = image_file_name(image)
     tiff, sidecar = folder / f"{name}.tiff", folder / f"{name}.json"
     text = (json.dumps(side_car(image), indent=1) + "\n").encode()
-    picture = folder / f"{name}.png"
+    png = folder / f"{name}.png"
     if (added := files.text_of(sidecar)) is not None:
         known = added == text
     else:
-        known = sidecar.is_file() and sidecar.read_bytes() == text and tiff.is_file() and picture.is_file()
+        known = sidecar.is_file() and sidecar.read_bytes() == text and tiff.is_file() and png.is_file()
     if known:
         return tiff, False
     folder.mkdir(parents=True, exist_ok=True)
@@ -73,7 +76,7 @@ def add_image(files: AtomicFiles, folder: Path, image: ReconstructedImage) -> tu
     before = len(files)
     try:
         files.add(tiff, tiff_bytes(tiff, pixels))
-        files.add(picture, png_bytes(picture, pixels))
+        files.add(png, png_bytes(png, pixels))
         files.add(sidecar, text, last=True)
     except BaseException:
         files.drop_from(before)

@@ -1,4 +1,4 @@
-"""The files that c2 keeps: where they are, rows of them for the index, and what retention removes."""
+"""Files that c2 stores: paths, rows for the index, and retention."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from sonarpost.messages import Decision, ReconstructedImage
 
 log = logging.getLogger(__name__)
 
-# The side-car first: where it is, the others are whole.
+# The side-car first: if it exists, the others are complete.
 SUFFIXES = (".json", ".tiff", ".png")
 
 
-def files_of(out_dir: Path, row: ImageRow) -> tuple[Path, ...]:
-    """Return the paths of a picture's files."""
+def image_paths(out_dir: Path, row: ImageRow) -> tuple[Path, ...]:
+    """Return the paths of an image's files."""
     return tuple(out_dir / row.vessel_id / f"{row.name}{suffix}" for suffix in SUFFIXES)
 
 
 def decision_file_name(decision_id: str) -> str:
     """Return the file name of a decision.
 
-    The identifier is the operator's text: only its hexadecimal form is safe as a file name. `RecordId` bounds it to 64
-    characters of one byte, so that no file system refuses the name for its length.
+    The identifier is external text: only its hexadecimal form is safe as a file name. `RecordId` limits it to 64
+    characters, so that the name is not too long for any file system.
     """
     return f"{decision_id.encode().hex()}.json"
 
 
-def picture_row(
+def image_row(
     out_dir: Path, name: str, image: ReconstructedImage | SideCar, relayed_utc_s: float | None, accepted_utc_s: float
 ) -> ImageRow:
-    """Return the index's row of a picture whose files are written.
+    """Return the index row of an image whose files are written.
 
     Raises:
-        OSError: A file is not there.
+        OSError: A file is missing.
     """
     height_px, width_px = (
         (image.height_px, image.width_px)
@@ -74,30 +74,30 @@ def picture_row(
     )
 
 
-def row_of_image(out_dir: Path, image: ReconstructedImage, relayed_utc_s: float) -> ImageRow:
-    """Return the row of a picture that was just written."""
-    return picture_row(out_dir, image_file_name(image), image, relayed_utc_s, time.time())
+def image_row_of_record(out_dir: Path, image: ReconstructedImage, relayed_utc_s: float) -> ImageRow:
+    """Return the index row of an image that was just written."""
+    return image_row(out_dir, image_file_name(image), image, relayed_utc_s, time.time())
 
 
-def add_missing(out_dir: Path, index: ShoreIndex) -> int:
-    """Add to the index what is in the files and not in it; return how many rows that were.
+def index_missing_files(out_dir: Path, index: ShoreIndex) -> int:
+    """Add files that are not in the index; return the number of rows.
 
-    A file that cannot be read is logged and left alone.
+    An unreadable file is logged and ignored.
 
     Raises:
-        OSError: The index or a folder cannot be used.
+        OSError: The index or a folder cannot be read or written.
     """
-    rows: list[ImageRow | DecisionRow] = [*_missing_pictures(out_dir, index), *_missing_decisions(out_dir, index)]
+    rows: list[ImageRow | DecisionRow] = [*_missing_images(out_dir, index), *_missing_decisions(out_dir, index)]
     if rows:
         index.put(rows)
     return len(rows)
 
 
-def remove_unfinished(out_dir: Path) -> int:
-    """Remove what a c2 that was killed was writing; return how many files that were.
+def remove_temporary_files(out_dir: Path) -> int:
+    """Delete temporary files of an interrupted c2; return their number.
 
     Raises:
-        OSError: One cannot be removed.
+        OSError: A file cannot be deleted.
     """
     count = 0
     for pattern in ("*/.*.tmp", f"*/{DECISIONS}/.*.tmp"):
@@ -107,15 +107,15 @@ def remove_unfinished(out_dir: Path) -> int:
     return count
 
 
-def _missing_pictures(out_dir: Path, index: ShoreIndex) -> Iterator[ImageRow]:
+def _missing_images(out_dir: Path, index: ShoreIndex) -> Iterator[ImageRow]:
     for path in sorted(out_dir.glob("*/[!.]*.json")):
-        if index.has_picture(path.parent.name, path.stem):
+        if index.has_image(path.parent.name, path.stem):
             continue
         try:
             side_car = SideCar.model_validate_json(path.read_bytes())
-            yield picture_row(out_dir, path.stem, side_car, None, path.stat().st_mtime)
+            yield image_row(out_dir, path.stem, side_car, None, path.stat().st_mtime)
         except (ValidationError, OSError) as error:
-            log.error("A kept picture cannot be read", extra=kv(file=path, reason=str(error)[:200]))
+            log.error("Stored image cannot be read", extra=kv(file=path, reason=str(error)[:200]))
 
 
 def _missing_decisions(out_dir: Path, index: ShoreIndex) -> Iterator[DecisionRow]:
@@ -125,20 +125,20 @@ def _missing_decisions(out_dir: Path, index: ShoreIndex) -> Iterator[DecisionRow
             if not index.has_decision(decision.vessel_id, decision.decision_id):
                 yield DecisionRow.of(decision, path.stat().st_mtime)
         except (ValidationError, OSError) as error:
-            log.error("A kept decision cannot be read", extra=kv(file=path, reason=str(error)[:200]))
+            log.error("Stored decision cannot be read", extra=kv(file=path, reason=str(error)[:200]))
 
 
-def to_remove(
-    pictures: Sequence[ImageRow], now_utc_s: float, retain_days: float | None, max_bytes: int | None
+def select_for_removal(
+    images: Sequence[ImageRow], now_utc_s: float, retain_days: float | None, max_bytes: int | None
 ) -> list[ImageRow]:
-    """Choose the pictures that retention removes: pure.
+    """Select the images that retention removes.
 
-    Everything accepted longer than `retain_days` ago goes. Of what is left, pictures that have been exported go first
-    and then the others, each oldest first, until no more than `max_bytes` are left. Decisions are not pictures.
+    Images accepted longer than `retain_days` ago are removed. Of the others, exported ones are removed first, oldest
+    first, then the rest, oldest first, until at most `max_bytes` remain.
     """
     old: list[ImageRow] = []
     kept: list[ImageRow] = []
-    for row in pictures:
+    for row in images:
         too_old = retain_days is not None and now_utc_s - row.accepted_utc_s > retain_days * 86400.0
         (old if too_old else kept).append(row)
     if max_bytes is None:
@@ -152,36 +152,36 @@ def to_remove(
     return old
 
 
-def remove_files(out_dir: Path, row: ImageRow) -> None:
-    """Remove a picture's files; those that are gone already do no harm.
+def delete_image_files(out_dir: Path, row: ImageRow) -> None:
+    """Delete the files of an image that still exist.
 
     Raises:
-        OSError: One cannot be removed.
+        OSError: A file cannot be deleted.
     """
-    for path in files_of(out_dir, row):
+    for path in image_paths(out_dir, row):
         path.unlink(missing_ok=True)
 
 
-def find_picture(pictures: Sequence[ImageRow], name: str, vessel: str | None, version: int | None) -> ImageRow:
-    """Return the picture that a person means.
+def find_image(images: Sequence[ImageRow], name: str, vessel: str | None, version: int | None) -> ImageRow:
+    """Find an image by the name that a user has given.
 
     Args:
-        pictures: Rows whose files are there.
-        name: VEHICLE/IMAGE_ID as tables show it, or the name of the files.
+        images: Rows whose files exist.
+        name: VEHICLE/IMAGE_ID as shown in tables, or the name of the files.
         vessel: Its vessel, None for any.
         version: Its version, None for the newest.
 
     Raises:
-        StoredFileError: There is none, or there are several that are not versions of one.
+        StoredFileError: There is no such image, or several that are not versions of one.
     """
     vehicle, _, image_id = name.partition("/")
-    named = [r for r in pictures if r.name == name or (r.vehicle_id, r.image_id) == (vehicle, image_id)]
+    named = [r for r in images if r.name == name or (r.vehicle_id, r.image_id) == (vehicle, image_id)]
     found = [r for r in named if vessel in (None, r.vessel_id) and version in (None, r.version)]
     if not found:
-        raise StoredFileError("index", "picture", name, "a picture that `sonarpost c2 ls` shows")
+        raise StoredFileError("index", "picture", name, "an image that `sonarpost c2 ls` shows")
     if len({(r.vessel_id, r.vehicle_id, r.image_id, r.first_frame_utc_s) for r in found}) > 1:
         names = ", ".join(f"{r.vessel_id}/{r.name}" for r in found)
         raise StoredFileError(
-            "index", "picture", name, f"one picture, with --vessel or by the name of its files: {names}"
+            "index", "picture", name, f"one image, with --vessel or by the name of its files: {names}"
         )
     return max(found, key=lambda r: r.version)

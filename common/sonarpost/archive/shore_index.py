@@ -1,7 +1,7 @@
-"""What a shore site has accepted, as a table that answers quickly: `index.db` beside the files that c2 keeps.
+"""Index of the records that a shore site has stored: `index.db` beside the files of c2.
 
-The files are what counts and the index follows from them: whatever is missing in it is added from the side-cars when
-c2 starts. c2 writes it; commands read it, and mark what they have exported.
+The files are authoritative: c2 adds missing rows from the side-cars when it starts. c2 writes the index; commands read
+it and mark exported images.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ CREATE TABLE IF NOT EXISTS tasking (
 
 @dataclass(frozen=True, slots=True)
 class ImageRow:
-    """One version of one picture.
+    """One version of an image.
 
     Attributes:
         name: File name without suffix, in the vessel's folder.
-        relayed_utc_s: When the vessel's relay took it, by the vessel's clock; None where only the files are known.
-        accepted_utc_s: When c2 wrote it, by the shore's clock.
-        size_bytes: Of its three files.
+        relayed_utc_s: When the vessel's relay accepted it, by the vessel's clock; None if restored from the files.
+        accepted_utc_s: When c2 stored it, by the shore's clock.
+        size_bytes: Size of its three files.
         exported_utc_s: When it was last exported; None for never.
-        removed_utc_s: When retention removed its files; None while they are there.
+        removed_utc_s: When retention deleted its files; None while they exist.
     """
 
     vessel_id: str
@@ -80,7 +80,7 @@ class ImageRow:
 
 @dataclass(frozen=True, slots=True)
 class DecisionRow:
-    """One decision, as its record has it."""
+    """One decision."""
 
     vessel_id: str
     decision_id: str
@@ -97,14 +97,14 @@ class DecisionRow:
 
     @classmethod
     def of(cls, decision: Decision, accepted_utc_s: float) -> DecisionRow:
-        """Make a row of a record."""
+        """Return the row of a record."""
         values = decision.model_dump(exclude={"accepted_utc_s"})
         return cls(**{f.name: values[f.name] for f in fields(cls) if f.name in values}, accepted_utc_s=accepted_utc_s)
 
 
 @dataclass(frozen=True, slots=True)
 class TaskingRow:
-    """Advice or a command, and how far it has come."""
+    """Advice or a command with its delivery state."""
 
     vessel_id: str
     kind: TaskingKind
@@ -125,14 +125,14 @@ Mark = Literal["exported_utc_s", "removed_utc_s"]
 
 
 class ShoreIndex:
-    """The index of one `out_dir`; safe to use from several threads and, as SQLite is, from several processes.
+    """Index of one `out_dir`, safe for several threads and processes.
 
     Args:
-        out_dir: c2's folder.
-        writable: False opens what is there for reading only.
+        out_dir: Folder of c2.
+        writable: False opens an existing index read-only.
 
     Raises:
-        StoredFileError: There is no index, or the file is none of this version.
+        StoredFileError: There is no index, or the file is not one of this version.
         OSError: It cannot be written.
     """
 
@@ -142,7 +142,7 @@ class ShoreIndex:
         if writable:
             out_dir.mkdir(parents=True, exist_ok=True)
         elif not self.path.is_file():
-            raise StoredFileError(str(self.path), "", "no such file", "the index that c2 keeps in its out_dir")
+            raise StoredFileError(str(self.path), "", "no such file", "the index in the out_dir of c2")
         mode = "rwc" if writable else "ro"
         try:
             self._db = sqlite3.connect(
@@ -156,7 +156,7 @@ class ShoreIndex:
         except sqlite3.DatabaseError as error:
             if isinstance(error, sqlite3.OperationalError) and writable:
                 raise OSError(f"{self.path}: {error}") from error
-            raise StoredFileError(str(self.path), "", str(error), "the index that c2 keeps in its out_dir") from error
+            raise StoredFileError(str(self.path), "", str(error), "the index in the out_dir of c2") from error
 
     def _open(self, *, writable: bool) -> None:
         version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
@@ -165,7 +165,7 @@ class ShoreIndex:
             raise StoredFileError(str(self.path), "user_version", version, str(INDEX_VERSION))
         if writable:
             self._db.execute("PRAGMA journal_mode=WAL")
-            # What a power cut takes from the index is in the files, and is added again at the next start.
+            # Rows that a power cut deletes are restored from the files at the next start.
             self._db.execute("PRAGMA synchronous=NORMAL")
             self._db.executescript(f"{_SCHEMA} PRAGMA user_version = {INDEX_VERSION};")
 
@@ -189,7 +189,7 @@ class ShoreIndex:
                 raise
 
     def put(self, rows: Iterable[ImageRow | DecisionRow | TaskingRow]) -> None:
-        """Add rows, or replace those of the same names.
+        """Add rows, or replace those with the same keys.
 
         Raises:
             OSError: The file cannot be written.
@@ -200,19 +200,19 @@ class ShoreIndex:
                 marks = ", ".join("?" * len(values))
                 db.execute(f"INSERT OR REPLACE INTO {_TABLES[type(row)]} VALUES ({marks})", values)  # noqa: S608
 
-    def mark(self, what: Mark, pictures: Iterable[ImageRow], at_utc_s: float) -> None:
-        """Note that pictures were exported or removed.
+    def mark(self, column: Mark, images: Iterable[ImageRow], at_utc_s: float) -> None:
+        """Mark images as exported or removed.
 
         Raises:
             OSError: The file cannot be written.
         """
         with self._writing() as db:
-            for row in pictures:
-                sql = f"UPDATE picture SET {what} = ? WHERE vessel_id = ? AND name = ?"  # noqa: S608 literals
+            for row in images:
+                sql = f"UPDATE picture SET {column} = ? WHERE vessel_id = ? AND name = ?"  # noqa: S608 literals
                 db.execute(sql, (at_utc_s, row.vessel_id, row.name))
 
-    def pictures(self, *, removed: bool = False) -> list[ImageRow]:
-        """Return all versions of all pictures, oldest first; those that were removed only where asked for.
+    def images(self, *, removed: bool = False) -> list[ImageRow]:
+        """Return all versions of all images, oldest first; removed ones only if `removed`.
 
         Raises:
             OSError: The file cannot be read.
@@ -229,17 +229,17 @@ class ShoreIndex:
         """Return all advice and commands, oldest first."""
         return self._rows(TaskingRow, "ORDER BY issued_utc_s, vessel_id, kind, record_id")
 
-    def has_picture(self, vessel_id: str, name: str) -> bool:
-        """Tell whether a picture's files are known and have not been removed."""
+    def has_image(self, vessel_id: str, name: str) -> bool:
+        """Return whether an image is indexed and not removed."""
         sql = "WHERE vessel_id = ? AND name = ? AND removed_utc_s IS NULL"
         return bool(self._rows(ImageRow, sql, (vessel_id, name)))
 
     def has_decision(self, vessel_id: str, decision_id: str) -> bool:
-        """Tell whether a decision is known."""
+        """Return whether a decision is indexed."""
         return bool(self._rows(DecisionRow, "WHERE vessel_id = ? AND decision_id = ?", (vessel_id, decision_id)))
 
     def size_bytes(self) -> int:
-        """Return how much the pictures take that are there."""
+        """Return the size of all images that are not removed, in bytes."""
         with self._lock:
             row = self._execute(
                 "SELECT COALESCE(SUM(size_bytes), 0) FROM picture WHERE removed_utc_s IS NULL"
@@ -260,6 +260,6 @@ class ShoreIndex:
 
 
 def _with_bool(row: ImageRow) -> ImageRow:
-    """SQLite knows no truth values."""
+    """Return the row with a boolean, which SQLite does not have."""
     values = {f.name: getattr(row, f.name) for f in fields(row)}
     return ImageRow(**{**values, "complete": bool(row.complete)})

@@ -20,6 +20,11 @@ def consumer_of(queue: str) -> str:
     return queue.partition(SITE_SEPARATOR)[0]
 
 
+def platform_of(queue: str) -> str:
+    """Return the platform of a queue, empty for a plain consumer name."""
+    return queue.partition(SITE_SEPARATOR)[2]
+
+
 @dataclass(frozen=True, slots=True)
 class Topic:
     """Subject and edition of a record: in a queue, a newer edition replaces older ones that are not in flight."""

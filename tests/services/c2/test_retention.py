@@ -10,7 +10,7 @@ from builders.records import picture_record
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.archive.shore_files import find_picture, to_remove
+from sonarpost.archive.shore_files import find_image, select_for_removal
 from sonarpost.archive.shore_index import FILE_NAME, ImageRow, ShoreIndex
 from sonarpost.errors import StoredFileError
 from sonarpost.messages import Decision, Pixels
@@ -90,15 +90,15 @@ def pictures_in(folder):
 
 def test_what_was_exported_goes_first_then_the_oldest():
     rows = [row("a", 1), row("b", 2), row("c", 3, exported_utc_s=9.0), row("d", 4, exported_utc_s=9.0)]
-    assert [r.name for r in to_remove(rows, 10.0, None, 250)] == ["c", "d"]
-    assert [r.name for r in to_remove(rows, 10.0, None, 100)] == ["c", "d", "a"]
-    assert to_remove(rows, 10.0, None, 400) == []
+    assert [r.name for r in select_for_removal(rows, 10.0, None, 250)] == ["c", "d"]
+    assert [r.name for r in select_for_removal(rows, 10.0, None, 100)] == ["c", "d", "a"]
+    assert select_for_removal(rows, 10.0, None, 400) == []
 
 
 def test_what_is_too_old_goes_however_much_room_there_is():
     rows = [row("old", 0.0), row("new", 5 * DAY_S)]
-    assert [r.name for r in to_remove(rows, 6 * DAY_S, 3.0, None)] == ["old"]
-    assert [r.name for r in to_remove(rows, 6 * DAY_S, 3.0, 10)] == ["old", "new"]
+    assert [r.name for r in select_for_removal(rows, 6 * DAY_S, 3.0, None)] == ["old"]
+    assert [r.name for r in select_for_removal(rows, 6 * DAY_S, 3.0, 10)] == ["old", "new"]
 
 
 @given(
@@ -108,7 +108,7 @@ def test_what_is_too_old_goes_however_much_room_there_is():
 )
 def test_what_is_left_is_within_the_limits_and_no_more_is_removed_than_needed(pictures, days, limit):
     rows = [row(str(n), at, size, 1.0 if done else None) for n, (at, size, done) in enumerate(pictures)]
-    removed = to_remove(rows, 1e6, days, limit)
+    removed = select_for_removal(rows, 1e6, days, limit)
     kept = [r for r in rows if r not in removed]
     assert len(removed) == len(set(removed))
     if days is not None:
@@ -123,27 +123,27 @@ def test_what_is_left_is_within_the_limits_and_no_more_is_removed_than_needed(pi
 
 def test_files_go_and_decisions_stay(archive, tmp_path):
     kept = archive(max_bytes=0)
-    kept.keep_image(image("AAAA"), 5.0)
+    kept.store_image(image("AAAA"), 5.0)
     kept.flush()
-    kept.keep_image(image("BBBB"), 5.0)
+    kept.store_image(image("BBBB"), 5.0)
     kept.flush()
-    kept.keep_decision(decision())
+    kept.store_decision(decision())
     kept.flush()
     removed = kept.apply_retention(1e9)
     assert [r.image_id for r in removed] == ["AAAA", "BBBB"]
     assert sorted(p.name for p in (tmp_path / "out").rglob("*") if p.is_file() and FILE_NAME not in p.name) == [
         f"{b'd1'.hex()}.json"
     ]
-    assert kept.pictures_bytes() == 0
-    assert len(kept.index().pictures(removed=True)) == 2
-    assert {r.removed_utc_s for r in kept.index().pictures(removed=True)} == {1e9}
+    assert kept.images_bytes() == 0
+    assert len(kept.index().images(removed=True)) == 2
+    assert {r.removed_utc_s for r in kept.index().images(removed=True)} == {1e9}
     assert len(kept.index().decisions()) == 1
     assert kept.apply_retention(2e9) == []
 
 
 def test_without_limits_nothing_is_removed(archive, tmp_path):
     kept = archive()
-    kept.keep_image(image(), 5.0)
+    kept.store_image(image(), 5.0)
     kept.flush()
     assert kept.apply_retention(1e12) == []
     assert len(pictures_in(tmp_path / "out")) == 1
@@ -151,44 +151,44 @@ def test_without_limits_nothing_is_removed(archive, tmp_path):
 
 def test_an_exported_picture_goes_before_an_older_one(archive):
     kept = archive()
-    kept.keep_image(image("AAAA"), 5.0)
+    kept.store_image(image("AAAA"), 5.0)
     kept.flush()
-    kept.keep_image(image("BBBB"), 5.0)
+    kept.store_image(image("BBBB"), 5.0)
     kept.flush()
     index = kept.index()
     size = index.size_bytes()
-    index.mark("exported_utc_s", [r for r in index.pictures() if r.image_id == "BBBB"], 7.0)
+    index.mark("exported_utc_s", [r for r in index.images() if r.image_id == "BBBB"], 7.0)
     limited = archive(max_bytes=size - 1)
     assert [r.image_id for r in limited.apply_retention(1e10)] == ["BBBB"]
 
 
 def test_a_removed_picture_that_comes_again_is_kept_again(archive, tmp_path):
     kept = archive(max_bytes=0)
-    assert kept.keep_image(image(), 5.0)
+    assert kept.store_image(image(), 5.0)
     kept.flush()
     kept.apply_retention(1.0)
-    assert kept.keep_image(image(), 5.0)
+    assert kept.store_image(image(), 5.0)
     kept.flush()
-    assert len(kept.index().pictures()) == 1
-    assert not kept.keep_image(image(), 5.0)
+    assert len(kept.index().images()) == 1
+    assert not kept.store_image(image(), 5.0)
     kept.flush()
 
 
 def test_the_index_is_completed_from_the_files(archive, tmp_path):
     first = archive()
-    first.keep_image(image("AAAA", 1), 5.0)
+    first.store_image(image("AAAA", 1), 5.0)
     first.flush()
-    first.keep_image(image("AAAA", 2), 5.0)
+    first.store_image(image("AAAA", 2), 5.0)
     first.flush()
-    first.keep_decision(decision())
+    first.store_decision(decision())
     first.flush()
-    before = [replace(r, relayed_utc_s=None, accepted_utc_s=0.0) for r in first.index().pictures()]
+    before = [replace(r, relayed_utc_s=None, accepted_utc_s=0.0) for r in first.index().images()]
     first.close()
     for path in (tmp_path / "out").glob(f"{FILE_NAME}*"):
         path.unlink()
     (tmp_path / "out" / "vessel-1" / "broken.json").write_text("{")
     again = archive()
-    assert [replace(r, accepted_utc_s=0.0) for r in again.index().pictures()] == before
+    assert [replace(r, accepted_utc_s=0.0) for r in again.index().images()] == before
     assert [d.decision_id for d in again.index().decisions()] == ["d1"]
 
 
@@ -203,14 +203,14 @@ def test_an_index_of_another_version_or_none_is_refused(tmp_path):
 
 def test_a_picture_is_found_by_name_and_newest_version():
     rows = [row("f1", version=1), row("f2", version=2), row("g", vessel_id="vessel-2", vehicle_id="uuv-2")]
-    assert find_picture(rows, "uuv-1/AAAA", None, None).name == "f2"
-    assert find_picture(rows, "uuv-1/AAAA", None, 1).name == "f1"
-    assert find_picture(rows, "g", None, None).name == "g"
-    with pytest.raises(StoredFileError, match="a picture that"):
-        find_picture(rows, "uuv-1/ZZZZ", None, None)
+    assert find_image(rows, "uuv-1/AAAA", None, None).name == "f2"
+    assert find_image(rows, "uuv-1/AAAA", None, 1).name == "f1"
+    assert find_image(rows, "g", None, None).name == "g"
+    with pytest.raises(StoredFileError, match="an image that"):
+        find_image(rows, "uuv-1/ZZZZ", None, None)
     twice = [*rows, row("h", first_frame_utc_s=9.0)]
-    with pytest.raises(StoredFileError, match="one picture, with --vessel or by the name of its files"):
-        find_picture(twice, "uuv-1/AAAA", None, None)
+    with pytest.raises(StoredFileError, match="one image, with --vessel or by the name of its files"):
+        find_image(twice, "uuv-1/AAAA", None, None)
 
 
 def test_the_service_removes_counts_and_logs(runner, platform, tmp_path, caplog):
@@ -230,4 +230,4 @@ def test_the_service_removes_counts_and_logs(runner, platform, tmp_path, caplog)
     eventually(lambda: service.health().counters.get("images_removed") == 1)
     assert service.health().gauges["pictures_bytes"] == 0
     assert pictures_in(tmp_path / "out") == []
-    assert "Picture removed by retention" in [record.message for record in caplog.records]
+    assert "Image removed by retention" in [record.message for record in caplog.records]

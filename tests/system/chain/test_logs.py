@@ -19,8 +19,8 @@ STEPS = {
     "uuv_modem": "Image sent",
     "op_modem": "Packet received",
     "decompressor": "Picture reconstructed",
-    "relay": "Owed to the shore",
-    "c2": "Picture accepted",
+    "relay": "Record queued for the shore",
+    "c2": "Image stored",
 }
 
 Line = dict[str, str]

@@ -118,4 +118,4 @@ def test_a_vessel_with_a_new_disk_doubles_nothing_and_is_taken_as_new(coast: Coa
     assert sum(1 for _ in coast.out.rglob("uuv-*")) == 6 * COUNT
     found = coast.pixels_by_file()
     assert sorted(found.values()) == sorted([i.picture_sha256 for i in (*old, *new)])
-    assert coast.log_text("c2").count("Picture known already") == len(repeated)
+    assert coast.log_text("c2").count("Image already stored") == len(repeated)

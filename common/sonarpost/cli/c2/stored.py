@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sonarpost.archive.shore_files import files_of, find_picture
+from sonarpost.archive.shore_files import find_image, image_paths
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, TaskingRow
 from sonarpost.cli.shared import printable, time_text
 from sonarpost.errors import BadInputError, ConfigError, StoredFileError
@@ -120,7 +120,7 @@ def run_ls(parsed: argparse.Namespace) -> int:
         if parsed.tasking:
             _print_tasking(index.tasking(), parsed, since_utc_s)
             return 0
-        images = join_decisions(index.pictures(), index.decisions())
+        images = join_decisions(index.images(), index.decisions())
     finally:
         index.close()
     rows = select_images(
@@ -261,11 +261,11 @@ def run_get(parsed: argparse.Namespace) -> int:
     """
     index = ShoreIndex(parsed.out_dir, writable=False)
     try:
-        row = find_picture(index.pictures(), parsed.picture, parsed.vessel, parsed.version)
+        row = find_image(index.images(), parsed.picture, parsed.vessel, parsed.version)
     finally:
         index.close()
     copies = []
-    for path in files_of(parsed.out_dir, row):
+    for path in image_paths(parsed.out_dir, row):
         try:
             copies.append((parsed.to / path.name, path.read_bytes()))
         except OSError as error:
@@ -327,7 +327,7 @@ def _mark_exported(out_dir: Path, contacts: Sequence[ExportContact]) -> None:
     try:
         index = ShoreIndex(out_dir)
         try:
-            rows = [row for row in index.pictures() if _image_key(row) in exported]
+            rows = [row for row in index.images() if _image_key(row) in exported]
             index.mark("exported_utc_s", rows, time.time())
         finally:
             index.close()
