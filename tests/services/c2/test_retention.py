@@ -1,4 +1,4 @@
-"""c2's index and retention: what is listed, what is removed and in which order, and that decisions never are."""
+"""c2: index and retention of images."""
 
 from __future__ import annotations
 
@@ -84,18 +84,18 @@ def archive(tmp_path):
         each.close()
 
 
-def pictures_in(folder):
+def images_in(folder):
     return sorted(path.name for path in folder.glob("*/*.tiff"))
 
 
-def test_what_was_exported_goes_first_then_the_oldest():
+def test_retention_removes_exported_images_first_then_the_oldest():
     rows = [row("a", 1), row("b", 2), row("c", 3, exported_utc_s=9.0), row("d", 4, exported_utc_s=9.0)]
     assert [r.name for r in select_for_removal(rows, 10.0, None, 250)] == ["c", "d"]
     assert [r.name for r in select_for_removal(rows, 10.0, None, 100)] == ["c", "d", "a"]
     assert select_for_removal(rows, 10.0, None, 400) == []
 
 
-def test_what_is_too_old_goes_however_much_room_there_is():
+def test_retention_removes_old_images_below_the_size_limit():
     rows = [row("old", 0.0), row("new", 5 * DAY_S)]
     assert [r.name for r in select_for_removal(rows, 6 * DAY_S, 3.0, None)] == ["old"]
     assert [r.name for r in select_for_removal(rows, 6 * DAY_S, 3.0, 10)] == ["old", "new"]
@@ -106,7 +106,7 @@ def test_what_is_too_old_goes_however_much_room_there_is():
     st.none() | st.floats(0.001, 20),
     st.none() | st.integers(0, 5000),
 )
-def test_what_is_left_is_within_the_limits_and_no_more_is_removed_than_needed(pictures, days, limit):
+def test_retention_keeps_the_limits_and_removes_no_more_than_needed(pictures, days, limit):
     rows = [row(str(n), at, size, 1.0 if done else None) for n, (at, size, done) in enumerate(pictures)]
     removed = select_for_removal(rows, 1e6, days, limit)
     kept = [r for r in rows if r not in removed]
@@ -121,7 +121,7 @@ def test_what_is_left_is_within_the_limits_and_no_more_is_removed_than_needed(pi
         assert removed == []
 
 
-def test_files_go_and_decisions_stay(archive, tmp_path):
+def test_retention_deletes_files_and_keeps_decisions(archive, tmp_path):
     kept = archive(max_bytes=0)
     kept.store_image(image("AAAA"), 5.0)
     kept.flush()
@@ -141,15 +141,15 @@ def test_files_go_and_decisions_stay(archive, tmp_path):
     assert kept.apply_retention(2e9) == []
 
 
-def test_without_limits_nothing_is_removed(archive, tmp_path):
+def test_retention_without_limits_removes_nothing(archive, tmp_path):
     kept = archive()
     kept.store_image(image(), 5.0)
     kept.flush()
     assert kept.apply_retention(1e12) == []
-    assert len(pictures_in(tmp_path / "out")) == 1
+    assert len(images_in(tmp_path / "out")) == 1
 
 
-def test_an_exported_picture_goes_before_an_older_one(archive):
+def test_exported_image_is_removed_before_an_older_one(archive):
     kept = archive()
     kept.store_image(image("AAAA"), 5.0)
     kept.flush()
@@ -162,7 +162,7 @@ def test_an_exported_picture_goes_before_an_older_one(archive):
     assert [r.image_id for r in limited.apply_retention(1e10)] == ["BBBB"]
 
 
-def test_a_removed_picture_that_comes_again_is_kept_again(archive, tmp_path):
+def test_removed_image_that_arrives_again_is_stored(archive, tmp_path):
     kept = archive(max_bytes=0)
     assert kept.store_image(image(), 5.0)
     kept.flush()
@@ -174,7 +174,7 @@ def test_a_removed_picture_that_comes_again_is_kept_again(archive, tmp_path):
     kept.flush()
 
 
-def test_the_index_is_completed_from_the_files(archive, tmp_path):
+def test_index_is_completed_from_the_files(archive, tmp_path):
     first = archive()
     first.store_image(image("AAAA", 1), 5.0)
     first.flush()
@@ -192,7 +192,7 @@ def test_the_index_is_completed_from_the_files(archive, tmp_path):
     assert [d.decision_id for d in again.index().decisions()] == ["d1"]
 
 
-def test_an_index_of_another_version_or_none_is_refused(tmp_path):
+def test_index_of_another_version_or_other_file_is_rejected(tmp_path):
     with pytest.raises(StoredFileError, match="no such file"):
         ShoreIndex(tmp_path, writable=False)
     (tmp_path / FILE_NAME).write_bytes(b"no database" * 100)
@@ -201,7 +201,7 @@ def test_an_index_of_another_version_or_none_is_refused(tmp_path):
             ShoreIndex(tmp_path, writable=writable)
 
 
-def test_a_picture_is_found_by_name_and_newest_version():
+def test_image_is_found_by_name_and_newest_version():
     rows = [row("f1", version=1), row("f2", version=2), row("g", vessel_id="vessel-2", vehicle_id="uuv-2")]
     assert find_image(rows, "uuv-1/AAAA", None, None).name == "f2"
     assert find_image(rows, "uuv-1/AAAA", None, 1).name == "f1"
@@ -213,7 +213,7 @@ def test_a_picture_is_found_by_name_and_newest_version():
         find_image(twice, "uuv-1/AAAA", None, None)
 
 
-def test_the_service_removes_counts_and_logs(runner, platform, tmp_path, caplog):
+def test_service_removes_counts_and_logs(runner, platform, tmp_path, caplog):
     from sonarpost import keys, wire
     from sonarpost.messages import Relayed
     from sonarpost.services.c2.service import C2Service
@@ -229,5 +229,5 @@ def test_the_service_removes_counts_and_logs(runner, platform, tmp_path, caplog)
     relay.send(keys.shore_inbox("vessel-1"), "c2", envelope)
     eventually(lambda: service.health().counters.get("images_removed") == 1)
     assert service.health().gauges["pictures_bytes"] == 0
-    assert pictures_in(tmp_path / "out") == []
+    assert images_in(tmp_path / "out") == []
     assert "Image removed by retention" in [record.message for record in caplog.records]

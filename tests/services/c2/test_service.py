@@ -1,4 +1,4 @@
-"""c2: what vessels relay is committed, kept in files and shown; nobody speaks for another vessel."""
+"""c2: records of vessels are committed, stored in files and published; a vessel cannot send for another one."""
 
 from __future__ import annotations
 
@@ -70,12 +70,12 @@ def send(relay, *records, vessel="vessel-1"):
 
 
 def files(folder):
-    """Everything but the index."""
+    """All files but the index."""
     found = (str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
     return sorted(name for name in found if not name.startswith("index.db"))
 
 
-def test_a_picture_is_kept_and_shown_for_msgpack_alone(begin, relay, image, out, watch, check_monitoring):
+def test_image_is_stored_and_published_as_plain_msgpack(begin, relay, image, out, watch, check_monitoring):
     seen = watch(keys.shore_image("vessel-1"))
     service = begin()
     sent = image()
@@ -101,7 +101,7 @@ def test_a_picture_is_kept_and_shown_for_msgpack_alone(begin, relay, image, out,
     check_monitoring(service)
 
 
-def test_a_decision_is_kept_and_shown(begin, relay, out, watch):
+def test_decision_is_stored_and_published(begin, relay, out, watch):
     seen = watch(keys.shore_decision("vessel-1"))
     begin()
     send(relay, decision_record("d1", remark="Stein oder Mine? \u2014 pr\u00fcfen", confidence=0.75))
@@ -114,7 +114,7 @@ def test_a_decision_is_kept_and_shown(begin, relay, out, watch):
     )
 
 
-def test_the_same_record_again_changes_no_file_and_is_shown_again(begin, relay, image, out, watch):
+def test_repeated_record_changes_no_file_and_is_published_again(begin, relay, image, out, watch):
     pictures, decisions = watch(keys.shore_image("vessel-1")), watch(keys.shore_decision("vessel-1"))
     service = begin()
     send(relay, image(), decision_record())
@@ -129,7 +129,7 @@ def test_the_same_record_again_changes_no_file_and_is_shown_again(begin, relay, 
     assert (counters["decisions_stored"], counters["decisions_repeated"]) == (1, 1)
 
 
-def test_another_decision_under_the_same_identifier_is_refused(begin, relay, out, refused, watch):
+def test_different_decision_with_the_same_identifier_is_refused(begin, relay, out, refused, watch):
     seen = watch(keys.shore_decision("vessel-1"))
     service = begin()
     send(relay, decision_record("d1"), decision_record("d1", verdict="not_mine_like"), decision_record("d2"))
@@ -146,7 +146,7 @@ def test_another_decision_under_the_same_identifier_is_refused(begin, relay, out
     "hostile",
     ["../../escaped", "/etc/cron.d/x", "..", ".", "a/b", "x" * 64, "%2e%2e%2f", "~root", "-rf", "CON:|<>?*", "$(x)`y`"],
 )
-def test_no_identifier_leads_out_of_the_folder(hostile, begin, relay, out, tmp_path):
+def test_identifier_cannot_leave_the_folder(hostile, begin, relay, out, tmp_path):
     service = begin()
     send(relay, decision_record(hostile), decision_record("after"))
     eventually(lambda: service.health().counters.get("decisions_stored") == 2)
@@ -157,8 +157,8 @@ def test_no_identifier_leads_out_of_the_folder(hostile, begin, relay, out, tmp_p
 
 
 @pytest.mark.parametrize("long", ["\u00fc" * 64, "\U0001f41f" * 64, "x" * 65, "a\x00b", "a\nb"])
-def test_an_identifier_that_is_no_file_name_blocks_nothing(long, begin, relay, refused):
-    """A vessel's console may be of another make; whatever it sends, the records behind go on."""
+def test_identifier_that_is_not_a_file_name_blocks_nothing(long, begin, relay, refused):
+    """The console of a vessel can be a third-party program: an invalid record must not block later ones."""
     service = begin()
     fields = msgpack.unpackb(wire.encode(decision_record())) | {"decision_id": long}
     send(relay, envelope(decision_record(), payload=msgpack.packb(fields)), decision_record("after"))
@@ -198,7 +198,7 @@ def damaged(image):
         (damaged, "payload"),
     ],
 )
-def test_an_envelope_with_the_wrong_content_is_refused_and_said(make, field, begin, relay, image, refused, out):
+def test_envelope_with_invalid_content_is_refused_with_the_reason(make, field, begin, relay, image, refused, out):
     service = begin()
     send(relay, make(image), image())
     eventually(lambda: service.health().counters.get("images_stored") == 1)
@@ -210,7 +210,7 @@ def test_an_envelope_with_the_wrong_content_is_refused_and_said(make, field, beg
     assert {p.parts[0] for p in (f.relative_to(out) for f in out.rglob("*.json"))} == {"vessel-1"}
 
 
-def test_no_vessel_speaks_for_another(begin, relay, image, refused, out):
+def test_vessel_cannot_send_for_another_one(begin, relay, image, refused, out):
     service = begin()
     forged = envelope(image(vessel="vessel-2"), "vessel-2")
     relay.send(keys.shore_inbox("vessel-1"), "c2", forged)
@@ -222,7 +222,7 @@ def test_no_vessel_speaks_for_another(begin, relay, image, refused, out):
     assert not (out / "vessel-2").exists()
 
 
-def test_two_vessels_are_kept_apart(begin, runner, relay, image, out):
+def test_vessels_have_separate_folders(begin, runner, relay, image, out):
     begin()
     other = runner.peer("vessel-2", "relay")
     send(relay, image(seed=1), decision_record())
@@ -233,7 +233,7 @@ def test_two_vessels_are_kept_apart(begin, runner, relay, image, out):
     assert one["picture_sha256"] != two["picture_sha256"]
 
 
-def test_what_was_committed_before_a_stop_is_handled_after_it(begin, runner, platform, relay, image, out, watch):
+def test_record_committed_before_a_stop_is_handled_after_the_restart(begin, runner, platform, relay, image, out, watch):
     seen = watch(keys.shore_image("vessel-1"))
     idle = C2Service(platform("shore-1"), C2Config(out_dir=out))
     with idle.store.transaction() as tx:
@@ -249,7 +249,7 @@ def test_what_was_committed_before_a_stop_is_handled_after_it(begin, runner, pla
     assert len(seen) == 1
 
 
-def test_a_folder_that_takes_nothing_keeps_records_in_the_store(begin, relay, image, tmp_path, watch):
+def test_records_stay_in_the_store_while_the_folder_is_not_writable(begin, relay, image, tmp_path, watch):
     seen = watch(keys.shore_image("vessel-1"))
     blocker = tmp_path / "disk"
     blocker.write_text("not mounted")
@@ -265,7 +265,7 @@ def test_a_folder_that_takes_nothing_keeps_records_in_the_store(begin, relay, im
     eventually(lambda: service.health().state == "ok")
 
 
-def test_records_that_come_together_are_kept_with_one_wait_for_the_disk(begin, relay, image, out, watch, monkeypatch):
+def test_batch_of_records_is_flushed_once(begin, relay, image, out, watch, monkeypatch):
     flushes = []
     commit = AtomicFiles.commit
     monkeypatch.setattr(AtomicFiles, "commit", lambda files: (flushes.append(len(files)), commit(files)))
@@ -282,7 +282,7 @@ def test_records_that_come_together_are_kept_with_one_wait_for_the_disk(begin, r
     eventually(lambda: len(seen) == 41)
 
 
-def test_of_a_batch_whose_files_cannot_be_written_nothing_is_lost(begin, relay, image, out, monkeypatch):
+def test_failed_batch_is_handled_again(begin, relay, image, out, monkeypatch):
     commit = AtomicFiles.commit
     failures = []
 
@@ -302,7 +302,7 @@ def test_of_a_batch_whose_files_cannot_be_written_nothing_is_lost(begin, relay, 
     assert service.health().counters["records_handled"] == 20
 
 
-def test_what_a_killed_c2_was_writing_is_removed_at_the_next_start(begin, relay, image, out):
+def test_temporary_files_of_a_killed_c2_are_deleted_at_the_next_start(begin, relay, image, out):
     for folder in (out / "vessel-1", out / "vessel-1" / "decisions"):
         folder.mkdir(parents=True)
         (folder / ".uuv-1_20231114T221320Z_AAAA_v1.tiff.k2j3h4.tmp").write_bytes(b"half")

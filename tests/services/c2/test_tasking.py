@@ -1,4 +1,4 @@
-"""Advice and commands from the shore to the vessel: never lost, taken once, and how far they came visible ashore."""
+"""Advice and commands from the shore to the vessel: delivered exactly once, with their state shown at the shore."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def command(command_id="c1", kind="refine"):
 
 
 def states(out):
-    """How far everything has come, by vessel, kind and identifier; nothing while there is no index yet."""
+    """Delivery states by vessel, kind and identifier; empty while there is no index."""
     try:
         index = ShoreIndex(out, writable=False)
     except StoredFileError:
@@ -88,7 +88,7 @@ def states(out):
         index.close()
 
 
-def test_advice_and_a_command_reach_their_consumers_on_the_vessel(begin, relay, expert, console, op_modem, out, watch):
+def test_advice_and_command_reach_their_consumers_on_the_vessel(begin, relay, expert, console, op_modem, out, watch):
     shown, aboard = watch(keys.tasking_state("vessel-1")), watch("sonarpost/v1/vessel-1/**")
     service = begin()
     relay()
@@ -101,12 +101,12 @@ def test_advice_and_a_command_reach_their_consumers_on_the_vessel(begin, relay, 
     eventually(lambda: len(shown) >= 2)
     told = [msgpack.unpackb(sample.payload.to_bytes()) for sample in shown]
     assert {(t["type"], t["state"]) for t in told} <= {(TaskingState.TYPE, s) for s in ("waiting", "delivered")}
-    # On the vessel they are shown once, by the relay.
+    # On the vessel, only the relay publishes them.
     eventually(lambda: len([s for s in aboard if "/health/" not in str(s.key_expr)]) == 2)
     assert service.health().counters["tasking_accepted"] == 2
 
 
-def test_with_the_vessel_away_it_waits_and_arrives_when_the_vessel_is_back(begin, relay, expert, console, out, runner):
+def test_advice_waits_for_an_unreachable_vessel(begin, relay, expert, console, out, runner):
     service = begin()
     expert.send(ADVICE, "c2", advice("a1"), advice("a2"))
     eventually(lambda: service.gauges()["waiting_for_vessels"] == 2)
@@ -121,10 +121,8 @@ def test_with_the_vessel_away_it_waits_and_arrives_when_the_vessel_is_back(begin
     assert service.gauges()["waiting_for_vessels"] == 0
 
 
-def test_over_a_link_that_is_cut_advice_waits_and_arrives_once_when_it_is_mended(
-    begin, runner, platform, expert, out, tmp_path, router
-):
-    """Two routers, the vessel's linked to the shore's through a proxy that can be cut."""
+def test_advice_arrives_once_after_a_link_cut(begin, runner, platform, expert, out, tmp_path, router):
+    """Two routers, linked through a proxy that can be cut."""
     proxy = TcpProxy(int(router.rpartition(":")[2]))
     vessel_endpoint = f"tcp/127.0.0.1:{free_port()}"
     vessel_router = zenoh.open(router_config([vessel_endpoint], [f"tcp/127.0.0.1:{proxy.port}"]))
@@ -151,7 +149,7 @@ def test_over_a_link_that_is_cut_advice_waits_and_arrives_once_when_it_is_mended
         proxy.close()
 
 
-def test_a_vessel_that_is_away_holds_no_other_back(begin, relay, expert, console, out):
+def test_unreachable_vessel_does_not_delay_others(begin, relay, expert, console, out):
     begin()
     relay()
     screen = console()
@@ -163,7 +161,7 @@ def test_a_vessel_that_is_away_holds_no_other_back(begin, relay, expert, console
     assert states(out)["vessel-9", "advice", "far"] == "waiting"
 
 
-def test_what_nobody_on_the_vessel_takes_is_refused_and_the_shore_is_told(begin, relay, expert, out, refused):
+def test_record_without_a_consumer_is_refused_with_a_state_at_the_shore(begin, relay, expert, out, refused):
     service = begin()
     relay(advice=(), commands=())
     expert.send(ADVICE, "c2", advice())
@@ -176,7 +174,7 @@ def test_what_nobody_on_the_vessel_takes_is_refused_and_the_shore_is_told(begin,
     index.close()
 
 
-def test_the_same_advice_again_is_taken_once_and_another_under_its_name_refused(begin, relay, expert, console, refused):
+def test_repeated_advice_is_accepted_once_and_a_conflicting_one_refused(begin, relay, expert, console, refused):
     service = begin()
     relay()
     screen = console()
@@ -196,7 +194,7 @@ def test_the_same_advice_again_is_taken_once_and_another_under_its_name_refused(
         (COMMAND, advice(), "type"),
     ],
 )
-def test_what_is_not_for_the_vessel_of_the_key_is_refused_at_once(key, record, field, begin, expert, refused):
+def test_record_for_another_vessel_than_the_key_is_refused(key, record, field, begin, expert, refused):
     service = begin()
     expert.send(key, "c2", record)
     eventually(lambda: len(refused(expert)) == 1)
@@ -204,7 +202,7 @@ def test_what_is_not_for_the_vessel_of_the_key_is_refused_at_once(key, record, f
     assert service.gauges()["waiting_for_vessels"] == 0
 
 
-def test_the_relay_refuses_advice_for_another_vessel_and_a_command_under_another_kind(relay, runner, refused):
+def test_relay_refuses_advice_of_another_vessel_and_command_of_another_kind(relay, runner, refused):
     relay()
     other = runner.peer("shore-9", "c2")
     other.send(keys.advice("vessel-1"), "relay", advice(vessel="vessel-2"))
@@ -215,8 +213,8 @@ def test_the_relay_refuses_advice_for_another_vessel_and_a_command_under_another
     assert "kind: got 'refine', expected the kind in the key" in reasons
 
 
-def test_what_a_program_aboard_publishes_is_not_the_relays(relay, console, publish):
-    """The console has it directly; through the relay it would have it twice."""
+def test_publication_on_the_vessel_is_ignored_by_the_relay(relay, console, publish):
+    """The console receives it directly; the relay would deliver it twice."""
     from sonarpost import wire
 
     service, screen = relay(), console()
@@ -226,7 +224,7 @@ def test_what_a_program_aboard_publishes_is_not_the_relays(relay, console, publi
     assert service.store.inbox_depth() == 0
 
 
-def test_another_vessels_envelope_is_refused_while_its_sender_can_be_told(begin, runner, refused):
+def test_envelope_of_another_vessel_is_refused_to_its_sender(begin, runner, refused):
     from sonarpost import wire
     from sonarpost.messages import Relayed
 

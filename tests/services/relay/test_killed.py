@@ -1,4 +1,4 @@
-"""relay killed (SIGKILL) again and again between two sites: every site has every record, once."""
+"""The relay is killed (SIGKILL) repeatedly with two sites; each site receives every record exactly once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KILLS = 3
 
 @pytest.fixture
 def relay_process(router, tmp_path):
-    """Starts the relay as a process of its own, on a store that stays."""
+    """Starts the relay as a separate process on a persistent store."""
     config = tmp_path / "vessel.toml"
     config.write_text(
         f'[platform]\nid = "vessel-1"\nrouter = ["{router}"]\nstate_dir = "{tmp_path / "relay"}"\n'
@@ -45,11 +45,11 @@ def relay_process(router, tmp_path):
         process.wait()
 
 
-def identifiers(neighbour):
-    return [msgpack.unpackb(envelope.payload)["decision_id"] for envelope in neighbour.received]
+def identifiers(site):
+    return [msgpack.unpackb(envelope.payload)["decision_id"] for envelope in site.received]
 
 
-def test_every_site_gets_every_record_once_however_often_the_relay_is_killed(runner, relay_process):
+def test_every_site_receives_every_record_once_if_the_relay_is_killed(runner, relay_process):
     first = runner.peer("shore-1", "c2", {keys.shore_inbox_all("shore"): Relayed})
     second = runner.peer("shore-2", "c2", {keys.shore_inbox_all("shore-2"): Relayed})
     console = runner.peer("vessel-1", "console")
@@ -74,7 +74,7 @@ def test_every_site_gets_every_record_once_however_often_the_relay_is_killed(run
     rng = random.Random(7)
     for kill in range(1, KILLS + 1):
         process = relay_process()
-        # A little further each time, and then somewhere within the next batches.
+        # A little later each time, at a random point of the next batches.
         eventually(lambda kill=kill: len(first.received) >= kill * RECORDS // (KILLS + 2), timeout_s=60)
         time.sleep(rng.uniform(0, 0.02))
         process.kill()

@@ -1,4 +1,4 @@
-"""relay: an envelope around each record of this vessel, urgent ones first, kept until the shore has them."""
+"""relay: records of the vessel in envelopes, urgent ones first, stored until the shore has acknowledged them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def image(texture):
     return make
 
 
-def test_each_record_travels_in_an_envelope_unchanged(begin, c2, source, image, check_monitoring):
+def test_records_are_relayed_unchanged_in_an_envelope(begin, c2, source, image, check_monitoring):
     shore, service = c2(), begin()
     records = {IMAGES: image(), DECISIONS: decision_record()}
     for key, record in records.items():
@@ -57,7 +57,7 @@ def test_each_record_travels_in_an_envelope_unchanged(begin, c2, source, image, 
     check_monitoring(service)
 
 
-def test_without_the_shore_everything_waits_and_decisions_go_first(begin, runner, c2, source, image):
+def test_records_wait_for_the_shore_and_decisions_are_first(begin, runner, c2, source, image):
     service = begin()
     source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(3)))
     eventually(lambda: service.health().gauges["waiting_for_shore"] == 3.0)
@@ -71,7 +71,7 @@ def test_without_the_shore_everything_waits_and_decisions_go_first(begin, runner
     assert [m.get("decision_id", m["image_id"]) for m in inner] == ["d1", "d2", "0000", "0001", "0002"]
 
 
-def test_nothing_is_shown_on_the_vessel_a_second_time(begin, c2, source, watch):
+def test_envelopes_are_not_published(begin, c2, source, watch):
     seen = watch(INBOX)
     shore = c2()
     begin()
@@ -80,7 +80,7 @@ def test_nothing_is_shown_on_the_vessel_a_second_time(begin, c2, source, watch):
     assert seen == []
 
 
-def test_another_vessels_record_is_refused_while_its_sender_can_be_told(begin, c2, source, image, refused):
+def test_record_of_another_vessel_is_refused_to_its_sender(begin, c2, source, image, refused):
     shore, service = c2(), begin()
     source.send(DECISIONS, "relay", decision_record("strange", vessel_id="vessel-2"))
     source.send(IMAGES, "relay", image("BBBB", vessel="vessel-2"))
@@ -95,7 +95,7 @@ def test_another_vessels_record_is_refused_while_its_sender_can_be_told(begin, c
 @pytest.mark.parametrize(
     "payload", [b"", b"\xff", msgpack.packb({"type": "decision", "v": 1}), wire.encode(decision_record())[:-1]]
 )
-def test_what_is_no_record_is_refused_and_the_next_one_relayed(payload, begin, c2, source, refused):
+def test_invalid_record_is_refused_and_the_next_one_relayed(payload, begin, c2, source, refused):
     shore, service = c2(), begin()
     source.send_bytes(DECISIONS, "relay", payload)
     source.send(DECISIONS, "relay", decision_record())
@@ -105,7 +105,7 @@ def test_what_is_no_record_is_refused_and_the_next_one_relayed(payload, begin, c
     assert service.health().state == "ok"
 
 
-def test_a_record_is_relayed_once_over_a_stop_between_taking_and_sending(begin, runner, c2, platform, image):
+def test_record_is_relayed_once_after_a_stop_before_sending(begin, runner, c2, platform, image):
     idle = RelayService(platform("vessel-1"), RelayConfig())
     with idle.store.transaction() as tx:
         tx.accept(IMAGES, wire.encode(image()), b"o" * 16, 1)
@@ -119,7 +119,7 @@ def test_a_record_is_relayed_once_over_a_stop_between_taking_and_sending(begin, 
     assert [e.key for e in shore.received] == [IMAGES]
 
 
-def test_a_full_disk_leaves_the_record_with_its_sender(begin, c2, source, image):
+def test_sender_keeps_the_record_while_the_disk_is_full(begin, c2, source, image):
     shore, service = c2(), begin()
     service.store._db.execute("PRAGMA max_page_count=1")
     source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(6)))

@@ -1,4 +1,4 @@
-"""relay with several sites: each has its own queue, session, limit and quota; and what happens while a site is away."""
+"""relay with several sites: queue, session, bandwidth limit and quota of each, and unreachable sites."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def image(image_id="AAAA", version=1, height_px=40, **changes):
     return picture_record(picture, image_id=image_id, version=version, **changes)
 
 
-def names(neighbour):
-    """What a site got: identifiers of decisions, identifier and version of pictures."""
-    inner = [msgpack.unpackb(envelope.payload) for envelope in neighbour.received]
+def names(site):
+    """Received records: identifiers of decisions, identifier and version of images."""
+    inner = [msgpack.unpackb(envelope.payload) for envelope in site.received]
     return [m.get("decision_id") or f"{m['image_id']}v{m['version']}" for m in inner]
 
 
-def test_every_site_gets_everything_and_one_that_is_away_holds_none_back(begin, runner, c2, source):
+def test_every_site_receives_everything_and_an_unreachable_one_delays_none(begin, runner, c2, source):
     first = c2("shore")
     service = begin(UpstreamOptions(), UpstreamOptions(site="shore-2"))
     source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(20)))
@@ -75,7 +75,7 @@ def test_every_site_gets_everything_and_one_that_is_away_holds_none_back(begin, 
     assert len(first.received) == 21
 
 
-def test_a_site_with_a_router_of_its_own_is_reached_when_that_comes_up(begin, source, c2):
+def test_site_with_its_own_router_is_reached_when_the_router_starts(begin, source, c2):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     near = c2("shore")
     service = begin(UpstreamOptions(), UpstreamOptions(site="far", router=(endpoint,)))
@@ -100,7 +100,7 @@ def test_a_site_with_a_router_of_its_own_is_reached_when_that_comes_up(begin, so
         far_router.close()
 
 
-def test_a_renamed_site_gets_its_records_although_its_c2_knows_the_old_numbers(begin, runner, c2, source, platform):
+def test_renamed_site_accepts_new_numbers(begin, runner, c2, source, platform):
     shore = c2("shore")
     service = begin(UpstreamOptions())
     source.send(DECISIONS, "relay", decision_record("d1"), decision_record("d2"))
@@ -114,7 +114,7 @@ def test_a_renamed_site_gets_its_records_although_its_c2_knows_the_old_numbers(b
     eventually(lambda: names(renamed) == ["d3"])
 
 
-def test_first_versions_come_before_more_detail_and_decisions_before_both(begin, c2, source, runner):
+def test_order_is_decisions_first_versions_later_versions(begin, c2, source, runner):
     service = begin(supersede=False)
     source.send(IMAGES, "relay", image("AAAA", 1), image("AAAA", 2), image("AAAA", 3), image("BBBB", 1))
     source.send(DECISIONS, "relay", decision_record())
@@ -126,9 +126,9 @@ def test_first_versions_come_before_more_detail_and_decisions_before_both(begin,
     assert names(shore) == ["d1", "AAAAv1", "BBBBv1", "AAAAv2", "AAAAv3"]
 
 
-def test_a_newer_version_takes_the_place_of_those_not_sent_yet(begin, c2, source, runner):
+def test_newer_version_replaces_unsent_ones(begin, c2, source, runner):
     service = begin()
-    # The first record is on its way as soon as the relay looks for c2; the ones behind it wait.
+    # The first record is in flight as soon as the relay queries c2; the others wait.
     source.send(DECISIONS, "relay", decision_record())
     eventually(lambda: service.gauges()["waiting_for_shore"] == 1)
     for version in (1, 2, 3):
@@ -143,18 +143,18 @@ def test_a_newer_version_takes_the_place_of_those_not_sent_yet(begin, c2, source
     service = begin()
     eventually(lambda: len(shore.received) == 3)
     assert names(shore) == ["d1", "AAAAv3", "BBBBv1"]
-    # The gaps in the numbers leave no trace at the consumer.
+    # The consumer stores nothing for the gaps in the numbers.
     source.send(IMAGES, "relay", image("CCCC", 1))
     eventually(lambda: len(shore.received) == 4)
     assert shore.store._query("SELECT COUNT(*) FROM seen") == [(0,)]
 
 
-def test_another_picture_under_the_same_identifier_is_no_version_of_the_first():
+def test_image_of_another_mission_is_not_a_version_of_the_first():
     assert topic_of(image(first_frame_utc_s=1.0)).name != topic_of(image(first_frame_utc_s=2.0)).name
     assert topic_of(image(version=1)).name == topic_of(image(version=2)).name
 
 
-def test_with_a_bandwidth_limit_a_decision_passes_a_picture_in_the_middle(begin, c2, source):
+def test_decision_overtakes_an_image_at_a_bandwidth_limit(begin, c2, source):
     shore = c2()
     begin(UpstreamOptions(bandwidth_bytes_per_s=20_000))
     started_s = time.monotonic()
@@ -169,9 +169,7 @@ def test_with_a_bandwidth_limit_a_decision_passes_a_picture_in_the_middle(begin,
 DiskUsage = namedtuple("DiskUsage", "total used free")
 
 
-def test_below_the_reserve_pictures_wait_with_their_senders_and_decisions_are_taken(
-    begin, c2, source, monkeypatch, refused
-):
+def test_senders_keep_images_below_the_reserve_and_decisions_are_accepted(begin, c2, source, monkeypatch, refused):
     free = [20_000_000]
     monkeypatch.setattr("sonarpost.delivery.store.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
     shore = c2()
@@ -187,7 +185,7 @@ def test_below_the_reserve_pictures_wait_with_their_senders_and_decisions_are_ta
     assert refused(source) == []
 
 
-def test_below_the_reserve_a_plain_publication_of_a_picture_is_refused_aloud(begin, c2, publish, monkeypatch):
+def test_plain_publication_of_an_image_below_the_reserve_is_refused_and_logged(begin, c2, publish, monkeypatch):
     from sonarpost import wire
 
     monkeypatch.setattr("sonarpost.delivery.store.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, 20_000_000))
@@ -197,7 +195,7 @@ def test_below_the_reserve_a_plain_publication_of_a_picture_is_refused_aloud(beg
     assert service.gauges()["waiting_for_shore"] == 0
 
 
-def test_a_quota_drops_pictures_of_one_site_and_no_decision(begin, runner, c2, source):
+def test_quota_drops_images_of_one_site_and_no_decisions(begin, runner, c2, source):
     service = begin(UpstreamOptions(max_bytes=15_000), UpstreamOptions(site="shore-2"))
     source.send(DECISIONS, "relay", decision_record())
     source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(6)))
@@ -211,7 +209,7 @@ def test_a_quota_drops_pictures_of_one_site_and_no_decision(begin, runner, c2, s
     assert names(shore) == ["d1", "0003v1", "0004v1", "0005v1"]
 
 
-def test_what_waits_for_a_removed_site_is_kept_until_it_is_dropped_on_purpose(begin, runner, source):
+def test_records_of_a_removed_site_are_kept_unless_dropped_by_configuration(begin, runner, source):
     service = begin(UpstreamOptions(), UpstreamOptions(site="old"))
     source.send(DECISIONS, "relay", decision_record())
     eventually(lambda: service.gauges().get("waiting_for_old") == 1)
@@ -237,6 +235,6 @@ def test_what_waits_for_a_removed_site_is_kept_until_it_is_dropped_on_purpose(be
         {"disk_reserve_bytes": -1},
     ],
 )
-def test_a_wrong_configuration_is_refused(wrong):
+def test_invalid_configuration_is_rejected(wrong):
     with pytest.raises(ValidationError):
         RelayConfig(**wrong)
