@@ -55,7 +55,7 @@ screenshots: setup
 # The documentation site, in build/site; a broken link or an undocumented name fails the build.
 docs: export NO_MKDOCS_2_WARNING = 1
 docs: setup
-	$(BIN)/mkdocs --quiet build --strict
+	$(BIN)/mkdocs build --strict
 
 docs-serve: export NO_MKDOCS_2_WARNING = 1
 docs-serve: setup
