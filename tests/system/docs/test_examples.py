@@ -1,0 +1,113 @@
+"""Every Python and shell block of the documentation runs, or a comment before it says why it does not.
+
+All blocks of a page run in order in one empty folder, Python blocks in one namespace. A block with a title is written to a file of
+that name instead. The line before a block may hold a mark:
+
+- `<!-- example: stop -->`: the command runs until Ctrl-C; the test interrupts it after its first line of output.
+- `<!-- example: run by PATH -->`: another test runs it.
+- `<!-- example: not run, REASON -->`: it cannot run here.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from builders.common import REPOSITORY
+
+PAGES = sorted(
+    path.relative_to(REPOSITORY).as_posix()
+    for pattern in ("*.md", "docs/**/*.md", "services/*/README.md", "examples/README.md", "research/**/README.md")
+    for path in REPOSITORY.glob(pattern)
+    if path.name != "CHANGELOG.md"
+)
+LANGUAGES = {"sh", "python", "text", "toml", "json", "json5", "yaml", "ini", "hex"}
+BLOCK = re.compile(
+    r"(?:^<!-- example: (?P<mark>[^>]*) -->\n)?^( *)```(?P<language>\w*)(?: title=\"(?P<title>[^\"]*)\")?\n(?P<text>.*?)^ *```$",
+    re.MULTILINE | re.DOTALL,
+)
+TIMEOUT_S = 150
+
+
+@dataclass(frozen=True)
+class Block:
+    """One fenced block: its language, the file that it is written to, its mark and its text."""
+
+    language: str
+    title: str | None
+    mark: str
+    text: str
+
+    @property
+    def runs(self) -> bool:
+        """Whether the block is executed by this test."""
+        return self.language in ("sh", "python") and not self.title and self.mark in ("", "stop")
+
+
+def blocks(page: str) -> list[Block]:
+    text = (REPOSITORY / page).read_text(encoding="utf-8")
+    return [Block(m["language"], m["title"], m["mark"] or "", m["text"]) for m in BLOCK.finditer(text)]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_blocks_have_a_language_and_valid_marks(page: str) -> None:
+    text = (REPOSITORY / page).read_text(encoding="utf-8")
+    assert len(re.findall(r"^ *```", text, re.MULTILINE)) == 2 * len(blocks(page))
+    assert text.count("<!-- example: ") == sum(bool(block.mark) for block in blocks(page))
+    assert not re.findall(r"^ {4,}(?:sonarpost|python|make|docker|pip) .*$", text, re.MULTILINE), "use a ```sh block"
+    for block in blocks(page):
+        assert block.language in LANGUAGES, block.text
+        if block.mark.startswith("run by "):
+            assert (REPOSITORY / block.mark.removeprefix("run by ")).exists()
+        else:
+            assert re.fullmatch(r"|stop|not run, .{10,}", block.mark), block.mark
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if any(block.runs for block in blocks(p))])
+def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
+    namespace: dict[str, object] = {"__name__": "example"}
+    modules = set(sys.modules)
+    try:
+        for block in blocks(page):
+            if block.title and not block.mark:
+                Path(block.title).parent.mkdir(parents=True, exist_ok=True)
+                Path(block.title).write_text(block.text, encoding="utf-8")
+            elif block.runs and block.language == "python":
+                exec(compile(block.text, page, "exec"), namespace)
+            elif block.runs:
+                run_shell(block)
+    finally:
+        for name in set(sys.modules) - modules:
+            if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
+                del sys.modules[name]
+
+
+def run_shell(block: Block) -> None:
+    process = subprocess.Popen(
+        ["bash", "-euo", "pipefail", "-c", block.text],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    with process:
+        try:
+            assert process.stdout is not None
+            output = process.stdout.readline() if block.mark == "stop" else ""
+            if block.mark == "stop":
+                os.killpg(process.pid, signal.SIGINT)
+            output += process.communicate(timeout=TIMEOUT_S)[0]
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode in ((0, 130, -signal.SIGINT) if block.mark == "stop" else (0,)), f"{block.text}\n{output}"
