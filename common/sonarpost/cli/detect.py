@@ -157,6 +157,7 @@ def _plot_path(plot: Path, survey_path: Path, *, several: bool) -> Path:
 
 def _write_snippets(folder: Path, result: FileResult) -> None:
     """Write the snippet of each contact at the resolution of the recording and, if possible, at 10 cm a pixel."""
+    folder.mkdir(parents=True, exist_ok=True)
     for number, contact in enumerate(result.contacts, start=1):
         name = f"{result.survey.path.stem}-{number:03d}"
         _write_png(folder / f"{name}.png", Image.fromarray(cut_snippet(contact.survey, contact.detection).image))

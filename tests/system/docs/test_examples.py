@@ -1,7 +1,7 @@
 """Every Python and shell block of the documentation runs, or a comment before it says why it does not.
 
-All blocks of a page run in order in one empty folder, Python blocks in one namespace. A block with a title is written to a file of
-that name instead. The line before a block may hold a mark:
+All blocks of a page run in order in one empty folder, Python blocks in one namespace. A block with a title is written
+to a file of that name instead. The line before a block may hold a mark:
 
 - `<!-- example: stop -->`: the command runs until Ctrl-C; the test interrupts it after its first line of output.
 - `<!-- example: run by PATH -->`: another test runs it.
@@ -29,7 +29,8 @@ PAGES = sorted(
 )
 LANGUAGES = {"sh", "python", "text", "toml", "json", "json5", "yaml", "ini", "hex"}
 BLOCK = re.compile(
-    r"(?:^<!-- example: (?P<mark>[^>]*) -->\n)?^( *)```(?P<language>\w*)(?: title=\"(?P<title>[^\"]*)\")?\n(?P<text>.*?)^ *```$",
+    r"(?:^<!-- example: (?P<mark>[^>]*) -->\n)?"
+    r"^ *```(?P<language>\w*)(?: title=\"(?P<title>[^\"]*)\")?\n(?P<text>.*?)^ *```$",
     re.MULTILINE | re.DOTALL,
 )
 TIMEOUT_S = 150

@@ -29,6 +29,7 @@ from sonarpost.runtime.service import Service, UnitOfWork
 
 PlatformMaker = Callable[[str], PlatformConfig]
 TEXT = (REPOSITORY / "docs" / "specifications" / "zenoh.md").read_text(encoding="utf-8")
+TUTORIAL = (REPOSITORY / "docs" / "tutorials" / "own-detector.md").read_text(encoding="utf-8")
 
 
 def test_limits_of_the_wire_format() -> None:
@@ -45,11 +46,11 @@ def test_example_of_an_error_message() -> None:
         wire.decode(
             Snippet, msgpack.packb({"type": "snippet", "v": 1} | snippet), "sonarpost/v1/uuv-1/contact/detected"
         )
-    assert f"    {caught.value}\n" in TEXT
+    assert f"\n{caught.value}\n" in TEXT
 
 
 def blocks(language: str) -> dict[str, str]:
-    return dict(re.findall(rf'^```{language} title="(\w+)"\n(.*?)^```$', TEXT, re.MULTILINE | re.DOTALL))
+    return dict(re.findall(rf'^```{language} title="([\w.]+)"\n(.*?)^```$', TEXT + TUTORIAL, re.MULTILINE | re.DOTALL))
 
 
 def hex_block(name: str) -> bytes:
@@ -160,7 +161,7 @@ def test_published_contact_reaches_consumer_and_watcher(run: Run, router: str, p
         watching = run("watch", router)
         while not watching.lines.get(timeout=15).startswith("sonarpost/v1/uuv-1/health/compressor health"):
             pass
-        run("publish", router).wait()
+        run("detector.py", router).wait()
         eventually(lambda: len(consumer.received) == 1)
         line = ""
         while not line.startswith(keys.contact_detected("uuv-1")):
@@ -184,7 +185,7 @@ def test_delivery_program_waits_for_its_consumer(
     run: Run, router: str, platform: PlatformMaker, tmp_path: Path
 ) -> None:
     (tmp_path / "record").write_bytes(hex_block("decision"))
-    program = run("handover", router, DecisionConsumer.key, "relay", str(tmp_path / "record"))
+    program = run("deliver", router, DecisionConsumer.key, "relay", str(tmp_path / "record"))
     with pytest.raises(queue.Empty):
         program.lines.get(timeout=0.5)
     consumer = DecisionConsumer(platform("vessel-1"))
@@ -205,7 +206,7 @@ def test_delivery_program_sends_pieces_and_reports_a_refusal(
     consumer = RecordingConsumer(platform("uuv-1"))
     consumer.start()
     try:
-        program = run("handover", router, RecordingConsumer.key, "compressor", str(tmp_path / "record"))
+        program = run("deliver", router, RecordingConsumer.key, "compressor", str(tmp_path / "record"))
         program.wait()
         assert (
             program.lines.get(timeout=5) == f"refused {RecordingConsumer.key}: contact: got 'nothing', expected a value"

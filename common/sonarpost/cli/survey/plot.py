@@ -83,6 +83,7 @@ def run(parsed: argparse.Namespace) -> int:
                 "waterfall": draw_waterfall(reduced, title, over_ground=parsed.ground),
                 "track": draw_track(thinned_track(source.pings()), title),
             }
+        parsed.out.mkdir(parents=True, exist_ok=True)
         for kind, image in images.items():
             target = parsed.out / f"{name}-{kind}.png"
             write_atomically(target, _png(image))
