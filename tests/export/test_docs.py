@@ -21,7 +21,7 @@ def section(title: str) -> str:
 
 
 def test_all_properties_are_documented() -> None:
-    cells = [line.split("|")[1] for line in section("What is exported").splitlines() if line.startswith("| `")]
+    cells = [line.split("|")[1] for line in section("Contents").splitlines() if line.startswith("| `")]
     named = [name for cell in cells for name in re.findall(r"`(\w+)`", cell)]
     assert sorted(named) == sorted(COLUMNS)
 
