@@ -10,16 +10,21 @@ to a file of that name instead. The line before a block may hold a mark:
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from builders.common import REPOSITORY
+
+from sonarpost.cli.main import COMMANDS, parser
 
 PAGES = sorted(
     path.relative_to(REPOSITORY).as_posix()
@@ -68,6 +73,52 @@ def test_blocks_have_a_language_and_valid_marks(page: str) -> None:
             assert (REPOSITORY / block.mark.removeprefix("run by ")).exists()
         else:
             assert re.fullmatch(r"|stop|not run, .{10,}", block.mark), block.mark
+
+
+def commands(text: str) -> Iterator[list[str]]:
+    """Yield every `sonarpost` and `research` command of a shell text with its arguments."""
+    for line in text.replace("\\\n", " ").splitlines():
+        lexer = shlex.shlex(line, posix=True, punctuation_chars="|&;<>()")
+        lexer.whitespace_split = True
+        words: list[str] = []
+        for word in [*lexer, ";"]:
+            if not set(word) <= set("|&;<>()"):
+                words.append(word)
+                continue
+            if word.startswith(">") and words and words[-1] in ("1", "2"):
+                words.pop()
+            for number, name in enumerate(words):
+                is_command = name in ("sonarpost", "/opt/sonarpost/bin/sonarpost") and words[number - 1] not in (
+                    "-o",
+                    "-g",
+                )
+                if is_command or name.startswith("research."):
+                    yield words[number:]
+                    break
+            words = []
+
+
+def usage_error(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """Return the error of the `sonarpost` command for its arguments; empty if only required ones are missing."""
+    try:
+        parser(arguments[0] if arguments else "").parse_args(arguments)
+    except SystemExit as end:
+        error = capsys.readouterr().err
+        return "" if end.code == 0 or "arguments are required" in error else error
+    return ""
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_have_valid_arguments(page: str, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (REPOSITORY / page).read_text(encoding="utf-8")
+    shells = [block.text for block in blocks(page) if block.language == "sh"]
+    names = "|".join(COMMANDS)
+    spans = re.findall(rf"`(sonarpost (?:{names})\b[^`\[…|{{]*|python -m research\.[^`\[…|{{]*)`", BLOCK.sub("", text))
+    for words in commands("\n".join([*shells, *(" ".join(span.split()) for span in spans)])):
+        if words[0].startswith("research."):
+            assert importlib.util.find_spec(words[0]) is not None, words[0]
+        else:
+            assert usage_error(words[1:], capsys) == "", shlex.join(words)
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if any(block.runs for block in blocks(p))])
