@@ -13,6 +13,10 @@ its files.
 One JSON object a run, with the host's load average during it (mean of samples of the one-minute average) and how much
 of the host's CPU was in use by all that ran on it, and by the bench's own processes. The exit status is 0 where every
 picture is ashore once, with the right sha256.
+
+
+## research.fleet
+Pictures for the benches: noise, so that nothing on the way can make them smaller, and none twice.
 """
 
 from __future__ import annotations
@@ -37,13 +41,12 @@ import msgpack
 import numpy as np
 import zenoh
 
-from research.common.noise import noise_picture
 from sonarpost import keys
 from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.bus.session import client_config
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.messages import ReconstructedImage, Record
+from sonarpost.messages import Pixels, ReconstructedImage, Record
 from sonarpost.parent_process import EXIT_WITH_PARENT
 from sonarpost.runtime.service import Service, UnitOfWork
 
@@ -356,3 +359,34 @@ def main() -> int:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+SHAPE = (100, 300)
+"""Height and width in pixels: 30 kB."""
+
+
+def noise_picture(
+    vessel_id: str, vehicle_id: str, image_id: str, seed: int | Sequence[int], first_frame_utc_s: float
+) -> ReconstructedImage:
+    """Return a picture that has arrived whole; the same seed gives the same pixels."""
+    raster = Pixels.from_array(np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8))
+    return ReconstructedImage(
+        vessel_id=vessel_id,
+        vehicle_id=vehicle_id,
+        image_id=image_id,
+        version=1,
+        contact=None,
+        codec="vq",
+        model="",
+        picture=raster,
+        picture_sha256=raster.sha256,
+        complete=True,
+        missing_fraction=0.0,
+        missing_mask=b"",
+        missing_halves=(),
+        bytes_received=232,
+        bytes_total=232,
+        frames_received=6,
+        first_frame_utc_s=first_frame_utc_s,
+        last_frame_utc_s=first_frame_utc_s,
+    )

@@ -38,7 +38,7 @@ from pathlib import Path
 
 import zenoh
 
-from research.common.noise import noise_picture
+from research.fleet import noise_picture
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.demo.settings import free_ports

@@ -1,95 +1,132 @@
-"""What `python -m research.codecs` says: tables for people, one JSON object for programs."""
+"""Report of `python -m research.codecs`: tables as text, one JSON object, and rate differences between the codecs."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
-from research.codecs.rate_distortion import BD_RESAMPLES, LEAST_SHARE, RateDifference, curves, rate_difference
-from research.common.images import PictureSet
-from research.common.measurement import Point, best_that_fit
-from research.common.statistics import Values, interval, mean_of_known, weighted_means
+from research.common.images import ImageSet
+from research.common.measurement import BudgetResult, best_within_budgets
+from research.common.statistics import (
+    Interval,
+    Values,
+    bd_rate_percent,
+    finite_mean,
+    interval,
+    overlap_db,
+    weighted_means,
+)
 
 REFERENCE: Final = "emb"
-"""The codec the others are compared with in the JSON object."""
+"""The codec with which the others are compared in the JSON object."""
+MIN_SHARE: Final = 0.9
+"""A budget counts if the codec coded at least this share of the images within it."""
+BD_RESAMPLES: Final = 200
 _METRICS: Final = ("psnr", "ssim", "msssim")
 _Json = dict[str, object]
+Curve = Sequence[BudgetResult]
 
 
-def at_budgets(points: Sequence[Point], budgets: Sequence[int]) -> list[Point]:
-    """Return one point for each codec and budget: for vq, whose sizes are its own, the best variant that fits."""
-    found: list[Point] = []
-    for curve in curves(points).values():
-        natural = [point for point in curve if point.subject.is_natural]
-        found += best_that_fit(natural, budgets) if natural else curve
+def curves(results: Sequence[BudgetResult]) -> dict[str, list[BudgetResult]]:
+    """Group results by codec name in order of first appearance; the variants of a codec form one curve."""
+    found: dict[str, list[BudgetResult]] = {}
+    for result in results:
+        found.setdefault(result.tested.codec.name, []).append(result)
     return found
 
 
-def result_rows(points: Sequence[Point], budgets: Sequence[int]) -> list[_Json]:
+def at_budgets(results: Sequence[BudgetResult], budgets: Sequence[int]) -> list[BudgetResult]:
+    """Return one result for each codec and budget; for natural sizes (vq) the best variant that fits."""
+    found: list[BudgetResult] = []
+    for curve in curves(results).values():
+        natural = [result for result in curve if result.tested.is_natural]
+        found += best_within_budgets(natural, budgets) if natural else curve
+    return found
+
+
+def result_rows(results: Sequence[BudgetResult], budgets: Sequence[int]) -> list[_Json]:
     """Return the rows of the JSON object, one for each codec and budget.
 
-    All figures of a row are null where fewer than `LEAST_SHARE` of the pictures fitted: a mean over the easy pictures
-    is not comparable with one over all.
+    All figures of a row are null if fewer than `MIN_SHARE` of the images fitted: a mean over the easy images is not
+    comparable with one over all.
     """
     rows: list[_Json] = []
-    for point in at_budgets(points, budgets):
-        counts = point.hits.mean() >= LEAST_SHARE
-        figures = _figures(point)
-        shown = {name: value if counts else None for name, value in figures.items()}
-        rows.append({"codec": point.subject.codec.name, "budget": point.shown_budget, **shown})
+    for result in at_budgets(results, budgets):
+        counts = result.hits.mean() >= MIN_SHARE
+        figures = {name: value if counts else None for name, value in _figures(result).items()}
+        rows.append({"codec": result.tested.codec.name, "budget": result.effective_budget, **figures})
     return rows
 
 
-def _figures(point: Point) -> dict[str, float | None]:
+def _figures(result: BudgetResult) -> dict[str, float | None]:
     return {
-        "bytes": _rounded(mean_of_known(point.stream_bytes), 2),
-        "psnr": _rounded(mean_of_known(point.psnr), 4),
-        "ssim": _rounded(mean_of_known(point.ssim), 5),
-        "msssim": _rounded(mean_of_known(point.msssim), 5),
-        "encode_ms": _rounded(_median(point.encode_ms), 3),
-        "decode_ms": _rounded(_median(point.decode_ms), 3),
+        "bytes": _rounded(finite_mean(result.stream_bytes), 2),
+        "psnr": _rounded(finite_mean(result.psnr), 4),
+        "ssim": _rounded(finite_mean(result.ssim), 5),
+        "msssim": _rounded(finite_mean(result.msssim), 5),
+        "encode_ms": _rounded(_finite_median(result.encode_ms), 3),
+        "decode_ms": _rounded(_finite_median(result.decode_ms), 3),
     }
 
 
-def detail_rows(points: Sequence[Point], weights: Values) -> list[_Json]:
-    """Return one JSON object a point: means over the pictures that were coded, their number, the misses, intervals.
+def detail_rows(results: Sequence[BudgetResult], weights: Values) -> list[_Json]:
+    """Return one JSON object a result: means over the coded images, their number, misses, intervals.
 
-    A figure of a point that missed every picture is null. `emb_gain` is the mean difference of emb over this codec in
-    each metric, at the same budget on the pictures both coded, with its interval.
+    A figure is null if every image was missed. `emb_gain` is the mean difference of emb over this codec in each
+    metric, at the same budget on the images that both coded, with its interval.
     """
-    reference = {p.budget_bytes: p for p in points if p.subject.codec.name == REFERENCE}
-    return [_row(point, reference.get(point.budget_bytes), weights) for point in points]
+    reference = {r.budget_bytes: r for r in results if r.tested.codec.name == REFERENCE}
+    return [_detail_row(result, reference.get(result.budget_bytes), weights) for result in results]
 
 
-def _row(point: Point, reference: Point | None, weights: Values) -> _Json:
+def _detail_row(result: BudgetResult, reference: BudgetResult | None, weights: Values) -> _Json:
     row: _Json = {
-        "codec": point.subject.codec.name,
-        "budget": point.shown_budget,
-        **_figures(point),
-        "n": int(point.hits.sum()),
-        "misses": point.misses,
-        "ci": {name: _ci(_metric(point, name), weights) for name in _METRICS},
+        "codec": result.tested.codec.name,
+        "budget": result.effective_budget,
+        **_figures(result),
+        "n": int(result.hits.sum()),
+        "misses": result.misses,
+        "ci": {name: _ci(getattr(result, name), weights) for name in _METRICS},
     }
-    if point.subject.variant:
-        row["variant"] = point.subject.variant
-    if point.reasons:
-        row["miss_reasons"] = dict(point.reasons.most_common(3))
-    if reference is not None and reference is not point:
-        row["emb_gain"] = {name: _gain(_metric(reference, name) - _metric(point, name), weights) for name in _METRICS}
+    if result.tested.variant:
+        row["variant"] = result.tested.variant
+    if result.reasons:
+        row["miss_reasons"] = dict(result.reasons.most_common(3))
+    if reference is not None and reference is not result:
+        differences = {name: getattr(reference, name) - getattr(result, name) for name in _METRICS}
+        row["emb_gain"] = {
+            name: {"mean": _rounded(finite_mean(values), 5), "ci": _ci(values, weights)}
+            for name, values in differences.items()
+        }
     return row
 
 
-def _gain(difference: Values, weights: Values) -> _Json:
-    return {"mean": _rounded(mean_of_known(difference), 5), "ci": _ci(difference, weights)}
+@dataclass(frozen=True)
+class RateDifference:
+    """Difference in rate of two codecs at equal PSNR.
+
+    Attributes:
+        percent: Bjøntegaard difference, negative if the first needs less; None if they are not comparable.
+        ci: 95 % bootstrap interval; None if too few samples were comparable.
+        overlap: PSNR range of the comparison, dB.
+        images: Number of images of both curves.
+    """
+
+    percent: float | None
+    ci: Interval | None
+    overlap: Interval | None
+    images: int
 
 
-def rate_differences(points: Sequence[Point], weights: Values) -> dict[str, dict[str, RateDifference]]:
-    """Compare every codec with every other; intervals for the reference codec only (they take their time)."""
-    by_codec = curves(points)
+def rate_differences(results: Sequence[BudgetResult], weights: Values) -> dict[str, dict[str, RateDifference]]:
+    """Compare every codec with every other; intervals for the reference codec only, as they take time."""
+    by_codec = curves(results)
     return {
         name: {
             other: rate_difference(curve, other_curve, weights if name == REFERENCE else None)
@@ -100,33 +137,85 @@ def rate_differences(points: Sequence[Point], weights: Values) -> dict[str, dict
     }
 
 
-def json_line(rows: list[_Json], pictures: int, differences: dict[str, dict[str, RateDifference]]) -> str:
-    """Return the JSON object: number of pictures, rows, and the reference codec's rate differences in percent."""
+def rate_difference(first: Curve, second: Curve, weights: Values | None = None) -> RateDifference:
+    """Compare two codecs by the Bjøntegaard rate difference (see `bd_rate_percent`).
+
+    Curves consist of mean bytes and mean PSNR over the same images: those that both codecs coded at every budget that
+    counts (`MIN_SHARE`). Means over different images would favour a codec that misses the difficult ones.
+
+    Args:
+        first: Results of one codec.
+        second: Results of the other.
+        weights: Bootstrap weights, shape (R, images), for the interval; None for no interval.
+    """
+    one, other = _counting(first), _counting(second)
+    if len(one) < 2 or len(other) < 2:
+        return RateDifference(None, None, None, 0)
+    common = np.logical_and.reduce([result.hits for result in (*one, *other)])
+    images = int(np.count_nonzero(common))
+    if images == 0:
+        return RateDifference(None, None, None, 0)
+    equal = np.full((1, common.size), 1.0)
+    (rates, quality), (other_rates, other_quality) = _means(one, common, equal), _means(other, common, equal)
+    percent = bd_rate_percent(rates[0], quality[0], other_rates[0], other_quality[0])
+    if percent is None:
+        return RateDifference(None, None, None, images)
+    shared = overlap_db(quality[0], other_quality[0])
+    return RateDifference(percent, _difference_interval(one, other, common, weights), shared, images)
+
+
+def _counting(curve: Curve) -> list[BudgetResult]:
+    return [result for result in curve if result.hits.mean() >= MIN_SHARE]
+
+
+def _means(results: Curve, common: npt.NDArray[np.bool_], weights: Values) -> tuple[Values, Values]:
+    """Return mean bytes and mean PSNR in each bootstrap sample, both of shape (R, results)."""
+    chosen = weights[:, common]
+    total = chosen.sum(axis=1, keepdims=True)
+    rates = np.stack([result.stream_bytes[common] for result in results], axis=1)
+    quality = np.stack([result.psnr[common] for result in results], axis=1)
+    return chosen @ rates / total, chosen @ quality / total
+
+
+def _difference_interval(
+    one: Curve, other: Curve, common: npt.NDArray[np.bool_], weights: Values | None
+) -> Interval | None:
+    if weights is None:
+        return None
+    samples = weights[:BD_RESAMPLES]
+    samples = samples[samples[:, common].sum(axis=1) > 0]
+    (rates, quality), (other_rates, other_quality) = _means(one, common, samples), _means(other, common, samples)
+    draws = [bd_rate_percent(rates[i], quality[i], other_rates[i], other_quality[i]) for i in range(samples.shape[0])]
+    return interval(np.array([np.nan if draw is None else draw for draw in draws]))
+
+
+def json_line(rows: list[_Json], images: int, differences: dict[str, dict[str, RateDifference]]) -> str:
+    """Return the JSON object: number of images, rows, and rate differences of the reference codec in percent."""
     compared: dict[str, dict[str, float | None]] = {}
     if REFERENCE in differences:
         found = differences[REFERENCE]
         compared[REFERENCE] = {other: _rounded(difference.percent, 2) for other, difference in found.items()}
-    return json.dumps({"images": pictures, "results": rows, "bd_rate": compared}, allow_nan=False)
+    return json.dumps({"images": images, "results": rows, "bd_rate": compared}, allow_nan=False)
 
 
 def details(
-    points: Sequence[Point],
+    results: Sequence[BudgetResult],
     budgets: Sequence[int],
-    measured: PictureSet,
+    measured: ImageSet,
     weights: Values,
     differences: dict[str, dict[str, RateDifference]],
 ) -> str:
-    """Return everything measured as a JSON object, for a file."""
-    natural = [point for point in points if point.subject.is_natural]
+    """Return all figures as a JSON object, for a file."""
+    natural = [result for result in results if result.tested.is_natural]
     found = {
-        "pictures": len(measured.pictures),
+        "pictures": len(measured.images),
         "origin": measured.origin,
-        "refused": list(measured.refused),
-        "results": detail_rows(at_budgets(points, budgets), weights),
+        "refused": list(measured.rejected),
+        "results": detail_rows(at_budgets(results, budgets), weights),
         "natural_sizes": detail_rows(natural, weights),
         "bd_rate": {
             name: {
-                other: {"percent": d.percent, "ci": d.ci, "overlap_db": d.overlap, "pictures": d.pictures}
+                other: {"percent": d.percent, "ci": d.ci, "overlap_db": d.overlap, "pictures": d.images}
                 for other, d in compared.items()
             }
             for name, compared in differences.items()
@@ -136,58 +225,58 @@ def details(
 
 
 def text(
-    points: Sequence[Point],
-    measured: PictureSet,
+    results: Sequence[BudgetResult],
+    measured: ImageSet,
     weights: Values,
     differences: dict[str, dict[str, RateDifference]],
 ) -> str:
-    """Return the whole report as text."""
-    rows = detail_rows(points, weights)
+    """Return the report as text."""
+    rows = detail_rows(results, weights)
     parts = [
-        f"{len(measured.pictures)} pictures of {measured.origin}, {len(measured.refused)} refused",
-        _quality_table(points, rows),
-        _miss_table(points),
+        f"{len(measured.images)} images of {measured.origin}, {len(measured.rejected)} rejected",
+        _quality_table(results, rows),
+        _miss_table(results),
         _difference_table(differences),
     ]
     return "\n\n".join(part for part in parts if part)
 
 
-def _quality_table(points: Sequence[Point], rows: Sequence[_Json]) -> str:
+def _quality_table(results: Sequence[BudgetResult], rows: Sequence[_Json]) -> str:
     head = ("codec", "budget", "n", "miss", "bytes", "PSNR dB", "95 %", "SSIM", "MS-SSIM", "enc ms", "dec ms")
     body = []
-    for point, row in zip(points, rows, strict=True):
+    for result, row in zip(results, rows, strict=True):
         ci = row["ci"]
         assert isinstance(ci, dict)
         body.append(
             (
-                point.subject.label,
-                str(row["budget"]) if point.budget_bytes is not None else "own",
+                result.tested.label,
+                str(row["budget"]) if result.budget_bytes is not None else "own",
                 str(row["n"]),
                 str(row["misses"]),
-                _shown(row["bytes"], 1),
-                _shown(row["psnr"], 2),
+                _fixed(row["bytes"], 1),
+                _fixed(row["psnr"], 2),
                 "-" if ci["psnr"] is None else f"{ci['psnr'][0]:.2f}..{ci['psnr'][1]:.2f}",
-                _shown(row["ssim"], 3),
-                _shown(row["msssim"], 3),
-                _shown(row["encode_ms"], 1),
-                _shown(row["decode_ms"], 1),
+                _fixed(row["ssim"], 3),
+                _fixed(row["msssim"], 3),
+                _fixed(row["encode_ms"], 1),
+                _fixed(row["decode_ms"], 1),
             )
         )
-    note = "Means over the n pictures that fitted; bytes are whole streams; ms are medians."
+    note = "Means over the n images that fitted; bytes include the header; times are medians."
     return aligned([head, *body]) + "\n" + note
 
 
-def miss_lines(points: Sequence[Point]) -> list[str]:
-    """Return one line for each point that missed pictures: how many, and the most frequent reason."""
+def miss_lines(results: Sequence[BudgetResult]) -> list[str]:
+    """Return one line for each result with misses: their number and the most frequent reason."""
     return [
-        f"{point.subject.label} at {point.shown_budget} B: {count} x {reason}"
-        for point in points
-        for reason, count in point.reasons.most_common(1)
+        f"{result.tested.label} at {result.effective_budget} B: {count} x {reason}"
+        for result in results
+        for reason, count in result.reasons.most_common(1)
     ]
 
 
-def _miss_table(points: Sequence[Point]) -> str:
-    lines = [f"  {line}" for line in miss_lines(points)]
+def _miss_table(results: Sequence[BudgetResult]) -> str:
+    lines = [f"  {line}" for line in miss_lines(results)]
     return "\n".join(["Misses (most frequent reason):", *lines]) if lines else ""
 
 
@@ -196,7 +285,7 @@ def _difference_table(differences: dict[str, dict[str, RateDifference]]) -> str:
         return ""
     names = list(differences)
     head = ("BD-rate %", *(f"vs {name}" for name in names))
-    body = [(name, *(_cell(differences[name].get(other)) for other in names)) for name in names]
+    body = [(name, *(_percent(differences[name].get(other)) for other in names)) for name in names]
     lines = [aligned([head, *body])]
     for other, found in differences.get(REFERENCE, {}).items():
         if found.percent is None or found.overlap is None:
@@ -205,23 +294,23 @@ def _difference_table(differences: dict[str, dict[str, RateDifference]]) -> str:
         ci = "" if found.ci is None else f", 95 % {found.ci[0]:.1f}..{found.ci[1]:.1f}"
         lines.append(
             f"  {REFERENCE} vs {other}: {found.percent:.1f} %{ci} "
-            f"({found.overlap[0]:.2f}..{found.overlap[1]:.2f} dB, {found.pictures} pictures)"
+            f"({found.overlap[0]:.2f}..{found.overlap[1]:.2f} dB, {found.images} images)"
         )
     lines.append(
-        f"Rate at equal PSNR, row against column, negative is less; budgets kept for {LEAST_SHARE:.0%} of the pictures "
-        f"count; intervals from {BD_RESAMPLES} resamples."
+        f"Rate at equal PSNR, row against column, negative is less. Only budgets within which {MIN_SHARE:.0%} of the "
+        f"images were coded count; intervals from {BD_RESAMPLES} resamples."
     )
     return "\n".join(lines)
 
 
-def _cell(found: RateDifference | None) -> str:
+def _percent(found: RateDifference | None) -> str:
     if found is None:
         return ""
     return "-" if found.percent is None else f"{found.percent:.1f}"
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Return rows as text with aligned columns, the first to the left, the others to the right."""
+    """Return rows as text with aligned columns: the first left-aligned, the others right-aligned."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return "\n".join(
         "  ".join(
@@ -232,23 +321,19 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     )
 
 
-def _metric(point: Point, name: str) -> Values:
-    return {"psnr": point.psnr, "ssim": point.ssim, "msssim": point.msssim}[name]
-
-
 def _ci(values: Values, weights: Values) -> list[float] | None:
     found = interval(weighted_means(values, weights))
     return None if found is None else [round(found[0], 5), round(found[1], 5)]
 
 
-def _median(values: Values) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else math.nan
+def _finite_median(values: Values) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else math.nan
 
 
 def _rounded(value: float | None, digits: int) -> float | None:
     return None if value is None or not math.isfinite(value) else round(value, digits)
 
 
-def _shown(value: object, digits: int) -> str:
+def _fixed(value: object, digits: int) -> str:
     return f"{value:.{digits}f}" if isinstance(value, float) else "-"

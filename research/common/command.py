@@ -5,8 +5,15 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from typing import Final
 
+from research.common.measurement import SHIPPED_CODEBOOKS, CodecUnderTest, create_codecs
 from sonarpost.cli.main import exit_status
+from sonarpost.codec.registry import default_registry
+from sonarpost.errors import ConfigError
+
+DEFAULT_BUDGETS: Final = "22,44,64,88,128,192,256,384,512"
+MAX_BUDGET_BYTES: Final = 1 << 20
 
 
 def command_parser(name: str, description: str) -> argparse.ArgumentParser:
@@ -27,6 +34,50 @@ def run_command(
     return exit_status(lambda: run(parsed), parser.prog)
 
 
-def say(line: str) -> None:
-    """Print progress to standard error, apart from the results."""
+def report_progress(line: str) -> None:
+    """Print a line to standard error, apart from the results."""
     print(line, file=sys.stderr, flush=True)
+
+
+def add_codec_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options for codecs, budgets and output."""
+    parser.add_argument(
+        "--budgets", default=DEFAULT_BUDGETS, metavar="B,B,…", help="maximum bytes of a stream (default: %(default)s)"
+    )
+    parser.add_argument("--codecs", metavar="NAME,…", help="default: all that are available")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
+
+
+def selected_codecs(
+    args: argparse.Namespace,
+    *,
+    all_packings: bool = True,
+    cut: bool = False,
+    codebooks: Sequence[str] = SHIPPED_CODEBOOKS,
+) -> list[CodecUnderTest]:
+    """Return the codecs of the options; print unavailable ones to standard error.
+
+    Raises:
+        ConfigError: A requested codec is unknown or not available.
+        CodebookError: A codebook cannot be read.
+    """
+    names = None if args.codecs is None else [name.strip() for name in args.codecs.split(",")]
+    found, unavailable = create_codecs(
+        default_registry(), names, all_packings=all_packings, cut=cut, codebooks=codebooks
+    )
+    for line in unavailable:
+        report_progress(f"left out: {line}")
+    return found
+
+
+def parse_budgets(text: str) -> tuple[int, ...]:
+    """Parse `22,44,…`; return the budgets in rising order without duplicates.
+
+    Raises:
+        ConfigError: A part is not an integer from 1 to 1,048,576.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    for part in parts:
+        if not (part.isascii() and part.isdigit() and len(part) < 9 and 1 <= int(part) <= MAX_BUDGET_BYTES):
+            raise ConfigError("research", "--budgets", part, f"integers 1..{MAX_BUDGET_BYTES}, separated by commas")
+    return tuple(sorted({int(part) for part in parts}))

@@ -1,4 +1,4 @@
-"""One codec over pictures: streams, rebuilt pictures, figures. A picture that does not fit a budget is a miss."""
+"""Measurement of one codec over images: streams, decoded images, quality, time. An image over budget is a miss."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from typing import Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from research.common.images import BenchPicture
+from research.common.images import SampleImage
+from research.common.quality import ms_ssim
 from sonarpost.codec.interface import Codec, Image
-from sonarpost.codec.quality import ms_ssim, psnr_db, ssim
+from sonarpost.codec.quality import psnr_db, ssim
 from sonarpost.codec.registry import CodecRegistry, CodecResources
 from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, open_codebook
 from sonarpost.codec.vq.codec import IndexPacking
@@ -23,20 +24,19 @@ Values = npt.NDArray[np.float64]
 T = TypeVar("T")
 
 PSNR_LIMIT_DB: Final = 60.0
-"""A picture rebuilt without error has an infinite PSNR, which no mean survives; it counts as this."""
+"""Upper limit of the PSNR, which is infinite for an image without error and would make every mean infinite."""
 SHIPPED_CODEBOOKS: Final = tuple(f"nominal-{tile_px}" for tile_px in DEFAULT_TILE_PX)
 
 
 @dataclass(frozen=True)
-class Subject:
-    """A codec as it is measured.
+class CodecUnderTest:
+    """A codec with the way it is measured.
 
     Attributes:
         codec: The codec.
-        variant: What tells several of one name apart (for vq codebook and packing); empty for the only one.
-        is_embedded: Whether one stream, made for the largest budget, is cut for the others; else each budget has a
-            stream of its own.
-        is_natural: Whether its size follows from the picture alone, so that it is one point, whatever the budgets.
+        variant: Distinguishes several of one name (for vq codebook and packing); empty for a single one.
+        is_embedded: Whether one stream, coded for the largest budget, is truncated for the others.
+        is_natural: Whether the size follows from the image alone, so that there is one result for all budgets.
     """
 
     codec: Codec
@@ -46,37 +46,37 @@ class Subject:
 
     @property
     def label(self) -> str:
-        """Name for people."""
+        """Name in tables."""
         return f"{self.codec.name} {self.variant}".strip()
 
 
 @dataclass(frozen=True)
-class Coded:
-    """One picture, coded and rebuilt."""
+class CodedImage:
+    """One image, coded and decoded."""
 
     stream: bytes
-    rebuilt: Image
+    decoded: Image
     encode_ms: float
     decode_ms: float
 
 
 @dataclass
-class Point:
-    """One codec at one budget over all pictures; arrays of shape (pictures,), NaN where the picture was missed.
+class BudgetResult:
+    """One codec at one budget over all images; arrays of shape (images,), NaN where the image was missed.
 
     Attributes:
-        subject: The codec.
-        budget_bytes: Most bytes of a stream; None for a natural size.
-        stream_bytes: Real length of each stream, its header included.
+        tested: The codec.
+        budget_bytes: Maximum length of a stream; None for a natural size.
+        stream_bytes: Length of each stream, header included.
         psnr: PSNR in dB, at most `PSNR_LIMIT_DB`.
         ssim: SSIM.
         msssim: MS-SSIM over three scales.
-        encode_ms: Time to encode; of an embedded codec the time for the largest budget.
+        encode_ms: Time to encode; for an embedded codec the time for the largest budget.
         decode_ms: Time to decode.
-        reasons: Why pictures were missed, and how many each.
+        reasons: Reasons of the misses with their counts.
     """
 
-    subject: Subject
+    tested: CodecUnderTest
     budget_bytes: int | None
     stream_bytes: Values
     psnr: Values
@@ -88,124 +88,124 @@ class Point:
 
     @property
     def hits(self) -> npt.NDArray[np.bool_]:
-        """Which pictures were coded, shape (pictures,)."""
+        """Which images were coded, shape (images,)."""
         return np.isfinite(self.stream_bytes)
 
     @property
     def misses(self) -> int:
-        """How many were not."""
+        """Number of images that were not coded."""
         return int(np.count_nonzero(~self.hits))
 
     @property
-    def shown_budget(self) -> int:
-        """The budget; for a natural size the longest stream, the budget that every picture would have fitted."""
+    def effective_budget(self) -> int:
+        """The budget; for a natural size the length of the longest stream."""
         if self.budget_bytes is not None:
             return self.budget_bytes
         return int(np.nanmax(self.stream_bytes)) if self.hits.any() else 0
 
 
-def subjects(
+def create_codecs(
     registry: CodecRegistry,
     names: Sequence[str] | None,
     *,
     all_packings: bool = True,
     cut: bool = False,
     codebooks: Sequence[str] = SHIPPED_CODEBOOKS,
-) -> tuple[list[Subject], list[str]]:
-    """Make the codecs to measure.
+) -> tuple[list[CodecUnderTest], list[str]]:
+    """Create the codecs to measure.
 
     Args:
-        registry: Where they are from.
-        names: Which; None for every one that can be made here.
-        all_packings: Whether vq is measured with every packing of an index, or the tightest only.
-        cut: Whether embedded codecs make one stream, cut for each budget.
-        codebooks: Names of shipped codebooks, or paths of others, that vq is measured with.
+        registry: Registry of the codecs.
+        names: Names of the codecs; None for all that are available.
+        all_packings: Whether vq is measured with every packing of an index, or with the shortest only.
+        cut: Whether embedded codecs code one stream that is truncated for each budget.
+        codebooks: Names of shipped codebooks, or paths of others, for vq.
 
     Returns:
-        The codecs, and one line for each that cannot be made here (only with `names` None).
+        The codecs, and one line for each that is not available (only with `names` None).
 
     Raises:
-        ConfigError: A codec asked for by name is unknown or cannot be made.
+        ConfigError: A codec of `names` is unknown or not available.
         CodebookError: A codebook cannot be read.
     """
     packings = tuple(IndexPacking) if all_packings else (IndexPacking.BITS14,)
-    found: list[Subject] = []
-    absent: list[str] = []
+    found: list[CodecUnderTest] = []
+    unavailable: list[str] = []
     for name in registry.names() if names is None else dict.fromkeys(names):
         try:
             if registry.spec(name).needs_tiles:
-                found += _with_tiles(registry, name, packings, codebooks)
+                found += _with_codebooks(registry, name, packings, codebooks)
             else:
                 codec = registry.create(name, CodecResources())
-                found.append(Subject(codec, is_embedded=cut and registry.is_embedded(name)))
+                found.append(CodecUnderTest(codec, is_embedded=cut and registry.is_embedded(name)))
         except ConfigError as error:
             if names is not None:
                 raise
-            absent.append(str(error))
-    return found, absent
+            unavailable.append(str(error))
+    return found, unavailable
 
 
-def _with_tiles(
+def _with_codebooks(
     registry: CodecRegistry, name: str, packings: Sequence[IndexPacking], codebooks: Sequence[str]
-) -> list[Subject]:
-    made = []
+) -> list[CodecUnderTest]:
+    found = []
     for codebook in codebooks:
         tiles = open_codebook(codebook).tiles
         for packing in packings:
             codec = registry.create(name, CodecResources(tiles, packing))
-            made.append(Subject(codec, f"{codebook} {packing.value}", is_natural=True))
-    return made
+            found.append(CodecUnderTest(codec, f"{codebook} {packing.value}", is_natural=True))
+    return found
 
 
-def code(subject: Subject, picture: Image, budgets: Sequence[int]) -> list[Coded | str]:
-    """Encode and decode one picture at every budget (once, for a codec of natural size).
+def code_image(tested: CodecUnderTest, image: Image, budgets: Sequence[int]) -> list[CodedImage | str]:
+    """Encode and decode one image at every budget (once for a codec of natural size).
 
     Returns:
-        For each budget the coded picture, or in words why there is none.
+        For each budget the coded image, or the reason of the miss.
     """
-    if subject.is_natural:
-        return [_code_once(subject.codec, picture, None)]
-    if not subject.is_embedded:
-        return _code_each(subject.codec, picture, budgets)
-    most = max(budgets)
+    if tested.is_natural:
+        return [_code_once(tested.codec, image, None)]
+    if not tested.is_embedded:
+        return _code_each(tested.codec, image, budgets)
+    largest = max(budgets)
     try:
-        stream, encode_ms = _timed(lambda: subject.codec.encode(picture, most))
+        stream, encode_ms = _timed(lambda: tested.codec.encode(image, largest))
     except StreamError as error:
         return [_reason(error)] * len(budgets)
-    return [_decoded(subject.codec, stream[:budget], budget, encode_ms) for budget in budgets]
+    return [_decode(tested.codec, stream[:budget], budget, encode_ms) for budget in budgets]
 
 
-def _code_each(codec: Codec, picture: Image, budgets: Sequence[int]) -> list[Coded | str]:
-    """Code at each budget, the largest first: a picture that missed one budget misses every smaller one.
+def _code_each(codec: Codec, image: Image, budgets: Sequence[int]) -> list[CodedImage | str]:
+    """Code at each budget, the largest first.
 
-    A budget is an upper bound, so a stream within the smaller would have been within the larger. Some codecs search
-    half a second in vain.
+    An image that misses one budget misses every smaller one as well, so those are not tried: some codecs search for
+    half a second.
     """
-    found: dict[int, Coded | str] = {}
+    results: dict[int, CodedImage | str] = {}
     missed: str | None = None
     for budget in sorted(budgets, reverse=True):
-        found[budget] = _code_once(codec, picture, budget) if missed is None else missed
-        result = found[budget]
+        results[budget] = _code_once(codec, image, budget) if missed is None else missed
+        result = results[budget]
         missed = result if isinstance(result, str) else None
-    return [found[budget] for budget in budgets]
+    return [results[budget] for budget in budgets]
 
 
-def _code_once(codec: Codec, picture: Image, budget: int | None) -> Coded | str:
+def _code_once(codec: Codec, image: Image, budget: int | None) -> CodedImage | str:
     try:
-        stream, encode_ms = _timed(lambda: codec.encode(picture, budget))
+        stream, encode_ms = _timed(lambda: codec.encode(image, budget))
     except StreamError as error:
         return _reason(error)
-    return _decoded(codec, stream, budget, encode_ms)
+    return _decode(codec, stream, budget, encode_ms)
 
 
-def _decoded(codec: Codec, stream: bytes, budget: int | None, encode_ms: float) -> Coded | str:
+def _decode(codec: Codec, stream: bytes, budget: int | None, encode_ms: float) -> CodedImage | str:
     if budget is not None and len(stream) > budget:
         return "the stream is longer than its budget"
     try:
         decoded, decode_ms = _timed(lambda: codec.decode(stream))
     except StreamError as error:
         return _reason(error)
-    return Coded(stream, decoded.image, encode_ms, decode_ms)
+    return CodedImage(stream, decoded.image, encode_ms, decode_ms)
 
 
 def _reason(error: StreamError) -> str:
@@ -218,75 +218,75 @@ def _timed(work: Callable[[], T]) -> tuple[T, float]:
     return result, (time.perf_counter() - start_s) * 1000.0
 
 
-def measure(
-    subject: Subject,
-    pictures: Sequence[BenchPicture],
+def measure_codec(
+    tested: CodecUnderTest,
+    images: Sequence[SampleImage],
     budgets: Sequence[int],
     progress: Callable[[str], None] | None = None,
-) -> list[Point]:
-    """Measure one codec over all pictures.
+) -> list[BudgetResult]:
+    """Measure one codec over all images.
 
-    The first picture is coded once beforehand: what a codec loads or compiles on first use is not its speed.
+    The first image is coded once in advance, so that loading and compiling on first use are not counted.
 
     Returns:
-        One point a budget, in their order; a single one for a codec of natural size.
+        One result a budget, in their order; a single one for a codec of natural size.
     """
-    code(subject, pictures[0].pixels, budgets)
-    wanted: tuple[int | None, ...] = (None,) if subject.is_natural else tuple(budgets)
-    points = [_empty(subject, budget, len(pictures)) for budget in wanted]
-    for number, picture in enumerate(pictures):
-        for point, coded in zip(points, code(subject, picture.pixels, budgets), strict=True):
+    code_image(tested, images[0].pixels, budgets)
+    result_budgets: tuple[int | None, ...] = (None,) if tested.is_natural else tuple(budgets)
+    results = [_empty_result(tested, budget, len(images)) for budget in result_budgets]
+    for number, image in enumerate(images):
+        for result, coded in zip(results, code_image(tested, image.pixels, budgets), strict=True):
             if isinstance(coded, str):
-                point.reasons[coded] += 1
+                result.reasons[coded] += 1
                 continue
-            point.stream_bytes[number] = len(coded.stream)
-            point.psnr[number] = min(psnr_db(picture.pixels, coded.rebuilt), PSNR_LIMIT_DB)
-            point.ssim[number] = ssim(picture.pixels, coded.rebuilt)
-            point.msssim[number] = ms_ssim(picture.pixels, coded.rebuilt)
-            point.encode_ms[number], point.decode_ms[number] = coded.encode_ms, coded.decode_ms
+            result.stream_bytes[number] = len(coded.stream)
+            result.psnr[number] = min(psnr_db(image.pixels, coded.decoded), PSNR_LIMIT_DB)
+            result.ssim[number] = ssim(image.pixels, coded.decoded)
+            result.msssim[number] = ms_ssim(image.pixels, coded.decoded)
+            result.encode_ms[number], result.decode_ms[number] = coded.encode_ms, coded.decode_ms
     if progress is not None:
-        progress(f"{subject.label}: {len(pictures)} pictures")
-    return points
+        progress(f"{tested.label}: {len(images)} images")
+    return results
 
 
-def best_that_fit(variants: Sequence[Point], budgets: Sequence[int]) -> list[Point]:
-    """Return what a codec of natural sizes gives within each budget: of each picture the best variant that fits.
+def best_within_budgets(variants: Sequence[BudgetResult], budgets: Sequence[int]) -> list[BudgetResult]:
+    """Return the results of a codec of natural size within each budget: for each image the best variant that fits.
 
     Args:
-        variants: Points of one codec, each of a natural size; at least one.
-        budgets: Most bytes of a stream.
+        variants: Results of one codec, each of a natural size; at least one.
+        budgets: Maximum lengths of a stream.
 
     Returns:
-        One point a budget; a picture that no variant squeezes into it is a miss.
+        One result a budget; an image for which no variant fits is a miss.
     """
-    lengths = np.stack([point.stream_bytes for point in variants])
-    quality = np.stack([point.psnr for point in variants])
+    lengths = np.stack([result.stream_bytes for result in variants])
+    quality = np.stack([result.psnr for result in variants])
     others = [
-        np.stack(each) for each in zip(*((p.ssim, p.msssim, p.encode_ms, p.decode_ms) for p in variants), strict=True)
+        np.stack(each) for each in zip(*((r.ssim, r.msssim, r.encode_ms, r.decode_ms) for r in variants), strict=True)
     ]
-    pictures = np.arange(lengths.shape[1])
+    images = np.arange(lengths.shape[1])
     found = []
     for budget in budgets:
-        fits = lengths <= budget  # False where a variant missed the picture
-        # Of equal quality the shortest, which is the first of the stably sorted.
+        fits = lengths <= budget  # False where a variant missed the image
+        # The stable sort selects the shortest stream among those of equal quality.
         order = np.argsort(np.where(fits, lengths, np.inf), axis=0, kind="stable")
-        ranked = np.where(fits, quality, -np.inf)[order, pictures]
-        chosen = order[np.argmax(ranked, axis=0), pictures]
-        some = np.asarray(fits.any(axis=0), dtype=np.bool_)
+        ranked = np.where(fits, quality, -np.inf)[order, images]
+        chosen = order[np.argmax(ranked, axis=0), images]
+        coded = np.asarray(fits.any(axis=0), dtype=np.bool_)
         size, psnr, ssim_, msssim, encode_ms, decode_ms = (
-            np.where(some, measured[chosen, pictures], np.nan) for measured in (lengths, quality, *others)
+            np.where(coded, measured[chosen, images], np.nan) for measured in (lengths, quality, *others)
         )
-        subject = Subject(variants[0].subject.codec)
-        point = Point(subject, budget, size, psnr, ssim_, msssim, encode_ms, decode_ms)
-        missed = int(np.count_nonzero(~some))
-        if missed:
-            point.reasons[f"budget_bytes: expected at least {int(np.nanmin(lengths))}"] = missed
-        found.append(point)
+        tested = CodecUnderTest(variants[0].tested.codec)
+        result = BudgetResult(tested, budget, size, psnr, ssim_, msssim, encode_ms, decode_ms)
+        misses = int(np.count_nonzero(~coded))
+        if misses:
+            result.reasons[f"budget_bytes: expected at least {int(np.nanmin(lengths))}"] = misses
+        found.append(result)
     return found
 
 
-def _empty(subject: Subject, budget: int | None, count: int) -> Point:
+def _empty_result(tested: CodecUnderTest, budget: int | None, count: int) -> BudgetResult:
     def unknown() -> Values:
         return np.full(count, np.nan)
 
-    return Point(subject, budget, unknown(), unknown(), unknown(), unknown(), unknown(), unknown())
+    return BudgetResult(tested, budget, unknown(), unknown(), unknown(), unknown(), unknown(), unknown())

@@ -1,4 +1,4 @@
-"""Chance and comparison: bootstrap intervals, the Bjøntegaard rate difference, the area under a ROC curve."""
+"""Statistics: bootstrap intervals, the Bjøntegaard rate difference, the area under a ROC curve."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ RESAMPLES: Final = 1000
 
 
 def bootstrap_weights(sources: Sequence[str], resamples: int = RESAMPLES, seed: int = 0) -> Values:
-    """Draw bootstrap samples of pictures, as weights, to be used for all codecs alike (a paired bootstrap).
+    """Draw bootstrap samples of images as weights, the same for all codecs (paired bootstrap).
 
-    Sources are drawn, with replacement, and bring all their pictures along: crops of one tile are no independent
-    evidence (a cluster bootstrap; Davison and Hinkley, "Bootstrap Methods and their Application", 1997, section 3.8).
+    Sources are drawn with replacement, together with all their images, because the crops of one tile are correlated
+    (cluster bootstrap; Davison and Hinkley, "Bootstrap Methods and their Application", 1997, section 3.8).
 
     Args:
-        sources: Source of each picture, n of them.
-        resamples: How many samples, R.
-        seed: Of the draws; the same values give the same samples.
+        sources: Source of each of the n images.
+        resamples: Number of samples, R.
+        seed: The same values give the same samples.
 
     Returns:
-        Shape (R, n), how often each picture is in each sample.
+        Shape (R, n), number of times each image is in each sample.
     """
     names = sorted(set(sources))
     rng = np.random.default_rng(seed)
     counts = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=resamples)
-    place = {name: number for number, name in enumerate(names)}
-    return np.asarray(counts[:, [place[source] for source in sources]], dtype=np.float64)
+    column = {name: number for number, name in enumerate(names)}
+    return np.asarray(counts[:, [column[source] for source in sources]], dtype=np.float64)
 
 
-def mean_of_known(values: Values) -> float:
-    """Return the mean of the values that are not NaN; NaN if none is."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if known.size else float("nan")
+def finite_mean(values: Values) -> float:
+    """Return the mean of the finite values; NaN if there is none."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else float("nan")
 
 
 def weighted_means(values: Values, weights: Values) -> Values:
-    """Return the mean over known values in each bootstrap sample, shape (R,); NaN for a sample without any.
+    """Return the mean over the finite values in each bootstrap sample, shape (R,); NaN for a sample without any.
 
     Args:
-        values: Shape (n,), NaN where unknown.
+        values: Shape (n,), NaN if unknown.
         weights: Shape (R, n), from `bootstrap_weights`.
     """
     known = np.isfinite(values)
@@ -57,7 +57,7 @@ def weighted_means(values: Values, weights: Values) -> Values:
 
 
 def interval(draws: Values) -> Interval | None:
-    """Return the 2.5th and 97.5th percentile of the known draws; None when nearly all are unknown."""
+    """Return the 2.5th and 97.5th percentile of the finite draws; None if fewer than 5 % or 20 are finite."""
     known = draws[np.isfinite(draws)]
     if known.size < max(20, draws.size // 20):
         return None
@@ -66,15 +66,15 @@ def interval(draws: Values) -> Interval | None:
 
 
 def bd_rate_percent(rates: Values, quality: Values, other_rates: Values, other_quality: Values) -> float | None:
-    """Return how much more rate the first codec needs than the other for the same quality, in percent.
+    """Return the additional rate of the first codec over the other for the same quality, in percent.
 
     G. Bjøntegaard, "Calculation of average PSNR differences between RD-curves", ITU-T VCEG-M33, 2001, with log10(rate)
-    as a function of PSNR, but through monotone piecewise cubic interpolation (PCHIP; Fritsch and Carlson 1980) instead
-    of one cubic, as in VCEG-AI11 and later practice: a cubic through few points overshoots. The logarithms' difference
-    is averaged over the PSNR range both curves cover; -50 means half the rate.
+    as a function of PSNR, with monotone piecewise cubic interpolation (PCHIP; Fritsch and Carlson 1980) in place of a
+    single cubic, as in VCEG-AI11 and later practice: a cubic through few points overshoots. The difference of the
+    logarithms is averaged over the common PSNR range; -50 means half the rate.
 
-    Of each curve only the points that are worth their rate are used: in order of rate, those with more quality than
-    every cheaper one (a quality that is had for several rates counts at the least).
+    Only the efficient points of each curve are used: in order of rate, those with a higher quality than every point of
+    lower rate.
 
     Args:
         rates: Shape (n,), positive (bytes).
@@ -83,7 +83,7 @@ def bd_rate_percent(rates: Values, quality: Values, other_rates: Values, other_q
         other_quality: Shape (m,).
 
     Returns:
-        The difference, or None where a curve has fewer than two points or the ranges do not overlap.
+        The difference, or None if a curve has fewer than two points or the ranges do not overlap.
     """
     first, second = _efficient(rates, quality), _efficient(other_rates, other_quality)
     if len(first[0]) < 2 or len(second[0]) < 2:
@@ -98,7 +98,7 @@ def bd_rate_percent(rates: Values, quality: Values, other_rates: Values, other_q
 
 
 def overlap_db(quality: Values, other_quality: Values) -> Interval | None:
-    """Return the PSNR range that two curves share, or None."""
+    """Return the common PSNR range of two curves, or None."""
     low, high = max(quality.min(), other_quality.min()), min(quality.max(), other_quality.max())
     return (float(low), float(high)) if high > low else None
 
@@ -108,21 +108,21 @@ def _efficient(rates: Values, quality: Values) -> tuple[Values, Values]:
     rates, quality = rates[known], quality[known]
     order = np.lexsort((-quality, rates))
     rates, quality = rates[order], quality[order]
-    best_before = np.concatenate(([-np.inf], np.maximum.accumulate(quality)[:-1]))
-    worth = quality > best_before
-    return rates[worth], quality[worth]
+    best_below = np.concatenate(([-np.inf], np.maximum.accumulate(quality)[:-1]))
+    efficient = quality > best_below
+    return rates[efficient], quality[efficient]
 
 
 def auc(scores: Values, is_target: Flags, weights: Values | None = None) -> Values:
-    """Return the area under the ROC curve: the chance that a target scores above a non-target (ties count half).
+    """Return the area under the ROC curve: the probability that a target scores above a non-target (ties count half).
 
     Args:
         scores: Shape (n,).
         is_target: Shape (n,); at least one True and one False.
-        weights: Shape (R, n) of bootstrap weights; None for every picture once.
+        weights: Shape (R, n) of bootstrap weights; None to count every image once.
 
     Returns:
-        Shape (R,), or (1,) without weights; NaN for samples without targets or without others.
+        Shape (R,), or (1,) without weights; NaN for samples without targets or without non-targets.
     """
     if weights is None:
         weights = np.ones((1, scores.shape[0]))

@@ -1,4 +1,4 @@
-"""The detector on simulated surveys that nothing was fitted to: what it finds, what it takes for an object."""
+"""Evaluation of the detector on simulated surveys that were not used for training."""
 
 from __future__ import annotations
 
@@ -10,78 +10,111 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from research.detection.truth import Scale, object_at
 from sonarpost.detection.detector import Detection, detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
-from sonarpost.sonar.survey import Survey
+from sonarpost.sonar.survey import Side, Survey
 
 Floats = npt.NDArray[np.float64]
 
 FIRST_SEED: Final = 5000
-"""Training uses 1000 to 1007 (research/training/detection.py)."""
-MOST_FILES: Final = 1000
-_EVERYTHING: Final = DetectorSettings(confidence_threshold=0.01)
+"""Training uses seeds 1000 to 1007 (research/training/detection.py)."""
+MAX_FILES: Final = 1000
+NEAR_M: Final = 1.5
+"""A contact within this distance of the centre of an object, along and across, is that object; for objects that are
+not mine-like, half the length of the object is added."""
+_ALL_CONTACTS: Final = DetectorSettings(confidence_threshold=0.01)
 
 
 @dataclass(frozen=True, slots=True)
-class JudgedContact:
-    """A contact and the object it is; None when there is none."""
+class Scale:
+    """Distance between two pings along-track, and between two samples across-track."""
+
+    row_m: float
+    sample_m: float
+
+
+def object_at(truth: Sequence[TruthObject], side: Side, row: int, sample: float, scale: Scale) -> int | None:
+    """Return the index of the nearest object at a ping and sample; None if there is none."""
+    nearest, nearest_m = None, float("inf")
+    for index, thing in enumerate(truth):
+        if thing.side is not side:
+            continue
+        limit_m = NEAR_M + (0.0 if thing.is_mine_like else thing.length_m / 2)
+        along_m = abs(row - thing.ping) * scale.row_m
+        across_m = abs(sample - thing.sample_index) * scale.sample_m
+        if along_m < limit_m and across_m < limit_m and max(along_m, across_m) < nearest_m:
+            nearest, nearest_m = index, max(along_m, across_m)
+    return nearest
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatedContact:
+    """A contact and its object.
+
+    Attributes:
+        confidence: Confidence of the contact.
+        thing: The object; None for a false alarm.
+        is_first: Whether it is the most confident contact of its object (True for a false alarm).
+    """
 
     confidence: float
     thing: TruthObject | None
     is_first: bool
-    """Whether it is the most confident contact of its object (true where there is no object)."""
 
 
 @dataclass(frozen=True)
-class JudgedFile:
-    """One simulated file after detection.
+class EvaluatedFile:
+    """A simulated file with its detections.
 
     Attributes:
-        seabed: What lies on the bottom.
+        seabed: Kind of seabed.
         survey: The file.
-        found: Every contact down to a confidence of 0.01, most confident first.
-        contacts: The same, judged.
+        detections: Every contact with a confidence of at least 0.01, most confident first.
+        contacts: The same contacts, evaluated.
         truth: The objects.
-        seconds: Processor time that detection took.
+        seconds: Processor time of the detection.
     """
 
     seabed: SeabedKind
     survey: Survey
-    found: tuple[Detection, ...]
-    contacts: tuple[JudgedContact, ...]
+    detections: tuple[Detection, ...]
+    contacts: tuple[EvaluatedContact, ...]
     truth: tuple[TruthObject, ...]
     seconds: float
 
 
-def judged_file(seabed: SeabedKind, seed: int) -> JudgedFile:
-    """Simulate a file of 1000 pings with four mine-like and six other objects, detect, and judge each contact."""
+def evaluate_file(seabed: SeabedKind, seed: int) -> EvaluatedFile:
+    """Simulate a file of 1000 pings with four mine-like and six other objects, detect, and evaluate each contact."""
     simulated = simulate_survey(SurveySpec(seed=seed, seabed=seabed, targets=4, clutter=6))
     survey = simulated.survey
-    began = time.process_time()
-    found = detect(survey, _EVERYTHING)
-    seconds = time.process_time() - began
-    met: set[int] = set()
+    started_s = time.process_time()
+    detections = detect(survey, _ALL_CONTACTS)
+    seconds = time.process_time() - started_s
+    assigned: set[int] = set()
     contacts = []
-    for one in found:
-        scale = Scale(one.pixel_along_m or _EVERYTHING.assumed_row_along_m, one.pixel_across_m)
-        index = object_at(simulated.truth, one.side, one.ping_index, one.sample, scale)
-        contacts.append(
-            JudgedContact(one.confidence, None if index is None else simulated.truth[index], index not in met)
-        )
+    for d in detections:
+        scale = Scale(d.pixel_along_m or _ALL_CONTACTS.assumed_row_along_m, d.pixel_across_m)
+        index = object_at(simulated.truth, d.side, d.ping_index, d.sample, scale)
+        thing = None if index is None else simulated.truth[index]
+        contacts.append(EvaluatedContact(d.confidence, thing, index not in assigned))
         if index is not None:
-            met.add(index)
-    return JudgedFile(seabed, survey, found, tuple(contacts), simulated.truth, seconds)
+            assigned.add(index)
+    return EvaluatedFile(seabed, survey, detections, tuple(contacts), simulated.truth, seconds)
 
 
 @dataclass(frozen=True, slots=True)
-class Operating:
-    """Probability of detection of mine-like objects, false alarms and other objects a file, at one confidence.
+class OperatingPoint:
+    """Performance at one confidence threshold.
 
-    A false alarm is a contact where no object was put; the simulator's other objects are counted apart, because an
-    operator is to see them.
+    A false alarm is a contact without an object. Other objects of the simulator (boulders, debris) are counted
+    separately, because an operator should see them.
+
+    Attributes:
+        pd: Probability of detection of mine-like objects.
+        false_alarms_per_file: Contacts without an object.
+        others_per_file: Detected objects that are not mine-like.
     """
 
     pd: float
@@ -89,8 +122,8 @@ class Operating:
     others_per_file: float
 
 
-def operating(files: Sequence[JudgedFile], confidence: float) -> Operating:
-    """Return how the detector does at a threshold, over files of any seabed."""
+def operating_point(files: Sequence[EvaluatedFile], confidence: float) -> OperatingPoint:
+    """Return the performance at a confidence threshold, over files of any seabed."""
     mines = sum(t.is_mine_like for f in files for t in f.truth)
     hits = alarms = others = 0
     for contact in (c for f in files for c in f.contacts if c.confidence >= confidence):
@@ -99,43 +132,49 @@ def operating(files: Sequence[JudgedFile], confidence: float) -> Operating:
         elif contact.is_first:
             hits += contact.thing.is_mine_like
             others += not contact.thing.is_mine_like
-    return Operating(hits / mines if mines else 0.0, alarms / len(files), others / len(files))
+    return OperatingPoint(hits / mines if mines else 0.0, alarms / len(files), others / len(files))
 
 
-def roc(files: Sequence[JudgedFile], kind: str | None = None) -> tuple[Floats, Floats]:
+def roc(files: Sequence[EvaluatedFile], kind: str | None = None) -> tuple[Floats, Floats]:
     """Return false alarms a file (rising) and probability of detection, shape (contacts + 1,) each.
 
     Args:
         files: The files.
         kind: A mine-like shape, or None for all of them.
     """
-    wanted = sum(t.is_mine_like and (kind is None or t.kind == kind) for f in files for t in f.truth)
+    objects = sum(t.is_mine_like and (kind is None or t.kind == kind) for f in files for t in f.truth)
     contacts = sorted((c for f in files for c in f.contacts), key=lambda c: -c.confidence)
     hit = [
         c.is_first and c.thing is not None and c.thing.is_mine_like and (kind is None or c.thing.kind == kind)
         for c in contacts
     ]
     alarms = np.cumsum([0.0, *(float(c.thing is None) for c in contacts)]) / max(len(files), 1)
-    return alarms, np.cumsum([0.0, *map(float, hit)]) / max(wanted, 1)
+    return alarms, np.cumsum([0.0, *map(float, hit)]) / max(objects, 1)
 
 
 def pd_at(curve: tuple[Floats, Floats], false_alarms_per_file: float) -> float:
-    """Return the greatest probability of detection with at most that many false alarms a file."""
+    """Return the maximum probability of detection up to a number of false alarms a file."""
     alarms, pd = curve
     return float(pd[alarms <= false_alarms_per_file + 1e-9].max())
 
 
 @dataclass(frozen=True, slots=True)
 class ReliabilityBin:
-    """Contacts of one range of confidence: how many, their mean confidence / 2, and the share that are objects."""
+    """Contacts within a range of confidence.
+
+    Attributes:
+        contacts: Their number.
+        claimed: Their mean confidence / 2.
+        true_share: Share of them that are objects.
+    """
 
     contacts: int
     claimed: float
     true_share: float
 
 
-def reliability(files: Sequence[JudgedFile], bins: int = 10) -> tuple[ReliabilityBin, ...]:
-    """Return claimed and true shares of objects among contacts by confidence; empty ranges are left out."""
+def reliability(files: Sequence[EvaluatedFile], bins: int = 10) -> tuple[ReliabilityBin, ...]:
+    """Return claimed and true share of objects by confidence, without empty bins."""
     pairs = [(c.confidence / 2, c.thing is not None) for f in files for c in f.contacts if c.is_first]
     found = []
     for number in range(bins):

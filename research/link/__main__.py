@@ -1,4 +1,4 @@
-"""`python -m research.link`: what arrives of pictures through lossy water, by scheme, at equal bytes on the air."""
+"""`python -m research.link`: quality of images over a lossy channel, by transmission scheme, at equal bytes."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import Final
 
 import numpy as np
 
-from research.codecs.__main__ import say
-from research.common.command import command_parser, run_command
-from research.common.images import PictureSet, read_folder, simulated_pictures
-from research.link.images import Codecs, LinkPicture
+from research.common.command import command_parser, report_progress, run_command
+from research.common.images import ImageSet, read_image_folder, simulated_images
 from research.link.schemes import (
-    Outcome,
+    Codecs,
+    LinkImage,
+    SchemeResult,
     Setting,
     bound_rates,
     feedback_stream_bytes,
@@ -32,18 +32,18 @@ from sonarpost.link.coding.channel_capacity import LossChannel, erasure_bound_fr
 from sonarpost.link.frames.v1.frame import MAX_FRAME_BYTES, MIN_FRAME_BYTES
 
 _Row = dict[str, object]
-_Scheme = Callable[[Sequence[LinkPicture], Codecs, Setting], Outcome]
-_DEFAULT_PICTURES: Final = 200
-_FRAME_ROOM: Final = 2
-"""Streams are coded this many times longer than a picture's frames: a group's easy pictures give to its hard ones."""
+_Scheme = Callable[[Sequence[LinkImage], Codecs, Setting], SchemeResult]
+_DEFAULT_IMAGES: Final = 200
+_STREAM_FACTOR: Final = 2
+"""Ratio of stream length to the bytes of an image's frames: within a group, difficult images receive more bytes."""
 
 
 def new_parser() -> argparse.ArgumentParser:
     """Return the parser of this command."""
     parser = command_parser(
         "link",
-        description="Send pictures through simulated loss with the paper's halves, a plain embedded stream, the wire "
-        "format v1 without and with feedback, at equal bytes on the air, and compare with the erasure bound.",
+        description="Send images over a simulated lossy channel with the paper's halves, a sequential embedded "
+        "stream, and the wire format v1 without and with feedback, at equal bytes, and compare with the erasure bound.",
     )
     parser.add_argument(
         "--loss", default="0.1,0.3,0.5", metavar="P,…", help="shares of frames lost (default: %(default)s)"
@@ -54,31 +54,31 @@ def new_parser() -> argparse.ArgumentParser:
         metavar="N,…",
         help="mean frames lost in a row, 1 = independent (default: %(default)s)",
     )
-    parser.add_argument("--frames", type=int, default=6, metavar="N", help="frames a picture (default: %(default)s)")
+    parser.add_argument("--frames", type=int, default=6, metavar="N", help="frames an image (default: %(default)s)")
     parser.add_argument("--frame-bytes", type=int, default=64, metavar="N", help="bytes a frame (default: %(default)s)")
     parser.add_argument(
         "--images",
-        default=str(_DEFAULT_PICTURES),
+        default=str(_DEFAULT_IMAGES),
         metavar="DIR|N",
-        help="pictures, or how many to simulate (%(default)s)",
+        help="folder, or number of simulated images (%(default)s)",
     )
     parser.add_argument(
-        "--groups", metavar="N,…", help="compare v1 broadcast with these numbers of pictures coded jointly too"
+        "--groups", metavar="N,…", help="also compare v1 broadcast with these numbers of images coded jointly"
     )
     parser.add_argument("--depth", type=int, default=2, metavar="N", help="groups interleaved (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of pictures and losses (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of images and losses (default: 0)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     return parser
 
 
-def _numbers(option: str, written: str, low: float, high: float) -> list[float]:
-    """Read `0.1,0.3`.
+def _numbers(option: str, text: str, low: float, high: float) -> list[float]:
+    """Parse `0.1,0.3`.
 
     Raises:
-        ConfigError: Something else than numbers in range.
+        ConfigError: A part is not a number in the range.
     """
     found = []
-    for part in written.split(","):
+    for part in text.split(","):
         try:
             value = float(part)
         except ValueError:
@@ -89,13 +89,13 @@ def _numbers(option: str, written: str, low: float, high: float) -> list[float]:
     return found
 
 
-def _pictures(args: argparse.Namespace) -> PictureSet:
-    written: str = args.images
-    if written.isascii() and written.isdigit():
-        return simulated_pictures(int(written), args.seed)
-    found = read_folder(Path(written))
-    for line in found.refused:
-        say(f"refused: {line}")
+def _images(args: argparse.Namespace) -> ImageSet:
+    count_or_folder: str = args.images
+    if count_or_folder.isascii() and count_or_folder.isdigit():
+        return simulated_images(int(count_or_folder), args.seed)
+    found = read_image_folder(Path(count_or_folder))
+    for line in found.rejected:
+        report_progress(f"rejected: {line}")
     return found
 
 
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure and report; return 0.
 
     Raises:
-        SonarpostError: Wrong options or folders.
+        SonarpostError: Invalid options or folders.
     """
     losses = _numbers("--loss", args.loss, 0.0, 0.9)
     bursts = _numbers("--burst", args.burst, 1.0, 1000.0)
@@ -116,36 +116,34 @@ def run(args: argparse.Namespace) -> int:
     ):
         if not low <= value <= high:
             raise ConfigError("link", option, value, f"{low}..{high}")
-    measured = _pictures(args)
+    measured = _images(args)
     codecs = Codecs.shipped()
-    say(f"coding {len(measured.pictures)} pictures of {measured.origin}")
-    room = _FRAME_ROOM * args.frames * args.frame_bytes
-    pictures = [codecs.code(p.pixels, n, room) for n, p in enumerate(measured.pictures)]
+    report_progress(f"coding {len(measured.images)} images of {measured.origin}")
+    stream_bytes = _STREAM_FACTOR * args.frames * args.frame_bytes
+    images = [codecs.code(image.pixels, n, stream_bytes) for n, image in enumerate(measured.images)]
     rows: list[_Row] = []
     for burst in bursts:
         for loss in losses:
-            say(f"loss {loss}, burst {burst}")
+            report_progress(f"loss {loss}, burst {burst}")
             setting = Setting(args.frames, args.frame_bytes, LossChannel(loss, burst), 0, args.depth, args.seed)
-            rows += measure_setting(pictures, codecs, setting, groups)
+            rows += measure_setting(images, codecs, setting, groups)
     if args.json:
-        print(json.dumps({"images": len(pictures), "results": rows}, allow_nan=False))
+        print(json.dumps({"images": len(images), "results": rows}, allow_nan=False))
     else:
-        print(
-            table(rows, f"{len(pictures)} pictures of {measured.origin}, {args.frames} frames of {args.frame_bytes} B")
-        )
+        print(table(rows, f"{len(images)} images of {measured.origin}, {args.frames} frames of {args.frame_bytes} B"))
     return 0
 
 
-def _broadcast(pictures: Sequence[LinkPicture], codecs: Codecs, setting: Setting) -> Outcome:
-    return run_v1(pictures, codecs, setting, feedback=False)
+def _broadcast(images: Sequence[LinkImage], codecs: Codecs, setting: Setting) -> SchemeResult:
+    return run_v1(images, codecs, setting, feedback=False)
 
 
-def _feedback(pictures: Sequence[LinkPicture], codecs: Codecs, setting: Setting) -> Outcome:
-    return run_v1(pictures, codecs, setting, feedback=True)
+def _feedback(images: Sequence[LinkImage], codecs: Codecs, setting: Setting) -> SchemeResult:
+    return run_v1(images, codecs, setting, feedback=True)
 
 
 def measure_setting(
-    pictures: Sequence[LinkPicture], codecs: Codecs, setting: Setting, groups: Sequence[int] = ()
+    images: Sequence[LinkImage], codecs: Codecs, setting: Setting, groups: Sequence[int] = ()
 ) -> list[_Row]:
     """Return a row for each scheme under one condition."""
     schemes: list[tuple[str, _Scheme, Setting]] = [
@@ -156,35 +154,35 @@ def measure_setting(
         ("v1-feedback", _feedback, setting),
         ("bound", run_bound, setting),
     ]
-    rows = [_row(name, scheme(pictures, codecs, its), its) for name, scheme, its in schemes]
+    rows = [_row(name, scheme(images, codecs, own), own) for name, scheme, own in schemes]
     rows[-1]["preview_rate"], rows[-1]["complete_rate"] = (round(r, 5) for r in bound_rates(setting))
-    rows[-1]["pooled_psnr"] = round(pooled_bound_db(pictures, codecs, setting), 4)
+    rows[-1]["pooled_psnr"] = round(pooled_bound_db(images, codecs, setting), 4)
     rows[-1]["airtime_ratio"] = 1.0
     return rows
 
 
-def _row(scheme: str, outcome: Outcome, setting: Setting) -> _Row:
-    delivered = outcome.delivered
+def _row(scheme: str, result: SchemeResult, setting: Setting) -> _Row:
+    delivered = result.delivered
     payload = sum(d.payload_bytes for d in delivered)
-    ideal = erasure_bound_frames(payload, setting.frame_bytes, setting.channel.loss)
+    bound_frames = erasure_bound_frames(payload, setting.frame_bytes, setting.channel.loss)
     return {
         "scheme": scheme,
         "loss": setting.channel.loss,
         "burst": setting.channel.burst,
-        "bytes": round(outcome.frames * setting.frame_bytes / len(delivered), 2),
+        "bytes": round(result.frames * setting.frame_bytes / len(delivered), 2),
         "psnr": round(float(np.mean([d.quality.psnr for d in delivered])), 4),
         "ssim": round(float(np.mean([d.quality.ssim for d in delivered])), 5),
         "preview_rate": round(float(np.mean([d.has_preview for d in delivered])), 5),
         "complete_rate": round(float(np.mean([d.is_complete for d in delivered])), 5),
-        "airtime_ratio": round(outcome.frames / ideal, 4) if ideal > 0 else None,
-        "frames": outcome.frames,
-        "reports": outcome.reports,
+        "airtime_ratio": round(result.frames / bound_frames, 4) if bound_frames > 0 else None,
+        "frames": result.frames,
+        "reports": result.reports,
         **({"stream_bytes": feedback_stream_bytes(setting)} if scheme == "v1-feedback" else {}),
     }
 
 
 def table(rows: Sequence[_Row], title: str) -> str:
-    """Return the rows for people."""
+    """Return the rows as text."""
     names = ("loss", "burst", "bytes", "PSNR", "SSIM", "preview", "complete", "air")
     widths = (5, 5, 7, 6, 6, 8, 8, 6)
     heads = " ".join(f"{name:>{width}}" for name, width in zip(names, widths, strict=True))

@@ -1,8 +1,8 @@
-"""The paper's Fig. 3: what keeping more principal components costs and gives.
+"""The paper's Fig. 3: cost and benefit of more principal components.
 
-The shipped codec compares tiles in at most 70 dimensions and then in all pixels, and its builder never projects. Here
-is the paper's own way instead: one rotation matrix for all, database and search wholly in the rotated space, in float64
-as there, so that 10 to 100 dimensions can be compared.
+The shipped codec compares tiles in at most 70 dimensions and then in all pixels, and its builder does not project. This
+module implements the paper's method: one rotation matrix, database and search in the rotated space, in float64, so
+that 10 to 100 dimensions can be compared.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ class DimensionPoint:
     """One point of each of Fig. 3's curves.
 
     Attributes:
-        dims: Dimensions kept.
+        dims: Number of dimensions.
         build_s: Time to compute the rotation and to build the database (Table IV).
-        encode_ms: Time to encode one picture: the best of five, and of that the median over pictures.
+        encode_ms: Time to encode one image: the shortest of five, median over the images.
         rotation_bytes: Size of the rotation matrix, float64.
         database_bytes: Size of the database: rotated tiles in float64, and their pixels.
         tiles: Tiles in the database.
-        fom: Mean figure of merit over the test pictures.
-        psnr: Mean PSNR in dB over the test pictures.
+        fom: Mean figure of merit over the test images.
+        psnr: Mean PSNR in dB over the test images.
     """
 
     dims: int
@@ -54,11 +54,11 @@ class DimensionPoint:
 
 
 class RotatedTiles:
-    """A tile database in rotated space, as the paper builds it.
+    """A tile database in rotated space, built with the paper's method.
 
     Args:
-        training: Every tile of the training pictures, shape (n, pixels), uint8: the rotation is theirs.
-        dims: Dimensions kept.
+        training: All tiles of the training images, shape (n, pixels), uint8; they determine the rotation.
+        dims: Number of dimensions.
     """
 
     def __init__(self, training: Tiles, dims: int) -> None:
@@ -83,29 +83,29 @@ class RotatedTiles:
 
     def nearest(self, rotated: _Floats) -> tuple[npt.NDArray[np.int64], _Floats]:
         """Return index and squared distance of the nearest tile for each of `rotated`, shape (m, dims)."""
-        known = self._rotated[: self._count]
-        squared = self._norms[: self._count] - 2.0 * (rotated @ known.T)
+        stored = self._rotated[: self._count]
+        squared = self._norms[: self._count] - 2.0 * (rotated @ stored.T)
         best = np.argmin(squared, axis=1)
         own = np.einsum("ij,ij->i", rotated, rotated)
         return best, np.maximum(squared[np.arange(len(best)), best] + own, 0.0)
 
-    def rebuild(self, picture: Image) -> Image:
-        """Encode and decode a picture."""
-        index, _ = self.nearest(self.rotate(cut_tiles(picture, TILE_PX)))
-        return join_tiles(self._tiles[index], picture.shape[0], picture.shape[1], TILE_PX)
+    def encode_and_decode(self, image: Image) -> Image:
+        """Encode and decode an image."""
+        index, _ = self.nearest(self.rotate(cut_tiles(image, TILE_PX)))
+        return join_tiles(self._tiles[index], image.shape[0], image.shape[1], TILE_PX)
 
-    def learn(self, picture: Image) -> None:
-        """Do Table IV for one picture: add what is far from everything, one tile after the other."""
-        tiles = cut_tiles(picture, TILE_PX)
+    def add_tiles_of(self, image: Image) -> None:
+        """Apply Table IV to one image: add each tile that is far from all tiles of the database."""
+        tiles = cut_tiles(image, TILE_PX)
         rotated = self.rotate(tiles)
         if self._count == 0:
             self._add(tiles[0], rotated[0])
-        elif fom(picture, self.rebuild(picture)) >= FOM_BELOW:
+        elif fom(image, self.encode_and_decode(image)) >= FOM_BELOW:
             return
         _, squared = self.nearest(rotated)
         for number in np.flatnonzero(squared > DISTANCE_ABOVE**2):
-            _, now = self.nearest(rotated[number : number + 1])
-            if now[0] > DISTANCE_ABOVE**2:
+            _, current = self.nearest(rotated[number : number + 1])
+            if current[0] > DISTANCE_ABOVE**2:
                 self._add(tiles[number], rotated[number])
 
     def _add(self, tile: Tiles, rotated: _Floats) -> None:
@@ -117,25 +117,25 @@ class RotatedTiles:
 def sensitivity(
     training: Sequence[Image], test: Sequence[Image], dimensions: Sequence[int] = DIMENSIONS
 ) -> list[DimensionPoint]:
-    """Measure Fig. 3's quantities for each number of dimensions.
+    """Measure the quantities of Fig. 3 for each number of dimensions.
 
     Args:
-        training: Pictures the databases are built from.
-        test: Others, to encode.
+        training: Images from which the databases are built.
+        test: Other images, to encode.
         dimensions: Numbers of principal components, 1..400.
     """
-    every = np.concatenate([cut_tiles(picture, TILE_PX) for picture in training])
-    return [_point(training, test, every, dims) for dims in dimensions]
+    all_tiles = np.concatenate([cut_tiles(image, TILE_PX) for image in training])
+    return [_point(training, test, all_tiles, dims) for dims in dimensions]
 
 
-def _point(training: Sequence[Image], test: Sequence[Image], every: Tiles, dims: int) -> DimensionPoint:
+def _point(training: Sequence[Image], test: Sequence[Image], all_tiles: Tiles, dims: int) -> DimensionPoint:
     start_s = time.perf_counter()
-    database = RotatedTiles(every, dims)
-    for picture in training:
-        database.learn(picture)
+    database = RotatedTiles(all_tiles, dims)
+    for image in training:
+        database.add_tiles_of(image)
     build_s = time.perf_counter() - start_s
-    times_ms = [min(_encode_ms(database, picture) for _ in range(_ENCODE_REPEATS)) for picture in test]
-    rebuilt = [database.rebuild(picture) for picture in test]
+    times_ms = [min(_encode_ms(database, image) for _ in range(_ENCODE_REPEATS)) for image in test]
+    decoded = [database.encode_and_decode(image) for image in test]
     return DimensionPoint(
         dims=dims,
         build_s=build_s,
@@ -143,12 +143,12 @@ def _point(training: Sequence[Image], test: Sequence[Image], every: Tiles, dims:
         rotation_bytes=database.rotation.nbytes,
         database_bytes=database.size_bytes,
         tiles=len(database),
-        fom=float(np.mean([fom(a, b) for a, b in zip(test, rebuilt, strict=True)])),
-        psnr=float(np.mean([psnr_db(a, b) for a, b in zip(test, rebuilt, strict=True)])),
+        fom=float(np.mean([fom(a, b) for a, b in zip(test, decoded, strict=True)])),
+        psnr=float(np.mean([psnr_db(a, b) for a, b in zip(test, decoded, strict=True)])),
     )
 
 
-def _encode_ms(database: RotatedTiles, picture: Image) -> float:
+def _encode_ms(database: RotatedTiles, image: Image) -> float:
     start_s = time.perf_counter()
-    database.nearest(database.rotate(cut_tiles(picture, TILE_PX)))
+    database.nearest(database.rotate(cut_tiles(image, TILE_PX)))
     return (time.perf_counter() - start_s) * 1000.0

@@ -1,4 +1,4 @@
-"""The paper's Table II and Fig. 2, measured again with this package's codecs at the paper's sizes."""
+"""The paper's Table II and Fig. 2, measured with the codecs of this package at the paper's sizes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from research.common.measurement import PSNR_LIMIT_DB, Coded, Subject, code
+from research.common.measurement import PSNR_LIMIT_DB, CodecUnderTest, CodedImage, code_image
 from sonarpost.codec.interface import Image
 from sonarpost.codec.quality import psnr_db, ssim
 from sonarpost.detection.detector import detect
@@ -24,7 +24,7 @@ HEIGHT_PX: Final = 49
 WIDTH_PX: Final = 113
 PIXELS: Final = HEIGHT_PX * WIDTH_PX
 _FIRST_SEED: Final = 920_000
-_CONTACTS_A_LINE: Final = 6
+_CONTACTS_PER_LINE: Final = 6
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class PaperFigure:
     """One entry of the paper's Table II or Fig. 2.
 
     Attributes:
-        title: As people know it.
-        codec: The codec here that does the same.
-        variant: Start of the variant, for vq.
-        paper_bytes: What the paper spent on 49 x 113 px.
-        paper_psnr: What it got, dB.
+        title: Name in tables.
+        codec: The corresponding codec of this package.
+        variant: Beginning of the variant, for vq.
+        paper_bytes: Bytes of the paper for 49 x 113 px.
+        paper_psnr: PSNR of the paper, dB.
     """
 
     title: str
@@ -54,107 +54,109 @@ FIG2: Final = (
     PaperFigure("VQ, 10 x 10 px tiles", "vq", 88, 19.24, "nominal-10"),
     PaperFigure("VQ, 20 x 20 px tiles", "vq", 20, 18.19, "nominal-20"),
 )
-# Table II gives ratios; its pictures are not described, so the bytes are those of a picture of Fig. 2's size.
+# Table II gives ratios; its images are not described, so the bytes are those of an image of the size of Fig. 2.
 TABLE2: Final = (
     PaperFigure("JPEG 2000", "jpeg2000", round(PIXELS / 9.449), 29.52),
     PaperFigure("Huffman", "huffman", round(PIXELS / 8.916), 21.66),
     PaperFigure("VQ", "vq", round(PIXELS / 251.682), 18.19, "nominal-20"),
     PaperFigure("SPIHT", "spiht", round(PIXELS / 25.924), 21.94),
 )
-FLAGSHIP: Final = "emb"
+EMB: Final = "emb"
 
 
 @dataclass(frozen=True)
 class Reproduced:
-    """A figure of the paper with what came out here; numbers are means over `pictures`, None where nothing did.
+    """A figure of the paper with the measured values: means over `images`, None without any.
 
     Attributes:
-        figure: The paper's.
+        figure: The figure of the paper.
         sent_bytes: Mean length of the streams, headers included.
         psnr: Mean PSNR, dB.
         ssim: Mean SSIM.
-        flagship_psnr: Mean PSNR of emb with at most as many bytes.
-        pictures: How many pictures the codec could do at this size.
-        reason: Why there is nothing, where there is nothing.
+        emb_psnr: Mean PSNR of emb with at most as many bytes.
+        images: Number of images that the codec coded at this size.
+        reason: Reason for missing values.
     """
 
     figure: PaperFigure
     sent_bytes: float | None
     psnr: float | None
     ssim: float | None
-    flagship_psnr: float | None
-    pictures: int
+    emb_psnr: float | None
+    images: int
     reason: str = ""
 
 
-def contact_pictures(survey: Survey, count: int = _CONTACTS_A_LINE) -> list[Image]:
-    """Cut a survey's most confident contacts to the paper's size, shape (49, 113) each.
+def contact_images(survey: Survey, count: int = _CONTACTS_PER_LINE) -> list[Image]:
+    """Cut the most confident contacts of a survey to the paper's size, shape (49, 113) each.
 
     Raises:
-        SurveyFileError: There is no contact, or the survey is smaller than the picture.
+        SurveyFileError: There is no contact, or the survey is smaller than the image.
     """
     cut = [cut_snippet(survey, contact, HEIGHT_PX, WIDTH_PX).image for contact in detect(survey)[:count]]
-    pictures = [image for image in cut if image.shape == (HEIGHT_PX, WIDTH_PX)]
-    if not pictures:
+    images = [image for image in cut if image.shape == (HEIGHT_PX, WIDTH_PX)]
+    if not images:
         expected = f"a survey with a contact and at least {HEIGHT_PX} pings of {WIDTH_PX} samples"
         raise SurveyFileError(str(survey.path), "contacts", len(cut), expected)
-    return pictures
+    return images
 
 
-def chosen_pictures(survey_file: Path | None) -> tuple[list[Image], str]:
-    """Return pictures of the paper's size and, in words, what they are of.
+def paper_images(survey_file: Path | None) -> tuple[list[Image], str]:
+    """Return images of the paper's size and a description of their origin.
 
     Args:
-        survey_file: A survey to cut contacts from; None for simulated ones over every kind of bottom.
+        survey_file: A survey with contacts; None for simulated surveys over every kind of seabed.
 
     Raises:
-        SurveyFileError: The survey cannot be read or shows no contact.
+        SurveyFileError: The survey cannot be read or has no contact.
     """
     if survey_file is not None:
-        return contact_pictures(read_survey(survey_file), 4 * _CONTACTS_A_LINE), f"contacts of {survey_file.name}"
-    pictures: list[Image] = []
+        return contact_images(read_survey(survey_file), 4 * _CONTACTS_PER_LINE), f"contacts of {survey_file.name}"
+    images: list[Image] = []
     for number, kind in enumerate(SeabedKind):
         spec = SurveySpec(seed=_FIRST_SEED + number, pings=600, seabed=kind, targets=6, clutter=3)
-        pictures += contact_pictures(simulate_survey(spec).survey)
-    return pictures, f"contacts of {len(SeabedKind)} simulated lines, one over each kind of bottom"
+        images += contact_images(simulate_survey(spec).survey)
+    return images, f"contacts of {len(SeabedKind)} simulated lines, one over each kind of bottom"
 
 
-def reproduce(figures: Sequence[PaperFigure], tested: Sequence[Subject], pictures: Sequence[Image]) -> list[Reproduced]:
-    """Measure each of the paper's figures again, with the same budget (vq: with its own size)."""
-    return [_reproduce(figure, tested, pictures) for figure in figures]
+def reproduce(
+    figures: Sequence[PaperFigure], tested: Sequence[CodecUnderTest], images: Sequence[Image]
+) -> list[Reproduced]:
+    """Measure each figure of the paper with the same budget (vq: with its natural size)."""
+    return [_reproduce(figure, tested, images) for figure in figures]
 
 
-def code_figure(figure: PaperFigure, tested: Sequence[Subject], picture: Image) -> Coded | str:
-    """Code one picture as a figure of the paper was; in words why not, where it cannot be."""
-    subject = _subject(tested, figure.codec, figure.variant)
-    if subject is None:
+def code_figure(figure: PaperFigure, tested: Sequence[CodecUnderTest], image: Image) -> CodedImage | str:
+    """Code one image for a figure of the paper; return the reason if it cannot be coded."""
+    codec = _find_codec(tested, figure.codec, figure.variant)
+    if codec is None:
         return f"codec {figure.codec} is not in this run"
-    return code(subject, picture, [figure.paper_bytes])[0]
+    return code_image(codec, image, [figure.paper_bytes])[0]
 
 
-def code_flagship(tested: Sequence[Subject], picture: Image, budget_bytes: int) -> Coded | str:
-    """Code one picture with the flagship codec; in words why not, where it cannot be."""
-    subject = _subject(tested, FLAGSHIP, "")
-    return f"codec {FLAGSHIP} is not in this run" if subject is None else code(subject, picture, [budget_bytes])[0]
+def code_emb(tested: Sequence[CodecUnderTest], image: Image, budget_bytes: int) -> CodedImage | str:
+    """Code one image with emb; return the reason if it cannot be coded."""
+    codec = _find_codec(tested, EMB, "")
+    return f"codec {EMB} is not in this run" if codec is None else code_image(codec, image, [budget_bytes])[0]
 
 
-def _subject(tested: Sequence[Subject], codec: str, variant: str) -> Subject | None:
-    return next((s for s in tested if s.codec.name == codec and s.variant.startswith(variant)), None)
+def _find_codec(tested: Sequence[CodecUnderTest], name: str, variant: str) -> CodecUnderTest | None:
+    return next((t for t in tested if t.codec.name == name and t.variant.startswith(variant)), None)
 
 
-def _reproduce(figure: PaperFigure, tested: Sequence[Subject], pictures: Sequence[Image]) -> Reproduced:
-    sizes, errors, likeness, flagship = [], [], [], []
+def _reproduce(figure: PaperFigure, tested: Sequence[CodecUnderTest], images: Sequence[Image]) -> Reproduced:
+    sizes, psnrs, ssims, emb_psnrs = [], [], [], []
     reason = ""
-    for picture in pictures:
-        coded = code_figure(figure, tested, picture)
+    for image in images:
+        coded = code_figure(figure, tested, image)
         if isinstance(coded, str):
             reason = coded
             continue
         sizes.append(float(len(coded.stream)))
-        errors.append(min(psnr_db(picture, coded.rebuilt), PSNR_LIMIT_DB))
-        likeness.append(ssim(picture, coded.rebuilt))
-        other = code_flagship(tested, picture, len(coded.stream))
-        if isinstance(other, Coded):
-            flagship.append(min(psnr_db(picture, other.rebuilt), PSNR_LIMIT_DB))
-    means = [float(np.mean(values)) if values else None for values in (sizes, errors, likeness, flagship)]
+        psnrs.append(min(psnr_db(image, coded.decoded), PSNR_LIMIT_DB))
+        ssims.append(ssim(image, coded.decoded))
+        with_emb = code_emb(tested, image, len(coded.stream))
+        if isinstance(with_emb, CodedImage):
+            emb_psnrs.append(min(psnr_db(image, with_emb.decoded), PSNR_LIMIT_DB))
+    means = [float(np.mean(values)) if values else None for values in (sizes, psnrs, ssims, emb_psnrs)]
     return Reproduced(figure, means[0], means[1], means[2], means[3], len(sizes), reason)

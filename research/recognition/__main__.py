@@ -1,4 +1,4 @@
-"""`python -m research.recognition`: what a judge trained on originals still recognises in decoded pictures."""
+"""`python -m research.recognition`: how well a classifier trained on originals recognises targets after coding."""
 
 from __future__ import annotations
 
@@ -13,21 +13,25 @@ from typing import Final
 
 import numpy as np
 
-from research.codecs.__main__ import add_codec_arguments, chosen_subjects, parse_budgets, say
 from research.codecs.report import aligned
-from research.common.command import command_parser, run_command
-from research.common.images import BenchPicture, simulated_pictures
-from research.common.measurement import Subject, code
-from research.common.sdvd import sdvd_crops
+from research.common.command import (
+    add_codec_arguments,
+    command_parser,
+    parse_budgets,
+    report_progress,
+    run_command,
+    selected_codecs,
+)
+from research.common.images import SampleImage, sdvd_crops, simulated_images
+from research.common.measurement import CodecUnderTest, code_image
 from research.common.statistics import Interval, Values, auc, bootstrap_weights, interval
-from research.recognition.classifier import Judge
-from research.recognition.speckle import DEFAULT_STRENGTH, grainy_twin, with_grain
+from research.recognition.classifier import DEFAULT_GRAIN_STRENGTH, TargetClassifier, codec_with_grain, with_grain
 from sonarpost.codec.interface import Image
 from sonarpost.errors import ConfigError
 
-LEAST_AUC: Final = 0.93
-"""A judge that tells originals apart worse than this is none."""
-EXIT_POOR_JUDGE: Final = 1
+MIN_AUC: Final = 0.93
+"""Minimum AUC of the classifier on originals for a valid result."""
+EXIT_POOR_CLASSIFIER: Final = 1
 MAX_STRENGTH: Final = 2.0
 _SIMULATED: Final = 240
 _SIMULATED_SEED: Final = 1  # not that of `research.codecs`
@@ -37,44 +41,49 @@ def new_parser() -> argparse.ArgumentParser:
     """Return the parser of this command."""
     parser = command_parser(
         "recognition",
-        description="Train a judge on original pictures (SDVD's train split and simulated ones) and let it tell "
-        "targets from clutter in decoded pictures of the test split. No survey line is judged by a judge that was "
-        "trained on it; intervals are of samples of survey lines. Of emb, streams that describe the bottom's grain, "
-        "within the same budget, are judged too, with the grain shown. Differences below about .03 are chance.",
+        description="Train a classifier on original images (SDVD's train split and simulated ones) and measure how "
+        "well it separates targets from clutter in decoded images of the test split. No survey line is classified "
+        "with a model trained on it; intervals are over survey lines. For emb, streams with a description of the "
+        "texture, within the same budget, are also measured, with synthetic texture added. Differences below about "
+        ".03 are not significant.",
     )
-    parser.add_argument("--sdvd", type=Path, required=True, metavar="DIR", help="the SDVD data set's folder")
+    parser.add_argument("--sdvd", type=Path, required=True, metavar="DIR", help="folder of the SDVD data set")
     parser.add_argument("--crop", type=int, default=80, metavar="PX", help="side of the crops (default: 80)")
     add_codec_arguments(parser)
     parser.add_argument(
-        "--simulated", type=int, default=_SIMULATED, metavar="N", help="simulated training pictures (%(default)s)"
+        "--simulated", type=int, default=_SIMULATED, metavar="N", help="simulated training images (%(default)s)"
     )
     parser.add_argument(
-        "--least-auc", type=float, default=LEAST_AUC, metavar="AUC", help="refuse a judge below this (%(default)s)"
+        "--least-auc",
+        type=float,
+        default=MIN_AUC,
+        metavar="AUC",
+        help="minimum AUC on originals (%(default)s)",
     )
     parser.add_argument(
         "--grain-strength",
-        default=str(DEFAULT_STRENGTH),
+        default=str(DEFAULT_GRAIN_STRENGTH),
         metavar="S,S,…",
-        help="shares of the synthetic grain to be shown, 0..2 (default: %(default)s)",
+        help="shares of the synthetic texture, 0..2 (default: %(default)s)",
     )
     return parser
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """The judge's success on one codec at one budget.
+class RecognitionResult:
+    """Result of one codec at one budget.
 
     Attributes:
         label: Codec and variant; "original" for the originals.
         codec: Name in the registry; empty for the originals.
-        budget_bytes: Most bytes of a stream; None for a natural size and for the originals.
-        grain: Share of the synthetic grain that was shown; None for the measured picture of a stream without.
-        mean_bytes: Mean real length of a stream; NaN for the originals.
-        pictures: How many pictures were judged.
-        misses: How many the codec missed.
-        area: Area under the ROC curve; None without both targets and others.
+        budget_bytes: Maximum bytes of a stream; None for a natural size and for the originals.
+        grain: Share of the synthetic texture added; None without description of the texture.
+        mean_bytes: Mean length of a stream; NaN for the originals.
+        images: Number of classified images.
+        misses: Number of images missed by the codec.
+        area: Area under the ROC curve; None without both targets and non-targets.
         ci: Its 95 % bootstrap interval over survey lines.
-        share: Of the area that the same pictures' originals have.
+        share: Ratio of the area to that of the originals of the same images.
         share_ci: Its 95 % interval over the same samples of survey lines.
     """
 
@@ -83,7 +92,7 @@ class Verdict:
     budget_bytes: int | None
     grain: float | None
     mean_bytes: float
-    pictures: int
+    images: int
     misses: int
     area: float | None
     ci: Interval | None
@@ -92,38 +101,41 @@ class Verdict:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, judge and report; return 0, or 1 if the judge is too poor to judge codecs.
+    """Train, classify and report; return 0, or 1 if the classifier is too poor on the originals.
 
     Raises:
-        SonarpostError: Wrong options, data set or codecs.
+        SonarpostError: Invalid options, data set or codecs.
     """
     budgets = parse_budgets(args.budgets)
     if not 0.0 <= args.least_auc <= 1.0:
         raise ConfigError("research", "--least-auc", args.least_auc, "0..1")
     strengths = _parse_strengths(args.grain_strength)
-    tested = chosen_subjects(args, all_packings=False)
-    training = sdvd_crops(args.sdvd, "train", args.crop).pictures
-    test = sdvd_crops(args.sdvd, "test", args.crop).pictures
-    simulated = simulated_pictures(args.simulated, _SIMULATED_SEED, args.crop).pictures if args.simulated else ()
-    say(f"training on {len(training)} real and {len(simulated)} simulated pictures")
-    judge = Judge(training, simulated, [picture.group for picture in test])
-    court = _Court(judge, test, bootstrap_weights([picture.group for picture in test]))
-    first = court.verdict([picture.pixels for picture in test], _Coding("original", "", None, None))
-    verdicts = [first]
-    for subject in tested:
-        verdicts += _verdicts_of(court, subject, budgets, strengths)
-        say(f"{subject.label}: judged")
-    print(_json_line(verdicts, len(test)) if args.json else _table(verdicts))
-    if first.area is None or first.area < args.least_auc:
-        say(f"the judge's AUC on originals is {first.area}, below {args.least_auc}: it says nothing about codecs")
-        return EXIT_POOR_JUDGE
+    tested = selected_codecs(args, all_packings=False)
+    training = sdvd_crops(args.sdvd, "train", args.crop).images
+    test = sdvd_crops(args.sdvd, "test", args.crop).images
+    simulated = simulated_images(args.simulated, _SIMULATED_SEED, args.crop).images if args.simulated else ()
+    report_progress(f"training on {len(training)} real and {len(simulated)} simulated images")
+    groups = [image.group for image in test]
+    evaluation = _Evaluation(TargetClassifier(training, simulated, groups), test, bootstrap_weights(groups))
+    originals = evaluation.result([image.pixels for image in test], _Coding("original", "", None, None))
+    results = [originals]
+    for codec in tested:
+        results += _codec_results(evaluation, codec, budgets, strengths)
+        report_progress(f"{codec.label}: classified")
+    print(_json_line(results, len(test)) if args.json else _table(results))
+    if originals.area is None or originals.area < args.least_auc:
+        report_progress(
+            f"AUC of the classifier on originals: got {originals.area}, expected at least {args.least_auc}; "
+            "the results are not valid"
+        )
+        return EXIT_POOR_CLASSIFIER
     return 0
 
 
-def _parse_strengths(written: str) -> tuple[float, ...]:
-    """Read `0.5,1`; return the strengths in rising order, none twice."""
+def _parse_strengths(text: str) -> tuple[float, ...]:
+    """Parse `0.5,1`; return the strengths in rising order without duplicates."""
     found = set()
-    for part in written.split(","):
+    for part in text.split(","):
         try:
             strength = float(part)
         except ValueError:
@@ -142,51 +154,50 @@ class _Coding:
     grain: float | None
 
 
-class _Court:
-    """The judge, the pictures of the test split, and the samples of survey lines that all verdicts share.
+class _Evaluation:
+    """The classifier, the test images, and the bootstrap samples common to all results.
 
     Args:
-        judge: Trained.
-        test: Original pictures.
-        weights: Bootstrap weights, shape (R, pictures).
+        classifier: The trained classifier.
+        test: Original images.
+        weights: Bootstrap weights, shape (R, images).
     """
 
-    def __init__(self, judge: Judge, test: Sequence[BenchPicture], weights: Values) -> None:
+    def __init__(self, classifier: TargetClassifier, test: Sequence[SampleImage], weights: Values) -> None:
         self.test = test
-        self._judge = judge
+        self._classifier = classifier
         self._weights = weights
-        self._is_target = np.array([bool(picture.is_target) for picture in test])
-        self._of_originals = judge.scores([picture.pixels for picture in test], [picture.group for picture in test])
+        self._is_target = np.array([bool(image.is_target) for image in test])
+        self._original_scores = classifier.scores([image.pixels for image in test], [image.group for image in test])
 
-    def verdict(self, pictures: Sequence[Image | None], coding: _Coding, lengths: Values | None = None) -> Verdict:
-        """Judge decoded pictures, one for each of the test split; None where there is none."""
-        shown = np.array([picture is not None for picture in pictures])
-        is_target = self._is_target[shown]
+    def result(
+        self, images: Sequence[Image | None], coding: _Coding, lengths: Values | None = None
+    ) -> RecognitionResult:
+        """Classify decoded images, one for each test image; None for a miss."""
+        coded = np.array([image is not None for image in images])
+        is_target = self._is_target[coded]
         area, ci, share, share_ci = None, None, None, None
         if is_target.any() and not is_target.all():
-            groups = [picture.group for picture, there in zip(self.test, shown, strict=True) if there]
-            scores = self._judge.scores([picture for picture in pictures if picture is not None], groups)
-            weights = self._weights[:, shown]
+            groups = [original.group for original, image in zip(self.test, images, strict=True) if image is not None]
+            scores = self._classifier.scores([image for image in images if image is not None], groups)
+            weights = self._weights[:, coded]
             area, draws = float(auc(scores, is_target)[0]), auc(scores, is_target, weights)
-            best = self._of_originals[shown]
-            best_area, best_draws = float(auc(best, is_target)[0]), auc(best, is_target, weights)
+            original = self._original_scores[coded]
+            original_area, original_draws = float(auc(original, is_target)[0]), auc(original, is_target, weights)
             ci = interval(draws)
-            if best_area > 0.0:
-                share = area / best_area
-                share_ci = interval(
-                    np.divide(draws, best_draws, out=np.full(draws.shape, np.nan), where=best_draws > 0)
-                )
-        count = int(np.count_nonzero(shown))
-        mean_bytes = math.nan if lengths is None or not count else float(lengths[shown].mean())
-        missed = len(self.test) - count
-        return Verdict(
+            if original_area > 0.0:
+                share = area / original_area
+                ratios = np.full(draws.shape, np.nan)
+                share_ci = interval(np.divide(draws, original_draws, out=ratios, where=original_draws > 0))
+        count = int(np.count_nonzero(coded))
+        return RecognitionResult(
             coding.label,
             coding.codec,
             coding.budget_bytes,
             coding.grain,
-            mean_bytes,
+            math.nan if lengths is None or not count else float(lengths[coded].mean()),
             count,
-            missed,
+            len(self.test) - count,
             area,
             ci,
             share,
@@ -194,87 +205,88 @@ class _Court:
         )
 
 
-def _verdicts_of(court: _Court, subject: Subject, budgets: Sequence[int], strengths: Sequence[float]) -> list[Verdict]:
-    """Judge a codec's pictures at every budget; then those of streams that say how strong the grain is.
+def _codec_results(
+    evaluation: _Evaluation, tested: CodecUnderTest, budgets: Sequence[int], strengths: Sequence[float]
+) -> list[RecognitionResult]:
+    """Return the results at every budget, then those of streams with a description of the texture.
 
-    Such a stream is within the same budget: the grain's description is paid for by the picture.
+    The description is part of the same budget, so it reduces the bytes of the image.
     """
-    verdicts = []
-    for coding, plain, _, lengths in _coded(court.test, subject, budgets):
-        verdicts.append(court.verdict(plain, coding, lengths))
-    twin = grainy_twin(subject.codec)
-    if twin is None:
-        return verdicts
-    grainy = replace(subject, codec=twin)
-    for coding, plain, streams, lengths in _coded(court.test, grainy, budgets):
+    results = []
+    for coding, images, _, lengths in _coded(evaluation.test, tested, budgets):
+        results.append(evaluation.result(images, coding, lengths))
+    grain_codec = codec_with_grain(tested.codec)
+    if grain_codec is None:
+        return results
+    for coding, images, streams, lengths in _coded(evaluation.test, replace(tested, codec=grain_codec), budgets):
         for strength in strengths:
-            views = [
-                None if picture is None or stream is None else with_grain(twin, stream, picture, strength)
-                for picture, stream in zip(plain, streams, strict=True)
+            textured = [
+                None if image is None or stream is None else with_grain(grain_codec, stream, image, strength)
+                for image, stream in zip(images, streams, strict=True)
             ]
-            verdicts.append(court.verdict(views, replace(coding, grain=strength), lengths))
-    return verdicts
+            results.append(evaluation.result(textured, replace(coding, grain=strength), lengths))
+    return results
 
 
 def _coded(
-    test: Sequence[BenchPicture], subject: Subject, budgets: Sequence[int]
+    test: Sequence[SampleImage], tested: CodecUnderTest, budgets: Sequence[int]
 ) -> Iterator[tuple[_Coding, list[Image | None], list[bytes | None], Values]]:
-    """Yield for each budget: what it is, the decoded pictures, their streams and lengths (None, None, NaN: missed)."""
-    coded = [code(subject, picture.pixels, budgets) for picture in test]
-    for place in range(len(coded[0])):
-        results = [each[place] for each in coded]
-        budget = None if subject.is_natural else budgets[place]
+    """Yield for each budget: the coding, decoded images, streams and their lengths (None, None, NaN for a miss)."""
+    coded = [code_image(tested, image.pixels, budgets) for image in test]
+    for column in range(len(coded[0])):
+        results = [each[column] for each in coded]
+        budget = None if tested.is_natural else budgets[column]
         yield (
-            _Coding(subject.label, subject.codec.name, budget, None),
-            [None if isinstance(r, str) else r.rebuilt for r in results],
+            _Coding(tested.label, tested.codec.name, budget, None),
+            [None if isinstance(r, str) else r.decoded for r in results],
             [None if isinstance(r, str) else r.stream for r in results],
             np.array([math.nan if isinstance(r, str) else float(len(r.stream)) for r in results]),
         )
 
 
-def _json_line(verdicts: Sequence[Verdict], images: int) -> str:
-    judge, *others = verdicts
-    results = [
+def _json_line(results: Sequence[RecognitionResult], images: int) -> str:
+    originals, *others = results
+    rows = [
         {
-            "codec": v.codec,
-            "label": v.label,
-            "budget": v.budget_bytes,
-            "grain": v.grain,
-            "bytes": None if math.isnan(v.mean_bytes) else round(v.mean_bytes, 2),
-            "n": v.pictures,
-            "misses": v.misses,
-            "auc": None if v.area is None else round(v.area, 4),
-            "ci": _rounded(v.ci),
-            "of_original": None if v.share is None else round(v.share, 4),
-            "of_original_ci": _rounded(v.share_ci),
+            "codec": r.codec,
+            "label": r.label,
+            "budget": r.budget_bytes,
+            "grain": r.grain,
+            "bytes": None if math.isnan(r.mean_bytes) else round(r.mean_bytes, 2),
+            "n": r.images,
+            "misses": r.misses,
+            "auc": None if r.area is None else round(r.area, 4),
+            "ci": _rounded(r.ci),
+            "of_original": None if r.share is None else round(r.share, 4),
+            "of_original_ci": _rounded(r.share_ci),
         }
-        for v in others
+        for r in others
     ]
-    original = {"auc": judge.area, "ci": None if judge.ci is None else list(judge.ci)}
-    return json.dumps({"images": images, "judge": original, "results": results}, allow_nan=False)
+    judge = {"auc": originals.area, "ci": None if originals.ci is None else list(originals.ci)}
+    return json.dumps({"images": images, "judge": judge, "results": rows}, allow_nan=False)
 
 
 def _rounded(found: Interval | None) -> list[float] | None:
     return None if found is None else [round(found[0], 4), round(found[1], 4)]
 
 
-def _table(verdicts: Sequence[Verdict]) -> str:
+def _table(results: Sequence[RecognitionResult]) -> str:
     head = ("codec", "budget", "grain", "n", "miss", "bytes", "AUC", "95 %", "of original", "95 %")
-    return aligned([head, *(_table_row(verdict) for verdict in verdicts)])
+    return aligned([head, *(_table_row(result) for result in results)])
 
 
-def _table_row(v: Verdict) -> tuple[str, ...]:
+def _table_row(r: RecognitionResult) -> tuple[str, ...]:
     return (
-        v.label,
-        "own" if v.budget_bytes is None else str(v.budget_bytes),
-        "no" if v.grain is None else f"{v.grain:g}",
-        str(v.pictures),
-        str(v.misses),
-        "-" if math.isnan(v.mean_bytes) else f"{v.mean_bytes:.1f}",
-        "-" if v.area is None else f"{v.area:.3f}",
-        "-" if v.ci is None else f"{v.ci[0]:.3f}..{v.ci[1]:.3f}",
-        "-" if v.share is None else f"{v.share:.3f}",
-        "-" if v.share_ci is None else f"{v.share_ci[0]:.3f}..{v.share_ci[1]:.3f}",
+        r.label,
+        "own" if r.budget_bytes is None else str(r.budget_bytes),
+        "no" if r.grain is None else f"{r.grain:g}",
+        str(r.images),
+        str(r.misses),
+        "-" if math.isnan(r.mean_bytes) else f"{r.mean_bytes:.1f}",
+        "-" if r.area is None else f"{r.area:.3f}",
+        "-" if r.ci is None else f"{r.ci[0]:.3f}..{r.ci[1]:.3f}",
+        "-" if r.share is None else f"{r.share:.3f}",
+        "-" if r.share_ci is None else f"{r.share_ci[0]:.3f}..{r.share_ci[1]:.3f}",
     )
 
 

@@ -1,82 +1,88 @@
-"""A judge of pictures: does this one show a target? Fixed random filters, pooled, and a logistic regression.
+"""Classifier for targets in images: fixed random filters, pooling, and a logistic regression.
 
-Filters that nobody trained cannot fit the marks one codec leaves, and the few numbers that are trained are trained on
-original pictures only, so the judge measures what of the target a codec leaves to be seen. (Random convolution
-features: Jarrett et al., "What is the best multi-stage architecture for object recognition?", ICCV 2009; Saxe et al.,
-"On random weights and unsupervised feature learning", ICML 2011.) Everything is deterministic.
+Filters without training cannot adapt to the artefacts of a codec, and the regression is trained on original images
+only. The classifier therefore measures how much of a target a codec preserves. (Random convolution features: Jarrett
+et al., "What is the best multi-stage architecture for object recognition?", ICCV 2009; Saxe et al., "On random weights
+and unsupervised feature learning", ICML 2011.) Everything is deterministic.
+
+Streams of `emb` may describe the texture of the bottom (grain). The decoder can add a synthetic texture of that
+strength to the image; the pixelser chooses its share.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 from scipy.optimize import minimize
 
-from research.common.images import BenchPicture
+from research.common.images import SampleImage
 from research.common.statistics import Flags, Values
-from sonarpost.codec.interface import Image
-from sonarpost.errors import ConfigError
+from sonarpost.codec import emb
+from sonarpost.codec.interface import Codec, Image
+from sonarpost.errors import ConfigError, StreamError
 
 Features = npt.NDArray[np.float64]
 
 FILTERS: Final = 48
 FILTER_PX: Final = 7
 HALVINGS: Final = (1, 2)
-"""The picture is looked at in half and in quarter size: where a target of a snippet is larger than the speckle."""
+"""Features come from half and quarter resolution, at which a target is larger than the speckle."""
 RIDGE: Final = 0.1
 FOLDS: Final = 7
-LEAST_SIDE_PX: Final = FILTER_PX * 2 ** max(HALVINGS) + 8
+MIN_SIDE_PX: Final = FILTER_PX * 2 ** max(HALVINGS) + 8
 SIMULATED_WEIGHT: Final = 0.25
-"""Weight of all simulated pictures together against all real ones: other targets, other sonar."""
+"""Weight of all simulated images relative to all real ones: their targets and sonar differ."""
 _CONTRAST_FLOOR: Final = 10.0
+DEFAULT_GRAIN_STRENGTH: Final = 0.5
+"""Share of the strength that restores the power of the texture; the default of `decode_with_grain` of emb."""
 
 
-def features(pictures: Sequence[Image]) -> Features:
-    """Return what the judge looks at, shape (pictures, 576), float64.
+def features(images: Sequence[Image]) -> Features:
+    """Return the features of images, shape (images, 576), float64.
 
-    Each picture is set to zero mean and unit spread, halved once and twice by block means, and filtered; the positive
-    and the negative part of each filter's answer give their mean, their largest value, and their mean over the middle
-    third.
+    Each image is scaled to zero mean and unit spread, reduced to half and quarter resolution by block means, and
+    filtered. The positive and the negative part of each response give their mean, their maximum, and their mean over
+    the central third.
 
     Args:
-        pictures: Each of shape (at least 36, at least 36), uint8; they may differ in size.
+        images: Each of shape (at least 36, at least 36), uint8; sizes may differ.
 
     Raises:
-        ConfigError: A picture is smaller than that.
+        ConfigError: An image is smaller.
     """
-    bank = _bank()
-    return np.stack([_features_of(picture, bank) for picture in pictures])
+    filters = _filter_bank()
+    return np.stack([_image_features(image, filters) for image in images])
 
 
-def _features_of(picture: Image, bank: Features) -> Features:
-    if min(picture.shape) < LEAST_SIDE_PX:
-        raise ConfigError("recognition bench", "crop", picture.shape, f"at least {LEAST_SIDE_PX} px a side")
-    view = picture.astype(np.float64)
-    view = (view - view.mean()) / (view.std() + _CONTRAST_FLOOR)
+def _image_features(image: Image, filters: Features) -> Features:
+    if min(image.shape) < MIN_SIDE_PX:
+        raise ConfigError("recognition", "crop", image.shape, f"at least {MIN_SIDE_PX} px a side")
+    pixels = image.astype(np.float64)
+    pixels = (pixels - pixels.mean()) / (pixels.std() + _CONTRAST_FLOOR)
     found = []
     for halving in range(1, max(HALVINGS) + 1):
-        rows, columns = view.shape[0] // 2, view.shape[1] // 2
-        view = view[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean(axis=(1, 3))
+        rows, columns = pixels.shape[0] // 2, pixels.shape[1] // 2
+        pixels = pixels[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean(axis=(1, 3))
         if halving in HALVINGS:
-            windows = np.lib.stride_tricks.sliding_window_view(view, (FILTER_PX, FILTER_PX))
-            answers = windows.reshape(*windows.shape[:2], -1) @ bank
-            found += [part for sign in (1.0, -1.0) for part in _pooled(np.maximum(sign * answers, 0.0))]
+            windows = np.lib.stride_tricks.sliding_window_view(pixels, (FILTER_PX, FILTER_PX))
+            responses = windows.reshape(*windows.shape[:2], -1) @ filters
+            found += [part for sign in (1.0, -1.0) for part in _pooled(np.maximum(sign * responses, 0.0))]
     return np.concatenate(found)
 
 
-def _pooled(answers: Features) -> list[Features]:
-    down, right = answers.shape[0] // 3, answers.shape[1] // 3
-    middle = answers[down : answers.shape[0] - down, right : answers.shape[1] - right]
-    return [answers.mean(axis=(0, 1)), answers.max(axis=(0, 1)), middle.mean(axis=(0, 1))]
+def _pooled(responses: Features) -> list[Features]:
+    down, right = responses.shape[0] // 3, responses.shape[1] // 3
+    middle = responses[down : responses.shape[0] - down, right : responses.shape[1] - right]
+    return [responses.mean(axis=(0, 1)), responses.max(axis=(0, 1)), middle.mean(axis=(0, 1))]
 
 
-def _bank() -> Features:
-    """Return the filters, shape (49, 48): smoothed Gaussian noise without mean, of unit length."""
+def _filter_bank() -> Features:
+    """Return the filters, shape (49, 48): smoothed Gaussian noise of zero mean and unit length."""
     noise = np.random.default_rng(1).standard_normal((FILTERS, FILTER_PX, FILTER_PX))
     smooth = np.stack([np.asarray(ndimage.gaussian_filter(each, 1.0)) for each in noise]).reshape(FILTERS, -1)
     smooth -= smooth.mean(axis=1, keepdims=True)
@@ -90,14 +96,14 @@ class _Regression:
     slopes: Values
     offset: float
 
-    def scores(self, seen: Features) -> Values:
-        return np.asarray((seen - self.mean) / self.spread @ self.slopes + self.offset)
+    def scores(self, samples: Features) -> Values:
+        return np.asarray((samples - self.mean) / self.spread @ self.slopes + self.offset)
 
 
-def _fit(seen: Features, is_target: Flags, weights: Values) -> _Regression:
-    """Fit a ridge-penalised logistic regression; targets and others weigh the same in all."""
-    mean, spread = seen.mean(axis=0), seen.std(axis=0) + 1e-6
-    scaled = (seen - mean) / spread
+def _fit(samples: Features, is_target: Flags, weights: Values) -> _Regression:
+    """Fit a ridge-penalised logistic regression; targets and non-targets have the same total weight."""
+    mean, spread = samples.mean(axis=0), samples.std(axis=0) + 1e-6
+    scaled = (samples - mean) / spread
     balanced = weights.copy()
     for flag in (True, False):
         balanced[is_target == flag] *= 0.5 / weights[is_target == flag].sum()
@@ -109,34 +115,34 @@ def _fit(seen: Features, is_target: Flags, weights: Values) -> _Regression:
         slope = -balanced * signs / (1.0 + np.exp(np.clip(margins, -50.0, 50.0)))
         return float(value), np.append(scaled.T @ slope + RIDGE * parameters[:-1], slope.sum())
 
-    found = minimize(loss, np.zeros(seen.shape[1] + 1), jac=True, method="L-BFGS-B", options={"maxiter": 300})
+    found = minimize(loss, np.zeros(samples.shape[1] + 1), jac=True, method="L-BFGS-B", options={"maxiter": 300})
     return _Regression(mean, spread, found.x[:-1], float(found.x[-1]))
 
 
-class Judge:
-    """Judges trained so that none has seen the survey line it judges (cross-fitting).
+class TargetClassifier:
+    """Classifier with cross-fitting: no survey line is classified by a regression trained on it.
 
-    Survey lines are dealt to seven folds; the pictures of a fold are judged by a regression trained on original
-    pictures of the other folds' lines, and on all simulated ones.
+    Survey lines are assigned to seven folds. The images of a fold are classified by a regression trained on original
+    images of the other folds and on all simulated images.
 
     Args:
-        training: Original pictures with `is_target` and `group` known.
-        simulated: Simulated pictures to train on as well; may be empty.
-        groups: Every survey line that will be judged or trained on.
+        training: Original images with `is_target` and `group`.
+        simulated: Simulated training images; may be empty.
+        groups: Survey lines to be classified.
 
     Raises:
-        ConfigError: A fold leaves no target or nothing else to train on.
+        ConfigError: The training images of a fold contain no target, or only targets.
     """
 
     def __init__(
-        self, training: Sequence[BenchPicture], simulated: Sequence[BenchPicture], groups: Sequence[str]
+        self, training: Sequence[SampleImage], simulated: Sequence[SampleImage], groups: Sequence[str]
     ) -> None:
-        self._fold_of = _deal(groups, training)
-        pictures = [*training, *simulated]
-        seen = features([picture.pixels for picture in pictures])
-        is_target = np.array([bool(picture.is_target) for picture in pictures])
-        real = np.arange(len(pictures)) < len(training)
-        folds = np.array([self._fold_of[p.group] for p in training] + [-1] * len(simulated))
+        self._fold_of = _assign_folds(groups, training)
+        images = [*training, *simulated]
+        samples = features([image.pixels for image in images])
+        is_target = np.array([bool(image.is_target) for image in images])
+        real = np.arange(len(images)) < len(training)
+        folds = np.array([self._fold_of[image.group] for image in training] + [-1] * len(simulated))
         share = SIMULATED_WEIGHT * len(training) / max(len(simulated), 1)
         weights = np.where(real, 1.0, share)
         self._regressions = []
@@ -144,30 +150,70 @@ class Judge:
             kept = folds != fold
             if not (is_target & kept & real).any() or not (~is_target & kept & real).any():
                 expected = "targets and others on at least two survey lines each"
-                raise ConfigError("recognition bench", "training pictures", f"{kept.sum()} in fold {fold}", expected)
-            self._regressions.append(_fit(seen[kept], is_target[kept], weights[kept]))
+                raise ConfigError("recognition", "training images", f"{kept.sum()} in fold {fold}", expected)
+            self._regressions.append(_fit(samples[kept], is_target[kept], weights[kept]))
 
-    def scores(self, pictures: Sequence[Image], groups: Sequence[str]) -> Values:
-        """Return how sure the judge is of a target, shape (pictures,), log odds.
+    def scores(self, images: Sequence[Image], groups: Sequence[str]) -> Values:
+        """Return the log odds of a target, shape (images,).
 
         Args:
-            pictures: As for `features`.
-            groups: Survey line of each, among those given to the constructor.
+            images: As for `features`.
+            groups: Survey line of each, among those of the constructor.
         """
-        seen = features(pictures)
+        samples = features(images)
         folds = np.array([self._fold_of[group] for group in groups])
-        result = np.empty(len(pictures))
+        result = np.empty(len(images))
         for fold, regression in enumerate(self._regressions):
-            result[folds == fold] = regression.scores(seen[folds == fold])
+            result[folds == fold] = regression.scores(samples[folds == fold])
         return result
 
 
-def _deal(groups: Sequence[str], training: Sequence[BenchPicture]) -> dict[str, int]:
-    """Deal survey lines to folds, lines with targets and lines without by themselves, so each fold has both."""
-    with_targets = {picture.group for picture in training if picture.is_target}
-    names = sorted(set(groups) | {picture.group for picture in training})
-    dealt: dict[str, int] = {}
+def _assign_folds(groups: Sequence[str], training: Sequence[SampleImage]) -> dict[str, int]:
+    """Assign survey lines to folds, lines with and without targets separately, so that each fold has both."""
+    with_targets = {image.group for image in training if image.is_target}
+    names = sorted(set(groups) | {image.group for image in training})
+    folds: dict[str, int] = {}
     for kind in (True, False):
         for number, name in enumerate(n for n in names if (n in with_targets) == kind):
-            dealt[name] = number % FOLDS
-    return dealt
+            folds[name] = number % FOLDS
+    return folds
+
+
+@runtime_checkable
+class GrainCodec(Protocol):
+    """A codec whose streams may describe the texture of the bottom."""
+
+    def decode_grain(self, stream: bytes) -> npt.NDArray[np.int16]:
+        """Return the synthetic texture to be added to the decoded image, shape (height, width), int16.
+
+        Raises:
+            StreamError: The stream is not of this codec, or has no description of the texture.
+        """
+
+
+def with_grain(codec: Codec, stream: bytes, image: Image, strength: float = DEFAULT_GRAIN_STRENGTH) -> Image | None:
+    """Return a decoded image with synthetic texture; None if codec or stream do not support it.
+
+    Args:
+        codec: Decoder of the stream.
+        stream: Header and body.
+        image: The decoded image, shape (height, width), uint8.
+        strength: Share of the texture that is added, 0..2.
+    """
+    if not isinstance(codec, GrainCodec):
+        return None
+    try:
+        layer = codec.decode_grain(stream)
+    except StreamError:
+        return None
+    added = np.floor(layer * strength).astype(np.int32)
+    return np.asarray(np.clip(image + added, 0, 255), dtype=np.uint8)
+
+
+def codec_with_grain(codec: Codec) -> Codec | None:
+    """Return the codec with a description of the texture in its streams, within the same budget; None if not emb."""
+    if codec.name not in (emb.NAME, emb.STRUCTURE_NAME):
+        return None
+    from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415  imported lazily: it loads numba
+
+    return replace(codec, grain=True) if isinstance(codec, EmbCodec) else None

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
-from research.detection.truth import Scale, object_at
+from research.detection.simulated import Scale, object_at
 from sonarpost.detection.candidates import Candidate, find_candidates
 from sonarpost.detection.fusion import (
     FILTERS,

@@ -1,4 +1,4 @@
-"""`python -m research.codecs`: pictures, misses, the JSON object, sheets and plots."""
+"""`python -m research.codecs`: images, misses, the JSON object, sheets and plots."""
 
 from __future__ import annotations
 
@@ -13,13 +13,11 @@ import pytest
 from PIL import Image
 
 from research.codecs import __main__ as command
-from research.codecs.rate_distortion import RateDifference
-from research.codecs.report import json_line
+from research.codecs.report import RateDifference, json_line
 from research.common import measurement as measuring
-from research.common.images import BenchPicture, read_folder, simulated_pictures
-from research.common.measurement import Subject, code, measure
-from research.common.sdvd import sdvd_crops, survey_line
-from research.recognition.speckle import with_grain
+from research.common.images import SampleImage, read_image_folder, sdvd_crops, simulated_images, survey_line
+from research.common.measurement import CodecUnderTest, code_image, measure_codec
+from research.recognition.classifier import with_grain
 from sonarpost.codec.interface import DecodedImage, StreamHeader
 from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.vq.codebook import Codebook, save
@@ -52,7 +50,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 class Halving:
-    """A codec that keeps the means of square blocks, as small as the budget demands; refuses dark pictures."""
+    """A codec that encodes the means of square blocks within the budget and rejects dark images."""
 
     name = "emb"
     codec_id = 0x7E
@@ -84,7 +82,7 @@ class Halving:
 ROW_KEYS = {"codec", "budget", "bytes", "psnr", "ssim", "msssim", "encode_ms", "decode_ms"}
 
 
-def test_the_json_object_has_exactly_these_keys(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_object_has_the_documented_keys(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--images", folder, "--codecs", "spiht,vq", "--budgets", "128,16,44", "--json") == 0
     lines = capsys.readouterr().out.splitlines()
     found = json.loads(lines[-1])
@@ -102,16 +100,16 @@ def test_the_json_object_has_exactly_these_keys(folder: Path, capsys: pytest.Cap
             assert row["encode_ms"] > 0
 
 
-def test_a_row_without_most_pictures_has_no_figures_but_the_details_do(
+def test_row_with_many_misses_is_null_and_details_have_the_figures(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_png(folder / "dark.png", np.zeros((40, 48), np.uint8))
-    monkeypatch.setattr("research.codecs.__main__.subjects", lambda *_, **__: ([Subject(Halving())], []))
+    monkeypatch.setattr("research.common.command.create_codecs", lambda *_, **__: ([CodecUnderTest(Halving())], []))
     file = tmp_path / "details.json"
     assert run("--images", folder, "--budgets", "60,900", "--json", "--details", file) == 0
     said = capsys.readouterr()
     rows = json.loads(said.out)["results"]
-    assert [row["psnr"] for row in rows] == [None, None]  # 3 of 4 pictures are fewer than nine tenths
+    assert [row["psnr"] for row in rows] == [None, None]  # 3 of 4 images are fewer than nine tenths
     assert "emb at 900 B: 1 x picture: expected a bright one" in said.err
     found = json.loads(file.read_text())
     assert [(row["n"], row["misses"]) for row in found["results"]] == [(3, 1), (3, 1)]
@@ -119,22 +117,22 @@ def test_a_row_without_most_pictures_has_no_figures_but_the_details_do(
     assert found["pictures"] == 4
 
 
-def test_of_vq_the_best_codebook_that_fits_a_budget_counts(folder: Path, tmp_path: Path) -> None:
-    subjects, _ = measuring.subjects(measuring_registry(), ["vq"])
-    pictures = read_folder(folder).pictures
-    variants = [measure(subject, pictures, [])[0] for subject in subjects]
-    coarse = next(p for p in variants if p.subject.variant == "nominal-20 14bit")
-    fine = next(p for p in variants if p.subject.variant == "nominal-10 14bit")
+def test_vq_row_is_the_best_codebook_within_the_budget(folder: Path, tmp_path: Path) -> None:
+    subjects, _ = measuring.create_codecs(measuring_registry(), ["vq"])
+    images = read_image_folder(folder).images
+    variants = [measure_codec(subject, images, [])[0] for subject in subjects]
+    coarse = next(p for p in variants if p.tested.variant == "nominal-20 14bit")
+    fine = next(p for p in variants if p.tested.variant == "nominal-10 14bit")
     budgets = [int(coarse.stream_bytes.min()) - 1, int(coarse.stream_bytes.max()), 4096]
-    none, small, large = measuring.best_that_fit(variants, budgets)
-    assert none.misses == len(pictures)
+    none, small, large = measuring.best_within_budgets(variants, budgets)
+    assert none.misses == len(images)
     assert np.array_equal(small.stream_bytes, coarse.stream_bytes)
     assert np.array_equal(large.psnr, np.maximum(coarse.psnr, fine.psnr))
     assert (large.stream_bytes <= fine.stream_bytes).all()  # of the packings the tightest
-    assert sum(none.reasons.values()) == len(pictures)
+    assert sum(none.reasons.values()) == len(images)
 
 
-def test_vq_is_measured_with_any_codebook(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_vq_uses_the_given_codebooks(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tiles = np.random.default_rng(3).integers(0, 256, (9, 400), np.uint8)
     own = tmp_path / "own.tiles"
     save(own, Codebook(TileDatabase.from_tiles(20, tiles), {}))
@@ -149,11 +147,11 @@ def test_vq_is_measured_with_any_codebook(folder: Path, tmp_path: Path, capsys: 
         run("--images", folder, "--codecs", "vq", "--codebooks", tmp_path / "absent.tiles")
 
 
-def test_bd_rate_of_the_flagship_against_every_other(
+def test_bd_rate_compares_emb_with_every_other_codec(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    subjects = [Subject(Halving()), *measuring.subjects(measuring_registry(), ["spiht", "vq"])[0]]
-    monkeypatch.setattr("research.codecs.__main__.subjects", lambda *_, **__: (subjects, []))
+    subjects = [CodecUnderTest(Halving()), *measuring.create_codecs(measuring_registry(), ["spiht", "vq"])[0]]
+    monkeypatch.setattr("research.common.command.create_codecs", lambda *_, **__: (subjects, []))
     file = tmp_path / "details.json"
     assert run("--images", folder, "--budgets", "24,44,88,192", "--json", "--details", file) == 0
     found = json.loads(capsys.readouterr().out)
@@ -174,10 +172,10 @@ def test_bd_rate_of_the_flagship_against_every_other(
 
 
 @pytest.mark.parametrize("option", ["--plot", "--sheet", "--details"])
-def test_an_absent_folder_is_said_before_the_work(
+def test_missing_output_folder_is_an_error_before_the_measurement(
     folder: Path, tmp_path: Path, option: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("research.codecs.__main__.measure", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr("research.codecs.__main__.measure_codec", lambda *_: pytest.fail("measured"))
     with pytest.raises(ConfigError, match=f"{option}.*a folder that exists"):
         run("--images", folder, "--codecs", "huffman", option, tmp_path / "absent" / "file.png")
 
@@ -188,7 +186,7 @@ def measuring_registry():
     return default_registry()
 
 
-def test_what_cannot_be_compared_is_null() -> None:
+def test_incomparable_codecs_have_a_null_bd_rate() -> None:
     nothing = RateDifference(None, None, None, 0)
     assert json.loads(json_line([], 0, {"emb": {"vq": nothing}})) == {
         "images": 0,
@@ -197,22 +195,22 @@ def test_what_cannot_be_compared_is_null() -> None:
     }
 
 
-def test_misses_are_counted_and_means_say_how_many_they_are_of() -> None:
+def test_misses_are_counted_and_excluded_from_means() -> None:
     dark = np.zeros((40, 48), np.uint8)
-    images = [snippet(0), dark, snippet(1), dark]
-    pictures = [BenchPicture(str(i), str(i), image) for i, image in enumerate(images)]
-    tight, roomy = measure(Subject(Halving()), pictures, [8, 200])
+    arrays = [snippet(0), dark, snippet(1), dark]
+    images = [SampleImage(str(i), str(i), array) for i, array in enumerate(arrays)]
+    tight, roomy = measure_codec(CodecUnderTest(Halving()), images, [8, 200])
     assert tight.misses == 4
     assert np.isnan(tight.psnr).all()
     assert roomy.misses == 2
     assert list(roomy.hits) == [True, False, True, False]
     assert roomy.reasons["picture: expected a bright one"] == 2
-    expected = Halving().decode(Halving().encode(images[0], 200)).image
-    assert roomy.psnr[0] == psnr_db(images[0], expected)
-    assert roomy.stream_bytes[0] == len(Halving().encode(images[0], 200)) <= 200
+    expected = Halving().decode(Halving().encode(arrays[0], 200)).image
+    assert roomy.psnr[0] == psnr_db(arrays[0], expected)
+    assert roomy.stream_bytes[0] == len(Halving().encode(arrays[0], 200)) <= 200
 
 
-def test_a_miss_shows_in_the_table(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_lists_misses(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--images", folder, "--codecs", "jpeg2000", "--budgets", "40,400") == 0
     text = capsys.readouterr().out
     rows = {line.split()[1]: line.split() for line in text.splitlines() if line.startswith("jpeg2000 ")}
@@ -220,18 +218,18 @@ def test_a_miss_shows_in_the_table(folder: Path, capsys: pytest.CaptureFixture[s
     assert rows["400"][2:4] == ["3", "0"]
     assert "Misses (most frequent reason):" in text
     assert "jpeg2000 at 40 B: 3 x" in text
-    assert "3 pictures of" in text
+    assert "3 images of" in text
 
 
-def test_streams_longer_than_their_budget_are_misses() -> None:
+def test_stream_longer_than_the_budget_is_a_miss() -> None:
     class Greedy(Halving):
         def encode(self, image: np.ndarray, budget_bytes: int | None = None) -> bytes:
             return super().encode(image, None)
 
-    assert code(Subject(Greedy()), snippet(0), [20]) == ["the stream is longer than its budget"]
+    assert code_image(CodecUnderTest(Greedy()), snippet(0), [20]) == ["the stream is longer than its budget"]
 
 
-def test_an_embedded_stream_is_made_once_and_cut() -> None:
+def test_embedded_stream_is_encoded_once_and_truncated() -> None:
     budgets: list[int | None] = []
 
     class Cut(Halving):
@@ -246,22 +244,22 @@ def test_an_embedded_stream_is_made_once_and_cut() -> None:
                 np.full((header.height_px, header.width_px), level, np.uint8), np.zeros((1, 1), np.bool_)
             )
 
-    coded = code(Subject(Cut(), is_embedded=True), snippet(0), [3, 30, 60])
+    coded = code_image(CodecUnderTest(Cut(), is_embedded=True), snippet(0), [3, 30, 60])
     assert budgets == [60]
     assert isinstance(coded[0], str)  # not even the header fits
     assert [len(c.stream) for c in coded[1:] if not isinstance(c, str)] == [30, 60]
-    levels = [int(c.rebuilt[0, 0]) for c in coded[1:] if not isinstance(c, str)]
+    levels = [int(c.decoded[0, 0]) for c in coded[1:] if not isinstance(c, str)]
     assert levels[1] - levels[0] == 30
 
 
-def test_a_perfect_picture_has_a_finite_psnr() -> None:
-    flat = BenchPicture("flat", "flat", np.full((32, 32), 77, np.uint8))
-    (point,) = measure(Subject(Halving()), [flat], [100])
+def test_image_without_error_has_a_finite_psnr() -> None:
+    flat = SampleImage("flat", "flat", np.full((32, 32), 77, np.uint8))
+    (point,) = measure_codec(CodecUnderTest(Halving()), [flat], [100])
     assert point.psnr[0] == measuring.PSNR_LIMIT_DB
     assert math.isfinite(point.psnr[0])
 
 
-def test_folders_are_read_at_any_depth_and_refusals_are_listed(folder: Path) -> None:
+def test_folder_is_read_recursively_and_rejections_are_listed(folder: Path) -> None:
     write_png(folder / "too_small.png", snippet(0)[:15])
     write_png(folder / "too_wide.png", np.zeros((20, 513), np.uint8))
     Image.fromarray(np.dstack([snippet(0), snippet(1), snippet(2)])).save(folder / "colour.png")
@@ -269,31 +267,31 @@ def test_folders_are_read_at_any_depth_and_refusals_are_listed(folder: Path) -> 
     (folder / "torn.png").write_bytes((folder / "a.png").read_bytes()[:60])
     (folder / "torn.jpg").write_bytes((folder / "deeper" / "c.JPG").read_bytes()[:200])
     (folder / "notes.txt").write_text("not a picture")
-    found = read_folder(folder)
-    assert [p.name for p in found.pictures] == ["a.png", "deeper/b.tiff", "deeper/c.JPG"]
-    assert [p.pixels.dtype for p in found.pictures] == [np.uint8] * 3
-    assert len(found.refused) == 6
-    refused = "\n".join(found.refused)
+    found = read_image_folder(folder)
+    assert [p.name for p in found.images] == ["a.png", "deeper/b.tiff", "deeper/c.JPG"]
+    assert [p.pixels.dtype for p in found.images] == [np.uint8] * 3
+    assert len(found.rejected) == 6
+    refused = "\n".join(found.rejected)
     for name in ("too_small.png: height", "too_wide.png: width", "colour.png", "colour.jpg: colour", "torn.png"):
         assert name in refused
     assert "torn.jpg: JPEG data" in refused
 
 
-def test_refusals_are_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rejected_files_are_printed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_png(folder / "tall.png", np.zeros((600, 20), np.uint8))
     run("--images", folder, "--codecs", "spiht", "--budgets", "64")
     output = capsys.readouterr()
     assert "tall.png: height: got '600 px'" in output.err
-    assert "1 refused" in output.out
+    assert "1 rejected" in output.out
 
 
-def test_wrong_folders_are_refused(tmp_path: Path) -> None:
+def test_invalid_folder_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(SurveyFileError, match="not a folder"):
         run("--images", tmp_path / "absent")
     with pytest.raises(SurveyFileError, match="at least one grey"):
         run("--images", tmp_path)
     write_png(tmp_path / "small.png", np.zeros((8, 8), np.uint8))
-    with pytest.raises(SurveyFileError, match=r"none, 1 refused.*small\.png: height"):
+    with pytest.raises(SurveyFileError, match=r"none, 1 rejected.*small\.png: height"):
         run("--images", tmp_path)
     with pytest.raises(SurveyFileError, match=r"index\.csv"):
         run("--sdvd", tmp_path)
@@ -314,12 +312,12 @@ def test_wrong_folders_are_refused(tmp_path: Path) -> None:
         ["--seed", "-1"],
     ],
 )
-def test_wrong_options_are_refused(options: list[str]) -> None:
+def test_invalid_option_is_an_error(options: list[str]) -> None:
     with pytest.raises(ConfigError):
         run(*options)
 
 
-def test_a_plot_without_matplotlib_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_plot_without_matplotlib_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     real = builtins.__import__
 
     def without(name: str, *rest: object, **more: object) -> object:
@@ -332,7 +330,7 @@ def test_a_plot_without_matplotlib_is_refused_before_any_work(monkeypatch: pytes
         run("--images", tmp_path / "absent", "--plot", tmp_path / "plot.png")
 
 
-def test_plot_and_sheet(folder: Path, tmp_path: Path) -> None:
+def test_plot_and_sheet_are_written(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is an optional extra")
     plot, sheet = tmp_path / "plot.png", tmp_path / "sheet.png"
     run(
@@ -357,18 +355,18 @@ def test_plot_and_sheet(folder: Path, tmp_path: Path) -> None:
     assert np.array_equal(drawn[56 : 56 + first.shape[0], 20 : 20 + first.shape[1]], first)
 
 
-def test_simulated_pictures_are_seeded_and_balanced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simulated_images_are_reproducible_and_balanced(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("research.common.images._PINGS", 260)
-    one, two = simulated_pictures(8, seed=5, side_px=64), simulated_pictures(8, seed=5, side_px=64)
-    assert [p.is_target for p in one.pictures] == [True, False] * 4
-    for a, b in zip(one.pictures, two.pictures, strict=True):
+    one, two = simulated_images(8, seed=5, side_px=64), simulated_images(8, seed=5, side_px=64)
+    assert [p.is_target for p in one.images] == [True, False] * 4
+    for a, b in zip(one.images, two.images, strict=True):
         assert a.pixels.shape == (64, 64)
         assert np.array_equal(a.pixels, b.pixels)
-    other = simulated_pictures(8, seed=6, side_px=64)
-    assert not np.array_equal(one.pictures[0].pixels, other.pictures[0].pixels)
+    other = simulated_images(8, seed=6, side_px=64)
+    assert not np.array_equal(one.images[0].pixels, other.images[0].pixels)
 
 
-def test_survey_lines_of_the_data_set() -> None:
+def test_survey_line_of_a_tile_name() -> None:
     assert survey_line("left_20240430052854L_tile_4.png") == "202404300528"
     assert survey_line("right_20240430052859H_sample_2_tile_8.png") == "202404300528"
     assert survey_line("3_143.jpg") == "3"
@@ -389,7 +387,7 @@ def test_survey_lines_of_the_data_set() -> None:
         ('split,image,w,h,target_px,x0,y0,x1,y1\ntest,"a\n', "text"),
     ],
 )
-def test_a_wrong_data_set_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_data_set_is_an_error(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "test" / "images").mkdir(parents=True)
     write_png(tmp_path / "test" / "images" / "small.png", np.zeros((64, 64), np.uint8))
     (tmp_path / "index.csv").write_text(text)
@@ -398,15 +396,15 @@ def test_a_wrong_data_set_is_refused(tmp_path: Path, text: str, message: str) ->
 
 
 @pytest.mark.realdata
-def test_the_crops_are_those_of_the_published_table(data_dir: Path) -> None:
+def test_crops_equal_those_of_the_published_table(data_dir: Path) -> None:
     found = sdvd_crops(data_dir / "snippets" / "sdvd")
-    assert len(found.pictures) == 138
-    assert sum(bool(p.is_target) for p in found.pictures) == 92
-    assert {p.pixels.shape for p in found.pictures} == {(80, 80)}
-    assert np.stack([p.pixels for p in found.pictures]).mean() == pytest.approx(79.2210661, abs=1e-6)
+    assert len(found.images) == 138
+    assert sum(bool(p.is_target) for p in found.images) == 92
+    assert {p.pixels.shape for p in found.images} == {(80, 80)}
+    assert np.stack([p.pixels for p in found.images]).mean() == pytest.approx(79.2210661, abs=1e-6)
 
 
-def test_grain_is_shown_only_where_a_codec_offers_it() -> None:
+def test_grain_is_added_only_for_codecs_that_support_it() -> None:
     class Grainy(Halving):
         def decode_grain(self, stream: bytes) -> np.ndarray:
             if len(stream) < 20:
@@ -421,7 +419,7 @@ def test_grain_is_shown_only_where_a_codec_offers_it() -> None:
     assert grain.tolist() == [[0, 98], [105, 250]]  # half of it, rounded down, clipped
 
 
-def test_codecs_that_cannot_be_made_here_are_told_unless_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unavailable_codecs_are_listed_unless_requested_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     from sonarpost.codec.registry import CodecRegistry, CodecSpec
 
     def absent(_: object) -> Halving:
@@ -430,12 +428,12 @@ def test_codecs_that_cannot_be_made_here_are_told_unless_asked_for(monkeypatch: 
     registry = CodecRegistry(
         [CodecSpec("rare", (0x90,), absent), CodecSpec("halving", (0x91,), lambda _: Halving(), is_embedded=True)],
     )
-    found, left_out = measuring.subjects(registry, None)
+    found, left_out = measuring.create_codecs(registry, None)
     assert [subject.codec.codec_id for subject in found] == [0x7E]
     assert "pip install rare" in left_out[0]
-    assert [measuring.subjects(registry, ["halving"], cut=cut)[0][0].is_embedded for cut in (False, True)] == [
+    assert [measuring.create_codecs(registry, ["halving"], cut=cut)[0][0].is_embedded for cut in (False, True)] == [
         False,
         True,
     ]
     with pytest.raises(SonarpostError, match="pip install rare"):
-        measuring.subjects(registry, ["rare"])
+        measuring.create_codecs(registry, ["rare"])

@@ -41,7 +41,7 @@ def recording(folder: Path, channel: str, pings: list[np.ndarray]) -> None:
     (folder / f"{channel}.IDX").write_bytes(index)
 
 
-def test_a_nominal_codebook_can_be_left_unrefined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refinement_passes_are_an_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     speckle = 60 * np.random.default_rng(4).rayleigh(1.0, (200, 200))
     images = list(cut_line("x", speckle.astype(np.float32), PatchPlan(copies=2)))
     monkeypatch.setattr(default_codebooks, "humminbird_images", lambda _: images)
@@ -61,7 +61,7 @@ def test_a_nominal_codebook_can_be_left_unrefined(tmp_path: Path, monkeypatch: p
         run("--humminbird", tmp_path, "--out", tmp_path / "file" / "folder")
 
 
-def test_a_recording_and_an_image_of_it_give_the_same_lines(tmp_path: Path) -> None:
+def test_recording_and_images_of_it_give_the_same_lines(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     folders = [tmp_path / "son" / "deeper", tmp_path / "png"]
     for folder in folders:
@@ -79,7 +79,7 @@ def test_a_recording_and_an_image_of_it_give_the_same_lines(tmp_path: Path) -> N
         assert np.isnan(values).any()
 
 
-def test_damaged_recordings_are_codebook_errors(tmp_path: Path) -> None:
+def test_damaged_recording_is_a_codebook_error(tmp_path: Path) -> None:
     ping = np.arange(1, 30, dtype=np.uint8)
     recording(tmp_path, "B002", [ping] * 3)
     son, idx = tmp_path / "B002.SON", tmp_path / "B002.IDX"
@@ -102,7 +102,7 @@ def test_damaged_recordings_are_codebook_errors(tmp_path: Path) -> None:
         read_channel(son)
 
 
-def test_a_missing_or_ambiguous_channel_is_named(tmp_path: Path) -> None:
+def test_error_names_the_missing_or_ambiguous_channel(tmp_path: Path) -> None:
     with pytest.raises(CodebookError, match="B002"):
         humminbird_lines(tmp_path)
     for name in ("a_B002.png", "b_B002.png"):
@@ -115,7 +115,7 @@ def test_a_missing_or_ambiguous_channel_is_named(tmp_path: Path) -> None:
         humminbird_lines(tmp_path)
 
 
-def test_a_nominal_codebook_is_the_same_bytes_in_any_order_of_its_images() -> None:
+def test_codebook_bytes_do_not_depend_on_the_order_of_images() -> None:
     images = list(cut_line("x", line(), PatchPlan(copies=2)))
     recipe = Recipe(10, 200, (Round(39.0, 400.0, 10), Round(100.0, 60.0)), 2)
     one, other = build_nominal(recipe, images), build_nominal(recipe, images[::-1])
@@ -124,14 +124,14 @@ def test_a_nominal_codebook_is_the_same_bytes_in_any_order_of_its_images() -> No
     assert one.notes["refine passes"] == "2"
 
 
-def test_the_recipes_fill_14_bit_codebooks_of_both_sizes() -> None:
+def test_recipes_give_14_bit_codebooks_of_both_sizes() -> None:
     assert [recipe.tile_px for recipe in RECIPES] == [10, 20]
     assert all(recipe.max_tiles < 1 << 14 for recipe in RECIPES)
     assert sum(recipe.max_tiles * recipe.tile_px**2 for recipe in RECIPES) <= 8_000_000
 
 
 @pytest.mark.realdata
-def test_the_real_recording_is_read_as_its_images_are() -> None:
+def test_real_recording_and_its_images_give_the_same_lines() -> None:
     if not (DATA / "surveys" / "humminbird").is_dir():
         pytest.skip(f"no recording under {DATA} (SONARPOST_DATA names the folder)")
     from_recording = humminbird_lines(DATA / "surveys" / "humminbird")
@@ -142,7 +142,7 @@ def test_the_real_recording_is_read_as_its_images_are() -> None:
 
 
 @pytest.mark.realdata
-def test_the_real_recording_gives_windows_of_many_scales() -> None:
+def test_real_recording_gives_training_images() -> None:
     if not (DATA / "surveys" / "derived").is_dir():
         pytest.skip(f"no recording under {DATA} (SONARPOST_DATA names the folder)")
     images = humminbird_images(DATA / "surveys" / "derived")
@@ -151,9 +151,7 @@ def test_the_real_recording_gives_windows_of_many_scales() -> None:
 
 
 @pytest.mark.parametrize("options", [(), ("--refine", -1)])
-def test_a_folder_without_a_recording_or_a_negative_number_is_refused(
-    tmp_path: Path, options: tuple[object, ...]
-) -> None:
+def test_folder_without_recording_and_negative_passes_are_errors(tmp_path: Path, options: tuple[object, ...]) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(SonarpostError):
         run("--humminbird", tmp_path / "empty", "--out", tmp_path, *options)

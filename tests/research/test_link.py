@@ -1,4 +1,4 @@
-"""`python -m research.link`: the schemes over the same water, and its one JSON line."""
+"""`python -m research.link`: the schemes over the same channel, and its one JSON line."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import pytest
 from PIL import Image
 
 from research.link.__main__ import main
-from research.link.images import Codecs, LinkPicture
-from research.link.schemes import Setting, Water, run_bound, run_paper, run_sequential, run_v1
+from research.link.schemes import Codecs, LinkImage, LossyChannel, Setting, run_bound, run_paper, run_sequential, run_v1
 from sonarpost.link.coding.channel_capacity import LossChannel
 
 
@@ -21,7 +20,7 @@ def codecs() -> Codecs:
 
 
 @pytest.fixture(scope="module")
-def pictures(codecs: Codecs) -> list[LinkPicture]:
+def images(codecs: Codecs) -> list[LinkImage]:
     rng = np.random.default_rng(0)
     found = []
     for number in range(6):
@@ -34,43 +33,43 @@ def setting(loss: float, burst: float = 1.0) -> Setting:
     return Setting(6, 64, LossChannel(loss, burst), group=24, depth=2, seed=3)
 
 
-def test_the_water_loses_what_it_says_in_bursts_as_long_as_it_says() -> None:
-    water = Water(LossChannel(0.3, 5.0), 0)
-    fates = np.array([water.passes() for _ in range(40_000)])
-    assert 1 - fates.mean() == pytest.approx(0.3, abs=0.02)
-    assert (~fates[:-1]).sum() / (~fates[:-1] & fates[1:]).sum() == pytest.approx(5.0, rel=0.1)
+def test_channel_has_the_configured_loss_and_burst_length() -> None:
+    channel = LossyChannel(LossChannel(0.3, 5.0), 0)
+    received = np.array([channel.receives() for _ in range(40_000)])
+    assert 1 - received.mean() == pytest.approx(0.3, abs=0.02)
+    assert (~received[:-1]).sum() / (~received[:-1] & received[1:]).sum() == pytest.approx(5.0, rel=0.1)
 
 
-def test_without_loss_everything_arrives(codecs: Codecs, pictures: list[LinkPicture]) -> None:
-    still = setting(0.0)
-    for outcome in (
-        run_paper(pictures, codecs, still),
-        run_sequential(pictures, codecs, still),
-        run_v1(pictures, codecs, still, feedback=False),
-        run_v1(pictures, codecs, still, feedback=True),
+def test_everything_arrives_without_loss(codecs: Codecs, images: list[LinkImage]) -> None:
+    lossless = setting(0.0)
+    for result in (
+        run_paper(images, codecs, lossless),
+        run_sequential(images, codecs, lossless),
+        run_v1(images, codecs, lossless, feedback=False),
+        run_v1(images, codecs, lossless, feedback=True),
     ):
-        assert all(d.has_preview and d.is_complete for d in outcome.delivered)
-        assert outcome.frames / len(pictures) == pytest.approx(6, abs=0.8)
-    ideal, plain = run_bound(pictures, codecs, still), run_sequential(pictures, codecs, still)
+        assert all(d.has_preview and d.is_complete for d in result.delivered)
+        assert result.frames / len(images) == pytest.approx(6, abs=0.8)
+    ideal, plain = run_bound(images, codecs, lossless), run_sequential(images, codecs, lossless)
     for best, found in zip(ideal.delivered, plain.delivered, strict=True):
         assert best.quality.psnr >= found.quality.psnr - 0.2
 
 
-def test_the_bound_is_the_mean_over_what_may_arrive(codecs: Codecs, pictures: list[LinkPicture]) -> None:
+def test_bound_is_the_expectation_over_received_frames(codecs: Codecs, images: list[LinkImage]) -> None:
     two = Setting(2, 64, LossChannel(0.5), group=24, depth=2, seed=0)
-    (best, *_) = run_bound(pictures, codecs, two).delivered
-    qualities = [pictures[0].quality(codecs.emb, n).psnr for n in (0, 39, 103)]
+    (best, *_) = run_bound(images, codecs, two).delivered
+    qualities = [images[0].quality(codecs.emb, n).psnr for n in (0, 39, 103)]
     assert best.quality.psnr == pytest.approx(0.25 * qualities[0] + 0.5 * qualities[1] + 0.25 * qualities[2])
     assert best.payload_bytes == 64
 
 
-def test_with_feedback_all_is_complete_at_half_lost(codecs: Codecs, pictures: list[LinkPicture]) -> None:
-    outcome = run_v1(pictures, codecs, setting(0.5, 4.0), feedback=True)
-    assert all(d.is_complete for d in outcome.delivered)
-    assert outcome.reports > 0
+def test_feedback_completes_all_images_at_half_loss(codecs: Codecs, images: list[LinkImage]) -> None:
+    result = run_v1(images, codecs, setting(0.5, 4.0), feedback=True)
+    assert all(d.is_complete for d in result.delivered)
+    assert result.reports > 0
 
 
-def test_the_command_prints_one_json_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_prints_one_json_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(5)
     for number in range(8):
         pixels = np.add.outer(np.arange(32) * number, np.arange(32) * 3) % 180 + rng.integers(0, 60, (32, 32))
@@ -107,6 +106,6 @@ def test_the_command_prints_one_json_object(tmp_path: Path, capsys: pytest.Captu
         ["--images", "/nix"],
     ],
 )
-def test_wrong_options_are_told(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_option_is_an_error(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*options]) == 2
     assert capsys.readouterr().err.startswith("python -m research.link: ")

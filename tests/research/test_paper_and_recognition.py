@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from research.common.images import BenchPicture
+from research.common.images import SampleImage
 from research.common.statistics import auc
 from research.paper import __main__ as paper
 from research.paper.dimensions import RotatedTiles, sensitivity
-from research.paper.figures import FIG2, PIXELS, TABLE2, contact_pictures, reproduce
+from research.paper.figures import FIG2, PIXELS, TABLE2, contact_images, reproduce
 from research.recognition import __main__ as recognition
-from research.recognition.classifier import FOLDS, Judge, features
+from research.recognition.classifier import FOLDS, TargetClassifier, features
 from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.vq.tiles import cut_tiles
 from sonarpost.errors import ConfigError, SurveyFileError
@@ -33,7 +33,7 @@ def run(command: ModuleType, *arguments: object) -> int:
 
 
 def scene(seed: int, *, target: bool, side_px: int = 80) -> np.ndarray:
-    """Speckle, with a highlight and a shadow if there is a target."""
+    """Speckle, with a highlight and a shadow for a target."""
     rng = np.random.default_rng(seed)
     image = 45 * rng.rayleigh(1.0, (side_px, side_px))
     if target:
@@ -43,9 +43,9 @@ def scene(seed: int, *, target: bool, side_px: int = 80) -> np.ndarray:
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def labelled(count: int, first_seed: int = 0) -> list[BenchPicture]:
+def labelled(count: int, first_seed: int = 0) -> list[SampleImage]:
     return [
-        BenchPicture(
+        SampleImage(
             str(i),
             str(i),
             scene(first_seed + i, target=i % 2 == 0),
@@ -57,11 +57,11 @@ def labelled(count: int, first_seed: int = 0) -> list[BenchPicture]:
 
 
 @pytest.fixture(scope="module")
-def judge() -> Judge:
-    return Judge(labelled(120), [], [])
+def classifier() -> TargetClassifier:
+    return TargetClassifier(labelled(120), [], [])
 
 
-def test_the_judge_tells_targets_from_clutter_and_noise_blinds_it(judge: Judge) -> None:
+def test_classifier_separates_targets_from_clutter_but_not_in_noise(classifier: TargetClassifier) -> None:
     test = labelled(60, first_seed=1000)
     is_target = np.array([bool(p.is_target) for p in test])
     groups = [p.group for p in test]
@@ -69,45 +69,45 @@ def test_the_judge_tells_targets_from_clutter_and_noise_blinds_it(judge: Judge) 
     for sigma in (0, 60, 600):
         rng = np.random.default_rng(sigma)
         seen = [np.clip(p.pixels + rng.normal(0, sigma, p.pixels.shape), 0, 255).astype(np.uint8) for p in test]
-        areas.append(auc(judge.scores(seen, groups), is_target)[0])
+        areas.append(auc(classifier.scores(seen, groups), is_target)[0])
     assert areas[0] > 0.97
     assert areas[0] >= areas[1] >= areas[2]
     assert areas[2] < 0.8
 
 
-def test_the_judge_is_deterministic(judge: Judge) -> None:
-    again = Judge(labelled(120), [], [])
-    pictures = [p.pixels for p in labelled(10, 500)]
+def test_classifier_is_deterministic(classifier: TargetClassifier) -> None:
+    again = TargetClassifier(labelled(120), [], [])
+    images = [p.pixels for p in labelled(10, 500)]
     groups = [p.group for p in labelled(10, 500)]
-    assert np.array_equal(judge.scores(pictures, groups), again.scores(pictures, groups))
+    assert np.array_equal(classifier.scores(images, groups), again.scores(images, groups))
 
 
-def test_no_line_is_judged_by_a_judge_that_was_trained_on_it() -> None:
-    # In one line every label is the other way round. A judge that had learnt that line would know; one that had not
-    # gets it all wrong.
+def test_no_survey_line_is_classified_by_a_model_trained_on_it() -> None:
+    # All labels of one line are inverted. A classifier that was not trained on this line gets all of them wrong.
     training = labelled(160)
-    odd = [
-        BenchPicture(f"odd {i}", f"odd {i}", scene(3000 + i, target=i % 2 == 0), "odd", i % 2 == 1) for i in range(40)
+    inverted = [
+        SampleImage(f"inv {i}", f"inv {i}", scene(3000 + i, target=i % 2 == 0), "inverted", i % 2 == 1)
+        for i in range(40)
     ]
-    judge = Judge([*training, *odd], [], [])
-    scores = judge.scores([p.pixels for p in odd], ["odd"] * len(odd))
-    assert auc(scores, np.array([bool(p.is_target) for p in odd]))[0] < 0.1
+    classifier = TargetClassifier([*training, *inverted], [], [])
+    scores = classifier.scores([p.pixels for p in inverted], ["inverted"] * len(inverted))
+    assert auc(scores, np.array([bool(p.is_target) for p in inverted]))[0] < 0.1
 
 
-def test_a_judge_needs_lines_of_both_kinds() -> None:
-    same_line = [BenchPicture(str(i), str(i), scene(i, target=i % 2 == 0), "one", i % 2 == 0) for i in range(10)]
+def test_classifier_requires_lines_with_and_without_targets() -> None:
+    same_line = [SampleImage(str(i), str(i), scene(i, target=i % 2 == 0), "one", i % 2 == 0) for i in range(10)]
     with pytest.raises(ConfigError, match="two survey lines each"):
-        Judge(same_line, [], [])
+        TargetClassifier(same_line, [], [])
 
 
-def test_simulated_pictures_change_what_is_learnt(judge: Judge) -> None:
-    simulated = [BenchPicture("s", "s", scene(9000 + i, target=i % 2 == 1), "sim", i % 2 == 0) for i in range(30)]
-    other = Judge(labelled(120), simulated, [])
-    pictures, groups = [p.pixels for p in labelled(10, 500)], [p.group for p in labelled(10, 500)]
-    assert not np.allclose(judge.scores(pictures, groups), other.scores(pictures, groups))
+def test_simulated_images_change_the_scores(classifier: TargetClassifier) -> None:
+    simulated = [SampleImage("s", "s", scene(9000 + i, target=i % 2 == 1), "sim", i % 2 == 0) for i in range(30)]
+    other = TargetClassifier(labelled(120), simulated, [])
+    images, groups = [p.pixels for p in labelled(10, 500)], [p.group for p in labelled(10, 500)]
+    assert not np.allclose(classifier.scores(images, groups), other.scores(images, groups))
 
 
-def test_features_do_not_depend_on_brightness_and_need_room() -> None:
+def test_features_are_invariant_to_brightness_and_require_a_minimum_size() -> None:
     image = (scene(1, target=True) // 2).astype(np.uint8)
     brighter = image + np.uint8(60)
     assert np.allclose(features([image]), features([brighter]), atol=1e-9)
@@ -118,7 +118,7 @@ def test_features_do_not_depend_on_brightness_and_need_room() -> None:
 
 @pytest.fixture
 def data_set(tmp_path: Path) -> Path:
-    """A data set of the SDVD's form: dated targets as PNG, numbered clutter as JPEG."""
+    """A data set in the layout of SDVD: dated targets as PNG, numbered clutter as JPEG."""
     rows = []
     for split, count in (("train", 2 * FOLDS), ("test", 6)):
         images = tmp_path / split / "images"
@@ -141,7 +141,7 @@ def data_set(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_recognition_of_decoded_pictures(data_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recognition_results_of_decoded_images(data_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--sdvd", data_set, "--codecs", "spiht,jpeg2000", "--budgets", "12,128", "--simulated", "0"]
     assert run(recognition, *options, "--json") == 0
     found = json.loads(capsys.readouterr().out)
@@ -159,9 +159,7 @@ def test_recognition_of_decoded_pictures(data_set: Path, capsys: pytest.CaptureF
     assert "original" in capsys.readouterr().out
 
 
-def test_streams_with_grain_are_judged_within_the_same_budget(
-    data_set: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_streams_with_grain_keep_the_budget(data_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--sdvd", data_set, "--codecs", "emb", "--budgets", "64", "--simulated", "0", "--crop", "40"]
     assert run(recognition, *options, "--grain-strength", "0,1", "--least-auc", "0", "--json") == 0
     rows = json.loads(capsys.readouterr().out)["results"]
@@ -171,15 +169,15 @@ def test_streams_with_grain_are_judged_within_the_same_budget(
     assert all(row["of_original_ci"][0] <= row["of_original"] <= row["of_original_ci"][1] for row in rows)
 
 
-def test_grain_is_added_at_the_strength_asked_for() -> None:
-    from research.recognition.speckle import grainy_twin, with_grain
+def test_grain_is_added_with_the_given_strength() -> None:
+    from research.recognition.classifier import codec_with_grain, with_grain
     from sonarpost.codec.baselines.spiht import SpihtCodec
     from sonarpost.codec.emb.codec import EmbCodec
 
-    plain, twin = EmbCodec(), grainy_twin(EmbCodec())
+    plain, twin = EmbCodec(), codec_with_grain(EmbCodec())
     assert isinstance(twin, EmbCodec)
     assert twin.grain
-    assert grainy_twin(SpihtCodec()) is None
+    assert codec_with_grain(SpihtCodec()) is None
     image = np.clip(45 * np.random.default_rng(0).rayleigh(1.0, (48, 48)), 0, 255).astype(np.uint8)
     stream = twin.encode(image, 64)
     picture = twin.decode(stream).image
@@ -193,16 +191,16 @@ def test_grain_is_added_at_the_strength_asked_for() -> None:
     assert with_grain(SpihtCodec(), stream, picture) is None
 
 
-def test_a_poor_judge_is_said_to_be_one(
+def test_poor_classifier_gives_status_1(
     data_set: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Judge, "scores", lambda _self, pictures, _groups: np.zeros(len(pictures)))
+    monkeypatch.setattr(TargetClassifier, "scores", lambda _self, images, _groups: np.zeros(len(images)))
     options = ["--sdvd", data_set, "--codecs", "spiht", "--budgets", "64", "--simulated", "0"]
     assert run(recognition, *options) == 1
-    assert "says nothing about codecs" in capsys.readouterr().err
+    assert "the results are not valid" in capsys.readouterr().err
 
 
-def test_recognition_refuses_wrong_folders_and_thresholds(tmp_path: Path) -> None:
+def test_invalid_folder_or_threshold_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(SurveyFileError, match=r"index\.csv"):
         run(recognition, "--sdvd", tmp_path)
     with pytest.raises(ConfigError, match="least-auc"):
@@ -212,13 +210,13 @@ def test_recognition_refuses_wrong_folders_and_thresholds(tmp_path: Path) -> Non
             run(recognition, "--sdvd", tmp_path, f"--grain-strength={strength}")
 
 
-def test_the_papers_own_numbers() -> None:
+def test_numbers_of_the_paper() -> None:
     assert {f.title: f.paper_bytes for f in TABLE2} == {"JPEG 2000": 586, "Huffman": 621, "VQ": 22, "SPIHT": 214}
     assert [f.paper_psnr for f in FIG2] == [29.65, 21.72, 24.49, 21.96, 19.24, 18.19]
     assert PIXELS == 5537
 
 
-def test_figures_without_their_codec_say_so() -> None:
+def test_figure_without_its_codec_has_a_reason() -> None:
     (found, *_) = reproduce(FIG2, [], [np.zeros((49, 113), np.uint8)])
     assert found.psnr is None
     assert "not in this run" in found.reason
@@ -229,16 +227,16 @@ def survey() -> Survey:
     return simulate_survey(SurveySpec(seed=11, pings=200, samples=512, targets=3, clutter=0)).survey
 
 
-def test_contacts_are_cut_to_the_papers_size(survey: Survey) -> None:
-    pictures = contact_pictures(survey, 2)
-    assert 1 <= len(pictures) <= 2
-    assert all(p.shape == (49, 113) for p in pictures)
+def test_contacts_are_cut_to_the_size_of_the_paper(survey: Survey) -> None:
+    images = contact_images(survey, 2)
+    assert 1 <= len(images) <= 2
+    assert all(p.shape == (49, 113) for p in images)
     empty = simulate_survey(SurveySpec(seed=11, pings=20, samples=128, targets=0, clutter=0)).survey
     with pytest.raises(SurveyFileError, match="a survey with a contact"):
-        contact_pictures(empty)
+        contact_images(empty)
 
 
-def test_more_dimensions_cost_more_and_rebuild_better() -> None:
+def test_more_dimensions_increase_size_and_quality() -> None:
     training = [scene(i, target=i % 2 == 0, side_px=100) for i in range(30)]
     test = [scene(100 + i, target=True, side_px=100) for i in range(4)]
     few, many = sensitivity(training, test, [5, 80])
@@ -252,12 +250,12 @@ def test_more_dimensions_cost_more_and_rebuild_better() -> None:
     assert few.encode_ms > 0
 
 
-def test_the_rotated_search_finds_the_nearest_and_learns_it_once() -> None:
+def test_rotated_search_finds_the_nearest_tile_and_adds_it_once() -> None:
     training = [scene(i, target=True, side_px=60) for i in range(6)]
     every = np.concatenate([cut_tiles(p, 20) for p in training])
     database = RotatedTiles(every, 40)
     for picture in training:
-        database.learn(picture)
+        database.add_tiles_of(picture)
     before = len(database)
     rotated = database.rotate(every)
     index, squared = database.nearest(rotated)
@@ -265,12 +263,12 @@ def test_the_rotated_search_finds_the_nearest_and_learns_it_once() -> None:
     assert (squared >= brute.min(axis=1) - 1e-6).all()
     assert len(np.unique(index)) == before
     for picture in training:
-        database.learn(picture)
+        database.add_tiles_of(picture)
     assert len(database) == before
-    assert psnr_db(training[0], database.rebuild(training[0])) > 25
+    assert psnr_db(training[0], database.encode_and_decode(training[0])) > 25
 
 
-def test_the_page_is_written_from_the_run(
+def test_page_contains_the_figures_of_the_run(
     survey: Survey, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is an optional extra")

@@ -1,4 +1,4 @@
-"""`python -m research.sea_trial`: the rig delivers what the water lets through, and the command tells it right."""
+"""`python -m research.sea_trial`: counts of the rig, claims, and the command."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from research.common.images import simulated_pictures
+from research.common.images import simulated_images
 from research.sea_trial import __main__ as sea_trial
 from research.sea_trial.__main__ import SIZES_PX, Cell, claims, measure, table
-from research.sea_trial.rig import Delivered, Rig, Sample, cross
+from research.sea_trial.rig import CodedSnippet, DeliveryCounts, Rig, send_images
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.link.frames.contact_record import ContactSummary
@@ -22,39 +22,41 @@ from sonarpost.simulation.channel.parameters import ChannelParameters, build_par
 
 
 @pytest.fixture(scope="module")
-def samples() -> list[Sample]:
+def samples() -> list[CodedSnippet]:
     codec = VqCodec(load_default(20).tiles, IndexPacking.ASCII5)
-    pictures = simulated_pictures(6, 3, 140).pictures
+    pictures = simulated_images(6, 3, 140).images
     return [
-        Sample(codec.encode(p.pixels[:80]), ContactSummary(lat_deg=44.0, lon_deg=-63.0, time_utc_s=1.4e9 + n))
+        CodedSnippet(codec.encode(p.pixels[:80]), ContactSummary(lat_deg=44.0, lon_deg=-63.0, time_utc_s=1.4e9 + n))
         for n, p in enumerate(pictures)
     ]
 
 
 @pytest.mark.parametrize("rate", [1, 4])
-def test_in_still_water_everything_arrives(samples: list[Sample], rate: int) -> None:
-    found = cross(ChannelParameters(), 300.0, rate, samples)
+def test_everything_arrives_in_a_channel_without_fading(samples: list[CodedSnippet], rate: int) -> None:
+    found = send_images(ChannelParameters(), 300.0, rate, samples)
     frames = 12 * (3 if rate == 1 else 2)
-    assert found == Delivered(12, 12, 0, frames, frames, 6, 6, 0, 0)
+    assert found == DeliveryCounts(12, 12, 0, frames, frames, 6, 6, 0, 0)
 
 
-def test_beyond_hearing_nothing_arrives(samples: list[Sample]) -> None:
-    found = cross(build_parameters({"preset": "sea-trial"}, "test"), 300.0, 1, samples)
-    assert found == Delivered(12, 0, 0, 36, 0, 6, 0, 0, 0)
+def test_nothing_arrives_beyond_the_range_of_the_modem(samples: list[CodedSnippet]) -> None:
+    found = send_images(build_parameters({"preset": "sea-trial"}, "test"), 300.0, 1, samples)
+    assert found == DeliveryCounts(12, 0, 0, 36, 0, 6, 0, 0, 0)
 
 
-def test_what_is_counted_is_what_the_water_let_through(samples: list[Sample], monkeypatch: pytest.MonkeyPatch) -> None:
-    """The water's own account of every frame agrees with what came out at the far driver."""
+def test_counts_agree_with_the_events_of_the_channel(
+    samples: list[CodedSnippet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The events of the channel agree with the frames received by the driver of the vessel."""
     resolved: list[ArrivalEnded] = []
     inner = ChannelModel.poll
 
     def poll(self: ChannelModel, now: float) -> list[ArrivalStarted | ArrivalEnded]:
-        happened = inner(self, now)
-        resolved.extend(event for event in happened if isinstance(event, ArrivalEnded))
-        return happened
+        events = inner(self, now)
+        resolved.extend(event for event in events if isinstance(event, ArrivalEnded))
+        return events
 
     monkeypatch.setattr(ChannelModel, "poll", poll)
-    found = cross(build_parameters({"frame_loss": 0.3, "packet_loss": 0.1, "seed": 4}, "test"), 50.0, 1, samples)
+    found = send_images(build_parameters({"frame_loss": 0.3, "packet_loss": 0.1, "seed": 4}, "test"), 50.0, 1, samples)
     outcomes = [[frame.outcome for frame in event.frames] for event in resolved if event.frames]
     assert len(outcomes) == found.packets == 12
     assert sum(outcome is FrameOutcome.DELIVERED for packet in outcomes for outcome in packet) == found.good_frames
@@ -69,15 +71,15 @@ def test_what_is_counted_is_what_the_water_let_through(samples: list[Sample], mo
     assert found.partial_pictures > 0
 
 
-def test_a_packet_comes_out_as_it_went_in() -> None:
+def test_received_packet_equals_the_sent_one() -> None:
     rig = Rig(ChannelParameters(), 100.0)
     before = rig.now
-    heard = rig.send((b"one", b"two" * 20), 1)
-    assert [frame.data for frame in heard] == [b"one", b"two" * 20]
+    received = rig.send((b"one", b"two" * 20), 1)
+    assert [frame.data for frame in received] == [b"one", b"two" * 20]
     assert rig.now - before > 6.1
 
 
-def test_the_trial_turns_where_the_papers_did_and_can_be_repeated() -> None:
+def test_boundary_is_that_of_the_paper_and_results_are_reproducible() -> None:
     near, far = (60, 120), (160, 250)
     cells = measure(12, 1, (*near, *far), SIZES_PX[:1])
     assert cells == measure(12, 1, (*near, *far), SIZES_PX[:1])
@@ -88,27 +90,27 @@ def test_the_trial_turns_where_the_papers_did_and_can_be_repeated() -> None:
     assert cells != measure(12, 2, (*near, *far), SIZES_PX[:1])
 
 
-def cell(range_m: int, delivered: Delivered, width_px: int = 140) -> Cell:
+def cell(range_m: int, delivered: DeliveryCounts, width_px: int = 140) -> Cell:
     return Cell(1, width_px, 80, range_m, delivered)
 
 
-def test_the_papers_words_are_judged_by_what_was_measured() -> None:
-    whole = Delivered(4, 4, 0, 12, 12, 2, 2, 0, 0)
-    second = Delivered(4, 3, 1, 12, 11, 2, 1, 1, 0)
-    lost = Delivered(4, 0, 0, 12, 0, 2, 0, 0, 0)
-    as_told = claims([cell(60, whole), cell(60, second, 80), cell(130, lost), cell(200, lost)])
-    assert [(c["measured"], c["agrees"]) for c in as_told] == [(0.875, True), (1.0, True), (0.5, True), (1.0, True)]
+def test_claims_of_the_paper_are_compared_with_the_measurement() -> None:
+    whole = DeliveryCounts(4, 4, 0, 12, 12, 2, 2, 0, 0)
+    second = DeliveryCounts(4, 3, 1, 12, 11, 2, 1, 1, 0)
+    lost = DeliveryCounts(4, 0, 0, 12, 0, 2, 0, 0, 0)
+    as_in_paper = claims([cell(60, whole), cell(60, second, 80), cell(130, lost), cell(200, lost)])
+    assert [(c["measured"], c["agrees"]) for c in as_in_paper] == [(0.875, True), (1.0, True), (0.5, True), (1.0, True)]
     at_every_size = claims([cell(60, second), cell(60, second, 80)])
     assert [(c["measured"], c["agrees"]) for c in at_every_size] == [(0.75, True), (0.5, False), (0.5, False)]
-    otherwise = claims([cell(60, lost), cell(60, whole, 80), cell(200, whole)])
-    assert [(c["measured"], c["agrees"]) for c in otherwise] == [(0.5, False), (0.0, False), (0.0, False), (0.0, False)]
-    shown = table([cell(60, whole), replace(cell(60, lost), rate=4)])
-    assert "| 60 | 100 / 100 | most received |" in shown
-    assert "| 60 | 0 / 0 | not tried at sea |" in shown
-    assert "as in the paper" in shown
+    contrary = claims([cell(60, lost), cell(60, whole, 80), cell(200, whole)])
+    assert [(c["measured"], c["agrees"]) for c in contrary] == [(0.5, False), (0.0, False), (0.0, False), (0.0, False)]
+    text = table([cell(60, whole), replace(cell(60, lost), rate=4)])
+    assert "| 60 | 100 / 100 | most received |" in text
+    assert "| 60 | 0 / 0 | not tested at sea |" in text
+    assert "as in the paper" in text
 
 
-def test_the_command_prints_and_draws(
+def test_command_prints_and_plots(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib")
@@ -116,19 +118,19 @@ def test_the_command_prints_and_draws(
     monkeypatch.setattr(sea_trial, "SIZES_PX", SIZES_PX[1:])
     path = tmp_path / "plot.png"
     assert sea_trial.main(["--pictures", "3", "--json", "--plot", str(path)]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["water"], told["seed"]) == ("sea-trial", 0)
-    assert [(row["rate"], row["width_px"], row["range_m"]) for row in told["results"]] == [
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["water"], printed["seed"]) == ("sea-trial", 0)
+    assert [(row["rate"], row["width_px"], row["range_m"]) for row in printed["results"]] == [
         (rate, width, range_m) for width in (80, 40) for rate in (1, 4) for range_m in (60, 130, 200)
     ]
-    assert all(row["pictures"] == 3 and row["packets"] == 6 for row in told["results"])
-    with Image.open(path) as drawn:
-        assert drawn.size[0] > 1000
+    assert all(row["pictures"] == 3 and row["packets"] == 6 for row in printed["results"])
+    with Image.open(path) as image:
+        assert image.size[0] > 1000
     assert sea_trial.main(["--pictures", "2"]) == 0
     assert "| 130 | " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("wrong", [["--pictures", "0"], ["--pictures", "1001"], ["--seed", "-1"]])
-def test_wrong_options_are_refused(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_option_is_an_error(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert sea_trial.main([*wrong]) == 2
     assert wrong[0] in capsys.readouterr().err

@@ -7,18 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from research.codecs.rate_distortion import rate_difference
-from research.common.measurement import Point, Subject
+from research.codecs.report import rate_difference
+from research.common.measurement import BudgetResult, CodecUnderTest
+from research.common.quality import ms_ssim
 from research.common.statistics import (
     auc,
     bd_rate_percent,
     bootstrap_weights,
+    finite_mean,
     interval,
-    mean_of_known,
     overlap_db,
     weighted_means,
 )
-from sonarpost.codec.quality import ms_ssim
 from sonarpost.errors import StreamError
 
 RATES = np.array([22.0, 44, 64, 128, 256, 512])
@@ -29,20 +29,20 @@ def curve(rates: np.ndarray, db_per_octave: float = 1.5, offset_db: float = 15.0
 
 
 @pytest.mark.parametrize("factor", [0.25, 0.5, 0.9, 1.0, 1.7, 3.0])
-def test_a_codec_that_needs_a_constant_factor_of_the_rate(factor: float) -> None:
+def test_bd_rate_of_a_constant_rate_factor(factor: float) -> None:
     quality = curve(RATES)
     found = bd_rate_percent(factor * RATES, quality, RATES, quality)
     assert found == pytest.approx(100 * (factor - 1), abs=1e-9)
 
 
-def test_a_constant_gain_in_db_on_a_logarithmic_curve() -> None:
+def test_bd_rate_of_a_constant_gain_on_a_logarithmic_curve() -> None:
     # At 1.5 dB an octave a gain of 1.5 dB is half the rate, wherever the points lie.
     other_rates = np.array([30.0, 70, 150, 400, 900])
     found = bd_rate_percent(RATES, curve(RATES) + 1.5, other_rates, curve(other_rates))
     assert found == pytest.approx(-50.0, abs=1e-6)
 
 
-def test_the_mean_is_of_logarithms_over_the_common_range_only() -> None:
+def test_bd_rate_averages_logarithms_over_the_common_range() -> None:
     # First: log10 rate = q / 10; second: log10 rate = q / 5 - 2. Common range 20..30: the mean difference of the
     # logarithms is mean(2 - q / 10) = -0.5.
     q1, q2 = np.array([10.0, 18, 24, 30]), np.array([20.0, 26, 33, 40])
@@ -61,7 +61,7 @@ def test_interpolation_does_not_overshoot() -> None:
     assert 0.0 <= found <= 5.0
 
 
-def test_curves_that_cannot_be_compared() -> None:
+def test_incomparable_curves_have_no_bd_rate() -> None:
     quality = curve(RATES)
     assert bd_rate_percent(RATES, quality, RATES, quality + 40) is None
     assert overlap_db(quality, quality + 40) is None
@@ -69,7 +69,7 @@ def test_curves_that_cannot_be_compared() -> None:
     assert bd_rate_percent(np.array([10.0, 20]), np.array([5.0, 5.0]), RATES, quality) is None
 
 
-def test_points_that_cost_more_without_being_better_do_not_count() -> None:
+def test_inefficient_points_are_ignored() -> None:
     quality = curve(RATES)
     rates = np.concatenate((RATES, RATES * 1.6, [600.0]))
     worse = np.concatenate((quality, quality, [1.0]))
@@ -81,7 +81,7 @@ def test_points_that_cost_more_without_being_better_do_not_count() -> None:
     st.lists(st.floats(0.5, 2.0), min_size=6, max_size=6),
     st.lists(st.floats(0.1, 2.0), min_size=6, max_size=6),
 )
-def test_swapping_the_codecs_inverts_the_factor(steps: list[float], others: list[float]) -> None:
+def test_swapping_the_codecs_inverts_the_bd_rate(steps: list[float], others: list[float]) -> None:
     first, second = 18 + np.cumsum(steps), 18 + np.cumsum(others)
     one, two = bd_rate_percent(RATES, first, RATES, second), bd_rate_percent(RATES, second, RATES, first)
     assert (one is None) == (two is None)
@@ -89,13 +89,13 @@ def test_swapping_the_codecs_inverts_the_factor(steps: list[float], others: list
         assert (1 + one / 100) * (1 + two / 100) == pytest.approx(1.0)
 
 
-def point(budget: int, sizes: list[float], psnr: list[float]) -> Point:
+def point(budget: int, sizes: list[float], psnr: list[float]) -> BudgetResult:
     blank = np.full(len(sizes), np.nan)
     codec = type("Named", (), {"name": "some"})()
-    return Point(Subject(codec), budget, np.array(sizes), np.array(psnr), blank, blank, blank, blank)
+    return BudgetResult(CodecUnderTest(codec), budget, np.array(sizes), np.array(psnr), blank, blank, blank, blank)
 
 
-def test_curves_rest_on_the_pictures_both_coded() -> None:
+def test_curves_use_the_images_coded_by_both_codecs() -> None:
     pictures = 20
     base = np.linspace(18, 24, pictures)
     easy = np.arange(pictures) < 19
@@ -110,13 +110,13 @@ def test_curves_rest_on_the_pictures_both_coded() -> None:
     weights = bootstrap_weights([str(i) for i in range(pictures)], 50)
     found = rate_difference(one, two, weights)
     assert found.percent == pytest.approx(-50.0)
-    assert found.pictures == 19
+    assert found.images == 19
     assert found.ci is not None
     assert found.ci == pytest.approx((-50.0, -50.0))
     assert rate_difference(one, two[:1]).percent is None
 
 
-def test_bootstrap_draws_whole_sources_and_the_same_ones_for_all() -> None:
+def test_bootstrap_draws_sources_and_is_reproducible() -> None:
     sources = ["a", "a", "b", "c", "c", "c"]
     weights = bootstrap_weights(sources, 500, seed=4)
     assert weights.shape == (500, 6)
@@ -127,7 +127,7 @@ def test_bootstrap_draws_whole_sources_and_the_same_ones_for_all() -> None:
     assert not np.array_equal(weights, bootstrap_weights(sources, 500, seed=5))
 
 
-def test_the_interval_of_a_mean_agrees_with_theory() -> None:
+def test_interval_of_a_mean_agrees_with_theory() -> None:
     values = np.random.default_rng(0).normal(20, 3, 400)
     weights = bootstrap_weights([str(i) for i in range(400)])
     found = interval(weighted_means(values, weights))
@@ -137,10 +137,10 @@ def test_the_interval_of_a_mean_agrees_with_theory() -> None:
     assert found[1] == pytest.approx(values.mean() + half, abs=0.06)
 
 
-def test_what_is_unknown_stays_out_of_means_and_intervals() -> None:
+def test_nan_is_excluded_from_means_and_intervals() -> None:
     values = np.array([1.0, np.nan, 3.0])
-    assert mean_of_known(values) == 2.0
-    assert np.isnan(mean_of_known(np.array([np.nan])))
+    assert finite_mean(values) == 2.0
+    assert np.isnan(finite_mean(np.array([np.nan])))
     weights = np.array([[1.0, 5.0, 3.0], [0.0, 3.0, 0.0]])
     means = weighted_means(values, weights)
     assert means[0] == pytest.approx(2.5)
@@ -148,7 +148,7 @@ def test_what_is_unknown_stays_out_of_means_and_intervals() -> None:
     assert interval(np.full(100, np.nan)) is None
 
 
-def test_auc_by_hand() -> None:
+def test_auc_of_small_examples() -> None:
     scores = np.array([3.0, 1.0, 2.0, 2.0, 0.0])
     is_target = np.array([True, True, False, True, False])
     # Pairs (target, other): 3>2, 3>0, 1<2, 1>0, 2=2, 2>0: 4.5 of 6.
@@ -160,7 +160,7 @@ def test_auc_by_hand() -> None:
     assert np.isnan(weighted[1])
 
 
-def test_auc_of_chance_and_of_certainty() -> None:
+def test_auc_of_random_and_of_perfect_scores() -> None:
     rng = np.random.default_rng(1)
     is_target = rng.random(2000) < 0.4
     assert auc(rng.random(2000), is_target)[0] == pytest.approx(0.5, abs=0.05)
@@ -172,7 +172,7 @@ def picture(seed: int, shape: tuple[int, int] = (80, 80)) -> np.ndarray:
     return np.clip(60 * np.random.default_rng(seed).rayleigh(1.0, shape), 0, 255).astype(np.uint8)
 
 
-def test_ms_ssim_of_equal_and_of_damaged_pictures() -> None:
+def test_ms_ssim_of_equal_and_of_damaged_images() -> None:
     image = picture(0)
     assert ms_ssim(image, image) == pytest.approx(1.0)
     rng = np.random.default_rng(1)
@@ -184,7 +184,7 @@ def test_ms_ssim_of_equal_and_of_damaged_pictures() -> None:
     assert 0.0 <= values[-1] < values[0] < 1.0
 
 
-def test_ms_ssim_of_flat_pictures_is_their_luminance_term() -> None:
+def test_ms_ssim_of_constant_images_is_the_luminance_term() -> None:
     # Without any contrast all contrast-structure terms are 1; what is left is the coarsest scale's luminance.
     a, b = np.full((32, 32), 100, np.uint8), np.full((32, 32), 140, np.uint8)
     c1 = (0.01 * 255) ** 2
@@ -192,8 +192,8 @@ def test_ms_ssim_of_flat_pictures_is_their_luminance_term() -> None:
     assert ms_ssim(a, b) == pytest.approx(luminance ** (0.3001 / (0.0448 + 0.2856 + 0.3001)))
 
 
-def test_ms_ssim_by_its_definition() -> None:
-    """Three scales written out with plain loops over a mirrored picture."""
+def test_ms_ssim_equals_its_definition() -> None:
+    """Computed with plain loops over three scales of a mirrored image."""
     a, b = picture(2, (17, 22)), picture(3, (17, 22))
     axis = np.arange(-5, 6)
     line = np.exp(-(axis**2) / (2 * 1.5**2))
@@ -219,7 +219,7 @@ def test_ms_ssim_by_its_definition() -> None:
     assert ms_ssim(a, b) == pytest.approx(result, rel=1e-9)
 
 
-def test_ms_ssim_refuses_what_has_no_three_scales() -> None:
+def test_ms_ssim_of_an_invalid_pair_is_an_error() -> None:
     with pytest.raises(StreamError, match="at least 4 px"):
         ms_ssim(picture(0, (3, 40)), picture(1, (3, 40)))
     with pytest.raises(StreamError, match="shape"):

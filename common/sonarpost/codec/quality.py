@@ -1,4 +1,4 @@
-"""How good a rebuilt picture is: PSNR, SSIM, MS-SSIM, and the figure of merit that decides what enters a codebook."""
+"""Quality of a decoded image: PSNR, SSIM, and the figure of merit of the codebook builder."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ FigureOfMerit = Callable[[GreyImage, GreyImage], float]
 PEAK = 255.0
 SSIM_SIGMA_PX = 1.5
 SSIM_RADIUS_PX = 5  # an 11 x 11 window
-MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001)  # the first three of the five of Wang et al., finest scale first
-MS_SSIM_LEAST = 1e-6  # a scale without likeness, or with the opposite, counts as this
 
 
 def psnr_db(original: GreyImage, rebuilt: GreyImage) -> float:
@@ -67,39 +65,6 @@ def ssim(original: GreyImage, rebuilt: GreyImage) -> float:
     return float(np.mean(numerator / denominator))
 
 
-def ms_ssim(original: GreyImage, rebuilt: GreyImage) -> float:
-    """Return the multi-scale structural similarity over three scales, 0..1, 1 for equal pictures.
-
-    Wang, Simoncelli, Bovik, "Multiscale structural similarity for image quality assessment", Asilomar 2003, with three
-    scales instead of five (a snippet of 80 px has no five) and their weights scaled to a sum of 1:
-
-        product over scales s of max(mean of contrast-structure_s, 1e-6) ** weight_s,
-
-    the coarsest scale with its luminance term. Windows and constants are those of `ssim`, but the picture is mirrored
-    at its edges, so every place counts. From a scale to the next 2 x 2 px are averaged; an odd last row or column is
-    left out.
-
-    Args:
-        original: Shape (height, width), both at least 4, uint8.
-        rebuilt: The same shape, uint8.
-
-    Raises:
-        StreamError: The shapes differ, a side is shorter than 4 px, or a dtype is not uint8.
-    """
-    _check_pair(original, rebuilt)
-    if min(original.shape) < 4:
-        raise StreamError("picture quality", "original.shape", original.shape, "at least 4 px a side for three scales")
-    a, b = original.astype(np.float64), rebuilt.astype(np.float64)
-    result = 1.0
-    for scale, weight in enumerate(MS_SSIM_WEIGHTS):
-        luminance, contrast_structure = _similarity_terms(a, b)
-        is_coarsest = scale == len(MS_SSIM_WEIGHTS) - 1
-        likeness = np.mean(luminance * contrast_structure) if is_coarsest else np.mean(contrast_structure)
-        result *= max(float(likeness), MS_SSIM_LEAST) ** (weight / sum(MS_SSIM_WEIGHTS))
-        a, b = _halved(a), _halved(b)
-    return result
-
-
 def fom(original: GreyImage, rebuilt: GreyImage) -> float:
     """Return the figure of merit used by default: 100 times the mean SSIM, so 100 is perfect and 0 is unrelated.
 
@@ -108,29 +73,6 @@ def fom(original: GreyImage, rebuilt: GreyImage) -> float:
     same shape (`FigureOfMerit`) can be handed to the codebook builder.
     """
     return 100.0 * ssim(original, rebuilt)
-
-
-def _similarity_terms(
-    a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return SSIM's luminance term and its contrast-structure term at every pixel, mirrored at the edges."""
-
-    def mean(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        smooth = ndimage.gaussian_filter(values, SSIM_SIGMA_PX, radius=SSIM_RADIUS_PX, mode="reflect")
-        return np.asarray(smooth, dtype=np.float64)
-
-    c1, c2 = (0.01 * PEAK) ** 2, (0.03 * PEAK) ** 2
-    mean_a, mean_b = mean(a), mean(b)
-    variances = mean(a * a) - mean_a * mean_a + mean(b * b) - mean_b * mean_b
-    covariance = mean(a * b) - mean_a * mean_b
-    luminance = (2 * mean_a * mean_b + c1) / (mean_a * mean_a + mean_b * mean_b + c1)
-    return luminance, (2 * covariance + c2) / (variances + c2)
-
-
-def _halved(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    rows, columns = values.shape[0] // 2, values.shape[1] // 2
-    blocks = values[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2)
-    return np.asarray(blocks.mean(axis=(1, 3)), dtype=np.float64)
 
 
 def _window_mean(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

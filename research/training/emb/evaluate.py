@@ -16,7 +16,8 @@ import numpy.typing as npt
 from PIL import Image
 from scipy.interpolate import PchipInterpolator
 
-from sonarpost.codec.quality import ms_ssim, psnr_db, ssim
+from research.common.quality import ms_ssim
+from sonarpost.codec.quality import psnr_db, ssim
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.errors import StreamError
 

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
+from research.common.quality import ms_ssim
 from sonarpost.codec.emb import perceptual_weights as aim
 from sonarpost.codec.emb import transform
 from sonarpost.codec.emb.codec import EmbCodec
@@ -18,7 +19,7 @@ from sonarpost.codec.emb.layout import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE
 from sonarpost.codec.emb.model import all_structure
 from sonarpost.codec.emb.side_info import Box
 from sonarpost.codec.emb.similarity import structural_similarity
-from sonarpost.codec.quality import ms_ssim, psnr_db
+from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.errors import StreamError
 
