@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 import griffe
@@ -370,6 +371,7 @@ def _default(value: object) -> str:
 
 
 def _toml(value: object) -> str:
+    value = value.value if isinstance(value, Enum) else value
     if isinstance(value, (bool, int, float)):
         return json.dumps(value)
     if isinstance(value, (list, tuple)):

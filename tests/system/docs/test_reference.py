@@ -9,6 +9,7 @@ import tomllib
 import pytest
 import reference
 from builders.common import REPOSITORY
+from pydantic_core import to_jsonable_python
 from reference import Command
 
 from sonarpost.config import SERVICES, PlatformConfig, ServiceConfig
@@ -66,15 +67,16 @@ def test_consumed_keys_of_a_service_are_in_its_table(name: str, service: Service
 
 @pytest.mark.parametrize("name", TABLES)
 def test_configuration_keys_are_described(name: str) -> None:
-    page = reference.configuration(name)
+    page, fields = reference.configuration(name), reference.configuration_type(name).model_fields
+    listed = set()
     for row in [line for line in page.splitlines() if line.startswith("| `")]:
-        key, kind, _, _, default, meaning = (cell.strip() for cell in re.split(r"(?<!\\)\|", row)[1:-1])
+        key, kind, _, _, default, meaning = (cell.strip("` ") for cell in re.split(r"(?<!\\)\|", row)[1:-1])
         assert all((kind, default, meaning)), f"[{name}] {key}"
-        if default.startswith("`"):
-            tomllib.loads(f"value = {default.strip('`')}")
-    assert set(reference.configuration_type(name).model_fields) <= set(
-        re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)
-    )
+        listed.add(key)
+        if key in fields and default not in ("**required**", "none", "below"):
+            value = tomllib.loads(f"value = {default}")["value"]
+            assert value == to_jsonable_python(fields[key].get_default(call_default_factory=True))
+    assert listed >= set(fields)
     assert f"## [{name}]\n" in reference.configuration()
 
 
