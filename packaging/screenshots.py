@@ -21,10 +21,10 @@ from sonarpost.messages import Advice
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import ContactFilter
-from sonarpost.services.console.store.database import Database, DisplayedImage
+from sonarpost.services.console.store.database import Actor, Database, DisplayedImage
 from sonarpost.services.console.store.decisions import DecisionInput
 from sonarpost.services.console.store.serialisers import Json
-from sonarpost.services.console.store.users import Actor, Users
+from sonarpost.services.console.store.users import Users
 from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 

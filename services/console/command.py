@@ -18,8 +18,8 @@ from sonarpost.config import load
 from sonarpost.errors import ConfigError
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.state import ConsoleState
-from sonarpost.services.console.store.database import Database
-from sonarpost.services.console.store.users import FILE_NAME, ROLES, Users
+from sonarpost.services.console.store.database import ROLES, Database
+from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 DATABASE_NAME = "console-review.db"

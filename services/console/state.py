@@ -17,7 +17,7 @@ from sonarpost.services.console.events import EventHub
 from sonarpost.services.console.fleet import FleetMonitor, fleet_json
 from sonarpost.services.console.store import contacts, decisions, requests
 from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter
-from sonarpost.services.console.store.database import Database, DisplayedImage, add_audit_entry, insert_row
+from sonarpost.services.console.store.database import Actor, Database, DisplayedImage, add_audit_entry, insert_row
 from sonarpost.services.console.store.decisions import DecisionInput, DeliveryStates
 from sonarpost.services.console.store.requests import ID_COLUMN, Table
 from sonarpost.services.console.store.serialisers import (
@@ -31,7 +31,6 @@ from sonarpost.services.console.store.serialisers import (
     request_json,
     version_json,
 )
-from sonarpost.services.console.store.users import Actor
 
 FRAME_HEADER_BYTES = 13
 """Header of a frame in the format of the paper; a v1 header is shorter."""

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+import threading
+import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from http.client import HTTPResponse
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from builders.records import picture_record
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.state import ConsoleState
@@ -43,7 +49,6 @@ def image_record(
     if missing_rows:
         mask[-missing_rows:] = True
         pixels[mask] = 0
-    picture = Pixels.from_array(pixels)
     fields: dict[str, Any] = {
         "altitude_m": 5.0,
         "ground_range_m": 12.0,
@@ -58,22 +63,18 @@ def image_record(
     contact = Contact(
         contact_id=f"{vehicle}/{image_id}", vehicle_id=vehicle, lat_deg=lat, lon_deg=lon, **{**fields, **contact_fields}
     )
-    received = total if not missing_rows else total * (40 - missing_rows) // 40
-    return ReconstructedImage(
+    return picture_record(
+        Pixels.from_array(pixels),
         vessel_id=vessel,
         vehicle_id=vehicle,
         image_id=image_id,
         version=version,
         contact=contact,
         codec="emb",
-        model="",
-        picture=picture,
-        picture_sha256=picture.sha256,
         complete=not missing_rows,
         missing_fraction=float(mask.mean()),
         missing_mask=np.packbits(mask).tobytes() if missing_rows else b"",
-        missing_halves=(),
-        bytes_received=received,
+        bytes_received=total if not missing_rows else total * (40 - missing_rows) // 40,
         bytes_total=total,
         frames_received=version,
         first_frame_utc_s=first_utc_s,
@@ -85,21 +86,80 @@ def image_record(
 class Browser:
     """A browser, with or without a session."""
 
-    client: TestClient
+    client: httpx2.Client
     csrf: str = ""
 
-    def login(self, user: str, password: str = PASSWORD) -> Any:
+    def login(self, user: str, password: str = PASSWORD) -> httpx2.Response:
         answer = self.client.post("/api/login", json={"user": user, "password": password})
         if answer.status_code == 200:
             self.csrf = answer.json()["csrf"]
         return answer
 
-    def get(self, path: str, **parameters: Any) -> Any:
+    def get(self, path: str, **parameters: Any) -> httpx2.Response:
         return self.client.get(path, params=parameters or None, follow_redirects=False)
 
-    def post(self, path: str, body: Any, **headers: str) -> Any:
-        given = {"X-CSRF-Token": self.csrf, **headers}
-        return self.client.post(path, json=body, headers=given)
+    def post(self, path: str, body: Any, **headers: str) -> httpx2.Response:
+        return self.client.post(path, json=body, headers={"X-CSRF-Token": self.csrf, **headers})
+
+    def contact(self, contact_id: str) -> Any:
+        return self.get(f"/api/contacts/{contact_id}").json()
+
+    def decide(self, contact_id: str, **changes: Any) -> httpx2.Response:
+        """Decide on the newest version of a contact's image."""
+        detail = self.contact(contact_id)
+        version = detail["versions"][-1]
+        body = {
+            "revision": detail["contact"]["revision"],
+            "version": version["version"],
+            "sha256": version["sha256"],
+            "layer": "raw",
+            "verdict": "mine_like",
+            "confidence": 0.8,
+            "mlo_class": "manta",
+            "remark": "clean edge",
+        }
+        return self.post(f"/api/contacts/{contact_id}/decisions", {**body, **changes})
+
+
+class EventReader:
+    """Reads the event stream in a thread, as an open page does.
+
+    Args:
+        address: URL of the server.
+        token: Token of a session.
+        query: Query string of the request.
+        headers: Additional HTTP headers.
+    """
+
+    def __init__(self, address: str, token: str, query: str = "", **headers: str) -> None:
+        request = urllib.request.Request(
+            f"{address}events{query}", None, {"Cookie": f"sonarpost_session={token}", **headers}
+        )
+        self._stream: HTTPResponse = urllib.request.urlopen(request, timeout=60)
+        self.events: list[tuple[str, str, Any]] = []
+        self.ended = False
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        identifier = name = ""
+        try:
+            for raw in self._stream:
+                field, _, value = raw.decode().rstrip("\n").partition(": ")
+                if field == "id":
+                    identifier = value
+                elif field == "event":
+                    name = value
+                elif field == "data":
+                    self.events.append((name, identifier, json.loads(value)))
+        except (OSError, ValueError, AttributeError):
+            pass  # closed by the test
+        self.ended = True
+
+    def names(self) -> list[str]:
+        return [name for name, _, _ in self.events]
+
+    def close(self) -> None:
+        self._stream.close()
 
 
 @dataclass
@@ -115,22 +175,6 @@ class Console:
         if user:
             assert browser.login(user).status_code == 200
         return browser
-
-    def decide(self, browser: Browser, contact_id: str, **changes: Any) -> Any:
-        """Decide on the newest version of a contact's image."""
-        detail = browser.get(f"/api/contacts/{contact_id}").json()
-        version = detail["versions"][-1]
-        body = {
-            "revision": detail["contact"]["revision"],
-            "version": version["version"],
-            "sha256": version["sha256"],
-            "layer": "raw",
-            "verdict": "mine_like",
-            "confidence": 0.8,
-            "mlo_class": "manta",
-            "remark": "clean edge",
-        }
-        return browser.post(f"/api/contacts/{contact_id}/decisions", {**body, **changes})
 
 
 ConsoleMaker = Callable[..., Console]

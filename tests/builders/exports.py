@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from builders.records import decision_record, picture_record
 from sonarpost.archive.image_files import write_image
 from sonarpost.archive.shore_files import decision_file_name
 from sonarpost.export.contacts import ContactSet
@@ -39,41 +40,22 @@ def image(image_id: str = "00A7", contact: dict[str, Any] | None = None, **chang
     }
     record = Contact(contact_id=f"{vehicle_id}/{image_id}", vehicle_id=vehicle_id, **(known | (contact or {})))
     fields: dict[str, Any] = {
-        "vessel_id": "vessel-1",
         "vehicle_id": vehicle_id,
         "image_id": image_id,
-        "version": 1,
         "contact": record,
-        "codec": "vq",
         "model": "1f" * 32,
-        "picture": picture,
-        "picture_sha256": picture.sha256,
-        "complete": True,
-        "missing_fraction": 0.0,
-        "missing_mask": b"",
-        "missing_halves": (),
         "bytes_received": 232,
         "bytes_total": 232,
         "frames_received": 6,
         "first_frame_utc_s": FIRST_UTC_S,
         "last_frame_utc_s": FIRST_UTC_S + 30,
-        "notes": (),
     }
-    return ReconstructedImage(**(fields | changes))
+    return picture_record(picture, **(fields | changes))
 
 
 def decision(image_id: str = "00A7", **changes: Any) -> Decision:
-    fields: dict[str, Any] = {
-        "decision_id": "d-1",
-        "vessel_id": "vessel-1",
-        "vehicle_id": "uuv-1",
-        "image_id": image_id,
-        "image_version": 1,
-        "verdict": "mine_like",
-        "operator": "A. Operator",
-        "decided_utc_s": FIRST_UTC_S + 600,
-    }
-    return Decision(**(fields | changes))
+    fields = {"image_id": image_id, "operator": "A. Operator", "decided_utc_s": FIRST_UTC_S + 600}
+    return decision_record(**{"decision_id": "d-1", **fields, **changes})
 
 
 def store(out_dir: Path, *records: ReconstructedImage | Decision) -> Path:

@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 import pytest
 import zenoh
 from builders.common import eventually, free_port, publish_once
-from builders.records import picture_record
+from builders.records import decision_record, picture_record
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import router_config
@@ -22,7 +22,7 @@ from sonarpost.cli.c2.stored import join_decisions, select_images, since_of
 from sonarpost.cli.main import main
 from sonarpost.cli.shared import printable
 from sonarpost.errors import ConfigError
-from sonarpost.messages import Advice, Contact, Decision, Pixels, TaskingState
+from sonarpost.messages import Advice, Contact, Pixels, TaskingState
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
@@ -44,18 +44,8 @@ def image(image_id="AAAA", version=1, vehicle="uuv-1", vessel="vessel-1", first_
     )
 
 
-def decision(decision_id="d1", image_id="AAAA", decided_utc_s=FIRST_S + 60, verdict="mine_like", **changes):
-    fields = {
-        "decision_id": decision_id,
-        "vessel_id": "vessel-1",
-        "vehicle_id": "uuv-1",
-        "image_id": image_id,
-        "image_version": 1,
-        "verdict": verdict,
-        "operator": "op",
-        "decided_utc_s": decided_utc_s,
-    }
-    return Decision(**(fields | changes))
+def decision(decision_id="d1", decided_utc_s=FIRST_S + 60, **changes):
+    return decision_record(decision_id, decided_utc_s=decided_utc_s, **changes)
 
 
 @pytest.fixture

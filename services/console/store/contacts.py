@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from sonarpost import wire
+from sonarpost.export.contacts import match_start_time
 from sonarpost.messages import ReconstructedImage
 from sonarpost.review.grouping import Look, nearest_group
 from sonarpost.review.local_frame import vehicle_position
@@ -27,6 +28,8 @@ SORT_COLUMNS: Final[Mapping[str, str]] = {
 }
 REVIEW_FILTERS: Final = ("unreviewed", "mine_like", "not_mine_like", "unsure", "reviewed")
 _METRES_PER_DEGREE: Final = 111_000.0
+_RECORD_COLUMNS: Final = ("atd_class", "atd_confidence", "lat_deg", "lon_deg", "position_sigma_m")
+_IMAGE_COLUMNS: Final = ("version", "codec", "bytes_received", "bytes_total", "first_frame_utc_s", "last_frame_utc_s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,32 +141,21 @@ def _update_contact(db: sqlite3.Connection, contact_id: str, image: Reconstructe
         )
     constant = {
         "id": contact_id,
-        "vessel_id": image.vessel_id,
-        "vehicle_id": image.vehicle_id,
-        "image_id": image.image_id,
+        **{name: getattr(image, name) for name in ("vessel_id", "vehicle_id", "image_id")},
         "first_s": int(image.first_frame_utc_s),
         "name": f"{image.vehicle_id}/{image.image_id}",
         "arrived_utc_s": now_utc_s,
     }
     variable = {
-        "version": image.version,
-        "atd_class": record and record.atd_class,
-        "atd_confidence": record and record.atd_confidence,
-        "lat_deg": record and record.lat_deg,
-        "lon_deg": record and record.lon_deg,
-        "position_sigma_m": record and record.position_sigma_m,
+        **{name: getattr(record, name, None) for name in _RECORD_COLUMNS},
+        **{name: getattr(image, name) for name in _IMAGE_COLUMNS},
         "range_m": record and record.ground_range_m,
         "vehicle_lat_deg": vehicle and vehicle[0],
         "vehicle_lon_deg": vehicle and vehicle[1],
         "seen_utc_s": record and record.time_utc_s,
-        "first_frame_utc_s": image.first_frame_utc_s,
-        "last_frame_utc_s": image.last_frame_utc_s,
         "updated_utc_s": now_utc_s,
         "complete": int(image.complete),
         "percent": percent_received(image),
-        "bytes_received": image.bytes_received,
-        "bytes_total": image.bytes_total,
-        "codec": image.codec,
         "has_picture": int(bool(image.codec)),
         "height_px": image.picture.height_px,
         "width_px": image.picture.width_px,
@@ -244,15 +236,11 @@ def find_version(db: sqlite3.Connection, contact_id: str, version: int) -> sqlit
 def find_contact_of_image(
     db: sqlite3.Connection, vessel_id: str, vehicle_id: str, image_id: str, utc_s: float
 ) -> str | None:
-    """Return the identifier of the contact that a record refers to; None if none matches.
-
-    If the image identifier occurs several times, it is the last contact that began to arrive before `utc_s`. A single
-    candidate always matches, because platform clocks differ.
-    """
+    """Return the identifier of the contact that a record refers to, or None; see `match_start_time`."""
     rows = db.execute(
-        "SELECT id, first_s FROM contact WHERE vessel_id = ? AND vehicle_id = ? AND image_id = ? ORDER BY first_s DESC",
+        "SELECT first_s, id FROM contact WHERE vessel_id = ? AND vehicle_id = ? AND image_id = ?",
         (vessel_id, vehicle_id, image_id),
-    ).fetchall()
-    if len(rows) == 1:
-        return str(rows[0]["id"])
-    return next((str(row["id"]) for row in rows if row["first_s"] <= utc_s), None)
+    )
+    contact_ids: dict[int, str] = dict(rows.fetchall())
+    start = match_start_time(tuple(contact_ids), utc_s)
+    return None if start is None else contact_ids[start]

@@ -11,11 +11,18 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Final, Literal
 
 from sonarpost.errors import DeliveryError
-from sonarpost.services.console.store.users import Actor
+
+Role = Literal["observer", "operator", "expert"]
+Side = Literal["vessel", "shore"]
+Permission = Literal["decide", "measure", "request", "advise"]
+
+ROLES: Final[tuple[Role, ...]] = ("observer", "operator", "expert")
+PERMISSIONS: Final[tuple[Permission, ...]] = ("decide", "measure", "request", "advise")
 
 SCHEMA_VERSION = 1
 
@@ -91,30 +98,37 @@ CREATE TRIGGER IF NOT EXISTS audit_is_not_deleted BEFORE DELETE ON audit
 """
 
 
-class Database:
-    """The database file, shared by several threads, with one transaction at a time.
+class SqliteFile:
+    """An SQLite file, shared by several threads, with one transaction at a time.
+
+    Args:
+        path: The file.
+        schema: SQL that creates the tables if they do not exist.
+        version: Schema version.
+        mode: Permissions of a new file.
 
     Raises:
         DeliveryError: The file cannot be opened, or has another schema version.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, schema: str, version: int = 0, mode: int = 0o666) -> None:
         self.path = path
         self._lock = threading.RLock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch(mode)
             self._db = sqlite3.connect(path, check_same_thread=False, isolation_level=None, timeout=10)
             self._db.row_factory = sqlite3.Row
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=FULL")
-            version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
-            if version not in (0, SCHEMA_VERSION):
+            found = int(self._db.execute("PRAGMA user_version").fetchone()[0])
+            if found not in (0, version):
                 self._db.close()
-                raise DeliveryError(f"{path}: console database of version {version}, expected {SCHEMA_VERSION}")
-            if version == 0:
-                self._db.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version={SCHEMA_VERSION}; COMMIT;")
+                raise DeliveryError(f"{path}: schema version {found}, expected {version}")
+            if found == 0:
+                self._db.executescript(f"BEGIN; {schema} PRAGMA user_version={version}; COMMIT;")
         except (OSError, sqlite3.Error) as error:
-            raise DeliveryError(f"{path}: cannot be opened as the database of the console: {error}") from error
+            raise DeliveryError(f"{path}: cannot be opened as an SQLite file: {error}") from error
 
     @contextmanager
     def read(self) -> Iterator[sqlite3.Connection]:
@@ -154,11 +168,41 @@ class Database:
             self._db.close()
 
 
+class Database(SqliteFile):
+    """The database of the console."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, _SCHEMA, SCHEMA_VERSION)
+
+
 def insert_row(db: sqlite3.Connection, table: str, values: Mapping[str, object]) -> int:
     """Insert a row; return its rowid."""
     columns, marks = ", ".join(values), ", ".join("?" * len(values))
     inserted = db.execute(f"INSERT INTO {table} ({columns}) VALUES ({marks})", tuple(values.values()))  # noqa: S608
     return inserted.lastrowid or 0
+
+
+@dataclass(frozen=True, slots=True)
+class Actor:
+    """A user who is logged in, with the network address of the browser."""
+
+    user: str
+    role: Role
+    address: str
+
+    def may(self, permission: Permission, side: Side) -> bool:
+        """Return whether the user has a permission on a vessel or at a shore site.
+
+        Decisions are made on the vessel, which can send them to the vehicle at once. Experts at the shore site comment
+        and send requests.
+        """
+        if permission == "advise":
+            return side == "shore" and self.role == "expert"
+        if permission == "decide":
+            return side == "vessel" and self.role != "observer"
+        if permission == "request" and side == "shore":
+            return self.role == "expert"
+        return self.role != "observer"
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,16 +230,5 @@ def add_audit_entry(
     detail: Mapping[str, object],
 ) -> None:
     """Add an entry to the audit, in the transaction of the action."""
-    values = {
-        "contact_id": contact_id,
-        "utc_s": utc_s,
-        "user": actor.user,
-        "role": actor.role,
-        "address": actor.address,
-        "action": action,
-        "version": displayed.version,
-        "sha256": displayed.sha256,
-        "layer": displayed.layer,
-        "detail": json.dumps(dict(detail)),
-    }
-    insert_row(db, "audit", values)
+    values = {"contact_id": contact_id, "utc_s": utc_s, "action": action, "detail": json.dumps(dict(detail))}
+    insert_row(db, "audit", {**values, **asdict(actor), **asdict(displayed)})

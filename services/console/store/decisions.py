@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import sqlite3
 import uuid
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from sonarpost import wire
 from sonarpost.errors import BadInputError, SonarpostError
 from sonarpost.messages import Decision, DownlinkState, Verdict
 from sonarpost.services.console.store.contacts import find_contact, find_contact_of_image, find_version
-from sonarpost.services.console.store.database import DisplayedImage, add_audit_entry, insert_row
+from sonarpost.services.console.store.database import Actor, DisplayedImage, add_audit_entry, insert_row
 from sonarpost.services.console.store.requests import is_later_state
 from sonarpost.services.console.store.serialisers import Json, contact_json, decision_json, decode_image
-from sonarpost.services.console.store.users import Actor
 
 
 class ConflictError(SonarpostError):
@@ -51,14 +52,8 @@ class DecisionInput:
     remark: str
 
 
-@dataclass(frozen=True, slots=True)
-class DeliveryStates:
-    """Initial delivery state of a decision.
-
-    Attributes:
-        shore: `waiting`, `relay` or `delivered`; `none` if no consumer is configured.
-        vehicle: `waiting`; `none` if no consumer is configured.
-    """
+class DeliveryStates(NamedTuple):
+    """Initial delivery state of a decision to shore site and vehicle; `none` without a configured consumer."""
 
     shore: str
     vehicle: str
@@ -88,21 +83,13 @@ def add_decision(
     """
     row = _check_revision(db, contact_id, entered.revision)
     _check_displayed_image(db, contact_id, entered.displayed)
-    record = Decision(
-        decision_id=f"d-{uuid.uuid4().hex}",
-        vessel_id=row["vessel_id"],
-        vehicle_id=row["vehicle_id"],
-        image_id=row["image_id"],
-        image_version=entered.displayed.version or row["version"],
-        verdict=entered.verdict,
-        confidence=entered.confidence,
-        mlo_class=entered.mlo_class,
-        remark=entered.remark,
-        operator=actor.user,
-        decided_utc_s=now_utc_s,
-    )
-    _insert(db, contact_id, record, entered.displayed, now_utc_s, delivery)
-    _update_contact(db, contact_id, now_utc_s)
+    content: Json = {
+        "verdict": entered.verdict,
+        "confidence": entered.confidence,
+        "mlo_class": entered.mlo_class,
+        "remark": entered.remark,
+    }
+    record = _add_own_decision(db, row, content, entered.displayed, actor, now_utc_s, delivery)
     detail = record.model_dump(include={"decision_id", "verdict", "confidence", "mlo_class", "remark"})
     detail["revision"] = row["revision"]
     add_audit_entry(db, contact_id, actor, "decide", now_utc_s, entered.displayed, detail)
@@ -133,22 +120,12 @@ def undo_decision(
     assert undone is not None
     db.execute("UPDATE decision SET undone = 1 WHERE decision_id = ?", (decision_id,))
     previous = _valid_decision(db, contact_id)
-    record = Decision(
-        decision_id=f"d-{uuid.uuid4().hex}",
-        vessel_id=row["vessel_id"],
-        vehicle_id=row["vehicle_id"],
-        image_id=row["image_id"],
-        image_version=undone["version"],
-        verdict="unsure" if previous is None else previous["verdict"],
-        confidence=None if previous is None else previous["confidence"],
-        mlo_class=None if previous is None else previous["mlo_class"],
-        remark=f"withdraws decision {decision_id}",
-        operator=actor.user,
-        decided_utc_s=now_utc_s,
-    )
+    content: Json = {"verdict": "unsure"}
+    if previous is not None:
+        content = {name: previous[name] for name in ("verdict", "confidence", "mlo_class")}
+    content["remark"] = f"withdraws decision {decision_id}"
     displayed = DisplayedImage(undone["version"], undone["sha256"], undone["layer"])
-    _insert(db, contact_id, record, displayed, now_utc_s, delivery, undoes=decision_id)
-    _update_contact(db, contact_id, now_utc_s)
+    record = _add_own_decision(db, row, content, displayed, actor, now_utc_s, delivery, undoes=decision_id)
     detail = {"decision_id": record.decision_id, "undoes": decision_id, "verdict": record.verdict, "revision": revision}
     add_audit_entry(db, contact_id, actor, "undo", now_utc_s, displayed, detail)
     return record.decision_id
@@ -268,6 +245,27 @@ def _check_displayed_image(db: sqlite3.Connection, contact_id: str, displayed: D
         raise BadInputError("decision", "version", displayed.version, "a version of this contact's image")
     if decode_image(row).picture_sha256 != displayed.sha256:
         raise BadInputError("decision", "sha256", displayed.sha256, f"that of version {displayed.version}")
+
+
+def _add_own_decision(
+    db: sqlite3.Connection,
+    row: sqlite3.Row,
+    content: Mapping[str, object],
+    displayed: DisplayedImage,
+    actor: Actor,
+    now_utc_s: float,
+    delivery: DeliveryStates,
+    *,
+    undoes: str | None = None,
+) -> Decision:
+    """Store a decision on the contact of a row, and update the contact."""
+    names = {name: row[name] for name in ("vessel_id", "vehicle_id", "image_id")}
+    fields = {"decision_id": f"d-{uuid.uuid4().hex}", "operator": actor.user, "decided_utc_s": now_utc_s}
+    version = displayed.version or row["version"]
+    record = Decision.model_validate({**names, **fields, **content, "image_version": version})
+    _insert(db, row["id"], record, displayed, now_utc_s, delivery, undoes=undoes)
+    _update_contact(db, row["id"], now_utc_s)
+    return record
 
 
 def _insert(

@@ -11,9 +11,8 @@ from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Advice, Command, CommandKind, DownlinkState, TaskingState
 from sonarpost.services.console.store.contacts import find_contact, find_contact_of_image
-from sonarpost.services.console.store.database import DisplayedImage, add_audit_entry, insert_row
+from sonarpost.services.console.store.database import Actor, DisplayedImage, add_audit_entry, insert_row
 from sonarpost.services.console.store.serialisers import Json, advice_json, request_json
-from sonarpost.services.console.store.users import Actor
 
 REQUEST_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider")
 """Kinds in the order of the page. `wider` is displayed as "expand"."""

@@ -23,89 +23,33 @@ FROM contact c LEFT JOIN decision d ON d.decision_id = c.last_decision
 """
 """Start of every query for rows of `contact_json`."""
 
-_CONTACT_COLUMNS: Final = [
-    "id",
-    "vessel_id",
-    "vehicle_id",
-    "image_id",
-    "name",
-    "revision",
-    "version",
-    "review",
-    "mlo_class",
-    "confidence",
-    "decided_by",
-    "decided_utc_s",
-    "atd_class",
-    "atd_confidence",
-    "lat_deg",
-    "lon_deg",
-    "position_sigma_m",
-    "range_m",
-    "seen_utc_s",
-    "first_frame_utc_s",
-    "last_frame_utc_s",
-    "updated_utc_s",
-    "bytes_received",
-    "bytes_total",
-    "height_px",
-    "width_px",
-]
-_DELIVERY_COLUMNS: Final = ("shore", "vehicle", "reason", "times_sent", "changed_utc_s")
-_DECISION_COLUMNS: Final = [
-    "decision_id",
-    "verdict",
-    "confidence",
-    "mlo_class",
-    "remark",
-    "operator",
-    "decided_utc_s",
-    "version",
-    "sha256",
-    "layer",
-    "undoes",
-]
-_REQUEST_COLUMNS: Final = [
-    "command_id",
-    "kind",
-    "user",
-    "asked_utc_s",
-    "airtime_s",
-    "state",
-    "times_sent",
-    "reason",
-    "changed_utc_s",
-]
-_ADVICE_COLUMNS: Final = [
-    "advice_id",
-    "version",
-    "verdict",
-    "confidence",
-    "mlo_class",
-    "remark",
-    "author",
-    "advised_utc_s",
-]
-_AUDIT_COLUMNS: Final = ["seq", "utc_s", "user", "role", "address", "action", "version", "sha256", "layer"]
-_VERSION_FIELDS: Final = [
-    "version",
-    "codec",
-    "model",
-    "complete",
-    "missing_fraction",
-    "bytes_received",
-    "bytes_total",
-    "frames_received",
-    "first_frame_utc_s",
-    "last_frame_utc_s",
-]
+_CONTACT_COLUMNS: Final = (
+    "id name vessel_id vehicle_id image_id revision version review mlo_class confidence decided_by decided_utc_s"
+    " atd_class atd_confidence lat_deg lon_deg position_sigma_m range_m seen_utc_s first_frame_utc_s last_frame_utc_s"
+    " updated_utc_s bytes_received bytes_total height_px width_px"
+)
+_DELIVERY_COLUMNS: Final = "shore vehicle reason times_sent changed_utc_s"
+_DECISION_COLUMNS: Final = (
+    "decision_id verdict confidence mlo_class remark operator decided_utc_s version sha256 layer undoes"
+)
+_REQUEST_COLUMNS: Final = "command_id kind user asked_utc_s airtime_s state times_sent reason changed_utc_s"
+_ADVICE_COLUMNS: Final = "advice_id version verdict confidence mlo_class remark author advised_utc_s"
+_AUDIT_COLUMNS: Final = "seq utc_s user role address action version sha256 layer"
+_VERSION_FIELDS: Final = (
+    "version codec model complete missing_fraction bytes_received bytes_total frames_received first_frame_utc_s"
+    " last_frame_utc_s"
+)
+
+
+def _select(row: sqlite3.Row, columns: str, prefix: str = "") -> Json:
+    return {name: row[prefix + name] for name in columns.split()}
 
 
 def contact_json(row: sqlite3.Row) -> Json:
     """Return a contact as in lists."""
     grouped = (row["looks"] or 0) > 1
     return {
-        **{name: row[name] for name in _CONTACT_COLUMNS},
+        **_select(row, _CONTACT_COLUMNS),
         "complete": bool(row["complete"]),
         "percent_received": row["percent"],
         "has_picture": bool(row["has_picture"]),
@@ -113,7 +57,7 @@ def contact_json(row: sqlite3.Row) -> Json:
         "group": row["group_id"] if grouped else None,
         "looks": row["looks"] if grouped else 1,
         "advised": bool(row["advised"]),
-        "delivery": None if row["d_shore"] is None else {name: row[f"d_{name}"] for name in _DELIVERY_COLUMNS},
+        "delivery": None if row["d_shore"] is None else _select(row, _DELIVERY_COLUMNS, "d_"),
         "open_requests": row["asking"],
     }
 
@@ -121,28 +65,27 @@ def contact_json(row: sqlite3.Row) -> Json:
 def decision_json(row: sqlite3.Row) -> Json:
     """Return a decision."""
     return {
-        **{name: row[name] for name in _DECISION_COLUMNS},
+        **_select(row, _DECISION_COLUMNS),
         "undone": bool(row["undone"]),
         "elsewhere": bool(row["elsewhere"]),
-        "delivery": {name: row[name] for name in _DELIVERY_COLUMNS},
+        "delivery": _select(row, _DELIVERY_COLUMNS),
     }
 
 
 def request_json(row: sqlite3.Row) -> Json:
     """Return a request."""
-    return {name: row[name] for name in _REQUEST_COLUMNS}
+    return _select(row, _REQUEST_COLUMNS)
 
 
 def advice_json(row: sqlite3.Row) -> Json:
     """Return a comment."""
     delivery = None if row["state"] is None else {"state": row["state"], "reason": row["reason"]}
-    return {**{name: row[name] for name in _ADVICE_COLUMNS}, "delivery": delivery}
+    return {**_select(row, _ADVICE_COLUMNS), "delivery": delivery}
 
 
 def audit_json(row: sqlite3.Row) -> Json:
     """Return an entry of the audit."""
-    detail: Json = json.loads(row["detail"])
-    return {**{name: row[name] for name in _AUDIT_COLUMNS}, "detail": detail}
+    return {**_select(row, _AUDIT_COLUMNS), "detail": json.loads(row["detail"])}
 
 
 def percent_received(image: ReconstructedImage) -> float:
@@ -165,7 +108,7 @@ def version_json(row: sqlite3.Row) -> Json:
     contact = image.contact
     airtime_s = None if rate is None else airtime_of_frames(image.frames_received, int(rate))
     return {
-        **{name: getattr(image, name) for name in _VERSION_FIELDS},
+        **{name: getattr(image, name) for name in _VERSION_FIELDS.split()},
         "received_utc_s": row["received_utc_s"],
         "height_px": image.picture.height_px,
         "width_px": image.picture.width_px,

@@ -1,4 +1,4 @@
-"""Users and sessions of the console: roles, permissions, password hashes, log-in limits. One SQLite file."""
+"""Users and sessions of the console: password hashes, log-in limits. One SQLite file."""
 
 from __future__ import annotations
 
@@ -6,25 +6,16 @@ import hashlib
 import hmac
 import re
 import secrets
-import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
 
 from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
 
-from sonarpost.errors import BadInputError, DeliveryError
-
-Role = Literal["observer", "operator", "expert"]
-Side = Literal["vessel", "shore"]
-Permission = Literal["decide", "measure", "request", "advise"]
-
-ROLES: Final[tuple[Role, ...]] = ("observer", "operator", "expert")
-PERMISSIONS: Final[tuple[Permission, ...]] = ("decide", "measure", "request", "advise")
+from sonarpost.errors import BadInputError
+from sonarpost.services.console.store.database import ROLES, Role, SqliteFile
 
 FILE_NAME = "console-users.db"
 SCRYPT_COST = 2**15
@@ -40,29 +31,6 @@ CREATE TABLE IF NOT EXISTS session (
     token_sha256 BLOB PRIMARY KEY, name TEXT NOT NULL, csrf TEXT NOT NULL, begun_utc_s REAL NOT NULL,
     used_utc_s REAL NOT NULL) WITHOUT ROWID;
 """
-
-
-@dataclass(frozen=True, slots=True)
-class Actor:
-    """A user who is logged in, with the network address of the browser."""
-
-    user: str
-    role: Role
-    address: str
-
-    def may(self, permission: Permission, side: Side) -> bool:
-        """Return whether the user has a permission on a vessel or at a shore site.
-
-        Decisions are made on the vessel, which can send them to the vehicle at once. Experts at the shore site comment
-        and send requests.
-        """
-        if permission == "advise":
-            return side == "shore" and self.role == "expert"
-        if permission == "decide":
-            return side == "vessel" and self.role != "observer"
-        if permission == "request" and side == "shore":
-            return self.role == "expert"
-        return self.role != "observer"
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +61,8 @@ class Session:
     expires_utc_s: float
 
 
-class Users:
-    """The file of users and sessions, shared by several threads and processes.
+class Users(SqliteFile):
+    """The file of users and sessions, shared by several threads and processes. It is readable by its owner only.
 
     Args:
         path: The file.
@@ -113,34 +81,11 @@ class Users:
         session_max_s: float = 24 * 3600.0,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        self.path = path
+        super().__init__(path, _SCHEMA, mode=0o600)
         self._session_s = session_s
         self._session_max_s = session_max_s
         self._clock = clock
-        self._lock = threading.RLock()
         self._hash_lock = threading.Lock()
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.touch(mode=0o600)
-            self._db = sqlite3.connect(path, check_same_thread=False, isolation_level=None, timeout=10)
-            self._db.row_factory = sqlite3.Row
-            self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.executescript(f"BEGIN; {_SCHEMA} COMMIT;")
-        except (OSError, sqlite3.Error) as error:
-            raise DeliveryError(f"{path}: cannot be opened as the user file of the console: {error}") from error
-
-    @contextmanager
-    def _connection(self) -> Iterator[sqlite3.Connection]:
-        with self._lock:
-            try:
-                yield self._db
-            except sqlite3.Error as error:
-                raise DeliveryError(f"{self.path}: {error}") from error
-
-    def close(self) -> None:
-        """Close the file."""
-        with self._lock:
-            self._db.close()
 
     # Users
 
@@ -173,7 +118,7 @@ class Users:
             raise BadInputError("user", "password", f"{len(password)} characters", expected)
         salt = secrets.token_bytes(16)
         hashed = self._hash(password, salt, SCRYPT_COST)
-        with self._connection() as db:
+        with self.transaction() as db:
             db.execute(
                 "INSERT OR REPLACE INTO user VALUES (?, ?, ?, ?, ?, ?)",
                 (name, role, salt, hashed, SCRYPT_COST, self._clock()),
@@ -183,7 +128,7 @@ class Users:
 
     def remove(self, name: str) -> bool:
         """Remove a user and the user's sessions; return whether the user existed."""
-        with self._connection() as db:
+        with self.transaction() as db:
             db.execute("DELETE FROM session WHERE name = ?", (name,))
             return db.execute("DELETE FROM user WHERE name = ?", (name,)).rowcount > 0
 
@@ -193,12 +138,12 @@ class Users:
 
     def all(self) -> list[User]:
         """Return all users by name."""
-        with self._connection() as db:
+        with self.read() as db:
             return [User(*row) for row in db.execute("SELECT name, role, changed_utc_s FROM user ORDER BY name")]
 
     def verify_password(self, name: str, password: str) -> bool:
         """Return whether a password is correct. The duration is the same for an unknown user."""
-        with self._connection() as db:
+        with self.read() as db:
             row = db.execute("SELECT salt, hash, cost FROM user WHERE name = ?", (name,)).fetchone()
         salt, cost = (bytes(16), SCRYPT_COST) if row is None else (bytes(row["salt"]), int(row["cost"]))
         hashed = self._hash(password[:MAX_PASSWORD], salt, cost)
@@ -213,7 +158,7 @@ class Users:
     def start_session(self, name: str) -> Session:
         """Start a session of an existing user."""
         token, csrf, now = secrets.token_urlsafe(32), secrets.token_urlsafe(24), self._clock()
-        with self._connection() as db:
+        with self.transaction() as db:
             db.execute("DELETE FROM session WHERE used_utc_s < ? OR begun_utc_s < ?", self._limits(now))
             db.execute("INSERT INTO session VALUES (?, ?, ?, ?, ?)", (_token_hash(token), name, csrf, now, now))
         session = self.find_session(token)
@@ -228,16 +173,17 @@ class Users:
             is_use: Whether this extends the session. An open page alone does not.
         """
         now = self._clock()
-        with self._connection() as db:
+        with self.read() as db:
             row = db.execute(
                 "SELECT s.*, u.role FROM session s JOIN user u USING (name)"
                 " WHERE token_sha256 = ? AND used_utc_s >= ? AND begun_utc_s >= ?",
                 (_token_hash(token), *self._limits(now)),
             ).fetchone()
-            if row is None:
-                return None
-            # The time is not updated at every request, to save disk writes.
-            if is_use and now - row["used_utc_s"] > min(60.0, self._session_s / 10):
+        if row is None:
+            return None
+        # The time is not updated at every request, to save disk writes.
+        if is_use and now - row["used_utc_s"] > min(60.0, self._session_s / 10):
+            with self.transaction() as db:
                 db.execute("UPDATE session SET used_utc_s = ? WHERE token_sha256 = ?", (now, _token_hash(token)))
         used_utc_s = now if is_use else row["used_utc_s"]
         expires_utc_s = min(used_utc_s + self._session_s, row["begun_utc_s"] + self._session_max_s)
@@ -245,7 +191,7 @@ class Users:
 
     def end_session(self, token: str) -> None:
         """End a session."""
-        with self._connection() as db:
+        with self.transaction() as db:
             db.execute("DELETE FROM session WHERE token_sha256 = ?", (_token_hash(token),))
 
     def _limits(self, now: float) -> tuple[float, float]:

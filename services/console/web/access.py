@@ -17,9 +17,10 @@ from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.logs import kv
 from sonarpost.review.measurement import NotMeasurableError
 from sonarpost.services.console.state import NotFoundError
+from sonarpost.services.console.store.database import Actor, Permission, Side
 from sonarpost.services.console.store.decisions import ConflictError
 from sonarpost.services.console.store.serialisers import Json
-from sonarpost.services.console.store.users import Actor, Permission, Session, Side, Users, is_equal_secret
+from sonarpost.services.console.store.users import Session, Users, is_equal_secret
 from sonarpost.wire import expected_text
 
 log = logging.getLogger(__name__)

@@ -18,29 +18,29 @@ from sonarpost.review.measurement import Line, MeasurementKind
 from sonarpost.review.rendering import LAYERS, MAPS
 from sonarpost.services.console.state import ConsoleState, NotFoundError
 from sonarpost.services.console.store.contacts import REVIEW_FILTERS, SORT_COLUMNS, ContactFilter
-from sonarpost.services.console.store.database import DisplayedImage
+from sonarpost.services.console.store.database import DisplayedImage, Permission
 from sonarpost.services.console.store.decisions import DecisionInput
-from sonarpost.services.console.store.users import Permission
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call, RequestBody
 
 _NUMBER = re.compile(r"-?\d{1,9}(\.\d{1,9})?")
-_Confidence = Annotated[float, Field(ge=0, le=1)] | None
-_Class = Annotated[str, Field(min_length=1, max_length=60)] | None
-_Remark = Annotated[str, Field(max_length=2000)]
 _Version = Annotated[int, Field(ge=1, le=2**31)]
 _Layer = Annotated[str, Field(max_length=20)]
 _Point = tuple[Annotated[float, Field(ge=0, le=4096)], Annotated[float, Field(ge=0, le=4096)]]
 
 
-class _DecisionBody(RequestBody):
-    revision: Annotated[int, Field(ge=0)]
+class _AdviceBody(RequestBody):
     version: _Version
+    verdict: Verdict | None = None
+    confidence: Annotated[float, Field(ge=0, le=1)] | None = None
+    mlo_class: Annotated[str, Field(min_length=1, max_length=60)] | None = None
+    remark: Annotated[str, Field(max_length=2000)] = ""
+
+
+class _DecisionBody(_AdviceBody):
+    verdict: Verdict
+    revision: Annotated[int, Field(ge=0)]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     layer: _Layer = "raw"
-    verdict: Verdict
-    confidence: _Confidence = None
-    mlo_class: _Class = None
-    remark: _Remark = ""
 
 
 class _UndoBody(RequestBody):
@@ -60,14 +60,6 @@ class _MeasureBody(RequestBody):
 class _RequestBody(RequestBody):
     kind: CommandKind
     airtime_s: Annotated[float, Field(ge=0, le=1e6)] | None = None
-
-
-class _AdviceBody(RequestBody):
-    version: _Version
-    verdict: Verdict | None = None
-    confidence: _Confidence = None
-    mlo_class: _Class = None
-    remark: _Remark = ""
 
 
 def number_parameter(call: Call, name: str, default: float | None, low: float, high: float) -> float | None:
@@ -225,14 +217,8 @@ class ContactRoutes:
 
     def _decide(self, call: Call) -> Response:
         body = call.parse_body(_DecisionBody)
-        entered = DecisionInput(
-            body.revision,
-            DisplayedImage(body.version, body.sha256, body.layer),
-            body.verdict,
-            body.confidence,
-            body.mlo_class,
-            body.remark,
-        )
+        displayed = DisplayedImage(body.version, body.sha256, body.layer)
+        entered = DecisionInput(body.revision, displayed, body.verdict, body.confidence, body.mlo_class, body.remark)
         return JSONResponse(self._state.decide(_id(call), entered, call.actor), 201)
 
     def _undo(self, call: Call) -> Response:
@@ -252,15 +238,12 @@ class ContactRoutes:
         body = call.parse_body(_AdviceBody)
         image = self._state.image(_id(call), body.version)
         record = Advice(
+            **body.model_dump(exclude={"version"}),
             advice_id=f"a-{uuid.uuid4().hex}",
             vessel_id=image.vessel_id,
             vehicle_id=image.vehicle_id,
             image_id=image.image_id,
             image_version=body.version,
-            verdict=body.verdict,
-            confidence=body.confidence,
-            mlo_class=body.mlo_class,
-            remark=body.remark,
             author=call.actor.user,
             advised_utc_s=self._state.clock(),
         )

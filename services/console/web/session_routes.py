@@ -10,17 +10,9 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from sonarpost.logs import kv
+from sonarpost.services.console.store.database import PERMISSIONS, Actor, Side
 from sonarpost.services.console.store.serialisers import Json
-from sonarpost.services.console.store.users import (
-    MAX_PASSWORD,
-    MIN_PASSWORD,
-    PERMISSIONS,
-    Actor,
-    LoginLimiter,
-    Session,
-    Side,
-    Users,
-)
+from sonarpost.services.console.store.users import MAX_PASSWORD, MIN_PASSWORD, LoginLimiter, Session, Users
 from sonarpost.services.console.web.access import COOKIE, AccessControl, ApiError, Call, RequestBody
 
 log = logging.getLogger(__name__)

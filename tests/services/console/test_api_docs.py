@@ -29,8 +29,8 @@ def test_all_routes_are_documented(console):
 def test_all_fields_of_a_contact_are_documented(console):
     console.state.store_image(image_record())
     anna = console.browser("anna")
-    console.decide(anna, ID)
-    detail = anna.get(f"/api/contacts/{ID}").json()
+    anna.decide(ID)
+    detail = anna.contact(ID)
     text = (REPOSITORY / "docs" / "specifications" / "console-api.md").read_text(encoding="utf-8")
     for part in (detail, detail["contact"], detail["versions"][0], detail["decisions"][0], detail["audit"][0]):
         for name in part:

@@ -85,7 +85,7 @@ def test_training_delivers_decisions_and_requests(console):
     assert console.state.counts().total == 2
     anna = console.browser("anna")
     [contact_id] = [row["id"] for row in anna.get("/api/contacts", limit=1).json()["items"]]
-    console.decide(anna, contact_id)
+    anna.decide(contact_id)
     now = time.time()
     simulator.accept_records(now)
     for later, state in ((0.0, "asked"), (5.0, "sent"), (11.0, "confirmed")):

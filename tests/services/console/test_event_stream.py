@@ -3,49 +3,15 @@
 from __future__ import annotations
 
 import json
-import threading
 import urllib.error
 import urllib.request
-from http.client import HTTPResponse
-from typing import Any
 
 import pytest
 from builders.common import eventually
-from builders.console import PASSWORD, image_record
+from builders.console import EventReader, image_record
 
 from sonarpost.services.console.events import EventHub, RateLimiter
 from sonarpost.services.console.web.server import WebServer
-
-
-class EventReader:
-    """Reads the event stream as an open page does."""
-
-    def __init__(self, stream: HTTPResponse) -> None:
-        self._stream = stream
-        self.events: list[tuple[str, str, Any]] = []
-        self.ended = False
-        threading.Thread(target=self._read, daemon=True).start()
-
-    def _read(self) -> None:
-        identifier = name = ""
-        try:
-            for raw in self._stream:
-                field, _, value = raw.decode().rstrip("\n").partition(": ")
-                if field == "id":
-                    identifier = value
-                elif field == "event":
-                    name = value
-                elif field == "data":
-                    self.events.append((name, identifier, json.loads(value)))
-        except (OSError, ValueError, AttributeError):
-            pass  # closed by the test
-        self.ended = True
-
-    def names(self) -> list[str]:
-        return [name for name, _, _ in self.events]
-
-    def close(self) -> None:
-        self._stream.close()
 
 
 @pytest.fixture
@@ -59,20 +25,16 @@ def served(console, monkeypatch):
 
 
 @pytest.fixture
-def headers(served):
-    body = json.dumps({"user": "anna", "password": PASSWORD}).encode()
-    with urllib.request.urlopen(served.address + "api/login", body, timeout=20) as answer:
-        cookie = answer.headers["set-cookie"].partition(";")[0]
-        return {"Cookie": cookie, "X-CSRF-Token": json.load(answer)["csrf"]}
+def token(console):
+    return console.users.start_session("anna").token
 
 
 @pytest.fixture
-def open_stream(served, headers):
+def open_stream(served, token):
     readers: list[EventReader] = []
 
-    def make(query: str = "", **more: str) -> EventReader:
-        request = urllib.request.Request(served.address + "events" + query, None, {**headers, **more})
-        readers.append(EventReader(urllib.request.urlopen(request, timeout=60)))
+    def make(query: str = "", **headers: str) -> EventReader:
+        readers.append(EventReader(served.address, token, query, **headers))
         return readers[-1]
 
     yield make
@@ -106,12 +68,10 @@ def test_idle_stream_sends_the_time(open_stream):
     eventually(lambda: page.names().count("clock") >= 2, what="clock")
 
 
-def test_stream_ends_with_its_session(console, served, headers, open_stream):
+def test_stream_ends_with_its_session(console, token, open_stream):
     page = open_stream()
     eventually(lambda: page.names() != [], what="stream")
-    request = urllib.request.Request(served.address + "api/logout", b"{}", headers)
-    with urllib.request.urlopen(request, timeout=20) as answer:
-        assert answer.status == 204
+    console.users.end_session(token)
     eventually(lambda: page.ended, what="end")
     assert page.names()[-1] == "session"
     eventually(lambda: console.state.events.subscriber_count == 0, what="no subscriber")

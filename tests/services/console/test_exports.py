@@ -16,7 +16,7 @@ def test_exports_contain_the_filtered_contacts(console):
     console.state.store_image(image_record("0001"))
     console.state.store_image(image_record("0002", vehicle="uuv-2", position=None))
     anna = console.browser("anna")
-    console.decide(anna, "sonarpost.vessel-1.uuv-1.20231114T221320Z.0001")
+    anna.decide("sonarpost.vessel-1.uuv-1.20231114T221320Z.0001")
     table = anna.get("/api/export/contacts.csv")
     assert "attachment" in table.headers["content-disposition"]
     rows = list(csv.DictReader(io.StringIO(table.content.decode("utf-8-sig"))))
@@ -35,7 +35,7 @@ def test_exports_contain_the_filtered_contacts(console):
 def test_report_shows_known_and_unknown_values(console):
     console.state.store_image(image_record(missing_rows=10, altitude_m=None))
     anna = console.browser("anna")
-    console.decide(anna, ID)
+    anna.decide(ID)
     page = anna.get(f"/report/{ID}").text
     assert "data:image/png;base64," in page
     assert "25.0 % (black in the image)" in page

@@ -43,7 +43,7 @@ def test_enhanced_layer_is_marked_as_not_measurable(anna):
     image = pixels_of(answer)
     assert (image[-10:] == 0).all()
     assert (image != image_record(missing_rows=10).picture.to_array()).any()
-    layers = anna.get(f"/api/contacts/{ID}").json()["versions"][0]["layers"]
+    layers = anna.contact(ID)["versions"][0]["layers"]
     assert {layer["name"]: layer["measurable"] for layer in layers} == {"raw": True, "enhanced": False}
     assert anna.get(f"{VERSION}/picture.png", layer="grain").status_code == 404
 
@@ -108,13 +108,13 @@ def test_height_from_shadow_with_uncertainty(anna):
     assert 0 < found["sigma_m"] < 0.1
     assert 0 < found["height_sigma_m"] < 0.1
     assert found["id"] is None
-    assert anna.get(f"/api/contacts/{ID}").json()["measurements"] == []
+    assert anna.contact(ID)["measurements"] == []
 
 
 def test_stored_measurement_is_in_the_audit(anna):
     found = measure(anna, kind="length", **{"from": [0.0, 10.0], "to": [20.0, 10.0]}, keep=True).json()
     assert (found["value_m"], found["height_m"]) == (pytest.approx(2.0), None)
-    detail = anna.get(f"/api/contacts/{ID}").json()
+    detail = anna.contact(ID)
     assert detail["measurements"] == [found]
     [entry] = detail["audit"]
     assert (entry["action"], entry["user"], entry["detail"]["value_m"]) == ("measure", "anna", found["value_m"])

@@ -16,10 +16,9 @@ from sonarpost.errors import DeliveryError
 from sonarpost.messages import Advice, Decision, DownlinkState
 from sonarpost.review.grouping import Look, nearest_group
 from sonarpost.services.console.store.contacts import ContactFilter
-from sonarpost.services.console.store.database import DisplayedImage
+from sonarpost.services.console.store.database import Actor, DisplayedImage
 from sonarpost.services.console.store.decisions import ConflictError, DecisionInput
 from sonarpost.services.console.store.requests import is_later_state
-from sonarpost.services.console.store.users import Actor
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 SECONDS = count()
@@ -32,7 +31,7 @@ def test_image_versions_belong_to_one_contact(console):
     assert (row["id"], row["version"], row["percent_received"], row["complete"]) == (ID, 1, 25.0, False)
     assert console.state.store_image(image_record(version=2))
     assert not console.state.store_image(image_record(version=2))
-    detail = watch.get(f"/api/contacts/{ID}").json()
+    detail = watch.contact(ID)
     assert [v["version"] for v in detail["versions"]] == [1, 2]
     assert detail["contact"]["complete"]
     assert detail["contact"]["percent_received"] == 100.0
@@ -43,7 +42,7 @@ def test_image_versions_belong_to_one_contact(console):
 def test_late_older_version_does_not_replace_the_newer(console):
     console.state.store_image(image_record(version=3))
     console.state.store_image(image_record(version=2, missing_rows=10))
-    detail = console.browser("watch").get(f"/api/contacts/{ID}").json()
+    detail = console.browser("watch").contact(ID)
     assert detail["contact"]["version"] == 3
     assert [v["version"] for v in detail["versions"]] == [2, 3]
 
@@ -123,11 +122,11 @@ def test_looks_of_one_pass_have_a_smaller_distance_limit():
 def test_decision_is_stored_with_the_displayed_image(console):
     console.state.store_image(image_record())
     anna = console.browser("anna")
-    answer = console.decide(anna, ID)
+    answer = anna.decide(ID)
     assert answer.status_code == 201, answer.text
     assert answer.json()["contact"]["review"] == "mine_like"
     assert answer.json()["decision"]["delivery"]["shore"] == "waiting"
-    detail = anna.get(f"/api/contacts/{ID}").json()
+    detail = anna.contact(ID)
     [entry] = detail["audit"]
     assert (entry["user"], entry["action"], entry["version"]) == ("anna", "decide", 1)
     assert entry["sha256"] == detail["versions"][0]["sha256"]
@@ -140,14 +139,14 @@ def test_decision_is_stored_with_the_displayed_image(console):
 def test_second_of_two_decisions_is_a_conflict(console):
     console.state.store_image(image_record())
     anna, bo = console.browser("anna"), console.browser("bo")
-    assert console.decide(anna, ID, revision=0).status_code == 201
-    answer = console.decide(bo, ID, revision=0, verdict="not_mine_like")
+    assert anna.decide(ID, revision=0).status_code == 201
+    answer = bo.decide(ID, revision=0, verdict="not_mine_like")
     assert answer.status_code == 409
     assert answer.json()["error"]["code"] == "conflict"
     assert answer.json()["decision"]["operator"] == "anna"
-    again = console.decide(bo, ID, revision=answer.json()["contact"]["revision"], verdict="not_mine_like")
+    again = bo.decide(ID, revision=answer.json()["contact"]["revision"], verdict="not_mine_like")
     assert again.status_code == 201
-    decided = bo.get(f"/api/contacts/{ID}").json()["decisions"]
+    decided = bo.contact(ID)["decisions"]
     assert [d["operator"] for d in decided] == ["bo", "anna"]
 
 
@@ -168,7 +167,7 @@ def test_one_of_many_simultaneous_decisions_is_stored(console):
     with ThreadPoolExecutor(12) as pool:
         results = dict(zip(names, pool.map(decide, names), strict=True))
     [winner] = [name for name, decided in results.items() if decided]
-    detail = console.browser("watch").get(f"/api/contacts/{ID}").json()
+    detail = console.browser("watch").contact(ID)
     assert [decision["operator"] for decision in detail["decisions"]] == [winner]
     assert (detail["contact"]["decided_by"], detail["contact"]["revision"]) == (winner, 1)
 
@@ -193,14 +192,14 @@ def test_search_finds_exactly_the_contacts_with_the_text(console, remarks, text)
 def test_new_image_version_is_no_conflict(console):
     console.state.store_image(image_record())
     console.state.store_image(image_record(version=2))
-    assert console.decide(console.browser("anna"), ID, revision=0).status_code == 201
+    assert console.browser("anna").decide(ID, revision=0).status_code == 201
 
 
 def test_undo_adds_a_record_and_restores_the_previous_verdict(console):
     console.state.store_image(image_record())
     anna = console.browser("anna")
-    first = console.decide(anna, ID).json()["decision"]
-    second = console.decide(anna, ID, verdict="unsure").json()
+    first = anna.decide(ID).json()["decision"]
+    second = anna.decide(ID, verdict="unsure").json()
     path = f"/api/contacts/{ID}/undo"
     stale = anna.post(path, {"revision": 1, "decision_id": second["decision"]["decision_id"]})
     assert stale.status_code == 409
@@ -211,21 +210,21 @@ def test_undo_adds_a_record_and_restores_the_previous_verdict(console):
     assert undone["decision"]["undoes"] == second["decision"]["decision_id"]
     first_undone = anna.post(path, {"revision": 3, "decision_id": first["decision_id"]}).json()
     assert (first_undone["contact"]["review"], first_undone["decision"]["verdict"]) == ("unreviewed", "unsure")
-    detail = anna.get(f"/api/contacts/{ID}").json()
+    detail = anna.contact(ID)
     assert len(detail["decisions"]) == len(detail["audit"]) == len(console.state.unsent_records()) == 4
 
 
 def test_decision_on_another_image_is_rejected(console):
     console.state.store_image(image_record())
     anna = console.browser("anna")
-    assert console.decide(anna, ID, sha256="0" * 64).json()["error"]["field"] == "sha256"
-    assert console.decide(anna, ID, version=2).json()["error"]["field"] == "version"
+    assert anna.decide(ID, sha256="0" * 64).json()["error"]["field"] == "sha256"
+    assert anna.decide(ID, version=2).json()["error"]["field"] == "version"
     assert console.state.unsent_records() == []
 
 
 def test_audit_is_append_only(console):
     console.state.store_image(image_record())
-    console.decide(console.browser("anna"), ID)
+    console.browser("anna").decide(ID)
     for change in ("UPDATE audit SET user = 'bo'", "DELETE FROM audit"):
         with pytest.raises(DeliveryError, match="only added to"), console.state.database.transaction() as db:
             db.execute(change)
@@ -236,10 +235,10 @@ def test_audit_is_append_only(console):
 def test_delivery_of_a_decision_to_shore_and_vehicle(console):
     console.state.store_image(image_record())
     anna = console.browser("anna")
-    decision_id = console.decide(anna, ID).json()["decision"]["decision_id"]
+    decision_id = anna.decide(ID).json()["decision"]["decision_id"]
 
     def delivery():
-        return anna.get(f"/api/contacts/{ID}").json()["contact"]["delivery"]
+        return anna.contact(ID)["contact"]["delivery"]
 
     console.state.apply_acknowledgement("decision", decision_id, "relay", None)
     console.state.apply_acknowledgement("decision", decision_id, "op_modem", None)
@@ -278,9 +277,9 @@ def test_order_of_delivery_states():
 def test_refused_decision_has_a_reason(console):
     console.state.store_image(image_record())
     anna = console.browser("anna")
-    decision_id = console.decide(anna, ID).json()["decision"]["decision_id"]
+    decision_id = anna.decide(ID).json()["decision"]["decision_id"]
     console.state.apply_acknowledgement("decision", decision_id, "op_modem", "no such vehicle")
-    delivery = anna.get(f"/api/contacts/{ID}").json()["contact"]["delivery"]
+    delivery = anna.contact(ID)["contact"]["delivery"]
     assert (delivery["vehicle"], delivery["reason"], delivery["shore"]) == ("refused", "no such vehicle", "waiting")
 
 
@@ -293,7 +292,7 @@ def test_records_before_their_image_are_attached_to_it(make_console):
     assert not console.state.store_decision(decision)
     console.state.store_advice(Advice(advice_id="a-1", author="eva", advised_utc_s=at, remark="look again", **names))
     console.state.store_image(image_record())
-    detail = console.browser("watch").get(f"/api/contacts/{ID}").json()
+    detail = console.browser("watch").contact(ID)
     assert detail["contact"]["review"] == "mine_like"
     assert detail["contact"]["advised"]
     assert [d["elsewhere"] for d in detail["decisions"]] == [True]
@@ -320,7 +319,7 @@ def test_request_costs_and_no_repeated_request(make_console):
     assert (asked.status_code, asked.json()["state"]) == (201, "waiting")
     assert anna.post(path, {"kind": "resend"}).status_code == 400
     console.state.apply_acknowledgement("request", asked.json()["command_id"], "op_modem", "no transmitter")
-    [request] = anna.get(f"/api/contacts/{ID}").json()["requests"]
+    [request] = anna.contact(ID)["requests"]
     assert (request["state"], request["reason"]) == ("refused", "no transmitter")
     assert anna.post(path, {"kind": "resend"}).status_code == 201
     assert anna.post(path, {"kind": "wider"}).status_code == 201
@@ -369,7 +368,7 @@ def test_at_the_shore_site_experts_comment_and_no_role_decides(make_console):
     console = make_console(role="shore")
     console.state.store_image(image_record())
     eva, anna = console.browser("eva"), console.browser("anna")
-    assert console.decide(eva, ID).status_code == 403
+    assert eva.decide(ID).status_code == 403
     body = {"version": 1, "verdict": "unsure", "confidence": None, "mlo_class": None, "remark": "shadow too long"}
     assert anna.post(f"/api/contacts/{ID}/advice", body).status_code == 403
     answer = eva.post(f"/api/contacts/{ID}/advice", body)

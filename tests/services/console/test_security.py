@@ -265,14 +265,14 @@ def test_invalid_body_is_rejected(with_contact, body):
     ],
 )
 def test_error_names_the_invalid_field(with_contact, changes, field):
-    answer = with_contact.decide(with_contact.browser("anna"), ID, **changes)
+    answer = with_contact.browser("anna").decide(ID, **changes)
     assert (answer.status_code, answer.json()["error"]["field"]) == (400, field)
     assert with_contact.state.unsent_records() == []
 
 
 def test_hostile_remark_is_stored_unchanged_and_escaped_in_markup(with_contact):
     anna = with_contact.browser("anna")
-    assert with_contact.decide(anna, ID, remark=HOSTILE, mlo_class=HOSTILE[:60]).status_code == 201
+    assert anna.decide(ID, remark=HOSTILE, mlo_class=HOSTILE[:60]).status_code == 201
     detail = anna.get(ONE)
     assert detail.headers["content-type"] == "application/json"
     assert json.loads(detail.text)["decisions"][0]["remark"] == HOSTILE

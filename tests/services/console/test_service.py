@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import threading
 import time
-import urllib.request
-from http.client import HTTPResponse
+from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
+import httpx2
 import pytest
 import zenoh
 from builders.common import eventually, publish_once
+from builders.console import PASSWORD, Browser, EventReader, image_record
 
 from sonarpost import keys, wire
 from sonarpost.archive.image_files import write_image
@@ -21,11 +19,9 @@ from sonarpost.messages import (
     AcousticFrame,
     Advice,
     Command,
-    Contact,
     Decision,
     DownlinkState,
     LinkQuality,
-    Pixels,
     ReconstructedImage,
     Relayed,
     TaskingState,
@@ -36,100 +32,37 @@ from sonarpost.services.console.service import ConsoleService
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
-PASSWORD = "correct horse battery"
 VESSEL = "vessel-1"
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 
 
 def image(version: int = 1, *, complete: bool = True) -> ReconstructedImage:
-    pixels = np.full((20, 20), 100 + version, np.uint8)
-    raster = Pixels.from_array(pixels)
-    mask = np.zeros(pixels.shape, np.bool_)
-    mask[10:] = not complete
-    return ReconstructedImage(
-        vessel_id=VESSEL,
-        vehicle_id="uuv-1",
-        image_id="00A7",
-        version=version,
-        contact=Contact(contact_id="uuv-1/00A7", vehicle_id="uuv-1", lat_deg=56.0, lon_deg=-5.0),
-        codec="emb",
-        model="",
-        picture=raster,
-        picture_sha256=raster.sha256,
-        complete=complete,
-        missing_fraction=float(mask.mean()),
-        missing_mask=b"" if complete else np.packbits(mask).tobytes(),
-        missing_halves=(),
-        bytes_received=128 if complete else 64,
-        bytes_total=128,
-        frames_received=version,
-        first_frame_utc_s=1_700_000_000.0,
-        last_frame_utc_s=1_700_000_000.0,
-    )
+    return image_record("00A7", version, missing_rows=0 if complete else 20)
 
 
-class Page:
-    """A browser with a session at a running console service."""
+@pytest.fixture
+def log_in() -> Iterator[Callable[..., Browser]]:
+    """Logs in to a running console service as a new user."""
+    clients: list[httpx2.Client] = []
 
-    def __init__(self, console: ConsoleService, user: str, role: str) -> None:
-        self.base = console.address
+    def make(console: ConsoleService, user: str, role: str) -> Browser:
         console._users.add(user, role, PASSWORD)
-        answer, headers = self._ask("/api/login", {"user": user, "password": PASSWORD}, {})
-        self.headers = {"Cookie": headers["set-cookie"].partition(";")[0], "X-CSRF-Token": answer["csrf"]}
+        clients.append(httpx2.Client(base_url=console.address, timeout=20))
+        browser = Browser(clients[-1])
+        assert browser.login(user).status_code == 200
+        return browser
 
-    def _ask(self, path: str, body: Any, headers: dict[str, str]) -> tuple[Any, Any]:
-        data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(self.base.rstrip("/") + path, data, headers)
-        with urllib.request.urlopen(request, timeout=20) as answer:
-            return json.load(answer), answer.headers
-
-    def get(self, path: str) -> Any:
-        return self._ask(path, None, self.headers)[0]
-
-    def post(self, path: str, body: Any) -> Any:
-        return self._ask(path, body, self.headers)[0]
-
-    def contact(self) -> Any:
-        return self.get(f"/api/contacts/{ID}")
-
-    def decide(self, **changes: Any) -> Any:
-        detail = self.contact()
-        version = detail["versions"][-1]
-        body = {"revision": detail["contact"]["revision"], "version": version["version"], "sha256": version["sha256"]}
-        return self.post(f"/api/contacts/{ID}/decisions", {**body, "verdict": "mine_like", **changes})["decision"]
-
-    def events(self) -> tuple[HTTPResponse, list[tuple[str, Any]]]:
-        """Read the event stream in a thread until it is closed."""
-        request = urllib.request.Request(self.base + "events", None, self.headers)
-        stream, found = urllib.request.urlopen(request, timeout=60), []
-
-        def read() -> None:
-            name = ""
-            try:
-                for raw in stream:
-                    line = raw.decode().rstrip("\n")
-                    if line.startswith("event: "):
-                        name = line.removeprefix("event: ")
-                    elif line.startswith("data: "):
-                        found.append((name, json.loads(line.removeprefix("data: "))))
-            except (OSError, ValueError, AttributeError):
-                return  # closed
-
-        threading.Thread(target=read, daemon=True).start()
-        return stream, found
-
-
-@pytest.fixture(autouse=True)
-def fast_password_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sonarpost.services.console.store.users.SCRYPT_COST", 2**4)
+    yield make
+    for client in clients:
+        client.close()
 
 
 @pytest.fixture
 def start(runner, platform):
     def make(**options: Any) -> ConsoleService:
-        side = options.get("side", "vessel")
+        role = options.get("role", "vessel")
         config = ConsoleConfig(port=0, **options)
-        return runner.start(ConsoleService(platform(VESSEL if side == "vessel" else "shore-1"), config))
+        return runner.start(ConsoleService(platform(VESSEL if role == "vessel" else "shore-1"), config))
 
     return make
 
@@ -138,23 +71,28 @@ def put(client: zenoh.Session, key: str, record: Any) -> None:
     publish_once(client, key, wire.encode(record), wire.encoding_of(type(record)))
 
 
-def test_images_are_published_and_a_decision_is_sent_to_relay_and_modem(runner, start):
+def test_images_are_published_and_a_decision_is_sent_to_relay_and_modem(runner, start, log_in):
     relay = runner.peer(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
     modem = runner.peer(
         VESSEL, "op_modem", {keys.contact_decision(VESSEL): Decision, keys.command_all(VESSEL): Command}
     )
     decompressor = runner.peer(VESSEL, "decompressor")
     console = start()
-    anna = Page(console, "anna", "operator")
-    stream, events = anna.events()
-    eventually(lambda: [name for name, _ in events] == ["hello"], what="stream")
+    anna = log_in(console, "anna", "operator")
+    stream = EventReader(console.address, anna.client.cookies["sonarpost_session"])
+    eventually(lambda: stream.names() == ["hello"], what="stream")
     key = keys.image_reconstructed(VESSEL)
     decompressor.send(key, "console", image(1, complete=False))
-    eventually(lambda: any(name == "contact" and data["new"] for name, data in events), what="contact")
+
+    def is_published(field: str) -> bool:
+        contacts = [data for name, _, data in stream.events if name == "contact"]
+        return any(data["contact"][field] if field == "complete" else data[field] for data in contacts)
+
+    eventually(lambda: is_published("new"), what="contact")
     decompressor.send(key, "console", image(2))
-    eventually(lambda: any(name == "contact" and data["contact"]["complete"] for name, data in events), what="refined")
-    decision = anna.decide(remark="clean edge")
-    eventually(lambda: len(relay.received) == len(modem.received) == 1, what="decision handed on")
+    eventually(lambda: is_published("complete"), what="complete image")
+    decision = anna.decide(ID).json()["decision"]
+    eventually(lambda: len(relay.received) == len(modem.received) == 1, what="decision")
     assert relay.received == modem.received
     assert (relay.received[0].decision_id, relay.received[0].operator, relay.received[0].image_version) == (
         decision["decision_id"],
@@ -163,21 +101,21 @@ def test_images_are_published_and_a_decision_is_sent_to_relay_and_modem(runner, 
     )
 
     def delivery() -> Any:
-        return anna.contact()["contact"]["delivery"]
+        return anna.contact(ID)["contact"]["delivery"]
 
-    eventually(lambda: (delivery()["shore"], delivery()["vehicle"]) == ("relay", "asked"), what="receipts")
+    eventually(lambda: (delivery()["shore"], delivery()["vehicle"]) == ("relay", "asked"), what="acknowledgements")
     stream.close()
 
 
-def test_delivery_state_of_a_decision_is_updated(runner, start, client):
+def test_delivery_state_of_a_decision_is_updated(runner, start, client, log_in):
     for name in ("relay", "op_modem"):
         runner.peer(VESSEL, name, {keys.contact_decision(VESSEL): Decision})
     console = start()
     put(client, keys.image_reconstructed(VESSEL), image())
-    anna = Page(console, "anna", "operator")
-    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
-    decision = anna.decide()
-    eventually(lambda: anna.contact()["contact"]["delivery"]["vehicle"] == "asked", what="receipt")
+    anna = log_in(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts").json()["total"] == 1, what="image")
+    decision = anna.decide(ID).json()["decision"]
+    eventually(lambda: anna.contact(ID)["contact"]["delivery"]["vehicle"] == "asked", what="acknowledgement")
     state = DownlinkState(
         vessel_id=VESSEL,
         vehicle_id="uuv-1",
@@ -189,21 +127,21 @@ def test_delivery_state_of_a_decision_is_updated(runner, start, client):
         changed_utc_s=time.time() + 1,
     )
     put(client, keys.acoustic_downlink(VESSEL), state)
-    eventually(lambda: anna.contact()["contact"]["delivery"]["vehicle"] == "confirmed", what="confirmation")
-    eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "relay", what="relay's receipt")
+    eventually(lambda: anna.contact(ID)["contact"]["delivery"]["vehicle"] == "confirmed", what="confirmation")
+    eventually(lambda: anna.contact(ID)["contact"]["delivery"]["shore"] == "relay", what="acknowledgement of the relay")
 
 
-def test_empty_relay_means_delivery_to_shore(start, client, runner, monkeypatch):
+def test_empty_relay_means_delivery_to_shore(start, client, runner, monkeypatch, log_in):
     monkeypatch.setattr("sonarpost.services.console.service.SHORE_DELIVERY_MARGIN_S", -1.0)
     relay = runner.peer(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
     console = start(decision_consumers=("relay",))
     put(client, keys.image_reconstructed(VESSEL), image())
-    anna = Page(console, "anna", "operator")
-    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
-    anna.decide()
-    eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "relay", what="relay's receipt")
+    anna = log_in(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts").json()["total"] == 1, what="image")
+    anna.decide(ID).json()["decision"]
+    eventually(lambda: anna.contact(ID)["contact"]["delivery"]["shore"] == "relay", what="acknowledgement of the relay")
     health = relay.health()
-    # The neighbour says nothing of decisions, so nothing is concluded from its own records.
+    # The health of the peer has no gauge for decisions, so that its own records change nothing.
     for gauges, at, ashore in (
         ({"inbox": 0.0, "decisions_waiting": 1.0}, 60, "relay"),
         ({"inbox": 1.0, "decisions_waiting": 0.0}, 60, "relay"),
@@ -211,43 +149,43 @@ def test_empty_relay_means_delivery_to_shore(start, client, runner, monkeypatch)
         ({"inbox": 0.0, "decisions_waiting": 0.0}, 60, "delivered"),
     ):
         console._on_relay_health(health.model_copy(update={"gauges": gauges, "time_utc_s": time.time() + at}))
-        assert anna.contact()["contact"]["delivery"]["shore"] == ashore
+        assert anna.contact(ID)["contact"]["delivery"]["shore"] == ashore
 
 
-def test_request_is_sent_to_the_modem(runner, start, client):
+def test_request_is_sent_to_the_modem(runner, start, client, log_in):
     modem = runner.peer(VESSEL, "op_modem", {keys.command_all(VESSEL): Command})
     console = start(decision_consumers=())
     put(client, keys.image_reconstructed(VESSEL), image(1, complete=False))
-    anna = Page(console, "anna", "operator")
-    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
-    asked = anna.post(f"/api/contacts/{ID}/requests", {"kind": "resend", "airtime_s": 9.3})
+    anna = log_in(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts").json()["total"] == 1, what="image")
+    asked = anna.post(f"/api/contacts/{ID}/requests", {"kind": "resend", "airtime_s": 9.3}).json()
     eventually(lambda: len(modem.received) == 1, what="request")
     assert (modem.received[0].command_id, modem.received[0].image_id, modem.received[0].issued_by) == (
         asked["command_id"],
         "00A7",
         "anna",
     )
-    eventually(lambda: anna.contact()["requests"][0]["state"] == "asked", what="receipt")
-    decision = anna.decide()
+    eventually(lambda: anna.contact(ID)["requests"][0]["state"] == "asked", what="acknowledgement")
+    decision = anna.decide(ID).json()["decision"]
     assert (decision["delivery"]["shore"], decision["delivery"]["vehicle"]) == ("none", "none")
 
 
-def test_comment_from_the_shore_site_is_shown(runner, start, client):
+def test_comment_from_the_shore_site_is_shown(runner, start, client, log_in):
     console = start()
     put(client, keys.image_reconstructed(VESSEL), image())
     relay = runner.peer(VESSEL, "relay")
-    anna = Page(console, "anna", "operator")
-    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
+    anna = log_in(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts").json()["total"] == 1, what="image")
     names = {"vessel_id": VESSEL, "vehicle_id": "uuv-1", "image_id": "00A7", "image_version": 1}
     advice = Advice(advice_id="a-1", author="eva", advised_utc_s=time.time(), remark="look again", **names)
     relay.send(keys.advice(VESSEL), "console", advice)
-    eventually(lambda: anna.contact()["contact"]["advised"], what="advice")
-    assert anna.contact()["advice"][0]["remark"] == "look again"
+    eventually(lambda: anna.contact(ID)["contact"]["advised"], what="advice")
+    assert anna.contact(ID)["advice"][0]["remark"] == "look again"
 
 
-def test_received_frames_are_assigned_to_their_vehicle(start, client):
+def test_received_frames_are_assigned_to_their_vehicle(start, client, log_in):
     console = start(vehicles={"3": "uuv-1"})
-    anna = Page(console, "anna", "observer")
+    anna = log_in(console, "anna", "observer")
     frame = AcousticFrame(
         direction="rx",
         platform_id=VESSEL,
@@ -262,10 +200,12 @@ def test_received_frames_are_assigned_to_their_vehicle(start, client):
         quality=LinkQuality(snr_in_db=12.5, frames=3, bad_frames=1),
     )
     put(client, keys.acoustic_rx(VESSEL), frame)
-    eventually(lambda: len(anna.get("/api/fleet")["vehicles"]) == 1, what="vehicle")
-    [vehicle] = anna.get("/api/fleet")["vehicles"]
+    eventually(lambda: len(anna.get("/api/fleet").json()["vehicles"]) == 1, what="vehicle")
+    [vehicle] = anna.get("/api/fleet").json()["vehicles"]
     assert (vehicle["vehicle_id"], vehicle["snr_in_db"], vehicle["loss"]) == ("uuv-1", 12.5, 0.333)
-    eventually(lambda: any(s["service"] == "console" for s in anna.get("/api/fleet")["services"]), what="own health")
+    eventually(
+        lambda: any(s["service"] == "console" for s in anna.get("/api/fleet").json()["services"]), what="own health"
+    )
 
 
 def test_invalid_record_is_counted_and_ignored(start, client):
@@ -283,61 +223,63 @@ def test_image_of_another_vessel_is_refused(start, client, refused):
     assert console.state.counts().total == 0
 
 
-def test_shore_console_shows_images_of_c2_and_sends_comments_to_it(runner, start, client):
+def test_shore_console_shows_images_of_c2_and_sends_comments_to_it(runner, start, client, log_in):
     c2 = runner.peer("shore-1", "c2", {keys.tasking_advice_all(): Advice, keys.tasking_command_all(): Command})
     console = start(role="shore")
     put(client, keys.shore_image(VESSEL), image())
-    eva = Page(console, "eva", "expert")
-    eventually(lambda: eva.get("/api/contacts")["total"] == 1, what="picture")
-    advice = eva.post(f"/api/contacts/{ID}/advice", {"version": 1, "verdict": "unsure", "remark": "shadow too long"})
+    eva = log_in(console, "eva", "expert")
+    eventually(lambda: eva.get("/api/contacts").json()["total"] == 1, what="image")
+    advice = eva.post(
+        f"/api/contacts/{ID}/advice", {"version": 1, "verdict": "unsure", "remark": "shadow too long"}
+    ).json()
     eventually(lambda: len(c2.received) == 1, what="advice")
     assert (c2.received[0].advice_id, c2.received[0].author) == (advice["advice_id"], "eva")
     state = TaskingState(
         vessel_id=VESSEL, kind="advice", record_id=advice["advice_id"], state="delivered", changed_utc_s=time.time()
     )
     put(client, keys.tasking_state(VESSEL), state)
-    eventually(lambda: eva.contact()["advice"][0]["delivery"]["state"] == "delivered", what="state")
+    eventually(lambda: eva.contact(ID)["advice"][0]["delivery"]["state"] == "delivered", what="state")
     names = {"vessel_id": VESSEL, "vehicle_id": "uuv-1", "image_id": "00A7", "image_version": 1}
     decision = Decision(decision_id="d-1", verdict="mine_like", operator="anna", decided_utc_s=time.time(), **names)
     put(client, keys.shore_decision(VESSEL), decision)
-    eventually(lambda: eva.contact()["contact"]["review"] == "mine_like", what="decision")
-    assert eva.contact()["decisions"][0]["delivery"]["shore"] == "delivered"
+    eventually(lambda: eva.contact(ID)["contact"]["review"] == "mine_like", what="decision")
+    assert eva.contact(ID)["decisions"][0]["delivery"]["shore"] == "delivered"
 
 
 def test_shore_console_reads_missed_records_from_the_folder_of_c2(start, tmp_path):
     write_image(tmp_path / "out" / VESSEL, image(2, complete=False))
     (tmp_path / "out" / VESSEL / "broken.json").write_text("{")
     console = start(role="shore", out_dir=tmp_path / "out")
-    eventually(lambda: console.state.counts().total == 1, what="kept picture")
-    kept = console.state.image(ID, 2)
-    assert (kept.missing() == image(2, complete=False).missing()).all()
-    assert kept.picture == image(2).picture
+    eventually(lambda: console.state.counts().total == 1, what="stored image")
+    stored = console.state.image(ID, 2)
+    assert (stored.missing() == image(2, complete=False).missing()).all()
+    assert stored.picture == image(2, complete=False).picture
 
 
-def test_decision_is_sent_after_a_restart(runner, start, client):
+def test_decision_is_sent_after_a_restart(runner, start, client, log_in):
     console = start()
     put(client, keys.image_reconstructed(VESSEL), image())
-    anna = Page(console, "anna", "operator")
-    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
-    decision = anna.decide()
+    anna = log_in(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts").json()["total"] == 1, what="image")
+    decision = anna.decide(ID).json()["decision"]
     runner.stop(console)
     again = start()
     relay = runner.peer(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
     eventually(lambda: len(relay.received) == 1, what="decision after the restart")
     assert relay.received[0].decision_id == decision["decision_id"]
-    bo = Page(again, "bo", "operator")
-    assert bo.contact()["contact"]["review"] == "mine_like"
-    assert [entry["user"] for entry in bo.contact()["audit"]] == ["anna"]
+    bo = log_in(again, "bo", "operator")
+    assert bo.contact(ID)["contact"]["review"] == "mine_like"
+    assert [entry["user"] for entry in bo.contact(ID)["audit"]] == ["anna"]
 
 
-def test_stored_decision_is_sent_after_a_crash(runner, start, client, monkeypatch):
+def test_stored_decision_is_sent_after_a_crash(runner, start, client, monkeypatch, log_in):
     console = start()
     put(client, keys.image_reconstructed(VESSEL), image())
-    anna = Page(console, "anna", "operator")
-    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
+    anna = log_in(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts").json()["total"] == 1, what="image")
     # Simulates a crash between the two transactions.
     monkeypatch.setattr(console, "_send", lambda _item: console.stopping.wait())
-    decision = anna.decide()
+    decision = anna.decide(ID).json()["decision"]
     runner.stop(console)
     start()
     relay = runner.peer(VESSEL, "relay", {keys.contact_decision(VESSEL): Decision})
@@ -366,15 +308,15 @@ def test_invalid_configuration_ends_the_process(tmp_path, capsys):
     assert "passwords are sent over this connection" in capsys.readouterr().err
 
 
-def test_delivery_to_shore_with_the_real_relay(runner, start, client, platform):
+def test_delivery_to_shore_with_the_real_relay(runner, start, client, platform, log_in):
     relay = runner.start(RelayService(platform(VESSEL), RelayConfig()))
     console = start(decision_consumers=("relay",))
     put(client, keys.image_reconstructed(VESSEL), image())
-    anna = Page(console, "anna", "operator")
-    eventually(lambda: anna.get("/api/contacts")["total"] == 1, what="picture")
-    anna.decide()
+    anna = log_in(console, "anna", "operator")
+    eventually(lambda: anna.get("/api/contacts").json()["total"] == 1, what="image")
+    anna.decide(ID).json()["decision"]
     eventually(lambda: relay.gauges()["decisions_waiting"] == 1.0, what="decision at the relay")
-    eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "relay", what="relay's receipt")
+    eventually(lambda: anna.contact(ID)["contact"]["delivery"]["shore"] == "relay", what="acknowledgement of the relay")
     c2 = runner.peer("shore-1", "c2", {keys.shore_inbox_all(): Relayed})
-    eventually(lambda: anna.contact()["contact"]["delivery"]["shore"] == "delivered", what="ashore")
+    eventually(lambda: anna.contact(ID)["contact"]["delivery"]["shore"] == "delivered", what="delivery to shore")
     assert keys.contact_decision(VESSEL) in [envelope.key for envelope in c2.received]
