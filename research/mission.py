@@ -20,7 +20,7 @@ from sonarpost.errors import ConfigError
 from sonarpost.link.config import QueueConfig, ReceiverConfig
 from sonarpost.link.downlink.messages import image_of_number, number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import Feedback
+from sonarpost.link.frames.v1.payload_objects import Feedback
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.mac import Tdma
 from sonarpost.link.queue.transmit_queue import TransmitQueue
@@ -288,7 +288,7 @@ def run_mission(spec: MissionSpec) -> MissionResult:
         unfinished_at=mission.unfinished_at(),
         left=sum(len(v.queue.open_numbers()) + len(v.queue.messages.waiting) for v in vehicles),
         expired=sum(v.queue.messages.expired for v in vehicles),
-        frames_sent=sum(v.queue.sender.frames_sent for v in vehicles),
+        frames_sent=sum(v.queue.sender.state.frames_sent for v in vehicles),
         state_bytes=state_bytes,
         restarts=restarts,
     )

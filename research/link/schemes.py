@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -21,6 +21,7 @@ from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import plan_packets
+from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.receiver import FeedbackReceived, ImageUpdate
@@ -295,7 +296,7 @@ def _exchange(
     sender: V1Sender, receiver: V1Receiver, channel: LossyChannel, *, feedback: bool
 ) -> Iterator[tuple[float, bytes, bool]]:
     """Yield time, received bytes (empty if lost) and whether it is feedback, for each frame in both directions."""
-    vessel, back = V1Sender(replace(sender.config, feedback=False)), V1Receiver()
+    back = V1Receiver()
     for step in range(1, _MAX_STEPS):
         now = step * _FRAME_S
         if sender.is_idle:
@@ -307,10 +308,10 @@ def _exchange(
         report = receiver.feedback(_SOURCE, now) if due else None
         if report is None:
             continue
-        vessel.add_feedback(report)
-        feedback_frame, is_received = vessel.next_frame(now), channel.receives()
+        feedback_frame = pack_segments([Segment(SegmentKind.FEEDBACK, report.pack())], sender.config.frame_bytes)
+        is_received = channel.receives()
         yield now, b"", True
-        for event in back.accept(_VESSEL, feedback_frame, now) if feedback_frame and is_received else []:
+        for event in back.accept(_VESSEL, feedback_frame, now) if is_received else []:
             if isinstance(event, FeedbackReceived):
                 sender.on_feedback(event.feedback, now)
 

@@ -13,7 +13,7 @@ from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.config import PlatformConfig
 from sonarpost.link.frames.paper.frame import format_image_id
-from sonarpost.link.frames.v1.preview import MAX_NUMBER
+from sonarpost.link.frames.v1.payload_objects import MAX_NUMBER
 from sonarpost.logs import kv
 from sonarpost.messages import Command, CommandKind, EncodedImage, Record, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork

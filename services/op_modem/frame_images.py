@@ -9,7 +9,7 @@ from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.frames.paper.frame import parse_frame
 from sonarpost.link.frames.v1.frame import Content, SegmentKind, Symbol, SymbolKind, parse_symbol
 from sonarpost.link.frames.v1.frame import parse_frame as parse_v1_frame
-from sonarpost.link.frames.v1.preview import Preview, entry_shape
+from sonarpost.link.frames.v1.payload_objects import Preview, entry_shape
 
 
 def image_ids_of_frame(data: bytes) -> str | None:

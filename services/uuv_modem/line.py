@@ -30,8 +30,7 @@ from sonarpost.link.downlink.messages import (
     unpack,
 )
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import unpack_mini
-from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
+from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, unpack_mini
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.queue.transmit_queue import TransmitQueue
 from sonarpost.link.receiver import FeedbackReceived, FrameRejected, MessageReceived

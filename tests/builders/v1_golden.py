@@ -13,10 +13,10 @@ import numpy as np
 from builders.common import GOLDEN_FOLDER
 from sonarpost.link.coding import erasure_code as fec
 from sonarpost.link.coding.channel_capacity import LossChannel
+from sonarpost.link.coding.erasure_code import Layering, layered_symbols
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest, pack_mini
 from sonarpost.link.frames.v1.frame import (
     Content,
     Segment,
@@ -27,9 +27,15 @@ from sonarpost.link.frames.v1.frame import (
     pack_segments,
     pack_symbol,
 )
-from sonarpost.link.frames.v1.layers import Layering, layered_symbols
-from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, StreamPiece
-from sonarpost.link.frames.v1.preview import Preview
+from sonarpost.link.frames.v1.payload_objects import (
+    Feedback,
+    MessageObject,
+    PieceList,
+    Preview,
+    RefineRequest,
+    StreamPiece,
+    pack_mini,
+)
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.receiver import Event, FeedbackReceived, FrameRejected, ImageUpdate, MessageReceived

@@ -10,6 +10,8 @@ import numpy as np
 from sonarpost.link.config import ReceiverConfig, SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.v1.frame import FrameProtection, Segment, SegmentKind, pack_segments
+from sonarpost.link.frames.v1.payload_objects import Feedback
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.receiver import Event, FeedbackReceived, FrameRejected, ImageUpdate, MessageReceived
@@ -33,6 +35,17 @@ def take_packet(queue: ImageSender, now: float) -> tuple[bytes, ...]:
     frames = () if packet is None else packet.frames
     queue.sent(frames, queue.packet_interval_s)
     return frames
+
+
+def next_frames(sender: V1Sender, count: int, now: float) -> tuple[bytes, ...]:
+    """Return the next frames of a sender, fewer if there are not so many."""
+    frames = (sender.next_frame(now) for _ in range(count))
+    return tuple(frame for frame in frames if frame is not None)
+
+
+def feedback_frame(feedback: Feedback, protection: FrameProtection | None = None) -> bytes:
+    """Return the frame of 32 bytes that carries a feedback."""
+    return pack_segments([Segment(SegmentKind.FEEDBACK, feedback.pack())], 32, protection)
 
 
 @dataclass
@@ -61,7 +74,7 @@ class World:
             self.sender.add_image(number, contact(number), self.sent[number], self.now)
 
     def run(self, most_frames: int = 100_000) -> None:
-        back, vessel = V1Receiver(), V1Sender(SenderConfig(frame_bytes=32))
+        back = V1Receiver()
         stop = self.now + most_frames
         while not self.sender.is_idle and self.now < stop:
             self.now += 1.0
@@ -75,13 +88,9 @@ class World:
                 continue
             report = self.receiver.feedback(VEHICLE, self.now)
             assert report is not None
-            vessel.add_feedback(report)
-            told = vessel.next_frame(self.now)
-            assert told is not None
-            assert len(told) == 32
             self.reports += 1
             if self.passes():
-                (event,) = back.accept(VESSEL, told, self.now)
+                (event,) = back.accept(VESSEL, feedback_frame(report), self.now)
                 assert isinstance(event, FeedbackReceived)
                 self.sender.on_feedback(event.feedback, self.now)
 

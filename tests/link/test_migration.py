@@ -27,7 +27,7 @@ from sonarpost.link.downlink.commands import CommandTracker
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.downlink.vessel_endpoint import VesselEndpoint
 from sonarpost.link.frames.paper.receiver import PaperReceiver, PaperReceiverCounts
-from sonarpost.link.frames.v1.feedback import Feedback
+from sonarpost.link.frames.v1.payload_objects import Feedback
 from sonarpost.link.frames.v1.receiver import V1Receiver, V1ReceiverCounts
 from sonarpost.link.queue.transmit_queue import TransmitQueue
 from sonarpost.link.receiver import Event, FeedbackReceived, FrameRejected, ImageUpdate, MessageReceived

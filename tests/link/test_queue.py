@@ -14,10 +14,10 @@ from sonarpost.link.config import QueueConfig
 from sonarpost.link.downlink.messages import image_of_number, number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.receiver import V1Receiver
-from sonarpost.link.queue.messages import MessageIdentifier, QueuedMessage
-from sonarpost.link.queue.transmit_queue import InFlight, QueueState, TransmitQueue
+from sonarpost.link.queue.messages import MessageIdentifier, MessageQueue, QueuedMessage
+from sonarpost.link.queue.transmit_queue import QueueState, TransmitQueue
 from sonarpost.link.receiver import ImageUpdate, MessageReceived
-from sonarpost.link.sender import ImageToSend
+from sonarpost.link.sender import ImageToSend, OutgoingPacket
 from sonarpost.link.state import SavedParts
 from sonarpost.modem.micromodem import RATES
 
@@ -288,7 +288,8 @@ def test_sent_names_the_images_of_which_nothing_is_left():
         ("queue", {"rate": 9}),
         ("queue", {"losses": {1: [1.5, 0.0]}}),
         ("queue", {"planned_loss": "no"}),
-        ("packet", {"packet": {"rate": 1, "frames": "no"}}),
+        ("packet", {"rate": 9}),
+        ("messages", {"served": {"s": -1}}),
         ("message/0", {"priority": 0}),
         ("message-id/0", {"name": None}),
     ],
@@ -300,11 +301,17 @@ def test_a_malformed_part_is_reported_and_the_rest_restored(name, change):
     for n in range(2):
         queue.add_message(f"m{n}", "s", b"data", 0.0)
     again = TransmitQueue(QueueConfig())
-    kinds = {"queue": QueueState, "packet": InFlight, "message": QueuedMessage, "message-id": MessageIdentifier}
+    kinds = {
+        "queue": QueueState,
+        "packet": OutgoingPacket,
+        "messages": MessageQueue,
+        "message": QueuedMessage,
+        "message-id": MessageIdentifier,
+    }
     errors = again.restore(with_fields(queue.parts(), name, kinds[name.partition("/")[0]], change))
     assert set(errors) == {name}
     assert f"queue state: {name}: " in str(errors[name])
-    kept = {part: data for part, data in queue.parts().items() if part not in (name, "queue", "packet")}
+    kept = {part: data for part, data in queue.parts().items() if part not in (name, "queue", "packet", "messages")}
     assert {part: data for part, data in again.parts().items() if part in kept} == kept
 
 
@@ -365,11 +372,11 @@ def test_a_longer_stream_of_a_picture_that_has_gone_brings_only_what_is_new():
     _, now = run(queue, 200.0, receiver=receiver)
     assert not queue.open_numbers()
     assert not queue.refine(1, 1000, now), "there is no more"
-    before = queue.sender.frames_sent
+    before = queue.sender.state.frames_sent
     assert queue.add_image(image(1, whole), now)
     events, now = run(queue, 600.0, now=now, receiver=receiver)
     assert max(len(e.stream) for e in events if isinstance(e, ImageUpdate)) == 1200
-    assert queue.sender.frames_sent - before < 900 / 50 + 8
+    assert queue.sender.state.frames_sent - before < 900 / 50 + 8
 
 
 def test_a_picture_that_is_given_again_goes_again_unless_it_waits():

@@ -9,7 +9,7 @@ import re
 import pytest
 from builders.authentication_world import VEHICLE, VESSEL, key, skip, vehicle_seal, vessel_seal
 from builders.link_state import group, with_fields
-from builders.v1_world import contact, stream
+from builders.v1_world import contact, feedback_frame, stream
 
 from sonarpost.errors import ConfigError, FrameError
 from sonarpost.link.auth.authentication import (
@@ -288,7 +288,7 @@ def test_pictures_and_reports_travel_sealed(frame_bytes: int, settings: Authenti
     down.grant(1000)
     config = SenderConfig(frame_bytes=frame_bytes, channels=(LossChannel(0.2),), feedback=True, stream_bytes=200)
     vehicle, hears = V1Sender(config, protection=up), V1Receiver(protection=up)
-    vessel, reports = V1Receiver(protection=down), V1Sender(SenderConfig(frame_bytes=32), protection=down)
+    vessel = V1Receiver(protection=down)
     pictures = {number: stream(number, 200) for number in range(1, 5)}
     for number, data in pictures.items():
         vehicle.add_image(number, contact(number), data, 0.0)
@@ -310,8 +310,7 @@ def test_pictures_and_reports_travel_sealed(frame_bytes: int, settings: Authenti
         if vessel.feedback_is_due(VEHICLE, now):
             told = vessel.feedback(VEHICLE, now)
             assert told is not None
-            reports.add_feedback(told)
-            (report,) = hears.accept(VESSEL, reports.next_frame(now) or b"", now)
+            (report,) = hears.accept(VESSEL, feedback_frame(told, down), now)
             assert isinstance(report, FeedbackReceived)
             vehicle.on_feedback(report.feedback, now)
     assert vehicle.is_idle

@@ -11,10 +11,9 @@ from builders import v1_golden
 
 from sonarpost.errors import FrameError
 from sonarpost.link.coding import erasure_code as fec
+from sonarpost.link.coding.erasure_code import Layering, recover_layer, recover_layering
 from sonarpost.link.frames.v1.frame import parse_frame
-from sonarpost.link.frames.v1.layers import Layering, recover_layer, recover_layering
-from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, unpack_object
-from sonarpost.link.frames.v1.preview import Preview
+from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, Preview, unpack_object
 from sonarpost.link.frames.v1.receiver import V1Receiver
 
 

@@ -14,7 +14,6 @@ from sonarpost.link.coding.blocks import OutgoingImage, SendBlock
 from sonarpost.link.coding.channel_capacity import LossChannel, erasure_bound_frames
 from sonarpost.link.config import ReceiverConfig, SenderConfig
 from sonarpost.link.downlink.messages import image_of_number, number_of_image
-from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest
 from sonarpost.link.frames.v1.frame import (
     Segment,
     SegmentKind,
@@ -24,6 +23,7 @@ from sonarpost.link.frames.v1.frame import (
     pack_symbol,
     parse_frame,
 )
+from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import SenderState, V1Sender, WaitingImages
 from sonarpost.link.receiver import FrameRejected, ImageUpdate
@@ -302,8 +302,8 @@ def test_the_sender_goes_on_after_a_restart_at_every_frame() -> None:
     [
         ("sender", {"format version": 1}),
         ("sender", {"next_block": 32}),
-        ("sender", {"meters": {1: {"loss": 7.0}}}),
-        ("sender", {"feedback": [{"kind": 99, "data": b""}]}),
+        ("sender", {"tracker": [{}, {1: [7.0, None]}]}),
+        ("sender", {"messages": [[], 256]}),
         ("waiting", {"numbers": 3}),
         ("waiting", {"numbers": [0]}),
         ("image/1", {"number": 0}),

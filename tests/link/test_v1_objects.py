@@ -11,11 +11,22 @@ from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
 from sonarpost.link.coding.delivery_ledger import LossMeter
+from sonarpost.link.coding.erasure_code import Layering, layered_symbols, recover_layer, recover_layering
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest, pack_mini, unpack_mini
-from sonarpost.link.frames.v1.layers import Layering, layered_symbols, recover_layer, recover_layering
-from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, StreamPiece, unpack_object
-from sonarpost.link.frames.v1.preview import Preview, contact_link, entry_shape, next_number
+from sonarpost.link.frames.v1.payload_objects import (
+    Feedback,
+    MessageObject,
+    PieceList,
+    Preview,
+    RefineRequest,
+    StreamPiece,
+    contact_link,
+    entry_shape,
+    number_after,
+    pack_mini,
+    unpack_mini,
+    unpack_object,
+)
 
 CONTACT = ContactSummary(lat_deg=44.7, lon_deg=-63.6, confidence=1.0).rounded()
 
@@ -87,7 +98,7 @@ def test_consecutive_contacts_with_one_start_cost_three_bytes_each() -> None:
     listed, number = [], 65534
     for _ in range(4):
         listed.append(StreamPiece(number, 9, 30, bytes(200)))
-        number = next_number(number)
+        number = number_after(number)
     assert [p.number for p in listed] == [65534, 65535, 1, 2]
     group = PieceList(tuple(listed), final=True)
     assert group.overhead_bytes() == 5 + 4 * 3 + 4

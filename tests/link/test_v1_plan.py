@@ -10,13 +10,14 @@ import pytest
 
 from sonarpost.errors import ConfigError, StreamError
 from sonarpost.link.coding.channel_capacity import LossChannel, best_rate
-from sonarpost.link.coding.rate_distortion import GroupDistortion, quality_curve
 from sonarpost.link.coding.redundancy_plan import (
+    GroupDistortion,
     arrivals,
     copies,
     plan_layers,
     plan_whole,
     preview_frames,
+    quality_curve,
     symbols_to_send,
 )
 from sonarpost.modem.micromodem import RATES
@@ -56,7 +57,7 @@ def test_a_curve_with_steps_is_used_by_its_hull() -> None:
 
 @pytest.mark.parametrize("error", [[1.0], [-1.0] * 11, [float("nan")] * 11])
 def test_estimates_that_make_no_sense_are_refused(error: list[float]) -> None:
-    with pytest.raises(StreamError, match="picture"):
+    with pytest.raises(StreamError, match="image"):
         quality_curve(10, error)
     with pytest.raises(StreamError):
         quality_curve(70000)

@@ -105,9 +105,9 @@ def test_what_is_settled_is_not_sent_again() -> None:
     exchange.run(3600.0, reports=True)
     assert len(exchange.whole) == 5
     assert settled(exchange)
-    sent = exchange.queue.sender.frames_sent
+    sent = exchange.queue.sender.state.frames_sent
     exchange.run(3600.0, reports=True)
-    assert exchange.queue.sender.frames_sent == sent
+    assert exchange.queue.sender.state.frames_sent == sent
     assert exchange.queue.is_idle
 
 
@@ -116,7 +116,7 @@ def test_what_receivers_have_of_a_block_sent_before_they_reported_is_not_sent_ag
     for number in range(1, 8):
         exchange.add(number)
         exchange.run(60.0, reports=False)
-    first = exchange.queue.sender.frames_sent
+    first = exchange.queue.sender.state.frames_sent
     assert len(exchange.queue.sender.retired) == 14
     there = sum(len(data) for data in exchange.shown.values())
     exchange.add(8)
@@ -125,7 +125,7 @@ def test_what_receivers_have_of_a_block_sent_before_they_reported_is_not_sent_ag
     assert settled(exchange)
     # What had been cut from seven, and the eighth.
     cut = 8 * 300 - there
-    assert exchange.queue.sender.frames_sent - first <= 2 + 1.25 * cut / exchange.queue.sender.symbol_bytes
+    assert exchange.queue.sender.state.frames_sent - first <= 2 + 1.25 * cut / exchange.queue.sender.symbol_bytes
 
 
 @pytest.mark.parametrize("reports", [True, False])

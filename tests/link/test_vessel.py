@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders.link_state import with_fields
+from builders.v1_world import next_frames
 
 from sonarpost.errors import FrameError
 from sonarpost.link.coding.channel_capacity import LossChannel
@@ -184,7 +185,7 @@ def test_reports_make_the_vehicle_complete_what_was_lost():
     while vehicle.sender.blocks or vehicle.sender.waiting:
         now += 6.0
         assert now < 3600
-        for frame in vehicle.sender.next_packet(3, now):
+        for frame in next_frames(vehicle.sender, 3, now):
             if rng.random() >= 0.3:
                 link.accept(UUV, frame, now)
         packet = link.next_packet(1, 32, now)

@@ -21,7 +21,7 @@ from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
-from sonarpost.link.frames.v1.preview import ENTRY_HEAD_BYTES, Preview
+from sonarpost.link.frames.v1.payload_objects import ENTRY_HEAD_BYTES, Preview
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.messages import AcousticFrame, ReconstructedImage
 from sonarpost.runtime.service import UnitOfWork

@@ -7,6 +7,7 @@ import time
 
 import pytest
 from builders.common import eventually
+from builders.v1_world import next_frames
 from pydantic import ValidationError
 
 from sonarpost import keys, wire
@@ -131,7 +132,7 @@ class Vehicle:
             self.send()
 
     def send(self):
-        self.modem.send_packet(1, 1, self.sender.next_packet(3, time.time()))
+        self.modem.send_packet(1, 1, next_frames(self.sender, 3, time.time()))
 
 
 @pytest.fixture
@@ -269,7 +270,7 @@ def test_reports_tell_the_vehicle_what_is_lacking(modem_pair, begin, vehicle, ru
     contact = ContactSummary(height_px=40, width_px=60, time_utc_s=1.0)
     for number in range(1, 5):
         far.sender.add_image(number, contact, bytes([0x20]) + bytes(range(150)), time.time())
-    far.sender.next_packet(2, time.time())  # lost
+    next_frames(far.sender, 2, time.time())  # lost
     far.send()
     eventually(lambda: len(far.reports) >= 1, timeout_s=60)
     assert sum(far.reports[0].needs) > 0

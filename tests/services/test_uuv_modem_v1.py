@@ -9,6 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 from builders.common import eventually
+from builders.v1_world import feedback_frame
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
@@ -326,8 +327,7 @@ def test_what_a_report_lacks_is_sent(vessel, begin, programs):
         receiver = V1Receiver()
         for number, frame in enumerate(vessel.frames):
             receiver.accept(3, frame.data, float(number))
-        vessel.sender.add_feedback(receiver.feedback(3, 1e3))
-        vessel.send(vessel.sender.next_frame(0.0))
+        vessel.send(feedback_frame(receiver.feedback(3, 1e3)))
         return soon(lambda: service.health().counters.get("reports_received", 0) > 0)
 
     assert any(report() for _ in range(20))

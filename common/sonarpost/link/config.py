@@ -8,8 +8,8 @@ from typing import Final
 
 from sonarpost.errors import ConfigError
 from sonarpost.link.coding.channel_capacity import LossChannel
-from sonarpost.link.frames.v1.feedback import WINDOW
 from sonarpost.link.frames.v1.frame import MAX_FRAME_BYTES, MIN_FRAME_BYTES
+from sonarpost.link.frames.v1.payload_objects import WINDOW
 
 _LINK: Final = "acoustic link v1"
 _QUEUE: Final = "acoustic queue"

@@ -20,8 +20,8 @@ from sonarpost.link.downlink.vessel_endpoint import EndpointState
 from sonarpost.link.frames.paper.receiver import PaperReceiverCounts, PendingImage
 from sonarpost.link.frames.v1.receiver import AssembledImage, PeerState, V1ReceiverCounts
 from sonarpost.link.frames.v1.sender import SenderState, WaitingImages
-from sonarpost.link.queue.messages import MessageIdentifier, QueuedMessage
-from sonarpost.link.queue.transmit_queue import InFlight, QueueState
+from sonarpost.link.queue.messages import MessageIdentifier, MessageQueue, QueuedMessage
+from sonarpost.link.queue.transmit_queue import QueueState
 from sonarpost.link.sender import OutgoingPacket
 from sonarpost.link.state import Errors, Parts, below, from_plain, pack_part, prefixed, to_plain, unpack_plain
 
@@ -221,8 +221,7 @@ def _message_parts(entry: _Map) -> dict[str, bytes]:
 @_converts
 def _packet_parts(maps: Mapping[str, _Map]) -> dict[str, bytes]:
     entry = maps["packet"]
-    packet = _read(OutgoingPacket, entry) if entry.get("frames") else None
-    return {"packet": pack_part(InFlight(packet))}
+    return {"packet": pack_part(_read(OutgoingPacket, entry))} if entry.get("frames") else {}
 
 
 @_converts
@@ -244,12 +243,11 @@ def _core_parts(maps: Mapping[str, _Map]) -> dict[str, bytes]:
     state = _read(
         SenderState,
         sender,
-        messages=[_message_copies(*entry) for entry in sender["messages"]],
-        feedback=[{"kind": kind, "data": data} for kind, data in sender["reports"]],
-        receivers=dict(sender["receivers"]),
-        meters={receiver: {"loss": loss, "last_counts": counts} for receiver, loss, counts in sender["meters"]},
+        messages=[[_message_copies(*entry) for entry in sender["messages"]], sender["next_message"]],
+        tracker=[dict(sender["receivers"]), {receiver: measured for receiver, *measured in sender["meters"]}],
     )
-    parts = {"queue": pack_part(queue), "sender": pack_part(state)}
+    messages = _read(MessageQueue, core)
+    parts = {"queue": pack_part(queue), "sender": pack_part(state), "messages": pack_part(messages)}
     parts["waiting"] = pack_part(_read(WaitingImages, {"numbers": sender["waiting"]}))
     names = {number: (image_id, contact_id) for number, image_id, contact_id in core["names"]}
     for order, (number, sent, *rest) in enumerate(core["sent"], start=1):
@@ -281,9 +279,8 @@ def _core_parts(maps: Mapping[str, _Map]) -> dict[str, bytes]:
             )
             parts[f"block/{block.number}"] = pack_part(block)
             parts[f"block-progress/{block.number}"] = pack_part(block, "progress")
-    for order, name in enumerate(core["known"], start=queue.next_key - len(core["known"])):
-        identifier = MessageIdentifier(max(0, order), name)
-        parts[f"message-id/{identifier.order}"] = pack_part(identifier)
+    for order, name in enumerate(core["known"], start=messages.next_key - len(core["known"])):
+        parts[f"message-id/{order}"] = pack_part(MessageIdentifier(max(0, order), name))
     return parts
 
 

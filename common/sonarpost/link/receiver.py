@@ -17,7 +17,7 @@ from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.coding.byte_ranges import Ranges, covered_within, gaps_within
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import HalfName, half_bounds, parse_frame
-from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest
+from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
 
 WireFormat = Literal["v1", "paper"]
 

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 from typing import Annotated, Protocol
 
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest
+from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
 from sonarpost.link.state import Bounds, Errors, Parts
 from sonarpost.modem.micromodem import RATES
+
+RateNumber = Annotated[int, Bounds(min(RATES), max(RATES))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +45,7 @@ class OutgoingPacket:
         frames: Its frames.
     """
 
-    rate: Annotated[int, Bounds(min(RATES), max(RATES))]
+    rate: RateNumber
     frames: tuple[bytes, ...]
 
     def without(self, sent: Sequence[bytes]) -> OutgoingPacket | None:

@@ -13,7 +13,6 @@ from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame
 from sonarpost.link.frames.paper.frame import parse_frame as parse_paper_frame
 from sonarpost.link.frames.paper.sender import body_capacity_bytes, plan_packets
-from sonarpost.link.frames.v1.feedback import Feedback
 from sonarpost.link.frames.v1.frame import (
     Segment,
     SegmentKind,
@@ -21,7 +20,7 @@ from sonarpost.link.frames.v1.frame import (
     checksum,
     parse_frame,
 )
-from sonarpost.link.frames.v1.preview import Preview, entry_shape
+from sonarpost.link.frames.v1.payload_objects import Feedback, Preview, entry_shape
 
 SPECIFICATIONS = REPOSITORY / "docs" / "specifications"
 PAPER = (SPECIFICATIONS / "acoustic-paper.md").read_text(encoding="utf-8")

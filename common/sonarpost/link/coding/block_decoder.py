@@ -11,10 +11,16 @@ import numpy as np
 
 from sonarpost.errors import FrameError
 from sonarpost.link.coding import erasure_code
+from sonarpost.link.coding.erasure_code import DESCRIPTOR_SYMBOLS, Layering, recover_layer, recover_layering
 from sonarpost.link.frames.v1.frame import BLOCKS, MAX_INDEX, Symbol, SymbolKind
-from sonarpost.link.frames.v1.layers import DESCRIPTOR_SYMBOLS, Layering, recover_layer, recover_layering
-from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceEnd, PieceList, unpack_object
-from sonarpost.link.frames.v1.preview import Preview, entry_shape
+from sonarpost.link.frames.v1.payload_objects import (
+    MessageObject,
+    PieceEnd,
+    PieceList,
+    Preview,
+    entry_shape,
+    unpack_object,
+)
 from sonarpost.link.state import SEPARATE, Bounds, Byte, Count
 
 DecodedObject = Preview | PieceList | MessageObject

@@ -12,24 +12,33 @@ import numpy as np
 from sonarpost.errors import FrameError
 from sonarpost.link.coding import erasure_code
 from sonarpost.link.coding.byte_ranges import Ranges
-from sonarpost.link.coding.rate_distortion import GroupDistortion, Values
-from sonarpost.link.coding.redundancy_plan import arrivals, plan_layers, plan_whole, preview_frames, symbols_to_send
+from sonarpost.link.coding.channel_capacity import Values
+from sonarpost.link.coding.erasure_code import Layering, layered_symbols
+from sonarpost.link.coding.redundancy_plan import (
+    GroupDistortion,
+    arrivals,
+    plan_layers,
+    plan_whole,
+    preview_frames,
+    symbols_to_send,
+)
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import BLOCKS, Symbol, SymbolKind
-from sonarpost.link.frames.v1.layers import Layering, layered_symbols
 from sonarpost.link.frames.v1.payload_objects import (
     CHECK_BYTES,
     MAX_STREAM_BYTES,
+    ImageNumber,
     PieceEnd,
     PieceList,
+    Preview,
     StreamPiece,
+    StreamPosition,
+    contact_link,
+    entry_shape,
 )
-from sonarpost.link.frames.v1.preview import MAX_NUMBER, Preview, contact_link, entry_shape
 from sonarpost.link.state import PROGRESS, SEPARATE, Bounds, Byte, Count
 
-ImageNumber = Annotated[int, Bounds(1, MAX_NUMBER)]
-StreamPosition = Annotated[int, Bounds(0, MAX_STREAM_BYTES)]
 StreamSpan = tuple[ImageNumber, Byte, StreamPosition, StreamPosition]
 """Number and link of an image, and a part of its stream, [start, stop)."""
 TakeNumber = Callable[[], int]

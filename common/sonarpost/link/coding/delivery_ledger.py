@@ -15,8 +15,8 @@ from sonarpost.link.coding.blocks import OutgoingImage, SendBlock
 from sonarpost.link.coding.byte_ranges import Ranges, add_range, gaps_within
 from sonarpost.link.coding.redundancy_plan import symbols_to_send
 from sonarpost.link.config import SenderConfig
-from sonarpost.link.frames.v1.feedback import NEVER_RECEIVED, WINDOW, Feedback
 from sonarpost.link.frames.v1.frame import BLOCKS
+from sonarpost.link.frames.v1.payload_objects import NEVER_RECEIVED, WINDOW, Feedback
 from sonarpost.link.state import Bounds, Count
 
 _MIN_FRAMES_TO_MEASURE: Final = 16

@@ -1,7 +1,7 @@
-"""How much of what to send: previews' redundancy, the layers of a group's pictures, the modem's rate.
+"""What to send: the value of the bytes of images, the layers of a group of images, and the number of symbols.
 
-All from the measured loss, the codec's estimates and the time that frames take. Nothing here is in the format: any
-sender may plan otherwise and every receiver will understand it.
+Inputs are the measured loss and the codec's estimates of distortion. Nothing here is part of the format: a sender may
+plan differently, and every receiver still understands it.
 """
 
 from __future__ import annotations
@@ -10,30 +10,134 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from sonarpost.errors import StreamError
 from sonarpost.link.coding.channel_capacity import LossChannel, Values, frames_for, received_distribution
-from sonarpost.link.coding.rate_distortion import GroupDistortion
-from sonarpost.link.frames.v1.layers import DESCRIPTOR_SYMBOLS, MAX_LAYERS, MAX_STEP, SHARES, Layering
+from sonarpost.link.coding.erasure_code import DESCRIPTOR_SYMBOLS, MAX_LAYERS, MAX_STEP, SHARES, Layering
+from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
+
+Counts = npt.NDArray[np.int64]
 
 PREVIEWS_UNSEEN: Final = 0.004
-"""Share of previews that may stay unseen at the loss that is planned for."""
+"""Share of previews that may stay unknown at the planned loss."""
+_PEAK_SQUARED: Final = 255.0**2
+_MIN_ERROR: Final = 0.065  # 60 dB
+_NO_IMAGE: Final = 3.0 * 55.0**2  # mean square error, against mid-grey, of an image that cannot be decoded at all
 _STEPS: Final = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 26, 34, 44, 63)
 _FIRST_TRIES: Final = 24
 _SURE: Final = 0.999
 
 
-@dataclass(frozen=True, slots=True)
-class LayerPlan:
-    """Layers and what they are expected to be worth.
+def quality_curve(stream_bytes: int, mean_square_error: Sequence[float] | Values | None = None) -> Values:
+    """Return the PSNR in dB by the number of bytes received, shape (stream_bytes + 1,).
+
+    Args:
+        stream_bytes: Length of the stream.
+        mean_square_error: Error of the image that the first n bytes give, shape (stream_bytes + 1,), infinite if there
+            is none; the codec `emb` estimates it. By default 1.2 dB for every doubling, which is typical of codecs at
+            these rates.
+
+    Raises:
+        StreamError: Another shape, or the stream is too long.
+    """
+    if stream_bytes > MAX_STREAM_BYTES:
+        raise StreamError("image", "stream", f"{stream_bytes} bytes", f"at most {MAX_STREAM_BYTES}")
+    if mean_square_error is None:
+        return 13.0 + 1.2 * np.log2(1.0 + np.arange(stream_bytes + 1) / 4.0)
+    error = np.asarray(mean_square_error, np.float64)
+    if error.shape != (stream_bytes + 1,) or np.isnan(error).any() or (error < 0).any():
+        raise StreamError("image", "mean square error", error.shape, f"{stream_bytes + 1} values of 0 or more")
+    error = np.minimum.accumulate(np.clip(error, _MIN_ERROR, _NO_IMAGE))
+    return 10.0 * np.log10(_PEAK_SQUARED / error)
+
+
+def _hull(curve: Values, start: int) -> tuple[list[int], list[float]]:
+    """Return positions and values of the corners of the upper concave hull of `curve[start:]`."""
+    # Only a rise of the curve can end in a corner.
+    rises = np.flatnonzero(np.diff(curve[start:]) > 0) + start + 1
+    places, values = [start], [float(curve[start])]
+    for place in rises.tolist():
+        value = float(curve[place])
+        while len(places) > 1 and (values[-1] - values[-2]) * (place - places[-1]) <= (value - values[-1]) * (
+            places[-1] - places[-2]
+        ):
+            places.pop()
+            values.pop()
+        places.append(place)
+        values.append(value)
+    return places, values
+
+
+@dataclass(frozen=True, eq=False)
+class GroupDistortion:
+    """Gain of the bytes of a group of images, steepest first.
+
+    The concave hull replaces the PSNR curve of each image, so that spending bytes at the steepest slope is optimal
+    (Shoham and Gersho, "Efficient bit allocation for an arbitrary set of quantizers", IEEE Trans. ASSP 36, 1988).
 
     Attributes:
-        layering: Of the block.
-        expected_db: Expected gain of the group over its previews, summed over its pictures.
+        starts: Shape (images,): bytes of each image that are sent elsewhere.
+        owners: Shape (steps,): image of each step.
+        step_bytes: Shape (steps,): bytes of each step.
+        bytes_by_step: Shape (steps + 1,): bytes of the group after each step, 0 first.
+        gain_by_step: Shape (steps + 1,): summed dB after each step, 0 first.
+    """
+
+    starts: Counts
+    owners: Counts
+    step_bytes: Counts
+    bytes_by_step: Counts
+    gain_by_step: Values
+
+    @classmethod
+    def of(cls, curves: Sequence[Values], starts: Sequence[int]) -> GroupDistortion:
+        """Merge the hulls of images, each from its start on."""
+        owners, sizes, gains = [], [], []
+        for owner, (curve, start) in enumerate(zip(curves, starts, strict=True)):
+            places, values = _hull(curve, min(start, len(curve) - 1))
+            owners += [owner] * (len(places) - 1)
+            sizes += [b - a for a, b in pairwise(places)]
+            gains += [b - a for a, b in pairwise(values)]
+        size, gain = np.array(sizes, np.int64), np.array(gains, np.float64)
+        order = np.argsort(-gain / np.maximum(size, 1), kind="stable") if size.size else np.zeros(0, np.int64)
+        return cls(
+            np.array(starts, np.int64),
+            np.array(owners, np.int64)[order],
+            size[order],
+            np.concatenate([[0], np.cumsum(size[order])]).astype(np.int64),
+            np.concatenate([[0.0], np.cumsum(gain[order])]),
+        )
+
+    @property
+    def total_bytes(self) -> int:
+        """Number of bytes with a gain."""
+        return int(self.bytes_by_step[-1])
+
+    def gains(self, group_bytes: Counts) -> Values:
+        """Return the summed dB for numbers of bytes, any shape."""
+        return np.interp(group_bytes, self.bytes_by_step, self.gain_by_step)
+
+    def stops(self, group_bytes: int) -> list[int]:
+        """Return the end of the part of each stream if the group has `group_bytes` bytes."""
+        step = int(np.searchsorted(self.bytes_by_step, group_bytes, side="right")) - 1
+        more = np.bincount(self.owners[:step], self.step_bytes[:step], self.starts.size).astype(np.int64)
+        if step < self.owners.size:
+            more[self.owners[step]] += group_bytes - self.bytes_by_step[step]
+        return [int(stop) for stop in self.starts + more]
+
+
+@dataclass(frozen=True, slots=True)
+class LayerPlan:
+    """Layers and their expected gain.
+
+    Attributes:
+        layering: The layers of the block.
+        expected_db: Expected gain over the previews, summed over the images of the group.
     """
 
     layering: Layering
@@ -41,8 +145,8 @@ class LayerPlan:
 
 
 @cache
-def _compositions(layers: int) -> npt.NDArray[np.int64]:
-    """Return every way to write 16 as a sum of `layers` positive numbers, shape (ways, layers)."""
+def _compositions(layers: int) -> Counts:
+    """Return all ways to write 16 as a sum of `layers` positive numbers, shape (ways, layers)."""
     cuts = list(combinations(range(1, SHARES), layers - 1))
     edges = np.array([(0, *cut, SHARES) for cut in cuts], np.int64)
     return np.diff(edges, axis=1)
@@ -51,19 +155,19 @@ def _compositions(layers: int) -> npt.NDArray[np.int64]:
 def plan_layers(
     distortion: GroupDistortion, symbol_bytes: int, arrive: Values, first_overhead: int, next_overhead: int
 ) -> LayerPlan | None:
-    """Return the layers with the greatest expected gain, None where the frames are too few for any.
+    """Return the layers with the greatest expected gain, None if the frames are too few.
 
-    Tries every division of a symbol in sixteenths into one to four layers, with the thresholds on a grid over the
-    frames that may arrive: all the format can say but for the grid. Of `expected = sum over layers of
-    (gain(bytes up to l) - gain(bytes up to l - 1)) P(at least k_l frames arrive)` the greatest wins.
+    Tries all divisions of a symbol into one to four layers in steps of a sixteenth, with the thresholds on a grid over
+    the number of frames that may arrive. The expected gain is the sum over layers of
+    (gain(bytes up to l) - gain(bytes up to l - 1)) P(at least k_l frames arrive).
 
     Args:
         distortion: Of the group's images.
-        symbol_bytes: Of a symbol.
+        symbol_bytes: Length of a symbol.
         arrive: Shape (frames + 1,), at most 255 frames: the probability that 0, 1, ... of them arrive. For several
-            receivers, or a loss that is not well known, the mean of several `received_distribution`.
-        first_overhead: Bytes of the lowest layer's object that are not picture.
-        next_overhead: Of every other layer's.
+            receivers or an uncertain loss, the mean of several `received_distribution`.
+        first_overhead: Bytes of the lowest layer's object that are not image data.
+        next_overhead: The same of every other layer.
     """
     frames = arrive.size - 1
     at_least = np.concatenate([np.cumsum(arrive[::-1])[::-1], np.zeros(1)])
@@ -91,13 +195,13 @@ def plan_layers(
 def plan_whole(
     distortion: GroupDistortion, symbol_bytes: int, arrive: Values, overhead: int
 ) -> tuple[int, float] | None:
-    """Return k and the expected gain of a block without layers (for groups too small for any), or None.
+    """Return k and the expected gain of a block without layers (for groups that are too small for layers), or None.
 
     Args:
         distortion: Of the group's images.
-        symbol_bytes: Of a symbol.
+        symbol_bytes: Length of a symbol.
         arrive: See `plan_layers`.
-        overhead: Bytes of the object that are not picture.
+        overhead: Bytes of the object that are not image data.
     """
     needs = np.arange(1, arrive.size)
     at_least = np.cumsum(arrive[::-1])[::-1][1:]
@@ -112,7 +216,7 @@ def plan_whole(
 def _best_shares(
     distortion: GroupDistortion,
     symbol_bytes: int,
-    needs: npt.NDArray[np.int64],
+    needs: Counts,
     reached: Values,
     first_overhead: int,
     next_overhead: int,
@@ -121,7 +225,7 @@ def _best_shares(
     edges = symbol_bytes * np.concatenate([np.zeros((len(shares), 1), np.int64), np.cumsum(shares, axis=1)], axis=1)
     overhead = np.where(np.arange(needs.size) == 0, first_overhead, next_overhead)
     room = np.diff(edges // SHARES, axis=1) * needs - overhead
-    # A layer without room for its own head cannot be made.
+    # A layer without room for its own overhead is impossible.
     values = distortion.gains(np.cumsum(np.maximum(room, 0), axis=1))
     steps = np.diff(values, axis=1, prepend=0.0)
     expected = np.where((room > 0).all(axis=1), steps @ reached, -1.0)
@@ -130,47 +234,47 @@ def _best_shares(
 
 
 def arrivals(frames: int, channels: Sequence[LossChannel], depth: int) -> Values:
-    """Return the probability that 0, 1, ... of a block's frames arrive, over receivers that are equally important.
+    """Return the probability that 0, 1, ... of the frames of a block arrive, as the mean over all receivers.
 
     Args:
-        frames: That are sent.
-        channels: What each receiver's frames meet.
-        depth: How far apart the block's frames are sent.
+        frames: Frames to send.
+        channels: Channel to each receiver.
+        depth: Distance between the frames of a block, in frames.
     """
-    met: list[Values] = [received_distribution(frames, channel.spread(depth)) for channel in channels]
-    mean: Values = np.mean(met, axis=0)
+    distributions: list[Values] = [received_distribution(frames, channel.spread(depth)) for channel in channels]
+    mean: Values = np.mean(distributions, axis=0)
     return mean
 
 
 def preview_frames(source_symbols: int, channel: LossChannel, unseen: float = PREVIEWS_UNSEEN, limit: int = 255) -> int:
-    """Return how many frames of a preview block to send for at most `unseen` of its contacts to stay unseen.
+    """Return how many frames of a preview block to send so that at most `unseen` of its contacts stay unknown.
 
     At most `limit`, but every source symbol once.
     """
     return frames_for(source_symbols, channel, unseen, limit=min(255, limit))
 
 
-def copies(channel: LossChannel, missed: float = 0.01, most: int = 8) -> int:
-    """Return how often to send what must arrive and fits one frame: missed at most with the given probability."""
+def copies(channel: LossChannel, missed: float = 0.01, limit: int = 8) -> int:
+    """Return how many copies of a frame to send so that all are lost with a probability of at most `missed`."""
     if channel.loss <= missed:
         return 1
-    return min(most, math.ceil(math.log(missed) / math.log(channel.loss)))
+    return min(limit, math.ceil(math.log(missed) / math.log(channel.loss)))
 
 
-def symbols_to_send(needed: int, channel: LossChannel, caution: float) -> int:
-    """Return how many symbols to send before the next report when `needed` are lacking.
+def symbols_to_send(missing_symbols: int, channel: LossChannel, caution: float) -> int:
+    """Return how many symbols to send before the next feedback.
 
-    Fewer than would arrive on average: what still lacks is asked for again, what arrives beyond the need is wasted.
+    Fewer than the average need: feedback requests the rest, while symbols beyond the need are useless.
 
     Args:
-        needed: Symbols that the receiver lacks.
-        channel: What they meet.
-        caution: Standard deviations by which to stay below the average, 0 or more.
+        missing_symbols: Symbols that the receiver lacks.
+        channel: The channel.
+        caution: Standard deviations below the average.
     """
-    if needed <= 0:
+    if missing_symbols <= 0:
         return 0
     passed = 1.0 - channel.loss
     memory = channel.memory
     widening = (1 + memory) / (1 - memory)
-    deviation = math.sqrt(needed * channel.loss * widening) / passed
-    return max(needed, math.ceil(needed / passed - caution * deviation))
+    deviation = math.sqrt(missing_symbols * channel.loss * widening) / passed
+    return max(missing_symbols, math.ceil(missing_symbols / passed - caution * deviation))

@@ -19,7 +19,7 @@ from typing import Final, Literal, TypeVar
 
 from sonarpost.errors import FrameError
 from sonarpost.link.frames.paper.frame import format_image_id
-from sonarpost.link.frames.v1.preview import MAX_NUMBER
+from sonarpost.link.frames.v1.payload_objects import MAX_NUMBER
 from sonarpost.messages import Verdict
 
 SMALLEST_ROOM_BYTES: Final = 27

@@ -15,8 +15,8 @@ from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.downlink.commands import CommandTracker, PendingCommand
 from sonarpost.link.downlink.messages import ConfirmationMessage, DataMessage, unpack
 from sonarpost.link.frames.paper.receiver import PaperReceiver
-from sonarpost.link.frames.v1.feedback import Feedback
 from sonarpost.link.frames.v1.frame import FrameProtection, Segment, SegmentKind, pack_segments, segments_room
+from sonarpost.link.frames.v1.payload_objects import Feedback
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.receiver import (
     CombinedReceiver,

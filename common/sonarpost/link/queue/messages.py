@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field
 from typing import Annotated, Final
 
 from sonarpost.errors import FrameError
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind
-from sonarpost.link.state import Bounds, Byte, Count
+from sonarpost.link.state import SEPARATE, Bounds, Byte, Count, PartReader, pack_part
 
 LOWEST_PRIORITY: Final = 7
 FILLER_PRIORITY: Final = 6
@@ -64,18 +63,18 @@ class MessageQueue:
     """The messages that wait.
 
     Attributes:
-        waiting: By key.
         next_key: Key of the next message.
         served: Bytes sent for each program. A program without waiting messages starts at the least value of the others.
-        known: Order of the recently accepted identifiers, to reject a message that arrives twice.
         expired: Number of messages that expired.
+        waiting: By key.
+        known: Order of the recently accepted identifiers, to reject a message that arrives twice.
     """
 
-    waiting: dict[int, QueuedMessage] = field(default_factory=dict)
-    next_key: int = 0
-    served: Counter[str] = field(default_factory=Counter)
-    known: dict[str, int] = field(default_factory=dict)
-    expired: int = 0
+    next_key: Count = 0
+    served: dict[str, Count] = field(default_factory=dict)
+    expired: Count = 0
+    waiting: dict[int, QueuedMessage] = field(default_factory=dict, metadata=SEPARATE)
+    known: dict[str, int] = field(default_factory=dict, metadata=SEPARATE)
 
     @property
     def waiting_bytes(self) -> int:
@@ -95,8 +94,8 @@ class MessageQueue:
         active = {m.source for m in self.waiting.values()}
         if source not in active:
             # A silent program gets no credit: otherwise it could block all others for as long.
-            floor = min((self.served[name] for name in active), default=0)
-            self.served[source] = max(self.served[source], floor)
+            floor = min((self.served.get(name, 0) for name in active), default=0)
+            self.served[source] = max(self.served.get(source, 0), floor)
         message = QueuedMessage(self.next_key, message_id, source, priority, added_s, expires_s, data)
         self.waiting[message.key] = message
         self.next_key += 1
@@ -113,13 +112,32 @@ class MessageQueue:
     def next(self, now: float, aging_s: float) -> QueuedMessage | None:
         """Return the message to send next: most urgent level, then least served program, then oldest."""
         return min(
-            self.waiting.values(), key=lambda m: (m.level(now, aging_s), self.served[m.source], m.key), default=None
+            self.waiting.values(),
+            key=lambda m: (m.level(now, aging_s), self.served.get(m.source, 0), m.key),
+            default=None,
         )
 
     def remove(self, message: QueuedMessage) -> None:
         """Remove a message that is being sent, and count its bytes for the program."""
         del self.waiting[message.key]
-        self.served[message.source] += len(message.data)
+        self.served[message.source] = self.served.get(message.source, 0) + len(message.data)
+
+    def parts(self) -> dict[str, bytes]:
+        """Return the state to save, see `sonarpost.link.state`."""
+        waiting = {f"message/{key}": pack_part(message) for key, message in self.waiting.items()}
+        known = {f"message-id/{n}": pack_part(MessageIdentifier(n, name)) for name, n in self.known.items()}
+        return {"messages": pack_part(self), **waiting, **known}
+
+    @classmethod
+    def restored(cls, reader: PartReader) -> MessageQueue:
+        """Return the queue that was saved."""
+        waiting = sorted(reader.read_group("message", QueuedMessage), key=lambda m: m.key)
+        known = sorted(reader.read_group("message-id", MessageIdentifier), key=lambda m: m.order)
+        keys = [*(m.key for m in waiting), *(m.order for m in known)]
+        queue = reader.read("messages", cls) or cls(next_key=1 + max(keys, default=-1))
+        queue.waiting = {m.key: m for m in waiting}
+        queue.known = {m.name: m.order for m in known}
+        return queue
 
 
 @dataclass(eq=False)

@@ -7,23 +7,20 @@ time, so that urgent content waits for one packet at most.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
 from sonarpost.link.coding.blocks import OutgoingImage
 from sonarpost.link.coding.channel_capacity import LossChannel, RateSelector
-from sonarpost.link.coding.rate_distortion import quality_curve
-from sonarpost.link.coding.redundancy_plan import copies
+from sonarpost.link.coding.redundancy_plan import copies, quality_curve
 from sonarpost.link.config import QueueConfig, SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
-from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest
 from sonarpost.link.frames.v1.frame import FrameProtection
-from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
+from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, Feedback, RefineRequest
 from sonarpost.link.frames.v1.sender import V1Sender
-from sonarpost.link.queue.messages import FILLER_PRIORITY, MessageIdentifier, MessageQueue, QueuedMessage
-from sonarpost.link.sender import ExpectedDelivery, ImageToSend, OutgoingPacket
+from sonarpost.link.queue.messages import FILLER_PRIORITY, MessageQueue
+from sonarpost.link.sender import ExpectedDelivery, ImageToSend, OutgoingPacket, RateNumber
 from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
 from sonarpost.modem.micromodem import RATES
 
@@ -44,9 +41,6 @@ class QueueState:
     """The small state of the queue, which changes with every packet.
 
     Attributes:
-        next_key: See `MessageQueue`.
-        served: See `MessageQueue`.
-        expired: See `MessageQueue`.
         rate: The rate in use.
         losses: See `RateSelector`.
         packet_interval_s: Smoothed time from one packet to the next.
@@ -57,24 +51,14 @@ class QueueState:
         planned_loss: Loss that plans use.
     """
 
-    next_key: Count
-    served: dict[str, int]
-    expired: Count
-    rate: Annotated[int, Bounds(min(RATES), max(RATES))]
-    losses: dict[Annotated[int, Bounds(min(RATES), max(RATES))], tuple[Annotated[float, Bounds(0, 1)], float]]
+    rate: RateNumber
+    losses: dict[RateNumber, tuple[Annotated[float, Bounds(0, 1)], float]]
     packet_interval_s: Annotated[float, Bounds(0, 1e9)]
     image_credit: float
     last_feedback_s: float | None
     frames_at_feedback: Count
     feedback: bool
     planned_loss: Annotated[float, Bounds(0, _MAX_LOSS)]
-
-
-@dataclass(frozen=True, slots=True)
-class InFlight:
-    """The packet that is being sent. `packet`: None between packets."""
-
-    packet: OutgoingPacket | None = None
 
 
 class TransmitQueue:
@@ -251,7 +235,7 @@ class TransmitQueue:
 
     def _feedback_arrived(self, now: float) -> None:
         self.last_feedback_s = now
-        self._frames_at_feedback = self.sender.frames_sent
+        self._frames_at_feedback = self.sender.state.frames_sent
         if self.config.feedback == "auto":
             self.sender.expect_feedback(expected=True)
 
@@ -269,9 +253,9 @@ class TransmitQueue:
         while len(frames) < RATES[self.rate].frames:
             self._load_messages(now)
             frame = self._next_frame(now)
-            if frame is None and not frames and self.sender.messages.waiting:
+            if frame is None and not frames and self.sender.state.messages.waiting:
                 # There is nothing to send between two copies of a message.
-                self.sender.messages.release(self.sender.frames_sent)
+                self.sender.state.messages.release(self.sender.state.frames_sent)
                 frame = self._next_frame(now)
             if frame is None:
                 break
@@ -293,8 +277,8 @@ class TransmitQueue:
         self.messages.prune(now)
         last_s = self.last_feedback_s
         if not self.sender.blocks:
-            self._frames_at_feedback = self.sender.frames_sent  # receivers have nothing to report
-        frames = self.sender.frames_sent - self._frames_at_feedback
+            self._frames_at_feedback = self.sender.state.frames_sent  # receivers have nothing to report
+        frames = self.sender.state.frames_sent - self._frames_at_feedback
         late = last_s is not None and not 0 <= now - last_s <= self.config.feedback_memory_s
         if late and frames >= _FRAMES_WITHOUT_FEEDBACK:
             self.last_feedback_s = None
@@ -303,13 +287,13 @@ class TransmitQueue:
             self.rate_selector.record_loss(1.0, now)
         before = self.rate
         if self.rate_selector.select(now) != before:
-            self.sender.tracker.meters.clear()
+            self.sender.state.tracker.meters.clear()
             self.sender.resize(RATES[self.rate].frame_bytes)
 
     def _load_messages(self, now: float) -> None:
         """Pass the next messages to the sender; the others wait here, where more urgent ones can overtake them."""
         room = _FRAMES_LOADED * self.sender.symbol_bytes
-        loaded = sum(len(m.data) for m in self.sender.messages.waiting)
+        loaded = sum(len(m.data) for m in self.sender.state.messages.waiting)
         worst, missed = self.sender.config.worst, self.config.message_missed
         while loaded < room and (message := self.messages.next(now, self.config.aging_s)) is not None:
             level = message.level(now, self.config.aging_s)
@@ -349,7 +333,7 @@ class TransmitQueue:
         frame_s = self.packet_interval_s / RATES[self.rate].frames
         frames_of = dict.fromkeys(self.open_numbers(), 0.0)
         previews: dict[int, float] = {}
-        ahead = len(self.sender.messages.waiting) / 2
+        ahead = len(self.sender.state.messages.waiting) / 2
         for block in [b for b in self.sender.blocks if b.is_fresh_preview and b.left > 0]:
             ahead += block.source_symbols - block.sent
             previews.update(dict.fromkeys(block.contacts, now + ahead * frame_s))
@@ -391,9 +375,6 @@ class TransmitQueue:
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`."""
         state = QueueState(
-            next_key=self.messages.next_key,
-            served=dict(self.messages.served),
-            expired=self.messages.expired,
             rate=self.rate,
             losses=self.rate_selector.losses,
             packet_interval_s=self.packet_interval_s,
@@ -403,13 +384,8 @@ class TransmitQueue:
             feedback=self.sender.config.feedback,
             planned_loss=min(self.planned_loss, _MAX_LOSS),
         )
-        messages = {f"message/{key}": pack_part(message) for key, message in self.messages.waiting.items()}
-        known = {
-            f"message-id/{order}": pack_part(MessageIdentifier(order, name))
-            for name, order in self.messages.known.items()
-        }
-        own = {"queue": pack_part(state), "packet": pack_part(InFlight(self._packet))}
-        return {**self.sender.parts(), **messages, **known, **own}
+        parts = {"queue": pack_part(state), **self.messages.parts(), **self.sender.parts()}
+        return parts if self._packet is None else {**parts, "packet": pack_part(self._packet)}
 
     def restore(self, parts: Parts) -> Errors:
         """Replace the state of a new queue by saved parts; the configuration stays.
@@ -420,18 +396,9 @@ class TransmitQueue:
             Why parts were skipped.
         """
         reader = PartReader(parts, "queue state")
-        messages = reader.read_group("message", QueuedMessage)
-        known = reader.read_group("message-id", MessageIdentifier)
-        packet = reader.read("packet", InFlight)
         state = reader.read("queue", QueueState)
-        self.messages = MessageQueue(
-            waiting={m.key: m for m in sorted(messages, key=lambda m: m.key)},
-            next_key=1 + max((m.key for m in messages), default=-1) if state is None else state.next_key,
-            served=Counter({} if state is None else state.served),
-            known={m.name: m.order for m in sorted(known, key=lambda m: m.order)},
-            expired=0 if state is None else state.expired,
-        )
-        self._packet = None if packet is None else packet.packet
+        self._packet = reader.read("packet", OutgoingPacket)
+        self.messages = MessageQueue.restored(reader)
         if state is not None:
             self._restore_plan(state)
         errors = {**reader.errors, **self.sender.restore(parts)}
@@ -440,12 +407,11 @@ class TransmitQueue:
         return errors
 
     def _restore_plan(self, state: QueueState) -> None:
-        channel = LossChannel(state.planned_loss, self.config.burst_frames)
         self.sender.config = replace(
             self.sender.config,
             frame_bytes=RATES[state.rate].frame_bytes,
             feedback=state.feedback,
-            channels=(channel,),
+            channels=(LossChannel(state.planned_loss, self.config.burst_frames),),
         )
         self.rate_selector.losses = dict(state.losses)
         if state.rate in self.config.rates:

@@ -32,7 +32,7 @@ from sonarpost.link.frames.paper.frame import (
     HalfName,
     half_bounds,
 )
-from sonarpost.link.frames.v1.feedback import Feedback, RefineRequest
+from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
 from sonarpost.link.sender import ExpectedDelivery, ImageToSend, OutgoingPacket
 from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
 from sonarpost.modem.micromodem import RATES

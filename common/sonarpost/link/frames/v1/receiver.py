@@ -12,7 +12,6 @@ from sonarpost.link.coding.byte_ranges import PartialBytes
 from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import NEVER_RECEIVED, WINDOW, Feedback, RefineRequest, pack_mini
 from sonarpost.link.frames.v1.frame import (
     BLOCKS,
     FrameProtection,
@@ -22,8 +21,19 @@ from sonarpost.link.frames.v1.frame import (
     parse_frame,
     parse_symbol,
 )
-from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, MessageObject, StreamPiece
-from sonarpost.link.frames.v1.preview import MAX_NUMBER, Preview, contact_link
+from sonarpost.link.frames.v1.payload_objects import (
+    MAX_NUMBER,
+    MAX_STREAM_BYTES,
+    NEVER_RECEIVED,
+    WINDOW,
+    Feedback,
+    MessageObject,
+    Preview,
+    RefineRequest,
+    StreamPiece,
+    contact_link,
+    pack_mini,
+)
 from sonarpost.link.receiver import Event, FeedbackReceived, FrameRejected, ImageUpdate, MessageReceived
 from sonarpost.link.state import SEPARATE, Bounds, Byte, Count, Errors, PartReader, Parts, pack_part
 

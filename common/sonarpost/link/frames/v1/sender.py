@@ -12,7 +12,6 @@ from typing import Annotated, Final
 
 from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.coding.blocks import (
-    ImageNumber,
     OutgoingImage,
     SendBlock,
     group_limit,
@@ -20,21 +19,18 @@ from sonarpost.link.coding.blocks import (
     numbers_needed,
     whole_blocks,
 )
-from sonarpost.link.coding.channel_capacity import LossChannel
+from sonarpost.link.coding.channel_capacity import LossChannel, Values
 from sonarpost.link.coding.delivery_ledger import (
     FeedbackTracker,
-    LossMeter,
     deletion_order,
     missing_images,
     record_delivered,
     take_reported,
     within_window,
 )
-from sonarpost.link.coding.rate_distortion import Values, quality_curve
-from sonarpost.link.coding.redundancy_plan import copies, symbols_to_send
+from sonarpost.link.coding.redundancy_plan import copies, quality_curve, symbols_to_send
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.feedback import WINDOW, Feedback, RefineRequest
 from sonarpost.link.frames.v1.frame import (
     BLOCKS,
     HEADER_BYTES,
@@ -43,15 +39,22 @@ from sonarpost.link.frames.v1.frame import (
     SegmentKind,
     Symbol,
     SymbolKind,
-    check_segment,
     pack_segments,
     pack_symbol,
     segments_room,
 )
-from sonarpost.link.frames.v1.payload_objects import MESSAGE_OVERHEAD_BYTES, MessageObject
-from sonarpost.link.frames.v1.preview import ENTRY_HEAD_BYTES, MAX_NUMBER
-from sonarpost.link.queue.messages import MessageCopies, MessageSender
-from sonarpost.link.state import Bounds, Byte, Count, Errors, PartReader, Parts, pack_part
+from sonarpost.link.frames.v1.payload_objects import (
+    ENTRY_HEAD_BYTES,
+    MAX_NUMBER,
+    MESSAGE_OVERHEAD_BYTES,
+    WINDOW,
+    Feedback,
+    ImageNumber,
+    MessageObject,
+    RefineRequest,
+)
+from sonarpost.link.queue.messages import MessageSender
+from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
 
 _MIN_PREFIX_BYTES: Final = 16
 _MAX_SYMBOL_FACTOR: Final = 4
@@ -70,25 +73,13 @@ class SenderState:
         next_block: Number of the next block.
         frames_sent: Frames sent since the first start.
         messages: Messages in transmission.
-        next_message: Number of the next message.
-        feedback: Feedback and requests to send.
-        receivers: See `FeedbackTracker`.
-        meters: See `FeedbackTracker`.
+        tracker: Receivers that send feedback.
     """
 
     next_block: Annotated[int, Bounds(0, BLOCKS - 1)]
-    frames_sent: Count
-    messages: list[MessageCopies]
-    next_message: Byte
-    feedback: list[Segment]
-    receivers: dict[int, float]
-    meters: dict[int, LossMeter]
-
-    def __post_init__(self) -> None:
-        for segment in self.feedback:
-            check_segment(segment)
-        if not all(message.data for message in self.messages):
-            raise FrameError("sender", "messages", b"", "at least one byte each")
+    frames_sent: Count = 0
+    messages: MessageSender = field(default_factory=MessageSender)
+    tracker: FeedbackTracker = field(default_factory=FeedbackTracker)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +101,7 @@ class V1Sender:
         retired: Blocks that were sent without feedback, and that feedback can still mention.
         kept: Images by number, the oldest first, including those that wait.
         may_repair: Whether some images may lack a part that no block holds.
+        state: The rest of the state.
 
     Args:
         config: The configuration.
@@ -126,12 +118,8 @@ class V1Sender:
         self.blocks: list[SendBlock] = []
         self.retired: list[SendBlock] = []
         self.may_repair = True
-        self.messages = MessageSender()
         self.kept: dict[int, OutgoingImage] = {}
-        self.next_block = first_block % BLOCKS
-        self.frames_sent = 0
-        self.tracker = FeedbackTracker()
-        self.feedback: list[Segment] = []
+        self.state = SenderState(first_block % BLOCKS)
 
     @property
     def symbol_bytes(self) -> int:
@@ -142,12 +130,12 @@ class V1Sender:
     @property
     def is_idle(self) -> bool:
         """Whether there is nothing to send, and nothing that feedback can request."""
-        return not (self.waiting or self.blocks or self.messages.waiting or self.feedback)
+        return not (self.waiting or self.blocks or self.state.messages.waiting)
 
     @property
     def measured_loss(self) -> float | None:
         """Share of frames lost according to the feedback of the worst receiver; None before the second feedback."""
-        return self.tracker.loss
+        return self.state.tracker.loss
 
     def add_image(
         self,
@@ -163,7 +151,7 @@ class V1Sender:
         """Add a contact and its image.
 
         Args:
-            number: Number of the contact, 1..65535; consecutive for consecutive contacts (`next_number`).
+            number: Number of the contact, 1..65535; consecutive for consecutive contacts (`number_after`).
             contact: The contact record.
             stream: Header and body, as much as may ever be sent.
             now: Seconds.
@@ -219,12 +207,7 @@ class V1Sender:
             FrameError: Empty or too long.
         """
         times = copies(self.config.worst) if times is None else max(1, times)
-        return self.messages.add(data, priority, float(now + lifetime_s), times, rises_s)
-
-    def add_feedback(self, feedback: Feedback | RefineRequest) -> None:
-        """Send feedback or a request in the next frame (a receiver's feedback goes through its own sender)."""
-        kind = SegmentKind.FEEDBACK if isinstance(feedback, Feedback) else SegmentKind.REQUEST
-        self.feedback.append(Segment(int(kind), feedback.pack()))
+        return self.state.messages.add(data, priority, float(now + lifetime_s), times, rises_s)
 
     def plan_for(self, channels: tuple[LossChannel, ...]) -> None:
         """Use another measured loss for future plans; existing plans stay."""
@@ -261,13 +244,6 @@ class V1Sender:
         again = {number for block in lost for number in block.contacts} - waiting
         self.waiting = [image for number, image in self.kept.items() if number in again] + self.waiting
 
-    def next_packet(self, frames: int, now: float) -> tuple[bytes, ...]:
-        """Return up to `frames` frames, none if there is nothing to send."""
-        packet: list[bytes] = []
-        while len(packet) < frames and (frame := self.next_frame(now)) is not None:
-            packet.append(frame)
-        return tuple(packet)
-
     def next_frame(self, now: float, *, images_first: bool = False) -> bytes | None:
         """Return the next frame, None if there is nothing to send.
 
@@ -277,12 +253,12 @@ class V1Sender:
         """
         self._begin_groups(now)
         self._begin_repairs(now)
-        self.messages.prune(now)
+        self.state.messages.prune(now)
         self._begin_long_messages(now)
         frame = self._images_frame(now) if images_first else self._segments_frame(now, min_priority=0)
         frame = frame or self._images_frame(now) or self._segments_frame(now, min_priority=_ANY_PRIORITY)
         if frame is not None:
-            self.frames_sent += 1
+            self.state.frames_sent += 1
         return frame
 
     def _images_frame(self, now: float) -> bytes | None:
@@ -335,22 +311,22 @@ class V1Sender:
     def _free_numbers(self) -> int:
         if not self.blocks:
             return WINDOW
-        return WINDOW - (self.next_block - self.blocks[0].number) % BLOCKS
+        return WINDOW - (self.state.next_block - self.blocks[0].number) % BLOCKS
 
     def _take_number(self) -> int:
         # A block beyond the window replaces the oldest: receivers delete it too.
         while self._free_numbers() < 1:
             self.blocks.pop(0)
             self.may_repair = True
-        number = self.next_block
-        self.next_block = (number + 1) % BLOCKS
+        number = self.state.next_block
+        self.state.next_block = (number + 1) % BLOCKS
         # A new block must never be mistaken for a retired one with the same number.
-        self.retired = within_window(self.retired, self.next_block)
+        self.retired = within_window(self.retired, self.state.next_block)
         return number
 
     def _begin_long_messages(self, now: float) -> None:
         room = segments_room(self.config.frame_bytes, self._protection) - 2
-        while self._free_numbers() >= 1 and (message := self.messages.take_long(room)) is not None:
+        while self._free_numbers() >= 1 and (message := self.state.messages.take_long(room)) is not None:
             size = self.symbol_bytes
             source = -(-(len(message.data) + MESSAGE_OVERHEAD_BYTES) // size)
             block = SendBlock(
@@ -367,19 +343,15 @@ class V1Sender:
             self.blocks.append(block)
 
     def _segments_frame(self, now: float, min_priority: int) -> bytes | None:
-        """Return a frame of feedback and messages of at least a priority, filled up; None if there are none."""
+        """Return a frame of messages of at least a priority, filled up; None if there are none."""
         room = segments_room(self.config.frame_bytes, self._protection)
-        chosen: list[Segment] = []
-        while self.feedback and self.feedback[0].size <= room:
-            chosen.append(self.feedback.pop(0))
-            room -= chosen[-1].size
-        if not chosen and not self.messages.has_ready(min_priority, self.frames_sent):
+        messages, frame = self.state.messages, self.state.frames_sent
+        if not messages.has_ready(min_priority, frame):
             return None
-        messages = self.messages.segments(room, self.frames_sent, spacing=round(4 * self.config.worst.burst))
-        room -= sum(segment.size for segment in messages)
-        chosen += messages
+        chosen = messages.segments(room, frame, spacing=round(4 * self.config.worst.burst))
         if not chosen:
             return None
+        room -= sum(segment.size for segment in chosen)
         return pack_segments([*chosen, *self._fillers(room)], self.config.frame_bytes, self._protection)
 
     def _fillers(self, room: int) -> list[Segment]:
@@ -477,7 +449,7 @@ class V1Sender:
             self.refine(feedback, now)
             return
         self._resume_retired(feedback)
-        self.tracker.measure(feedback, receiver, self.frames_sent)
+        self.state.tracker.measure(feedback, receiver, self.state.frames_sent)
         self._apply(feedback, now, receiver)
 
     def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int = 0) -> None:
@@ -487,7 +459,7 @@ class V1Sender:
         self._apply(feedback, now, receiver)
 
     def _apply(self, feedback: Feedback, now: float, receiver: int) -> None:
-        self.blocks, done = self.tracker.apply(feedback, self.blocks, self.config, now, receiver)
+        self.blocks, done = self.state.tracker.apply(feedback, self.blocks, self.config, now, receiver)
         record_delivered(self.kept, done)
 
     def _resume_retired(self, feedback: Feedback) -> None:
@@ -495,7 +467,7 @@ class V1Sender:
         if self.config.feedback and (found := take_reported(self.retired, feedback)):
             for block in found:
                 block.retired = False
-            self.blocks = sorted([*self.blocks, *found], key=lambda b: (b.number - self.next_block) % BLOCKS)
+            self.blocks = sorted([*self.blocks, *found], key=lambda b: (b.number - self.state.next_block) % BLOCKS)
 
     def refine(self, request: RefineRequest, now: float) -> bool:
         """Send more detail of an image than was planned; return whether there is any.
@@ -518,16 +490,8 @@ class V1Sender:
 
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`."""
-        state = SenderState(
-            self.next_block,
-            self.frames_sent,
-            self.messages.waiting,
-            self.messages.next_number,
-            self.feedback,
-            self.tracker.receivers,
-            self.tracker.meters,
-        )
-        parts = {"sender": pack_part(state), "waiting": pack_part(WaitingImages([i.number for i in self.waiting]))}
+        waiting = WaitingImages([image.number for image in self.waiting])
+        parts = {"sender": pack_part(self.state), "waiting": pack_part(waiting)}
         for image in {image.number: image for image in (*self.kept.values(), *self.waiting)}.values():
             parts[f"image/{image.number}"] = pack_part(image)
             parts[f"image-progress/{image.number}"] = pack_part(image, "progress")
@@ -549,11 +513,11 @@ class V1Sender:
         images = reader.read_group("image", OutgoingImage, progress="image-progress")
         blocks = reader.read_group("block", SendBlock, progress="block-progress")
         waiting = reader.read("waiting", WaitingImages) or WaitingImages()
-        state = reader.read("sender", SenderState) or SenderState(self.next_block, 0, [], 0, [], {}, {})
+        state = reader.read("sender", SenderState) or self.state
         self.kept = {image.number: image for image in sorted(images, key=lambda image: image.order)}
         self.waiting = [self.kept[number] for number in waiting.numbers if number in self.kept]
         if "sender" not in reader or any(not name.startswith("image/") for name in reader.errors):
-            # Receivers must not take new blocks for those that they have: half the numbers away they do not.
+            # A receiver takes a block half the numbers away for a new one.
             state.next_block = (blocks[0].number + WINDOW) % BLOCKS if blocks else state.next_block
             blocks = []
             self.waiting = [image for image in self.kept.values() if missing_images([image], self.config, (), 1)]
@@ -562,9 +526,5 @@ class V1Sender:
         blocks.sort(key=lambda b: (b.number - state.next_block) % BLOCKS)
         self.blocks = [block for block in blocks if not block.retired]
         self.retired = [block for block in blocks if block.retired]
-        self.next_block, self.frames_sent = state.next_block, state.frames_sent
-        self.messages = MessageSender(state.messages, state.next_message)
-        self.feedback = state.feedback
-        self.tracker = FeedbackTracker(state.receivers, state.meters)
-        self.may_repair = True
+        self.state, self.may_repair = state, True
         return reader.errors
