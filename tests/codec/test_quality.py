@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from sonarpost.codec.quality import fom, psnr_db, ssim
+from sonarpost.codec.quality import psnr_db, ssim
+from sonarpost.codec.vq.builder import figure_of_merit
 from sonarpost.errors import StreamError
 
 
@@ -16,7 +17,7 @@ def noise(height_px: int, width_px: int, seed: int = 0) -> np.ndarray:
 
 
 def ssim_by_definition(a: np.ndarray, b: np.ndarray) -> float:
-    """Wang et al. 2004, window by window."""
+    """Return the SSIM of Wang et al. 2004, computed window by window."""
     axis = np.arange(-5, 6)
     line = np.exp(-(axis**2) / (2 * 1.5**2))
     window = np.outer(line, line) / line.sum() ** 2
@@ -40,39 +41,39 @@ def test_psnr_of_known_errors() -> None:
     assert psnr_db(np.zeros_like(image), np.full_like(image, 255)) == 0.0
 
 
-def test_ssim_follows_its_definition() -> None:
+def test_ssim_matches_its_definition() -> None:
     a = noise(23, 19)
     b = np.clip(a.astype(int) + noise(23, 19, 1) // 4 - 32, 0, 255).astype(np.uint8)
     assert ssim(a, b) == pytest.approx(ssim_by_definition(a, b), abs=1e-9)
     assert 0.5 < ssim(a, b) < 1
-    assert fom(a, b) == 100 * ssim(a, b)
+    assert figure_of_merit(a, b) == 100 * ssim(a, b)
 
 
-def test_ssim_of_equal_opposite_and_unrelated_pictures() -> None:
+def test_ssim_of_equal_inverted_and_unrelated_images() -> None:
     a = noise(40, 40)
     assert ssim(a, a) == pytest.approx(1.0)
     assert ssim(a, 255 - a) < -0.8
     assert abs(ssim(a, noise(40, 40, 2))) < 0.1
 
 
-def test_ssim_of_pictures_narrower_than_the_window() -> None:
+def test_ssim_of_images_narrower_than_the_window() -> None:
     a = noise(6, 30)
     assert ssim(a, a) == pytest.approx(1.0)
     assert ssim(a, noise(6, 30, 1)) < 0.5
 
 
-@pytest.mark.parametrize("measure", [psnr_db, ssim, fom])
+@pytest.mark.parametrize("measure", [psnr_db, ssim, figure_of_merit])
 @pytest.mark.parametrize(
     ("a", "b", "field"),
     [
-        (noise(16, 16), noise(16, 17), "rebuilt.shape"),
+        (noise(16, 16), noise(16, 17), "decoded.shape"),
         (noise(16, 16)[:0], noise(16, 16)[:0], "original.shape"),
         (noise(16, 16)[0], noise(16, 16)[0], "original.shape"),
-        (noise(16, 16), noise(16, 16).astype(float), "rebuilt.dtype"),
+        (noise(16, 16), noise(16, 16).astype(float), "decoded.dtype"),
         (noise(16, 16).astype(np.uint16), noise(16, 16), "original.dtype"),
     ],
 )
-def test_pictures_that_cannot_be_compared_are_refused(measure, a, b, field: str) -> None:
+def test_images_that_cannot_be_compared_are_rejected(measure, a, b, field: str) -> None:
     with pytest.raises(StreamError) as caught:
         measure(a, b)
     assert caught.value.field == field

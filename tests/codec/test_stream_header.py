@@ -1,4 +1,4 @@
-"""The header that every codec's stream begins with: golden bytes, every size, every kind of tag, hostile input."""
+"""The stream header: golden bytes, every size, every kind of tag, invalid input."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sonarpost.errors import StreamError
 
 GOLDEN = json.loads((GOLDEN_FOLDER / "codec" / "stream_headers.json").read_text())
 UNCOMMON_SIDES_PX = sorted(set(range(MIN_SIDE_PX, MAX_SIDE_PX + 1)) - set(COMMON_SIDES_PX))
-ONE_ID_OF_EACH_KIND = (0x01, 0x10, 0x20, 0x80)
+ONE_CODEC_ID_OF_EACH_CLASS = (0x01, 0x10, 0x20, 0x80)
 SHA256 = "f893" + "a5" * 30
 
 
@@ -55,11 +55,11 @@ def test_golden_rejected_headers(case: dict[str, Any]) -> None:
     assert str(caught.value).startswith("stream 7: ")
 
 
-def test_the_common_sides_are_those_of_the_format() -> None:
+def test_common_sides_are_those_of_the_format() -> None:
     assert list(COMMON_SIDES_PX) == GOLDEN["common_sides_px"]
 
 
-def test_every_codec_id_has_the_tag_length_of_its_class() -> None:
+def test_tag_length_of_every_codec_id() -> None:
     lengths = [tag_length(codec_id) for codec_id in range(256)]
     assert lengths == [0] * 0x10 + [2] * 0x10 + [1] * 0x60 + [2] * 0x80
 
@@ -68,15 +68,15 @@ def test_every_codec_id_has_the_tag_length_of_its_class() -> None:
     ("codec_id", "tag"),
     [(0x00, 0), (0x0F, 0), (0x10, 0xF893), (0x1F, 0xF893), (0x20, 0xF8), (0x7F, 0xF8), (0x80, 0xF893), (0xFF, 0xF893)],
 )
-def test_the_tag_is_the_beginning_of_the_models_hash(codec_id: int, tag: int) -> None:
+def test_tag_is_the_start_of_the_model_hash(codec_id: int, tag: int) -> None:
     assert model_tag(codec_id, SHA256) == tag
     assert model_tag(codec_id, "") == 0
     packed = StreamHeader(codec_id, tag, 80, 140).pack()
     assert packed[1:-1].hex() == SHA256[: 2 * tag_length(codec_id)]
 
 
-@pytest.mark.parametrize("codec_id", ONE_ID_OF_EACH_KIND)
-def test_every_pair_of_common_sides_has_its_own_byte(codec_id: int) -> None:
+@pytest.mark.parametrize("codec_id", ONE_CODEC_ID_OF_EACH_CLASS)
+def test_every_pair_of_common_sides_has_one_size_byte(codec_id: int) -> None:
     codes = set()
     for height_px in COMMON_SIDES_PX:
         for width_px in COMMON_SIDES_PX:
@@ -88,8 +88,8 @@ def test_every_pair_of_common_sides_has_its_own_byte(codec_id: int) -> None:
     assert codes == set(range(225))
 
 
-def test_every_other_pair_of_sides_is_written_out() -> None:
-    # Each uncommon side once with a common and once with an uncommon one, as height and as width.
+def test_other_sides_use_the_long_form() -> None:
+    # Each uncommon side with a common and with an uncommon one, as height and as width.
     for side_px in UNCOMMON_SIDES_PX:
         for other_px in (80, 512, 17, 511):
             for height_px, width_px in ((side_px, other_px), (other_px, side_px)):
@@ -101,7 +101,7 @@ def test_every_other_pair_of_sides_is_written_out() -> None:
 
 
 @given(headers(), st.binary(max_size=20))
-def test_headers_round_trip_whatever_follows(header: StreamHeader, body: bytes) -> None:
+def test_headers_round_trip_before_any_body(header: StreamHeader, body: bytes) -> None:
     packed = header.pack()
     assert len(packed) == header.size
     assert 2 <= header.size <= StreamHeader.MAX_SIZE
@@ -109,7 +109,7 @@ def test_headers_round_trip_whatever_follows(header: StreamHeader, body: bytes) 
 
 
 @given(headers())
-def test_a_header_cut_anywhere_is_refused(header: StreamHeader) -> None:
+def test_truncated_header_is_rejected(header: StreamHeader) -> None:
     packed = header.pack()
     for length in range(len(packed)):
         with pytest.raises(StreamError) as caught:
@@ -117,24 +117,24 @@ def test_a_header_cut_anywhere_is_refused(header: StreamHeader) -> None:
         assert caught.value.field == "header"
 
 
-@pytest.mark.parametrize("codec_id", ONE_ID_OF_EACH_KIND)
-def test_a_header_cut_short_says_how_long_it_should_be(codec_id: int) -> None:
+@pytest.mark.parametrize("codec_id", ONE_CODEC_ID_OF_EACH_CLASS)
+def test_error_for_a_truncated_header_names_the_required_length(codec_id: int) -> None:
     common, other = StreamHeader(codec_id, 0, 80, 80), StreamHeader(codec_id, 0, 81, 80)
     for header, length in ((common, common.size - 1), (other, other.size - 1)):
         with pytest.raises(StreamError, match=f"at least {header.size} bytes"):
             StreamHeader.unpack(header.pack()[:length])
 
 
-@pytest.mark.parametrize("codec_id", ONE_ID_OF_EACH_KIND)
+@pytest.mark.parametrize("codec_id", ONE_CODEC_ID_OF_EACH_CLASS)
 @pytest.mark.parametrize("code", range(225, 255))
-def test_reserved_size_codes_are_refused(codec_id: int, code: int) -> None:
+def test_reserved_size_codes_are_rejected(codec_id: int, code: int) -> None:
     data = bytes([codec_id]) + bytes(tag_length(codec_id)) + bytes([code]) + bytes(8)
     with pytest.raises(StreamError) as caught:
         StreamHeader.unpack(data)
     assert (caught.value.field, caught.value.value) == ("size", code)
 
 
-def test_common_sides_written_out_are_refused() -> None:
+def test_common_sides_in_the_long_form_are_rejected() -> None:
     for height_px in COMMON_SIDES_PX:
         for width_px in COMMON_SIDES_PX:
             with pytest.raises(StreamError, match="one-byte form"):
@@ -142,7 +142,7 @@ def test_common_sides_written_out_are_refused() -> None:
 
 
 @pytest.mark.parametrize("side_px", [0, 1, 15, 513, 1024, 4095])
-def test_sides_out_of_bounds_are_refused_and_named(side_px: int) -> None:
+def test_error_names_the_side_out_of_range(side_px: int) -> None:
     for text, field in ((f"01ff{side_px:03x}011", "height_px"), (f"01ff011{side_px:03x}", "width_px")):
         with pytest.raises(StreamError) as caught:
             StreamHeader.unpack(bytes.fromhex(text))
@@ -150,15 +150,15 @@ def test_sides_out_of_bounds_are_refused_and_named(side_px: int) -> None:
 
 
 @given(st.binary(max_size=12))
-def test_any_bytes_are_a_header_that_packs_to_them_or_stream_error(data: bytes) -> None:
+def test_any_bytes_unpack_to_a_header_that_packs_to_them_or_are_rejected(data: bytes) -> None:
     try:
         header = StreamHeader.unpack(data)
     except StreamError:
         return
-    assert data.startswith(header.pack())  # one picture, one header: receivers tell images apart by equal headers
+    assert data.startswith(header.pack())  # unique headers: receivers compare them to assign frames to images
 
 
-def test_headers_are_values() -> None:
+def test_headers_are_hashable_values() -> None:
     header = StreamHeader(0x10, 0xBEEF, 80, 140)
     assert header == StreamHeader(0x10, 0xBEEF, 80, 140)
     assert len({header, dataclasses.replace(header), dataclasses.replace(header, width_px=141)}) == 2

@@ -1,60 +1,56 @@
-"""Quality of a decoded image: PSNR, SSIM, and the figure of merit of the codebook builder."""
+"""Image quality: PSNR and SSIM."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from sonarpost.codec.interface import Image
 from sonarpost.errors import StreamError
-
-GreyImage = npt.NDArray[np.uint8]
-FigureOfMerit = Callable[[GreyImage, GreyImage], float]
-"""Takes the original and the rebuilt picture (same shape, uint8); larger is better, 100 is perfect."""
 
 PEAK = 255.0
 SSIM_SIGMA_PX = 1.5
 SSIM_RADIUS_PX = 5  # an 11 x 11 window
 
 
-def psnr_db(original: GreyImage, rebuilt: GreyImage) -> float:
-    """Return the peak signal-to-noise ratio in dB for a peak of 255; infinite for equal pictures.
+def psnr_db(original: Image, decoded: Image) -> float:
+    """Return the peak signal-to-noise ratio in dB for a peak of 255; infinite for equal images.
 
-    PSNR = 10 log10(255^2 / mean((original - rebuilt)^2)).
+    PSNR = 10 log10(255^2 / mean((original - decoded)^2)).
 
     Args:
         original: Shape (height, width), uint8.
-        rebuilt: The same shape, uint8.
+        decoded: The same shape, uint8.
 
     Raises:
-        StreamError: The shapes differ, a picture is empty, or a dtype is not uint8.
+        StreamError: The shapes differ, an image is empty, or a dtype is not uint8.
     """
-    _check_pair(original, rebuilt)
-    error = original.astype(np.float64) - rebuilt.astype(np.float64)
+    _check_pair(original, decoded)
+    error = original.astype(np.float64) - decoded.astype(np.float64)
     mean_square = float(np.mean(error * error))
     return math.inf if mean_square == 0.0 else 10.0 * math.log10(PEAK * PEAK / mean_square)
 
 
-def ssim(original: GreyImage, rebuilt: GreyImage) -> float:
-    """Return the mean structural similarity, -1..1, 1 for equal pictures.
+def ssim(original: Image, decoded: Image) -> float:
+    """Return the mean structural similarity, -1..1, 1 for equal images.
 
     Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural similarity",
     IEEE Trans. Image Processing 13(4), 2004: Gaussian window 11 x 11 with sigma 1.5 px, K1 = 0.01, K2 = 0.03, L = 255,
-    population (co)variances. As there, only places where the whole window lies inside the picture count; along a
-    side shorter than 11 px there is none, so that side is mirrored at its edges and all of it counts.
+    population (co)variances. As there, only places with the whole window inside the image count. A side shorter than
+    11 px is mirrored at its edges, and all of it counts.
 
     Args:
         original: Shape (height, width), uint8.
-        rebuilt: The same shape, uint8.
+        decoded: The same shape, uint8.
 
     Raises:
-        StreamError: The shapes differ, a picture is empty, or a dtype is not uint8.
+        StreamError: The shapes differ, an image is empty, or a dtype is not uint8.
     """
-    _check_pair(original, rebuilt)
-    a, b = original.astype(np.float64), rebuilt.astype(np.float64)
+    _check_pair(original, decoded)
+    a, b = original.astype(np.float64), decoded.astype(np.float64)
     c1, c2 = (0.01 * PEAK) ** 2, (0.03 * PEAK) ** 2
     mean_a, mean_b = _window_mean(a), _window_mean(b)
     variance_a = _window_mean(a * a) - mean_a * mean_a
@@ -65,18 +61,8 @@ def ssim(original: GreyImage, rebuilt: GreyImage) -> float:
     return float(np.mean(numerator / denominator))
 
 
-def fom(original: GreyImage, rebuilt: GreyImage) -> float:
-    """Return the figure of merit used by default: 100 times the mean SSIM, so 100 is perfect and 0 is unrelated.
-
-    The paper leaves its figure of merit "user-defined" and gives the threshold 39. SSIM is chosen because operators
-    judge structure (highlight, shadow, texture), which PSNR hardly measures on speckle; any other callable of the
-    same shape (`FigureOfMerit`) can be handed to the codebook builder.
-    """
-    return 100.0 * ssim(original, rebuilt)
-
-
 def _window_mean(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Gaussian-weighted mean around each place that the whole window fits into."""
+    """Return the Gaussian-weighted mean around each place with the whole window inside."""
     for axis in (0, 1):
         values = np.asarray(
             ndimage.gaussian_filter1d(values, SSIM_SIGMA_PX, axis=axis, radius=SSIM_RADIUS_PX, mode="reflect"),
@@ -87,11 +73,11 @@ def _window_mean(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return values
 
 
-def _check_pair(original: GreyImage, rebuilt: GreyImage) -> None:
+def _check_pair(original: Image, decoded: Image) -> None:
     if original.ndim != 2 or original.size == 0:
-        raise StreamError("picture quality", "original.shape", original.shape, "(height, width), not empty")
-    if original.shape != rebuilt.shape:
-        raise StreamError("picture quality", "rebuilt.shape", rebuilt.shape, f"the original's {original.shape}")
-    for name, picture in (("original", original), ("rebuilt", rebuilt)):
-        if picture.dtype != np.uint8:
-            raise StreamError("picture quality", f"{name}.dtype", str(picture.dtype), "uint8")
+        raise StreamError("image quality", "original.shape", original.shape, "(height, width), not empty")
+    if original.shape != decoded.shape:
+        raise StreamError("image quality", "decoded.shape", decoded.shape, f"the original's {original.shape}")
+    for name, image in (("original", original), ("decoded", decoded)):
+        if image.dtype != np.uint8:
+            raise StreamError("image quality", f"{name}.dtype", str(image.dtype), "uint8")

@@ -1,4 +1,4 @@
-"""Huffman: the code, the choice of levels, the budget, the cut stream, damage."""
+"""Huffman codec: code, choice of levels, budgets, truncation, damage."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders.common import GOLDEN_FOLDER
-from builders.images import picture, sdvd_crops
+from builders.images import sdvd_crops, snippet
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.codec.baselines.huffman import HuffmanCodec
-from sonarpost.codec.baselines.huffman_code import MAX_CODE_BITS, canonical_codes, code_lengths
+from sonarpost.codec.baselines.huffman import MAX_CODE_BITS, HuffmanCodec, canonical_codes, code_lengths
 from sonarpost.codec.interface import StreamHeader, received_body
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError, StreamError
@@ -29,24 +28,24 @@ def body_of(codec: HuffmanCodec, image: np.ndarray, budget: int | None = None) -
 
 
 @pytest.mark.parametrize("name", ["80x80-None", "49x113-900", "17x31-4000", "49x113-671", "80x80-22"])
-def test_golden_streams_are_written_and_read_for_ever(name: str) -> None:
+def test_golden_streams_are_reproduced_and_decoded(name: str) -> None:
     size, budget = name.split("-")
     height_px, width_px = map(int, size.split("x"))
     golden = bytes.fromhex((GOLDEN / f"{name}.hex").read_text())
     decoded = HuffmanCodec().decode(golden)
     expected = np.frombuffer(bytes.fromhex((GOLDEN / f"{name}-picture.hex").read_text()), np.uint8)
     scale = golden[StreamHeader.unpack(golden).size] + 1
-    # A reduced picture is enlarged by Pillow, whose rounding is not ours to promise.
+    # Pillow enlarges a reduced image; its rounding may differ between versions.
     assert np.abs(decoded.image.ravel().astype(int) - expected).max() <= (0 if scale == 32 else 1)
     assert not decoded.missing.any()
     if scale == 32:
         budget_bytes = None if budget == "None" else int(budget)
-        assert HuffmanCodec().encode(picture(height_px, width_px), budget_bytes).hex() == golden.hex()
+        assert HuffmanCodec().encode(snippet(height_px, width_px), budget_bytes).hex() == golden.hex()
 
 
 @given(counts=COUNTS)
 @settings(max_examples=80, deadline=None)
-def test_the_code_is_complete_and_within_a_bit_of_the_entropy(counts: list[int]) -> None:
+def test_code_is_complete_and_within_one_bit_of_the_entropy(counts: list[int]) -> None:
     lengths = code_lengths(counts)
     total, used = sum(counts), sum(1 for count in counts if count)
     assert all((length > 0) == (count > 0) for length, count in zip(lengths, counts, strict=True)) or used == 1
@@ -61,7 +60,7 @@ def test_the_code_is_complete_and_within_a_bit_of_the_entropy(counts: list[int])
 
 @given(counts=st.lists(st.integers(1, 50), min_size=2, max_size=5))
 @settings(max_examples=40, deadline=None)
-def test_no_other_prefix_code_is_shorter(counts: list[int]) -> None:
+def test_code_lengths_are_optimal(counts: list[int]) -> None:
     shortest = min(
         sum(count * length for count, length in zip(counts, lengths, strict=True))
         for lengths in itertools.product(range(1, 6), repeat=len(counts))
@@ -70,7 +69,7 @@ def test_no_other_prefix_code_is_shorter(counts: list[int]) -> None:
     assert sum(count * length for count, length in zip(counts, code_lengths(counts), strict=True)) == shortest
 
 
-def test_a_deep_tree_is_cut_to_15_bits() -> None:
+def test_deep_tree_is_limited_to_15_bits() -> None:
     fibonacci = [1, 1]
     while len(fibonacci) < 40:
         fibonacci.append(fibonacci[-1] + fibonacci[-2])
@@ -81,20 +80,20 @@ def test_a_deep_tree_is_cut_to_15_bits() -> None:
 
 @given(counts=COUNTS)
 @settings(max_examples=50, deadline=None)
-def test_no_code_begins_with_another(counts: list[int]) -> None:
+def test_codes_are_prefix_free(counts: list[int]) -> None:
     lengths = code_lengths(counts)
     codes = canonical_codes(lengths)
     texts = sorted(f"{code:0{length}b}" for code, length in zip(codes, lengths, strict=True) if length)
     assert not any(after.startswith(before) for before, after in itertools.pairwise(texts))
 
 
-def test_the_canonical_code_is_this_one() -> None:
+def test_canonical_codes_of_an_example() -> None:
     assert canonical_codes([2, 1, 0, 3, 3]) == [0b10, 0b0, 0, 0b110, 0b111]
 
 
 @given(size=st.tuples(st.integers(16, 40), st.integers(16, 40)), seed=st.integers(0, 999), spread=st.integers(1, 256))
 @settings(max_examples=30, deadline=None)
-def test_with_room_enough_the_picture_is_exact(size: tuple[int, int], seed: int, spread: int) -> None:
+def test_large_budget_is_lossless(size: tuple[int, int], seed: int, spread: int) -> None:
     image = np.random.default_rng(seed).integers(0, spread, size, dtype=np.uint8)
     codec = HuffmanCodec()
     stream = codec.encode(image, 4000)
@@ -104,7 +103,7 @@ def test_with_room_enough_the_picture_is_exact(size: tuple[int, int], seed: int,
 
 @given(greys=st.lists(st.integers(0, 255), min_size=2, max_size=7, unique=True), data=st.data())
 @settings(max_examples=40, deadline=None)
-def test_no_other_levels_have_a_smaller_error(greys: list[int], data: st.DataObject) -> None:
+def test_chosen_levels_minimise_the_error(greys: list[int], data: st.DataObject) -> None:
     shares = data.draw(st.lists(st.integers(1, 60), min_size=len(greys), max_size=len(greys)))
     levels = data.draw(st.integers(2, 4))
     pixels = np.resize(
@@ -113,7 +112,7 @@ def test_no_other_levels_have_a_smaller_error(greys: list[int], data: st.DataObj
     pixels.sort()
     image = pixels.reshape(20, 20)
     rebuilt = HuffmanCodec(levels).decode(HuffmanCodec(levels).encode(image)).image
-    met = ((image.astype(int) - rebuilt) ** 2).sum()
+    actual = ((image.astype(int) - rebuilt) ** 2).sum()
     distinct = np.unique(image)
     least = math.inf
     for edges in itertools.combinations(range(1, len(distinct)), min(levels, len(distinct)) - 1):
@@ -123,14 +122,14 @@ def test_no_other_levels_have_a_smaller_error(greys: list[int], data: st.DataObj
             members = pixels[(pixels >= group[0]) & (pixels <= group[-1])].astype(int)
             error += ((members - math.floor(members.mean() + 0.5)) ** 2).sum()
         least = min(least, error)
-    # Levels are whole: the group chosen by its exact mean may round worse than its rival, by 1/4 a pixel at most.
-    assert met <= least + 100
+    # Levels are integers: a group chosen by its exact mean may round worse than another, by at most 1/4 a pixel.
+    assert actual <= least + 100
 
 
-def test_every_budget_from_20_bytes_on_is_met_and_more_is_better() -> None:
+def test_every_budget_from_20_bytes_is_met_and_quality_increases() -> None:
     codec = HuffmanCodec()
     for size in ((16, 16), (49, 113), (80, 80), (16, 512), (140, 80)):
-        image = picture(*size)
+        image = snippet(*size)
         quality = []
         for budget in (20, 48, 120, 300, 6000):
             stream = codec.encode(image, budget)
@@ -143,8 +142,8 @@ def test_every_budget_from_20_bytes_on_is_met_and_more_is_better() -> None:
         assert quality[-1] > quality[0] + 8
 
 
-def test_a_budget_never_gives_less_than_the_levels_that_fit_it() -> None:
-    image, codec = picture(49, 113), HuffmanCodec()
+def test_budget_is_at_least_as_good_as_the_levels_that_fit() -> None:
+    image, codec = snippet(49, 113), HuffmanCodec()
     for levels in (2, 3, 4, 8, 16):
         plain = HuffmanCodec(levels).encode(image)
         stream = codec.encode(image, len(plain))
@@ -152,7 +151,7 @@ def test_a_budget_never_gives_less_than_the_levels_that_fit_it() -> None:
         assert psnr_db(image, codec.decode(stream).image) >= psnr_db(image, codec.decode(plain).image)
 
 
-def test_less_resolution_is_taken_where_it_shows_more() -> None:
+def test_resolution_is_reduced_when_the_error_is_smaller() -> None:
     rows, columns = np.mgrid[:80, :80]
     smooth = (rows + 2 * columns).astype(np.uint8)
     noise = np.random.default_rng(0).choice(np.array([20, 200], np.uint8), (80, 80))
@@ -160,16 +159,16 @@ def test_less_resolution_is_taken_where_it_shows_more() -> None:
     assert body_of(HuffmanCodec(), noise, 900)[0] == 31
 
 
-def test_the_papers_operating_point_is_of_its_order() -> None:
-    # Fig. 2: 671 B, 21.72 dB for 49 x 113 px of a picture that is not published.
-    image = picture(49, 113)
+def test_operating_point_of_the_paper_has_the_same_order() -> None:
+    # Fig. 2: 671 B, 21.72 dB for 49 x 113 px of an image that is not published.
+    image = snippet(49, 113)
     stream = HuffmanCodec(2).encode(image)
     assert 690 < len(stream) < 720
     assert psnr_db(image, HuffmanCodec().decode(stream).image) > 18
 
 
 @pytest.mark.parametrize("grey", [0, 77, 255])
-def test_a_flat_picture_is_exact_in_a_few_bytes(grey: int) -> None:
+def test_flat_image_is_lossless_in_5_bytes(grey: int) -> None:
     image = np.full((80, 80), grey, np.uint8)
     for budget in (None, 5, 64):
         stream = HuffmanCodec().encode(image, budget)
@@ -180,24 +179,24 @@ def test_a_flat_picture_is_exact_in_a_few_bytes(grey: int) -> None:
 
 
 @pytest.mark.parametrize("levels", [0, 17])
-def test_levels_out_of_bounds_are_refused(levels: int) -> None:
+def test_levels_out_of_range_are_rejected(levels: int) -> None:
     with pytest.raises(ConfigError, match="levels"):
         HuffmanCodec(levels)
 
 
 @pytest.mark.parametrize("budget", [None, 30, 100, 400, 2500])
-def test_a_cut_stream_shows_what_it_holds_and_nothing_else(budget: int | None) -> None:
-    codec, image = HuffmanCodec(), picture(49, 60)
+def test_truncated_stream_decodes_only_the_pixels_it_holds(budget: int | None) -> None:
+    codec, image = HuffmanCodec(), snippet(49, 60)
     stream = codec.encode(image, budget)
     size = StreamHeader.unpack(stream).size
-    whole = codec.decode(stream).image
+    complete = codec.decode(stream).image
     before = image.size
     for length in sorted({*range(size, min(size + 30, len(stream))), *range(size, len(stream), 11)}):
         try:
             decoded = codec.decode(stream[:length])
         except StreamError:
-            pytest.fail("a cut is no damage")
-        assert np.array_equal(decoded.image[~decoded.missing], whole[~decoded.missing])
+            pytest.fail("truncation is not damage")
+        assert np.array_equal(decoded.image[~decoded.missing], complete[~decoded.missing])
         assert not decoded.image[decoded.missing].any()
         assert decoded.missing.any()
         assert decoded.missing.sum() <= before
@@ -206,8 +205,8 @@ def test_a_cut_stream_shows_what_it_holds_and_nothing_else(budget: int | None) -
     assert before < image.size / 2
 
 
-def test_a_gap_ends_what_is_used() -> None:
-    codec, image = HuffmanCodec(), picture(40, 40)
+def test_bytes_after_a_gap_are_not_used() -> None:
+    codec, image = HuffmanCodec(), snippet(40, 40)
     stream = codec.encode(image)
     received = np.ones(len(stream) - 5, np.bool_)
     received[100:110] = False
@@ -224,9 +223,9 @@ def test_a_gap_ends_what_is_used() -> None:
 
 
 @pytest.mark.parametrize("received", [np.ones(6, np.bool_), np.ones((7, 1), np.bool_), np.ones(400, np.uint8)])
-def test_a_mask_of_another_shape_or_type_is_refused(received: np.ndarray) -> None:
+def test_mask_of_wrong_shape_or_dtype_is_rejected(received: np.ndarray) -> None:
     with pytest.raises(StreamError, match="received"):
-        HuffmanCodec().decode(HuffmanCodec().encode(picture(20, 20)), received)
+        HuffmanCodec().decode(HuffmanCodec().encode(snippet(20, 20)), received)
 
 
 @pytest.mark.parametrize(
@@ -237,21 +236,21 @@ def test_a_mask_of_another_shape_or_type_is_refused(received: np.ndarray) -> Non
         ("1fff", "kind"),
         ("1f010505", "levels"),
         ("1f020504ff", "levels"),
-        ("1f0201020378", "code lengths"),  # 1, 1, 1: more than a prefix code holds
+        ("1f0201020378", "code lengths"),  # 1, 1, 1: too many for a prefix code
         ("1f02010203" + "ff" * 4, "code lengths"),  # all unused
-        ("1f02010203" + "0a", "code length"),  # 1 0100: 0 and then -1 ... below nought
+        ("1f02010203" + "0a", "code length"),  # 1 0100: 0 and then -1, below zero
         ("1f02010203" + "00ff", "code length"),
     ],
 )
-def test_levels_and_codes_that_cannot_be_are_named(body: str, field: str) -> None:
+def test_error_names_the_invalid_field(body: str, field: str) -> None:
     header = StreamHeader(0x01, 0, 16, 16).pack()
     with pytest.raises(StreamError) as caught:
         HuffmanCodec().decode(header + bytes.fromhex(body) + bytes(64))
     assert caught.value.field == field
 
 
-def test_bytes_behind_the_last_pixel_are_told() -> None:
-    stream = HuffmanCodec().encode(picture(20, 20))
+def test_bytes_after_the_last_pixel_give_a_note() -> None:
+    stream = HuffmanCodec().encode(snippet(20, 20))
     decoded = HuffmanCodec().decode(stream + b"\0\0\0")
     assert decoded.notes == ("3 B after the body ignored",)
     assert not decoded.missing.any()
@@ -259,7 +258,7 @@ def test_bytes_behind_the_last_pixel_are_told() -> None:
 
 @given(body=st.binary(max_size=300), size=st.tuples(st.integers(16, 60), st.integers(16, 60)))
 @settings(max_examples=80, deadline=None)
-def test_any_body_is_a_picture_or_refused(body: bytes, size: tuple[int, int]) -> None:
+def test_any_body_decodes_or_is_rejected(body: bytes, size: tuple[int, int]) -> None:
     try:
         decoded = HuffmanCodec().decode(StreamHeader(0x01, 0, *size).pack() + body)
     except StreamError:
@@ -270,9 +269,9 @@ def test_any_body_is_a_picture_or_refused(body: bytes, size: tuple[int, int]) ->
 
 @pytest.mark.realdata
 @pytest.mark.parametrize(("budget", "least_db"), [(22, 19.86), (64, 20.69), (256, 22.15)])
-def test_real_snippets_keep_their_quality(data_dir: Path, budget: int, least_db: float) -> None:
+def test_quality_on_real_snippets(data_dir: Path, budget: int, least_db: float) -> None:
     crops = sdvd_crops(data_dir)
     assert len(crops) == 69
     quality = [psnr_db(crop, HuffmanCodec().decode(HuffmanCodec().encode(crop, budget)).image) for crop in crops]
-    # What was measured, less 0.05 dB for another build of the libraries.
+    # The measured value minus 0.05 dB, a margin for other builds of the libraries.
     assert np.mean(quality) > least_db

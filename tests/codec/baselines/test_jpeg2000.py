@@ -1,4 +1,4 @@
-"""JPEG 2000: the headers that are not sent, budgets, golden streams, damage, silence."""
+"""JPEG 2000: omitted headers, budgets, golden streams, damage, no output of the library."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders.common import GOLDEN_FOLDER
-from builders.images import picture, sdvd_crops
+from builders.images import sdvd_crops, snippet
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image as Pillow
@@ -31,7 +31,7 @@ def body(stream: bytes) -> bytes:
 @pytest.mark.parametrize(
     "name", ["raw-80x80-300", "raw-49x113-588", "raw-17x31-None", "packets-80x80-64", "packets-49x113-588"]
 )
-def test_golden_streams_are_read_for_ever(name: str) -> None:
+def test_golden_streams_are_decoded(name: str) -> None:
     stream = bytes.fromhex((GOLDEN / f"{name}.hex").read_text())
     expected = np.frombuffer(bytes.fromhex((GOLDEN / f"{name}-picture.hex").read_text()), np.uint8)
     decoded = (RAW if name.startswith("raw") else PACKETS).decode(stream)
@@ -47,9 +47,7 @@ def test_golden_streams_are_read_for_ever(name: str) -> None:
     packets=st.binary(max_size=50),
 )
 @settings(max_examples=60, deadline=None)
-def test_a_codestream_comes_apart_as_it_was_put_together(
-    size: tuple[int, int], decompositions: int, packets: bytes
-) -> None:
+def test_packets_of_inverts_codestream(size: tuple[int, int], decompositions: int, packets: bytes) -> None:
     stream = codestream(*size, decompositions, packets)
     assert packets_of(stream, *size) == (decompositions, packets)
     with pytest.raises(StreamError):
@@ -60,35 +58,35 @@ def test_a_codestream_comes_apart_as_it_was_put_together(
 
 @pytest.mark.parametrize("decompositions", [3, 4, 5, 6])
 @pytest.mark.parametrize("size", [(64, 64), (80, 140), (512, 65)])
-def test_openjpeg_writes_the_header_we_write(decompositions: int, size: tuple[int, int]) -> None:
+def test_main_header_is_that_of_openjpeg(decompositions: int, size: tuple[int, int]) -> None:
     file = io.BytesIO()
-    Pillow.fromarray(picture(*size)).save(
+    Pillow.fromarray(snippet(*size)).save(
         file, "JPEG2000", no_jp2=True, irreversible=True, num_resolutions=decompositions + 1
     )
     stream = file.getvalue()
     header = main_header(*size, decompositions)
     assert stream.startswith(header)
-    assert stream[len(header) : len(header) + 2] in (b"\xff\x64", b"\xff\x90")  # a comment, or the tile
+    assert stream[len(header) : len(header) + 2] in (b"\xff\x64", b"\xff\x90")  # a comment or the tile
 
 
-def test_the_main_header_is_these_bytes() -> None:
+def test_main_header_of_an_example() -> None:
     assert main_header(49, 113, 3).hex() == (
         "ff4fff5100290000000000710000003100000000000000000000007100000031000000000000000000010701"
         "01ff52000c00000001000304040000ff5c001742673867506750676850055005504757d357d35762"
     )
 
 
-def test_the_raw_body_is_a_file_for_anybody() -> None:
-    stream = RAW.encode(picture(80, 80), 400)
+def test_raw_body_is_a_standard_file() -> None:
+    stream = RAW.encode(snippet(80, 80), 400)
     with Pillow.open(io.BytesIO(body(stream))) as opened:
         assert (opened.format, opened.size, opened.mode) == ("JPEG2000", (80, 80), "L")
         assert np.array_equal(np.asarray(opened), RAW.decode(stream).image)
     assert b"\xff\x64" not in body(stream)[:120]  # no comment
 
 
-def test_leaving_the_headers_out_saves_what_they_take() -> None:
-    image = picture(100, 128)
-    image += 128 - int(image.mean())  # so that no shift pays
+def test_packets_codec_saves_the_headers() -> None:
+    image = snippet(100, 128)
+    image += 128 - int(image.mean())  # so that no shift helps
     raw, packets = RAW.encode(image), PACKETS.encode(image)
     decompositions, inside = packets_of(body(raw), 100, 128)
     assert body(packets)[1:] == inside
@@ -96,8 +94,8 @@ def test_leaving_the_headers_out_saves_what_they_take() -> None:
     assert len(raw) - len(packets) > 90
 
 
-def test_a_dark_picture_is_brightened_for_the_coder() -> None:
-    dark = (picture(80, 80) // 6).astype(np.uint8)
+def test_dark_image_is_brightened_before_coding() -> None:
+    dark = (snippet(80, 80) // 6).astype(np.uint8)
     stream = PACKETS.encode(dark, 40)
     assert 4 * ((body(stream)[0] & 0x3F) - 32) > 80
     decompositions = 3 + (body(stream)[0] >> 6)
@@ -108,9 +106,9 @@ def test_a_dark_picture_is_brightened_for_the_coder() -> None:
 
 
 @BOTH
-def test_budgets_are_met_and_more_is_better(codec: Jpeg2000Codec) -> None:
+def test_budgets_are_met_and_quality_increases(codec: Jpeg2000Codec) -> None:
     for size in ((16, 16), (49, 113)):
-        image = picture(*size)
+        image = snippet(*size)
         quality = []
         for budget in (150, 220, 400, 3000):
             stream = codec.encode(image, budget)
@@ -119,35 +117,35 @@ def test_budgets_are_met_and_more_is_better(codec: Jpeg2000Codec) -> None:
         assert quality == sorted(quality)
 
 
-def test_the_packets_alone_fit_a_22_byte_picture() -> None:
-    image = picture(80, 80)
+def test_packets_codec_meets_22_bytes() -> None:
+    image = snippet(80, 80)
     stream = PACKETS.encode(image, 22)
     assert len(stream) <= 22
     assert psnr_db(image, PACKETS.decode(stream).image) > psnr_db(image, np.full_like(image, int(image.mean())))
 
 
 @BOTH
-def test_a_budget_below_the_coarsest_is_refused(codec: Jpeg2000Codec) -> None:
+def test_budget_below_the_coarsest_quality_is_rejected(codec: Jpeg2000Codec) -> None:
     for budget in (0, 3, 6):
         with pytest.raises(StreamError, match="budget_bytes"):
-            codec.encode(picture(80, 80), budget)
+            codec.encode(snippet(80, 80), budget)
 
 
 @BOTH
 @pytest.mark.parametrize("size", [(16, 16), (17, 33), (512, 16), (31, 512), (201, 203)])
-def test_every_size_is_divided_as_far_as_it_goes(codec: Jpeg2000Codec, size: tuple[int, int]) -> None:
-    image = picture(*size)
+def test_every_size_is_decomposed_as_far_as_possible(codec: Jpeg2000Codec, size: tuple[int, int]) -> None:
+    image = snippet(*size)
     decoded = codec.decode(codec.encode(image))
     assert psnr_db(image, decoded.image) > 18
 
 
 @pytest.mark.parametrize("quality_db", [0.5, 61.0, float("nan")])
-def test_a_quality_out_of_bounds_is_refused(quality_db: float) -> None:
+def test_quality_out_of_range_is_rejected(quality_db: float) -> None:
     with pytest.raises(ConfigError, match="quality_db"):
         Jpeg2000Codec(quality_db=quality_db)
 
 
-def test_another_size_in_the_codestream_is_refused_before_it_is_decoded() -> None:
+def test_codestream_of_another_size_is_rejected_before_decoding() -> None:
     inside = codestream(512, 512, 5, b"\0" * 20)
     for header in (StreamHeader(0x02, 0, 80, 80), StreamHeader(0x02, 0, 17, 80)):
         with pytest.raises(StreamError, match="codestream"):
@@ -157,8 +155,8 @@ def test_another_size_in_the_codestream_is_refused_before_it_is_decoded() -> Non
         RAW.decode(StreamHeader(0x02, 0, 512, 512).pack() + huge)
 
 
-def test_the_raw_codestream_is_refused_wherever_it_is_cut() -> None:
-    stream = RAW.encode(picture(33, 47), 200)
+def test_truncated_raw_codestream_is_rejected() -> None:
+    stream = RAW.encode(snippet(33, 47), 200)
     for length in range(2, len(stream)):
         with pytest.raises(StreamError):
             RAW.decode(stream[:length])
@@ -167,11 +165,11 @@ def test_the_raw_codestream_is_refused_wherever_it_is_cut() -> None:
 
 
 @BOTH
-def test_cut_or_damaged_is_a_picture_or_refused_and_openjpeg_says_nothing(
+def test_damaged_codestream_decodes_or_is_rejected_without_output(
     codec: Jpeg2000Codec, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    stream = codec.encode(picture(60, 80), 300)
-    refused = 0
+    stream = codec.encode(snippet(60, 80), 300)
+    rejected = 0
     for at in range(5, len(stream)):
         damaged = bytearray(stream)
         damaged[at] ^= 0x5A
@@ -179,14 +177,14 @@ def test_cut_or_damaged_is_a_picture_or_refused_and_openjpeg_says_nothing(
             try:
                 assert codec.decode(data).image.shape == (60, 80)
             except StreamError:
-                refused += 1
-    assert refused > len(stream) / 4
+                rejected += 1
+    assert rejected > len(stream) / 4
     assert capfd.readouterr() == ("", "")
 
 
 @given(junk=st.binary(max_size=200), size=st.sampled_from([(16, 16), (80, 80), (33, 200)]))
 @settings(max_examples=80, deadline=None)
-def test_any_packets_are_a_picture_or_refused(junk: bytes, size: tuple[int, int]) -> None:
+def test_any_packets_decode_or_are_rejected(junk: bytes, size: tuple[int, int]) -> None:
     try:
         decoded = PACKETS.decode(StreamHeader(0x03, 0, *size).pack() + junk)
     except StreamError:
@@ -196,11 +194,11 @@ def test_any_packets_are_a_picture_or_refused(junk: bytes, size: tuple[int, int]
 
 
 @BOTH
-def test_a_gap_leaves_nothing_and_says_so(codec: Jpeg2000Codec) -> None:
-    stream = codec.encode(picture(80, 80), 400)
+def test_gap_makes_all_pixels_missing(codec: Jpeg2000Codec) -> None:
+    stream = codec.encode(snippet(80, 80), 400)
     received = np.ones(len(body(stream)), np.bool_)
     assert np.array_equal(codec.decode(stream, received).image, codec.decode(stream).image)
-    with pytest.raises(StreamError):  # damage is no gap
+    with pytest.raises(StreamError):  # damage is not a gap
         codec.decode(stream[:-20], received[:-20])
     received[-20] = False
     decoded = codec.decode(stream, received)
@@ -210,17 +208,17 @@ def test_a_gap_leaves_nothing_and_says_so(codec: Jpeg2000Codec) -> None:
     assert "nothing can be decoded" in decoded.notes[1]
 
 
-def test_an_openjpeg_that_writes_other_parameters_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_names_an_openjpeg_with_other_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jpeg2000, "_LOWEST_STEPS", {3: 1, 4: 1, 5: 1, 6: 1})
     with pytest.raises(ConfigError, match="OpenJPEG"):
-        RAW.encode(picture(80, 80))
+        RAW.encode(snippet(80, 80))
 
 
 @pytest.mark.realdata
 @pytest.mark.parametrize(("budget", "least_db"), [(64, 20.31), (256, 21.89)])
-def test_real_snippets_keep_their_quality(data_dir: Path, budget: int, least_db: float) -> None:
+def test_quality_on_real_snippets(data_dir: Path, budget: int, least_db: float) -> None:
     crops = sdvd_crops(data_dir)
     assert len(crops) == 69
     quality = [psnr_db(crop, PACKETS.decode(PACKETS.encode(crop, budget)).image) for crop in crops[::4]]
-    # What was measured, less 0.05 dB for another build of the libraries.
+    # The measured value minus 0.05 dB, a margin for other builds of the libraries.
     assert np.mean(quality) > least_db

@@ -1,1 +1,1 @@
-"""Codecs to compare with: Huffman, SPIHT, JPEG 2000, WebP, AVIF, JPEG XL."""
+"""Baseline codecs for comparison: Huffman, SPIHT, JPEG 2000, JPEG XL, AVIF, WebP."""

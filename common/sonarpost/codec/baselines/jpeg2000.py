@@ -1,19 +1,18 @@
-"""JPEG 2000 (ISO/IEC 15444-1) through OpenJPEG: one of the four codecs the paper compares.
+"""JPEG 2000 (ISO/IEC 15444-1) through OpenJPEG, one of the four codecs that the paper compares.
 
-Two codecs with the same coder: single tile, one layer, irreversible 9/7 transform, code-blocks of 64 x 64, resolution
-after resolution.
+Two codecs with the same coder: single tile, one layer, irreversible 9/7 transform, code-blocks of 64 x 64, progression
+by resolution.
 
-* `jpeg2000` sends the raw codestream, markers and all: about 100 bytes before the first coded bit. Any JPEG 2000
-  software reads it. Only OpenJPEG's comment is taken out.
-* `jpeg2000-packets` sends the packets alone. Main header, tile header and end follow from the picture's size and the
-  parameters above, so the decoder writes them itself. One byte before the packets says how many decompositions
-  there are and by how much the picture was brightened: OpenJPEG wants unsigned samples and takes 128 off them, so a
-  dark picture would waste its first bits on its mean.
+* `jpeg2000` sends the raw codestream with all markers: about 100 bytes before the first coded bit. Any JPEG 2000
+  software reads it. Only OpenJPEG's comment segment is removed.
+* `jpeg2000-packets` sends the packets only. The decoder rebuilds main header, tile header and end marker from the image
+  size and the parameters above. One byte before the packets holds the number of decompositions and a brightness offset.
+  OpenJPEG subtracts 128 from unsigned samples, so without the offset a dark image spends its first bits on its mean.
 
-OpenJPEG's target rate does not go below 30 bytes of packets, so the budget is met by a search over its target
-quality, in each number of decompositions; the picture nearest to the original is sent.
+OpenJPEG's target rate does not go below 30 bytes of packets. The encoder therefore searches over the target quality,
+for each number of decompositions, and sends the candidate nearest to the original.
 
-Nothing in a cut codestream can be relied upon: it is refused, unless the cut is where OpenJPEG finds all packets whole.
+A truncated codestream is rejected, unless OpenJPEG finds all packets complete.
 """
 
 from __future__ import annotations
@@ -21,27 +20,36 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image as Pillow
 
-from sonarpost.codec.interface import DecodedImage, Image, Mask, StreamHeader, check_image, received_body, to_uint8
+from sonarpost.codec.interface import (
+    DecodedImage,
+    Image,
+    Mask,
+    SnippetPixels,
+    StreamHeader,
+    check_image,
+    received_body,
+    to_uint8,
+)
 from sonarpost.errors import ConfigError, StreamError
 
 RAW_CODEC_ID = 0x02
 PACKETS_CODEC_ID = 0x03
-NATURAL_QUALITY_DB = 22.0
+DEFAULT_QUALITY_DB = 22.0
 MIN_DECOMPOSITIONS = 3
 MAX_DECOMPOSITIONS = 6
 
 _SHIFT_STEP = 4
 _SEARCH_STEPS = 12
 _SEARCH_DB = (1.0, 60.0)
-_MANY_PIXELS = 200 * 200  # from here on fewer decompositions than five gain nothing
+_LARGE_IMAGE_PX = 200 * 200  # from this size, fewer than five decompositions never gain
 
-# Step sizes of the irreversible transform, from the norms of its bands: the lowest band for 3 to 6 decompositions, and
-# (HL, LH, HH) of each decomposition, finest first. The standard leaves them to the encoder; these are OpenJPEG's.
+# Quantiser steps of OpenJPEG for the irreversible transform: the lowest band for 3 to 6 decompositions, and (HL, LH,
+# HH) of each decomposition, finest first.
 _LOWEST_STEPS = {3: 0x6738, 4: 0x6F20, 5: 0x7720, 6: 0x7F20}
 _DETAIL_STEPS = (
     (0x57D3, 0x57D3, 0x5762),
@@ -55,7 +63,7 @@ _SOT, _SOD, _EOC = b"\xff\x90", b"\xff\x93", b"\xff\xd9"
 
 
 def main_header(height_px: int, width_px: int, decompositions: int) -> bytes:
-    """Return SOC, SIZ, COD and QCD of every codestream of this module (ISO/IEC 15444-1, annex A)."""
+    """Return SOC, SIZ, COD and QCD of the codestreams of this module (ISO/IEC 15444-1, annex A)."""
     width, height = width_px.to_bytes(4, "big"), height_px.to_bytes(4, "big")
     origin = bytes(8)
     siz = b"\0\0" + width + height + origin + width + height + origin + b"\0\1" + b"\x07\1\1"  # one component, 8 bits
@@ -74,23 +82,23 @@ def codestream(height_px: int, width_px: int, decompositions: int, packets: byte
 
 
 def packets_of(stream: bytes, height_px: int, width_px: int) -> tuple[int, bytes]:
-    """Return the number of decompositions and the packets of a codestream; the inverse of `codestream`.
+    """Return the number of decompositions and the packets of a codestream. The inverse of `codestream`.
 
     Raises:
-        StreamError: It is not a whole codestream of this module's parameters.
+        StreamError: It is not a complete codestream with the parameters of this module.
     """
     for decompositions in range(MIN_DECOMPOSITIONS, MAX_DECOMPOSITIONS + 1):
         start = len(main_header(height_px, width_px, decompositions)) + 14
         packets = stream[start : -len(_EOC)]
         if stream == codestream(height_px, width_px, decompositions, packets):
             return decompositions, packets
-    expected = f"a whole codestream of one tile, {height_px} x {width_px} px, 9/7, 64 x 64 blocks"
+    expected = f"a complete codestream of one tile, {height_px} x {width_px} px, 9/7, 64 x 64 blocks"
     raise StreamError("jpeg2000 body", "codestream", stream, expected)
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """An encoded picture: packets, and how they were made."""
+    """One way to encode the image, and its squared error."""
 
     decompositions: int
     shift: int
@@ -100,18 +108,19 @@ class _Candidate:
 
 @dataclass(frozen=True)
 class Jpeg2000Codec:
-    """JPEG 2000, with or without its headers. Satisfies `sonarpost.codec.interface.Codec`.
+    """JPEG 2000, with or without its headers. Implements `sonarpost.codec.Codec`.
 
     Attributes:
         packets_only: Whether only the packets are sent.
-        quality_db: PSNR that OpenJPEG aims at when no budget is given.
+        quality_db: Target PSNR of OpenJPEG without a budget, 1..60 dB.
 
     Raises:
-        ConfigError: `quality_db` is out of bounds.
+        ConfigError: `quality_db` is out of range.
     """
 
     packets_only: bool = False
-    quality_db: float = NATURAL_QUALITY_DB
+    quality_db: float = DEFAULT_QUALITY_DB
+    model_hash: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
         low, high = _SEARCH_DB
@@ -125,59 +134,36 @@ class Jpeg2000Codec:
 
     @property
     def codec_id(self) -> int:
-        """Number in the stream header."""
+        """Codec id in the stream header."""
         return PACKETS_CODEC_ID if self.packets_only else RAW_CODEC_ID
 
-    @property
-    def model_hash(self) -> str:
-        """Empty: there is no model."""
-        return ""
-
-    def encode(self, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], budget_bytes: int | None = None) -> bytes:
-        """Return the stream.
-
-        Args:
-            image: Shape (16..512, 16..512), uint8 or uint16 (uint16 is mapped to 8 bits by `to_uint8`).
-            budget_bytes: Most bytes of the whole stream; None for what `quality_db` takes.
-
-        Raises:
-            StreamError: Size or dtype is not supported, or the budget cannot be met.
-        """
+    def encode(self, image: SnippetPixels, budget_bytes: int | None = None) -> bytes:
+        """Return the stream (see `Codec.encode`); without a budget, at `quality_db`."""
         check_image(image)
         grey = to_uint8(image)
         header = StreamHeader(self.codec_id, 0, grey.shape[0], grey.shape[1]).pack()
         best = min(self._candidates(grey, header, budget_bytes), key=lambda c: c.error, default=None)
         if best is None:
-            needed = "a larger budget: not even the coarsest quality fits"
-            raise StreamError(f"codec {self.name}", "budget_bytes", budget_bytes, needed)
+            expected = "a larger budget: the coarsest quality does not fit"
+            raise StreamError(f"codec {self.name}", "budget_bytes", budget_bytes, expected)
         return header + self._body(best, grey.shape)
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
-        """Rebuild the picture.
+        """Reconstruct the image (see `Codec.decode`).
 
-        Args:
-            stream: Header and body.
-            received: Shape (body bytes in `stream`,), False where a body byte did not arrive. If what precedes the
-                first gap does not decode, the whole picture is black and missing.
-
-        Raises:
-            StreamError: The header is wrong, the stream is another codec's, or the codestream is cut or damaged so that
-                OpenJPEG refuses it.
+        If the bytes before the first gap do not decode, all pixels are missing.
         """
         header, body, notes = received_body(stream, received, self.codec_id, self.name)
-        shape = (header.height_px, header.width_px)
         try:
-            image = self._decode_body(body, shape)
+            return DecodedImage.without_gaps(self._decode_body(body, (header.height_px, header.width_px)), notes)
         except StreamError as error:
             if received is None or received.all():
                 raise
-            notes.append(f"nothing can be decoded: {error}")
-            return DecodedImage(np.zeros(shape, np.uint8), np.ones(shape, np.bool_), tuple(notes))
-        return DecodedImage(image, np.zeros(shape, np.bool_), tuple(notes))
+            return DecodedImage.all_missing(header, [*notes, f"nothing can be decoded: {error}"])
 
     def _decode_body(self, body: bytes, shape: tuple[int, int]) -> Image:
         if not self.packets_only:
-            packets_of(body, *shape)  # its size is the header's before OpenJPEG makes room for it
+            packets_of(body, *shape)  # checks the size before OpenJPEG allocates memory for it
             return _decode(body)
         if not body:
             raise StreamError("jpeg2000 body", "length", 0, "at least 1 B")
@@ -191,25 +177,25 @@ class Jpeg2000Codec:
         return bytes([parameters]) + chosen.packets
 
     def _candidates(self, grey: Image, header: bytes, budget_bytes: int | None) -> Iterator[_Candidate]:
-        """Return the best that fits the budget for each way to encode."""
+        """Yield the best candidate within the budget for each number of decompositions and each brightness offset."""
         height_px, width_px = grey.shape
         shifts = {0}
         if self.packets_only:
             centre = (128 - int(grey.sum(dtype=np.int64)) // grey.size) // _SHIFT_STEP
             shifts.add(_SHIFT_STEP * min(max(centre, -32), 31))
-        wanted = (5,) if grey.size >= _MANY_PIXELS else (3, 4, 5)
-        # OpenJPEG refuses to divide a side below one sample.
-        for decompositions in (number for number in wanted if 1 << number <= min(grey.shape)):
+        allowed = (5,) if grey.size >= _LARGE_IMAGE_PX else (3, 4, 5)
+        # OpenJPEG rejects decompositions below one sample a side.
+        for decompositions in (number for number in allowed if 1 << number <= min(grey.shape)):
             for shift in sorted(shifts):
-                around = len(header) + len(self._body(_Candidate(decompositions, shift, b"", 0), grey.shape))
+                overhead = len(header) + len(self._body(_Candidate(decompositions, shift, b"", 0), grey.shape))
                 shifted = _shifted(grey, shift)
                 if budget_bytes is None:
                     packets: bytes | None = _encode(shifted, decompositions, self.quality_db)
                 else:
-                    packets = _search(shifted, decompositions, budget_bytes - around)
+                    packets = _search(shifted, decompositions, budget_bytes - overhead)
                 if packets is not None:
-                    rebuilt = _shifted(_decode(codestream(height_px, width_px, decompositions, packets)), -shift)
-                    error = int(((rebuilt.astype(np.int64) - grey) ** 2).sum())
+                    reconstructed = _shifted(_decode(codestream(height_px, width_px, decompositions, packets)), -shift)
+                    error = int(((reconstructed.astype(np.int64) - grey) ** 2).sum())
                     yield _Candidate(decompositions, shift, packets, error)
 
 
@@ -222,11 +208,11 @@ def _shifted(image: Image, shift: int) -> Image:
 
 
 def _search(image: Image, decompositions: int, limit_bytes: int) -> bytes | None:
-    """Return the packets of the best quality found that take at most so many bytes, or None."""
+    """Return the packets of the best quality of at most `limit_bytes`, or None."""
     best = None
     low, high = _SEARCH_DB
     for step in range(_SEARCH_STEPS + 1):
-        quality_db = low if step == 0 else (low + high) / 2  # the coarsest first: if that does not fit, nothing does
+        quality_db = low if step == 0 else (low + high) / 2  # the coarsest first: if it does not fit, nothing fits
         packets = _encode(image, decompositions, quality_db)
         if len(packets) <= limit_bytes:
             best = packets
@@ -239,10 +225,10 @@ def _search(image: Image, decompositions: int, limit_bytes: int) -> bytes | None
 
 
 def _encode(image: Image, decompositions: int, quality_db: float) -> bytes:
-    """Return the packets that OpenJPEG makes.
+    """Return the packets that OpenJPEG writes.
 
     Raises:
-        ConfigError: This OpenJPEG writes other parameters than the ones the decoder will assume.
+        ConfigError: This OpenJPEG writes other parameters than the decoder assumes.
     """
     file = io.BytesIO()
     Pillow.fromarray(image).save(
@@ -276,13 +262,13 @@ def _without_comments(stream: bytes) -> bytes:
 
 
 def _decode(stream: bytes) -> Image:
-    """Return the picture of a codestream whose main header is this module's.
+    """Return the image of a codestream with a main header of this module.
 
     Raises:
-        StreamError: OpenJPEG refuses it.
+        StreamError: OpenJPEG rejects it.
     """
     try:
-        with Pillow.open(io.BytesIO(stream), formats=["JPEG2000"]) as picture:
-            return np.array(picture, dtype=np.uint8)
-    except Exception as error:  # Pillow raises many types on damaged data, and means one thing
+        with Pillow.open(io.BytesIO(stream), formats=["JPEG2000"]) as file:
+            return np.array(file, dtype=np.uint8)
+    except Exception as error:  # Pillow raises many types on damaged data
         raise StreamError("jpeg2000 body", "packets", repr(error), "packets that OpenJPEG decodes") from error

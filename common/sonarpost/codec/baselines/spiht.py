@@ -1,137 +1,403 @@
-"""SPIHT: set partitioning in hierarchical trees, one of the four codecs the paper compares.
+"""SPIHT: set partitioning in hierarchical trees, one of the four codecs that the paper compares.
 
 A. Said, W. A. Pearlman, "A new, fast, and efficient image codec based on set partitioning in hierarchical trees", IEEE
-Trans. Circuits and Systems for Video Technology 6(3), 1996, without arithmetic coding. The stream is embedded: cut at
-any bit, it decodes to the best picture those bits can give.
+Trans. Circuits and Systems for Video Technology 6(3), 1996, without arithmetic coding. The stream is embedded:
+truncated at any bit, it decodes to the best image that the remaining bits give.
 
-The transform is the 9/7 wavelet by lifting (Daubechies and Sweldens, 1998), whole-sample symmetric at the edges, in
-fixed-point integers: two machines agree to the last bit. A picture of any size is transformed as it is, unpadded, so
-that no bit is spent on pixels nobody sees; trees of odd bands hang their last row and column below the last parent.
+The transform is the 9/7 wavelet by lifting (Daubechies and Sweldens, 1998), with whole-sample symmetric extension, in
+fixed-point integers: all machines agree to the last bit. Images of any size are transformed without padding. In bands
+of odd size, the last row and column belong to the last parent.
 
-Body, most significant bit first: mean grey level / 8 (5 bits); phase (2 bits); highest plane (5 bits); then the
-passes, and zero bits to a whole byte. In plane k a coefficient is significant from (4 + phase) * 2**k / 8 grey levels
-on. The four phases divide the octave between two planes; with a budget, the encoder takes the one whose picture has the
-smallest error, which gains about 0.1 dB.
+Body, most significant bit first: mean grey level / 8 (5 bits); phase (2 bits); highest plane (5 bits); the passes; zero
+bits up to a whole byte. In plane k a coefficient is significant from (4 + phase) * 2**k / 8 grey levels. The four
+phases divide the octave between two planes. With a budget, the encoder sends the phase with the smallest error, which
+gains about 0.1 dB.
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.baselines.spiht_passes import MAX_PLANES, DecoderTests, EncoderTests, EndOfBits, run_passes
-from sonarpost.codec.baselines.spiht_wavelet import Forest, Integers, forest_of, inverse, transform
-from sonarpost.codec.interface import DecodedImage, Image, Mask, StreamHeader, check_image, received_body, to_uint8
+from sonarpost.codec.interface import (
+    DecodedImage,
+    Image,
+    Mask,
+    SnippetPixels,
+    StreamHeader,
+    check_image,
+    received_body,
+    to_uint8,
+)
 from sonarpost.errors import ConfigError, StreamError
 
-CODEC_ID = 0x04
-NATURAL_MAXLOOP = 7  # the paper's larger SPIHT picture in its Fig. 2
+Integers = npt.NDArray[np.int64]
+
+DEFAULT_MAXLOOP = 7  # the larger SPIHT image in Fig. 2 of the paper
+MAX_PLANES = 20
+"""The energy of 512 x 512 px keeps every coefficient below plane 18."""
+FRACTION_BITS = 8
+"""Fraction bits of wavelet coefficients."""
+PHASE_STEP = 1 << (FRACTION_BITS - 3)
+"""One step of the phase, 1/8 grey level, in coefficient units."""
 _PREFIX_BITS = 12
 _MEAN_STEP = 8
+
+# Lifting steps of the 9/7 wavelet and the scale that makes it nearly orthonormal, times 2**16.
+_LIFT = (-103949, -3472, 57862, 29066)
+_LOW_GAIN, _HIGH_GAIN = 75340, 57008
 
 
 @dataclass(frozen=True)
 class SpihtCodec:
-    """SPIHT without arithmetic coding. Satisfies `sonarpost.codec.interface.Codec`.
+    """SPIHT without arithmetic coding. Implements `sonarpost.codec.Codec`.
 
     Attributes:
-        maxloop: Most bit-plane passes, the paper's option of that name; None for 7 without a budget and for no bound
-            with one.
+        maxloop: Maximum number of bit-plane passes, the option of that name in the paper. None: 7 without a budget,
+            unlimited with a budget.
 
     Raises:
-        ConfigError: `maxloop` is out of bounds.
+        ConfigError: `maxloop` is out of range.
     """
 
     maxloop: int | None = None
+    name: ClassVar[str] = "spiht"
+    codec_id: ClassVar[int] = 0x04
+    model_hash: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
         if self.maxloop is not None and not 1 <= self.maxloop <= MAX_PLANES:
             raise ConfigError("codec spiht", "maxloop", self.maxloop, f"1..{MAX_PLANES}, or none")
 
-    @property
-    def name(self) -> str:
-        """Name in the registry."""
-        return "spiht"
-
-    @property
-    def codec_id(self) -> int:
-        """Number in the stream header."""
-        return CODEC_ID
-
-    @property
-    def model_hash(self) -> str:
-        """Empty: there is no model."""
-        return ""
-
-    def encode(self, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], budget_bytes: int | None = None) -> bytes:
-        """Return the stream; it may be cut anywhere behind its 12 leading bits of body.
-
-        Args:
-            image: Shape (16..512, 16..512), uint8 or uint16 (uint16 is mapped to 8 bits by `to_uint8`).
-            budget_bytes: Most bytes of the whole stream. All of them are used unless `maxloop` or the last plane, half
-                a grey level, comes first.
-
-        Raises:
-            StreamError: Size or dtype is not supported, or the budget leaves the body less than 2 bytes.
-        """
+    def encode(self, image: SnippetPixels, budget_bytes: int | None = None) -> bytes:
+        """Return the stream (see `Codec.encode`). It uses the whole budget unless it reaches `maxloop` or plane 0."""
         check_image(image)
         grey = to_uint8(image)
-        header = StreamHeader(CODEC_ID, 0, grey.shape[0], grey.shape[1]).pack()
+        header = StreamHeader(self.codec_id, 0, grey.shape[0], grey.shape[1]).pack()
         if budget_bytes is not None and budget_bytes < len(header) + 2:
             raise StreamError("codec spiht", "budget_bytes", budget_bytes, f"at least {len(header) + 2} B")
-        forest = forest_of(*grey.shape)
+        trees = wavelet_trees(*grey.shape)
         mean = (int(grey.sum(dtype=np.int64)) // grey.size) // _MEAN_STEP
-        flat = transform(grey, _MEAN_STEP * mean + _MEAN_STEP // 2, forest)
+        coefficients = forward_transform(grey, _MEAN_STEP * mean + _MEAN_STEP // 2, trees)
         if budget_bytes is None:
-            return header + _write_body(flat, mean, 0, forest, self.maxloop or NATURAL_MAXLOOP, None)
+            return header + _write_body(coefficients, mean, 0, trees, self.maxloop or DEFAULT_MAXLOOP, None)
         loops, length = self.maxloop or MAX_PLANES, budget_bytes - len(header)
-        bodies = [_write_body(flat, mean, phase, forest, loops, length) for phase in range(4)]
-        errors = [int(((_read_body(body, forest).astype(np.int64) - grey) ** 2).sum()) for body in bodies]
+        bodies = [_write_body(coefficients, mean, phase, trees, loops, length) for phase in range(4)]
+        errors = [int(((_read_body(body, trees).astype(np.int64) - grey) ** 2).sum()) for body in bodies]
         return header + bodies[errors.index(min(errors))]
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
-        """Rebuild the picture from the bytes up to the first that did not arrive.
+        """Reconstruct the image (see `Codec.decode`).
 
-        Every coefficient bears on a wide neighbourhood and the coarse ones come first, so a cut stream gives the whole
-        picture, only less sharp: nothing is missing, unless not even the leading 12 bits arrived.
-
-        Args:
-            stream: Header and body, cut anywhere.
-            received: Shape (body bytes in `stream`,), False where a body byte did not arrive.
-
-        Raises:
-            StreamError: The header is wrong, the stream is another codec's, or its highest plane cannot be right.
+        A truncated stream gives a coarser image without missing pixels. If the first two body bytes did not arrive, all
+        pixels are missing.
         """
-        header, body, notes = received_body(stream, received, CODEC_ID, self.name)
+        header, body, notes = received_body(stream, received, self.codec_id, self.name)
         if 8 * len(body) < _PREFIX_BITS:
-            shape = (header.height_px, header.width_px)
-            notes.append(f"{len(body)} B of the body arrived, at least 2 are needed")
-            return DecodedImage(np.zeros(shape, np.uint8), np.ones(shape, np.bool_), tuple(notes))
-        image = _read_body(body, forest_of(header.height_px, header.width_px))
-        return DecodedImage(image, np.zeros(image.shape, np.bool_), tuple(notes))
+            return DecodedImage.all_missing(
+                header, [*notes, f"{len(body)} B of the body arrived, at least 2 are needed"]
+            )
+        return DecodedImage.without_gaps(_read_body(body, wavelet_trees(header.height_px, header.width_px)), notes)
 
 
-def _write_body(flat: Integers, mean: int, phase: int, forest: Forest, loops: int, length: int | None) -> bytes:
-    """Return a body of at most `length` bytes, of at most `loops` planes."""
-    picture = EncoderTests(flat, phase, forest, None if length is None else 8 * length - _PREFIX_BITS)
-    top = picture.planes - 1
+def _write_body(
+    coefficients: Integers, mean: int, phase: int, trees: WaveletTrees, loops: int, length: int | None
+) -> bytes:
+    """Return a body of at most `length` bytes and at most `loops` planes."""
+    tests = EncoderTests(coefficients, phase, trees, None if length is None else 8 * length - _PREFIX_BITS)
+    top = tests.planes - 1
     with suppress(EndOfBits):
-        run_passes(forest, range(top, max(top - loops, -1), -1), picture.tests())
+        run_passes(trees, range(top, max(top - loops, -1), -1), tests)
     prefix = f"{mean:05b}{phase:02b}{top:05b}".encode()
-    bits = np.concatenate((np.frombuffer(prefix, np.uint8) - ord("0"), np.frombuffer(picture.bits, np.uint8)))
+    bits = np.concatenate((np.frombuffer(prefix, np.uint8) - ord("0"), np.frombuffer(tests.bits, np.uint8)))
     return np.packbits(bits).tobytes()
 
 
-def _read_body(body: bytes, forest: Forest) -> Image:
-    """Return the picture of a body of at least 2 bytes."""
+def _read_body(body: bytes, trees: WaveletTrees) -> Image:
+    """Return the image of a body of at least 2 bytes."""
     bits = np.unpackbits(np.frombuffer(body, np.uint8)).tobytes()
     mean, phase, top = (body[0] >> 3), (body[0] >> 1) & 3, (body[0] & 1) << 4 | body[1] >> 4
     if top >= MAX_PLANES:
         raise StreamError("spiht body", "highest plane", top, f"0..{MAX_PLANES - 1}")
-    stream = DecoderTests(bits[_PREFIX_BITS:], forest)
+    tests = DecoderTests(bits[_PREFIX_BITS:], trees)
     with suppress(EndOfBits):
-        run_passes(forest, range(top, -1, -1), stream.tests())
-    return inverse(stream.coefficients(phase), _MEAN_STEP * mean + _MEAN_STEP // 2, forest)
+        run_passes(trees, range(top, -1, -1), tests)
+    return inverse_transform(tests.coefficients(phase), _MEAN_STEP * mean + _MEAN_STEP // 2, trees)
+
+
+class EndOfBits(Exception):  # noqa: N818  (no error: the budget is used up, or the stream ends)
+    """The budget is used up, or the stream ends."""
+
+
+class SignificanceTests(Protocol):
+    """The tests of SPIHT. The encoder answers them from the coefficients, the decoder from the stream.
+
+    Every method raises EndOfBits when no bit is left.
+    """
+
+    def significant(self, node: int, plane: int) -> bool:
+        """Return whether a coefficient is significant in a plane."""
+
+    def negative(self, node: int) -> bool:
+        """Return the sign of a coefficient that has just become significant."""
+
+    def descendants(self, node: int, plane: int) -> bool:
+        """Return whether a coefficient has significant descendants."""
+
+    def grandchildren(self, node: int, plane: int) -> bool:
+        """Return whether a coefficient has significant descendants below its children."""
+
+    def refine(self, node: int, plane: int) -> None:
+        """Code the bit of a plane of a significant coefficient."""
+
+
+def run_passes(trees: WaveletTrees, planes: range, tests: SignificanceTests) -> None:
+    """Run all tests in the order of SPIHT, plane by plane, until a test raises EndOfBits.
+
+    Encoder and decoder share this function, so their order is the same.
+    """
+    children = trees.children
+    insignificant = list(range(trees.roots))
+    significant: list[int] = []
+    sets = [(node, False) for node in range(trees.roots) if children[node]]  # insignificant sets; True: type B
+    for plane in planes:
+        found: list[int] = []
+
+        def classify(node: int, plane: int = plane, found: list[int] = found) -> bool:
+            if tests.significant(node, plane):
+                found.append(node)
+                tests.negative(node)
+                return True
+            return False
+
+        insignificant = [node for node in insignificant if not classify(node)]
+        remaining: list[tuple[int, bool]] = []
+        for node, is_type_b in sets:  # the loop appends to the list
+            if not (tests.grandchildren if is_type_b else tests.descendants)(node, plane):
+                remaining.append((node, is_type_b))
+            elif is_type_b:
+                sets.extend((child, False) for child in children[node] if children[child])
+            else:
+                insignificant.extend([child for child in children[node] if not classify(child)])
+                if any(children[child] for child in children[node]):
+                    sets.append((node, True))
+        sets = remaining
+        for node in significant:
+            tests.refine(node, plane)
+        significant += found
+
+
+class EncoderTests:
+    """Answers from the quantised coefficients; writes every answer to `bits`."""
+
+    def __init__(self, coefficients: Integers, phase: int, trees: WaveletTrees, limit_bits: int | None) -> None:
+        quantised = np.abs(coefficients) // ((4 + phase) * PHASE_STEP)
+        below = np.zeros(trees.size, dtype=np.int64)
+        below_children = np.zeros(trees.size, dtype=np.int64)
+        ends = [trees.roots, *(start + h * w for start, h, w in trees.bands[2::3])]
+        for start, stop in reversed(list(pairwise(ends))):
+            parents = trees.parents[start:stop]
+            np.maximum.at(below_children, parents, below[start:stop])
+            np.maximum.at(below, parents, np.maximum(quantised[start:stop], below[start:stop]))
+        self.planes = max(int(quantised.max()).bit_length(), 1)
+        self.bits = bytearray()
+        self._limit_bits = MAX_PLANES * trees.size * 4 if limit_bits is None else limit_bits
+        self._levels = quantised.tolist()
+        self._below, self._below_children = below.tolist(), below_children.tolist()
+        self._signs = (coefficients < 0).tolist()
+
+    def significant(self, node: int, plane: int) -> bool:
+        """See `SignificanceTests`."""
+        return self._write(bool(self._levels[node] >> plane))
+
+    def negative(self, node: int) -> bool:
+        """See `SignificanceTests`."""
+        return self._write(self._signs[node])
+
+    def descendants(self, node: int, plane: int) -> bool:
+        """See `SignificanceTests`."""
+        return self._write(bool(self._below[node] >> plane))
+
+    def grandchildren(self, node: int, plane: int) -> bool:
+        """See `SignificanceTests`."""
+        return self._write(bool(self._below_children[node] >> plane))
+
+    def refine(self, node: int, plane: int) -> None:
+        """See `SignificanceTests`."""
+        self._write(bool(self._levels[node] >> plane & 1))
+
+    def _write(self, answer: bool) -> bool:  # noqa: FBT001  (the answer is the bit)
+        if len(self.bits) >= self._limit_bits:
+            raise EndOfBits
+        self.bits.append(answer)
+        return answer
+
+
+class DecoderTests:
+    """Answers from the stream; stores the lower bound and the interval width of each coefficient."""
+
+    def __init__(self, bits: bytes, trees: WaveletTrees) -> None:
+        self._bits = iter(bits)
+        self._lower = [0] * trees.size
+        self._width = [0] * trees.size
+        self._sign = [1] * trees.size
+        self._plane = 0
+
+    def significant(self, node: int, plane: int) -> bool:
+        """See `SignificanceTests`."""
+        self._plane = plane
+        return self._read()
+
+    def negative(self, node: int) -> bool:
+        """See `SignificanceTests`. A coefficient without a sign stays zero."""
+        is_negative = self._read()
+        self._sign[node] = -1 if is_negative else 1
+        self._lower[node] = self._width[node] = 1 << self._plane
+        return is_negative
+
+    def descendants(self, node: int, plane: int) -> bool:
+        """See `SignificanceTests`."""
+        return self._read()
+
+    def grandchildren(self, node: int, plane: int) -> bool:
+        """See `SignificanceTests`."""
+        return self._read()
+
+    def refine(self, node: int, plane: int) -> None:
+        """See `SignificanceTests`."""
+        self._lower[node] += self._read() << plane
+        self._width[node] = 1 << plane
+
+    def coefficients(self, phase: int) -> Integers:
+        """Return the reconstructed coefficients, shape (trees.size,), in 2**-8 grey levels."""
+        lower, width, sign = (np.array(values, dtype=np.int64) for values in (self._lower, self._width, self._sign))
+        # Small coefficients are more frequent than large ones within an interval too: 3/8 of the width, not 1/2.
+        return sign * ((8 * lower + 3 * width) * ((4 + phase) * PHASE_STEP) >> 3)
+
+    def _read(self) -> bool:
+        bit = next(self._bits, None)
+        if bit is None:
+            raise EndOfBits
+        return bool(bit)
+
+
+@dataclass(frozen=True)
+class WaveletTrees:
+    """The coefficients of an image size in one row, and the trees over them.
+
+    Attributes:
+        shapes: Height and width of the image and of each low band, finest first.
+        size: Number of coefficients.
+        roots: Number of coefficients of the lowest band, which come first.
+        bands: Start, height and width of each detail band; HL, LH, HH, coarsest level first.
+        parents: Parent of each coefficient, -1 for a root.
+        children: Children of each coefficient.
+    """
+
+    shapes: tuple[tuple[int, int], ...]
+    size: int
+    roots: int
+    bands: tuple[tuple[int, int, int], ...]
+    parents: Integers
+    children: tuple[tuple[int, ...], ...]
+
+
+@lru_cache(maxsize=8)
+def wavelet_trees(height_px: int, width_px: int) -> WaveletTrees:
+    """Return the trees of an image size. The shorter side of the lowest band is one coefficient."""
+    shapes = [(height_px, width_px)]
+    while min(shapes[-1]) >= 2:
+        shapes.append(((shapes[-1][0] + 1) // 2, (shapes[-1][1] + 1) // 2))
+    low_h, low_w = shapes[-1]
+    parents, bands, start = [np.full(low_h * low_w, -1, dtype=np.int64)], [], low_h * low_w
+    coarser = [(0, low_h, low_w, 1)] * 3
+    for (h, w), (half_h, half_w) in zip(reversed(shapes[:-1]), reversed(shapes[1:]), strict=True):
+        level = []
+        for (parent_start, parent_h, parent_w, step), size in zip(
+            coarser, ((half_h, w // 2), (h // 2, half_w), (h // 2, w // 2)), strict=True
+        ):
+            rows = np.minimum(np.arange(size[0]) // step, parent_h - 1)
+            columns = np.minimum(np.arange(size[1]) // step, parent_w - 1)
+            parents.append((parent_start + rows[:, None] * parent_w + columns).ravel())
+            level.append((start, *size, 2))
+            bands.append((start, *size))
+            start += size[0] * size[1]
+        coarser = level
+    flat = np.concatenate(parents)
+    order = np.argsort(flat, kind="stable")
+    ends = np.searchsorted(flat[order], np.arange(start + 1)).tolist()
+    ordered = order.tolist()
+    children = tuple(tuple(ordered[a:b]) for a, b in pairwise(ends))
+    return WaveletTrees(tuple(shapes), start, low_h * low_w, tuple(bands), flat, children)
+
+
+def forward_transform(image: Image, mean: int, trees: WaveletTrees) -> Integers:
+    """Return the coefficients of the image minus `mean`, shape (trees.size,), in 2**-8 grey levels."""
+    low = (image.astype(np.int64) - mean) << FRACTION_BITS
+    flat = np.empty(trees.size, dtype=np.int64)
+    for level in range(len(trees.shapes) - 1):
+        top, bottom = _analyse(low)
+        low, hl = (band.T for band in _analyse(top.T))
+        lh, hh = (band.T for band in _analyse(bottom.T))
+        first = len(trees.bands) - 3 * (level + 1)
+        for (start, h, w), band in zip(trees.bands[first : first + 3], (hl, lh, hh), strict=True):
+            flat[start : start + h * w] = band.ravel()
+    flat[: trees.roots] = low.ravel()
+    return flat
+
+
+def inverse_transform(flat: Integers, mean: int, trees: WaveletTrees) -> Image:
+    """Return the image of coefficients, shape `trees.shapes[0]`, uint8."""
+    low = flat[: trees.roots].reshape(trees.shapes[-1])
+    for level in range(len(trees.shapes) - 1):
+        hl, lh, hh = (
+            flat[start : start + h * w].reshape(h, w) for start, h, w in trees.bands[3 * level : 3 * level + 3]
+        )
+        low = _synthesise(_synthesise(low.T, hl.T).T, _synthesise(lh.T, hh.T).T)
+    grey = ((low + (1 << (FRACTION_BITS - 1))) >> FRACTION_BITS) + mean
+    return np.asarray(np.clip(grey, 0, 255), dtype=np.uint8)
+
+
+def _analyse(samples: Integers) -> tuple[Integers, Integers]:
+    """Split along axis 0 (at least 2 long) into the low band of length ceil(n / 2) and the high band."""
+    even, odd = samples[0::2].copy(), samples[1::2].copy()
+    for step in (0, 2):
+        odd += _scale(_sum_of_even_neighbours(even, len(odd)), _LIFT[step])
+        even += _scale(_sum_of_odd_neighbours(odd, len(even)), _LIFT[step + 1])
+    return _scale(even, _LOW_GAIN), _scale(odd, _HIGH_GAIN)
+
+
+def _synthesise(low: Integers, high: Integers) -> Integers:
+    """Invert `_analyse` along axis 0, except for the rounding of the last fraction bit."""
+    even, odd = _scale(low, _HIGH_GAIN), _scale(high, _LOW_GAIN)
+    for step in (2, 0):
+        even -= _scale(_sum_of_odd_neighbours(odd, len(even)), _LIFT[step + 1])
+        odd -= _scale(_sum_of_even_neighbours(even, len(odd)), _LIFT[step])
+    samples = np.empty((len(even) + len(odd), *even.shape[1:]), dtype=np.int64)
+    samples[0::2], samples[1::2] = even, odd
+    return samples
+
+
+def _scale(values: Integers, factor: int) -> Integers:
+    return (values * factor + (1 << 15)) >> 16
+
+
+def _sum_of_even_neighbours(even: Integers, count: int) -> Integers:
+    """Sum the even samples on both sides of each of `count` odd ones, mirrored at the end."""
+    right = even[1 : count + 1]
+    if len(right) < count:
+        right = np.concatenate((right, even[-1:]))
+    return even[:count] + right
+
+
+def _sum_of_odd_neighbours(odd: Integers, count: int) -> Integers:
+    """Sum the odd samples on both sides of each of `count` even ones, mirrored at both ends."""
+    left = np.concatenate((odd[:1], odd))[:count]
+    right = odd if len(odd) == count else np.concatenate((odd, odd[-1:]))
+    return left + right

@@ -1,16 +1,19 @@
-"""What came after JPEG 2000: JPEG XL, AVIF and WebP through Pillow, to compare with.
+"""JPEG XL, AVIF and WebP through Pillow, for comparison.
 
-Each is there where the installed Pillow offers it: WebP and AVIF in its usual wheels, JPEG XL with the plug-in
-`pillow-jxl-plugin`. They are made for pictures of many kilobytes. With a budget, the best quality that fits is sent; on
-textured snippets even the lowest takes some hundred bytes, and a smaller budget is refused.
+A format is available if the installed Pillow supports it: WebP and AVIF in its usual wheels, JPEG XL with
+`pillow-jxl-plugin`. These formats are made for images of many kilobytes. With a budget, the encoder sends the best
+quality that fits. On textured snippets the lowest quality needs some hundred bytes, and a smaller budget is rejected.
 
-The body of `jpegxl` is the codestream as the library writes it. Of `webp` it is the VP8 key frame less its start code
-and size, which the decoder knows (RFC 6386, section 9.1); with the RIFF container that saves 27 bytes. Of `avif` it is
-the AV1 sequence header and frame without the file around them, which saves 271 (`avif_file`); a body that is a whole
-file, as earlier releases sent it, is read too.
+The body omits everything that follows from the image size:
 
-Libraries make room for a picture when they read its size, so the size is compared with the stream header's first.
-None of the three decodes in part: what is cut is refused.
+* `jpegxl`: the codestream as the library writes it.
+* `webp`: the VP8 key frame without start code and size (RFC 6386, section 9.1). 27 bytes less than the file.
+* `avif`: the AV1 sequence header and frame (AV1 specification, section 5.5). libavif writes 269 bytes of boxes before
+  the first byte of AV1 (ISO/IEC 14496-12 and 23008-12, AVIF 1.1), then a temporal delimiter of 2 bytes. Only two
+  lengths, the size and the level vary. A body that is a complete file, as sent by earlier releases, is decoded too.
+
+Libraries allocate memory for the size in the data, so the decoder first compares that size with the stream header. No
+format decodes a truncated body.
 """
 
 from __future__ import annotations
@@ -20,25 +23,36 @@ import importlib.util
 import io
 from dataclasses import dataclass
 from enum import Enum
+from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image as Pillow
 from PIL import features
 
-from sonarpost.codec.baselines.avif_file import avif_file, check_frame, frame_of
-from sonarpost.codec.interface import DecodedImage, Image, Mask, StreamHeader, check_image, received_body, to_uint8
+from sonarpost.codec.interface import (
+    DecodedImage,
+    Image,
+    Mask,
+    SnippetPixels,
+    StreamHeader,
+    check_image,
+    received_body,
+    to_uint8,
+)
 from sonarpost.errors import ConfigError, StreamError
 
-NATURAL_QUALITY = 30
-MAX_QUALITY = 99  # 100 asks JPEG XL for lossless coding, by another route
+DEFAULT_QUALITY = 30
+MAX_QUALITY = 99  # 100 selects lossless JPEG XL
 
-_KEY_FRAME_TAG = 3  # bytes
-_START_CODE = b"\x9d\x01\x2a"
+_VP8_TAG_BYTES = 3
+_VP8_START_CODE = b"\x9d\x01\x2a"
+_AV1_DELIMITER = b"\x12\x00"
+_AV1_SEQUENCE_HEADER, _AV1_FRAME = 0x0A, 0x32  # OBU types 1 and 6, each with its length
+_AV1_LEVEL_2_0_PIXELS = 147_456  # AV1 specification, annex A.3; level 2.1 is enough for 512 x 512
 
 
 class StillImageFormat(Enum):
-    """A format, by its name in the registry."""
+    """A format. The value is the name in the registry."""
 
     JPEGXL = "jpegxl"
     AVIF = "avif"
@@ -46,17 +60,17 @@ class StillImageFormat(Enum):
 
     @property
     def codec_id(self) -> int:
-        """Number in the stream header."""
+        """Codec id in the stream header."""
         return {"jpegxl": 0x05, "avif": 0x06, "webp": 0x07}[self.value]
 
     @property
-    def needs(self) -> str:
-        """What has to be installed, for people."""
+    def requirement(self) -> str:
+        """Software to install for this format."""
         return "pillow-jxl-plugin" if self is StillImageFormat.JPEGXL else f"a Pillow built with {self.value}"
 
     @property
     def available(self) -> bool:
-        """Whether the library is there."""
+        """Whether that software is installed."""
         if self is StillImageFormat.JPEGXL:
             return importlib.util.find_spec("pillow_jxl") is not None
         return bool(features.check(self.value))
@@ -64,22 +78,23 @@ class StillImageFormat(Enum):
 
 @dataclass(frozen=True)
 class StillImageCodec:
-    """A format of a library. Satisfies `sonarpost.codec.interface.Codec`.
+    """Codec of one format. Implements `sonarpost.codec.Codec`.
 
     Attributes:
-        format: Which one.
-        quality: The library's quality when no budget is given, 0..99.
+        format: The format.
+        quality: Quality setting of the library without a budget, 0..99.
 
     Raises:
-        ConfigError: The library is not installed, or `quality` is out of bounds.
+        ConfigError: The library is not installed, or `quality` is out of range.
     """
 
     format: StillImageFormat
-    quality: int = NATURAL_QUALITY
+    quality: int = DEFAULT_QUALITY
+    model_hash: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
         if not self.format.available:
-            raise ConfigError(f"codec {self.name}", "library", "not installed", self.format.needs)
+            raise ConfigError(f"codec {self.name}", "library", "not installed", self.format.requirement)
         if not 0 <= self.quality <= MAX_QUALITY:
             raise ConfigError(f"codec {self.name}", "quality", self.quality, f"0..{MAX_QUALITY}")
 
@@ -90,171 +105,235 @@ class StillImageCodec:
 
     @property
     def codec_id(self) -> int:
-        """Number in the stream header."""
+        """Codec id in the stream header."""
         return self.format.codec_id
 
-    @property
-    def model_hash(self) -> str:
-        """Empty: there is no model."""
-        return ""
-
-    def encode(self, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], budget_bytes: int | None = None) -> bytes:
-        """Return the stream.
-
-        Args:
-            image: Shape (16..512, 16..512), uint8 or uint16 (uint16 is mapped to 8 bits by `to_uint8`).
-            budget_bytes: Most bytes of the whole stream; None for what `quality` takes.
-
-        Raises:
-            StreamError: Size or dtype is not supported, or no quality tried fits the budget.
-        """
+    def encode(self, image: SnippetPixels, budget_bytes: int | None = None) -> bytes:
+        """Return the stream (see `Codec.encode`); without a budget, at `quality`."""
         check_image(image)
         grey = to_uint8(image)
         header = StreamHeader(self.codec_id, 0, grey.shape[0], grey.shape[1]).pack()
         if budget_bytes is None:
             return header + _encode(self.format, grey, self.quality)
-        body = _search(self.format, grey, budget_bytes - len(header))
+        body = _search_quality(self.format, grey, budget_bytes - len(header))
         if body is None:
-            raise StreamError(f"codec {self.name}", "budget_bytes", budget_bytes, "more: not the lowest quality fits")
+            expected = "a larger budget: the lowest quality does not fit"
+            raise StreamError(f"codec {self.name}", "budget_bytes", budget_bytes, expected)
         return header + body
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
-        """Rebuild the picture.
+        """Reconstruct the image (see `Codec.decode`).
 
-        Args:
-            stream: Header and body.
-            received: Shape (body bytes in `stream`,), False where a body byte did not arrive. If what precedes the
-                first gap does not decode, the whole picture is black and missing.
-
-        Raises:
-            StreamError: The header is wrong, the stream is another codec's, or the body is cut, damaged, or a picture
-                of another size.
+        If the bytes before the first gap do not decode, all pixels are missing.
         """
         header, body, notes = received_body(stream, received, self.codec_id, self.name)
-        shape = (header.height_px, header.width_px)
         try:
-            image = _decode(self.format, body, shape)
+            image = _decode(self.format, body, (header.height_px, header.width_px))
+            return DecodedImage.without_gaps(image, notes)
         except StreamError as error:
             if received is None or received.all():
                 raise
-            notes.append(f"nothing can be decoded: {error}")
-            return DecodedImage(np.zeros(shape, np.uint8), np.ones(shape, np.bool_), tuple(notes))
-        return DecodedImage(image, np.zeros(shape, np.bool_), tuple(notes))
+            return DecodedImage.all_missing(header, [*notes, f"nothing can be decoded: {error}"])
 
 
-def _search(wanted: StillImageFormat, grey: Image, limit_bytes: int) -> bytes | None:
-    """Return the body with the least error among those tried that fit, or None.
+def _search_quality(image_format: StillImageFormat, grey: Image, limit_bytes: int) -> bytes | None:
+    """Return the body with the smallest error among the tested ones of at most `limit_bytes`, or None.
 
-    Halves the range of qualities. Neither length nor error follow the quality strictly, so the last that fits need not
-    be the best; on average it is 0.01 dB below.
+    Binary search over the quality. Length and error are not strictly monotonic in it, so the last body that fits is not
+    always the best; on average it is 0.01 dB below the best.
     """
-    best, least = None, 0
+    best, best_error = None, 0
     low, high = 0, MAX_QUALITY
     while low <= high:
         quality = (low + high) // 2
-        body = _encode(wanted, grey, quality)
+        body = _encode(image_format, grey, quality)
         if len(body) > limit_bytes:
             high = quality - 1
             continue
         low = quality + 1
-        error = int(((_decode(wanted, body, grey.shape).astype(np.int64) - grey) ** 2).sum())
-        if best is None or error < least:
-            best, least = body, error
+        error = int(((_decode(image_format, body, grey.shape).astype(np.int64) - grey) ** 2).sum())
+        if best is None or error < best_error:
+            best, best_error = body, error
     return best
 
 
-def _encode(wanted: StillImageFormat, grey: Image, quality: int) -> bytes:
-    file, picture = io.BytesIO(), Pillow.fromarray(grey)
-    match wanted:
+def _encode(image_format: StillImageFormat, grey: Image, quality: int) -> bytes:
+    file, image = io.BytesIO(), Pillow.fromarray(grey)
+    match image_format:
         case StillImageFormat.WEBP:
-            picture.save(file, "WEBP", quality=quality, method=6)
-            return _key_frame(file.getvalue(), grey.shape)
+            image.save(file, "WEBP", quality=quality, method=6)
+            return webp_body(file.getvalue(), grey.shape)
         case StillImageFormat.AVIF:
-            picture.save(file, "AVIF", quality=quality, subsampling="4:0:0", speed=4, max_threads=1)
-            return frame_of(file.getvalue(), grey.shape)
+            image.save(file, "AVIF", quality=quality, subsampling="4:0:0", speed=4, max_threads=1)
+            return avif_body(file.getvalue(), grey.shape)
         case StillImageFormat.JPEGXL:
             importlib.import_module("pillow_jxl")
-            picture.save(file, "JXL", quality=quality, effort=7, num_threads=0)
+            image.save(file, "JXL", quality=quality, effort=7, num_threads=0)
     return file.getvalue()
 
 
-def _decode(wanted: StillImageFormat, body: bytes, shape: tuple[int, ...]) -> Image:
-    """Return the picture.
+def _decode(image_format: StillImageFormat, body: bytes, shape: tuple[int, ...]) -> Image:
+    """Return the image of a body.
 
     Raises:
-        StreamError: The library refuses it, or it has another size.
+        StreamError: The library rejects the body, or the body has another size.
     """
-    file = body
-    if wanted is StillImageFormat.WEBP:
-        file = _webp_file(body, shape)
-    elif wanted is StillImageFormat.AVIF:
-        file = _avif_file(body, shape)
-    elif wanted is StillImageFormat.JPEGXL:
-        importlib.import_module("pillow_jxl")
-        _check_size(wanted, jpegxl_size(body), shape)
+    match image_format:
+        case StillImageFormat.WEBP:
+            file = webp_file(body, shape)
+        case StillImageFormat.AVIF:
+            file = _avif_file_of_body(body, shape)
+        case StillImageFormat.JPEGXL:
+            importlib.import_module("pillow_jxl")
+            _check_size(image_format, jpegxl_size(body), shape)
+            file = body
+    pillow_name = "JXL" if image_format is StillImageFormat.JPEGXL else image_format.name
     try:
-        with Pillow.open(
-            io.BytesIO(file), formats=["JXL" if wanted is StillImageFormat.JPEGXL else wanted.name]
-        ) as picture:
-            _check_size(wanted, (picture.height, picture.width), shape)
-            return np.array(picture.convert("L"), dtype=np.uint8)
+        with Pillow.open(io.BytesIO(file), formats=[pillow_name]) as opened:
+            _check_size(image_format, (opened.height, opened.width), shape)
+            return np.array(opened.convert("L"), dtype=np.uint8)
     except StreamError:
         raise
-    except Exception as error:  # the libraries raise many types on damaged data, and mean one thing
-        raise StreamError(f"{wanted.value} body", "data", repr(error), "data that the library decodes") from error
+    except Exception as error:  # the libraries raise many types on damaged data
+        raise StreamError(f"{image_format.value} body", "data", repr(error), "data that the library decodes") from error
 
 
-def _check_size(wanted: StillImageFormat, met: tuple[int, int], shape: tuple[int, ...]) -> None:
-    if met != shape:
-        raise StreamError(f"{wanted.value} body", "size", met, f"{shape}, the stream header's")
+def _check_size(image_format: StillImageFormat, actual: tuple[int, int], shape: tuple[int, ...]) -> None:
+    if actual != shape:
+        raise StreamError(f"{image_format.value} body", "size", actual, f"{shape}, the stream header's")
+
+
+def webp_body(file: bytes, shape: tuple[int, ...]) -> bytes:
+    """Return the VP8 key frame of a WebP file without start code and size.
+
+    Raises:
+        ConfigError: This libwebp writes something other than one plain lossy frame.
+    """
+    frame = file[20 : 20 + int.from_bytes(file[16:20], "little")]
+    removed = _VP8_START_CODE + _vp8_size(shape)
+    end = _VP8_TAG_BYTES + len(removed)
+    if file[:4] + file[8:16] != b"RIFFWEBPVP8 " or frame[_VP8_TAG_BYTES:end] != removed:
+        raise ConfigError("libwebp", "file", file[:40].hex(), "one VP8 key frame")
+    return frame[:_VP8_TAG_BYTES] + frame[end:]
+
+
+def webp_file(body: bytes, shape: tuple[int, ...]) -> bytes:
+    """Return the WebP file of a body. The inverse of `webp_body`."""
+    frame = body[:_VP8_TAG_BYTES] + _VP8_START_CODE + _vp8_size(shape) + body[_VP8_TAG_BYTES:]
+    chunk = b"WEBPVP8 " + len(frame).to_bytes(4, "little") + frame
+    return b"RIFF" + len(chunk).to_bytes(4, "little") + chunk
 
 
 def _vp8_size(shape: tuple[int, ...]) -> bytes:
     return shape[1].to_bytes(2, "little") + shape[0].to_bytes(2, "little")
 
 
-def _key_frame(file: bytes, shape: tuple[int, ...]) -> bytes:
-    """Return a WebP file's VP8 key frame without start code and size.
+def avif_body(file: bytes, shape: tuple[int, ...]) -> bytes:
+    """Return the AV1 sequence header and frame of an AVIF file. The inverse of `avif_file`.
 
     Raises:
-        ConfigError: This libwebp writes something else than one plain lossy frame.
+        ConfigError: This libavif writes other boxes.
     """
-    frame = file[20 : 20 + int.from_bytes(file[16:20], "little")]
-    known = _START_CODE + _vp8_size(shape)
-    end = _KEY_FRAME_TAG + len(known)
-    if file[:4] + file[8:16] != b"RIFFWEBPVP8 " or frame[_KEY_FRAME_TAG:end] != known:
-        raise ConfigError("libwebp", "file", file[:40].hex(), "one VP8 key frame")
-    return frame[:_KEY_FRAME_TAG] + frame[end:]
+    frame = file[len(avif_file(b"", shape)) :]
+    if file != avif_file(frame, shape):
+        raise ConfigError("libavif", "file", file[:300].hex(), "the boxes of version 1, around one grey AV1 frame")
+    return frame
 
 
-def _webp_file(body: bytes, shape: tuple[int, ...]) -> bytes:
-    """Return the WebP file around what `_key_frame` leaves."""
-    frame = body[:_KEY_FRAME_TAG] + _START_CODE + _vp8_size(shape) + body[_KEY_FRAME_TAG:]
-    chunk = b"WEBPVP8 " + len(frame).to_bytes(4, "little") + frame
-    return b"RIFF" + len(chunk).to_bytes(4, "little") + chunk
+def avif_file(frame: bytes, shape: tuple[int, ...]) -> bytes:
+    """Return the AVIF file around a sequence header and frame.
+
+    Args:
+        frame: AV1 sequence header and frame.
+        shape: (height_px, width_px).
+    """
+    payload = _AV1_DELIMITER + frame
+    start = _box(b"ftyp", b"avif", bytes(4), b"avifmif1miaf")
+    size = shape[1].to_bytes(4, "big") + shape[0].to_bytes(4, "big")
+    level = int(shape[0] * shape[1] > _AV1_LEVEL_2_0_PIXELS)
+    properties = _box(
+        b"ipco",
+        _box(b"ispe", bytes(4), size),
+        _box(b"pixi", bytes(4), b"\x01\x08"),  # one channel of 8 bits
+        _box(b"av1C", bytes([0x81, level, 0x1C, 0])),  # monochrome
+        _box(b"colr", b"nclx\x00\x01\x00\x0d\x00\x06\x80"),  # BT.709, sRGB, BT.601, full range
+    )
+    associations = _box(b"ipma", bytes(4), b"\0\0\0\1\0\1\4\1\2\x83\4")
+    boxes = (
+        _box(b"hdlr", bytes(8), b"pict", bytes(13)),
+        _box(b"pitm", bytes(4), b"\0\1"),
+        _box(b"iloc", bytes(4), b"\x44\0\0\1\0\1\0\0\0\1", (269).to_bytes(4, "big"), len(payload).to_bytes(4, "big")),
+        _box(b"iinf", bytes(4), b"\0\1", _box(b"infe", b"\2\0\0\0\0\1\0\0av01Color\0")),
+        _box(b"iprp", properties, associations),
+    )
+    return start + _box(b"meta", bytes(4), *boxes) + _box(b"mdat", payload)
 
 
-def _avif_file(body: bytes, shape: tuple[int, ...]) -> bytes:
-    """Return the AVIF file around a body, or the body if it is one already.
+def _box(name: bytes, *parts: bytes) -> bytes:
+    content = b"".join(parts)
+    return (8 + len(content)).to_bytes(4, "big") + name + content
+
+
+def _avif_file_of_body(body: bytes, shape: tuple[int, ...]) -> bytes:
+    """Return the AVIF file of a body, which can be a complete file.
 
     Raises:
-        StreamError: It is neither, or a picture of another size.
+        StreamError: The body is neither a file nor a frame, or it has another size.
     """
     frame = body
     if body[4:8] == b"ftyp":
         try:
-            frame = frame_of(body, shape)
+            frame = avif_body(body, shape)
         except ConfigError as error:
             raise StreamError("avif body", "file or its size", body[:32], f"a grey still of {shape}") from error
-    check_frame(frame, shape)
+    check_av1_frame(frame, shape)
     return avif_file(frame, shape)
 
 
-def jpegxl_size(codestream: bytes) -> tuple[int, int]:
-    """Return height and width that a bare JPEG XL codestream begins with (ISO/IEC 18181-1, SizeHeader).
+def check_av1_frame(frame: bytes, shape: tuple[int, ...]) -> None:
+    """Check that a body is one sequence header of a still picture of this size and one frame.
+
+    The decoder allocates memory for the size in the sequence header. In the reduced form of still pictures the frame
+    cannot have another size.
 
     Raises:
-        StreamError: It is no bare codestream, or too short.
+        StreamError: The body is something else.
+    """
+    expected = f"an AV1 sequence header and frame of a still picture of {shape[0]} x {shape[1]} px"
+    length = frame[1] if len(frame) > 1 else 0
+    header, rest = frame[2 : 2 + length], frame[2 + length :]
+    # The length of the frame: 7 bits a byte, least significant first, at most 3 bytes.
+    last = next((place for place in range(1, min(4, len(rest))) if not rest[place] & 0x80), 0)
+    frame_bytes = sum((rest[place] & 0x7F) << 7 * (place - 1) for place in range(1, last + 1))
+    if not last or frame[0] != _AV1_SEQUENCE_HEADER or rest[0] != _AV1_FRAME or frame_bytes != len(rest) - last - 1:
+        raise StreamError("avif body", "units", frame[:16], expected)
+    size = av1_sequence_size(header)
+    if size != shape:
+        raise StreamError("avif body", "size", size, f"{shape}, the stream header's")
+
+
+def av1_sequence_size(header: bytes) -> tuple[int, int] | None:
+    """Return height and width of a sequence header in the reduced form of still pictures, or None for other headers."""
+    if len(header) < 7 or (header[0] >> 3) & 3 != 3:  # still_picture and reduced_still_picture_header
+        return None
+    bits = int.from_bytes(header[:8].ljust(8, b"\0"), "big")
+    left = 64 - 10  # after the profile, the two flags and the level
+
+    def read(count: int) -> int:
+        nonlocal left
+        left -= count
+        return bits >> left & ((1 << count) - 1)
+
+    width_bits, height_bits = read(4) + 1, read(4) + 1
+    width_px, height_px = read(width_bits) + 1, read(height_bits) + 1
+    return height_px, width_px
+
+
+def jpegxl_size(codestream: bytes) -> tuple[int, int]:
+    """Return height and width of a bare JPEG XL codestream (ISO/IEC 18181-1, SizeHeader).
+
+    Raises:
+        StreamError: The data is not a bare codestream, or is too short.
     """
     if len(codestream) < 12 or codestream[:2] != b"\xff\x0a":
         raise StreamError("jpegxl body", "signature", codestream[:12], "a JPEG XL codestream")
@@ -265,14 +344,14 @@ def jpegxl_size(codestream: bytes) -> tuple[int, int]:
         value, bits = bits & ((1 << count) - 1), bits >> count
         return value
 
-    small = read(1)
+    is_small = read(1)
 
-    def side() -> int:
-        return 8 * (read(5) + 1) if small else read((9, 13, 18, 30)[read(2)]) + 1
+    def read_side() -> int:
+        return 8 * (read(5) + 1) if is_small else read((9, 13, 18, 30)[read(2)]) + 1
 
-    height = side()
+    height_px = read_side()
     ratio = read(3)
     if ratio == 0:
-        return height, side()
-    over, under = ((1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))[ratio - 1]
-    return height, height * over // under
+        return height_px, read_side()
+    numerator, denominator = ((1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))[ratio - 1]
+    return height_px, height_px * numerator // denominator
