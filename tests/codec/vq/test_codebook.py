@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from sonarpost.codec.vq.codebook import (
     DEFAULT_TILE_PX,
     Codebook,
-    default_for_tag,
+    find_codebook,
     from_bytes,
     load,
     load_default,
@@ -33,7 +33,7 @@ def small() -> Codebook:
     return Codebook(TileDatabase.from_tiles(4, tiles, 3), {"name": "klein", "source": "Rauschen, für den Test"})
 
 
-def test_saved_and_loaded_it_is_the_same(tmp_path: Path) -> None:
+def test_codebook_round_trips_through_a_file(tmp_path: Path) -> None:
     path = tmp_path / "a.tiles"
     save(path, small())
     loaded = load(path)
@@ -44,7 +44,7 @@ def test_saved_and_loaded_it_is_the_same(tmp_path: Path) -> None:
     assert open_codebook(str(path)).tiles.identity == loaded.tiles.identity
 
 
-def test_the_layout_is_the_documented_one() -> None:
+def test_file_has_the_documented_layout() -> None:
     codebook = small()
     data = to_bytes(codebook)
     notes = json.dumps(dict(codebook.notes), sort_keys=True, ensure_ascii=False).encode()
@@ -69,12 +69,12 @@ def test_any_damage_is_a_codebook_error(data: st.DataObject) -> None:
 
 
 @pytest.mark.parametrize("length", [0, 1, 8, 21, 22, 53, 54, 100, -33, -1])
-def test_a_cut_file_is_refused(length: int) -> None:
+def test_truncated_file_is_rejected(length: int) -> None:
     with pytest.raises(CodebookError):
         from_bytes(to_bytes(small())[:length], "cut")
 
 
-def with_right_hash(data: bytes) -> bytes:
+def with_valid_hash(data: bytes) -> bytes:
     return data[:-32] + hashlib.sha256(data[:-32]).digest()
 
 
@@ -94,29 +94,29 @@ def with_right_hash(data: bytes) -> bytes:
         (22, b"\xff", "notes"),
     ],
 )
-def test_a_wrong_field_is_named_even_under_a_right_hash(offset: int, value: bytes, field: str) -> None:
+def test_error_names_the_invalid_field_under_a_valid_hash(offset: int, value: bytes, field: str) -> None:
     data = bytearray(to_bytes(small()))
     data[offset : offset + len(value)] = value
     with pytest.raises(CodebookError) as caught:
-        from_bytes(with_right_hash(bytes(data)), "x.tiles")
+        from_bytes(with_valid_hash(bytes(data)), "x.tiles")
     assert caught.value.field == field
     assert caught.value.where == "x.tiles"
 
 
 @pytest.mark.parametrize("notes", [b"[1]", b'{"a": 1}', b"null", b"[" * 9999])
-def test_notes_that_are_not_strings_by_name_are_refused(notes: bytes) -> None:
+def test_invalid_notes_are_rejected(notes: bytes) -> None:
     data = to_bytes(Codebook(small().tiles, {}))
     changed = data[:18] + len(notes).to_bytes(4, "big") + notes + data[24:]
     with pytest.raises(CodebookError, match="notes"):
-        from_bytes(with_right_hash(changed), "x")
+        from_bytes(with_valid_hash(changed), "x")
 
 
-def test_notes_beyond_bounds_are_refused() -> None:
+def test_long_notes_are_rejected() -> None:
     with pytest.raises(CodebookError, match="notes"):
         to_bytes(Codebook(small().tiles, {"a": "x" * (1 << 20)}))
 
 
-def test_a_file_that_cannot_be_read_or_written_is_named(tmp_path: Path) -> None:
+def test_error_names_an_unreadable_or_unwritable_file(tmp_path: Path) -> None:
     with pytest.raises(CodebookError, match=r"absent\.tiles"):
         load(tmp_path / "absent.tiles")
     with pytest.raises(CodebookError):
@@ -125,7 +125,7 @@ def test_a_file_that_cannot_be_read_or_written_is_named(tmp_path: Path) -> None:
         save(tmp_path / "nowhere" / "a.tiles", small())
 
 
-def test_a_failed_write_leaves_the_old_codebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_write_keeps_the_old_codebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.tiles"
     save(path, small())
     before = path.read_bytes()
@@ -141,7 +141,7 @@ def test_a_failed_write_leaves_the_old_codebook(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("tile_px", DEFAULT_TILE_PX)
-def test_the_shipped_codebooks_are_whole_and_fit_14_bits(tile_px: int) -> None:
+def test_shipped_codebooks_are_valid_and_fit_14_bits(tile_px: int) -> None:
     codebook = load_default(tile_px)
     assert codebook.tiles.tile_px == tile_px
     assert 1000 <= len(codebook.tiles) <= 15_992
@@ -152,16 +152,69 @@ def test_the_shipped_codebooks_are_whole_and_fit_14_bits(tile_px: int) -> None:
     assert open_codebook(f"nominal-{tile_px}") is codebook
 
 
-def test_a_shipped_codebook_is_found_by_the_tag_in_a_stream() -> None:
+def test_shipped_codebook_is_found_by_its_tag() -> None:
     tags = {tile_px: codebook_tag(load_default(tile_px).tiles) for tile_px in DEFAULT_TILE_PX}
     assert len(set(tags.values())) == len(tags)
     for tile_px, tag in tags.items():
-        assert default_for_tag(tag) is load_default(tile_px)
+        assert find_codebook(tag).tiles.identity == load_default(tile_px).tiles.identity
     unknown = next(tag for tag in range(9) if tag not in tags.values())
     with pytest.raises(CodebookError, match="nominal-10"):
-        default_for_tag(unknown)
+        find_codebook(unknown)
 
 
-def test_there_is_no_other_nominal_size() -> None:
+def codebook_file(folder: Path, seed: int) -> tuple[Path, int]:
+    """Write a codebook of random tiles; return its path and tag."""
+    tiles = np.random.default_rng(seed).integers(0, 256, (7, 16), dtype=np.uint8)
+    codebook = Codebook(TileDatabase.from_tiles(4, tiles, 3), {})
+    path = folder / f"{seed}.tiles"
+    save(path, codebook)
+    return path, codebook_tag(codebook.tiles)
+
+
+def test_codebook_is_found_in_the_search_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, tag = codebook_file(tmp_path, 1)
+    with pytest.raises(CodebookError, match="SONARPOST_CODEBOOKS"):
+        find_codebook(tag)
+    for search_path in ([path], [str(path)], [tmp_path], ["nominal-20", tmp_path]):
+        assert find_codebook(tag, search_path).tiles.identity == load(path).tiles.identity
+    monkeypatch.setenv("SONARPOST_CODEBOOKS", f"{tmp_path / 'absent'}{os.pathsep}{tmp_path}")
+    assert find_codebook(tag).tiles.identity == load(path).tiles.identity
+
+
+def test_error_for_an_unknown_tag_names_the_places_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (path, tag), (other_path, other_tag) = codebook_file(tmp_path, 1), codebook_file(tmp_path, 2)
+    (tmp_path / "damaged.tiles").write_bytes(b"SPTILES")
+    monkeypatch.setenv("SONARPOST_CODEBOOKS", str(other_path))
+    unknown = next(number for number in range(99) if number not in (tag, other_tag))
+    with pytest.raises(CodebookError) as caught:
+        find_codebook(unknown, [tmp_path])
+    assert (caught.value.field, caught.value.value) == ("model_tag", f"{unknown:#06x}")
+    for place in (
+        f"{path} ({tag:#06x})",
+        "damaged.tiles (unreadable)",
+        "nominal-10 (0x",
+        f"{other_path} ({other_tag:#06x})",
+    ):
+        assert place in caught.value.expected
+
+
+def test_two_codebooks_with_the_same_tag_are_ambiguous(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    codebook_file(tmp_path, 1)
+    codebook_file(tmp_path, 2)
+    monkeypatch.setattr("sonarpost.codec.vq.codebook.codebook_tag", lambda _: 0x1234)
+    with pytest.raises(CodebookError, match="one codebook with this tag"):
+        find_codebook(0x1234, [tmp_path])
+
+
+def test_replaced_codebook_file_is_read_again(tmp_path: Path) -> None:
+    path, tag = codebook_file(tmp_path, 1)
+    assert find_codebook(tag, [path]).tiles.identity == load(path).tiles.identity
+    other_path, other_tag = codebook_file(tmp_path, 2)
+    path.write_bytes(other_path.read_bytes())
+    os.utime(path, ns=(1, 1))
+    assert find_codebook(other_tag, [path]).tiles.identity == load(other_path).tiles.identity
+
+
+def test_other_nominal_sizes_are_rejected() -> None:
     with pytest.raises(CodebookError, match="10 or 20"):
         load_default(15)

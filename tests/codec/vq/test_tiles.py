@@ -17,7 +17,7 @@ def random_tiles(count: int, tile_px: int, seed: int = 0) -> np.ndarray:
 
 
 def brute_force(database: TileDatabase, tile: np.ndarray) -> list[tuple[int, int]]:
-    """Squared distance in the basis and index of every tile, nearest first, in Python's own integers."""
+    """Return squared distance in the basis and index of every tile, nearest first, in Python integers."""
     basis = [[int(value) for value in row] for row in database.basis]
     squares = []
     for index, other in enumerate(database.tiles):
@@ -28,7 +28,7 @@ def brute_force(database: TileDatabase, tile: np.ndarray) -> list[tuple[int, int
 
 
 @pytest.mark.parametrize(("tile_px", "dims"), [(4, 16), (5, 7), (10, 70), (20, 30), (32, 70)])
-def test_nearest_in_the_basis_is_the_brute_force_nearest_exactly(tile_px: int, dims: int) -> None:
+def test_nearest_in_the_basis_matches_brute_force(tile_px: int, dims: int) -> None:
     database = TileDatabase.from_tiles(tile_px, random_tiles(30, tile_px), dims)
     queries = np.concatenate([random_tiles(2, tile_px, 1), database.tiles[20:21]])
     indices, distances = database.nearest_in_basis(queries, 5)
@@ -40,8 +40,8 @@ def test_nearest_in_the_basis_is_the_brute_force_nearest_exactly(tile_px: int, d
     assert first[:, 0].tolist() == indices[:, 0].tolist()
 
 
-def test_the_shortlist_is_judged_in_all_pixels() -> None:
-    database = TileDatabase.from_tiles(10, random_tiles(3000, 10), 6)  # a basis that sees little
+def test_shortlist_is_compared_in_all_pixels() -> None:
+    database = TileDatabase.from_tiles(10, random_tiles(3000, 10), 6)  # a small basis
     queries = random_tiles(20, 10, 1)
     index, distance = database.nearest(queries)
     shortlist, _ = database.nearest_in_basis(queries, SHORTLIST)
@@ -51,8 +51,8 @@ def test_the_shortlist_is_judged_in_all_pixels() -> None:
     assert (index != shortlist[:, 0]).any()
 
 
-def test_extreme_tiles_stay_within_exact_integers() -> None:
-    # All black against all white at the largest tile is the greatest distance there can be.
+def test_extreme_tiles_give_exact_integers() -> None:
+    # Black and white tiles of the largest size have the largest possible distance.
     tiles = np.stack([np.zeros(1024, np.uint8), np.full(1024, 255, np.uint8)])
     database = TileDatabase.from_tiles(32, tiles)
     assert database.dims == 1
@@ -67,7 +67,7 @@ def test_extreme_tiles_stay_within_exact_integers() -> None:
 
 
 @pytest.mark.parametrize("copies", [2, 3, 5000])
-def test_of_equal_tiles_the_lowest_index_wins_within_and_across_blocks(copies: int) -> None:
+def test_lowest_index_of_equal_tiles_is_returned(copies: int) -> None:
     one = random_tiles(2, 4)
     tiles = np.concatenate([one[:1], np.repeat(one[1:], copies, axis=0)])
     index, distance = TileDatabase.from_tiles(4, tiles).nearest(one)
@@ -75,7 +75,7 @@ def test_of_equal_tiles_the_lowest_index_wins_within_and_across_blocks(copies: i
     assert distance.tolist() == [0.0, 0.0]
 
 
-def test_every_stored_tile_finds_itself_over_all_query_blocks() -> None:
+def test_every_stored_tile_is_its_own_nearest() -> None:
     tiles = np.unique(random_tiles(600, 5), axis=0)
     index, _ = TileDatabase.from_tiles(5, tiles).nearest(tiles)
     assert index.tolist() == list(range(len(tiles)))
@@ -88,7 +88,7 @@ def test_no_queries_give_no_indices() -> None:
 
 def test_basis_rows_are_orthonormal_signed_and_ordered_by_variance() -> None:
     tiles = random_tiles(500, 6)
-    tiles[:, :6] = tiles[:, :1]  # six pixels in step: one strong component
+    tiles[:, :6] = tiles[:, :1]  # six equal pixels: one strong component
     mean, basis = principal_basis(tiles, 20)
     assert mean.tolist() == np.floor(tiles.mean(axis=0) + 0.5).astype(int).tolist()
     rows = basis.astype(float) / BASIS_SCALE
@@ -100,13 +100,13 @@ def test_basis_rows_are_orthonormal_signed_and_ordered_by_variance() -> None:
 
 
 @pytest.mark.parametrize("tiles", [np.zeros((1, 16), np.uint8), np.full((9, 16), 200, np.uint8)])
-def test_tiles_without_variance_still_make_a_database(tiles: np.ndarray) -> None:
+def test_tiles_without_variance_give_a_database(tiles: np.ndarray) -> None:
     database = TileDatabase.from_tiles(4, tiles)
     assert database.dims == 1
     assert database.nearest(random_tiles(4, 4))[0].tolist() == [0, 0, 0, 0]
 
 
-def test_identity_changes_with_everything_that_decides_a_picture_or_an_index() -> None:
+def test_identity_depends_on_all_data() -> None:
     tiles = random_tiles(40, 4)
     base = TileDatabase.from_tiles(4, tiles, 8)
     altered = tiles.copy()
@@ -128,7 +128,7 @@ def test_identity_changes_with_everything_that_decides_a_picture_or_an_index() -
     assert len(base.identity) == 64
 
 
-def test_a_database_cannot_be_changed_behind_its_identity() -> None:
+def test_database_is_immutable() -> None:
     tiles = random_tiles(10, 4)
     database = TileDatabase.from_tiles(4, tiles)
     before = database.identity
@@ -154,7 +154,7 @@ def test_a_database_cannot_be_changed_behind_its_identity() -> None:
         ("basis.shape", lambda t: TileDatabase(4, t, t[0], np.ones((0, 16), np.int16))),
     ],
 )
-def test_a_wrong_shape_or_type_is_refused_by_name(field: str, make) -> None:
+def test_error_names_an_array_of_wrong_shape_or_dtype(field: str, make) -> None:
     with pytest.raises(CodebookError) as caught:
         make(random_tiles(6, 4))
     assert caught.value.field == field
@@ -165,12 +165,12 @@ def test_a_wrong_shape_or_type_is_refused_by_name(field: str, make) -> None:
     image=hnp.arrays(np.uint8, st.tuples(st.integers(1, 50), st.integers(1, 50))),
     tile_px=st.integers(4, 32),
 )
-def test_cutting_and_joining_gives_the_picture_back(image: np.ndarray, tile_px: int) -> None:
+def test_join_inverts_cut(image: np.ndarray, tile_px: int) -> None:
     tiles = cut_tiles(image, tile_px)
     assert np.array_equal(join_tiles(tiles, *image.shape, tile_px), image)
 
 
-def test_tiles_come_in_raster_order_with_edges_repeated() -> None:
+def test_tiles_are_in_raster_order_with_repeated_edges() -> None:
     image = np.arange(30, dtype=np.uint8).reshape(5, 6)
     tiles = cut_tiles(image, 4)
     assert tiles.shape == (4, 16)

@@ -1,13 +1,13 @@
-r"""The journal of a codebook build: what each image added, and each refinement pass, appended as soon as it is known.
+r"""The journal of a codebook build: the result of each image and refinement pass, appended when it is known.
 
-A build over hundreds of images takes minutes to hours on a small computer. Rewriting the whole database after each
-image would cost megabytes every time; a record appended and forced to disk costs only its own tiles. A record that
-was cut off by a crash fails its checksum, and the journal is continued from the last whole one.
+A build over hundreds of images takes minutes to hours. Rewriting the whole database after each image would write
+megabytes every time; a record contains only the new tiles and is forced to disk. A record truncated by a crash fails
+its checksum, and the journal continues after the last valid record.
 
-Layout: `SPJOURNAL2\n`, sha256 of the plan (32 bytes), then records: kind (u8: 0 an image, 1 a refinement pass), round
-from 0 or pass from 1 (u16), image from 0 (u32; 0 for a pass), tiles (u32), big endian, sha256 of the pixels they were
-made from (32 bytes), the tiles' pixels, crc32 (u32) of all of that. Records are read one at a time: a journal may be
-larger than memory.
+Layout: `SPJOURNAL2\n`, SHA-256 of the build's fingerprint (32 bytes), then records: kind (u8: 0 image, 1 refinement
+pass), round from 0 or pass from 1 (u16), image number from 0 (u32; 0 for a pass), number of tiles (u32), big endian,
+SHA-256 of the source pixels (32 bytes), pixels of the tiles, CRC-32 (u32) of the record before it. Records are read one
+at a time, so a journal may be larger than memory.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _CRC = struct.Struct(">I")
 
 
 class EntryKind(IntEnum):
-    """What a record holds the tiles of."""
+    """Source of the tiles of a record."""
 
     IMAGE = 0
     PASS = 1
@@ -42,13 +42,13 @@ class EntryKind(IntEnum):
 
 @dataclass(frozen=True)
 class JournalEntry:
-    """What one image added, or all tiles as one refinement pass left them.
+    """The tiles that one image added, or all tiles after a refinement pass.
 
     Attributes:
-        kind: Which of the two.
-        number: Which round, from 0, or which pass, from 1.
-        image_number: Which image of the list, from 0; 0 for a pass.
-        pixels_hash: sha256 of the image's pixels, or over those of all images.
+        kind: Image or pass.
+        number: Round, from 0, or pass, from 1.
+        image_number: Position in the list of images, from 0; 0 for a pass.
+        pixels_hash: SHA-256 of the image's pixels, or over the hashes of all images.
         tiles: Shape (0.., pixels), uint8.
     """
 
@@ -60,26 +60,26 @@ class JournalEntry:
 
 
 class Journal:
-    """A journal file, open for appending; with a path of None it keeps nothing and costs nothing.
+    """A journal file, open for appending. Without a path, a journal that stores nothing.
 
     Args:
-        path: The file; created if it is not there.
-        plan: Text of all that decides the build but pixels. Going on with another plan would give a database that no
-            single plan gives, so it is refused.
-        pixels: Pixels of a tile.
+        path: The file, created if it does not exist.
+        fingerprint: Arguments of the build as text. A journal with another fingerprint is rejected, because no single
+            set of arguments would give the resulting database.
+        tile_pixels: Pixels of a tile.
 
     Raises:
-        CodebookError: The file is no journal, belongs to another plan, or cannot be read or written.
+        CodebookError: The file is not a journal, belongs to another build, or cannot be read or written.
     """
 
-    def __init__(self, path: Path | None, plan: str, pixels: int) -> None:
+    def __init__(self, path: Path | None, fingerprint: str, tile_pixels: int) -> None:
         self._path = path
-        self._pixels = pixels
+        self._tile_pixels = tile_pixels
         self._file: BinaryIO | None = None
         self._start = len(MAGIC) + hashlib.sha256().digest_size
         if path is not None:
             try:
-                self._file = self._open(path, MAGIC + hashlib.sha256(plan.encode()).digest())
+                self._file = self._open(path, MAGIC + hashlib.sha256(fingerprint.encode()).digest())
             except OSError as error:
                 raise CodebookError(str(path), "", str(error), "a journal that can be read and written") from error
 
@@ -98,7 +98,7 @@ class Journal:
         return str(self._path)
 
     def entries(self) -> Iterator[JournalEntry]:
-        """Yield the whole records, in the order they were written. Nothing may be appended meanwhile.
+        """Yield the complete records in order. Do not append during the iteration.
 
         Raises:
             CodebookError: The file cannot be read.
@@ -107,7 +107,7 @@ class Journal:
             return
         try:
             self._file.seek(self._start)
-            yield from _records(self._file, self._pixels)
+            yield from _records(self._file, self._tile_pixels)
             self._file.seek(0, os.SEEK_END)
         except OSError as error:
             raise CodebookError(self.name, "", str(error), "a journal that can be read") from error
@@ -116,7 +116,7 @@ class Journal:
         """Write one record and force it to disk.
 
         Raises:
-            CodebookError: It cannot be written (full disk).
+            CodebookError: It cannot be written (disk full).
         """
         if self._file is None:
             return
@@ -132,14 +132,14 @@ class Journal:
     def _open(self, path: Path, start: bytes) -> BinaryIO:
         file = path.open("r+b" if path.exists() else "w+b")
         try:
-            met = file.read(len(start))
-            _check_start(str(path), met, start)
-            if len(met) < len(start):  # new, or cut off while its first bytes were written
+            actual = file.read(len(start))
+            _check_start(str(path), actual, start)
+            if len(actual) < len(start):  # new, or truncated in its first bytes
                 file.seek(0)
                 file.write(start)
             else:
                 end = len(start)
-                for _ in _records(file, self._pixels):
+                for _ in _records(file, self._tile_pixels):
                     end = file.tell()
                 file.seek(end)
                 file.truncate()
@@ -149,26 +149,26 @@ class Journal:
         return file
 
 
-def _check_start(where: str, met: bytes, start: bytes) -> None:
-    if met != start[: len(met)]:
-        if met[: len(MAGIC)] != MAGIC[: len(met)]:
-            raise CodebookError(where, "magic", met[: len(MAGIC)], repr(MAGIC))
-        expected = "this build's images, rounds and tile size (remove the journal to start anew)"
-        raise CodebookError(where, "plan", met[len(MAGIC) :].hex(), expected)
+def _check_start(where: str, actual: bytes, start: bytes) -> None:
+    if actual != start[: len(actual)]:
+        if actual[: len(MAGIC)] != MAGIC[: len(actual)]:
+            raise CodebookError(where, "magic", actual[: len(MAGIC)], repr(MAGIC))
+        expected = "this build's images, rounds and tile size (remove the journal to start over)"
+        raise CodebookError(where, "fingerprint", actual[len(MAGIC) :].hex(), expected)
 
 
-def _records(file: BinaryIO, pixels: int) -> Iterator[JournalEntry]:
-    """Yield the whole records from where the file stands, which is after the record whenever one is yielded."""
+def _records(file: BinaryIO, tile_pixels: int) -> Iterator[JournalEntry]:
+    """Yield the complete records from the current position. The position is after each record when it is yielded."""
     size = os.fstat(file.fileno()).st_size
     while True:
         head = file.read(_RECORD.size)
         if len(head) < _RECORD.size:
             return
         kind, number, image_number, count, pixels_hash = _RECORD.unpack(head)
-        if count * pixels + _CRC.size > size - file.tell():  # also keeps a damaged count from asking for gigabytes
+        if count * tile_pixels + _CRC.size > size - file.tell():  # a damaged count must not allocate gigabytes
             return
-        body = file.read(count * pixels)
+        body = file.read(count * tile_pixels)
         if zlib.crc32(body, zlib.crc32(head)) != _CRC.unpack(file.read(_CRC.size))[0] or kind not in tuple(EntryKind):
             return
-        tiles = np.frombuffer(body, np.uint8).reshape(count, pixels)
+        tiles = np.frombuffer(body, np.uint8).reshape(count, tile_pixels)
         yield JournalEntry(EntryKind(kind), number, image_number, pixels_hash, tiles)

@@ -1,19 +1,21 @@
-"""Codebook files and the shipped codebooks; docs/specifications/codebook-file.md specifies the file.
+"""Codebook files, the shipped codebooks, and the search for the codebook of a stream.
 
-Everything in the file is stored plainly, not compressed, so the same database and notes are the same bytes on every
-machine and with every version of every library.
+docs/specifications/codebook-file.md specifies the file. Nothing in it is compressed: the same database and notes give
+the same bytes with every version of every library.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -25,6 +27,9 @@ from sonarpost.files import write_atomically
 MAGIC = b"SPTILES\n"
 VERSION = 1
 DEFAULT_TILE_PX = (10, 20)
+SEARCH_PATH_VARIABLE: Final = "SONARPOST_CODEBOOKS"
+"""Environment variable: files and folders to search for the codebook of a stream, separated by `os.pathsep`."""
+SUFFIX: Final = ".tiles"
 
 _HEADER = struct.Struct(">8sHHIHI")  # magic, version, tile_px, tiles, dims, bytes of notes
 _HASH_BYTES = 32
@@ -33,11 +38,11 @@ MAX_NOTES_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class Codebook:
-    """A tile database with notes about where it comes from.
+    """A tile database with notes about its origin.
 
     Attributes:
         tiles: The database.
-        notes: What people want to know of it (source, licence, rounds); no part of the identity.
+        notes: Information for people (source, licence, rounds); not part of the identity.
     """
 
     tiles: TileDatabase
@@ -45,10 +50,10 @@ class Codebook:
 
 
 def to_bytes(codebook: Codebook) -> bytes:
-    """Return the file's bytes.
+    """Return the content of a codebook file.
 
     Raises:
-        CodebookError: The notes take more than 1 MiB.
+        CodebookError: The notes exceed 1 MiB.
     """
     tiles = codebook.tiles
     notes = json.dumps(dict(codebook.notes), sort_keys=True, ensure_ascii=False).encode()
@@ -62,14 +67,14 @@ def to_bytes(codebook: Codebook) -> bytes:
 
 
 def from_bytes(data: bytes, where: str) -> Codebook:
-    """Parse a codebook.
+    """Parse the content of a codebook file.
 
     Args:
         data: The whole file.
-        where: Its name, for messages.
+        where: Name of the file, for messages.
 
     Raises:
-        CodebookError: Not a codebook, of another version, cut off, or damaged (the sha256 at its end differs).
+        CodebookError: Not a codebook, another version, truncated, or damaged (the SHA-256 at its end differs).
     """
     if len(data) < _HEADER.size + _HASH_BYTES:
         raise CodebookError(where, "", f"{len(data)} B", f"a tile codebook of at least {_HEADER.size + 32} B")
@@ -77,7 +82,7 @@ def from_bytes(data: bytes, where: str) -> Codebook:
     if magic != MAGIC:
         raise CodebookError(where, "magic", magic, repr(MAGIC))
     if version != VERSION:
-        raise CodebookError(where, "version", version, f"{VERSION}, the only one this release reads")
+        raise CodebookError(where, "version", version, f"{VERSION}, the only version that this release reads")
     if not MIN_TILE_PX <= tile_px <= MAX_TILE_PX:
         raise CodebookError(where, "tile_px", tile_px, f"{MIN_TILE_PX}..{MAX_TILE_PX}")
     if not 1 <= dims <= min(MAX_DIMS, tile_px * tile_px):
@@ -87,7 +92,7 @@ def from_bytes(data: bytes, where: str) -> Codebook:
     pixels = tile_px * tile_px
     sizes = (_HEADER.size, notes_bytes, pixels, dims * pixels * 2, count * pixels, _HASH_BYTES)
     if len(data) != sum(sizes):
-        raise CodebookError(where, "length", f"{len(data)} B", f"{sum(sizes)} B, as its header says")
+        raise CodebookError(where, "length", f"{len(data)} B", f"{sum(sizes)} B, according to its header")
     if hashlib.sha256(data[:-_HASH_BYTES]).digest() != data[-_HASH_BYTES:]:
         raise CodebookError(where, "sha256", data[-_HASH_BYTES:].hex(), "the hash of the content (the file is damaged)")
     ends = np.cumsum(sizes)
@@ -110,19 +115,19 @@ def _parse_notes(data: bytes, where: str) -> dict[str, str]:
 
 
 def save(path: Path, codebook: Codebook) -> None:
-    """Write a codebook atomically.
+    """Write a codebook file atomically.
 
     Raises:
-        CodebookError: It cannot be written.
+        CodebookError: The file cannot be written.
     """
     try:
         write_atomically(path, to_bytes(codebook))
     except OSError as error:
-        raise CodebookError(str(path), "", str(error), "a place that can be written to") from error
+        raise CodebookError(str(path), "", str(error), "a writable file") from error
 
 
 def load(path: Path) -> Codebook:
-    """Read a codebook and verify its hash.
+    """Read a codebook file and verify its hash.
 
     Raises:
         CodebookError: The file cannot be read or is damaged.
@@ -136,15 +141,15 @@ def load(path: Path) -> Codebook:
 
 @cache
 def load_default(tile_px: int) -> Codebook:
-    """Return the codebook shipped with the package for tiles of 10 or 20 px; kept in memory after the first call.
+    """Return the shipped codebook for tiles of 10 or 20 px. It stays in memory after the first call.
 
     Raises:
-        CodebookError: There is none for that size, or the installed file is damaged.
+        CodebookError: No codebook of that size is shipped, or the installed file is damaged.
     """
     if tile_px not in DEFAULT_TILE_PX:
         sizes = " or ".join(str(size) for size in DEFAULT_TILE_PX)
         raise CodebookError("nominal codebooks", "tile_px", tile_px, sizes)
-    name = f"nominal-{tile_px}.tiles"
+    name = f"nominal-{tile_px}{SUFFIX}"
     try:
         data = (resources.files("sonarpost.codec.vq") / "data" / name).read_bytes()
     except OSError as error:
@@ -152,11 +157,11 @@ def load_default(tile_px: int) -> Codebook:
     return from_bytes(data, name)
 
 
-def open_codebook(name_or_path: str) -> Codebook:
-    """Return a shipped codebook by its name (`nominal-10`, `nominal-20`) or any other by its path.
+def open_codebook(name_or_path: str | Path) -> Codebook:
+    """Return a shipped codebook by name (`nominal-10`, `nominal-20`) or any other by path.
 
     Raises:
-        CodebookError: It cannot be read.
+        CodebookError: The codebook cannot be read.
     """
     for tile_px in DEFAULT_TILE_PX:
         if name_or_path == f"nominal-{tile_px}":
@@ -164,18 +169,61 @@ def open_codebook(name_or_path: str) -> Codebook:
     return load(Path(name_or_path))
 
 
-def default_for_tag(tag: int) -> Codebook:
-    """Return the shipped codebook whose identity has the 16-bit tag that a stream header carries.
+def find_codebook(tag: int, search_path: Sequence[str | Path] = ()) -> Codebook:
+    """Return the codebook with the tag of a stream header.
+
+    The order of the search is: `search_path`, the shipped codebooks, the files and folders of the environment variable
+    SONARPOST_CODEBOOKS. A folder stands for its `.tiles` files.
+
+    Args:
+        tag: The 16 bits of the codebook's identity in the stream header.
+        search_path: Names of shipped codebooks, files or folders.
 
     Raises:
-        CodebookError: The stream was made with a codebook that is not one of the shipped ones.
+        CodebookError: No codebook has this tag, or two of one source have it. The message names the tag and the places
+            searched.
     """
-    tags = {}
-    for tile_px in DEFAULT_TILE_PX:
-        codebook = load_default(tile_px)
-        own = codebook_tag(codebook.tiles)
-        if own == tag:
-            return codebook
-        tags[f"nominal-{tile_px}"] = own
-    known = ", ".join(f"{own:#06x} ({name})" for name, own in tags.items())
-    raise CodebookError("stream", "model_tag", f"{tag:#06x}", f"one of {known}, or the codebook it was made with")
+    variable = os.environ.get(SEARCH_PATH_VARIABLE, "")
+    searched: list[str] = []
+    shipped = [f"nominal-{tile_px}" for tile_px in DEFAULT_TILE_PX]
+    for source in (search_path, shipped, [part for part in variable.split(os.pathsep) if part]):
+        found: dict[str, Codebook] = {}
+        for name in _codebook_names(source):
+            try:
+                codebook = _open_cached(name)
+            except CodebookError:
+                searched.append(f"{name} (unreadable)")
+                continue
+            own_tag = codebook_tag(codebook.tiles)
+            searched.append(f"{name} ({own_tag:#06x})")
+            if own_tag == tag:
+                found[codebook.tiles.identity] = codebook
+        if len(found) > 1:
+            expected = f"one codebook with this tag among {', '.join(searched)}"
+            raise CodebookError("stream", "model_tag", f"{tag:#06x}", expected)
+        if found:
+            return next(iter(found.values()))
+    expected = f"the tag of a codebook. Searched: {', '.join(searched)}. {SEARCH_PATH_VARIABLE} adds files and folders"
+    raise CodebookError("stream", "model_tag", f"{tag:#06x}", expected)
+
+
+def _codebook_names(source: Sequence[str | Path]) -> Iterator[str]:
+    for name in source:
+        if Path(name).is_dir():
+            yield from (str(path) for path in sorted(Path(name).glob(f"*{SUFFIX}")))
+        else:
+            yield str(name)
+
+
+def _open_cached(name: str) -> Codebook:
+    """Return a codebook; a file is read again only when its size or modification time has changed."""
+    try:
+        status = Path(name).stat()
+    except OSError:
+        return open_codebook(name)
+    return _open_version(name, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=8)
+def _open_version(name: str, _mtime_ns: int, _size: int) -> Codebook:
+    return open_codebook(name)

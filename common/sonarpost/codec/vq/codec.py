@@ -1,29 +1,39 @@
-"""The paper's codec: a picture as the indices of tiles in a database that both ends hold.
+"""The paper's codec: an image as indices of tiles in a database that both ends have.
 
-The picture is cut into tiles that cover all of it (edge tiles are filled by repeating the last row and column, the
-decoder crops); each tile is replaced by the index of the nearest database tile; indices travel in raster order, so
-the first half of the body is the top half of the picture.
+The image is cut into tiles that cover it; edge tiles repeat the last row and column, and the decoder crops. Each tile
+is replaced by the index of the nearest database tile. Indices are sent in raster order, so the first half of the body
+is the top half of the image.
 
-Two departures from the paper, both about honesty:
+Two differences from the paper:
 
-* **Stored tile i travels as i + 1; index 0 is reserved.** Modem drivers and the paper's own pairing of halves fill
-  what did not arrive with zeros. In the paper these zeros decode as tile 0, a piece of seabed that nobody measured.
-  Here a zero decodes as a black tile that is marked missing.
-* The paper leaves edge pixels that do not fill a tile unsent; here the whole picture is sent.
+* Stored tile i is sent as i + 1; index 0 is reserved. Modem drivers and the pairing of halves fill missing data with
+  zeros. In the paper these decode as tile 0, which looks like measured seabed. Here a zero decodes as a black tile that
+  is marked as missing.
+* The paper does not send edge pixels that do not fill a tile. Here the whole image is sent.
 
-An index above the database's last tile (or, in ASCII, anything but digits) means a damaged packet: black and missing,
-as in the paper.
+An index above the last tile, or ASCII other than digits, indicates a damaged packet: the tile is black and missing, as
+in the paper.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.interface import DecodedImage, Mask, StreamHeader, check_image, model_tag, to_uint8
+from sonarpost.codec.interface import (
+    DecodedImage,
+    Mask,
+    SnippetPixels,
+    StreamHeader,
+    check_image,
+    check_received,
+    model_tag,
+    to_uint8,
+)
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles, join_tiles, tile_grid
 from sonarpost.errors import ConfigError, StreamError
 
@@ -33,10 +43,10 @@ _WireIndices = npt.NDArray[np.int64]
 
 
 class IndexPacking(Enum):
-    """How an index is written. Each packing has its own codec id, so a stream says how to read it.
+    """Format of an index. Each packing has its own codec id.
 
-    `BITS14` is the tight form. The others are the forms the paper moved through: 2 bytes (its Fig. 2), 3 bytes, and 5
-    ASCII decimal digits.
+    `BITS14` is the compact form. The others are the forms of the paper: 2 bytes (its Fig. 2), 3 bytes, and 5 ASCII
+    decimal digits.
     """
 
     BITS14 = "14bit"
@@ -47,12 +57,12 @@ class IndexPacking(Enum):
     @property
     def codec_id(self) -> int:
         """Codec id in the stream header: 0x10..0x13."""
-        return _CODEC_IDS[self]
+        return {"14bit": 0x10, "2byte": 0x11, "3byte": 0x12, "ascii5": 0x13}[self.value]
 
     @property
     def max_index(self) -> int:
-        """Largest wire index that can be written."""
-        return {"14bit": 0x3FFF, "2byte": 0xFFFF, "3byte": 0xFFFFFF, "ascii5": 99_999}[self.value]
+        """Largest wire index."""
+        return 99_999 if self is IndexPacking.ASCII5 else (1 << self.bits) - 1
 
     @property
     def bits(self) -> int:
@@ -60,35 +70,27 @@ class IndexPacking(Enum):
         return {"14bit": 14, "2byte": 16, "3byte": 24, "ascii5": 40}[self.value]
 
     def body_length(self, indices: int) -> int:
-        """Return the bytes that `indices` indices take; unused bits at the end are zero."""
+        """Return the bytes of a body. Unused bits at the end are zero."""
         return -(-indices * self.bits // 8)
 
     @classmethod
     def from_codec_id(cls, codec_id: int) -> IndexPacking | None:
-        """Return the packing of a codec id, or None if it is not one of this codec's."""
-        return next((packing for packing, number in _CODEC_IDS.items() if number == codec_id), None)
-
-
-_CODEC_IDS = {
-    IndexPacking.BITS14: 0x10,
-    IndexPacking.BYTES2: 0x11,
-    IndexPacking.BYTES3: 0x12,
-    IndexPacking.ASCII5: 0x13,
-}
+        """Return the packing of a codec id, or None for an id of another codec."""
+        return next((packing for packing in cls if packing.codec_id == codec_id), None)
 
 
 def codebook_tag(tiles: TileDatabase) -> int:
-    """Return the tag that streams made with a tile database carry, the same for every packing."""
+    """Return the tag of a tile database in stream headers, the same for every packing."""
     return model_tag(IndexPacking.BITS14.codec_id, tiles.identity)
 
 
 @dataclass(frozen=True)
 class VqCodec:
-    """Vector quantisation with a shared tile database. Satisfies `sonarpost.codec.interface.Codec`.
+    """Vector quantisation with a shared tile database. Implements `sonarpost.codec.Codec`.
 
     Attributes:
-        tiles: The database; its identity is the codec's model hash.
-        packing: How indices are written.
+        tiles: The database. Its identity is the model hash.
+        packing: Format of the indices.
 
     Raises:
         ConfigError: The database has more tiles than the packing can number.
@@ -96,6 +98,7 @@ class VqCodec:
 
     tiles: TileDatabase
     packing: IndexPacking = IndexPacking.BITS14
+    name: ClassVar[str] = "vq"
 
     def __post_init__(self) -> None:
         if len(self.tiles) > self.packing.max_index:
@@ -107,11 +110,6 @@ class VqCodec:
             )
 
     @property
-    def name(self) -> str:
-        """Name in the registry."""
-        return "vq"
-
-    @property
     def codec_id(self) -> int:
         """The packing's codec id."""
         return self.packing.codec_id
@@ -121,21 +119,16 @@ class VqCodec:
         """Identity of the tile database."""
         return self.tiles.identity
 
-    def encode(self, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], budget_bytes: int | None = None) -> bytes:
-        """Return header and packed indices.
-
-        Args:
-            image: Shape (16..512, 16..512), uint8 or uint16 (uint16 is mapped to 8 bits by `to_uint8`).
-            budget_bytes: Most bytes of the whole stream. The size of this codec's stream follows from the picture's
-                size alone, so a smaller budget cannot be met.
+    def encode(self, image: SnippetPixels, budget_bytes: int | None = None) -> bytes:
+        """Return the stream (see `Codec.encode`). Its length depends on the image size only.
 
         Raises:
-            StreamError: Size or dtype is not supported, or the budget (or 65,535 body bytes) is too small.
+            StreamError: Size or dtype is not supported, or the stream exceeds the budget or 65,535 body bytes.
         """
         check_image(image)
         height_px, width_px = int(image.shape[0]), int(image.shape[1])
         length = self._body_length(height_px, width_px)
-        header = StreamHeader(self.codec_id, self._tag, height_px, width_px)
+        header = StreamHeader(self.codec_id, codebook_tag(self.tiles), height_px, width_px)
         limit = MAX_BODY_BYTES if budget_bytes is None else min(budget_bytes - header.size, MAX_BODY_BYTES)
         if length > limit:
             needed = f"at least {length + header.size} B for {height_px} x {width_px} px"
@@ -144,19 +137,10 @@ class VqCodec:
         return header.pack() + pack_indices(indices + 1, self.packing)
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
-        """Rebuild the picture from its tiles; what did not arrive is black and missing.
-
-        Args:
-            stream: Header and body. A short body counts as missing at its end; bytes beyond it are ignored and noted.
-            received: Shape (body bytes in `stream`,), False where a body byte did not arrive.
-
-        Raises:
-            StreamError: The header is wrong, the stream is of another codec or packing, or it was made with a
-                codebook of another identity.
-        """
+        """Reconstruct the image (see `Codec.decode`). Tiles with a missing or invalid index are black and missing."""
         header = self._check_header(stream)
         length = self._body_length(header.height_px, header.width_px)
-        body, arrived, notes = _complete_body(stream[header.size :], length, received)
+        body, arrived, notes = _padded_body(stream[header.size :], length, received)
         rows, columns = tile_grid(header.height_px, header.width_px, self.tiles.tile_px)
         wire = unpack_indices(body, rows * columns, self.packing)
         lost = ~_indices_arrived(arrived, rows * columns, self.packing.bits)
@@ -167,20 +151,16 @@ class VqCodec:
             f"{int(count)} of {rows * columns} tiles {what}"
             for count, what in (
                 (lost.sum(), "did not arrive"),
-                (empty.sum(), "carry the reserved index 0 (zero padding)"),
+                (empty.sum(), "have the reserved index 0 (zero padding)"),
                 (damaged.sum(), "have an index outside the codebook (damaged packet)"),
             )
             if count
         ]
         chosen = self.tiles.tiles[np.where(missing, 0, wire - 1)]
         chosen[missing] = 0
-        blank = np.repeat(missing[:, None].astype(np.uint8), self.tiles.tile_px**2, axis=1)
+        mask = np.repeat(missing[:, None].astype(np.uint8), self.tiles.tile_px**2, axis=1)
         size = (header.height_px, header.width_px, self.tiles.tile_px)
-        return DecodedImage(join_tiles(chosen, *size), join_tiles(blank, *size).astype(np.bool_), tuple(notes))
-
-    @property
-    def _tag(self) -> int:
-        return codebook_tag(self.tiles)
+        return DecodedImage(join_tiles(chosen, *size), join_tiles(mask, *size).astype(np.bool_), tuple(notes))
 
     def _body_length(self, height_px: int, width_px: int) -> int:
         rows, columns = tile_grid(height_px, width_px, self.tiles.tile_px)
@@ -191,19 +171,15 @@ class VqCodec:
         if header.codec_id != self.codec_id:
             expected = f"{self.codec_id:#04x} (vq, {self.packing.value} indices)"
             raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", expected)
-        if header.model_tag != self._tag:
-            expected = f"{self._tag:#06x}: the stream was made with a codebook of another identity"
+        tag = codebook_tag(self.tiles)
+        if header.model_tag != tag:
+            expected = f"{tag:#06x}: the stream was made with a codebook of another identity"
             raise StreamError("stream", "model_tag", f"{header.model_tag:#06x}", expected)
         return header
 
 
 def pack_indices(indices: _WireIndices, packing: IndexPacking) -> bytes:
-    """Write wire indices, most significant bit or digit first.
-
-    Args:
-        indices: Shape (n,), int64, each 0..`packing.max_index`.
-        packing: How to write them.
-    """
+    """Pack wire indices, shape (n,), each 0..`packing.max_index`, most significant bit or digit first."""
     if packing is IndexPacking.ASCII5:
         digits = indices[:, None] // 10 ** np.arange(4, -1, -1) % 10
         return (digits + ord("0")).astype(np.uint8).tobytes()
@@ -213,9 +189,9 @@ def pack_indices(indices: _WireIndices, packing: IndexPacking) -> bytes:
 
 
 def unpack_indices(body: bytes, count: int, packing: IndexPacking) -> _WireIndices:
-    """Read `count` wire indices, shape (count,), int64; -1 where ASCII holds something other than five digits.
+    """Unpack `count` wire indices, shape (count,), int64; -1 for ASCII other than five digits.
 
-    Five zero bytes, which padding leaves in place of ASCII digits, read as 0 like zero bits do in the other packings.
+    Five zero bytes, the padding of ASCII digits, give 0, as zero bits do in the other packings.
     """
     data = np.frombuffer(body, dtype=np.uint8)
     if packing is IndexPacking.ASCII5:
@@ -229,13 +205,11 @@ def unpack_indices(body: bytes, count: int, packing: IndexPacking) -> _WireIndic
     return np.asarray(bits @ (np.int64(1) << np.arange(packing.bits - 1, -1, -1, dtype=np.int64)), dtype=np.int64)
 
 
-def _complete_body(body: bytes, length: int, received: Mask | None) -> tuple[bytes, Mask, list[str]]:
-    """Cut or zero-fill the body to `length`; return it with a mask of what arrived, and notes."""
+def _padded_body(body: bytes, length: int, received: Mask | None) -> tuple[bytes, Mask, list[str]]:
+    """Truncate or zero-pad the body to `length`; return it with a mask of the bytes that arrived, and notes."""
     if received is None:
         received = np.ones(len(body), dtype=np.bool_)
-    elif received.shape != (len(body),) or received.dtype != np.bool_:
-        met = f"{received.dtype} {received.shape}"
-        raise StreamError("stream", "received", met, f"bool ({len(body)},), one for each body byte")
+    check_received(received, len(body))
     arrived = np.zeros(length, dtype=np.bool_)
     arrived[: len(body)] = received[:length]
     notes = []
@@ -247,7 +221,7 @@ def _complete_body(body: bytes, length: int, received: Mask | None) -> tuple[byt
 
 
 def _indices_arrived(arrived: Mask, count: int, bits: int) -> Mask:
-    """Return, shape (count,), whether every byte that holds a bit of the index arrived."""
+    """Return, shape (count,), whether all bytes of each index arrived."""
     lost_before = np.concatenate(([0], np.cumsum(~arrived)))
     first_bit = np.arange(count) * bits
     first, last = first_bit // 8, (first_bit + bits - 1) // 8

@@ -1,8 +1,8 @@
-"""Training images cut from whole side-scan lines, stretched to 8 bits as snippets are.
+"""Training images cut from side-scan lines and stretched to 8 bits like snippets.
 
-A codebook serves many sonars, so a line is looked at in several scales and tones: each window is reduced by block
-means (finer or coarser sampling than the line's own), mirrored in turn (port and starboard cast shadows to opposite
-sides), and shown in one of a few tones (a snippet may be dark with one bright target, or bright all over).
+A codebook serves many sonars, so a line is used at several scales and tones. Each window is reduced by block means, as
+if the line were sampled more coarsely. Windows are mirrored in turn (port and starboard shadows point in opposite
+directions) and mapped to one of several tones (dark with one bright target, or bright all over).
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.vq.training_config import TrainingImage
+from sonarpost.codec.interface import Image
+from sonarpost.codec.vq.builder import TrainingImage
 
-TrainingSnippet = npt.NDArray[np.uint8]
 SonarLine = npt.NDArray[np.float32]
 
 
@@ -27,7 +27,7 @@ class ToneMapping:
     gamma: float
     gain: float
 
-    def table(self) -> TrainingSnippet:
+    def table(self) -> Image:
         """Return the curve as a table, shape (256,), uint8."""
         values = 255.0 * self.gain * (np.arange(256) / 255.0) ** self.gamma
         return np.minimum(np.floor(values + 0.5), 255.0).astype(np.uint8)
@@ -35,15 +35,16 @@ class ToneMapping:
 
 @dataclass(frozen=True)
 class PatchPlan:
-    """How a line is cut.
+    """Settings for cutting a line.
 
     Attributes:
         side_px: Side of the square windows after reduction.
-        reductions: (pings, samples) averaged into one pixel, one set of windows for each.
-        per_reduction: Most windows of one line and reduction, scattered over it.
-        least_std: Windows flatter than this (grey levels, before stretching) hold no bottom and are left out.
-        tones: Given to the windows in turn.
-        copies: How often each window is used, each time with the next tone and another mirroring.
+        reductions: (pings, samples) averaged into one pixel; one set of windows for each.
+        per_reduction: Maximum number of windows for a line and a reduction, scattered over the line.
+        least_std: Windows with a smaller standard deviation (grey levels, before stretching) show no seabed and are
+            skipped.
+        tones: Assigned to the windows in turn.
+        copies: Uses of each window, each with the next tone and another mirroring.
     """
 
     side_px: int = 80
@@ -64,10 +65,10 @@ class PatchPlan:
     copies: int = 1
 
 
-def stretch(window: npt.NDArray[np.float64], low_percent: float = 1.0, high_percent: float = 99.5) -> TrainingSnippet:
-    """Map a window to 8 bits: the two percentiles become 0 and 255, what lies beyond is limited.
+def stretch(window: npt.NDArray[np.float64], low_percent: float = 1.0, high_percent: float = 99.5) -> Image:
+    """Map a window to 8 bits: the two percentiles become 0 and 255, values beyond are clipped.
 
-    Percentiles are order statistics (no interpolation), so the result is the same everywhere.
+    Percentiles are order statistics without interpolation, so the result is the same on all machines.
     """
     ordered = np.sort(window, axis=None)
     low = float(ordered[int((ordered.size - 1) * low_percent / 100)])
@@ -78,7 +79,7 @@ def stretch(window: npt.NDArray[np.float64], low_percent: float = 1.0, high_perc
 
 
 def reduce_line(line: SonarLine, pings: int, samples: int) -> npt.NDArray[np.float64]:
-    """Average blocks of (pings, samples); the remainder at the far edges is left out."""
+    """Average blocks of (pings, samples). The remainder at the far edges is dropped."""
     rows, columns = line.shape[0] // pings, line.shape[1] // samples
     blocks = line[: rows * pings, : columns * samples].astype(np.float64).reshape(rows, pings, columns, samples)
     return np.asarray(blocks.mean(axis=(1, 3)), dtype=np.float64)
@@ -88,9 +89,9 @@ def cut_line(name: str, line: SonarLine, plan: PatchPlan) -> Iterator[TrainingIm
     """Cut one side of a survey line into training images.
 
     Args:
-        name: Name of the line, the start of the images' names.
-        line: Shape (pings, samples), float32; NaN where there is no sample.
-        plan: How to cut.
+        name: Name of the line, the start of the image names.
+        line: Shape (pings, samples), float32; NaN for missing samples.
+        plan: Settings.
     """
     tables = [tone.table() for tone in plan.tones]
     serial = 0
@@ -99,27 +100,24 @@ def cut_line(name: str, line: SonarLine, plan: PatchPlan) -> Iterator[TrainingIm
         for top, left in _scattered(_usable_corners(reduced, plan), plan.per_reduction):
             window = stretch(reduced[top : top + plan.side_px, left : left + plan.side_px])
             for _ in range(plan.copies):
-                mirrored = window[:: -1 if serial & 1 else 1, :: -1 if serial & 2 else 1]
-                # The step of 1 + the reduction's own count keeps tone and mirroring from going in step.
-                pixels = tables[(serial + serial // len(tables)) % len(tables)][mirrored]
-                label = f"{name} {pings}x{samples} at {top},{left} #{serial}"
-                yield _training_image(label, np.ascontiguousarray(pixels))
+                yield _variant(f"{name} {pings}x{samples} at {top},{left} #{serial}", window, serial, tables)
                 serial += 1
 
 
 def cut_around(
     name: str, line: SonarLine, places: Sequence[tuple[int, int]], plan: PatchPlan
 ) -> Iterator[TrainingImage]:
-    """Cut windows that each show one place, for what is rare on the bottom (objects with their shadows).
+    """Cut a window around each place, for rare objects on the seabed and their shadows.
 
     Args:
-        name: Name of the line, the start of the images' names.
+        name: Name of the line, the start of the image names.
         line: As for `cut_line`.
-        places: (ping, sample) to show. They come to lie off the windows' middle, by turns to each side.
-        plan: How to cut; `per_reduction` and `least_std` do not apply.
+        places: (ping, sample) of each object, placed off the centre of its windows in varying directions.
+        plan: Settings; `per_reduction` and `least_std` do not apply.
     """
     tables = [tone.table() for tone in plan.tones]
-    offsets = ((0, 0), (3, -9), (-7, 5), (9, 8), (-4, -13), (13, -3), (-11, 11))  # no two alike modulo a tile's side
+    # All different modulo the side of a tile.
+    offsets = ((0, 0), (3, -9), (-7, 5), (9, 8), (-4, -13), (13, -3), (-11, 11))
     serial = 0
     for pings, samples in plan.reductions:
         reduced = reduce_line(line, pings, samples)
@@ -132,15 +130,13 @@ def cut_around(
                 left = min(max(sample // samples - plan.side_px // 2 + right, 0), reduced.shape[1] - plan.side_px)
                 window = reduced[top : top + plan.side_px, left : left + plan.side_px]
                 if np.isfinite(window).all():
-                    mirrored = stretch(window)[:: -1 if serial & 1 else 1, :: -1 if serial & 2 else 1]
-                    pixels = tables[(serial + serial // len(tables)) % len(tables)][mirrored]
                     label = f"{name} object {pings}x{samples} at {top},{left} #{serial}"
-                    yield _training_image(label, np.ascontiguousarray(pixels))
+                    yield _variant(label, stretch(window), serial, tables)
                 serial += 1
 
 
 def shuffled(images: Sequence[TrainingImage]) -> list[TrainingImage]:
-    """Return the images in an order that mixes lines and scales yet depends only on their names."""
+    """Return the images in an order that mixes lines and scales and depends only on their names."""
     return sorted(images, key=lambda image: hashlib.sha256(image.name.encode()).digest())
 
 
@@ -154,10 +150,14 @@ def _usable_corners(line: npt.NDArray[np.float64], plan: PatchPlan) -> list[tupl
     return corners
 
 
-def _scattered(corners: list[tuple[int, int]], wanted: int) -> list[tuple[int, int]]:
-    """Return some corners by the order of their hashes: even steps could meet the same column (the nadir) each time."""
-    return sorted(corners, key=lambda corner: hashlib.sha256(repr(corner).encode()).digest())[:wanted]
+def _scattered(corners: list[tuple[int, int]], count: int) -> list[tuple[int, int]]:
+    """Return the first `count` corners by hash. Even steps could repeat the same column, such as the nadir."""
+    return sorted(corners, key=lambda corner: hashlib.sha256(repr(corner).encode()).digest())[:count]
 
 
-def _training_image(name: str, pixels: TrainingSnippet) -> TrainingImage:
+def _variant(name: str, window: Image, serial: int, tables: Sequence[Image]) -> TrainingImage:
+    """Return a mirrored copy of a window in one of the tones."""
+    mirrored = window[:: -1 if serial & 1 else 1, :: -1 if serial & 2 else 1]
+    # The extra step after each cycle of tones changes the combination of tone and mirroring.
+    pixels = np.ascontiguousarray(tables[(serial + serial // len(tables)) % len(tables)][mirrored])
     return TrainingImage(name, lambda: pixels)

@@ -1,89 +1,101 @@
-"""The exact search for the nearest of many vectors, most of whose work is one matrix product in single precision.
+"""Exact nearest-neighbour search among tiles; most of its work is a matrix product in single precision.
 
-The product's result is only used to leave out vectors that cannot be among the nearest, by more than its rounding error
-can be; the few that remain are compared in integers. The product itself is spared for vectors whose first coordinate
-alone is too far away.
+The product only excludes vectors that cannot be among the nearest, with a margin for its rounding error. The remaining
+vectors are compared in exact integers. The product is skipped for vectors whose first coordinate alone is too far away.
 """
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import ParamSpec, cast
+from typing import ParamSpec
 
 import numpy as np
 import numpy.typing as npt
 
-BLOCK_TILES = 2048  # tiles of one matrix product: its result stays in a processor's cache
-LEADING = 48  # coordinates of a tile that count singly in the first, rough comparison
-_GLANCE_TILES = 128  # tiles of like key that tell how far to search
-_LANES = 32  # scores that are compared at once
-_FAR = np.float32(1e30)  # score of a place that holds no tile; squared norms stay below 2e15
+from sonarpost.codec.jit import jit
+
+BLOCK_TILES = 2048  # tiles of one matrix product: its result fits a processor cache
+LEADING = 48  # leading coordinates of a tile used in the single-precision comparison
+_INITIAL_TILES = 128  # tiles around the query's key that give the first upper bound
+_LANES = 32  # scores compared at once
+_EMPTY = np.float32(1e30)  # score of an empty place; squared norms stay below 2e15
 _NO_LIMIT = 1e29
+_CENTRE = 128
+_QUERY_ROWS = 256
+_CHUNK_TILES = 256
+_POOL_TILES = 4096
 
 P = ParamSpec("P")
+Tiles = npt.NDArray[np.uint8]
 Indices = npt.NDArray[np.int64]
 Distances = npt.NDArray[np.float64]
+FloatArray = npt.NDArray[np.float32]
+Vectors = npt.NDArray[np.signedinteger]
 
 
 @dataclass(frozen=True)
 class NearestSearch:
-    """Exact search for the nearest among integer vectors, at the speed of single precision.
+    """Exact nearest-neighbour search among integer vectors.
 
-    A product of matrices in single precision gives a score for each vector b that is no more than its true score
-    |b|^2 - 2ab (squared distance less |a|^2), apart from a rounding error of at most `rounding_bound`: the leading
-    coordinates count as they are, of the others only the lengths r, since their product is at most r(a) r(b). Only
-    vectors whose score is not above the best so far by more than the error are compared in exact integers. A block of
-    vectors is spared altogether where its keys alone are too far away from the query's: a key is any function of a
-    vector with |key(a) - key(b)| <= |a - b|, such as a coordinate.
+    The score of a vector b for a query a is |b|^2 - 2ab, the squared distance minus |a|^2. A single-precision matrix
+    product gives a lower bound of each score, up to a rounding error of `rounding_bound`. It uses the leading
+    coordinates, and of the others only their lengths r: their product is at most r(a) r(b). Only vectors whose lower
+    bound does not exceed the best score plus the error are compared exactly.
+
+    A block of vectors is skipped if its keys are too far from the query's key. A key is any function of a vector with
+    |key(a) - key(b)| <= |a - b|, for example a coordinate.
 
     Attributes:
-        blocks: Shape (blocks, leading + 2, vectors of a block), float32: in each column a vector's leading
-            coordinates, the length of the others, and its squared norm.
-        order: Shape (n,), int64: the number of the vector that a place holds.
-        vectors: Shape (n, dims), integers, by places.
-        norms: Shape (n,), float64: exact squared norms, by places.
-        keys: Shape (n,), float64: keys of the places; ascending, or else nothing is spared and the search is slower.
+        blocks: Shape (blocks, leading + 2, vectors a block), float32. Each column holds a vector's leading coordinates,
+            the length of the others, and the squared norm.
+        order: Shape (n,): vector number of each place.
+        vectors: Shape (n, dims), integers, by place.
+        norms: Shape (n,): exact squared norms, by place.
+        keys: Shape (n,): keys, by place. If they are not ascending, no block is skipped.
     """
 
-    blocks: npt.NDArray[np.float32]
+    blocks: FloatArray
     order: Indices
-    vectors: npt.NDArray[np.signedinteger]
+    vectors: Vectors
     norms: Distances
     keys: Distances
 
     @classmethod
-    def over(cls, vectors: npt.NDArray[np.signedinteger], keys: Distances, leading: int) -> NearestSearch:
-        """Lay out vectors, shape (n, dims), sorted by their keys, shape (n,); see the class for `leading`."""
+    def over(cls, vectors: Vectors, keys: Distances, leading: int) -> NearestSearch:
+        """Build a search over vectors, shape (n, dims), sorted by their keys, shape (n,)."""
         count = vectors.shape[0]
         width = min(BLOCK_TILES, -(-count // _LANES) * _LANES)
         order = np.argsort(keys, kind="stable")
         vectors = vectors[order]
-        norms = squared_norms(vectors)
-        blocks = empty_blocks(-(-count // width), leading, width)
-        fill_blocks(blocks, 0, vectors, norms)
+        norms = _squared_norms(vectors)
+        blocks = _empty_blocks(-(-count // width), leading, width)
+        _fill_blocks(blocks, 0, vectors, norms)
         return cls(blocks, order, vectors, norms, keys[order])
 
     def nearest(self, queries: Distances, keys: Distances, count: int) -> tuple[Indices, Distances]:
-        """Return numbers and squared distances, shape (m, count) each, nearest first, of equals the lowest first.
+        """Find the nearest vectors of each query.
 
         Args:
-            queries: Shape (m, dims), float64, integers.
-            keys: Shape (m,), float64, their keys.
-            count: How many; no more than there are vectors.
+            queries: Shape (m, dims), float64 holding integers.
+            keys: Shape (m,): keys of the queries.
+            count: Number of vectors to find, at most n.
+
+        Returns:
+            Vector numbers and squared distances, shape (m, count) each, nearest first, the lowest number first among
+            equally near ones.
         """
-        found = _Found(self, queries, count)
-        found.look_around(np.searchsorted(self.keys, keys))
+        state = _SearchState(self, queries, count)
+        state.compare_around(np.searchsorted(self.keys, keys))
         width = self.blocks.shape[2]
-        for block, (least, largest) in enumerate(self._key_ranges):
-            reach = np.sqrt(np.maximum(found.limit + found.own, 0.0)) * (1 + 1e-9)
-            rows = np.flatnonzero((least <= keys + reach) & (largest >= keys - reach))
+        for block, (low, high) in enumerate(self._key_ranges):
+            reach = np.sqrt(np.maximum(state.limit + state.query_norms, 0.0)) * (1 + 1e-9)
+            rows = np.flatnonzero((low <= keys + reach) & (high >= keys - reach))
             if rows.size:
-                scores = found.singles[rows] @ self.blocks[block]
-                found.take(scores, rows, np.full(rows.size, block * width))
-        return found.index, found.value + found.own[:, None]
+                scores = state.query_rows[rows] @ self.blocks[block]
+                state.compare(scores, rows, np.full(rows.size, block * width))
+        return state.index, state.score + state.query_norms[:, None]
 
     @cached_property
     def _key_ranges(self) -> list[tuple[float, float]]:
@@ -92,88 +104,84 @@ class NearestSearch:
         return [(float(part.min()), float(part.max())) for part in parts]
 
 
-class _Found:
-    """The nearest vectors found so far for each of some queries.
+class _SearchState:
+    """The nearest vectors found so far for each query.
 
     Attributes:
-        index: Shape (queries, count), int64: their numbers.
-        value: Shape (queries, count), float64: their exact scores, ascending; infinite where none is found yet.
-        limit: Shape (queries,), float64: a vector with a single-precision score above this is not among the nearest.
-        own: Shape (queries,), float64: |a|^2.
-        singles: Shape (queries, leading + 2), float32: rows whose product with a column of the blocks is its score.
+        index: Shape (queries, count): their numbers.
+        score: Shape (queries, count): their exact scores, ascending; infinite for places not yet filled.
+        limit: Shape (queries,): a vector with a single-precision score above the limit is not among the nearest.
+        query_norms: Shape (queries,): |a|^2.
+        query_rows: Shape (queries, leading + 2), float32: the product with a column of a block is its score.
     """
 
     def __init__(self, search: NearestSearch, queries: Distances, count: int) -> None:
         self._search = search
         self._queries = queries
         self.index = np.full((queries.shape[0], count), -1, dtype=np.int64)
-        self.value = np.full((queries.shape[0], count), np.inf)
+        self.score = np.full((queries.shape[0], count), np.inf)
         self.limit = np.full(queries.shape[0], _NO_LIMIT)
-        self.own = squared_norms(queries)
+        self.query_norms = _squared_norms(queries)
         leading = search.blocks.shape[1] - 2
-        self.singles = np.ones((queries.shape[0], leading + 2), dtype=np.float32)
-        self.singles[:, :-2] = queries[:, :leading]
-        self.singles[:, -2] = np.sqrt(squared_norms(queries[:, leading:]))
-        self.singles[:, :-1] *= -2.0
+        self.query_rows = np.ones((queries.shape[0], leading + 2), dtype=np.float32)
+        self.query_rows[:, :-2] = queries[:, :leading]
+        self.query_rows[:, -2] = np.sqrt(_squared_norms(queries[:, leading:]))
+        self.query_rows[:, :-1] *= -2.0
         largest = float(np.sqrt(search.norms.max()))
-        self._slack = rounding_bound(np.sqrt(self.own), largest, leading + 1)
+        self._rounding = rounding_bound(np.sqrt(self.query_norms), largest, leading + 1)
 
-    def look_around(self, places: Indices) -> None:
-        """Compare each query with some vectors around a place, which tells how far there is to search."""
+    def compare_around(self, places: Indices) -> None:
+        """Compare each query with the vectors around a place. The result limits the search in the blocks."""
         width = self._search.blocks.shape[2]
-        length = min(_GLANCE_TILES, width)
+        length = min(_INITIAL_TILES, width)
         block, column = np.divmod(np.minimum(places, self._search.keys.size - 1), width)
         column = np.clip(column - length // 2, 0, width - length)
         scores = np.empty((places.size, length), dtype=np.float32)
-        _compiled(_score_around)(self._search.blocks, self.singles, block, column, scores)
-        self.take(scores, np.arange(places.size), block * width + column)
+        _compiled(_score_around)(self._search.blocks, self.query_rows, block, column, scores)
+        self.compare(scores, np.arange(places.size), block * width + column)
 
-    def take(self, scores: npt.NDArray[np.float32], rows: Indices, firsts: Indices) -> None:
-        """Take what is near.
+    def compare(self, scores: FloatArray, rows: Indices, first_places: Indices) -> None:
+        """Insert the vectors whose scores are within the limit.
 
         Args:
-            scores: Shape (m, n), n a multiple of 32: of a query and consecutive places each.
+            scores: Shape (m, n), n a multiple of 32: scores of consecutive places.
             rows: Shape (m,): the queries.
-            firsts: Shape (m,): the first of the places.
+            first_places: Shape (m,): the first place of each row of scores.
         """
         search = self._search
-        exact = (search.order, self._queries, search.vectors, search.norms, self._slack)
-        _compiled(_take)(scores, rows, firsts, *exact, self.index, self.value, self.limit)
+        exact = (search.order, self._queries, search.vectors, search.norms, self._rounding)
+        _compiled(_insert_nearest)(scores, rows, first_places, *exact, self.index, self.score, self.limit)
 
 
 def _score_around(
-    blocks: npt.NDArray[np.float32],
-    singles: npt.NDArray[np.float32],
-    block: Indices,
-    column: Indices,
-    scores: npt.NDArray[np.float32],
+    blocks: FloatArray, query_rows: FloatArray, block: Indices, column: Indices, scores: FloatArray
 ) -> None:
-    """Score each query against the columns from `column` on in its block, as many as `scores` is wide."""
-    for query in range(singles.shape[0]):
+    """Score each query against the columns of its block, from `column`, as many as `scores` has columns."""
+    for query in range(query_rows.shape[0]):
         own = scores[query]
         own[:] = 0.0
-        for row in range(singles.shape[1]):
-            factor = singles[query, row]
+        for row in range(query_rows.shape[1]):
+            factor = query_rows[query, row]
             values = blocks[block[query], row, column[query] : column[query] + own.size]
             for lane in range(own.size):
                 own[lane] += factor * values[lane]
 
 
-def _take(
-    scores: npt.NDArray[np.float32],
+def _insert_nearest(
+    scores: FloatArray,
     rows: Indices,
-    firsts: Indices,
+    first_places: Indices,
     order: Indices,
     queries: Distances,
-    vectors: npt.NDArray[np.signedinteger],
+    vectors: Vectors,
     norms: Distances,
-    slack: Distances,
+    rounding: Distances,
     index: Indices,
-    value: Distances,
+    score: Distances,
     limit: Distances,
 ) -> None:
-    """Insert the vectors that belong into the sorted `index` and `value` of their query; see `_Found.take`."""
-    last = value.shape[1] - 1
+    """Insert vectors into the sorted `index` and `score` of their query; see `_SearchState.compare`."""
+    last = score.shape[1] - 1
     for i in range(rows.size):
         query = rows[i]
         bound = np.float32(limit[query])
@@ -187,7 +195,7 @@ def _take(
             for lane in range(_LANES):
                 if own[lane] > bound:
                     continue
-                place = firsts[i] + start + lane
+                place = first_places[i] + start + lane
                 number = order[place]
                 product = 0.0
                 for axis in range(queries.shape[1]):
@@ -195,60 +203,34 @@ def _take(
                 exact = norms[place] - 2.0 * product
                 rank = last + 1
                 while rank > 0 and (
-                    exact < value[query, rank - 1]
-                    or (exact == value[query, rank - 1] and number < index[query, rank - 1])
+                    exact < score[query, rank - 1]
+                    or (exact == score[query, rank - 1] and number < index[query, rank - 1])
                 ):
                     rank -= 1
                 if rank > last or (rank > 0 and index[query, rank - 1] == number):
                     continue
                 for later in range(last, rank, -1):
-                    index[query, later], value[query, later] = index[query, later - 1], value[query, later - 1]
-                index[query, rank], value[query, rank] = number, exact
-                limit[query] = min(value[query, last] + slack[query], _NO_LIMIT)
+                    index[query, later], score[query, later] = index[query, later - 1], score[query, later - 1]
+                index[query, rank], score[query, rank] = number, exact
+                limit[query] = min(score[query, last] + rounding[query], _NO_LIMIT)
                 bound = np.float32(limit[query])
 
 
 @cache
 def _compiled(function: Callable[P, None]) -> Callable[P, None]:
-    """Compile on first use: importing the compiler takes longer than most commands.
+    """Compile on first use, so that importing this module does not import numba.
 
-    Sums may be reassociated: those of integers are exact anyhow, and `rounding_bound` is for any order.
+    Sums may be reordered: sums of integers are exact in any order, and `rounding_bound` holds for any order.
     """
-    numba = importlib.import_module("numba")
-    return cast(Callable[P, None], numba.njit(cache=True, fastmath={"reassoc", "contract", "nnan", "nsz"})(function))
-
-
-def squared_norms(vectors: npt.NDArray[np.generic]) -> Distances:
-    """Return the exact squared norms of integer vectors, shape (n, dims), as float64, shape (n,)."""
-    wide = vectors.astype(np.float64)
-    return np.asarray(np.einsum("ij,ij->i", wide, wide), dtype=np.float64)
-
-
-def empty_blocks(number: int, leading: int, width: int = BLOCK_TILES) -> npt.NDArray[np.float32]:
-    """Return blocks as `NearestSearch` holds them, in which every place is empty."""
-    blocks = np.zeros((number, leading + 2, width), dtype=np.float32)
-    blocks[:, -1] = _FAR
-    return blocks
-
-
-def fill_blocks(
-    blocks: npt.NDArray[np.float32], start: int, vectors: npt.NDArray[np.signedinteger], norms: Distances
-) -> None:
-    """Put vectors, shape (m, dims), and their squared norms, shape (m,), into the places from `start` on."""
-    block, column = np.divmod(np.arange(start, start + vectors.shape[0]), blocks.shape[2])
-    leading = blocks.shape[1] - 2
-    blocks[block, :-2, column] = vectors[:, :leading]
-    blocks[block, -2, column] = np.sqrt(squared_norms(vectors[:, leading:]))
-    blocks[block, -1, column] = norms
+    return jit(function, reorder_sums=True)
 
 
 def rounding_bound(norms: Distances, largest: float, dims: int) -> Distances:
-    """Return how far |b|^2 - 2ab in single precision may be from the truth, whatever the order of summation.
+    """Return the largest rounding error of |b|^2 - 2ab in single precision, for any order of summation.
 
-    Each of dims + 1 products has two rounded factors and is rounded, and takes part in at most dims additions: a
-    relative error of (dims + 3) units of 2^-24 to first order (Higham, "Accuracy and Stability of Numerical
-    Algorithms", 2nd ed., section 3.1), and the sum of the magnitudes is at most 2 |a| |b| + |b|^2. The factor 1.01
-    covers the rest.
+    Each of dims + 1 products has two rounded factors, is rounded, and takes part in at most dims additions: a relative
+    error of (dims + 3) units of 2^-24 to first order (Higham, "Accuracy and Stability of Numerical Algorithms", 2nd
+    ed., section 3.1). The sum of the magnitudes is at most 2 |a| |b| + |b|^2. The factor 1.01 covers the higher orders.
 
     Args:
         norms: Shape (m,), |a|.
@@ -256,3 +238,152 @@ def rounding_bound(norms: Distances, largest: float, dims: int) -> Distances:
         dims: Length of the vectors.
     """
     return np.asarray(1.01 * (dims + 4) * 2.0**-24 * (2.0 * norms * largest + largest * largest), dtype=np.float64)
+
+
+def _squared_norms(vectors: npt.NDArray[np.generic]) -> Distances:
+    """Return the exact squared norms of integer vectors, shape (n, dims)."""
+    wide = vectors.astype(np.float64)
+    return np.asarray(np.einsum("ij,ij->i", wide, wide), dtype=np.float64)
+
+
+def _empty_blocks(count: int, leading: int, width: int = BLOCK_TILES) -> FloatArray:
+    """Return blocks of `NearestSearch` with empty places."""
+    blocks = np.zeros((count, leading + 2, width), dtype=np.float32)
+    blocks[:, -1] = _EMPTY
+    return blocks
+
+
+def _fill_blocks(blocks: FloatArray, start: int, vectors: Vectors, norms: Distances) -> None:
+    """Write vectors, shape (m, dims), and their squared norms to the places from `start`."""
+    block, column = np.divmod(np.arange(start, start + vectors.shape[0]), blocks.shape[2])
+    leading = blocks.shape[1] - 2
+    blocks[block, :-2, column] = vectors[:, :leading]
+    blocks[block, -2, column] = np.sqrt(_squared_norms(vectors[:, leading:]))
+    blocks[block, -1, column] = norms
+
+
+class IncrementalTileSet:
+    """A growing set of tiles with an exact nearest-neighbour search over all pixels.
+
+    Pixels are stored minus 128. Sums of products of two tiles of at most 32 x 32 px then never exceed 2^24 and are
+    exact in single precision, so the result does not depend on the machine.
+
+    Memory: 5 bytes a pixel of all tiles, three times that while the arrays grow, and 2 MiB for a search.
+    """
+
+    def __init__(self, tile_px: int, capacity: int) -> None:
+        self.tile_px = tile_px
+        self.capacity = capacity
+        self._count = 0
+        allocated = min(capacity, BLOCK_TILES)
+        self._vectors = np.zeros((allocated, tile_px * tile_px), dtype=np.int8)
+        self._norms = np.zeros(allocated)
+        self._keys = np.zeros(allocated)
+        self._blocks = _empty_blocks(1, tile_px * tile_px)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def full(self) -> bool:
+        """Whether the capacity is reached."""
+        return self._count >= self.capacity
+
+    def tiles(self) -> Tiles:
+        """Return the tiles, shape (n, pixels), in the order of their addition."""
+        return _uncentred(self._vectors[: self._count])
+
+    def tiles_at(self, index: Indices) -> Tiles:
+        """Return the tiles of these numbers, shape (m, pixels)."""
+        return _uncentred(self._vectors[index])
+
+    def append(self, tiles: Tiles) -> None:
+        """Add tiles, shape (m, pixels). The caller respects the capacity."""
+        end = self._count + tiles.shape[0]
+        self._grow(end)
+        part = slice(self._count, end)
+        self._vectors[part] = _centred(tiles)
+        self._norms[part] = _squared_norms(self._vectors[part])
+        self._keys[part] = _diagonal_coordinate(tiles, self.tile_px)
+        _fill_blocks(self._blocks, self._count, self._vectors[part], self._norms[part])
+        self._count = end
+
+    def nearest(self, tiles: Tiles) -> tuple[Indices, Distances]:
+        """Return number and squared distance of the nearest stored tile (the lowest of equals) for each of `tiles`."""
+        used = slice(self._count)
+        blocks = self._blocks[: -(-self._count // BLOCK_TILES)]
+        order = np.arange(self._count)
+        search = NearestSearch(blocks, order, self._vectors[used], self._norms[used], self._keys[used])
+        index = np.empty(tiles.shape[0], dtype=np.int64)
+        squared = np.empty(tiles.shape[0])
+        for start in range(0, tiles.shape[0], _QUERY_ROWS):
+            part = slice(start, start + _QUERY_ROWS)
+            queries = _centred(tiles[part]).astype(np.float64)
+            found, distances = search.nearest(queries, _diagonal_coordinate(tiles[part], self.tile_px), 1)
+            index[part], squared[part] = found[:, 0], distances[:, 0]
+        return index, squared
+
+    def add_far(self, tiles: Tiles, squared_distance: Distances, min_distance: float) -> Tiles:
+        """Add, in order, each tile farther than `min_distance` from all stored tiles, including those just added.
+
+        Args:
+            tiles: Shape (m, pixels).
+            squared_distance: Shape (m,): squared distance of each tile to its nearest stored tile.
+            min_distance: Distance that must be exceeded. 0 rejects only exact duplicates.
+
+        Returns:
+            The added tiles, shape (0..m, pixels).
+        """
+        far = np.flatnonzero(squared_distance > min_distance * min_distance)
+        free = self.capacity - self._count
+        chosen: list[int] = []
+        for start in range(0, far.size, _CHUNK_TILES):
+            chunk = far[start : start + _CHUNK_TILES]
+            least = squared_distance[chunk]
+            for first in range(0, len(chosen), _POOL_TILES):
+                pool = tiles[chosen[first : first + _POOL_TILES]]
+                np.minimum(least, _squared_distances(tiles[chunk], pool).min(axis=1), out=least)
+            between = _squared_distances(tiles[chunk], tiles[chunk])
+            for position in range(chunk.size):
+                if least[position] > min_distance * min_distance and len(chosen) < free:
+                    chosen.append(int(chunk[position]))
+                    np.minimum(least, between[position], out=least)
+            if len(chosen) == free:
+                break
+        added = np.ascontiguousarray(tiles[chosen])
+        self.append(added)
+        return added
+
+    def _grow(self, count: int) -> None:
+        allocated = self._vectors.shape[0]
+        if count <= allocated:
+            return
+        allocated = min(max(count, 2 * allocated), max(self.capacity, count))
+        for name in ("_vectors", "_norms", "_keys"):
+            old = getattr(self, name)
+            larger = np.zeros((allocated, *old.shape[1:]), dtype=old.dtype)
+            larger[: self._count] = old[: self._count]
+            setattr(self, name, larger)
+        blocks = _empty_blocks(-(-allocated // BLOCK_TILES), self._vectors.shape[1])
+        blocks[: self._blocks.shape[0]] = self._blocks
+        self._blocks = blocks
+
+
+def _centred(tiles: Tiles) -> npt.NDArray[np.int8]:
+    return (tiles ^ np.uint8(_CENTRE)).view(np.int8)  # subtracts 128 in one byte
+
+
+def _uncentred(vectors: npt.NDArray[np.int8]) -> Tiles:
+    return vectors.view(np.uint8) ^ np.uint8(_CENTRE)
+
+
+def _diagonal_coordinate(tiles: Tiles, tile_px: int) -> Distances:
+    """Return the coordinate along the diagonal of the pixel space, a key of `NearestSearch`."""
+    return np.asarray(tiles.sum(axis=1, dtype=np.int64) / tile_px, dtype=np.float64)
+
+
+def _squared_distances(tiles_a: Tiles, tiles_b: Tiles) -> Distances:
+    """Return exact squared distances, shape (m, n)."""
+    a, b = _centred(tiles_a), _centred(tiles_b)
+    products = (a.astype(np.float32) @ b.astype(np.float32).T).astype(np.float64)
+    return np.asarray(_squared_norms(a)[:, None] + _squared_norms(b) - 2.0 * products, dtype=np.float64)

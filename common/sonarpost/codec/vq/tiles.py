@@ -1,21 +1,19 @@
-"""The tile database both ends of the link share, and the search for the tile most like a piece of a picture.
+"""The tile database that both ends of the link share, and the search for the nearest tile.
 
-Tiles are compared after projection on a principal-component basis, as the paper does (70 dimensions kept). The basis
-cannot see a tile's finest grain, and a grainy tile would be chosen where a smooth one is nearer; so the few tiles
-nearest in the basis are compared once more in all pixels (with 20 x 20 tiles this gains 0.1 to 0.2 dB).
+Tiles are compared in a basis of principal components, as in the paper (70 dimensions). The basis loses the finest
+texture of a tile, and a textured tile would be chosen although a smooth one is nearer. The few nearest tiles in the
+basis are therefore compared again in all pixels; with 20 x 20 tiles this gains 0.1 to 0.2 dB.
 
-Mean and basis are held as **integers** (the basis in units of 1/4096), so projections and squared distances are
-integers that float64 holds exactly: they are the same, and so are the indices, whatever the processor or the
-linear-algebra library. A stream encoded on one machine is byte for byte the stream of any other.
-
-The search itself is `sonarpost.codec.vq.tile_search`.
+Mean and basis are stored as integers, the basis in units of 1/4096. Projections and squared distances are integers that
+float64 holds exactly, so indices do not depend on the processor or the linear-algebra library. A stream has the same
+bytes on every machine. The search itself is in `sonarpost.codec.vq.tile_search`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -30,9 +28,9 @@ MAX_DIMS = 70
 BASIS_SCALE = 4096
 
 SHORTLIST = 8
-"""Tiles nearest in the basis that are compared in all pixels; 32 or 128 give the same pictures, measured."""
+"""Number of nearest tiles in the basis that are compared in all pixels. 32 or 128 give the same images."""
 
-_QUERY_ROWS = 256  # tiles looked up at once
+_QUERY_ROWS = 256  # tiles searched at once
 
 Tiles = npt.NDArray[np.uint8]
 Basis = npt.NDArray[np.int16]
@@ -40,24 +38,22 @@ Basis = npt.NDArray[np.int16]
 
 @dataclass(frozen=True, eq=False)
 class TileDatabase:
-    """A fixed list of tiles with the space they are compared in.
+    """An immutable list of tiles with the basis in which they are compared.
 
     Attributes:
         tile_px: Side of the square tiles, 4..32 px.
         tiles: Shape (n, tile_px * tile_px), uint8, each row one tile in raster order; n is at least 1.
         mean: Shape (tile_px * tile_px,), uint8, subtracted before projection.
         basis: Shape (dims, tile_px * tile_px), int16, rows are unit vectors times 4096; 1..70 dims.
-        projections: Shape (n, dims), float64 holding integers: `(tiles - mean) @ basis.T`.
 
     Raises:
-        CodebookError: A shape, dtype or count is not as above.
+        CodebookError: A shape, dtype or count is out of range.
     """
 
     tile_px: int
     tiles: Tiles
     mean: Tiles
     basis: Basis
-    projections: npt.NDArray[np.float64] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         pixels = self.tile_px * self.tile_px
@@ -67,25 +63,22 @@ class TileDatabase:
         dims = min(max(1, self.basis.shape[0]), MAX_DIMS, pixels)
         _check_array("basis", self.basis, np.dtype(np.int16), (dims, pixels))
         for name in ("tiles", "mean", "basis"):
-            # A private, read-only copy: the identity below must stay true for as long as the object lives.
+            # A private, read-only copy: `identity` must not change.
             array = np.array(getattr(self, name), order="C")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
-        projections = self.project(self.tiles)
-        projections.setflags(write=False)
-        object.__setattr__(self, "projections", projections)
 
     @classmethod
     def from_tiles(cls, tile_px: int, tiles: Tiles, dims: int = MAX_DIMS) -> TileDatabase:
-        """Make a database whose basis is the principal components of its own tiles.
+        """Build a database with the principal components of its own tiles as basis.
 
         Args:
             tile_px: Side of a tile in pixels.
             tiles: Shape (n, tile_px * tile_px), uint8.
-            dims: Dimensions to keep, 1..70; fewer are kept where the tiles span fewer.
+            dims: Dimensions to keep, 1..70. Fewer are kept if the tiles span fewer.
 
         Raises:
-            CodebookError: Shapes or counts outside the documented ranges.
+            CodebookError: A shape, dtype or count is out of range.
         """
         _check("dims", dims, f"1..{MAX_DIMS}", 1 <= dims <= MAX_DIMS)
         _check("tile_px", tile_px, f"{MIN_TILE_PX}..{MAX_TILE_PX}", MIN_TILE_PX <= tile_px <= MAX_TILE_PX)
@@ -98,12 +91,12 @@ class TileDatabase:
 
     @property
     def dims(self) -> int:
-        """Dimensions of the space tiles are compared in."""
+        """Dimensions of the basis."""
         return int(self.basis.shape[0])
 
     @cached_property
     def identity(self) -> str:
-        """Hex sha256 over everything that decides a picture or an index (see docs/specifications/codebook-file.md)."""
+        """Hex SHA-256 over all data that affect an image or an index (see docs/specifications/codebook-file.md)."""
         digest = hashlib.sha256(b"sonarpost tile database 1\n")
         digest.update(struct.pack(">HIH", self.tile_px, len(self), self.dims))
         digest.update(self.tiles.tobytes())
@@ -111,8 +104,15 @@ class TileDatabase:
         digest.update(self.basis.astype(">i2").tobytes())
         return digest.hexdigest()
 
+    @cached_property
+    def projections(self) -> npt.NDArray[np.float64]:
+        """Coordinates of the tiles in the basis, shape (n, dims), see `project`."""
+        projections = self.project(self.tiles)
+        projections.setflags(write=False)
+        return projections
+
     def project(self, tiles: Tiles) -> npt.NDArray[np.float64]:
-        """Return the coordinates of tiles, shape (m, dims), float64 holding integers (1/4096 grey level).
+        """Return the coordinates of tiles, shape (m, dims), float64 holding integers, in 1/4096 grey level.
 
         Args:
             tiles: Shape (m, tile_px * tile_px), uint8.
@@ -121,14 +121,14 @@ class TileDatabase:
         return np.asarray(centred @ self.basis.T.astype(np.float64), dtype=np.float64)
 
     def nearest(self, tiles: Tiles) -> tuple[Indices, Distances]:
-        """Find, for each of `tiles`, the nearest in all pixels among the `SHORTLIST` nearest in the basis.
+        """Find for each tile the nearest in all pixels among the `SHORTLIST` nearest in the basis.
 
         Args:
             tiles: Shape (m, tile_px * tile_px), uint8.
 
         Returns:
-            Indices, shape (m,), int64 (the lowest of equally near ones); Euclidean distances over all pixels, shape
-            (m,), float64, grey levels.
+            Indices, shape (m,), the lowest among equally near ones; Euclidean distances over all pixels, shape (m,), in
+            grey levels.
         """
         shortlist, _ = self.nearest_in_basis(tiles, SHORTLIST)
         shortlist = np.sort(shortlist, axis=1)  # so that the first of equals is the lowest index
@@ -142,17 +142,15 @@ class TileDatabase:
         return shortlist[rows, best], np.sqrt(squared[rows, best].astype(np.float64))
 
     def nearest_in_basis(self, tiles: Tiles, count: int = 1) -> tuple[Indices, Distances]:
-        """Find, for each of `tiles`, the `count` database tiles of least Euclidean distance in the basis.
-
-        With a count of 1 this is the paper's search. Squared distances are exact (module docstring). Of
-        equally near tiles those with lower indices come first.
+        """Find for each tile the `count` nearest database tiles in the basis. With a count of 1: the paper's search.
 
         Args:
             tiles: Shape (m, tile_px * tile_px), uint8.
-            count: How many; at most as many as there are tiles are returned.
+            count: Number of tiles to find, limited to the number of stored tiles.
 
         Returns:
-            Indices, shape (m, count), int64, nearest first; distances, same shape, float64, grey levels.
+            Indices, shape (m, count), nearest first, the lowest first among equally near ones; exact distances, same
+            shape, in grey levels.
         """
         count = min(count, len(self))
         indices = np.empty((tiles.shape[0], count), dtype=np.int64)
@@ -171,15 +169,15 @@ class TileDatabase:
 
 
 def principal_basis(tiles: Tiles, dims: int) -> tuple[Tiles, Basis]:
-    """Return the rounded mean and the leading principal components of `tiles`, in integers.
+    """Return the rounded mean and the leading principal components of `tiles`, as integers.
 
-    Sums and products of pixels are exact integers; only the eigenvectors of the covariance are floating point, and
-    they are rounded to 1/4096. The sign of each is fixed: its entry of largest magnitude (the first of equals) is
-    positive. Components that carry no variance are left out, but at least one is kept.
+    Sums and products of pixels are exact integers. Only the eigenvectors of the covariance are floating point; they are
+    rounded to 1/4096. The first entry of largest magnitude of each component is positive. Components without variance
+    are dropped, except the first.
 
     Args:
         tiles: Shape (n, pixels), uint8, n at least 1.
-        dims: Most components to keep.
+        dims: Maximum number of components.
 
     Returns:
         Mean, shape (pixels,), uint8; basis, shape (1..dims, pixels), int16.
@@ -199,7 +197,7 @@ def principal_basis(tiles: Tiles, dims: int) -> tuple[Tiles, Basis]:
 
 
 def cut_tiles(image: npt.NDArray[np.uint8], tile_px: int) -> Tiles:
-    """Cut an image into tiles that cover all of it; edge tiles are filled by repeating the last row and column.
+    """Cut an image into tiles that cover it. Edge tiles repeat the last row and column.
 
     Args:
         image: Shape (height, width), uint8.
@@ -216,23 +214,19 @@ def cut_tiles(image: npt.NDArray[np.uint8], tile_px: int) -> Tiles:
 
 
 def join_tiles(tiles: Tiles, height_px: int, width_px: int, tile_px: int) -> npt.NDArray[np.uint8]:
-    """Put tiles back together and crop to the picture: the inverse of `cut_tiles`.
-
-    Returns:
-        Shape (height_px, width_px), uint8.
-    """
+    """Join tiles and crop to the image size, shape (height_px, width_px). The inverse of `cut_tiles`."""
     rows, columns = tile_grid(height_px, width_px, tile_px)
     blocks = tiles.reshape(rows, columns, tile_px, tile_px).swapaxes(1, 2)
     return np.ascontiguousarray(blocks.reshape(rows * tile_px, columns * tile_px)[:height_px, :width_px])
 
 
 def tile_grid(height_px: int, width_px: int, tile_px: int) -> tuple[int, int]:
-    """Return rows and columns of tiles that cover a picture."""
+    """Return the rows and columns of tiles that cover an image."""
     return -(-height_px // tile_px), -(-width_px // tile_px)
 
 
-def _check(name: str, value: object, expected: str, good: bool) -> None:  # noqa: FBT001 - a condition, not a switch
-    if not good:
+def _check(name: str, value: object, expected: str, is_valid: bool) -> None:  # noqa: FBT001 - a condition
+    if not is_valid:
         raise CodebookError("tile database", name, value, expected)
 
 

@@ -1,4 +1,4 @@
-"""Training windows that a codebook is built from."""
+"""Training windows cut from side-scan lines."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ def line(pings: int = 300, samples: int = 260, seed: int = 0) -> np.ndarray:
     return np.clip(values, 1, 255).astype(np.uint8).astype(np.float32)
 
 
-def test_a_tone_is_its_curve() -> None:
+def test_tone_table_is_its_curve() -> None:
     assert ToneMapping(1.0, 1.0).table().tolist() == list(range(256))
     dark = ToneMapping(2.0, 0.5).table()
     assert (dark[0], dark[255], dark[128]) == (0, 128, 32)
     assert ToneMapping(1.0, 3.0).table()[-1] == 255
 
 
-def test_stretching_puts_the_percentiles_at_the_ends() -> None:
+def test_stretch_maps_the_percentiles_to_the_ends() -> None:
     window = np.arange(10_000, dtype=float).reshape(100, 100)
-    window[0, 0], window[-1, -1] = -1e6, 1e6  # a dropout and a flash do not count
+    window[0, 0], window[-1, -1] = -1e6, 1e6  # outliers beyond the percentiles
     stretched = stretch(window)
     assert stretched.min() == 0
     assert stretched.max() == 255
@@ -32,13 +32,13 @@ def test_stretching_puts_the_percentiles_at_the_ends() -> None:
     assert not stretch(np.full((9, 9), 7.0)).any()
 
 
-def test_reducing_averages_blocks() -> None:
+def test_reduction_averages_blocks() -> None:
     values = np.arange(24, dtype=np.float32).reshape(4, 6)
     assert reduce_line(values, 2, 3).tolist() == [[4.0, 7.0], [16.0, 19.0]]
     assert reduce_line(values, 3, 4).shape == (1, 1)
 
 
-def test_windows_avoid_what_was_not_recorded_and_what_is_flat() -> None:
+def test_missing_and_flat_windows_are_skipped() -> None:
     values = line()
     values[:, 160:] = np.nan
     values[:80, :80] = 40.0
@@ -48,7 +48,7 @@ def test_windows_avoid_what_was_not_recorded_and_what_is_flat() -> None:
     assert all(image.load().shape == (80, 80) for image in cut_line("x", values, plan))
 
 
-def test_windows_are_limited_repeated_in_other_tones_and_mirrored() -> None:
+def test_windows_are_limited_and_repeated_in_other_tones_and_mirrored() -> None:
     plan = PatchPlan(reductions=((1, 1), (2, 2)), per_reduction=1, copies=3)
     images = list(cut_line("x", line(), plan))
     assert len(images) == 6
@@ -64,18 +64,18 @@ def test_windows_are_limited_repeated_in_other_tones_and_mirrored() -> None:
         assert np.array_equal(image.load(), expected)
 
 
-def test_windows_around_an_object_show_it() -> None:
+def test_windows_around_an_object_contain_it() -> None:
     values = line()
     values[140:150, 120:135] = 2000.0
     plan = PatchPlan(reductions=((1, 1), (2, 1), (9, 9)), copies=3)
     images = list(cut_around("x", values, [(145, 127)], plan))
-    assert len(images) == 6  # reduced nine times the line is smaller than a window
+    assert len(images) == 6  # with a reduction of 9 the line is smaller than a window
     assert all((image.load() > 100).sum() > 40 for image in images)
     corner = list(cut_around("x", values, [(0, 0), (299, 259)], PatchPlan(reductions=((1, 1),))))
     assert [image.load().shape for image in corner] == [(80, 80), (80, 80)]
 
 
-def test_the_order_depends_on_names_alone() -> None:
+def test_shuffled_order_depends_on_names_only() -> None:
     images = list(cut_line("x", line(), PatchPlan()))
     assert [i.name for i in shuffled(images)] == [i.name for i in shuffled(images[::-1])]
     assert [i.name for i in shuffled(images)] != [i.name for i in images]

@@ -15,17 +15,17 @@ def database(seed: int, count: int = 60, tile_px: int = 8) -> TileDatabase:
     return TileDatabase.from_tiles(tile_px, rng.integers(0, 256, (count, tile_px**2), dtype=np.uint8), 20)
 
 
-def test_a_codebook_does_not_differ_from_itself() -> None:
+def test_codebook_equals_itself() -> None:
     one = database(0)
     difference = compare(one, one)
     assert difference.same_identity
-    assert difference.same_places == difference.common == 60
+    assert difference.same_numbers == difference.common == 60
     assert difference.first.only_here == difference.second.only_here == 0
-    assert difference.first.rms_largest == 0.0
-    assert difference.angle_largest_deg == pytest.approx(0.0, abs=1e-6)
+    assert difference.first.rms_max == 0.0
+    assert difference.angle_max_deg == pytest.approx(0.0, abs=1e-6)
 
 
-def test_tiles_of_one_alone_are_counted_and_measured() -> None:
+def test_tiles_of_one_codebook_only_are_counted_and_measured() -> None:
     one = database(0)
     other_tiles = one.tiles.copy()
     other_tiles[7] = np.where(other_tiles[7] < 128, other_tiles[7] + 5, other_tiles[7] - 5)  # 5 grey levels away
@@ -34,39 +34,39 @@ def test_tiles_of_one_alone_are_counted_and_measured() -> None:
     assert not difference.same_identity
     assert difference.common == 59
     assert (difference.first.only_here, difference.second.only_here) == (1, 1)
-    assert (difference.first.tiles, difference.second.tiles) == (60, 60)  # three stand in the other twice
-    assert difference.first.rms_largest == pytest.approx(5.0)
-    assert difference.second.rms_largest == pytest.approx(5.0)
+    assert (difference.first.tiles, difference.second.tiles) == (60, 60)  # the second has three of them twice
+    assert difference.first.rms_max == pytest.approx(5.0)
+    assert difference.second.rms_max == pytest.approx(5.0)
     assert difference.first.rms_median == 0.0
-    assert difference.same_places == 0
+    assert difference.same_numbers == 0
 
 
-def test_angles_of_known_spaces() -> None:
+def test_principal_angles_of_known_spaces() -> None:
     def basis(*rows: tuple[float, ...]) -> np.ndarray:
         return np.round(4096 * np.array(rows)).astype(np.int16)
 
     x, y, z = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)
     for angle in (0.0, 0.05, 1.0, 30.0, 60.0, 89.0, 90.0):
-        turned = (0, float(np.cos(np.radians(angle))), float(np.sin(np.radians(angle))), 0)
-        found = principal_angles_deg(basis(x, y), basis(x, turned))
-        assert sorted(found) == pytest.approx([0.0, angle], abs=0.02)  # the basis is rounded to 1/4096: 0.014 deg
+        rotated = (0, float(np.cos(np.radians(angle))), float(np.sin(np.radians(angle))), 0)
+        angles = principal_angles_deg(basis(x, y), basis(x, rotated))
+        assert sorted(angles) == pytest.approx([0.0, angle], abs=0.02)  # the basis is rounded to 1/4096: 0.014 deg
     assert principal_angles_deg(basis(x, y, z), basis(y)) == pytest.approx([0.0], abs=1e-6)
     assert principal_angles_deg(basis(z), basis(x, y)) == pytest.approx([90.0])
 
 
-def test_a_basis_sees_the_variance_that_lies_in_it() -> None:
+def test_variance_fraction_of_a_basis() -> None:
     rng = np.random.default_rng(3)
     grey = rng.integers(20, 236, (50, 1)).astype(np.uint8)
-    one = TileDatabase.from_tiles(8, np.repeat(grey, 64, axis=1), 5)  # flat tiles: one dimension says all
+    one = TileDatabase.from_tiles(8, np.repeat(grey, 64, axis=1), 5)  # flat tiles: one dimension
     step = np.repeat(np.array([1, -1]), 32) * rng.integers(-90, 90, (50, 1)) + 128
-    other = TileDatabase.from_tiles(8, step.astype(np.uint8), 5)  # two halves against each other, of the same mean
+    other = TileDatabase.from_tiles(8, step.astype(np.uint8), 5)  # two opposite halves with the same mean
     difference = compare(one, other)
     assert difference.first.variance_own == pytest.approx(1.0, abs=1e-4)
     assert difference.first.variance_other == pytest.approx(0.0, abs=1e-4)
     assert difference.second.variance_other == pytest.approx(0.0, abs=1e-4)
-    assert difference.angle_largest_deg == pytest.approx(90.0, abs=0.1)
+    assert difference.angle_max_deg == pytest.approx(90.0, abs=0.1)
 
 
-def test_other_tile_sizes_cannot_be_compared() -> None:
+def test_other_tile_sizes_are_rejected() -> None:
     with pytest.raises(CodebookError, match="tile_px"):
         compare(database(0), database(0, tile_px=9))

@@ -1,4 +1,4 @@
-"""The exact search for tiles, held against distances in plain integers."""
+"""The exact tile search, compared with distances in Python integers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sonarpost.codec.vq.tile_search import NearestSearch, rounding_bound
 from sonarpost.codec.vq.tiles import TileDatabase
 
 
-def plainly(vectors: np.ndarray, queries: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def brute_force(vectors: np.ndarray, queries: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     difference = queries[:, None].astype(np.int64) - vectors[None].astype(np.int64)
     squared = (difference * difference).sum(axis=2)
     index = np.argsort(squared, axis=1, kind="stable")[:, :count]
@@ -24,7 +24,7 @@ def check(vectors: np.ndarray, queries: np.ndarray, count: int, leading: int) ->
     search = NearestSearch.over(vectors, vectors[:, 0].astype(np.float64), leading)
     wide = queries.astype(np.float64)
     index, squared = search.nearest(wide, wide[:, 0], count)
-    expected_index, expected_squared = plainly(vectors, queries, count)
+    expected_index, expected_squared = brute_force(vectors, queries, count)
     assert np.array_equal(squared, expected_squared)
     assert np.array_equal(index, expected_index)
 
@@ -39,76 +39,78 @@ def check(vectors: np.ndarray, queries: np.ndarray, count: int, leading: int) ->
     count=st.integers(1, 12),
     leading=st.integers(1, 7),
 )
-def test_it_is_exact_with_ties_and_duplicates(
+def test_search_is_exact_with_ties_and_duplicates(
     seed: int, vectors: int, queries: int, dims: int, largest: int, count: int, leading: int
 ) -> None:
     rng = np.random.default_rng(seed)
     stored = rng.integers(-largest, largest + 1, (vectors, dims), dtype=np.int32)
-    asked = rng.integers(-largest, largest + 1, (queries, dims), dtype=np.int32)
-    asked[::2] = stored[rng.integers(0, vectors, asked[::2].shape[0])]
-    check(stored, asked, min(count, vectors), min(leading, dims))
+    query_vectors = rng.integers(-largest, largest + 1, (queries, dims), dtype=np.int32)
+    query_vectors[::2] = stored[rng.integers(0, vectors, query_vectors[::2].shape[0])]
+    check(stored, query_vectors, min(count, vectors), min(leading, dims))
 
 
 @pytest.mark.parametrize("count", [1, 8, 200])
 @pytest.mark.parametrize("size", [2047, 2048, 2049, 5000])
-def test_it_is_exact_across_blocks(size: int, count: int) -> None:
+def test_search_is_exact_across_blocks(size: int, count: int) -> None:
     rng = np.random.default_rng(size)
     stored = (rng.standard_normal((size, 20)) * np.geomspace(3e6, 1e4, 20)).astype(np.int32)
-    stored[size // 2 :: 7] = stored[0]  # doubled vectors, spread over the blocks of the layout by their numbers
-    asked = (rng.standard_normal((40, 20)) * np.geomspace(4e6, 1e4, 20)).astype(np.int32)
-    asked[0] = stored[0]
-    check(stored, asked, count, 9)
+    stored[size // 2 :: 7] = stored[0]  # duplicates, distributed over the blocks
+    queries = (rng.standard_normal((40, 20)) * np.geomspace(4e6, 1e4, 20)).astype(np.int32)
+    queries[0] = stored[0]
+    check(stored, queries, count, 9)
 
 
-def test_distances_closer_than_single_precision_are_told_apart() -> None:
-    # Around 8e6 the squares are near 6e13, where single precision steps by 4 million: all these look alike to it.
+def test_distances_closer_than_single_precision_are_distinguished() -> None:
+    # Around 8e6 the squares are near 6e13, where single precision has steps of 4 million.
     rng = np.random.default_rng(0)
     stored = (8_000_000 + rng.integers(-3, 4, (3000, 30))).astype(np.int32)
     check(stored, stored[:50] + 1, 8, 12)
 
 
 @pytest.mark.parametrize("leading", [1, 10, 30])
-def test_scores_stay_within_their_bound(leading: int) -> None:
+def test_scores_are_within_the_rounding_bound(leading: int) -> None:
     rng = np.random.default_rng(leading)
     stored = rng.integers(-(2**24), 2**24, (500, 30), dtype=np.int32)
-    asked = rng.integers(-(2**24), 2**24, (60, 30), dtype=np.int32).astype(np.float64)
+    queries = rng.integers(-(2**24), 2**24, (60, 30), dtype=np.int32).astype(np.float64)
     search = NearestSearch.over(stored, stored[:, 0].astype(np.float64), leading)
-    found = module._Found(search, asked, 1)
-    scores = (found.singles @ search.blocks[0])[:, : len(stored)].astype(np.float64)
-    true = search.norms - 2.0 * asked @ search.vectors.T.astype(np.float64)
-    slack = rounding_bound(np.sqrt(found.own), float(np.sqrt(search.norms.max())), leading + 1)
-    assert (scores <= true + slack[:, None]).all()
+    state = module._SearchState(search, queries, 1)
+    scores = (state.query_rows @ search.blocks[0])[:, : len(stored)].astype(np.float64)
+    true = search.norms - 2.0 * queries @ search.vectors.T.astype(np.float64)
+    margin = rounding_bound(np.sqrt(state.query_norms), float(np.sqrt(search.norms.max())), leading + 1)
+    assert (scores <= true + margin[:, None]).all()
     if leading == 30:
-        assert (np.abs(scores - true) <= slack[:, None]).all()
+        assert (np.abs(scores - true) <= margin[:, None]).all()
         assert np.abs(scores - true).max() > 0.0
 
 
-def test_far_blocks_are_spared(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_distant_blocks_are_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
     stored = rng.integers(-1000, 1001, (8 * module.BLOCK_TILES, 3), dtype=np.int32)
     stored[:, 0] *= 1000
     search = NearestSearch.over(stored, stored[:, 0].astype(np.float64), 3)
     compared = []
-    take = module._Found.take
-    monkeypatch.setattr(module._Found, "take", lambda self, s, r, f: (compared.append(s.size), take(self, s, r, f)))
-    asked = stored[:64].astype(np.float64)
-    assert np.array_equal(search.nearest(asked, asked[:, 0], 1)[0][:, 0], np.arange(64))
+    compare = module._SearchState.compare
+    monkeypatch.setattr(
+        module._SearchState, "compare", lambda self, s, r, f: (compared.append(s.size), compare(self, s, r, f))
+    )
+    queries = stored[:64].astype(np.float64)
+    assert np.array_equal(search.nearest(queries, queries[:, 0], 1)[0][:, 0], np.arange(64))
     assert sum(compared) < 0.25 * 64 * len(stored)
 
 
-def test_the_shipped_codebook_is_searched_exactly() -> None:
+def test_search_in_the_shipped_codebook_is_exact() -> None:
     database = load_default(10).tiles
     rng = np.random.default_rng(2)
     noise = np.clip(60 * rng.rayleigh(1.0, (60, 100)), 0, 255).astype(np.uint8)
     flat = np.repeat(np.arange(0, 256, 51, dtype=np.uint8)[:, None], 100, axis=1)
-    asked = np.concatenate((noise, flat, database.tiles[::3000]))
-    index, distance = database.nearest_in_basis(asked, 8)
-    expected, squared = plainly(database.projections, database.project(asked), 8)
+    queries = np.concatenate((noise, flat, database.tiles[::3000]))
+    index, distance = database.nearest_in_basis(queries, 8)
+    expected, squared = brute_force(database.projections, database.project(queries), 8)
     assert np.array_equal(index, expected)
     assert np.allclose(distance, np.sqrt(squared) / 4096, rtol=1e-12)
 
 
-def test_no_tiles_asked_and_few_stored() -> None:
+def test_search_without_queries_and_with_few_tiles() -> None:
     database = TileDatabase.from_tiles(4, np.arange(32, dtype=np.uint8).reshape(2, 16))
     index, distance = database.nearest_in_basis(np.zeros((0, 16), np.uint8), 8)
     assert index.shape == distance.shape == (0, 2)

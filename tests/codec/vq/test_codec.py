@@ -25,8 +25,8 @@ def tiles() -> TileDatabase:
     return load(GOLDEN / "small.tiles").tiles
 
 
-def picture(height_px: int, width_px: int) -> np.ndarray:
-    """A slope with a bright box and its shadow, in integers."""
+def snippet(height_px: int, width_px: int) -> np.ndarray:
+    """Return a slope with a bright box and its shadow, by integer arithmetic."""
     rows, columns = np.mgrid[:height_px, :width_px]
     image = 40 + (rows * 3 + columns * 5) % 97
     image[height_px // 3 : height_px // 2, width_px // 4 : width_px // 2] = 240
@@ -35,19 +35,19 @@ def picture(height_px: int, width_px: int) -> np.ndarray:
 
 
 def split(stream: bytes) -> tuple[bytes, bytes]:
-    """Header and body."""
+    """Return header and body."""
     size = StreamHeader.unpack(stream).size
     return stream[:size], stream[size:]
 
 
 @pytest.mark.parametrize("packing", PACKINGS)
 @pytest.mark.parametrize("size", [(80, 80), (49, 113), (17, 31)])
-def test_golden_streams_are_written_and_read_for_ever(
+def test_golden_streams_are_reproduced_and_decoded(
     tiles: TileDatabase, packing: IndexPacking, size: tuple[int, int]
 ) -> None:
     golden = bytes.fromhex((GOLDEN / f"{size[0]}x{size[1]}-{packing.value}.hex").read_text())
     codec = VqCodec(tiles, packing)
-    assert codec.encode(picture(*size)).hex() == golden.hex()
+    assert codec.encode(snippet(*size)).hex() == golden.hex()
     expected = bytes.fromhex((GOLDEN / f"{size[0]}x{size[1]}-picture.hex").read_text())
     decoded = codec.decode(golden)
     assert decoded.image.tobytes() == expected
@@ -56,15 +56,15 @@ def test_golden_streams_are_written_and_read_for_ever(
     assert decoded.notes == ()
 
 
-def test_it_is_a_codec(tiles: TileDatabase) -> None:
+def test_vq_implements_the_codec_protocol(tiles: TileDatabase) -> None:
     codec = VqCodec(tiles)
     assert isinstance(codec, Codec)
     assert (codec.name, codec.codec_id, codec.model_hash) == ("vq", 0x10, tiles.identity)
 
 
-def test_the_papers_sizes_come_out() -> None:
+def test_stream_sizes_are_those_of_the_paper() -> None:
     tiles = TileDatabase.from_tiles(10, np.arange(0, 200, 2, dtype=np.uint8)[:, None].repeat(100, axis=1))
-    lengths = {packing: len(VqCodec(tiles, packing).encode(picture(140, 80))) - 4 for packing in PACKINGS}
+    lengths = {packing: len(VqCodec(tiles, packing).encode(snippet(140, 80))) - 4 for packing in PACKINGS}
     assert lengths == {
         IndexPacking.BITS14: 196,
         IndexPacking.BYTES2: 224,
@@ -83,7 +83,7 @@ def test_packing_round_trips(packing: IndexPacking, data: st.DataObject) -> None
     assert unpack_indices(body, len(values), packing).tolist() == values
 
 
-def test_packings_are_these_bytes() -> None:
+def test_packed_bytes_of_an_example() -> None:
     values = np.array([1, 0x2ABC, 0], dtype=np.int64)
     assert pack_indices(values, IndexPacking.BITS14).hex() == "0006abc00000"  # 14 + 14 + 14 bits, then 6 zero bits
     assert pack_indices(values, IndexPacking.BYTES2).hex() == "00012abc0000"
@@ -92,7 +92,7 @@ def test_packings_are_these_bytes() -> None:
 
 
 @pytest.mark.parametrize("packing", PACKINGS)
-def test_a_stored_tile_travels_as_its_number_plus_one(tiles: TileDatabase, packing: IndexPacking) -> None:
+def test_wire_index_is_the_tile_number_plus_one(tiles: TileDatabase, packing: IndexPacking) -> None:
     image = tiles.tiles[0].reshape(tiles.tile_px, tiles.tile_px).repeat(4, axis=0).repeat(4, axis=1)
     codec = VqCodec(tiles, packing)
     flat = np.tile(tiles.tiles[0].reshape(tiles.tile_px, -1), (4, 4))
@@ -103,15 +103,15 @@ def test_a_stored_tile_travels_as_its_number_plus_one(tiles: TileDatabase, packi
 
 
 @pytest.mark.parametrize("packing", PACKINGS)
-def test_zero_padding_is_black_and_missing_never_tile_0(tiles: TileDatabase, packing: IndexPacking) -> None:
+def test_zero_padding_is_black_and_missing(tiles: TileDatabase, packing: IndexPacking) -> None:
     codec = VqCodec(tiles, packing)
-    stream = codec.encode(picture(80, 40))
+    stream = codec.encode(snippet(80, 40))
     header, body = split(stream)
     half = len(body) // 2
     decoded = codec.decode(header + body[:half] + bytes(len(body) - half))
-    whole = codec.decode(stream)
-    # Indices are in raster order: the first half of the body is the top half of the picture.
-    assert np.array_equal(decoded.image[:40], whole.image[:40])
+    complete = codec.decode(stream)
+    # Indices are in raster order: the first half of the body is the top half of the image.
+    assert np.array_equal(decoded.image[:40], complete.image[:40])
     assert not decoded.missing[:40].any()
     assert decoded.missing[40:].all()
     assert not decoded.image[40:].any()
@@ -119,9 +119,9 @@ def test_zero_padding_is_black_and_missing_never_tile_0(tiles: TileDatabase, pac
 
 
 @pytest.mark.parametrize("packing", PACKINGS)
-def test_an_index_above_the_last_tile_is_black_and_missing(tiles: TileDatabase, packing: IndexPacking) -> None:
+def test_index_above_the_last_tile_is_black_and_missing(tiles: TileDatabase, packing: IndexPacking) -> None:
     codec = VqCodec(tiles, packing)
-    stream = codec.encode(picture(20, 30))
+    stream = codec.encode(snippet(20, 30))
     header, body = split(stream)
     indices = unpack_indices(body, 6, packing)
     indices[4] = len(tiles) + 1
@@ -135,9 +135,9 @@ def test_an_index_above_the_last_tile_is_black_and_missing(tiles: TileDatabase, 
 
 
 @pytest.mark.parametrize("text", [b"12x45", b"    1", b"-0001", b"+0001", b"\xff" * 5, b"\x000001", b"1_000"])
-def test_ascii_that_is_not_five_digits_is_black_and_missing(tiles: TileDatabase, text: bytes) -> None:
+def test_invalid_ascii_is_black_and_missing(tiles: TileDatabase, text: bytes) -> None:
     codec = VqCodec(tiles, IndexPacking.ASCII5)
-    stream = codec.encode(picture(16, 16))
+    stream = codec.encode(snippet(16, 16))
     header, body = split(stream)
     decoded = codec.decode(header + text + body[5:])
     assert decoded.missing[:10, :10].all()
@@ -146,28 +146,28 @@ def test_ascii_that_is_not_five_digits_is_black_and_missing(tiles: TileDatabase,
 
 
 @pytest.mark.parametrize("packing", PACKINGS)
-def test_a_tile_is_missing_if_any_byte_of_its_index_is(tiles: TileDatabase, packing: IndexPacking) -> None:
+def test_tile_with_a_missing_index_byte_is_missing(tiles: TileDatabase, packing: IndexPacking) -> None:
     codec = VqCodec(tiles, packing)
-    stream = codec.encode(picture(16, 160))
+    stream = codec.encode(snippet(16, 160))
     header, sent = split(stream)
     count, length = 32, len(sent)
-    whole = codec.decode(stream)
+    complete = codec.decode(stream)
     for lost_byte in range(length):
         received = np.ones(length, dtype=np.bool_)
         received[lost_byte] = False
         body = bytearray(sent)
         body[lost_byte] = 0
         decoded = codec.decode(header + bytes(body), received)
-        touched = [i for i in range(count) if i * packing.bits // 8 <= lost_byte <= ((i + 1) * packing.bits - 1) // 8]
-        shown = [int(cut_tiles(decoded.missing.astype(np.uint8), 10)[i].max()) for i in range(count)]
-        assert [i for i in range(count) if shown[i]] == touched
+        affected = [i for i in range(count) if i * packing.bits // 8 <= lost_byte <= ((i + 1) * packing.bits - 1) // 8]
+        is_missing = [int(cut_tiles(decoded.missing.astype(np.uint8), 10)[i].max()) for i in range(count)]
+        assert [i for i in range(count) if is_missing[i]] == affected
         assert not decoded.image[decoded.missing].any()
-        assert np.array_equal(decoded.image[~decoded.missing], whole.image[~decoded.missing])
+        assert np.array_equal(decoded.image[~decoded.missing], complete.image[~decoded.missing])
 
 
-def test_a_short_body_and_trailing_bytes_are_told(tiles: TileDatabase) -> None:
+def test_short_and_long_bodies_give_notes(tiles: TileDatabase) -> None:
     codec = VqCodec(tiles, IndexPacking.BYTES2)
-    stream = codec.encode(picture(20, 20))
+    stream = codec.encode(snippet(20, 20))
     short = codec.decode(stream[:-3])
     assert short.missing.sum() == 200
     assert "body ends after 5 of 8 B" in short.notes
@@ -177,9 +177,9 @@ def test_a_short_body_and_trailing_bytes_are_told(tiles: TileDatabase) -> None:
     assert longer.notes == ("3 B after the body ignored",)
 
 
-def test_a_codebook_of_another_identity_is_named_with_both_tags(tiles: TileDatabase) -> None:
+def test_error_for_another_codebook_names_both_tags(tiles: TileDatabase) -> None:
     other = TileDatabase.from_tiles(tiles.tile_px, tiles.tiles[::-1])
-    stream = VqCodec(other).encode(picture(20, 20))
+    stream = VqCodec(other).encode(snippet(20, 20))
     with pytest.raises(StreamError, match="another identity") as caught:
         VqCodec(tiles).decode(stream)
     assert f"{codebook_tag(other):#06x}" in str(caught.value)
@@ -198,9 +198,11 @@ def test_a_codebook_of_another_identity_is_named_with_both_tags(tiles: TileDatab
         ({"width_px": 513}, "width_px"),
     ],
 )
-def test_a_header_that_does_not_fit_is_refused(tiles: TileDatabase, change: dict[str, int], field: str) -> None:
+def test_header_of_another_codec_or_codebook_is_rejected(
+    tiles: TileDatabase, change: dict[str, int], field: str
+) -> None:
     codec = VqCodec(tiles)
-    header = StreamHeader.unpack(codec.encode(picture(20, 20)))
+    header = StreamHeader.unpack(codec.encode(snippet(20, 20)))
     with pytest.raises(StreamError) as caught:
         codec.decode(dataclasses.replace(header, **change).pack() + bytes(16))
     assert caught.value.field == field
@@ -209,56 +211,54 @@ def test_a_header_that_does_not_fit_is_refused(tiles: TileDatabase, change: dict
 @pytest.mark.parametrize(
     ("height_px", "note"), [(41, "body ends after 14 of 18 B"), (10 + 6, "7 B after the body ignored")]
 )
-def test_a_header_with_another_height_shows_the_disagreement(tiles: TileDatabase, height_px: int, note: str) -> None:
+def test_header_with_another_height_gives_a_note(tiles: TileDatabase, height_px: int, note: str) -> None:
     codec = VqCodec(tiles)
-    header, body = split(codec.encode(picture(40, 20)))
+    header, body = split(codec.encode(snippet(40, 20)))
     wrong = dataclasses.replace(StreamHeader.unpack(header), height_px=height_px)
     decoded = codec.decode(wrong.pack() + body)
     assert decoded.image.shape == (height_px, 20)
     assert note in decoded.notes
-    whole = codec.decode(header + body).image
-    assert np.array_equal(decoded.image[:16], whole[:16])
+    complete = codec.decode(header + body).image
+    assert np.array_equal(decoded.image[:16], complete[:16])
 
 
 @pytest.mark.parametrize("packing", PACKINGS)
 @pytest.mark.parametrize("size", [(80, 80), (140, 80), (81, 80), (17, 31), (512, 512)])
-def test_a_stream_starts_with_four_bytes_or_seven(
-    tiles: TileDatabase, packing: IndexPacking, size: tuple[int, int]
-) -> None:
-    header, _ = split(VqCodec(tiles, packing).encode(picture(*size)))
+def test_header_has_4_or_7_bytes(tiles: TileDatabase, packing: IndexPacking, size: tuple[int, int]) -> None:
+    header, _ = split(VqCodec(tiles, packing).encode(snippet(*size)))
     common = all(side in (80, 140, 512) for side in size)
     assert len(header) == (4 if common else 7)
     assert header[:3] == bytes([packing.codec_id]) + bytes.fromhex(tiles.identity[:4])
 
 
-def test_the_tag_is_the_same_for_every_packing_and_begins_the_identity(tiles: TileDatabase) -> None:
+def test_tag_is_the_start_of_the_identity_for_every_packing(tiles: TileDatabase) -> None:
     assert f"{codebook_tag(tiles):04x}" == tiles.identity[:4]
-    tags = {StreamHeader.unpack(VqCodec(tiles, packing).encode(picture(20, 20))).model_tag for packing in PACKINGS}
+    tags = {StreamHeader.unpack(VqCodec(tiles, packing).encode(snippet(20, 20))).model_tag for packing in PACKINGS}
     assert tags == {codebook_tag(tiles)}
 
 
 @pytest.mark.parametrize("received", [np.ones(6, np.bool_), np.ones((7, 1), np.bool_), np.ones(7, np.uint8)])
-def test_a_mask_of_another_shape_or_type_is_refused(tiles: TileDatabase, received: np.ndarray) -> None:
+def test_mask_of_wrong_shape_or_dtype_is_rejected(tiles: TileDatabase, received: np.ndarray) -> None:
     codec = VqCodec(tiles)
     with pytest.raises(StreamError, match="received"):
-        codec.decode(codec.encode(picture(20, 20)), received)
+        codec.decode(codec.encode(snippet(20, 20)), received)
 
 
-def test_a_budget_is_met_or_refused(tiles: TileDatabase) -> None:
+def test_vq_budget_is_met_or_rejected(tiles: TileDatabase) -> None:
     codec = VqCodec(tiles)
-    needed = len(codec.encode(picture(40, 40)))
-    assert len(codec.encode(picture(40, 40), needed)) == needed
+    needed = len(codec.encode(snippet(40, 40)))
+    assert len(codec.encode(snippet(40, 40), needed)) == needed
     with pytest.raises(StreamError, match=f"at least {needed} B"):
-        codec.encode(picture(40, 40), needed - 1)
+        codec.encode(snippet(40, 40), needed - 1)
 
 
-def test_a_body_a_half_frame_cannot_count_is_refused() -> None:
+def test_body_above_65535_bytes_is_rejected() -> None:
     codec = VqCodec(TileDatabase.from_tiles(4, np.eye(16, dtype=np.uint8)), IndexPacking.ASCII5)
     with pytest.raises(StreamError, match="81924"):
-        codec.encode(picture(512, 512))
+        codec.encode(snippet(512, 512))
 
 
-def test_more_tiles_than_the_packing_can_number_are_refused() -> None:
+def test_more_tiles_than_wire_indices_are_rejected() -> None:
     many = np.zeros((0x4000, 16), dtype=np.uint8)
     database = TileDatabase.from_tiles(4, many)
     with pytest.raises(ConfigError, match="wider packing"):
@@ -267,7 +267,7 @@ def test_more_tiles_than_the_packing_can_number_are_refused() -> None:
     assert VqCodec(TileDatabase.from_tiles(4, many[1:])).codec_id == 0x10
 
 
-def test_every_packing_has_its_own_id_and_is_found_by_it() -> None:
+def test_every_packing_has_its_own_codec_id() -> None:
     ids = [packing.codec_id for packing in PACKINGS]
     assert ids == [0x10, 0x11, 0x12, 0x13]
     assert [IndexPacking.from_codec_id(number) for number in ids] == PACKINGS
