@@ -1,4 +1,4 @@
-"""The compiled coding loop's parts against plain arithmetic written here a second time."""
+"""Parts of the compiled coding loop, compared with independent arithmetic in Python integers."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sonarpost.codec.emb import kernel
-from sonarpost.codec.emb.bitplanes import PASSES, known_plane
+from sonarpost.codec.emb.bitplanes import PASSES, reconstructed_coefficients
 from sonarpost.codec.emb.codec import EmbCodec
-from sonarpost.codec.emb.coder import State
-from sonarpost.codec.emb.layout import (
+from sonarpost.codec.emb.coder import CoefficientState
+from sonarpost.codec.emb.model import shipped_models
+from sonarpost.codec.emb.transform import (
+    BAND_GAINS,
     COUSIN_1,
     HEIGHT,
     LEVEL,
@@ -23,15 +25,13 @@ from sonarpost.codec.emb.layout import (
     SIBLING_1,
     STRIDE,
     WIDTH,
-    layout,
+    layout_of,
 )
-from sonarpost.codec.emb.model import shipped
-from sonarpost.codec.emb.transform import STRENGTHS
 
-MODEL = shipped()
+MODEL = shipped_models()[0]
 
 
-def picture(seed: int = 5) -> np.ndarray:
+def image_of(seed: int = 5) -> np.ndarray:
     rng = np.random.default_rng(seed)
     image = rng.integers(30, 120, (48, 64))
     image[16:24, 16:32] += 100
@@ -39,7 +39,7 @@ def picture(seed: int = 5) -> np.ndarray:
 
 
 def plain_logit(features: list[int], net: int, last: list[int]) -> tuple[int, list[int]]:
-    """The network in Python's whole numbers, which have no limit: shows that no sum of the compiled one wraps."""
+    """Evaluate the network in Python integers, which cannot overflow."""
     w1, b1, w2, b2 = (getattr(MODEL, name)[net].tolist() for name in ("w1", "b1", "w2", "b2"))
     first = [b1[j] + sum(f * w1[i][j] for i, f in enumerate(features)) for j in range(kernel.HIDDEN_1)]
     first = [min(max(v >> 6, 0), 4095) for v in first]
@@ -51,32 +51,32 @@ def plain_logit(features: list[int], net: int, last: list[int]) -> tuple[int, li
 
 @pytest.mark.parametrize("net", [0, 1])
 @pytest.mark.parametrize("reach", [5, 48, 288])
-def test_the_network_and_its_learning_are_the_plain_sums(net: int, reach: int) -> None:
+def test_network_and_adaptation_match_unbounded_integers(net: int, reach: int) -> None:
     rng = np.random.default_rng(reach + net)
-    live = np.concatenate([MODEL.w3[net].astype(np.int64) << 16, [int(MODEL.b3[net]) << 8]])
-    last = live.tolist()
+    last_layer = np.concatenate([MODEL.w3[net].astype(np.int64) << 16, [int(MODEL.b3[net]) << 8]])
+    last = last_layer.tolist()
     h1, h2 = np.zeros(kernel.HIDDEN_1, np.int32), np.zeros(kernel.HIDDEN_2, np.int32)
     base = np.zeros(kernel.HIDDEN_1, np.int32)
-    moved = []
+    steps_taken = []
     for _ in range(60):
         f = rng.integers(-reach // 4, reach + 1, kernel.FEATURES).astype(np.int32)
         kernel.band_base(f, MODEL.w1[net], MODEL.b1[net], base)
-        got = kernel._logit(f, base, MODEL.w1[net], MODEL.w2[net], MODEL.b2[net], live, h1, h2)
+        logit = kernel._logit(f, base, MODEL.w1[net], MODEL.w2[net], MODEL.b2[net], last_layer, h1, h2)
         expected, hidden = plain_logit(f.tolist(), net, last)
-        assert got == expected
+        assert logit == expected
         assert h2.tolist() == hidden
-        bit, chance = int(rng.integers(2)), int(MODEL.chances[got + kernel.LOGIT_LIMIT])
-        kernel._learn(live, h2, bit, chance)
-        error = (bit << 16) - chance
+        bit, probability = int(rng.integers(2)), int(MODEL.probabilities[logit + kernel.LOGIT_LIMIT])
+        kernel._adapt(last_layer, h2, bit, probability)
+        error = (bit << 16) - probability
         steps = [*(error * v >> 4 for v in hidden), error << 4]
         last = [min(max(w + s, -(1 << 34)), 1 << 34) for w, s in zip(last, steps, strict=True)]
-        assert live.tolist() == last
-        moved.append(max(map(abs, steps)))
-    assert max(moved) > 0
+        assert last_layer.tolist() == last
+        steps_taken.append(max(map(abs, steps)))
+    assert max(steps_taken) > 0
 
 
 def plain_sign_logit(features: list[int], orient: int) -> int:
-    """The sign network in Python's whole numbers."""
+    """Evaluate the sign network in Python integers."""
     w1, base, w2 = (getattr(MODEL, name)[orient].tolist() for name in ("sign_w1", "sign_b1", "sign_w2"))
     total = 0
     for j in range(kernel.SIGN_HIDDEN):
@@ -88,7 +88,7 @@ def plain_sign_logit(features: list[int], orient: int) -> int:
 
 @pytest.mark.parametrize("orient", range(4))
 @pytest.mark.parametrize("reach", [3, 48, 96])
-def test_the_sign_network_is_the_plain_sums_and_odd(orient: int, reach: int) -> None:
+def test_sign_network_matches_unbounded_integers_and_is_odd(orient: int, reach: int) -> None:
     rng = np.random.default_rng(reach + orient)
     logits = []
     for _ in range(40):
@@ -98,33 +98,35 @@ def test_the_sign_network_is_the_plain_sums_and_odd(orient: int, reach: int) -> 
         logits.append(kernel._sign_logit(f, *nets))
         assert logits[-1] == plain_sign_logit(f.tolist(), orient)
         f[: kernel.SIGN_ODD] *= -1
-        assert abs(kernel._sign_logit(f, *nets) + logits[-1]) <= 1  # rounded down, whichever way it is turned
+        assert abs(kernel._sign_logit(f, *nets) + logits[-1]) <= 1  # rounded down for both signs
     assert len(set(logits)) > 20
 
 
 @pytest.mark.parametrize("orient", range(4))
-def test_a_picture_turned_to_its_negative_has_the_other_sign(orient: int) -> None:
-    """All that the sign network sees turns, but for where the coefficient is."""
-    lay = layout(80, 80)
-    row = next(n for n, band in enumerate(lay.bands) if band[ORIENT] == orient and band[LEVEL] in (0, 2, lay.levels))
+def test_sign_features_are_odd_and_even(orient: int) -> None:
+    """The odd features change sign with the image, the even ones do not."""
+    layout = layout_of(80, 80)
+    row = next(
+        n for n, band in enumerate(layout.bands) if band[ORIENT] == orient and band[LEVEL] in (0, 2, layout.levels)
+    )
     rng = np.random.default_rng(orient)
-    signed = rng.integers(-48, 49, lay.cells).astype(np.int32)
-    lows = rng.integers(-3000, 3000, lay.low_cells).astype(np.int32) * 512  # exact in thresholds, so that halves are
-    f, turned = np.zeros(kernel.SIGN_FEATURES, np.int32), np.zeros(kernel.SIGN_FEATURES, np.int32)
-    band = lay.bands[row]
-    width = int(lay.sides[band[LEVEL], 1])
+    signed = rng.integers(-48, 49, layout.cells).astype(np.int32)
+    lows = rng.integers(-3000, 3000, layout.low_cells).astype(np.int32) * 512  # exact multiples of the threshold
+    f, inverted = np.zeros(kernel.SIGN_FEATURES, np.int32), np.zeros(kernel.SIGN_FEATURES, np.int32)
+    band = layout.bands[row]
+    width = int(layout.sides[band[LEVEL], 1])
     for y, x in ((0, 0), (2, 3), (int(band[HEIGHT]) - 1, int(band[WIDTH]) - 1)):
         at = int(band[OFFSET] + y * band[STRIDE] + x)
-        kernel._sign_context(f, signed, lows, lay.bands, width, 2048, row, y, x, at)
-        kernel._sign_context(turned, -signed, -lows, lay.bands, width, 2048, row, y, x, at)
-        assert np.array_equal(f[: kernel.SIGN_ODD], -turned[: kernel.SIGN_ODD])
-        assert np.array_equal(f[kernel.SIGN_ODD :], turned[kernel.SIGN_ODD :])
+        kernel._sign_context(f, signed, lows, layout.bands, width, 2048, row, y, x, at)
+        kernel._sign_context(inverted, -signed, -lows, layout.bands, width, 2048, row, y, x, at)
+        assert np.array_equal(f[: kernel.SIGN_ODD], -inverted[: kernel.SIGN_ODD])
+        assert np.array_equal(f[kernel.SIGN_ODD :], inverted[kernel.SIGN_ODD :])
         assert f[: kernel.SIGN_ODD].any()
 
 
 @given(threshold=st.integers(100, 2880 * 64 << 6), size=st.integers(0, 2**40))
 @example(threshold=2880 * 64 << 6, size=48 * (2880 * 64 << 6) - 1)
-def test_sizes_in_thresholds_need_no_division(threshold: int, size: int) -> None:
+def test_quotient_without_division_is_exact(threshold: int, size: int) -> None:
     inverse = (1 << kernel._INVERSE_BITS) // threshold + 1
     for near in (
         size,
@@ -132,67 +134,70 @@ def test_sizes_in_thresholds_need_no_division(threshold: int, size: int) -> None
         max(size // threshold * threshold - 1, 0),
         size % (50 * threshold),
     ):
-        assert kernel._thresholds(near, threshold, inverse) == min(near // threshold, kernel.CAP)
+        assert kernel._quotient(near, threshold, inverse) == min(near // threshold, kernel.MAX_EIGHTHS)
 
 
 @given(st.integers(1, 2**40))
-def test_the_logarithm_is_that_of_the_power_below_and_a_line(value: int) -> None:
+def test_logarithm_is_linear_between_powers_of_two(value: int) -> None:
     power = value.bit_length() - 1
     assert kernel._log2_eighths(value) == 8 * power + ((value << 3) >> power) - 8
 
 
-def test_learning_makes_what_happened_likelier() -> None:
-    live = np.concatenate([MODEL.w3[0].astype(np.int64) << 16, [int(MODEL.b3[0]) << 8]])
+def test_adaptation_increases_the_probability_of_a_repeated_bit() -> None:
+    last_layer = np.concatenate([MODEL.w3[0].astype(np.int64) << 16, [int(MODEL.b3[0]) << 8]])
     h1, h2 = np.zeros(kernel.HIDDEN_1, np.int32), np.zeros(kernel.HIDDEN_2, np.int32)
     f, base = np.full(kernel.FEATURES, 6, np.int32), np.zeros(kernel.HIDDEN_1, np.int32)
     kernel.band_base(f, MODEL.w1[0], MODEL.b1[0], base)
     logits = []
     for _ in range(40):
-        logits.append(kernel._logit(f, base, MODEL.w1[0], MODEL.w2[0], MODEL.b2[0], live, h1, h2))
-        kernel._learn(live, h2, 1, int(MODEL.chances[logits[-1] + kernel.LOGIT_LIMIT]))
+        logits.append(kernel._logit(f, base, MODEL.w1[0], MODEL.w2[0], MODEL.b2[0], last_layer, h1, h2))
+        kernel._adapt(last_layer, h2, 1, int(MODEL.probabilities[logits[-1] + kernel.LOGIT_LIMIT]))
     assert logits == sorted(logits)
     assert logits[-1] > logits[0]
 
 
-def test_what_one_picture_taught_does_not_reach_the_next() -> None:
-    """Each stream stands by itself: else a lost picture would spoil all after it."""
+def test_adaptation_does_not_carry_over_to_the_next_image() -> None:
+    """Each stream is independent, so that a lost image does not damage later ones."""
     codec, before = EmbCodec(), (MODEL.w3.copy(), MODEL.b3.copy())
-    first = codec.encode(picture(), 120)
-    codec.decode(codec.encode(picture(9), 300))
-    assert codec.encode(picture(), 120) == first
+    first = codec.encode(image_of(), 120)
+    codec.decode(codec.encode(image_of(9), 300))
+    assert codec.encode(image_of(), 120) == first
     assert np.array_equal(MODEL.w3, before[0])
     assert np.array_equal(MODEL.b3, before[1])
 
 
-def test_reconstruction_points_follow_table_size_and_chance() -> None:
-    lay = layout(16, 16)
-    state = State(lay)
-    cell = int(lay.bands[2, 0])
+def test_reconstruction_points_follow_the_table() -> None:
+    layout = layout_of(16, 16)
+    state = CoefficientState(layout)
+    cell = int(layout.bands[2, 0])
     for size in (1, 2, 3, 4, 9):
-        for odds in (-kernel.LOGIT_LIMIT, -900, -300, 0, kernel.LOGIT_LIMIT):
-            state.values[cell], state.widths[cell], state.signs[cell] = size * 4096, 4096, -1
-            state.odds[cell] = odds
-            column = min(max((odds + 2304) // 128, 0), kernel.CENTRE_COLUMNS - 1)
+        for logit in (-kernel.LOGIT_LIMIT, -900, -300, 0, kernel.LOGIT_LIMIT):
+            state.lower[cell], state.widths[cell], state.signs[cell] = size * 4096, 4096, -1
+            state.logits[cell] = logit
+            column = min(max((logit + 2304) // 128, 0), kernel.CENTRE_COLUMNS - 1)
             expected = -(size * 4096 + (4096 * int(MODEL.centres[min(size, 4) - 1, column]) >> 8))
-            strength = STRENGTHS[3][int(lay.bands[2, ORIENT])]
-            assert known_plane(state, MODEL)[lay.position == cell] == (expected * 1024 + strength // 2) // strength
+            gain = BAND_GAINS[3][int(layout.bands[2, ORIENT])]
+            assert (
+                reconstructed_coefficients(state, MODEL)[layout.position == cell]
+                == (expected * 1024 + gain // 2) // gain
+            )
     assert np.all((MODEL.centres > 0) & (MODEL.centres < 160))
-    # The unlikely lie low in their interval.
+    # Unlikely coefficients lie low in their interval.
     assert MODEL.centres[0, 8] < MODEL.centres[0, 16] - 30
 
 
-def test_the_last_pass_takes_all_that_the_others_left() -> None:
-    kinds, bars = zip(*PASSES, strict=True)
+def test_last_pass_codes_all_remaining_coefficients() -> None:
+    kinds, minimums = zip(*PASSES, strict=True)
     assert kinds[-1] == kernel.ALL
-    assert bars[-1] < -kernel.LOGIT_LIMIT
-    assert dict(zip(kinds, bars, strict=True))[kernel.REFINE] < -kernel.LOGIT_LIMIT
-    taken = [bar for kind, bar in PASSES if kind != kernel.REFINE]
-    assert taken == sorted(taken, reverse=True)
+    assert minimums[-1] < -kernel.LOGIT_LIMIT
+    assert dict(zip(kinds, minimums, strict=True))[kernel.REFINE] < -kernel.LOGIT_LIMIT
+    coded = [minimum for kind, minimum in PASSES if kind != kernel.REFINE]
+    assert coded == sorted(coded, reverse=True)
 
 
 @pytest.mark.parametrize("size", [(16, 16), (80, 80), (17, 33), (16, 512), (301, 127)])
-def test_bands_know_their_relatives(size: tuple[int, int]) -> None:
-    bands = layout(*size).bands
+def test_relatives_of_bands(size: tuple[int, int]) -> None:
+    bands = layout_of(*size).bands
     for number, band in enumerate(bands):
         if band[ORIENT] == LL:
             assert (band[[NEXT_1, NEXT_1 + 1, COUSIN_1, COUSIN_1 + 1]] == -1).all()

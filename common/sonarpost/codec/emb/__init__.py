@@ -1,9 +1,10 @@
-"""The embedded wavelet codec. `codec.EmbCodec` is imported on use, since it brings a compiler with it."""
+"""The embedded wavelet codec. Its module `codec` loads numba, so import it only when an image is coded."""
 
 from typing import Final
 
-CODEC_ID: Final = 0x20
 NAME: Final = "emb"
-STRUCTURE_ID: Final = 0x21
-STRUCTURE_NAME: Final = "emb-structure"
-"""Of models with an aim; see `aim`."""
+DEFAULT_MODEL: Final = "standard"
+MODEL_FILES: Final = {"standard": ("emb-2.model", "emb.model"), "structure": ("emb-structure.model",)}
+"""Model files by model name. The first file encodes; the others decode streams of earlier releases."""
+CODEC_IDS: Final = {"standard": 0x20, "structure": 0x21}
+"""Codec id in the stream header, by model name."""

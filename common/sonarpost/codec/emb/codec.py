@@ -1,46 +1,56 @@
-"""The embedded codec: a stream that is a picture at every length.
+"""The embedded codec `emb`: every prefix of a stream decodes to an image.
 
-Body: side information, then the wavelet coefficients plane by plane, all through one range coder. Cut anywhere, it
-decodes to the picture that its bytes determine, and to nothing that they do not.
+Body: side information, then the wavelet coefficients plane by plane, all through one range coder. A truncated stream
+decodes to the image that its bytes determine.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Final
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb import CODEC_ID, NAME, STRUCTURE_ID, STRUCTURE_NAME, transform
-from sonarpost.codec.emb.bitplanes import held
-from sonarpost.codec.emb.coder import State, error_by_length
-from sonarpost.codec.emb.decode import DecodedCoefficients, picture_of, plain_of, read_body, usable
-from sonarpost.codec.emb.layout import layout
-from sonarpost.codec.emb.model import Model, all_shipped, all_structure, shipped
-from sonarpost.codec.emb.rate_distortion_opt import target_coefficients
-from sonarpost.codec.emb.region import fill_unknown, weights
-from sonarpost.codec.emb.search import MAX_BODY_BYTES, TrialEncoder
-from sonarpost.codec.emb.side_info import MEAN_STEP, Box, SideInfo
+from sonarpost.codec.emb import CODEC_IDS, DEFAULT_MODEL, NAME, transform
+from sonarpost.codec.emb.bitplanes import constrained_targets
+from sonarpost.codec.emb.coder import CoefficientState
+from sonarpost.codec.emb.decode import DecodedCoefficients, decoded_image, image_before_enhancer, read_body
+from sonarpost.codec.emb.encode import MAX_BODY_BYTES, TrialEncoder, error_by_length, fill_invalid
+from sonarpost.codec.emb.model import Model, shipped_models
+from sonarpost.codec.emb.rate_distortion_opt import TargetCoefficients, target_coefficients
+from sonarpost.codec.emb.side_info import MEAN_STEP, RegionOfInterest, SideInfo, region_weights
 from sonarpost.codec.emb.speckle_synthesis import measure_speckle, synthesise_speckle
-from sonarpost.codec.interface import DecodedImage, Image, Mask, StreamHeader, check_image, model_tag, to_uint8
+from sonarpost.codec.emb.transform import layout_of
+from sonarpost.codec.interface import (
+    DecodedImage,
+    Image,
+    Mask,
+    SnippetPixels,
+    StreamHeader,
+    before_gap,
+    check_image,
+    model_tag,
+    to_uint8,
+)
 from sonarpost.errors import StreamError
 
 MIN_BODY_BYTES: Final = 3
 _PRICE: Final = 20
-"""Least error, in 1/256 of the squared threshold, that a bit must take away; see `kernel.code_band`."""
+"""Least squared error, in 1/256 of the squared threshold, that a bit must remove; see `kernel.code_band`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """A stream and how good each of its prefixes is.
+    """A stream with an estimate of the error of each of its prefixes.
 
     Attributes:
         stream: Header and body.
-        mean_square_error: Shape (len(stream) + 1,), float64: estimated mean squared error in grey values of the picture
-            that the first n bytes decode to. From the coefficients: clipping to 0..255 and the enhancer make the true
-            one some per cent smaller; with a region of interest its error weighs 9/4. Infinite where there is no
-            picture yet.
+        mean_square_error: Shape (len(stream) + 1,), float64: estimated mean squared error, in grey levels squared, of
+            the image that the first n bytes decode to; infinite for prefixes without an image. It is computed from the
+            coefficients: clipping and the enhancer reduce the true error by some per cent. With a region of interest,
+            the error in it weighs 9/4.
     """
 
     stream: bytes
@@ -49,197 +59,193 @@ class Encoded:
 
 @dataclass(frozen=True)
 class EmbCodec:
-    """The embedded codec. Satisfies `sonarpost.codec.interface.Codec`.
+    """The embedded codec. Implements `sonarpost.codec.Codec`. Decodes the streams of all shipped models.
 
     Attributes:
-        model: The networks that encode; those that the package encodes with if not given. Streams of the package's
-            earlier models are decoded with theirs.
-        grain: Whether streams say how strong the picture's texture is (4 bytes); see `decode_grain`.
-        steps: Start steps to try; none: as many as the time allows, see `search.SEARCHES`.
+        model: Model that encodes: "standard" (least squared error), "structure" (structural similarity), or a trained
+            model.
+        send_texture: Whether streams carry the strength of the image's texture (4 bytes); see `speckle_layer`.
+        start_steps: Start steps to try; empty: see `encode.SEARCHES`.
         price: See `kernel.code_band`.
+
+    Raises:
+        ConfigError: No model has this name.
     """
 
-    model: Model = field(default_factory=shipped)
-    grain: bool = False
-    steps: tuple[int, ...] = ()
+    model: str | Model = DEFAULT_MODEL
+    send_texture: bool = False
+    start_steps: tuple[int, ...] = ()
     price: int = _PRICE
+    name: ClassVar[str] = NAME
 
-    @property
-    def name(self) -> str:
-        """Name in the registry."""
-        return NAME if self.model.aim is None else STRUCTURE_NAME
+    def __post_init__(self) -> None:
+        _ = self.network  # rejects an unknown name at once
+
+    @cached_property
+    def network(self) -> Model:
+        """The model that encodes."""
+        return shipped_models(self.model)[0] if isinstance(self.model, str) else self.model
 
     @property
     def codec_id(self) -> int:
-        """Number in the stream header."""
-        return CODEC_ID if self.model.aim is None else STRUCTURE_ID
+        """Codec id in the stream header."""
+        return _codec_id_of(self.network)
 
     @property
     def model_hash(self) -> str:
-        """Sha256 of the model file."""
-        return self.model.identity
+        """SHA-256 of the model file."""
+        return self.network.identity
 
-    def encode(self, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], budget_bytes: int | None = None) -> bytes:
-        """Return header and body.
-
-        Args:
-            image: Shape (16..512, 16..512), uint8 or uint16 (uint16 is mapped to 8 bits by `to_uint8`).
-            budget_bytes: Length of the whole stream; None for a twenty-fifth of a byte a pixel, at least 64 bytes.
-
-        Raises:
-            StreamError: Size or dtype is not supported, or the budget leaves less than 3 bytes of body.
-        """
+    def encode(self, image: SnippetPixels, budget_bytes: int | None = None) -> bytes:
+        """Return the stream (see `Codec.encode`); without a budget, 1/25 byte a pixel and at least 64 bytes."""
         return self.encode_with_estimate(image, budget_bytes).stream
 
     def encode_with_estimate(
         self,
-        image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+        image: SnippetPixels,
         budget_bytes: int | None = None,
         *,
-        box: Box | None = None,
-        known: Mask | None = None,
+        region: RegionOfInterest | None = None,
+        valid: Mask | None = None,
     ) -> Encoded:
-        """Encode, and say what each prefix is worth (for the choice of what to protect how well).
+        """Encode and estimate the error of each prefix, from which the link computes its redundancy.
 
         Args:
-            image: As `encode`.
-            budget_bytes: As `encode`.
-            box: Region of interest, which gets more of the bits; costs 2 bytes.
-            known: Same shape as the image, False where the survey has no data: what is there is not sent.
+            image: As for `encode`.
+            budget_bytes: As for `encode`.
+            region: Region of interest, which gets more of the bits. Costs 2 bytes.
+            valid: Same shape as the image, False for pixels without survey data; these are not sent.
 
         Raises:
-            StreamError: As `encode`, or `known` has another shape.
+            StreamError: As for `encode`, or `valid` has another shape.
         """
         check_image(image)
-        picture = to_uint8(image)
-        if known is not None:
-            picture = fill_unknown(picture, known)
-        height_px, width_px = (int(n) for n in picture.shape)
-        header = StreamHeader(self.codec_id, model_tag(self.codec_id, self.model.identity), height_px, width_px)
+        grey = to_uint8(image) if valid is None else fill_invalid(to_uint8(image), valid)
+        height_px, width_px = (int(n) for n in grey.shape)
+        header = StreamHeader(self.codec_id, model_tag(self.codec_id, self.model_hash), height_px, width_px)
         budget = max(64, height_px * width_px // 25) if budget_bytes is None else budget_bytes
         limit = min(budget - header.size, MAX_BODY_BYTES)
         if limit < MIN_BODY_BYTES:
             raise StreamError("codec emb", "budget_bytes", budget, f"at least {header.size + MIN_BODY_BYTES} B")
-        lay = layout(height_px, width_px)
-        mean_index = min((int(picture.astype(np.int64).sum()) // picture.size + MEAN_STEP // 2) // MEAN_STEP, 63)
-        plane = (picture.astype(np.int64) - mean_index * MEAN_STEP) * transform.UNIT
-        wanted = target_coefficients(plane, lay, weights(lay, box), limit, self.model.aim)
-        grain = measure_speckle(picture, lay) if self.grain else None
-        written = TrialEncoder(self.model, limit, self.price).best(wanted, mean_index, box, grain, self.steps)
-        estimate = error_by_length(written.curve, len(written.body), header.size, picture.size)
-        return Encoded(header.pack() + written.body, estimate)
+        mean_index = min((int(grey.astype(np.int64).sum()) // grey.size + MEAN_STEP // 2) // MEAN_STEP, 63)
+        targets = _targets(grey, mean_index * MEAN_STEP, region, limit, self.network)
+        texture = measure_speckle(grey, targets.layout) if self.send_texture else None
+        encoder = TrialEncoder(self.network, limit, self.price)
+        best = encoder.best(targets, mean_index, region, texture, self.start_steps)
+        estimate = error_by_length(best.curve, len(best.body), header.size, grey.size)
+        return Encoded(header.pack() + best.body, estimate)
 
-    def extend(
-        self,
-        stream: bytes,
-        image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-        budget_bytes: int,
-        *,
-        known: Mask | None = None,
-    ) -> bytes:
-        """Return a longer stream of the picture that begins as `stream` does, but for its last byte.
+    def extend(self, stream: bytes, image: SnippetPixels, budget_bytes: int, *, valid: Mask | None = None) -> bytes:
+        """Return a longer stream of the same snippet (see `ExtensibleCodec.extend`).
 
         Args:
-            stream: Of this picture.
-            image: The picture, as `encode` had it.
+            stream: A stream of this snippet.
+            image: The snippet, as passed to `encode`.
             budget_bytes: Length of the longer stream.
-            known: As `encode_with_estimate` had it.
-
-        Returns:
-            The longer stream; `stream` itself where there is none: it said all there is to say.
+            valid: As passed to `encode_with_estimate`.
 
         Raises:
-            StreamError: As `encode` and `decode`; the picture has another size than the stream says.
+            StreamError: As for `encode` and `decode`, or the sizes of snippet and stream differ.
         """
         check_image(image)
-        model, header = self._model_of(stream)
-        picture = to_uint8(image) if known is None else fill_unknown(to_uint8(image), known)
-        if picture.shape != (header.height_px, header.width_px):
-            raise StreamError("image", "shape", picture.shape, f"the stream's {(header.height_px, header.width_px)}")
-        state, side = read_body(stream[header.size :], layout(header.height_px, header.width_px), model)
+        model, header = _model_of(stream, self.network)
+        grey = to_uint8(image) if valid is None else fill_invalid(to_uint8(image), valid)
+        if grey.shape != (header.height_px, header.width_px):
+            raise StreamError("image", "shape", grey.shape, f"the stream's {(header.height_px, header.width_px)}")
+        state, side = read_body(stream[header.size :], layout_of(header.height_px, header.width_px), model)
         limit = min(budget_bytes - header.size, MAX_BODY_BYTES)
-        if side.step < 0 or limit < len(stream) - header.size:
+        if side.start_step < 0 or limit < len(stream) - header.size:
             return stream
-        plane = (picture.astype(np.int64) - side.mean) * transform.UNIT
-        wanted = target_coefficients(plane, state.lay, weights(state.lay, side.box), limit, model.aim)
-        wanted = replace(wanted, targets=held(wanted.targets, state, side))
-        longer = header.pack() + TrialEncoder(model, limit, 0, stream[header.size : -1]).write(wanted, side).body
+        targets = _targets(grey, side.mean, side.region, limit, model)
+        targets = replace(targets, targets=constrained_targets(targets.targets, state, side))
+        encoder = TrialEncoder(model, limit, price=0, prefix=stream[header.size : -1])
+        longer = header.pack() + encoder.write(targets, side).body
         return longer if len(longer) > len(stream) and longer.startswith(stream[:-1]) else stream
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
-        """Rebuild the picture from as much of the stream as is there.
+        """Reconstruct the image from the bytes before the first gap (see `Codec.decode`).
 
-        Args:
-            stream: Header and body; a body that ends early gives a coarser picture.
-            received: Shape (body bytes in `stream`,), False where a body byte did not arrive; what follows the first
-                of them cannot be used.
-
-        Raises:
-            StreamError: The header is wrong, or the stream is of another codec or model.
+        A truncated body gives a coarser image without missing pixels.
         """
-        model, header = self._model_of(stream)
-        body, notes = usable(stream[header.size :], received)
-        state, side = read_body(body, layout(header.height_px, header.width_px), model)
+        model, header = _model_of(stream, self.network)
+        body, notes = before_gap(stream[header.size :], received)
+        state, side = read_body(body, layout_of(header.height_px, header.width_px), model)
         if side.mean_index < 0:
-            blank = np.zeros((header.height_px, header.width_px), np.uint8)
-            return DecodedImage(blank, np.ones(blank.shape, np.bool_), (*notes, "too little arrived for any picture"))
-        picture = picture_of(state, side, model)
-        return DecodedImage(picture, np.zeros(picture.shape, np.bool_), notes)
+            return DecodedImage.all_missing(header, [*notes, "too few bytes arrived for an image"])
+        return DecodedImage.without_gaps(decoded_image(state, side, model), notes)
 
-    def decode_grain(self, stream: bytes) -> npt.NDArray[np.int16]:
-        """Return the layer of invented speckle that the picture lacks, in grey to be added; see `grain.make_grain`.
+    def speckle_layer(self, stream: bytes) -> npt.NDArray[np.int16]:
+        """Return the synthetic speckle that the decoded image lacks; see `speckle_synthesis.synthesise_speckle`.
 
         Raises:
-            StreamError: As `decode`, or the stream carries no grain.
+            StreamError: As for `decode`, or the stream carries no texture levels.
         """
-        model, state, side = self._known(stream)
-        if side.grain is None:
-            raise StreamError("stream", "grain", None, "a stream made by a codec with grain on")
-        return synthesise_speckle(picture_of(state, side, model), state.lay, side.grain)
+        model, state, side = self._read(stream)
+        if side.texture is None:
+            raise StreamError("stream", "texture", None, "a stream encoded with send_texture")
+        return synthesise_speckle(decoded_image(state, side, model), state.layout, side.texture)
 
-    def decode_with_grain(self, stream: bytes) -> Image:
-        """Return the picture with grain at half strength: a view for the eye, not to be measured on.
+    def decode_with_speckle(self, stream: bytes) -> Image:
+        """Return the image with synthetic speckle at half strength, for viewing. Do not measure on it.
 
         Raises:
-            StreamError: As `decode_grain`.
+            StreamError: As for `speckle_layer`.
         """
-        layer = self.decode_grain(stream).astype(np.int32)
+        layer = self.speckle_layer(stream).astype(np.int32)
         return np.clip(self.decode(stream).image + (layer >> 1), 0, 255).astype(np.uint8)
 
-    def decode_plain(self, stream: bytes) -> DecodedCoefficients:
-        """Return the picture as the coefficients say, before the enhancer: what that is trained on.
+    def decode_before_enhancer(self, stream: bytes) -> DecodedCoefficients:
+        """Return the image before the enhancer, the input for its training.
 
         Raises:
-            StreamError: As `decode`, or the stream is too short for any picture.
+            StreamError: As for `decode`, or the stream is too short for an image.
         """
-        model, state, side = self._known(stream)
+        model, state, side = self._read(stream)
         if side.mean_index < 0:
             raise StreamError("stream", "length", len(stream), "enough bytes for a mean level")
-        return plain_of(state, side, model)
+        return image_before_enhancer(state, side, model)
 
-    def read_state(self, stream: bytes) -> tuple[State, SideInfo]:
-        """Return what a stream says of the coefficients, and its side information.
+    def read_coefficients(self, stream: bytes) -> tuple[CoefficientState, SideInfo]:
+        """Return the coefficients and the side information of a stream.
 
         Raises:
-            StreamError: As `decode`.
+            StreamError: As for `decode`.
         """
-        _, state, side = self._known(stream)
+        _, state, side = self._read(stream)
         return state, side
 
-    def _known(self, stream: bytes) -> tuple[Model, State, SideInfo]:
-        model, header = self._model_of(stream)
-        return model, *read_body(stream[header.size :], layout(header.height_px, header.width_px), model)
+    def _read(self, stream: bytes) -> tuple[Model, CoefficientState, SideInfo]:
+        model, header = _model_of(stream, self.network)
+        return model, *read_body(stream[header.size :], layout_of(header.height_px, header.width_px), model)
 
-    def _model_of(self, stream: bytes) -> tuple[Model, StreamHeader]:
-        """The model that a stream was made with, and the stream's header."""
-        header = StreamHeader.unpack(stream)
-        if header.codec_id != self.codec_id:
-            expected = f"{self.codec_id:#04x} ({self.name})"
-            raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", expected)
-        others = all_shipped() if self.model.aim is None else all_structure()
-        for model in (self.model, *others):
-            if header.model_tag == model_tag(self.codec_id, model.identity):
-                return model, header
-        tag = model_tag(self.codec_id, self.model.identity)
-        expected = f"{tag:#04x}: the stream was made with a model that is not at hand"
-        raise StreamError("stream", "model_tag", f"{header.model_tag:#04x}", expected)
+
+def _codec_id_of(model: Model) -> int:
+    return CODEC_IDS["standard" if model.perceptual is None else "structure"]
+
+
+def _targets(grey: Image, mean: int, region: RegionOfInterest | None, limit: int, model: Model) -> TargetCoefficients:
+    layout = layout_of(*grey.shape)
+    plane = (grey.astype(np.int64) - mean) * transform.UNIT
+    return target_coefficients(plane, layout, region_weights(layout, region), limit, model.perceptual)
+
+
+def _model_of(stream: bytes, own: Model) -> tuple[Model, StreamHeader]:
+    """Return the model of a stream and the stream's header.
+
+    Raises:
+        StreamError: The header is invalid, or the stream belongs to another codec or an unknown model.
+    """
+    header = StreamHeader.unpack(stream)
+    name = next((name for name, codec_id in CODEC_IDS.items() if codec_id == header.codec_id), None)
+    if name is None:
+        expected = " or ".join(f"{codec_id:#04x}" for codec_id in CODEC_IDS.values())
+        raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", f"{expected} ({NAME})")
+    models = shipped_models(name)
+    if header.codec_id == _codec_id_of(own):
+        models = (own, *models)
+    for model in models:
+        if header.model_tag == model_tag(header.codec_id, model.identity):
+            return model, header
+    tags = ", ".join(f"{model_tag(header.codec_id, model.identity):#04x}" for model in models)
+    expected = f"{tags}: the stream was made with a model that this release does not have"
+    raise StreamError("stream", "model_tag", f"{header.model_tag:#04x}", expected)

@@ -1,4 +1,4 @@
-"""What both ends keep while they code a picture: the state of its coefficients, and the range coder."""
+"""State of encoder and decoder: the coefficients of an image, and the range coder."""
 
 from __future__ import annotations
 
@@ -6,117 +6,112 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from sonarpost.codec.emb import kernel
-from sonarpost.codec.emb.layout import Layout
-from sonarpost.codec.emb.transform import UNIT
+from sonarpost.codec.emb.kernel import I16, I32, I64, U8
+from sonarpost.codec.emb.transform import Layout
 
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
-
-
-PLAIN_SCALE: Final = 256
-"""A coefficient that is coded as it is."""
+UNIT_SCALE: Final = 256
+"""Scale of a coefficient that is coded without a perceptual weight."""
 
 
 @dataclass
-class State:
-    """What is known of a picture's coefficients; flat arrays of `Layout.cells`, see `kernel.code_band`.
+class CoefficientState:
+    """The decoded information about the coefficients of an image: flat arrays of `Layout.cells`.
 
     Attributes:
-        threshold: Of the plane that was coded last.
-        scale: By what each coefficient is multiplied before it is coded, 1/256; see `aim`.
+        layout: Layout of the image.
+        threshold: Threshold of the plane coded last.
+        lower: Lower bound of the magnitude; 0 if the coefficient is not significant.
+        widths: Width of the interval above the lower bound.
+        signs: -1 or 1.
+        sizes: Magnitude in eighths of the threshold.
+        signed: The same with sign.
+        planes: Plane that decided last, or minus the plane that evaluated last.
+        logits: Logit of the last decision or evaluation, in 1/256.
+        scale: Factor of each coefficient before coding, in 1/256; see `perceptual_weights`.
     """
 
-    lay: Layout
+    layout: Layout
     threshold: int = 1 << 17
-    values: I32 = field(init=False)
+    lower: I32 = field(init=False)
     widths: I32 = field(init=False)
     signs: I32 = field(init=False)
-    seen: I32 = field(init=False)
+    sizes: I32 = field(init=False)
     signed: I32 = field(init=False)
-    marks: I32 = field(init=False)
-    odds: I32 = field(init=False)
+    planes: I32 = field(init=False)
+    logits: I32 = field(init=False)
     scale: I32 = field(init=False)
 
     def __post_init__(self) -> None:
-        for name in ("values", "widths", "signs", "seen", "signed", "marks", "odds"):
-            setattr(self, name, np.zeros(self.lay.cells, np.int32))
-        self.scale = np.full(self.lay.cells, PLAIN_SCALE, np.int32)
+        for name in ("lower", "widths", "signs", "sizes", "signed", "planes", "logits"):
+            setattr(self, name, np.zeros(self.layout.cells, np.int32))
+        self.scale = np.full(self.layout.cells, UNIT_SCALE, np.int32)
+
+    def update_sizes(self) -> None:
+        """Compute `sizes` and `signed` for the current threshold."""
+        kernel.update_sizes(self.lower, self.widths, self.signs, self.sizes, self.signed, self.threshold)
 
 
 @dataclass
 class Coder:
-    """The range coder and where it writes to or reads from."""
+    """The range coder with its input or output.
+
+    Attributes:
+        mode: `kernel.WRITE`, `READ` or `COLLECT`.
+        data: Bytes to read, or written so far.
+        words: State of the coder; see `kernel`.
+        best: The best complete stream so far (WRITE).
+        curve: Squared error by number of bytes (WRITE); `curve[0]` is the current error.
+        decisions: Training examples of decisions (COLLECT).
+        sign_decisions: Training examples of signs (COLLECT).
+    """
 
     mode: int
-    data: npt.NDArray[np.uint8]
+    data: U8
     words: I64 = field(default_factory=lambda: np.zeros(kernel.CODER_WORDS, np.int64))
-    good: npt.NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    best: U8 = field(default_factory=lambda: np.zeros(0, np.uint8))
     curve: I64 = field(default_factory=lambda: np.zeros(1, np.int64))
-    rows: npt.NDArray[np.int16] = field(default_factory=lambda: np.zeros((0, kernel.FEATURES + 3), np.int16))
-    sign_rows: npt.NDArray[np.int16] = field(default_factory=lambda: np.zeros((0, kernel.SIGN_FEATURES + 2), np.int16))
+    decisions: I16 = field(default_factory=lambda: np.zeros((0, kernel.FEATURES + 3), np.int16))
+    sign_decisions: I16 = field(default_factory=lambda: np.zeros((0, kernel.SIGN_FEATURES + 2), np.int16))
 
     @classmethod
     def reader(cls, body: bytes) -> Coder:
-        """Read from a body."""
+        """Return a coder that reads a body."""
         coder = cls(kernel.READ, np.frombuffer(body, np.uint8).copy())
         kernel.start_reading(coder.words, coder.data)
         return coder
 
     @classmethod
-    def writer(cls, limit_bytes: int, begin: bytes = b"") -> Coder:
-        """Write a body of at most `limit_bytes` that begins with `begin`.
+    def writer(cls, limit_bytes: int, prefix: bytes = b"") -> Coder:
+        """Return a coder that writes a body of at most `limit_bytes` that starts with `prefix`.
 
-        What is written first must be what `begin` says; the decisions after that are turned where they would change it.
+        The first bits written must be those of `prefix`. Later bits are inverted if they would change the prefix.
         """
         coder = cls(kernel.WRITE, np.zeros(limit_bytes + 8, np.uint8))
-        coder.good = np.zeros(limit_bytes, np.uint8)
+        coder.best = np.zeros(limit_bytes, np.uint8)
         coder.curve = np.full(limit_bytes + 2, -1, np.int64)
         coder.words[kernel.CODER_RANGE] = (1 << 32) - 1
         coder.words[kernel.CODER_LIMIT] = limit_bytes
-        coder.words[kernel.CODER_HELD] = len(begin)
-        coder.good[: len(begin)] = np.frombuffer(begin, np.uint8)
+        coder.words[kernel.CODER_PREFIX] = len(prefix)
+        coder.best[: len(prefix)] = np.frombuffer(prefix, np.uint8)
         return coder
 
-    def record(self) -> None:
-        """Note that the squared error so far is that of the bytes so far."""
-        at = 1 + (int(self.words[kernel.CODER_COST]) >> 11)
-        self.curve[min(at, len(self.curve) - 1)] = self.curve[0]
+    def record_error(self) -> None:
+        """Store the current squared error as that of the bytes so far."""
+        position = 1 + (int(self.words[kernel.CODER_COST]) >> 11)
+        self.curve[min(position, len(self.curve) - 1)] = self.curve[0]
 
     def finish(self) -> bytes:
-        """Return the shortest body that tells everything that was written and fits the budget."""
-        kernel.finish_writing(self.words, self.data, self.good)
-        return self.good[: int(self.words[kernel.CODER_GOOD_LENGTH])].tobytes()
+        """Return the shortest body within the budget that determines all bits written."""
+        kernel.finish_writing(self.words, self.data, self.best)
+        return self.best[: int(self.words[kernel.CODER_BEST_LENGTH])].tobytes()
 
-    def plain(self, bit: int, chance: int = 32768) -> int:
-        """Write or read one decision; -1 at the end."""
-        if self.mode == kernel.LIST:
+    def code_bit(self, bit: int, probability: int = 32768) -> int:
+        """Write or read one bit with `probability` / 65536 of 1; return it, or -1 at the end."""
+        if self.mode == kernel.COLLECT:
             return bit
         if self.mode == kernel.WRITE:
-            share = chance if bit else 65536 - chance
-            self.words[kernel.CODER_COST] += round(256 * (16 - np.log2(share)))
-        return int(kernel.code_plain(self.words, self.data, self.good, bit, chance, self.mode))
-
-
-def error_by_length(curve: I64, body_bytes: int, header_bytes: int, pixels: int) -> npt.NDArray[np.float64]:
-    """Return the mean squared error by stream length, from the coder's record of squared error by bytes begun.
-
-    Args:
-        curve: See `Coder.curve`.
-        body_bytes: Length of the body.
-        header_bytes: Length of what stands before it.
-        pixels: Of the picture.
-
-    Returns:
-        Shape (header_bytes + body_bytes + 1,), grey squared; infinite where there is no picture yet.
-    """
-    out = np.full(header_bytes + body_bytes + 1, np.inf)
-    last = np.inf
-    for n in range(body_bytes + 1):
-        # What was coded within the first n bytes; the coder's record n + 1 is of the byte begun after them.
-        if n < len(curve) - 1 and n > 0 and curve[n] >= 0:
-            last = float(curve[n]) / UNIT**2 / pixels
-        out[header_bytes + n] = last
-    return out
+            own = probability if bit else 65536 - probability
+            self.words[kernel.CODER_COST] += round(256 * (16 - np.log2(own)))
+        return int(kernel.code_bit(self.words, self.data, self.best, bit, probability, self.mode))

@@ -1,82 +1,140 @@
-"""From a body to a picture: what a stream says, its coefficients, and the picture before and after the enhancer."""
+"""The decoder: from a body to coefficients, and from coefficients to the image before and after the enhancer.
+
+The enhancer is a small convolutional network. From the decoded image it estimates the mean of the images that give the
+same bytes, with slightly more contrast than that mean (see docs/explanation/codecs.md). It works in integers at half
+the resolution on blocks of 2 x 2 pixels, and changes no pixel by more than `LIMIT_GREY`.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
-from sonarpost.codec.emb.bitplanes import code_planes, known_plane, situation
-from sonarpost.codec.emb.coder import Coder, State
-from sonarpost.codec.emb.enhance import enhanced
-from sonarpost.codec.emb.layout import Layout
-from sonarpost.codec.emb.model import Model
-from sonarpost.codec.emb.side_info import SideInfo, read_side
-from sonarpost.codec.interface import Image, Mask
-from sonarpost.errors import StreamError
+from sonarpost.codec.emb.bitplanes import code_planes, image_features, reconstructed_coefficients
+from sonarpost.codec.emb.coder import Coder, CoefficientState
+from sonarpost.codec.emb.kernel import I32, I64
+from sonarpost.codec.emb.model import DILATIONS, Model
+from sonarpost.codec.emb.side_info import SideInfo, read_side_info
+from sonarpost.codec.emb.transform import UNIT, Layout
+from sonarpost.codec.interface import Image
+from sonarpost.codec.jit import jit
+
+LIMIT_GREY: Final = 48
+_MAX_ACTIVATION: Final = 4095  # activations are 1/256
 
 
 @dataclass(frozen=True, eq=False)
 class DecodedCoefficients:
-    """A picture before the enhancer.
+    """An image before the enhancer.
 
     Attributes:
-        plane: Shape (height_px, width_px), int64, 1/64 grey, without the mean.
-        mean: Grey.
-        situation: See `planes.situation`.
+        plane: Shape (height_px, width_px), int64, 1/64 grey, minus the mean level.
+        mean: Mean grey level.
+        features: See `bitplanes.image_features`.
     """
 
-    plane: npt.NDArray[np.int64]
+    plane: I64
     mean: int
-    situation: tuple[int, int, int]
+    features: tuple[int, int, int]
 
 
-def read_body(body: bytes, lay: Layout, model: Model) -> tuple[State, SideInfo]:
-    """Return what a body says of the coefficients, and its side information.
+def read_body(body: bytes, layout: Layout, model: Model) -> tuple[CoefficientState, SideInfo]:
+    """Return the coefficients and the side information of a body.
 
     Args:
-        body: Any bytes; as much of it as there is.
-        lay: Layout of the picture's size.
-        model: The one it was made with.
+        body: Any bytes; the body may be truncated.
+        layout: Layout of the image size.
+        model: The model that encoded it.
     """
-    coder, state = Coder.reader(body), State(lay)
-    side = read_side(coder, model)
-    if side.step >= 0:
-        code_planes(coder, state, model, np.zeros(lay.cells, np.int32), side)
+    coder, state = Coder.reader(body), CoefficientState(layout)
+    side = read_side_info(coder, model)
+    if side.start_step >= 0:
+        code_planes(coder, state, model, np.zeros(layout.cells, np.int32), side)
     return state, side
 
 
-def plain_of(state: State, side: SideInfo, model: Model) -> DecodedCoefficients:
-    """Return the picture that the coefficients say."""
-    plane, _ = transform.inverse(known_plane(state, model, side.box), state.lay)
-    return DecodedCoefficients(plane, side.mean, situation(state, side.mean))
+def image_before_enhancer(state: CoefficientState, side: SideInfo, model: Model) -> DecodedCoefficients:
+    """Return the image of the coefficients."""
+    plane, _ = transform.inverse(reconstructed_coefficients(state, model, side.region), state.layout)
+    return DecodedCoefficients(plane, side.mean, image_features(state, side.mean))
 
 
-def grey_of(plane: npt.NDArray[np.int64], mean: int) -> Image:
-    """Return a plane without its mean, 1/64 grey, as a picture."""
-    return np.clip((plane + transform.UNIT // 2) // transform.UNIT + mean, 0, 255).astype(np.uint8)
+def decoded_image(state: CoefficientState, side: SideInfo, model: Model) -> Image:
+    """Return the image of the coefficients after the enhancer."""
+    decoded = image_before_enhancer(state, side, model)
+    return grey_of(enhance(decoded, model), decoded.mean)
 
 
-def picture_of(state: State, side: SideInfo, model: Model) -> Image:
-    """Return the picture with what the model knows of what the coefficients do not say."""
-    plain = plain_of(state, side, model)
-    plane = enhanced(plain.plane, plain.mean, plain.situation, model)
-    return grey_of(plane, plain.mean)
+def grey_of(plane: I64, mean: int) -> Image:
+    """Convert a plane in 1/64 grey minus the mean level to an image."""
+    return np.clip((plane + UNIT // 2) // UNIT + mean, 0, 255).astype(np.uint8)
 
 
-def usable(body: bytes, received: Mask | None) -> tuple[bytes, tuple[str, ...]]:
-    """Return the bytes before the first that did not arrive, and a note if there is one.
+def enhance(decoded: DecodedCoefficients, model: Model) -> I64:
+    """Return the enhanced image minus the mean level, 1/64 grey."""
+    height, width = decoded.plane.shape
+    padded = np.pad(decoded.plane, ((0, height % 2), (0, width % 2)), mode="edge")
+    grey = np.clip(padded, -decoded.mean * UNIT, (255 - decoded.mean) * UNIT)
+    activations = to_blocks(grey >> 4)
+    rows, columns, _ = activations.shape
+    for i, ((taps, bias), dilation) in enumerate(zip(model.layers, DILATIONS, strict=True)):
+        total = bias
+        if i == 0:
+            total = (bias + np.array(decoded.features, np.int32) @ model.image_weights).astype(np.int32)
+        out = np.zeros((rows, columns, bias.shape[0]), np.int32)
+        _convolve(activations, taps, total, dilation, out, int(i < len(model.layers) - 1))
+        activations = out
+    # The network's output is 1/256 of 16 grey.
+    change = from_blocks(activations).astype(np.int64) * (UNIT // 16)
+    return np.asarray(grey + np.clip(change, -UNIT * LIMIT_GREY, UNIT * LIMIT_GREY), np.int64)[:height, :width]
 
-    Raises:
-        StreamError: `received` has another shape than the body.
+
+def to_blocks(grey: I64) -> I32:
+    """Convert shape (2 r, 2 c) to blocks of 2 x 2 pixels, shape (r, c, 4)."""
+    rows, columns = grey.shape[0] // 2, grey.shape[1] // 2
+    blocks = grey.reshape(rows, 2, columns, 2).transpose(0, 2, 1, 3).reshape(rows, columns, 4)
+    return np.ascontiguousarray(blocks.astype(np.int32))
+
+
+def from_blocks(blocks: I32) -> I32:
+    """Invert `to_blocks`."""
+    rows, columns, _ = blocks.shape
+    return blocks.reshape(rows, columns, 2, 2).transpose(0, 2, 1, 3).reshape(2 * rows, 2 * columns)
+
+
+@jit
+def _convolve(source: I32, weights: I32, bias: I32, dilation: int, out: I32, rectify: int) -> None:
+    """Apply a layer of 3 x 3 taps. Outside the image its edge repeats.
+
+    Args:
+        source: Shape (rows, columns, channels in), int32, at most 4095 in magnitude.
+        weights: Shape (9, channels in, channels out), 1/4096.
+        bias: Shape (channels out,), 1/2^20.
+        dilation: Distance of the taps.
+        out: Shape (rows, columns, channels out).
+        rectify: 1: multiply negative sums by 1/8 and clip to +-4095 in 1/256. 0: store the sum in 1/256.
     """
-    if received is None:
-        return body, ()
-    if received.shape != (len(body),):
-        raise StreamError("stream", "received", received.shape, f"one value for each of {len(body)} body bytes")
-    lost = np.flatnonzero(~received)
-    if not lost.size:
-        return body, ()
-    return body[: lost[0]], (f"{len(body) - int(lost[0])} of {len(body)} bytes are lost or follow a lost one",)
+    rows, columns, inputs = source.shape
+    outputs = out.shape[2]
+    total = np.zeros(outputs, np.int32)
+    for y in range(rows):
+        for x in range(columns):
+            for j in range(outputs):
+                total[j] = bias[j]
+            for tap in range(9):
+                from_y = min(max(y + (tap // 3 - 1) * dilation, 0), rows - 1)
+                from_x = min(max(x + (tap % 3 - 1) * dilation, 0), columns - 1)
+                for i in range(inputs):
+                    value = source[from_y, from_x, i]
+                    if value != 0:
+                        for j in range(outputs):
+                            total[j] += value * weights[tap, i, j]
+            for j in range(outputs):
+                value = (total[j] + 2048) >> 12
+                if rectify == 1:
+                    value = min(max(value, value >> 3), _MAX_ACTIVATION)
+                    value = max(value, -_MAX_ACTIVATION)
+                out[y, x, j] = value

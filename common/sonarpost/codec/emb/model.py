@@ -1,8 +1,8 @@
-"""The trained model: integer weights of the networks, reconstruction points and tables.
+"""The trained models of `emb`: integer weights of the networks, reconstruction points and tables.
 
-A model file is a magic word, which says which form it has, and then the form's arrays of fixed shapes and types,
-little-endian, one after the other (`FORMS`). Its sha256 is the model's identity. `training/emb` makes it. Models of
-earlier releases stay in the package, so that their streams decode for ever: what their networks do not have is zero.
+A model file is a magic word for its format, then the arrays of that format in order, little-endian (`FORMATS`). Its
+SHA-256 is the identity of the model. `training/emb` makes model files. Models of earlier releases stay in the package,
+so that their streams always decode; the weights that their networks do not have are zero.
 """
 
 from __future__ import annotations
@@ -15,27 +15,26 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from sonarpost.codec.emb import DEFAULT_MODEL, MODEL_FILES
 from sonarpost.codec.emb import kernel as k
-from sonarpost.codec.emb.perceptual_weights import CONTRASTS, LEVELS, PerceptualWeights
-from sonarpost.errors import StreamError
+from sonarpost.codec.emb.kernel import I32
+from sonarpost.errors import ConfigError, StreamError
 
-I32 = npt.NDArray[np.int32]
 Arrays = tuple[tuple[str, tuple[int, ...], str], ...]
 
-GLOBALS: Final = 3
+IMAGE_FEATURES: Final = 3
 CHANNELS: Final = 24
 DILATIONS: Final = (1, 2, 3, 1)
-SHIPPED: Final = ("emb-2.model", "emb.model")
-"""Model files of `emb`; the first is the one that encodes."""
-STRUCTURE: Final = ("emb-structure.model",)
-"""Those of `emb-structure`."""
+SCALE_LEVELS: Final = 7
+"""Perceptual scales of the lowest band and of levels 1 to 6."""
+CONTRASTS: Final = 128
+"""Entries of the table of perceptual scales by contrast, in eighths of octaves."""
 
 
-def _arrays(features: int, sign_features: int, sign_hidden: int, channels: int, layers: int) -> Arrays:
-    """Name, shape and type in the file, in order."""
-    sides = [4, *[channels] * (layers - 1), 4]
+def _network_arrays(features: int, sign_features: int, sign_hidden: int) -> Arrays:
+    """Return name, shape and type of each array, in the order of the file."""
+    sides = [4, *[CHANNELS] * (len(DILATIONS) - 1), 4]
     return (
         ("w1", (2, features, k.HIDDEN_1), "<i2"),
         ("b1", (2, k.HIDDEN_1), "<i4"),
@@ -46,11 +45,11 @@ def _arrays(features: int, sign_features: int, sign_hidden: int, channels: int, 
         ("sign_w1", (4, sign_features, sign_hidden), "<i2"),
         ("sign_b1", (4, sign_hidden), "<i4"),
         ("sign_w2", (4, sign_hidden), "<i2"),
-        ("chances", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
+        ("probabilities", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
         ("costs", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
         ("centres", (4, k.CENTRE_COLUMNS), "<i2"),
         ("mean_tree", (64,), "<u2"),
-        ("situation", (GLOBALS, channels), "<i4"),
+        ("image_weights", (IMAGE_FEATURES, CHANNELS), "<i4"),
         *(
             (f"{kind}{i}", shape, number)
             for i, (inputs, outputs) in enumerate(pairwise(sides))
@@ -61,45 +60,54 @@ def _arrays(features: int, sign_features: int, sign_hidden: int, channels: int, 
 
 @dataclass(frozen=True)
 class ModelFormat:
-    """What a model file holds.
+    """Format of a model file.
 
     Attributes:
-        magic: How it begins.
+        magic: First bytes of the file.
         arrays: Name, shape and type of each array, in order.
-        dilations: Of the enhancer's layers; see `enhance`.
     """
 
     magic: bytes
     arrays: Arrays
-    dilations: tuple[int, ...]
 
 
-_AIM_ARRAYS: Final[Arrays] = (("aim_levels", (LEVELS,), "<i2"), ("aim_contrast", (CONTRASTS,), "<i2"))
-FIRST: Final = ModelFormat(b"SPEMB1\n", _arrays(50, 11, 8, channels=24, layers=4), (1, 2, 3, 1))
-SECOND: Final = ModelFormat(
-    b"SPEMB2\n",
-    _arrays(k.FEATURES, k.SIGN_FEATURES, k.SIGN_HIDDEN, channels=CHANNELS, layers=len(DILATIONS)),
-    DILATIONS,
+_PERCEPTUAL_ARRAYS: Final[Arrays] = (
+    ("perceptual_levels", (SCALE_LEVELS,), "<i2"),
+    ("perceptual_contrast", (CONTRASTS,), "<i2"),
 )
-AIMED: Final = ModelFormat(b"SPEMB3\n", SECOND.arrays + _AIM_ARRAYS, DILATIONS)
-FORMS: Final = (FIRST, SECOND, AIMED)
-_FIRST_LOCAL: Final = 40
-"""Features of one coefficient in the first form; those of its band came after them."""
+FORMAT_1: Final = ModelFormat(b"SPEMB1\n", _network_arrays(50, 11, 8))
+FORMAT_2: Final = ModelFormat(b"SPEMB2\n", _network_arrays(k.FEATURES, k.SIGN_FEATURES, k.SIGN_HIDDEN))
+FORMAT_3: Final = ModelFormat(b"SPEMB3\n", FORMAT_2.arrays + _PERCEPTUAL_ARRAYS)
+FORMATS: Final = (FORMAT_1, FORMAT_2, FORMAT_3)
+_FORMAT_1_BAND_FEATURES: Final = 40
+"""Index of the first band feature in format 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class PerceptualWeights:
+    """Scales that a perceptual model applies to coefficients before coding, in 1/256; see `perceptual_weights`.
+
+    Attributes:
+        levels: Shape (SCALE_LEVELS,), int32: scale of the lowest band, then of the bands of levels 1 to 6.
+        contrast: Shape (CONTRASTS,), int32: scale by 8 log2 of the local variance in grey squared and VARIANCE_OFFSET.
+    """
+
+    levels: I32
+    contrast: I32
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Integer weights and tables, all int32; see `kernel.code_band` for what each is.
+    """Integer weights and tables, all int32; see `kernel.code_band`.
 
     Attributes:
-        identity: Hex sha256 of the file.
-        centres: Where in its interval a coefficient lies on the mean, in 1/256; by lower bound / width (1..4) and the
-            logit of its last decision.
-        mean_tree: Probability of 1 of each decision of the mean level, by node of the binary tree.
-        situation: Shape (GLOBALS, CHANNELS): the enhancer's weights of the whole picture's features.
+        identity: Hex SHA-256 of the file.
+        centres: Reconstruction points in 1/256 of the interval, by lower bound / width (1..4) and the logit of the last
+            decision.
+        mean_tree: Probability of 1 at each node of the binary tree of the mean level.
+        image_weights: Shape (IMAGE_FEATURES, CHANNELS): the enhancer's weights of the features of the whole image.
         layers: Taps (9, in, out) and bias (out,) of the enhancer's layers.
-        dilations: Distance of the taps of each layer.
-        aim: How it scales coefficients; None: it aims at the least squared error.
+        perceptual: Scales of the coefficients; None for a model trained for the least squared error.
     """
 
     identity: str
@@ -112,61 +120,55 @@ class Model:
     sign_w1: I32
     sign_b1: I32
     sign_w2: I32
-    chances: I32
+    probabilities: I32
     costs: I32
     centres: I32
     mean_tree: I32
-    situation: I32
+    image_weights: I32
     layers: tuple[tuple[I32, I32], ...]
-    dilations: tuple[int, ...]
-    aim: PerceptualWeights | None = None
-
-
-def form_of(raw: bytes, where: str = "emb model") -> ModelFormat:
-    """Return what a model file holds.
-
-    Raises:
-        StreamError: It is not one.
-    """
-    for form in FORMS:
-        if raw.startswith(form.magic):
-            return form
-    raise StreamError(where, "magic", raw[: len(SECOND.magic)], " or ".join(repr(form.magic) for form in FORMS))
+    perceptual: PerceptualWeights | None = None
 
 
 def read_arrays(raw: bytes, where: str = "emb model") -> dict[str, I32]:
     """Read the arrays of a model file.
 
     Raises:
-        StreamError: It is not one, or its length is wrong.
+        StreamError: It is not a model file, or its length is wrong.
     """
-    form = form_of(raw, where)
-    expected = len(form.magic) + sum(int(np.prod(shape)) * np.dtype(kind).itemsize for _, shape, kind in form.arrays)
-    if len(raw) != expected:
-        raise StreamError(where, "length", len(raw), f"{expected} bytes")
-    arrays, at = {}, len(form.magic)
-    for name, shape, kind in form.arrays:
-        count = int(np.prod(shape))
-        arrays[name] = np.frombuffer(raw, kind, count, at).reshape(shape).astype(np.int32)
-        at += count * np.dtype(kind).itemsize
+    for model_format in FORMATS:
+        if raw.startswith(model_format.magic):
+            break
+    else:
+        expected = " or ".join(repr(one.magic) for one in FORMATS)
+        raise StreamError(where, "magic", raw[: len(FORMAT_1.magic)], expected)
+    position = len(model_format.magic)
+    sizes = [int(np.prod(shape)) * np.dtype(kind).itemsize for _, shape, kind in model_format.arrays]
+    if len(raw) != position + sum(sizes):
+        raise StreamError(where, "length", len(raw), f"{position + sum(sizes)} bytes")
+    arrays = {}
+    for (name, shape, kind), size in zip(model_format.arrays, sizes, strict=True):
+        arrays[name] = np.frombuffer(raw[position : position + size], kind).reshape(shape).astype(np.int32)
+        position += size
     return arrays
 
 
-def model_of(arrays: dict[str, I32], identity: str = "", dilations: tuple[int, ...] = DILATIONS) -> Model:
-    """Make a model of its arrays, of any form."""
-    plain = {name: array for name, array in arrays.items() if name[:4] not in ("taps", "bias", "aim_")}
-    plain["w1"] = _with_rows(plain["w1"], _FIRST_LOCAL, k.FEATURES)
-    plain["sign_w1"] = _with_rows(plain["sign_w1"], plain["sign_w1"].shape[1], k.SIGN_FEATURES)
+def model_of(arrays: dict[str, I32], identity: str = "") -> Model:
+    """Build a model from the arrays of any format."""
+    layers = tuple((arrays[f"taps{i}"], arrays[f"bias{i}"]) for i in range(len(DILATIONS)))
+    perceptual = None
+    if "perceptual_levels" in arrays:
+        perceptual = PerceptualWeights(arrays["perceptual_levels"], arrays["perceptual_contrast"])
+    own = {name: array for name, array in arrays.items() if not name.startswith(("taps", "bias", "perceptual_"))}
+    own["w1"] = _with_zero_rows(own["w1"], _FORMAT_1_BAND_FEATURES, k.FEATURES)
+    own["sign_w1"] = _with_zero_rows(own["sign_w1"], own["sign_w1"].shape[1], k.SIGN_FEATURES)
     for name in ("sign_w1", "sign_b1", "sign_w2"):
-        missing = k.SIGN_HIDDEN - plain[name].shape[-1]
-        plain[name] = np.pad(plain[name], [(0, 0)] * (plain[name].ndim - 1) + [(0, missing)])
-    layers = tuple((arrays[f"taps{i}"], arrays[f"bias{i}"]) for i in range(len(dilations)))
-    aim = PerceptualWeights(arrays["aim_levels"], arrays["aim_contrast"]) if "aim_levels" in arrays else None
-    return Model(identity=identity, layers=layers, dilations=dilations, aim=aim, **plain)
+        missing = k.SIGN_HIDDEN - own[name].shape[-1]
+        own[name] = np.pad(own[name], [(0, 0)] * (own[name].ndim - 1) + [(0, missing)])
+    return Model(identity=identity, layers=layers, perceptual=perceptual, **own)
 
 
-def _with_rows(weights: I32, at: int, rows: int) -> I32:
-    """Insert weights of zero for features that the network does not have; its second axis is made `rows` long."""
+def _with_zero_rows(weights: I32, at: int, rows: int) -> I32:
+    """Insert zero weights for missing features, so that the second axis has `rows` entries."""
     missing = np.zeros((weights.shape[0], rows - weights.shape[1], weights.shape[2]), np.int32)
     return np.concatenate([weights[:, :at], missing, weights[:, at:]], axis=1)
 
@@ -175,29 +177,19 @@ def parse(raw: bytes, where: str = "emb model") -> Model:
     """Read a model file.
 
     Raises:
-        StreamError: It is not one, or its length is wrong.
+        StreamError: It is not a model file, or its length is wrong.
     """
-    dilations = form_of(raw, where).dilations
-    return model_of(read_arrays(raw, where), hashlib.sha256(raw).hexdigest(), dilations)
+    return model_of(read_arrays(raw, where), hashlib.sha256(raw).hexdigest())
 
 
-def _read(names: tuple[str, ...]) -> tuple[Model, ...]:
+@cache
+def shipped_models(name: str = DEFAULT_MODEL) -> tuple[Model, ...]:
+    """Return the shipped models of a name: the current one, then those of earlier releases.
+
+    Raises:
+        ConfigError: No model has this name.
+    """
+    if name not in MODEL_FILES:
+        raise ConfigError("codec emb", "model", name, " or ".join(MODEL_FILES))
     data = files("sonarpost.codec.emb").joinpath("data")
-    return tuple(parse(data.joinpath(name).read_bytes(), name) for name in names)
-
-
-@cache
-def all_shipped() -> tuple[Model, ...]:
-    """Return the models of `emb` that come with the package, the one that encodes first."""
-    return _read(SHIPPED)
-
-
-@cache
-def all_structure() -> tuple[Model, ...]:
-    """Return the models of `emb-structure` that come with the package, the one that encodes first."""
-    return _read(STRUCTURE)
-
-
-def shipped() -> Model:
-    """Return the model with which `emb` encodes."""
-    return all_shipped()[0]
+    return tuple(parse(data.joinpath(file).read_bytes(), file) for file in MODEL_FILES[name])

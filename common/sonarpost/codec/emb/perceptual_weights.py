@@ -1,114 +1,103 @@
-"""What a model aims at when that is not the least squared error: likeness of structure (`emb-structure`).
+"""Perceptual weights: how a model for structural similarity scales coefficients before coding.
 
-Structural similarity divides an error by the contrast around it, and two and four times reduced pictures decide it.
-So a model with an aim codes every coefficient as if it were larger or smaller: by its level, and at the levels that
-carry objects by the contrast around it, as far as both ends know it from what was coded before. Integers throughout.
+Structural similarity divides an error by the local contrast, and the image at a half and a quarter of its size decides
+it. A perceptual model therefore codes every coefficient with a scale. The scale depends on the level and, at the levels
+that carry objects, on the local contrast that encoder and decoder know from the coefficients coded before. Integer
+arithmetic only.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from sonarpost.codec.emb import transform
-from sonarpost.codec.emb._jit import jit
-from sonarpost.codec.emb.coder import PLAIN_SCALE, State
-from sonarpost.codec.emb.layout import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, Layout, cells_of
+from sonarpost.codec.emb.coder import UNIT_SCALE, CoefficientState
+from sonarpost.codec.emb.kernel import I32, I64
+from sonarpost.codec.emb.model import CONTRASTS, PerceptualWeights
+from sonarpost.codec.emb.transform import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, Layout, cells_of
+from sonarpost.codec.jit import jit
 
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
-
-LEVELS: Final = 7
-"""Scales of the lowest band and of levels 1 to 6."""
-CONTRASTS: Final = 128
-"""Places of the table of contrast: eighths of octaves."""
-FOLLOWING: Final = (3, 2)
-"""Levels whose scale follows the contrast; coarser ones hardly profit, of the finest little is coded."""
-STILL_GREY2: Final = 150
-"""Added to the local variance: a seabed without any contrast is not worth everything."""
-# Radius and rounds of the box that the variance is taken in, by level less the level of the picture it is taken of:
-# standard deviation of 4 to 5 px at levels 2 and 3.
+ADAPTIVE_LEVELS: Final = (3, 2)
+"""Levels whose scale depends on the contrast. Coarser levels gain little; of the finest level little is coded."""
+VARIANCE_OFFSET: Final = 150
+"""Added to the local variance, in grey squared: limits the weight of a seabed without contrast."""
+# Radius and rounds of the box filter of the variance, by level minus the level of the image: a standard deviation of 4
+# to 5 px at levels 2 and 3.
 _WINDOWS: Final = ((1, 1), (1, 2), (2, 2))
 
 
-@dataclass(frozen=True, eq=False)
-class PerceptualWeights:
-    """How a model scales coefficients before it codes them, in 1/256.
-
-    Attributes:
-        levels: Shape (LEVELS,), int32: scale of the lowest band, then of the other bands of level 1 to 6.
-        contrast: Shape (CONTRASTS,), int32: scale by 8 log2 of the local variance in grey squared and `STILL_GREY2`.
-    """
-
-    levels: I32
-    contrast: I32
+def initial_scales(weights: PerceptualWeights, layout: Layout) -> I32:
+    """Return the scales of all coefficients by their level only, flat, int32. Do not modify the result."""
+    return _scales_by_level(tuple(weights.levels.tolist()), layout)
 
 
 @lru_cache(maxsize=8)
-def _first_scales(levels: tuple[int, ...], lay: Layout) -> I32:
-    out = np.full(lay.cells, PLAIN_SCALE, np.int32)
-    for band in lay.bands.tolist():
+def _scales_by_level(levels: tuple[int, ...], layout: Layout) -> I32:
+    out = np.full(layout.cells, UNIT_SCALE, np.int32)
+    for band in layout.bands.tolist():
         out[cells_of(band)] = levels[0 if band[ORIENT] == LL else band[LEVEL]]
     return out
 
 
-def start_scales(aim: PerceptualWeights, lay: Layout) -> I32:
-    """Return the scales of all coefficients by their level alone; flat, int32, not to be written to."""
-    return _first_scales(tuple(aim.levels.tolist()), lay)
+def apply_initial_scales(weights: PerceptualWeights, state: CoefficientState, targets: I32) -> I32:
+    """Set the initial scales in the state; return the scaled targets."""
+    state.scale[:] = initial_scales(weights, state.layout)
+    return (np.abs(targets.astype(np.int64)) * state.scale // UNIT_SCALE * np.sign(targets)).astype(np.int32)
 
 
-def begin(aim: PerceptualWeights, state: State, targets: I32) -> I32:
-    """Scale every coefficient by its level, before anything is known; returns the targets so scaled."""
-    state.scale[:] = start_scales(aim, state.lay)
-    return (np.abs(targets.astype(np.int64)) * state.scale // PLAIN_SCALE * np.sign(targets)).astype(np.int32)
-
-
-def follow(aim: PerceptualWeights, state: State, row: int, lows: I32, finest: int, targets: I32, scaled: I32) -> None:
-    """Scale the bands of a level anew by the contrast that is known around each coefficient.
+def adapt_scales(
+    weights: PerceptualWeights,
+    state: CoefficientState,
+    row: int,
+    lows: I32,
+    finest: int,
+    targets: I32,
+    scaled: I32,
+) -> None:
+    """Adapt the scales of the bands of a level to the local contrast.
 
     Args:
-        aim: The model's.
-        state: Brought forward: scales, and what is known in them.
-        row: The level's first band.
-        lows: Low-pass pictures known so far, see `planes.low_pictures`.
-        finest: The finest level of these.
-        targets: Coefficients to tell, not scaled.
-        scaled: The same scaled; brought forward.
+        weights: Perceptual weights of the model.
+        state: Scales and intervals; modified.
+        row: First band of the level.
+        lows: Low-pass images, see `bitplanes.low_pass_images`.
+        finest: Finest level of these.
+        targets: Coefficients to code, not scaled.
+        scaled: Scaled coefficients; modified.
     """
-    lay = state.lay
-    level = int(lay.bands[row, LEVEL])
-    variance = _variance(lows, lay, finest, level)
-    _apply(
-        lay.bands, row, int(aim.levels[level]), level - finest, aim.contrast, variance, state.scale, state.values,
-        state.widths, targets, scaled,
+    layout = state.layout
+    level = int(layout.bands[row, LEVEL])
+    variance = local_variance(lows, layout, finest, level)
+    _rescale(
+        layout.bands, row, int(weights.levels[level]), level - finest, weights.contrast, variance, state.scale,
+        state.lower, state.widths, targets, scaled,
     )  # fmt: skip
 
 
-def expected(aim: PerceptualWeights, shown: I32, lay: Layout) -> I32:
-    """Return the scales that a picture will have once its coefficients `shown` (flat, int32) are coded; flat, int32."""
-    state = State(lay)
-    begin(aim, state, shown)
-    _, lows = transform.inverse(transform.from_flat(shown, lay), lay, 1)
-    for row in range(1, lay.bands.shape[0], 3):
-        if lay.bands[row, LEVEL] in FOLLOWING:
-            follow(aim, state, row, lows, 1, shown, shown.copy())
+def expected_scales(weights: PerceptualWeights, coefficients: I32, layout: Layout) -> I32:
+    """Return the scales after coding of these coefficients (flat, int32); flat, int32."""
+    state = CoefficientState(layout)
+    apply_initial_scales(weights, state, coefficients)
+    _, lows = transform.inverse(transform.from_flat(coefficients, layout), layout, 1)
+    for row in range(1, layout.bands.shape[0], 3):
+        if layout.bands[row, LEVEL] in ADAPTIVE_LEVELS:
+            adapt_scales(weights, state, row, lows, 1, coefficients, coefficients.copy())
     return state.scale
 
 
-def _variance(lows: I32, lay: Layout, finest: int, level: int) -> I64:
-    """Local variance, in grey squared, of the low-pass picture of level `finest`, as wide as suits `level`."""
-    height, width = (int(n) for n in lay.sides[finest])
+def local_variance(lows: I32, layout: Layout, finest: int, level: int) -> I64:
+    """Return the local variance of the low-pass image of level `finest`, in grey squared, for scales of `level`."""
+    height, width = (int(n) for n in layout.sides[finest])
     radius, rounds = _WINDOWS[min(level - finest, len(_WINDOWS) - 1)]
-    return np.asarray(_spread(lows, int(lay.low_offsets[finest]), height, width, finest + 3, radius, rounds))
+    return np.asarray(_variance(lows, int(layout.low_offsets[finest]), height, width, finest + 3, radius, rounds))
 
 
 @jit
-def _sum_around(plane: I64, radius: int) -> I64:
-    """Sum over a square around each place; outside the picture its edge repeats."""
+def _box_sum(plane: I64, radius: int) -> I64:
+    """Return the sum over a square around each cell. Outside the image its edge repeats."""
     height, width = plane.shape
     across, out = np.zeros_like(plane), np.zeros_like(plane)
     for y in range(height):
@@ -124,22 +113,22 @@ def _sum_around(plane: I64, radius: int) -> I64:
 
 
 @jit
-def _spread(lows: I32, at: int, height: int, width: int, shift: int, radius: int, rounds: int) -> I64:
-    """Local variance in grey squared; `shift` makes eighths of grey of the values."""
+def _variance(lows: I32, start: int, height: int, width: int, shift: int, radius: int, rounds: int) -> I64:
+    """Return the local variance in grey squared. `shift` converts the values to 1/8 grey."""
     sums, squares = np.zeros((height, width), np.int64), np.zeros((height, width), np.int64)
     for y in range(height):
         for x in range(width):
-            value = np.int64(lows[at + (y + 1) * (width + 2) + x + 1]) >> shift
+            value = np.int64(lows[start + (y + 1) * (width + 2) + x + 1]) >> shift
             sums[y, x], squares[y, x] = value, value * value
     count = np.int64(1)
     for _ in range(rounds):
-        sums, squares = _sum_around(sums, radius), _sum_around(squares, radius)
+        sums, squares = _box_sum(sums, radius), _box_sum(squares, radius)
         count *= (2 * radius + 1) ** 2
     return (squares * count - sums * sums) // (count * count * 64)
 
 
 @jit
-def _apply(
+def _rescale(
     bands: I32,
     row: int,
     level_scale: int,
@@ -147,7 +136,7 @@ def _apply(
     contrast: I32,
     variance: I64,
     scale: I32,
-    values: I32,
+    lower: I32,
     widths: I32,
     targets: I32,
     scaled: I32,
@@ -159,15 +148,15 @@ def _apply(
             for x in range(bands[band, WIDTH]):
                 at = bands[band, OFFSET] + y * bands[band, STRIDE] + x
                 place_y, place_x = min((y << halvings) + middle, height - 1), min((x << halvings) + middle, width - 1)
-                rest = variance[place_y, place_x] + STILL_GREY2
+                total = variance[place_y, place_x] + VARIANCE_OFFSET
                 power = np.int64(0)
-                while rest >> (power + 1):
+                while total >> (power + 1):
                     power += 1
-                eighth = 8 * power + ((rest << 3) >> power) - 8
+                eighth = 8 * power + ((total << 3) >> power) - 8
                 new = max((np.int64(level_scale) * contrast[min(eighth, CONTRASTS - 1)]) >> 8, 1)
                 old = np.int64(scale[at])
-                if values[at] > 0:
-                    values[at] = max((values[at] * new + (old >> 1)) // old, 1)
+                if lower[at] > 0:
+                    lower[at] = max((lower[at] * new + (old >> 1)) // old, 1)
                     widths[at] = max((widths[at] * new + (old >> 1)) // old, 1)
                 scale[at] = new
                 size = (abs(np.int64(targets[at])) * new) >> 8

@@ -1,25 +1,32 @@
-"""What a stream says before its coefficients: mean level, start step, and two things that are seldom there."""
+"""Side information at the start of a body: mean level, start step, region of interest and texture levels."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+
 from sonarpost.codec.emb.coder import Coder
+from sonarpost.codec.emb.kernel import I64
 from sonarpost.codec.emb.model import Model
+from sonarpost.codec.emb.transform import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, Layout
 from sonarpost.errors import StreamError
 
 MEAN_STEP: Final = 4
-GRAIN_BANDS: Final = 8
-_RARE: Final = 1024  # chance of 1, in 1/65536, of a flag that is seldom set
-_ODD_STEP: Final = 4096  # chance of an odd start step, in 1/65536: the encoder usually tries the even ones
+TEXTURE_BANDS: Final = 8
+MAX_EXTRA_PLANES: Final = 6
 SIXTEENTHS: Final = 16
-MAX_EXTRA: Final = 6
+INSIDE_WEIGHT: Final = 384
+UNIT_WEIGHT: Final = 256
+"""Coefficients inside the region of interest are coded as if they were 3/2 as large: their error weighs 9/4 as much."""
+_RARE: Final = 1024  # probability of 1, in 1/65536, of a flag that is rarely set
+_ODD_STEP: Final = 4096  # probability of an odd start step, in 1/65536: the encoder usually tries the even ones
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
-    """A part of the picture that gets more of the bits, in sixteenths of its sides.
+class RegionOfInterest:
+    """A part of the image that gets more bits, in sixteenths of the sides.
 
     Attributes:
         top: First row, 0..15.
@@ -28,7 +35,7 @@ class Box:
         right: Last column, `left`..15.
 
     Raises:
-        StreamError: A value outside these limits.
+        StreamError: A value is out of range.
     """
 
     top: int
@@ -43,11 +50,13 @@ class Box:
                 raise StreamError("region of interest", name, value, f"{low}..{SIXTEENTHS - 1} sixteenths")
 
     @classmethod
-    def around(cls, top_px: int, left_px: int, bottom_px: int, right_px: int, height_px: int, width_px: int) -> Box:
-        """Return the smallest box that holds these rows and columns, first and last ones included.
+    def around(
+        cls, top_px: int, left_px: int, bottom_px: int, right_px: int, height_px: int, width_px: int
+    ) -> RegionOfInterest:
+        """Return the smallest region with these first and last rows and columns.
 
         Raises:
-            StreamError: They are not inside the picture.
+            StreamError: They are outside the image.
         """
         return cls(
             top_px * SIXTEENTHS // height_px,
@@ -57,83 +66,106 @@ class Box:
         )
 
 
+def region_weights(layout: Layout, region: RegionOfInterest | None) -> I64:
+    """Return the weight of every coefficient in the flat layout, in 1/256. The lowest band keeps unit weight."""
+    out = np.full(layout.cells, UNIT_WEIGHT, np.int64)
+    if region is None:
+        return out
+    for band in layout.bands.tolist():
+        if band[ORIENT] == LL:
+            continue
+        top, bottom = _cells_over(region.top, region.bottom, band[HEIGHT], layout.height_px, band[LEVEL])
+        left, right = _cells_over(region.left, region.right, band[WIDTH], layout.width_px, band[LEVEL])
+        for y in range(top, bottom):
+            at = band[OFFSET] + y * band[STRIDE]
+            out[at + left : at + right] = INSIDE_WEIGHT
+    return out
+
+
+def _cells_over(first: int, last: int, cells: int, side_px: int, level: int) -> tuple[int, int]:
+    """Return the first and last + 1 cell of a band over a range of sixteenths of the side."""
+    start_px, stop_px = first * side_px // SIXTEENTHS, -(-(last + 1) * side_px // SIXTEENTHS)
+    return min(start_px >> level, cells), min(-(-stop_px >> level), cells)
+
+
 @dataclass(frozen=True, slots=True)
 class SideInfo:
     """Side information.
 
     Attributes:
-        mean_index: Mean grey / 4, 0..63; -1 where the stream is too short to tell.
-        step: Start step, 0..7; -1 where the stream is too short to tell (then nothing after it is known either).
-        box: Region of interest.
-        grain: Strength of the picture's texture by band, 0..15 each; see `grain`.
-        extra: How many planes come above the usual first one, 0..6: for pictures that are half black, half white.
+        mean_index: Mean grey / 4, 0..63; -1 if the stream is too short.
+        start_step: 0..7; -1 if the stream is too short. Then nothing after it is known.
+        region: Region of interest.
+        texture: Strength of the image's texture in each band, 0..15; see `speckle_synthesis`.
+        extra_planes: Planes above the usual first one, 0..6, for images that are half black and half white.
     """
 
     mean_index: int
-    step: int
-    box: Box | None = None
-    grain: tuple[int, ...] | None = None
-    extra: int = 0
+    start_step: int
+    region: RegionOfInterest | None = None
+    texture: tuple[int, ...] | None = None
+    extra_planes: int = 0
 
     @property
     def mean(self) -> int:
-        """Mean level in grey."""
+        """Mean grey level."""
         return self.mean_index * MEAN_STEP
 
 
 class _EndOfStreamError(Exception):
-    """The bytes do not tell the next decision."""
+    """The bytes do not determine the next bit."""
 
 
-def write_side(coder: Coder, model: Model, side: SideInfo) -> None:
-    """Write side information. A coder whose budget ends within it stops, which the caller sees from its length."""
+def write_side_info(coder: Coder, model: Model, side: SideInfo) -> None:
+    """Write side information. If the budget ends within it, the coder stops."""
     _code(coder, model, side)
 
 
-def read_side(coder: Coder, model: Model) -> SideInfo:
-    """Read as much as the stream tells."""
+def read_side_info(coder: Coder, model: Model) -> SideInfo:
+    """Read the side information that the stream determines."""
     return _code(coder, model, None)
 
 
 def _code(coder: Coder, model: Model, side: SideInfo | None) -> SideInfo:
     mean_index = -1
     try:
-        mean_index = _mean(coder, model, side.mean_index if side else 0)
-        step = side.step if side else 0
-        found = 2 * _number(coder, 2, step >> 1) + _bit(coder, step & 1, _ODD_STEP)
+        mean_index = _code_mean(coder, model, side.mean_index if side else 0)
+        step = side.start_step if side else 0
+        start_step = 2 * _code_number(coder, 2, step >> 1) + _code_bit(coder, step & 1, _ODD_STEP)
         extra = 0
-        while extra < MAX_EXTRA and _bit(coder, int(side is not None and extra < side.extra), _RARE):
+        while extra < MAX_EXTRA_PLANES and _code_bit(coder, int(side is not None and extra < side.extra_planes), _RARE):
             extra += 1
-        box = None
-        if _bit(coder, int(side is not None and side.box is not None), _RARE):
-            corners = (side.box.top, side.box.left, side.box.bottom, side.box.right) if side and side.box else (0,) * 4
-            top, left, bottom, right = (_number(coder, 4, n) for n in corners)
-            box = Box(min(top, bottom), min(left, right), max(top, bottom), max(left, right))
-        grain = None
-        if _bit(coder, int(side is not None and side.grain is not None), _RARE):
-            given = side.grain if side and side.grain else (0,) * GRAIN_BANDS
-            grain = tuple(_number(coder, 4, n) for n in given)
-        return SideInfo(mean_index, found, box, grain, extra)
+        region = None
+        if _code_bit(coder, int(side is not None and side.region is not None), _RARE):
+            given = side.region if side else None
+            corners = (given.top, given.left, given.bottom, given.right) if given else (0,) * 4
+            top, left, bottom, right = (_code_number(coder, 4, n) for n in corners)
+            region = RegionOfInterest(min(top, bottom), min(left, right), max(top, bottom), max(left, right))
+        texture = None
+        if _code_bit(coder, int(side is not None and side.texture is not None), _RARE):
+            levels = side.texture if side and side.texture else (0,) * TEXTURE_BANDS
+            texture = tuple(_code_number(coder, 4, n) for n in levels)
+        return SideInfo(mean_index, start_step, region, texture, extra)
     except _EndOfStreamError:
         return SideInfo(mean_index, -1)
 
 
-def _bit(coder: Coder, bit: int, chance: int = 32768) -> int:
-    found = coder.plain(bit, chance)
-    if found < 0:
+def _code_bit(coder: Coder, bit: int, probability: int = 32768) -> int:
+    coded = coder.code_bit(bit, probability)
+    if coded < 0:
         raise _EndOfStreamError
-    return found
+    return coded
 
 
-def _number(coder: Coder, bits: int, value: int) -> int:
-    found = 0
+def _code_number(coder: Coder, bits: int, value: int) -> int:
+    coded = 0
     for place in range(bits - 1, -1, -1):
-        found = 2 * found + _bit(coder, value >> place & 1)
-    return found
+        coded = 2 * coded + _code_bit(coder, value >> place & 1)
+    return coded
 
 
-def _mean(coder: Coder, model: Model, mean_index: int) -> int:
+def _code_mean(coder: Coder, model: Model, mean_index: int) -> int:
     node = 1
     for place in range(5, -1, -1):
-        node = 2 * node + _bit(coder, mean_index >> place & 1, int(model.mean_tree[node]))
+        node = 2 * node + _code_bit(coder, mean_index >> place & 1, int(model.mean_tree[node]))
     return node - 64

@@ -1,25 +1,31 @@
-"""The 9/7 wavelet and a cosine transform of its lowest band, in integers.
+"""The wavelet transform of `emb`, in integers, and the memory layout of its coefficients.
 
-Lifting steps of Daubechies and Sweldens, "Factoring wavelet transforms into lifting steps" (1998), with 14-bit
-constants and symmetric extension at the borders; any side from one pixel up. Scaled so that both transforms are
-orthonormal to within a few per cent: an error in a coefficient is the same error in the picture. Values are 1/64 grey.
+The transform is the 9/7 wavelet with a cosine transform of its lowest band. Lifting steps of Daubechies and Sweldens,
+"Factoring wavelet transforms into lifting steps" (1998), with 14-bit constants and symmetric extension at the borders.
+Any side from one pixel is possible. Both transforms are orthonormal to within a few per cent: an error in a coefficient
+is the same error in the image. Values are 1/64 grey.
+
+The layout stores all bands one after the other in one flat array. Each band has a border of `BORDER` zero cells, so a
+neighbour outside the band reads as not significant without a test.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb._jit import jit
-from sonarpost.codec.emb.layout import Layout
+from sonarpost.codec.jit import jit
 
+I32 = npt.NDArray[np.int32]
 Plane = npt.NDArray[np.int64]
 
 UNIT: Final = 64
-"""Steps of a grey value."""
+"""Steps of a grey level."""
 FRACTION_BITS: Final = 14
 _ROUND: Final = 1 << (FRACTION_BITS - 1)
 # The constants times 2^14, rounded.
@@ -27,23 +33,132 @@ ALPHA: Final = -25987
 BETA: Final = -868
 GAMMA: Final = 14466
 DELTA: Final = 7266
-GAIN: Final = 18834  # 1.14954: makes a low-pass output as strong as its input's mean times sqrt(2)
+GAIN: Final = 18834  # 1.14954: the low-pass output is the mean of its input times sqrt(2)
 GAIN_INVERSE: Final = 14253
-
-
-# Strength in the picture of a coefficient's error, by level (the last for all above) and orientation LL, HL, LH, HH, in
-# 1/1024; coefficients are multiplied by it, so that one threshold is right for all.
-STRENGTHS: Final = (
+# Gain of a coefficient's error in the image, in 1/1024, by level (the last for all above) and orientation LL, HL, LH,
+# HH. Coefficients are multiplied by it, so that one threshold suits all of them.
+BAND_GAINS: Final = (
     (1024, 1035, 1035, 1065),
     (1024, 1023, 1023, 990),
     (1024, 1071, 1071, 1065),
     (1243, 1097, 1097, 1109),
 )
 
+BORDER: Final = 2
+LL, HL, LH, HH = 0, 1, 2, 3
+
+# Columns of the band table.
+(
+    OFFSET,
+    STRIDE,
+    HEIGHT,
+    WIDTH,
+    LEVEL,
+    ORIENT,
+    PARENT,
+    SIBLING_1,
+    SIBLING_2,
+    CHILD,
+    LOW,
+    NEXT_1,
+    NEXT_2,
+    COUSIN_1,
+    COUSIN_2,
+) = range(15)
+"""OFFSET: flat index of cell (0, 0). LEVEL: 1 is the finest. LOW: start of the level's low-pass image in the array of
+low-pass images. The others are rows of the table, -1 for none: SIBLING_1, SIBLING_2, bands of the same level coded
+earlier; NEXT_1, NEXT_2, bands of the same level coded later; COUSIN_1, COUSIN_2, siblings of the parent."""
+
+
+def level_count(height_px: int, width_px: int) -> int:
+    """Return the number of wavelet levels. The lowest band then has at most 10 cells a side."""
+    longest = max(height_px, width_px)
+    return 4 if longest <= 160 else 5 if longest <= 320 else 6
+
+
+def cells_of(band: list[int]) -> Plane:
+    """Return the flat index of each cell of a band, shape (height, width), from its row of the table."""
+    return np.asarray(band[OFFSET] + np.arange(band[HEIGHT])[:, None] * band[STRIDE] + np.arange(band[WIDTH]), np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Memory layout of the coefficients of an image size.
+
+    Attributes:
+        height_px: Rows of the image.
+        width_px: Columns of the image.
+        levels: Number of wavelet levels.
+        bands: Shape (1 + 3 * levels, 15), int32: the band table, in coding order (coarse to fine).
+        cells: Length of the flat array of coefficients.
+        position: Shape (height_px, width_px), int64: flat index of each cell of the usual square layout.
+        sides: Shape (levels + 1, 2), int32: height and width of the low-pass image of each level; level 0 is the image.
+        low_offsets: Shape (levels + 1,), int64: start of each low-pass image, which has a border of one cell.
+        low_cells: Length of the array of low-pass images.
+    """
+
+    height_px: int
+    width_px: int
+    levels: int
+    bands: I32
+    cells: int
+    position: Plane
+    sides: I32
+    low_offsets: Plane
+    low_cells: int
+
+
+@lru_cache(maxsize=8)
+def layout_of(height_px: int, width_px: int) -> Layout:
+    """Return the layout of an image size."""
+    levels = level_count(height_px, width_px)
+    sides = [(height_px, width_px)]
+    for _ in range(levels):
+        sides.append(((sides[-1][0] + 1) // 2, (sides[-1][1] + 1) // 2))
+    low_offsets = np.zeros(levels + 1, np.int64)
+    low_cells = 0
+    for level in range(1, levels + 1):
+        low_offsets[level] = low_cells
+        low_cells += (sides[level][0] + 2) * (sides[level][1] + 2)
+    table: list[tuple[int, ...]] = []
+    position, cells = np.zeros((height_px, width_px), np.int64), 0
+    for level, orient in [(levels, LL), *((lv, o) for lv in range(levels, 0, -1) for o in (HL, LH, HH))]:
+        low_h, low_w = sides[level]
+        height, width = sides[level - 1]
+        top, left = (low_h if orient in (LH, HH) else 0), (low_w if orient in (HL, HH) else 0)
+        rows = height - low_h if orient in (LH, HH) else low_h
+        columns = width - low_w if orient in (HL, HH) else low_w
+        stride = columns + 2 * BORDER
+        offset = cells + BORDER * stride + BORDER
+        cells += (rows + 2 * BORDER) * stride
+        row = len(table)
+        parent = -1 if orient == LL or level == levels else row - 3
+        child = -1 if orient == LL or level == 1 else row + 3
+        first = -1 if orient in (LL, HL) else row - (orient - 1)
+        second = row - 1 if orient == HH else -1
+        following = (-1, -1) if orient == LL else ((row + 1, row + 2), (row + 1, -1), (-1, -1))[orient - 1]
+        cousins = (-1, -1) if parent < 0 else tuple(parent - orient + o for o in (HL, LH, HH) if o != orient)
+        low = int(low_offsets[level])
+        table.append(
+            (offset, stride, rows, columns, level, orient, parent, first, second, child, low, *following, *cousins)
+        )
+        position[top : top + rows, left : left + columns] = cells_of(list(table[-1]))
+    return Layout(
+        height_px,
+        width_px,
+        levels,
+        np.array(table, np.int32),
+        cells,
+        position,
+        np.array(sides, np.int32),
+        low_offsets,
+        low_cells,
+    )
+
 
 @jit
 def _lift(line: Plane, n: int, first: int, constant: int) -> None:
-    """Add to every second value, from `first` on, its two neighbours times a constant; mirrored at the ends."""
+    """Add to every second value, from `first`, its two neighbours times a constant; mirrored at the ends."""
     for i in range(first, n, 2):
         left = line[i - 1] if i > 0 else line[i + 1]
         right = line[i + 1] if i + 1 < n else line[i - 1]
@@ -69,7 +184,7 @@ def _analyse(line: Plane, n: int, scratch: Plane) -> None:
 
 @jit
 def synthesise_line(line: Plane, n: int, scratch: Plane) -> None:
-    """Undo one level of the wavelet on the first `n` values of a line, in place; `scratch` is at least as long."""
+    """Invert one level of the wavelet on the first `n` values of a line, in place. `scratch` is at least as long."""
     if n == 1:
         return
     low = (n + 1) // 2
@@ -86,7 +201,7 @@ def synthesise_line(line: Plane, n: int, scratch: Plane) -> None:
 
 
 @jit
-def _forward(plane: Plane, sides: npt.NDArray[np.int32]) -> None:
+def _forward(plane: Plane, sides: I32) -> None:
     line = np.zeros(max(plane.shape), np.int64)
     scratch = np.zeros(max(plane.shape), np.int64)
     for level in range(sides.shape[0] - 1):
@@ -102,10 +217,8 @@ def _forward(plane: Plane, sides: npt.NDArray[np.int32]) -> None:
 
 
 @jit
-def _inverse(
-    plane: Plane, sides: npt.NDArray[np.int32], down_to: int, lows: npt.NDArray[np.int32], offsets: Plane
-) -> None:
-    """Undo the levels above `down_to`; keep the low-pass picture of every level met, its border repeated."""
+def _inverse(plane: Plane, sides: I32, down_to: int, lows: I32, offsets: Plane) -> None:
+    """Invert the levels above `down_to`; store the low-pass image of each level, with repeated border."""
     line = np.zeros(max(plane.shape), np.int64)
     scratch = np.zeros(max(plane.shape), np.int64)
     for level in range(sides.shape[0] - 1, down_to - 1, -1):
@@ -129,7 +242,7 @@ def _inverse(
 
 @lru_cache(maxsize=64)
 def cosine_matrix(n: int) -> Plane:
-    """Return the orthonormal cosine transform of length `n`, rounded to 14 bits, by integer arithmetic alone.
+    """Return the orthonormal cosine transform of length `n`, rounded to 14 bits, by integer arithmetic only.
 
     Row k holds sqrt(2 / n) cos(pi (2 i + 1) k / 2n), row 0 sqrt(1 / n).
     """
@@ -137,20 +250,20 @@ def cosine_matrix(n: int) -> Plane:
     pi = 3622009729038561421  # round(pi * 2^60)
     matrix = np.zeros((n, n), np.int64)
     for k in range(n):
-        # Norm as a rational square: value = cos * sqrt(c / n); both squares are exact integers until the last step.
-        share = 1 if k == 0 else 2
+        # value = cos * sqrt(numerator / n). Squares are exact integers until the last step.
+        numerator = 1 if k == 0 else 2
         for i in range(n):
             quarter_turns, rest = divmod((2 * i + 1) * k, n)
             cosine = _cos(pi * rest // (2 * n), one)
             sine = _cos(pi * (n - rest) // (2 * n), one)
             value = (cosine, -sine, -cosine, sine)[quarter_turns % 4]
-            square = value * value * share // n
+            square = value * value * numerator // n
             matrix[k, i] = _rounded_root(square, 60 - FRACTION_BITS) * (1 if value > 0 else -1)
     return matrix
 
 
 def _cos(angle: int, one: int) -> int:
-    """Cosine of `angle` / `one` for 0..pi/2 by its series, scaled by `one`."""
+    """Return the cosine of `angle` / `one` for 0..pi/2 by its series, scaled by `one`."""
     term = total = one
     for m in range(1, 14):
         term = -(term * angle // one) * angle // one // ((2 * m - 1) * (2 * m))
@@ -159,88 +272,78 @@ def _cos(angle: int, one: int) -> int:
 
 
 def _rounded_root(square: int, drop_bits: int) -> int:
-    """Square root, without its last `drop_bits` bits, rounded."""
-    root = _integer_root(square)
-    return (root + (1 << (drop_bits - 1))) >> drop_bits
-
-
-def _integer_root(square: int) -> int:
-    guess = 1 << ((square.bit_length() + 1) // 2)
-    while True:
-        better = (guess + square // guess) // 2 if guess else 0
-        if better >= guess:
-            return guess
-        guess = better
+    """Return the square root without its last `drop_bits` bits, rounded."""
+    return (math.isqrt(square) + (1 << (drop_bits - 1))) >> drop_bits
 
 
 def _matrix_step(matrix: Plane, plane: Plane) -> Plane:
     return (matrix @ plane + _ROUND) >> FRACTION_BITS
 
 
-def forward(picture: Plane, lay: Layout) -> Plane:
-    """Return the coefficients of a picture in the usual square layout.
+def forward(image: Plane, layout: Layout) -> Plane:
+    """Return the coefficients of an image in the usual square layout.
 
     Args:
-        picture: Shape (height_px, width_px), int64, in 1/64 grey, with its mean level taken off.
-        lay: The picture's layout.
+        image: Shape (height_px, width_px), int64, in 1/64 grey, minus its mean level.
+        layout: Layout of the image.
     """
-    plane = np.ascontiguousarray(picture, np.int64).copy()
-    _forward(plane, lay.sides)
-    height, width = (int(n) for n in lay.sides[lay.levels])
+    plane = np.ascontiguousarray(image, np.int64).copy()
+    _forward(plane, layout.sides)
+    height, width = (int(n) for n in layout.sides[layout.levels])
     low = _matrix_step(cosine_matrix(height), plane[:height, :width])
     plane[:height, :width] = _matrix_step(cosine_matrix(width), low.T).T
     return plane
 
 
-def inverse(coefficients: Plane, lay: Layout, down_to: int = 0) -> tuple[Plane, npt.NDArray[np.int32]]:
-    """Return the picture and the low-pass pictures on the way to it.
+def inverse(coefficients: Plane, layout: Layout, down_to: int = 0) -> tuple[Plane, I32]:
+    """Return the image and its low-pass images.
 
     Args:
         coefficients: Shape (height_px, width_px), int64, in the usual square layout.
-        lay: The picture's layout.
-        down_to: The level to stop at; 0 gives the picture.
+        layout: Layout of the image.
+        down_to: Level of the result; 0 gives the image.
 
     Returns:
-        The plane, of which the top left holds the low-pass picture of level `down_to`; and all low-pass pictures from
-        that level up, at `lay.low_offsets`, each with a border of one cell, int32.
+        The plane, with the low-pass image of level `down_to` at its top left; and all low-pass images from that level
+        up, at `layout.low_offsets`, each with a border of one cell, int32.
     """
     plane = coefficients.astype(np.int64, copy=True)
-    height, width = (int(n) for n in lay.sides[lay.levels])
+    height, width = (int(n) for n in layout.sides[layout.levels])
     low = _matrix_step(cosine_matrix(width).T, plane[:height, :width].T).T
     plane[:height, :width] = _matrix_step(cosine_matrix(height).T, low)
-    lows = np.zeros(lay.low_cells, np.int32)
-    _inverse(plane, lay.sides, down_to, lows, lay.low_offsets)
+    lows = np.zeros(layout.low_cells, np.int32)
+    _inverse(plane, layout.sides, down_to, lows, layout.low_offsets)
     return plane, lows
 
 
 @lru_cache(maxsize=8)
-def strength_map(lay: Layout) -> Plane:
-    """Return the strength of every coefficient in the flat layout, in 1/1024."""
-    strengths = np.full(lay.cells, 1024, np.int64)
-    for offset, stride, rows, columns, level, orient, *_ in lay.bands.tolist():
+def gain_map(layout: Layout) -> Plane:
+    """Return the gain of every coefficient in the flat layout, in 1/1024."""
+    gains = np.full(layout.cells, 1024, np.int64)
+    for offset, stride, rows, columns, level, orient, *_ in layout.bands.tolist():
         if rows and columns:
-            strengths[offset : offset + rows * stride] = STRENGTHS[min(level, 4) - 1][orient]
-    return strengths
+            gains[offset : offset + rows * stride] = BAND_GAINS[min(level, 4) - 1][orient]
+    return gains
 
 
-def to_flat(plane: Plane, lay: Layout) -> npt.NDArray[np.int32]:
-    """Return coefficients in the flat layout, weighted by their strength, int32."""
-    flat = np.zeros(lay.cells, np.int64)
-    flat[lay.position] = plane
-    return ((flat * strength_map(lay) + 512) >> 10).astype(np.int32)
+def to_flat(plane: Plane, layout: Layout) -> I32:
+    """Return coefficients in the flat layout, multiplied by their gains, int32."""
+    flat = np.zeros(layout.cells, np.int64)
+    flat[layout.position] = plane
+    return ((flat * gain_map(layout) + 512) >> 10).astype(np.int32)
 
 
-def from_flat(flat: npt.NDArray[np.int32], lay: Layout) -> Plane:
-    """Undo `to_flat`."""
-    out = np.zeros(lay.position.shape, np.int64)
-    _place(flat, strength_map(lay), lay.position, out)
+def from_flat(flat: I32, layout: Layout) -> Plane:
+    """Invert `to_flat`."""
+    out = np.zeros(layout.position.shape, np.int64)
+    _place(flat, gain_map(layout), layout.position, out)
     return out
 
 
 @jit
-def _place(flat: npt.NDArray[np.int32], strengths: Plane, position: Plane, out: Plane) -> None:
+def _place(flat: I32, gains: Plane, position: Plane, out: Plane) -> None:
     for y in range(out.shape[0]):
         for x in range(out.shape[1]):
             at = position[y, x]
             value = np.int64(flat[at])
-            out[y, x] = (value * 1024 + (strengths[at] >> 1)) // strengths[at] if value != 0 else 0
+            out[y, x] = (value * 1024 + (gains[at] >> 1)) // gains[at] if value != 0 else 0

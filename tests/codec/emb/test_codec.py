@@ -1,4 +1,4 @@
-"""The embedded codec beyond the contract: every prefix, exact agreement, damage, other models."""
+"""The codec emb: prefixes, damage, models, transform."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost.codec.emb import transform
+from sonarpost.codec.emb import MODEL_FILES, transform
 from sonarpost.codec.emb.codec import EmbCodec
-from sonarpost.codec.emb.layout import layout
-from sonarpost.codec.emb.model import SHIPPED, all_shipped, parse, shipped
+from sonarpost.codec.emb.model import parse, shipped_models
+from sonarpost.codec.emb.transform import layout_of
 from sonarpost.codec.interface import StreamHeader, model_tag
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.codec.registry import default_registry
 from sonarpost.errors import StreamError
 
 CODEC = EmbCodec()
 
 
 def contact(height_px: int = 80, width_px: int = 80, seed: int = 0) -> np.ndarray:
-    """Speckled slope with a highlight and a shadow."""
+    """Return a speckled slope with a highlight and a shadow."""
     rng = np.random.default_rng(seed)
     image = (50 + 30 * np.linspace(0, 1, width_px)) * rng.gamma(6, 1 / 6, (height_px, width_px))
     image[height_px // 3 : height_px // 2, width_px // 4 : width_px // 2] *= 3
@@ -32,12 +32,12 @@ def contact(height_px: int = 80, width_px: int = 80, seed: int = 0) -> np.ndarra
 
 
 @pytest.mark.parametrize("budget", [6, 7, 22, 23, 64, 200, 512])
-def test_a_budget_is_used_and_never_exceeded(budget: int) -> None:
+def test_budget_is_used_completely(budget: int) -> None:
     stream = CODEC.encode(contact(), budget)
     assert len(stream) == budget
 
 
-def test_every_prefix_decodes_and_longer_ones_do_not_get_much_worse() -> None:
+def test_longer_prefixes_are_not_much_worse() -> None:
     image = contact(64, 56)
     stream = CODEC.encode(image, 160)
     quality = []
@@ -51,30 +51,29 @@ def test_every_prefix_decodes_and_longer_ones_do_not_get_much_worse() -> None:
     assert np.all(best - quality < 0.35)
 
 
-def test_a_prefix_of_a_long_stream_decides_only_what_the_whole_confirms() -> None:
-    """Whatever follows a prefix, the decoder never had to take anything back: no decision came from bytes not there."""
+def test_decisions_of_a_prefix_hold_for_every_continuation() -> None:
     stream = CODEC.encode(contact(48, 48), 120)
     for length in range(8, 60, 5):
-        states = [_known(stream[:length] + tail) for tail in (b"", bytes(40), b"\xff" * 40, stream[length:])]
+        states = [_coefficients(stream[:length] + tail) for tail in (b"", bytes(40), b"\xff" * 40, stream[length:])]
         short = states[0]
         significant = short[0] > 0
-        for values, signs in states[1:]:
-            assert np.all(values[significant] >= short[0][significant])
+        for lower, signs in states[1:]:
+            assert np.all(lower[significant] >= short[0][significant])
             assert np.array_equal(signs[significant], short[1][significant])
 
 
-def _known(stream: bytes) -> tuple[np.ndarray, np.ndarray]:
-    state, _ = CODEC.read_state(stream)
-    return state.values, state.signs
+def _coefficients(stream: bytes) -> tuple[np.ndarray, np.ndarray]:
+    state, _ = CODEC.read_coefficients(stream)
+    return state.lower, state.signs
 
 
-def test_more_bytes_are_a_better_picture() -> None:
+def test_quality_increases_with_the_budget() -> None:
     image = contact()
     quality = [psnr_db(image, CODEC.decode(CODEC.encode(image, n)).image) for n in (12, 22, 44, 88, 176, 352, 704)]
     assert quality == sorted(quality)
 
 
-def test_the_whole_budget_reaches_far() -> None:
+def test_long_stream_has_high_quality() -> None:
     image = contact(32, 32)
     stream = CODEC.encode(image, 4000)
     assert len(stream) < 2000
@@ -82,7 +81,7 @@ def test_the_whole_budget_reaches_far() -> None:
 
 
 @pytest.mark.parametrize("grey", [0, 3, 128, 255])
-def test_flat_pictures_cost_almost_nothing(grey: int) -> None:
+def test_flat_images_need_few_bytes(grey: int) -> None:
     image = np.full((80, 80), grey, np.uint8)
     stream = CODEC.encode(image, 64)
     assert len(stream) < 40
@@ -90,8 +89,8 @@ def test_flat_pictures_cost_almost_nothing(grey: int) -> None:
 
 
 @pytest.mark.parametrize("size", [(80, 80), (512, 512), (300, 40)])
-def test_half_black_half_white(size: tuple[int, int]) -> None:
-    """The largest coefficients there are: they need planes above the usual first one."""
+def test_half_black_half_white_image(size: tuple[int, int]) -> None:
+    """The largest possible coefficients need planes above the usual first one."""
     image = np.zeros(size, np.uint8)
     image[:, size[1] // 2 :] = 255
     assert psnr_db(image, CODEC.decode(CODEC.encode(image, 256)).image) > 26
@@ -105,7 +104,7 @@ def test_half_black_half_white(size: tuple[int, int]) -> None:
     budget=st.integers(10, 90),
 )
 @settings(max_examples=40, deadline=None)
-def test_any_picture_comes_back_near(height_px: int, width_px: int, seed: int, contrast: int, budget: int) -> None:
+def test_error_of_any_image_is_bounded(height_px: int, width_px: int, seed: int, contrast: int, budget: int) -> None:
     rng = np.random.default_rng(seed)
     image = (rng.integers(0, contrast + 1, (height_px, width_px)) + rng.integers(0, 256 - contrast)).astype(np.uint8)
     stream = CODEC.encode(image, budget)
@@ -116,21 +115,20 @@ def test_any_picture_comes_back_near(height_px: int, width_px: int, seed: int, c
     assert (error**2).mean() < 1.25 * image.astype(float).var() + 9
 
 
-def test_the_estimate_of_each_prefix_is_near_the_truth() -> None:
-    """Decision for decision the decoder knows what the encoder thought it would: else the errors would part."""
+def test_error_estimate_of_each_prefix_is_accurate() -> None:
     image = contact()
     result = CODEC.encode_with_estimate(image, 200)
     assert result.mean_square_error.shape == (201,)
     assert np.isinf(result.mean_square_error[:4]).all()
     for length in (12, 30, 64, 120, 200):
-        plain = CODEC.decode_plain(result.stream[:length])
-        error = plain.plane / 64 + plain.mean - image
+        decoded = CODEC.decode_before_enhancer(result.stream[:length])
+        error = decoded.plane / 64 + decoded.mean - image
         assert (error**2).mean() == pytest.approx(result.mean_square_error[length], rel=0.1)
     known = result.mean_square_error[6:]
     assert np.all(np.diff(known) < 0.01 * known[:-1])
 
 
-def test_lost_bytes_end_the_picture_there() -> None:
+def test_bytes_after_a_lost_byte_are_not_used() -> None:
     stream = CODEC.encode(contact(), 100)
     size = StreamHeader.unpack(stream).size
     received = np.ones(100 - size, np.bool_)
@@ -139,7 +137,7 @@ def test_lost_bytes_end_the_picture_there() -> None:
     zeroed[size + 40] = 0
     decoded = CODEC.decode(bytes(zeroed), received)
     assert np.array_equal(decoded.image, CODEC.decode(stream[: size + 40]).image)
-    assert "57 of 97 bytes" in decoded.notes[0]
+    assert "body byte 40 of 97 did not arrive" in decoded.notes[0]
     nothing = CODEC.decode(stream, np.zeros(97, np.bool_))
     assert nothing.missing.all()
     assert not nothing.image.any()
@@ -147,63 +145,62 @@ def test_lost_bytes_end_the_picture_there() -> None:
         CODEC.decode(stream, np.ones(5, np.bool_))
 
 
-def test_other_codecs_models_and_small_budgets_are_refused() -> None:
+def test_unknown_models_and_small_budgets_are_rejected() -> None:
     stream = bytearray(CODEC.encode(contact(), 40))
     with pytest.raises(StreamError, match="codec_id"):
-        CODEC.decode(bytes([0x21]) + bytes(stream[1:]))
-    with pytest.raises(StreamError, match="not at hand"):
+        CODEC.decode(bytes([0x22]) + bytes(stream[1:]))
+    with pytest.raises(StreamError, match="does not have"):
         CODEC.decode(bytes([stream[0], stream[1] ^ 1]) + bytes(stream[2:]))
     for budget in (-1, 0, 3, 5):
         with pytest.raises(StreamError, match="budget_bytes"):
             CODEC.encode(contact(), budget)
 
 
-def test_the_model_file_is_checked() -> None:
+def test_invalid_model_files_are_rejected() -> None:
     from importlib.resources import files
 
-    for name, model in zip(SHIPPED, all_shipped(), strict=True):
+    for name, model in zip(MODEL_FILES["standard"], shipped_models(), strict=True):
         raw = files("sonarpost.codec.emb").joinpath("data", name).read_bytes()
         assert parse(raw).identity == hashlib.sha256(raw).hexdigest() == model.identity
         with pytest.raises(StreamError, match="magic"):
             parse(b"x" + raw)
         with pytest.raises(StreamError, match="length"):
             parse(raw[:-1])
-    assert CODEC.model_hash == shipped().identity == all_shipped()[0].identity
+    assert CODEC.model_hash == shipped_models()[0].identity
 
 
-def test_models_of_the_package_have_tags_of_their_own() -> None:
-    tags = [model_tag(CODEC.codec_id, model.identity) for model in all_shipped()]
+def test_shipped_models_have_different_tags() -> None:
+    tags = [model_tag(CODEC.codec_id, model.identity) for model in shipped_models()]
     assert len(set(tags)) == len(tags)
 
 
-def test_streams_of_an_earlier_model_are_read_and_go_on() -> None:
-    """A vehicle may be older or newer than its vessel."""
-    old = EmbCodec(all_shipped()[-1])
+def test_streams_of_an_earlier_model_are_decoded_and_extended() -> None:
+    """Vehicle and vessel may have different releases."""
+    old = EmbCodec(shipped_models()[-1])
     image = contact()
     stream = old.encode(image, 64)
     assert stream[:1] == CODEC.encode(image, 64)[:1]
     assert stream[1] != CODEC.encode(image, 64)[1]
     assert np.array_equal(CODEC.decode(stream).image, old.decode(stream).image)
-    assert np.array_equal(CODEC.decode_plain(stream).plane, old.decode_plain(stream).plane)
+    assert np.array_equal(CODEC.decode_before_enhancer(stream).plane, old.decode_before_enhancer(stream).plane)
     longer = CODEC.extend(stream, image, 160)
     assert longer == old.extend(stream, image, 160)
     assert len(longer) > 150
     assert longer.startswith(stream[:-1])
-    found = default_registry().create_for_stream(stream, CodecResources())
+    found = default_registry().create_for_stream(stream)
     assert found.model_hash == old.model_hash != CODEC.model_hash
 
 
-def test_weights_decide_the_bytes() -> None:
-    """A model with one weight changed is another code: the networks are really in use."""
-    model = shipped()
+def test_stream_depends_on_the_weights() -> None:
+    model = shipped_models()[0]
     b3 = model.b3.copy()
     b3[0] += 1 << 19
     other = EmbCodec(replace(model, b3=b3))
     assert other.encode(contact(), 64) != CODEC.encode(contact(), 64)
 
 
-def test_accumulators_hold_the_largest_sums() -> None:
-    for model in all_shipped():
+def test_accumulators_do_not_overflow() -> None:
+    for model in shipped_models():
         first = 290 * np.abs(model.w1.astype(np.int64)).sum(1) + np.abs(model.b1)
         second = 4095 * np.abs(model.w2.astype(np.int64)).sum(1) + np.abs(model.b2)
         sign = 96 * np.abs(model.sign_w1.astype(np.int64)).sum(1) + np.abs(model.sign_b1)
@@ -211,15 +208,15 @@ def test_accumulators_hold_the_largest_sums() -> None:
 
 
 @pytest.mark.parametrize("size", [(16, 16), (17, 33), (80, 80), (140, 80), (16, 512), (301, 127)])
-def test_the_transform_is_undone(size: tuple[int, int]) -> None:
-    lay = layout(*size)
+def test_transform_is_invertible(size: tuple[int, int]) -> None:
+    layout = layout_of(*size)
     plane = np.random.default_rng(1).integers(-8000, 8000, size)
-    flat = transform.to_flat(transform.forward(plane, lay), lay)
-    back, _ = transform.inverse(transform.from_flat(flat, lay), lay)
-    assert np.abs(back - plane).max() <= 16  # a quarter of a grey value
+    flat = transform.to_flat(transform.forward(plane, layout), layout)
+    back, _ = transform.inverse(transform.from_flat(flat, layout), layout)
+    assert np.abs(back - plane).max() <= 16  # 1/4 grey level
 
 
-def test_the_cosine_matrix_is_the_cosine_transform() -> None:
+def test_cosine_matrix_matches_its_definition() -> None:
     for n in range(1, 11):
         k, i = np.mgrid[:n, :n]
         exact = np.cos(np.pi * (2 * i + 1) * k / (2 * n)) * np.sqrt(np.where(k == 0, 1, 2) / n)

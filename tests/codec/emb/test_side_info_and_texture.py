@@ -1,0 +1,237 @@
+"""Side information, region of interest, invalid pixels, speckle, and the golden streams of emb."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders.common import GOLDEN_FOLDER
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.codec.emb.coder import Coder
+from sonarpost.codec.emb.encode import fill_invalid
+from sonarpost.codec.emb.model import shipped_models
+from sonarpost.codec.emb.side_info import (
+    INSIDE_WEIGHT,
+    UNIT_WEIGHT,
+    RegionOfInterest,
+    SideInfo,
+    read_side_info,
+    region_weights,
+    write_side_info,
+)
+from sonarpost.codec.emb.speckle_synthesis import measure_speckle, synthesise_speckle
+from sonarpost.codec.emb.transform import layout_of
+from sonarpost.codec.interface import StreamHeader
+from sonarpost.errors import StreamError
+
+GOLDEN = GOLDEN_FOLDER / "emb"
+FIRST, OPTIMISED, SECOND, STRUCTURE = (
+    GOLDEN / name for name in ("streams.json", "streams_fitted.json", "streams_second.json", "streams_structure.json")
+)
+"""Streams of the first encoder, of the encoder with optimised targets, of the second model, of the structure model."""
+CODEC = EmbCodec()
+MODEL = shipped_models()[0]
+
+
+def speckled(height_px: int = 80, width_px: int = 80, seed: int = 3) -> np.ndarray:
+    """Return gravel with a highlight and a shadow, from integer random numbers: the same on every machine."""
+    rng = np.random.default_rng(seed)
+    image = rng.integers(40, 110, (height_px, width_px)) + rng.integers(0, 60, (height_px, width_px))
+    image[height_px // 3 : height_px // 2, width_px // 4 : width_px // 2] += 80
+    image[height_px // 3 : height_px // 2, width_px // 2 : width_px * 3 // 4] //= 8
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def pixels_of(region: RegionOfInterest, size: int = 80) -> tuple[slice, slice]:
+    edge = size // 16
+    return slice(region.top * edge, (region.bottom + 1) * edge), slice(region.left * edge, (region.right + 1) * edge)
+
+
+@given(
+    mean_index=st.integers(0, 63),
+    step=st.integers(0, 7),
+    corners=st.none() | st.tuples(*[st.integers(0, 15)] * 4),
+    texture=st.none() | st.tuples(*[st.integers(0, 15)] * 8),
+    extra=st.integers(0, 6),
+)
+def test_side_information_round_trips_and_truncates(
+    mean_index: int,
+    step: int,
+    corners: tuple[int, int, int, int] | None,
+    texture: tuple[int, ...] | None,
+    extra: int,
+) -> None:
+    region = None
+    if corners:
+        (top, bottom), (left, right) = sorted(corners[:2]), sorted(corners[2:])
+        region = RegionOfInterest(top, left, bottom, right)
+    side = SideInfo(mean_index, step, region, texture, extra)
+    coder = Coder.writer(40)
+    write_side_info(coder, MODEL, side)
+    body = coder.finish()
+    assert len(body) <= 3 + 2 * (region is not None) + 4 * (texture is not None) + 3 + 5
+    assert read_side_info(Coder.reader(body), MODEL) == side
+    for length in range(len(body)):
+        part = read_side_info(Coder.reader(body[:length]), MODEL)
+        assert part.mean_index in (-1, mean_index)
+        assert part == side or part.start_step == -1
+
+
+def test_region_of_interest_gets_more_bits() -> None:
+    image = speckled()
+    region = RegionOfInterest.around(22, 15, 45, 64, 80, 80)
+    rows, columns = pixels_of(region)
+    errors = []
+    for chosen in (None, region):
+        decoded = CODEC.decode(CODEC.encode_with_estimate(image, 128, region=chosen).stream).image.astype(float)
+        square = (decoded - image) ** 2
+        errors.append((square[rows, columns].mean(), square.mean()))
+    assert errors[1][0] < 0.97 * errors[0][0]
+    assert errors[1][1] < 1.15 * errors[0][1]
+
+
+def test_region_weights_cover_the_region() -> None:
+    layout = layout_of(80, 80)
+    weight = region_weights(layout, RegionOfInterest(4, 4, 7, 7))
+    assert set(np.unique(weight[layout.position])) == {UNIT_WEIGHT, INSIDE_WEIGHT}
+    finest = weight[layout.position][:40, 40:]
+    assert (finest[10:20, 10:20] == INSIDE_WEIGHT).all()
+    assert (finest == INSIDE_WEIGHT).sum() == 100
+    assert (region_weights(layout, None) == UNIT_WEIGHT).all()
+
+
+@pytest.mark.parametrize("corners", [(-1, 0, 3, 3), (0, 16, 3, 16), (5, 0, 4, 3), (0, 5, 3, 4)])
+def test_regions_outside_the_image_are_rejected(corners: tuple[int, int, int, int]) -> None:
+    with pytest.raises(StreamError, match="region of interest"):
+        RegionOfInterest(*corners)
+
+
+def test_invalid_pixels_cost_few_bits() -> None:
+    image = speckled()
+    valid = np.ones(image.shape, np.bool_)
+    valid[:, 60:] = False
+    valid[10:14, :8] = False
+    with_holes = np.where(valid, image, 0).astype(np.uint8)
+    error = []
+    for mask in (None, valid):
+        decoded = CODEC.decode(CODEC.encode_with_estimate(with_holes, 100, valid=mask).stream).image.astype(float)
+        error.append(((decoded - image)[valid] ** 2).mean())
+    assert error[1] < 0.97 * error[0]
+
+
+def test_fill_keeps_valid_pixels_and_their_range() -> None:
+    image = speckled(33, 47)
+    rng = np.random.default_rng(0)
+    valid = rng.random(image.shape) < 0.3
+    filled = fill_invalid(image, valid)
+    assert np.array_equal(filled[valid], image[valid])
+    assert filled.min() >= image[valid].min()
+    assert filled.max() <= image[valid].max()
+    assert (fill_invalid(image, np.zeros_like(valid)) == 128).all()
+    assert fill_invalid(image, np.ones_like(valid)) is image
+    with pytest.raises(StreamError, match=r"valid\.shape"):
+        fill_invalid(image, valid[1:])
+
+
+def test_speckle_is_a_separate_layer() -> None:
+    image = speckled()
+    with_texture = EmbCodec(send_texture=True)
+    stream = with_texture.encode(image, 68)
+    decoded = with_texture.decode(stream).image
+    layer = CODEC.speckle_layer(stream)
+    assert layer.shape == image.shape
+    assert layer.dtype == np.int16
+    assert np.array_equal(layer, with_texture.speckle_layer(stream))
+    view = CODEC.decode_with_speckle(stream)
+    assert np.array_equal(with_texture.decode(stream).image, decoded)
+    assert np.array_equal(view, np.clip(decoded.astype(int) + (layer >> 1), 0, 255))
+    assert abs(float(layer.mean())) < 6
+    with pytest.raises(StreamError, match="texture"):
+        CODEC.speckle_layer(CODEC.encode(image, 68))
+
+
+def test_speckle_restores_the_strength_of_the_texture() -> None:
+    image = speckled()
+    layout = layout_of(80, 80)
+    levels = measure_speckle(image, layout)
+    assert len(levels) == 8
+    decoded = CODEC.decode(CODEC.encode(image, 64)).image
+    textured = np.clip(decoded + synthesise_speckle(decoded, layout, levels), 0, 255).astype(np.uint8)
+    assert abs(textured[60:].std() / image[60:].std() - 1) < 0.3
+    assert decoded[60:].std() < 0.6 * image[60:].std()
+    # Two levels are a factor of 2 in strength.
+    softer = (image.astype(int) // 2 + int(image.mean()) // 2).astype(np.uint8)
+    difference = np.array(levels[:4]) - measure_speckle(softer, layout)[:4]
+    assert np.all((difference >= 1) & (difference <= 3))
+
+
+def test_flat_image_has_no_speckle() -> None:
+    layout = layout_of(64, 64)
+    flat = np.full((64, 64), 90, np.uint8)
+    assert measure_speckle(flat, layout) == (0,) * 8
+    assert not synthesise_speckle(flat, layout, (0,) * 8).any()
+
+
+@given(seed=st.integers(0, 2**16), length=st.integers(3, 80))
+@settings(max_examples=30, deadline=None)
+def test_any_bytes_after_a_header_decode(seed: int, length: int) -> None:
+    stream = CODEC.encode(speckled(32, 48), 40)
+    header = stream[: StreamHeader.unpack(stream).size]
+    body = np.random.default_rng(seed).integers(0, 256, length, np.uint8).tobytes()
+    decoded = CODEC.decode(header + body)
+    assert decoded.image.shape == (32, 48)
+
+
+@pytest.mark.parametrize("byte", [0, 255])
+def test_extreme_bodies_decode(byte: int) -> None:
+    header = CODEC.encode(speckled(32, 48), 40)[:4]
+    header = header[: StreamHeader.unpack(header).size]
+    for length in (1, 4, 5, 50, 400):
+        assert CODEC.decode(header + bytes([byte]) * length).image.shape == (32, 48)
+
+
+def golden_cases(model: str = "standard") -> dict[str, tuple[np.ndarray, int, EmbCodec]]:
+    plain, with_texture = (EmbCodec(model, send_texture=texture) for texture in (False, True))
+    return {
+        "80x80 at 64 B": (speckled(), 64, plain),
+        "140x80 at 256 B": (speckled(140, 80), 256, plain),
+        "17x33 at 40 B": (speckled(17, 33), 40, plain),
+        "201x300 at 200 B": (speckled(201, 300), 200, plain),
+        "80x80 with grain at 68 B": (speckled(), 68, with_texture),
+    }
+
+
+def hashes(stream: bytes, codec: EmbCodec) -> dict[str, str]:
+    """Return hashes of the images of the stream and of its first half."""
+    parts = {"half": stream[: len(stream) // 2], "whole": stream}
+    out = {name: hashlib.sha256(codec.decode(part).image.tobytes()).hexdigest() for name, part in parts.items()}
+    if codec.send_texture:
+        out["grain"] = hashlib.sha256(codec.speckle_layer(stream).astype("<i2").tobytes()).hexdigest()
+    return out
+
+
+def model_of_file(file: Path) -> str:
+    return "structure" if file == STRUCTURE else "standard"
+
+
+@pytest.mark.parametrize("file", [FIRST, OPTIMISED, SECOND, STRUCTURE], ids=lambda path: path.stem)
+@pytest.mark.parametrize("name", golden_cases())
+def test_golden_streams_of_every_encoder_and_model_are_decoded(name: str, file: Path) -> None:
+    """The pixels are the same on every machine and in every release that has the model."""
+    golden = json.loads(file.read_text())[name]
+    stream = bytes.fromhex(golden.pop("stream"))
+    assert hashes(stream, golden_cases(model_of_file(file))[name][2]) == golden
+
+
+@pytest.mark.parametrize("file", [SECOND, STRUCTURE], ids=lambda path: path.stem)
+@pytest.mark.parametrize("name", golden_cases())
+def test_golden_streams_are_reproduced(name: str, file: Path) -> None:
+    """The bytes are the same on every machine."""
+    image, budget, codec = golden_cases(model_of_file(file))[name]
+    assert codec.encode(image, budget).hex() == json.loads(file.read_text())[name]["stream"]
