@@ -1,4 +1,4 @@
-"""What decoding may do with any bytes: refuse them with a StreamError, or give a picture that owns up to its gaps.
+"""Rules for decoding any bytes: a StreamError, or an image whose missing pixels are black.
 
 Used by the coverage-guided fuzzer (`run_atheris.py`) and by the bounded tests of the default suite.
 """
@@ -18,47 +18,47 @@ from sonarpost.codec.vq.codebook import load
 from sonarpost.errors import StreamError
 
 GOLDEN = GOLDEN_FOLDER
-GOOD_HEADER, GAP = 1, 2
-"""Flags of an input's first byte: a good header is put before the body; a stretch of the body did not arrive."""
+VALID_HEADER, GAP = 1, 2
+"""Flags in the first byte of an input: put a valid header before the body; mark a part of the body as missing."""
 PREFIX_BYTES = 6
-"""Flags, codec, row and column of the size, start and length of the gap; then the stream, or the body alone."""
+"""Flags, codec, row and column of the size, start and length of the gap; then the stream or the body."""
 
 
 @cache
 def resources() -> CodecResources:
-    """Return the golden codebook, small enough to be quick."""
+    """Return the golden codebook, which is small."""
     return CodecResources(load(GOLDEN / "vq" / "small.tiles").tiles)
 
 
 @cache
 def codec_for(codec_id: int) -> Codec:
-    """Return the codec of an id, made once: making it is not what is tested."""
+    """Return the codec of a codec id, created once."""
     return default_registry().spec_for_id(codec_id).create(replace(resources(), codec_id=codec_id))
 
 
 def codec_ids(names: Sequence[str] | None = None) -> tuple[int, ...]:
-    """Return the ids of these codecs, or of all that are installed."""
+    """Return the codec ids of these codecs, or of all installed ones."""
     registry = default_registry()
     return tuple(number for name in names or registry.names() for number in registry.spec(name).codec_ids)
 
 
-def good_header(codec_id: int, height_px: int, width_px: int) -> StreamHeader:
-    """Return a header that the codec of this id takes for one of its own."""
+def valid_header(codec_id: int, height_px: int, width_px: int) -> StreamHeader:
+    """Return a header that the codec of this id accepts."""
     return StreamHeader(codec_id, model_tag(codec_id, codec_for(codec_id).model_hash), height_px, width_px)
 
 
 def stream_of(data: bytes, ids: Sequence[int]) -> tuple[bytes, Mask | None]:
-    """Read a fuzzer's input: a stream, and which body bytes arrived (None: all).
+    """Parse the input of a fuzzer: a stream, and the mask of the body bytes that arrived (None: all).
 
     Args:
-        data: See `PREFIX_BYTES`; a shorter one is read as if zeros followed.
-        ids: Ids that a good header may have.
+        data: See `PREFIX_BYTES`; shorter data are padded with zeros.
+        ids: Codec ids for the valid header.
     """
     flags, codec, row, column, first, count = data[:PREFIX_BYTES].ljust(PREFIX_BYTES, b"\0")
     stream = data[PREFIX_BYTES:]
-    if flags & GOOD_HEADER:
+    if flags & VALID_HEADER:
         height_px, width_px = (COMMON_SIDES_PX[side % len(COMMON_SIDES_PX)] for side in (row, column))
-        stream = good_header(ids[codec % len(ids)], height_px, width_px).pack() + stream
+        stream = valid_header(ids[codec % len(ids)], height_px, width_px).pack() + stream
     if not flags & GAP:
         return stream, None
     try:
@@ -70,22 +70,22 @@ def stream_of(data: bytes, ids: Sequence[int]) -> tuple[bytes, Mask | None]:
 
 
 def check(stream: bytes, received: Mask | None, ids: Sequence[int]) -> str:
-    """Decode; return "refused", "concealed" or "whole".
+    """Decode; return "rejected", "concealed" or "complete".
 
     Raises:
-        AssertionError: What was decoded is not a picture of the header's size, or shows what it says is missing.
-        Exception: Anything but a StreamError that decoding raised.
+        AssertionError: The image does not have the header's size, or a missing pixel is not black.
+        Exception: Decoding raised something other than a StreamError.
     """
     try:
         header = StreamHeader.unpack(stream)
         if header.codec_id not in ids:
-            return "refused"
+            return "rejected"
         decoded = codec_for(header.codec_id).decode(stream, received)
     except StreamError:
-        return "refused"
+        return "rejected"
     shape = (header.height_px, header.width_px)
     assert decoded.image.shape == decoded.missing.shape == shape, (decoded.image.shape, shape)
     assert decoded.image.dtype == np.uint8
     assert decoded.missing.dtype == np.bool_
     assert not decoded.image[decoded.missing].any()
-    return "concealed" if decoded.missing.any() else "whole"
+    return "concealed" if decoded.missing.any() else "complete"

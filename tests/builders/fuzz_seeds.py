@@ -1,4 +1,4 @@
-"""Streams to start from: every golden stream, and new ones of each codec in several sizes."""
+"""Seeds for the fuzzer: all golden streams, and new streams of each codec in several sizes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from builders.codec_oracle import GAP, GOLDEN, GOOD_HEADER, PREFIX_BYTES, codec_for
+from builders.codec_oracle import GAP, GOLDEN, PREFIX_BYTES, VALID_HEADER, codec_for
 from sonarpost.codec.interface import COMMON_SIDES_PX, Codec, StreamHeader
 from sonarpost.errors import StreamError
 
@@ -24,7 +24,7 @@ def golden_streams(ids: Sequence[int]) -> Iterator[bytes]:
 
 
 def new_streams(ids: Sequence[int]) -> Iterator[bytes]:
-    """Yield streams of a speckled picture with a highlight and a shadow; what does not fit a budget is left out."""
+    """Yield streams of speckle with a highlight and a shadow, for the budgets that the codec can meet."""
     for codec_id in ids:
         codec = codec_for(codec_id)
         for size in _SIZES:
@@ -35,9 +35,9 @@ def new_streams(ids: Sequence[int]) -> Iterator[bytes]:
 
 
 def as_input(stream: bytes, flags: int, ids: Sequence[int]) -> bytes:
-    """Return the fuzzer's input that `oracle.stream_of` reads as this stream (its body, where flags ask for that)."""
+    """Return the input that `codec_oracle.stream_of` parses to this stream, or to its body, depending on the flags."""
     header = StreamHeader.unpack(stream)
-    if not flags & GOOD_HEADER:
+    if not flags & VALID_HEADER:
         return bytes([flags]) + bytes(PREFIX_BYTES - 3) + bytes([3, flags & GAP]) + stream
     sides = [
         COMMON_SIDES_PX.index(side) if side in COMMON_SIDES_PX else 0 for side in (header.height_px, header.width_px)

@@ -1,4 +1,4 @@
-"""Pictures that the tests of several codecs share."""
+"""Images for the tests of several codecs."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image as Pillow
 
 
-def picture(height_px: int, width_px: int) -> np.ndarray:
-    """Texture with a highlight and its shadow, in integers."""
+def snippet(height_px: int, width_px: int) -> np.ndarray:
+    """Return texture with a highlight and its shadow, by integer arithmetic."""
     rows, columns = np.mgrid[:height_px, :width_px]
     noise = ((rows * 7919 + columns * 104_729) * 2_654_435_761 >> 13) % 64
     image = 50 + noise + (rows + columns) % 40
@@ -20,7 +20,7 @@ def picture(height_px: int, width_px: int) -> np.ndarray:
 
 
 def sdvd_crops(data_dir: Path) -> list[np.ndarray]:
-    """The middle 120 x 120 px of every test picture (or around its target), as 80 x 80 px."""
+    """Return 120 x 120 px of every test image (its centre or its target), reduced to 80 x 80 px."""
     folder = data_dir / "snippets" / "sdvd"
     crops = []
     with (folder / "index.csv").open() as index:
@@ -32,7 +32,7 @@ def sdvd_crops(data_dir: Path) -> list[np.ndarray]:
                     else [(int(row[f"{axis}0"]) + int(row[f"{axis}1"])) // 2 for axis in "xy"]
                 )
                 left, top = (min(max(value - 60, 0), 136) for value in centre)
-                with Pillow.open(folder / "test" / "images" / row["image"]) as picture_:
-                    crop = picture_.convert("L").crop((left, top, left + 120, top + 120))
+                with Pillow.open(folder / "test" / "images" / row["image"]) as opened:
+                    crop = opened.convert("L").crop((left, top, left + 120, top + 120))
                 crops.append(np.array(crop.resize((80, 80), Pillow.Resampling.LANCZOS)))
     return crops

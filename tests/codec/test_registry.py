@@ -16,6 +16,7 @@ from sonarpost.codec.registry import (
     CodecSpec,
     default_registry,
     load_plugins,
+    present_name,
 )
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec, codebook_tag
 from sonarpost.codec.vq.tiles import TileDatabase
@@ -47,7 +48,7 @@ def plugin(name: str, value: str) -> EntryPoint:
     return EntryPoint(name, f"sonarpost_test_plugin:{value}", ENTRY_POINT_GROUP)
 
 
-def test_vq_is_there_by_name_and_by_every_id(registry: CodecRegistry) -> None:
+def test_vq_is_registered_by_name_and_by_every_codec_id(registry: CodecRegistry) -> None:
     assert "vq" in registry.names()
     image = np.random.default_rng(1).integers(0, 256, (16, 24), dtype=np.uint8)
     for packing in IndexPacking:
@@ -58,7 +59,7 @@ def test_vq_is_there_by_name_and_by_every_id(registry: CodecRegistry) -> None:
         assert np.array_equal(reader.decode(stream).image, codec.decode(stream).image)
 
 
-def test_unknown_names_and_ids_list_what_there_is(registry: CodecRegistry) -> None:
+def test_errors_for_unknown_names_and_ids_list_the_known_ones(registry: CodecRegistry) -> None:
     with pytest.raises(ConfigError, match="vq"):
         registry.create("jpg", CodecResources())
     with pytest.raises(StreamError, match=r"0x10 \(vq\)"):
@@ -67,7 +68,7 @@ def test_unknown_names_and_ids_list_what_there_is(registry: CodecRegistry) -> No
         registry.create_for_stream(b"\x10", CodecResources(TILES))
 
 
-def test_vq_without_tiles_says_what_it_needs(registry: CodecRegistry) -> None:
+def test_error_for_vq_without_tiles_names_a_codebook(registry: CodecRegistry) -> None:
     with pytest.raises(ConfigError, match="nominal-10"):
         registry.create("vq", CodecResources())
 
@@ -83,18 +84,18 @@ def test_vq_without_tiles_says_what_it_needs(registry: CodecRegistry) -> None:
         ("other", (-1,), "0..255"),
     ],
 )
-def test_a_name_or_id_is_taken_once(registry: CodecRegistry, name: str, ids: tuple[int, ...], match: str) -> None:
+def test_names_and_codec_ids_are_unique(registry: CodecRegistry, name: str, ids: tuple[int, ...], match: str) -> None:
     before = registry.names()
     with pytest.raises(ConfigError, match=match):
         registry.register(CodecSpec(name, ids, make_nothing))
     assert registry.names() == before
     if 0x90 in ids:
         with pytest.raises(StreamError):
-            registry.spec_for_id(0x90)  # a refused codec leaves nothing behind
+            registry.spec_for_id(0x90)  # a rejected codec leaves no entry
 
 
 @pytest.mark.parametrize("codec_id", [0x0F, 0x20, 0x7F])
-def test_a_codec_with_a_codebook_takes_an_id_whose_streams_can_name_it(registry: CodecRegistry, codec_id: int) -> None:
+def test_codec_with_a_codebook_needs_codec_ids_with_a_tag_of_two_bytes(registry: CodecRegistry, codec_id: int) -> None:
     with pytest.raises(ConfigError, match=r"0x10\.\.0x1f or 0x80\.\.0xff"):
         registry.register(CodecSpec("other", (0x90, codec_id), make_nothing, needs_tiles=True))
     assert "other" not in registry.names()
@@ -105,13 +106,13 @@ def test_a_codec_with_a_codebook_takes_an_id_whose_streams_can_name_it(registry:
 
 
 @pytest.mark.parametrize("codec_id", [0x14, 0x1F, 0x80, 0xFF])
-def test_a_registered_codec_with_a_codebook_finds_it_by_the_tag(registry: CodecRegistry, codec_id: int) -> None:
+def test_codec_ids_of_other_distributions_have_a_codebook_tag(registry: CodecRegistry, codec_id: int) -> None:
     registry.register(CodecSpec("other", (codec_id,), make_nothing, needs_tiles=True))
     header = StreamHeader(codec_id, codebook_tag(TILES), 16, 24)
     assert StreamHeader.unpack(header.pack()).model_tag == codebook_tag(TILES)
 
 
-def test_a_plug_in_is_registered_like_a_codec_of_ours(registry: CodecRegistry) -> None:
+def test_plugin_is_registered(registry: CodecRegistry) -> None:
     load_plugins(registry, [plugin("plugin", "PLUGIN")])
     assert "plugin" in registry.names()
     assert registry.spec_for_id(0x81) is PLUGIN
@@ -126,23 +127,33 @@ def test_a_plug_in_is_registered_like_a_codec_of_ours(registry: CodecRegistry) -
         ("another", "PLUGIN", "entry point's name"),
     ],
 )
-def test_a_wrong_plug_in_is_named(registry: CodecRegistry, name: str, value: str, match: str) -> None:
+def test_error_names_an_invalid_plugin(registry: CodecRegistry, name: str, value: str, match: str) -> None:
     with pytest.raises(ConfigError, match=match) as caught:
         load_plugins(registry, [plugin(name, value)])
     assert name in caught.value.where
 
 
-def test_the_default_registry_is_made_once() -> None:
+def test_default_registry_is_created_once() -> None:
     assert default_registry() is default_registry()
     assert "vq" in default_registry().names()
 
 
-def test_embedded_codecs_are_those_whose_beginnings_are_pictures(registry: CodecRegistry) -> None:
-    assert {name for name in registry.names() if registry.is_embedded(name)} == {"emb", "emb-structure", "spiht"}
+def test_error_for_a_retired_name_names_codec_and_model(registry: CodecRegistry) -> None:
+    with pytest.raises(ConfigError) as caught:
+        registry.create("emb-structure")
+    assert caught.value.value == "emb-structure"
+    assert 'codec = "emb", model = "structure"' in caught.value.expected
+    assert present_name("emb-structure") == "emb"
+    assert present_name("vq") == "vq"
+
+
+def test_prefixes_of_embedded_codecs_are_images(registry: CodecRegistry) -> None:
+    assert {name for name in registry.names() if registry.is_embedded(name)} == {"emb", "spiht"}
+    assert registry.is_embedded("emb-structure")  # in records of version 0.1
     assert not registry.is_embedded("nothing")
     image = np.random.default_rng(1).integers(0, 256, (32, 40), dtype=np.uint8)
-    for name in ("emb", "emb-structure", "spiht"):
-        codec = registry.create(name, CodecResources())
+    for name in ("emb", "spiht"):
+        codec = registry.create(name)
         stream = codec.encode(image, 120)
         errors = [np.abs(codec.decode(stream[:n]).image.astype(int) - image).mean() for n in (30, 120)]
         assert errors[1] < errors[0]

@@ -1,18 +1,19 @@
-"""Codecs by name (to encode) and by the id in a stream's header (to decode).
+"""Codecs by name, for encoding, and by the codec id in a stream header, for decoding.
 
-Codecs of this package are listed in `BUILTINS`. Another distribution adds its own through the entry-point group
-`sonarpost.codecs`: the entry point loads to a `CodecSpec` whose name equals the entry point's.
+`BUILTINS` lists the codecs of this package. Another distribution adds codecs through the entry-point group
+`sonarpost.codecs`: the entry point loads a `CodecSpec` with the name of the entry point.
 
-Codec ids are never reused. 0x01..0x0F have no model; 0x10..0x13 belong to vq (one for each packing); 0x80 and above are
-left to other distributions.
+Codec ids are never reused. 0x01..0x0F have no model, 0x10..0x13 belong to vq (one for each packing), 0x20 and 0x21 to
+emb (one for each kind of model). 0x80 and above are for other distributions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from typing import Final
 
 from sonarpost.codec import emb
 from sonarpost.codec.baselines.huffman import HuffmanCodec
@@ -26,37 +27,44 @@ from sonarpost.errors import ConfigError, StreamError
 
 ENTRY_POINT_GROUP = "sonarpost.codecs"
 CODEBOOK_TAG_BYTES = 2
+RETIRED_NAMES: Final[Mapping[str, tuple[str, str]]] = {
+    "emb-structure": (emb.NAME, 'codec = "emb", model = "structure" (on command lines: --codec emb --model structure)')
+}
+"""Codec names of earlier releases: the present name, and how to select the codec. Stored records may contain them."""
 
 
 @dataclass(frozen=True)
 class CodecResources:
-    """What a codec may need to be made. A codec ignores what it does not use.
+    """Options and resources for the creation of a codec. A codec ignores those that it does not use.
 
     Attributes:
         tiles: The tile database, for codecs with a codebook.
-        packing: How vq writes indices.
-        codec_id: Which of its ids the codec is wanted for; None for the one that follows from the rest. Set when a
-            stream is to be decoded.
+        packing: Format of the indices of vq.
+        model: Name of the model of emb; None: the default model.
+        codec_id: Codec id of the stream to decode; None for encoding.
+        model_tag: Model tag of the stream to decode; None for encoding.
     """
 
     tiles: TileDatabase | None = None
     packing: IndexPacking = IndexPacking.BITS14
+    model: str | None = None
     codec_id: int | None = None
     model_tag: int | None = None
 
 
 @dataclass(frozen=True)
 class CodecSpec:
-    """A codec as the registry knows it.
+    """Entry of the registry.
 
     Attributes:
-        name: Name in configurations.
-        codec_ids: Every id its streams may carry.
-        create: Makes the codec; raises ConfigError where a resource it needs is absent.
+        name: Name in configuration files.
+        codec_ids: All codec ids of its streams.
+        create: Creates the codec. Raises ConfigError if a required resource is missing.
         summary: One line for people.
-        needs_tiles: Whether `create` needs a tile database. A receiver finds it by the two bytes of its identity that a
-            stream carries, so all ids must be of the class that carries two (`interface.tag_length`).
-        is_embedded: Whether every beginning of a stream is a picture, and longer streams can begin as shorter ones do.
+        needs_tiles: Whether `create` requires a tile database. A receiver finds it by the two bytes of its identity in
+            the stream, so all codec ids must have a tag of two bytes (`interface.tag_length`).
+        has_models: Whether the option `model` selects a trained model.
+        is_embedded: Whether every prefix of a stream is an image, and longer streams can start with shorter ones.
     """
 
     name: str
@@ -64,6 +72,7 @@ class CodecSpec:
     create: Callable[[CodecResources], Codec]
     summary: str = ""
     needs_tiles: bool = False
+    has_models: bool = False
     is_embedded: bool = False
 
 
@@ -76,44 +85,34 @@ def _create_vq(resources: CodecResources) -> Codec:
     return VqCodec(resources.tiles, packing)
 
 
-def _modern_spec(wanted: StillImageFormat) -> CodecSpec:
-    summary = f"{wanted.name} at the best quality that fits, for comparison"
-    return CodecSpec(wanted.value, (wanted.codec_id,), lambda _: StillImageCodec(wanted), summary)
-
-
-def _what_is_absent(name_or_id: str | int) -> str:
-    """Return what to install for a codec that is absent because its library is, as the end of a message."""
-    absent = (
-        wanted for wanted in StillImageFormat if name_or_id in (wanted.value, wanted.codec_id) and not wanted.available
-    )
-    return "".join(f" ({wanted.value} needs {wanted.needs})" for wanted in absent)
-
-
-def _create_emb(resources: CodecResources, codec_id: int) -> Codec:
-    # It brings a compiler, which nobody else waits for.
+def _create_emb(resources: CodecResources) -> Codec:
+    # Imported lazily: these modules load numba.
     from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415
-    from sonarpost.codec.emb.model import all_shipped, all_structure  # noqa: PLC0415
+    from sonarpost.codec.emb.model import shipped_models  # noqa: PLC0415
 
-    # The first encodes, and tells a stream of a strange model so.
-    models = all_shipped() if codec_id == emb.CODEC_ID else all_structure()
-    wanted = (model for model in models if model_tag(codec_id, model.identity) == resources.model_tag)
-    return EmbCodec(next(wanted, models[0]))
+    for name, codec_id in emb.CODEC_IDS.items():
+        if codec_id == resources.codec_id:
+            models = shipped_models(name)
+            # For an unknown tag, the current model: its `decode` raises the error.
+            known = (one for one in models if model_tag(codec_id, one.identity) == resources.model_tag)
+            return EmbCodec(next(known, models[0]))
+    return EmbCodec(resources.model or emb.DEFAULT_MODEL)
 
 
-def _emb_spec(name: str, codec_id: int, summary: str) -> CodecSpec:
-    return CodecSpec(name, (codec_id,), lambda resources: _create_emb(resources, codec_id), summary, is_embedded=True)
+def _still_image_spec(image_format: StillImageFormat) -> CodecSpec:
+    summary = f"{image_format.name} at the best quality that fits, for comparison"
+    codec_ids = (image_format.codec_id,)
+    return CodecSpec(image_format.value, codec_ids, lambda _: StillImageCodec(image_format), summary)
 
 
 BUILTINS = (
-    _emb_spec(
+    CodecSpec(
         emb.NAME,
-        emb.CODEC_ID,
-        "embedded wavelet codec with learned contexts: a picture at every length, from 20 bytes up",
-    ),
-    _emb_spec(
-        emb.STRUCTURE_NAME,
-        emb.STRUCTURE_ID,
-        "the same, made for likeness of structure (MS-SSIM) instead of the least squared error",
+        tuple(emb.CODEC_IDS.values()),
+        _create_emb,
+        "embedded wavelet codec with learned contexts: an image at every length from 20 bytes",
+        has_models=True,
+        is_embedded=True,
     ),
     CodecSpec(
         "vq",
@@ -132,12 +131,17 @@ BUILTINS = (
         "set partitioning of a 9/7 wavelet, embedded (in the paper)",
         is_embedded=True,
     ),
-    *(_modern_spec(wanted) for wanted in StillImageFormat if wanted.available),
+    *(_still_image_spec(image_format) for image_format in StillImageFormat if image_format.available),
 )
 
 
+def present_name(name: str) -> str:
+    """Return the present name of a codec whose name is in a record, which an earlier release may have written."""
+    return RETIRED_NAMES.get(name, (name, ""))[0]
+
+
 class CodecRegistry:
-    """Codecs by name and by id; neither can be taken twice."""
+    """Codecs by name and by codec id. Both are unique."""
 
     def __init__(self, specs: Iterable[CodecSpec] = ()) -> None:
         self._by_name: dict[str, CodecSpec] = {}
@@ -149,8 +153,8 @@ class CodecRegistry:
         """Add a codec.
 
         Raises:
-            ConfigError: Its name or one of its ids is taken, is outside 0..255, or it has no id; or it needs tiles and
-                streams with one of its ids could not say which.
+            ConfigError: The name or a codec id is taken, a codec id is outside 0..255, there is none, or the codec
+                needs tiles and a codec id does not have a tag of two bytes.
         """
         where = f"codec {spec.name}"
         if spec.name in self._by_name:
@@ -161,11 +165,11 @@ class CodecRegistry:
             if not 0 <= codec_id <= 0xFF:
                 raise ConfigError(where, "codec_ids", codec_id, "0..255")
             if spec.needs_tiles and tag_length(codec_id) != CODEBOOK_TAG_BYTES:
-                expected = "0x10..0x1f or 0x80..0xff, whose streams say in two bytes which codebook they need"
+                expected = "0x10..0x1f or 0x80..0xff, which have a codebook tag of two bytes"
                 raise ConfigError(where, "codec_ids", f"{codec_id:#04x}", expected)
             if codec_id in self._by_id:
-                taken = self._by_id[codec_id].name
-                raise ConfigError(where, "codec_ids", f"{codec_id:#04x}", f"an id that is not taken (it is {taken}'s)")
+                owner = self._by_id[codec_id].name
+                raise ConfigError(where, "codec_ids", f"{codec_id:#04x}", f"an id that is not taken (it is {owner}'s)")
         self._by_name[spec.name] = spec
         self._by_id.update(dict.fromkeys(spec.codec_ids, spec))
 
@@ -174,63 +178,76 @@ class CodecRegistry:
         return tuple(sorted(self._by_name))
 
     def is_embedded(self, name: str) -> bool:
-        """Return whether a codec's streams may be cut and continued; False of one that is not known."""
+        """Return whether the streams of a codec can be truncated and extended; False for an unknown name."""
+        name = present_name(name)
         return name in self._by_name and self._by_name[name].is_embedded
 
     def spec(self, name: str) -> CodecSpec:
-        """Return a codec's entry.
+        """Return the entry of a codec.
 
         Raises:
-            ConfigError: No codec has this name; the message lists those there are.
+            ConfigError: No codec has this name. The message lists the names, or how to select a retired codec.
         """
+        if name in RETIRED_NAMES and name not in self._by_name:
+            raise ConfigError("codec registry", "name", name, RETIRED_NAMES[name][1])
         if name not in self._by_name:
-            raise ConfigError(
-                "codec registry", "name", name, "one of " + ", ".join(self.names()) + _what_is_absent(name)
-            )
+            raise ConfigError("codec registry", "name", name, "one of " + ", ".join(self.names()) + _requirement(name))
         return self._by_name[name]
 
-    def create(self, name: str, resources: CodecResources) -> Codec:
-        """Make the codec called `name`.
+    def create(self, name: str, resources: CodecResources | None = None) -> Codec:
+        """Create a codec.
 
         Raises:
-            ConfigError: No codec has this name, or a resource it needs is absent or does not suit it.
+            ConfigError: No codec has this name, or a required resource is missing or invalid.
         """
-        return self.spec(name).create(resources)
+        return self.spec(name).create(resources or CodecResources())
 
     def spec_for_id(self, codec_id: int) -> CodecSpec:
-        """Return the entry of the codec whose streams carry `codec_id`.
+        """Return the entry of the codec with this codec id.
 
         Raises:
-            StreamError: No codec does.
+            StreamError: No codec has it.
         """
         if codec_id not in self._by_id:
             known = ", ".join(f"{number:#04x} ({self._by_id[number].name})" for number in sorted(self._by_id))
-            raise StreamError("stream", "codec_id", f"{codec_id:#04x}", f"one of {known}{_what_is_absent(codec_id)}")
+            raise StreamError("stream", "codec_id", f"{codec_id:#04x}", f"one of {known}{_requirement(codec_id)}")
         return self._by_id[codec_id]
 
-    def create_for_stream(self, stream: bytes, resources: CodecResources) -> Codec:
-        """Make the codec that a stream (its header is enough) was encoded with.
+    def create_for_stream(self, stream: bytes, resources: CodecResources | None = None) -> Codec:
+        """Create the codec that encoded a stream.
+
+        Args:
+            stream: The stream, or its header.
+            resources: The tile database, for a codec with a codebook.
 
         Raises:
-            StreamError: The header is wrong or its codec unknown.
-            ConfigError: A resource the codec needs is absent or does not suit it.
+            StreamError: The header is invalid or its codec is unknown.
+            ConfigError: A required resource is missing or invalid.
         """
         header = StreamHeader.unpack(stream)
+        resources = resources or CodecResources()
         resources = replace(resources, codec_id=header.codec_id, model_tag=header.model_tag)
         return self.spec_for_id(header.codec_id).create(resources)
 
 
+def _requirement(name_or_id: str | int) -> str:
+    """Return the software to install for a codec that is not available, as the end of a message."""
+    missing = (one for one in StillImageFormat if name_or_id in (one.value, one.codec_id) and not one.available)
+    return "".join(f" ({one.value} needs {one.requirement})" for one in missing)
+
+
 def load_plugins(registry: CodecRegistry, found: Iterable[EntryPoint]) -> None:
-    """Register the codecs that other distributions offer, in the order of their names.
+    """Register the codecs of other distributions, in the order of their names.
 
     Raises:
-        ConfigError: An entry point does not load, is not a `CodecSpec`, has another name, or takes a name or id again.
+        ConfigError: An entry point does not load, is not a `CodecSpec`, has another name, or its name or codec id is
+            taken.
     """
     for point in sorted(found, key=lambda p: (p.name, p.value)):
         where = f"entry point {ENTRY_POINT_GROUP}:{point.name}"
         try:
             spec = point.load()
-        except Exception as error:  # whatever foreign code raises while it is imported, this names the culprit
+        except Exception as error:  # foreign code can raise any exception; the message names the entry point
             raise ConfigError(where, "value", f"{point.value} ({error!r})", "an object that imports") from error
         if not isinstance(spec, CodecSpec):
             raise ConfigError(where, "value", repr(spec), "a sonarpost.codec.registry.CodecSpec")
@@ -241,10 +258,10 @@ def load_plugins(registry: CodecRegistry, found: Iterable[EntryPoint]) -> None:
 
 @cache
 def default_registry() -> CodecRegistry:
-    """Return the registry of this package's codecs and installed plug-ins, made on first use.
+    """Return the registry with the codecs of this package and of the installed plug-ins.
 
     Raises:
-        ConfigError: A plug-in is wrong.
+        ConfigError: A plug-in is invalid.
     """
     registry = CodecRegistry(BUILTINS)
     load_plugins(registry, entry_points(group=ENTRY_POINT_GROUP))

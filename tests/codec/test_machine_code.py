@@ -1,0 +1,76 @@
+"""Preparation of machine code, and the message when a codec compiles in a running process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from builders.images import snippet
+
+from sonarpost.sonar.image_files import write_png
+
+MESSAGE = "Preparing machine code for the {codec} codec: about {seconds} s, once for each installation"
+ENCODE_AND_DECODE = """
+import logging, sys
+import numpy as np
+logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s", stream=sys.stdout)
+import sonarpost.codec as c
+from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.codec.emb.side_info import RegionOfInterest
+from sonarpost.codec.jit import compilation_log
+image = np.random.default_rng(0).integers(0, 256, (75, 48), dtype=np.uint8)
+valid = image > 3
+for model in ("standard", "structure"):
+    codec = EmbCodec(model, send_texture=True)
+    stream = codec.encode_with_estimate(image, 90, region=RegionOfInterest(2, 2, 7, 7), valid=valid).stream
+    codec.extend(stream, image, 150, valid=valid)
+    codec.decode_with_speckle(stream)
+    codec.decode(stream[:20])
+    c.decode(c.encode(image.astype(np.uint16) * 257, model=model))
+c.decode(c.encode(image, "vq"))
+c.decode(c.encode(image, "vq", codebook="nominal-20"))
+print("compiled", compilation_log.compiled)
+"""
+
+
+def run(cache: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache), "OMP_NUM_THREADS": "1"}
+    return subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True, check=True)
+
+
+@pytest.mark.timeout(900)  # compiles everything: 20 s on an idle machine
+def test_prepared_machine_code_is_complete(tmp_path: Path) -> None:
+    first = run(tmp_path, "-m", "sonarpost.cli.main", "prepare").stdout.splitlines()
+    assert first[0] == "Preparing machine code: emb, model standard"
+    assert first[-1].startswith("Machine code is ready: compiled=")
+    assert str(tmp_path) in first[-1]
+    assert list(tmp_path.rglob("*.nbc"))
+    second = run(tmp_path, "-m", "sonarpost.cli.main", "prepare").stdout.splitlines()
+    assert second[-1] == "Machine code is ready: the cache holds all functions"
+    # Encoding and decoding in another process, with all options, compiles nothing and logs nothing.
+    assert run(tmp_path, "-c", ENCODE_AND_DECODE).stdout.splitlines() == ["compiled 0"]
+
+
+@pytest.mark.timeout(900)  # compiles everything: 20 s on an idle machine
+def test_compilation_is_logged_once_for_each_codec(tmp_path: Path) -> None:
+    lines = run(tmp_path, "-c", ENCODE_AND_DECODE).stdout.splitlines()
+    assert lines[:-1] == [
+        "INFO sonarpost.codec.jit " + MESSAGE.format(codec="emb", seconds=20),
+        "INFO sonarpost.codec.jit " + MESSAGE.format(codec="vq", seconds=5),
+    ]
+    assert int(lines[-1].removeprefix("compiled ")) > 20
+
+
+@pytest.mark.timeout(900)
+def test_encode_command_prints_the_message_once_to_standard_error(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    for name in ("a", "b"):
+        write_png(tmp_path / "images" / f"{name}.png", snippet(32, 48))
+    command = ("-m", "sonarpost.cli.main", "encode", str(tmp_path / "images"))
+    first = run(tmp_path / "cache", *command)
+    assert first.stderr.splitlines() == [MESSAGE.format(codec="vq", seconds=5)]
+    assert "2 of 2 files done" in first.stdout
+    assert run(tmp_path / "cache", *command).stderr == ""
