@@ -26,6 +26,7 @@ COMMANDS = {
     "encode": "encode",
     "decode": "encode",
     "codebook": "codebook",
+    "prepare": "prepare",
     "pki": "pki",
     "modem-emulator": "modem_emulator",
 }

@@ -1,0 +1,48 @@
+"""`sonarpost prepare`: compile the machine code of the codecs in advance."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+import time
+
+from sonarpost.codec.machine_code import prepare_machine_code
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "prepare",
+        help="compile the machine code of the codecs in advance",
+        description="Compiles the machine code of the codecs emb and vq and stores it on disk, so that the first image "
+        "does not wait for the compiler. Run it once for each installation.",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(_: argparse.Namespace) -> int:
+    """Compile what the cache on disk does not hold; return 0."""
+    started_s = time.monotonic()
+    prepared = prepare_machine_code(lambda step: print(f"Preparing machine code: {step}", flush=True))
+    if not prepared.compiled:
+        print("Machine code is ready: the cache holds all functions")
+        return 0
+    folders = ", ".join(str(folder) for folder in prepared.cache_folders)
+    print(
+        f"Machine code is ready: compiled={prepared.compiled} after_s={time.monotonic() - started_s:.1f} in {folders}"
+    )
+    return 0
+
+
+class _StderrHandler(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        print(record.getMessage(), file=sys.stderr)
+
+
+def log_preparation_to_stderr() -> None:
+    """Print a line to the standard error stream when a codec compiles its machine code in this process."""
+    logger = logging.getLogger("sonarpost.codec.jit")
+    logger.setLevel(logging.INFO)
+    if not any(isinstance(handler, _StderrHandler) for handler in logger.handlers):
+        logger.addHandler(_StderrHandler())
