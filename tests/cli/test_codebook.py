@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from sonarpost.cli import codebook, encode
-from sonarpost.cli.codebook.build import parse_rounds
-from sonarpost.cli.codebook.progress import ProgressDisplay
+from sonarpost.cli.codebook import parse_rounds
+from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.quality import psnr_db
+from sonarpost.codec.vq.builder import Round
 from sonarpost.codec.vq.codebook import load, load_default
-from sonarpost.codec.vq.training_config import Round
 from sonarpost.errors import CodebookError, ConfigError, SonarpostError, StreamError
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff
 
@@ -28,12 +28,12 @@ def run() -> Run:
     codebook.add_parser(subparsers)
     encode.add_parser(subparsers)
 
-    def go(*arguments: object) -> int:
+    def run_command(*arguments: object) -> int:
         parsed = parser.parse_args([str(argument) for argument in arguments])
         status: int = parsed.run(parsed)
         return status
 
-    return go
+    return run_command
 
 
 def snippet(seed: int, height_px: int = 60, width_px: int = 45) -> np.ndarray:
@@ -56,7 +56,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("packing", ["14bit", "2byte", "3byte", "ascii5"])
-def test_a_folder_goes_there_and_back(run: Run, folder: Path, text: bool, packing: str) -> None:
+def test_folder_is_encoded_and_decoded(run: Run, folder: Path, text: bool, packing: str) -> None:
     assert run("encode", folder, "--packing", packing, *(["--text"] if text else [])) == 0
     suffix = ".txt" if text else ".vq"
     streams = sorted(folder.glob(f"*{suffix}"))
@@ -73,7 +73,7 @@ def test_a_folder_goes_there_and_back(run: Run, folder: Path, text: bool, packin
     assert not list((folder / "out").glob("*missing*"))
 
 
-def test_one_file_with_another_codebook_into_a_folder(run: Run, folder: Path, tmp_path: Path) -> None:
+def test_one_file_with_another_codebook_and_output_folder(run: Run, folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / "deeper"
     assert run("encode", folder / "b.png", "--codebook", "nominal-20", "--out", out) == 0
     assert [path.name for path in out.iterdir()] == ["b.vq"]
@@ -84,28 +84,30 @@ def test_one_file_with_another_codebook_into_a_folder(run: Run, folder: Path, tm
         run("decode", out / "b.vq", "--codebook", "nominal-10")
 
 
-def test_bad_files_of_a_folder_are_told_and_counted_and_the_rest_goes_on(
+def test_invalid_files_of_a_folder_are_reported_and_the_others_processed(
     run: Run, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "0bad.png").write_bytes(b"\x89PNG\r\n\x1a\n but no more")
     write_png(folder / "small.png", np.zeros((8, 8), np.uint8))
     write_png(folder / "a.png", snippet(5))  # the stem of a.tiff: one stream would overwrite the other
     assert run("encode", folder) == 1
-    told = capsys.readouterr()
-    assert "3 of 6 files done" in told.out
+    output = capsys.readouterr()
+    assert "3 of 6 files done" in output.out
     for name in ("0bad.png", "small.png", "a.tiff"):
-        assert name in told.err
+        assert name in output.err
     assert sorted(path.name for path in folder.glob("*.vq")) == ["a.vq", "b.vq", "c.vq"]
     (folder / "a.vq").write_bytes(b"\x10\0")
     (folder / "d.txt").write_text("xyz")
     assert run("decode", folder) == 1
-    told = capsys.readouterr()
-    assert "2 of 4 files done" in told.out
-    assert "a.vq" in told.err
-    assert "hexadecimal" in told.err
+    output = capsys.readouterr()
+    assert "2 of 4 files done" in output.out
+    assert "a.vq" in output.err
+    assert "hexadecimal" in output.err
 
 
-def test_what_is_missing_is_drawn_and_told(run: Run, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_pixels_are_written_as_a_mask_and_reported(
+    run: Run, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run("encode", folder / "a.tiff")
     stream = folder / "a.vq"
     stream.write_bytes(stream.read_bytes()[:-20])
@@ -117,12 +119,12 @@ def test_what_is_missing_is_drawn_and_told(run: Run, folder: Path, capsys: pytes
     assert not read_image(folder / "out" / "a.tiff")[mask == 255].any()
 
 
-def test_wrong_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Path) -> None:
+def test_invalid_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
     (tmp_path / "big.vq").write_bytes(bytes(1 << 19))
     (tmp_path / "file").write_text("")
-    wrong = [
+    invalid = [
         ("encode", tmp_path / "absent.png"),
         ("encode", empty),
         ("encode", folder / "notes.md"),
@@ -136,27 +138,27 @@ def test_wrong_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Path
         ("codebook", "info", tmp_path / "file"),
         ("codebook", "build", "--images", empty, "--out", tmp_path / "x.tiles"),
     ]
-    for arguments in wrong:
+    for arguments in invalid:
         with pytest.raises(SonarpostError):
             run(*arguments)
     assert not (tmp_path / "x.tiles").exists()
 
 
-def test_the_codecs_are_listed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_codecs_are_listed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("encode", "unused", "--codec", "help") == 0
     assert "vector quantisation" in capsys.readouterr().out
 
 
-def test_info_shows_a_shipped_codebook(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_prints_a_shipped_codebook(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("codebook", "info", "nominal-10") == 0
-    shown = capsys.readouterr().out
-    assert load_default(10).tiles.identity in shown
-    assert "10 x 10 px" in shown
+    output = capsys.readouterr().out
+    assert load_default(10).tiles.identity in output
+    assert "10 x 10 px" in output
     assert run("codebook") == 0
     assert "build" in capsys.readouterr().out
 
 
-def test_a_codebook_is_built_from_a_folder_and_used(run: Run, folder: Path, tmp_path: Path) -> None:
+def test_codebook_is_built_from_a_folder_and_used(run: Run, folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "mine.tiles"
     (folder / "broken.tif").write_bytes(b"II*\0")
     assert run("codebook", "build", "--images", folder, "--tile", 8, "--out", out, "--rounds", "90:8,99:1:2") == 1
@@ -165,17 +167,17 @@ def test_a_codebook_is_built_from_a_folder_and_used(run: Run, folder: Path, tmp_
     assert built.tiles.tile_px == 8
     assert not out.with_name("mine.tiles.journal").exists()
     assert run("encode", folder / "a.tiff", "--codebook", out) == 0
-    with pytest.raises(CodebookError, match="the codebook it was made with"):
+    with pytest.raises(CodebookError, match="SONARPOST_CODEBOOKS"):
         run("decode", folder / "a.vq")
     assert run("decode", folder / "a.vq", "--codebook", out) == 0
-    # The first image's tiles are all in the codebook, so it comes back as it was.
+    # The codebook holds all tiles of the first image, so it is reconstructed exactly.
     assert np.array_equal(read_image(folder / "out" / "a.tiff"), snippet(0))
     more = tmp_path / "more.tiles"
     assert run("codebook", "build", "--images", folder / "b.png", "--tile", 8, "--out", more, "--core", out) == 0
     assert np.array_equal(load(more).tiles.tiles[: len(built.tiles)], built.tiles.tiles)
 
 
-def test_a_stopped_build_is_resumed_only_when_asked(run: Run, folder: Path, tmp_path: Path, monkeypatch) -> None:
+def test_interrupted_build_is_resumed_only_with_the_option(run: Run, folder: Path, tmp_path: Path, monkeypatch) -> None:
     out = tmp_path / "mine.tiles"
     arguments = ("codebook", "build", "--images", folder, "--out", out, "--rounds", "90:4", "--refine", 1)
     assert run(*arguments) == 0
@@ -196,12 +198,12 @@ def test_a_stopped_build_is_resumed_only_when_asked(run: Run, folder: Path, tmp_
     assert out.read_bytes() == expected
 
 
-def test_rounds_are_read_in_grey_levels() -> None:
+def test_rounds_are_parsed_in_grey_levels() -> None:
     assert parse_rounds("39:16", 20) == (Round(39.0, 320.0, None),)
     assert parse_rounds("30:40.5:500, 60:8", 10) == (Round(30.0, 405.0, 500), Round(60.0, 80.0, None))
-    for wrong in ("", "39", "39:", "39:16:", "39:16:1.5", "39:-1", "nan:1", "39:16,", "39:16:5:5", "٣٩:16"):
+    for text in ("", "39", "39:", "39:16:", "39:16:1.5", "39:-1", "nan:1", "39:16,", "39:16:5:5", "٣٩:16"):
         with pytest.raises(ConfigError, match="FOM:RMS"):
-            parse_rounds(wrong, 10)
+            parse_rounds(text, 10)
 
 
 def test_codebooks_are_compared(run: Run, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -210,20 +212,20 @@ def test_codebooks_are_compared(run: Run, folder: Path, tmp_path: Path, capsys: 
     assert run("codebook", "build", "--images", folder / "b.png", "--tile", 8, "--out", other, "--core", one) == 0
     capsys.readouterr()
     assert run("codebook", "diff", one, one) == 0
-    told = capsys.readouterr().out
-    assert "the same" in told
-    assert "principal angles up to 0.00 deg" in told
+    output = capsys.readouterr().out
+    assert "the same" in output
+    assert "principal angles up to 0.00 deg" in output
     assert run("codebook", "diff", one, other) == 1
-    told = capsys.readouterr().out
-    assert load(one).tiles.identity in told
-    assert load(other).tiles.identity in told
-    assert "only in A      0 tiles" in told
-    assert f"{len(load(one).tiles)} tiles have the same number in both" in told
+    output = capsys.readouterr().out
+    assert load(one).tiles.identity in output
+    assert load(other).tiles.identity in output
+    assert "only in A      0 tiles" in output
+    assert f"{len(load(one).tiles)} tiles have the same number in both" in output
     with pytest.raises(CodebookError, match="tile_px"):
         run("codebook", "diff", one, "nominal-10")
 
 
-def test_a_codebook_is_adapted_to_a_folder(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_codebook_is_adapted_to_a_folder(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     images = tmp_path / "images"
     images.mkdir()
     for seed in range(8):
@@ -233,13 +235,13 @@ def test_a_codebook_is_adapted_to_a_folder(run: Run, tmp_path: Path, capsys: pyt
     (images / "broken.tif").write_bytes(b"II*\0")
     capsys.readouterr()
     assert run("codebook", "adapt", base, "--images", images, "--out", out, "--keep", 10, "--max-tiles", 60) == 1
-    told = capsys.readouterr()
-    assert "broken.tif" in told.err.replace("\n", "")  # lines are folded where the terminal ends
-    assert "6 to learn from, 2 held out" in told.out
-    assert "better in 2 of 2" in told.out
+    output = capsys.readouterr()
+    assert "broken.tif" in output.err.replace("\n", "")  # lines are wrapped at the terminal width
+    assert "6 for training, 2 held out" in output.out
+    assert "better in 2 of 2" in output.out
     adapted, original = load(out), load(base)
     assert adapted.notes["adapted from"].endswith(original.tiles.identity)
-    assert adapted.notes["held-out PSNR dB"] in told.out
+    assert adapted.notes["held-out PSNR dB"] in output.out
     assert len(adapted.tiles) == 60
     assert (adapted.tiles.tiles[:40] == original.tiles.tiles).all(axis=1).sum() >= 10
     with pytest.raises(ConfigError, match="keep"):
@@ -248,7 +250,7 @@ def test_a_codebook_is_adapted_to_a_folder(run: Run, tmp_path: Path, capsys: pyt
         run("codebook", "adapt", base, "--images", images / "0.png", "--out", out)
 
 
-def test_no_gain_is_told(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_gain_is_reported(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     images = tmp_path / "images"
     images.mkdir()
     for number in range(2):
@@ -257,6 +259,6 @@ def test_no_gain_is_told(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture
     run("codebook", "build", "--images", images / "0.png", "--tile", 8, "--out", base)
     capsys.readouterr()
     assert run("codebook", "adapt", base, "--images", images, "--out", tmp_path / "out.tiles") == 0
-    told = capsys.readouterr()
-    assert "no gain" in told.err
-    assert "99.00 before, 99.00 after; better in 0 of 1" in told.out
+    output = capsys.readouterr()
+    assert "no gain" in output.err
+    assert "99.00 before, 99.00 after; better in 0 of 1" in output.out

@@ -1,4 +1,4 @@
-"""`sonarpost encode` and `sonarpost decode`: the paper's Table III over one file or a folder."""
+"""`sonarpost encode` and `sonarpost decode`: the paper's Table III for a file or a folder."""
 
 from __future__ import annotations
 
@@ -9,110 +9,120 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.codec.interface import Codec, StreamHeader
-from sonarpost.codec.registry import CodecRegistry, CodecResources, default_registry
-from sonarpost.codec.vq.codebook import default_for_tag, open_codebook
+from sonarpost.cli.prepare import log_preparation_to_stderr
+from sonarpost.codec import Codec, StreamHeader, codec_names, decode_image, get_codec
+from sonarpost.codec.api import CodecOptions
+from sonarpost.codec.registry import RETIRED_NAMES, CodecResources, default_registry
+from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.codec import IndexPacking
+from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import SonarpostError, StreamError
 from sonarpost.files import write_atomically
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff
 
 IMAGE_SUFFIXES = (".tiff", ".tif", ".png")
 TEXT_SUFFIX = ".txt"
-MAX_STREAM_FILE_BYTES = 1 << 18  # header and the longest body, twice for hex, and room for line ends
+MAX_STREAM_FILE_BYTES = 1 << 18  # header and the longest body, twice for hexadecimal text, and line ends
 EXIT_SOME_FAILED = 1
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add both commands."""
-    _add_encode(subparsers)
-    _add_decode(subparsers)
-
-
-def _add_encode(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser("encode", help="encode an image or a folder of images")
-    parser.add_argument("input", type=Path, metavar="IMAGE_OR_DIR", help="TIFF or PNG, grey, 8 or 16 bits")
-    parser.add_argument("--codec", default="vq", help="codec, one of those `--codec help` lists (default: vq)")
-    parser.add_argument(
-        "--codebook", default="nominal-10", metavar="NAME_OR_FILE", help="nominal-10 (default), nominal-20 or a file"
+    encode = subparsers.add_parser("encode", help="encode an image or a folder of images")
+    encode.add_argument("input", type=Path, metavar="IMAGE_OR_DIR", help="TIFF or PNG, grey, 8 or 16 bits")
+    encode.add_argument("--codec", default="vq", help="name of a codec; `--codec help` lists them (default: vq)")
+    encode.add_argument("--model", help="model of emb: standard (default) or structure")
+    encode.add_argument(
+        "--codebook",
+        default="nominal-10",
+        metavar="NAME_OR_FILE",
+        help="codebook of vq: nominal-10 (default), nominal-20 or a file",
     )
-    parser.add_argument(
+    encode.add_argument(
         "--packing",
         choices=[packing.value for packing in IndexPacking],
         default=IndexPacking.BITS14.value,
-        help="how vq writes an index (default: 14bit)",
+        help="index format of vq (default: 14bit)",
     )
-    parser.add_argument("--budget", type=int, metavar="BYTES", help="most bytes of a stream, its header included")
-    parser.add_argument("--text", action="store_true", help="write hexadecimal text (.txt), as the paper does")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where streams go (default: beside the image)")
-    parser.set_defaults(run=run_encode)
-
-
-def _add_decode(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser("decode", help="decode a stream or a folder of streams to TIFF and PNG")
-    parser.add_argument("input", type=Path, metavar="FILE_OR_DIR", help="what `sonarpost encode` wrote")
-    parser.add_argument(
-        "--codebook", metavar="NAME_OR_FILE", help="default: the shipped codebook the stream was made with"
+    encode.add_argument(
+        "--budget", type=int, metavar="BYTES", help="maximum length of a stream, header included (default: the codec's)"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where images go (default: out/ beside the stream)")
-    parser.set_defaults(run=run_decode)
+    encode.add_argument("--text", action="store_true", help="write hexadecimal text (.txt), as the paper does")
+    encode.add_argument("--out", type=Path, metavar="DIR", help="folder for the streams (default: that of the image)")
+    encode.set_defaults(run=run_encode)
+    decode = subparsers.add_parser("decode", help="decode a stream or a folder of streams to TIFF and PNG")
+    decode.add_argument("input", type=Path, metavar="FILE_OR_DIR", help="output of `sonarpost encode`")
+    decode.add_argument(
+        "--codebook",
+        metavar="NAME_OR_FILE",
+        help="codebook of the streams (default: found by the tag in the stream, among the shipped codebooks and the "
+        "files and folders in the environment variable SONARPOST_CODEBOOKS)",
+    )
+    decode.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the images (default: out/ beside the stream)"
+    )
+    decode.set_defaults(run=run_decode)
 
 
 def run_encode(args: argparse.Namespace) -> int:
     """Encode; return 0, or 1 if any file of the folder could not be encoded.
 
     Raises:
-        SonarpostError: The codec or the codebook cannot be had, or the one image given is bad.
+        SonarpostError: The codec or the codebook is not available, or a single input file is invalid.
     """
     registry = default_registry()
     if args.codec == "help":
         for name in registry.names():
-            print(f"{name:12} {registry.spec(name).summary}")
+            print(f"{name:16} {registry.spec(name).summary}")
         return 0
-    tiles = open_codebook(args.codebook).tiles if registry.spec(args.codec).needs_tiles else None
-    codec = registry.create(args.codec, CodecResources(tiles, IndexPacking(args.packing)))
+    log_preparation_to_stderr()
+    options: CodecOptions = {} if args.model is None else {"model": args.model}
+    if registry.spec(args.codec).needs_tiles:
+        options |= {"codebook": args.codebook, "packing": args.packing}
+    codec = get_codec(args.codec, **options)
     suffix = TEXT_SUFFIX if args.text else f".{codec.name}"
 
     def encode_one(path: Path) -> str:
-        return _encode_file(codec, path, _target_folder(args.out, path.parent) / (path.stem + suffix), args)
+        return _encode_file(codec, path, _output_folder(args.out, path.parent) / (path.stem + suffix), args)
 
-    return _over_files(args.input, IMAGE_SUFFIXES, encode_one)
+    return _process_files(args.input, IMAGE_SUFFIXES, encode_one)
 
 
 def run_decode(args: argparse.Namespace) -> int:
     """Decode; return 0, or 1 if any file of the folder could not be decoded.
 
     Raises:
-        SonarpostError: The codebook cannot be had, or the one stream given is bad.
+        SonarpostError: The codebook cannot be read, or a single input file is invalid.
     """
-    registry = default_registry()
-    suffixes = (*(f".{name}" for name in registry.names()), TEXT_SUFFIX)
-    if args.codebook is not None:
-        open_codebook(args.codebook)  # a wrong codebook is one error, not one for each file of the folder
+    log_preparation_to_stderr()
+    suffixes = (*(f".{name}" for name in (*codec_names(), *RETIRED_NAMES)), TEXT_SUFFIX)
+    # Opened before the loop: an unreadable codebook is one error, not one for each file.
+    tiles = open_codebook(args.codebook).tiles if args.codebook is not None else None
 
     def decode_one(path: Path) -> str:
-        return _decode_file(registry, path, _target_folder(args.out, path.parent / "out"), args.codebook)
+        return _decode_file(path, _output_folder(args.out, path.parent / "out"), tiles)
 
-    return _over_files(args.input, suffixes, decode_one)
+    return _process_files(args.input, suffixes, decode_one)
 
 
-def _over_files(source: Path, suffixes: tuple[str, ...], work: Callable[[Path], str]) -> int:
-    """Do `work` on one file or on a folder's files; in a folder a bad file is reported and the rest go on."""
+def _process_files(source: Path, suffixes: tuple[str, ...], process: Callable[[Path], str]) -> int:
+    """Process one file, or the files of a folder. In a folder, an invalid file is reported and the loop continues."""
     if not source.is_dir():
-        print(work(source))
+        print(process(source))
         return 0
     paths = sorted(path for path in source.iterdir() if path.suffix.lower() in suffixes and path.is_file())
     if not paths:
-        raise StreamError(str(source), "", "nothing to do", "a folder with files ending in " + ", ".join(suffixes))
+        raise StreamError(str(source), "", "no such file", "a folder with files ending in " + ", ".join(suffixes))
     failed = 0
-    taken: dict[str, Path] = {}
+    path_by_stem: dict[str, Path] = {}
     for path in paths:
         try:
-            if path.stem in taken:
-                # Results bear the input's stem, as in the paper: a second one would overwrite the first.
-                raise StreamError(str(path), "name", path.stem, f"another stem than that of {taken[path.stem].name}")
-            taken[path.stem] = path
-            print(work(path))
+            if path.stem in path_by_stem:
+                # The output has the stem of the input, as in the paper: a second file would overwrite the first.
+                other = path_by_stem[path.stem].name
+                raise StreamError(str(path), "name", path.stem, f"another stem than that of {other}")
+            path_by_stem[path.stem] = path
+            print(process(path))
         except SonarpostError as error:
             failed += 1
             print(f"{path.name}: {error}", file=sys.stderr)
@@ -126,26 +136,26 @@ def _encode_file(codec: Codec, path: Path, target: Path, args: argparse.Namespac
     try:
         write_atomically(target, (stream.hex() + "\n").encode() if args.text else stream)
     except OSError as error:
-        raise StreamError(str(target), "", error.strerror or str(error), "a file that can be written") from error
+        raise StreamError(str(target), "", error.strerror or str(error), "a writable file") from error
     return f"{path} -> {target}: {image.nbytes} B -> {len(stream)} B ({image.nbytes / len(stream):.1f}:1)"
 
 
-def _decode_file(registry: CodecRegistry, path: Path, folder: Path, codebook: str | None) -> str:
+def _decode_file(path: Path, folder: Path, tiles: TileDatabase | None) -> str:
     stream = _read_stream(path)
     header = StreamHeader.unpack(stream, str(path))
-    tiles = None
-    if registry.spec_for_id(header.codec_id).needs_tiles:
-        tiles = (open_codebook(codebook) if codebook is not None else default_for_tag(header.model_tag)).tiles
-    decoded = registry.create_for_stream(stream, CodecResources(tiles)).decode(stream)
+    if tiles is None:
+        decoded = decode_image(stream)
+    else:
+        decoded = default_registry().create_for_stream(stream, CodecResources(tiles)).decode(stream)
     target = folder / f"{path.stem}.tiff"
     write_tiff(target, decoded.image)
     write_png(target.with_suffix(".png"), decoded.image)
-    lost = ""
+    missing = ""
     if decoded.missing.any():
         mask = folder / f"{path.stem}.missing.png"
         write_png(mask, decoded.missing.astype(np.uint8) * np.uint8(255))
-        lost = f", {100 * decoded.missing.mean():.1f} % missing (white in {mask.name}): {'; '.join(decoded.notes)}"
-    return f"{path} -> {target}: {header.height_px} x {header.width_px} px{lost}"
+        missing = f", {100 * decoded.missing.mean():.1f} % missing (white in {mask.name}): {'; '.join(decoded.notes)}"
+    return f"{path} -> {target}: {header.height_px} x {header.width_px} px{missing}"
 
 
 def _read_stream(path: Path) -> bytes:
@@ -156,19 +166,19 @@ def _read_stream(path: Path) -> bytes:
             raise StreamError(str(path), "size", f"{size} B", f"at most {MAX_STREAM_FILE_BYTES} B")
         data = path.read_bytes()
     except OSError as error:
-        raise StreamError(str(path), "", error.strerror or str(error), "a stream file that can be read") from error
+        raise StreamError(str(path), "", error.strerror or str(error), "a readable stream file") from error
     if path.suffix.lower() != TEXT_SUFFIX:
         return data
     try:
         return bytes.fromhex(data.decode("ascii"))
-    except ValueError as error:  # UnicodeDecodeError is one too
+    except ValueError as error:  # includes UnicodeDecodeError
         raise StreamError(str(path), "text", data[:40], "hexadecimal digits") from error
 
 
-def _target_folder(wanted: Path | None, default: Path) -> Path:
-    folder = wanted if wanted is not None else default
+def _output_folder(chosen: Path | None, default: Path) -> Path:
+    folder = chosen if chosen is not None else default
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StreamError(str(folder), "", error.strerror or str(error), "a folder that can be made") from error
+        raise StreamError(str(folder), "", error.strerror or str(error), "a folder that can be created") from error
     return folder

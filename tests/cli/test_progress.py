@@ -1,4 +1,4 @@
-"""What a long command shows on a terminal and in a log."""
+"""Progress display on a terminal and in a log."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import io
 
 from rich.console import Console
 
-from sonarpost.cli.codebook.progress import ProgressDisplay
-from sonarpost.codec.vq.training_config import BuildProgress, RefinementProgress
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.codec.vq.builder import BuildProgress, RefinementProgress
 
 
-def progress(done: int, whole: int = 100, round_number: int = 0) -> BuildProgress:
-    return BuildProgress(round_number, 2, done, done, whole, "name", 30.0, 5, 10 * done)
+def progress(done: int, total: int = 100, round_number: int = 0) -> BuildProgress:
+    return BuildProgress(round_number, 2, done, done, total, "name", 30.0, 5, 10 * done)
 
 
-def test_a_log_gets_a_line_now_and_then() -> None:
+def test_log_gets_a_line_every_ten_seconds() -> None:
     out = io.StringIO()
     now = [0.0]
     with ProgressDisplay(Console(file=out, width=200), clock=lambda: now[0]) as display:
@@ -34,7 +34,7 @@ def test_a_log_gets_a_line_now_and_then() -> None:
     ]
 
 
-def test_a_terminal_gets_a_bar_that_leaves_nothing_but_lines() -> None:
+def test_terminal_gets_a_bar_and_lines() -> None:
     out = io.StringIO()
     console = Console(file=out, force_terminal=True, width=100)
     with ProgressDisplay(console) as display:
