@@ -19,11 +19,10 @@ import numpy.typing as npt
 from rich.console import Console
 
 from research.common.command import command_parser, run_command
-from sonarpost.cli.codebook.progress import ProgressDisplay
-from sonarpost.codec.vq.builder import ProgressCallback, build
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.codec.vq.builder import ProgressCallback, Round, TrainingImage, build, rms_distance
 from sonarpost.codec.vq.codebook import Codebook, load, save
 from sonarpost.codec.vq.patches import PatchPlan, SonarLine, cut_around, cut_line, shuffled
-from sonarpost.codec.vq.training_config import Round, TrainingImage, rms_distance
 from sonarpost.errors import CodebookError, ConfigError
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind

@@ -37,7 +37,7 @@ def curves(results: Sequence[BudgetResult]) -> dict[str, list[BudgetResult]]:
     """Group results by codec name in order of first appearance; the variants of a codec form one curve."""
     found: dict[str, list[BudgetResult]] = {}
     for result in results:
-        found.setdefault(result.tested.codec.name, []).append(result)
+        found.setdefault(result.tested.name, []).append(result)
     return found
 
 
@@ -60,7 +60,7 @@ def result_rows(results: Sequence[BudgetResult], budgets: Sequence[int]) -> list
     for result in at_budgets(results, budgets):
         counts = result.hits.mean() >= MIN_SHARE
         figures = {name: value if counts else None for name, value in _figures(result).items()}
-        rows.append({"codec": result.tested.codec.name, "budget": result.effective_budget, **figures})
+        rows.append({"codec": result.tested.name, "budget": result.effective_budget, **figures})
     return rows
 
 
@@ -81,13 +81,13 @@ def detail_rows(results: Sequence[BudgetResult], weights: Values) -> list[_Json]
     A figure is null if every image was missed. `emb_gain` is the mean difference of emb over this codec in each
     metric, at the same budget on the images that both coded, with its interval.
     """
-    reference = {r.budget_bytes: r for r in results if r.tested.codec.name == REFERENCE}
+    reference = {r.budget_bytes: r for r in results if r.tested.name == REFERENCE}
     return [_detail_row(result, reference.get(result.budget_bytes), weights) for result in results]
 
 
 def _detail_row(result: BudgetResult, reference: BudgetResult | None, weights: Values) -> _Json:
     row: _Json = {
-        "codec": result.tested.codec.name,
+        "codec": result.tested.name,
         "budget": result.effective_budget,
         **_figures(result),
         "n": int(result.hits.sum()),

@@ -13,9 +13,10 @@ import numpy.typing as npt
 
 from research.common.images import SampleImage
 from research.common.quality import ms_ssim
+from sonarpost.codec import emb
 from sonarpost.codec.interface import Codec, Image
 from sonarpost.codec.quality import psnr_db, ssim
-from sonarpost.codec.registry import CodecRegistry, CodecResources
+from sonarpost.codec.registry import CodecRegistry, CodecResources, default_registry
 from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, open_codebook
 from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.errors import ConfigError, StreamError
@@ -37,17 +38,24 @@ class CodecUnderTest:
         variant: Distinguishes several of one name (for vq codebook and packing); empty for a single one.
         is_embedded: Whether one stream, coded for the largest budget, is truncated for the others.
         is_natural: Whether the size follows from the image alone, so that there is one result for all budgets.
+        model: Name of the codec's model; empty for the default model.
     """
 
     codec: Codec
     variant: str = ""
     is_embedded: bool = False
     is_natural: bool = False
+    model: str = ""
+
+    @property
+    def name(self) -> str:
+        """Name of the codec, with its model if that is not the default, as in `emb:structure`."""
+        return f"{self.codec.name}:{self.model}" if self.model else self.codec.name
 
     @property
     def label(self) -> str:
         """Name in tables."""
-        return f"{self.codec.name} {self.variant}".strip()
+        return f"{self.name} {self.variant}".strip()
 
 
 @dataclass(frozen=True)
@@ -116,7 +124,7 @@ def create_codecs(
 
     Args:
         registry: Registry of the codecs.
-        names: Names of the codecs; None for all that are available.
+        names: Names of the codecs, or `NAME:MODEL`; None for all codecs and models that are available.
         all_packings: Whether vq is measured with every packing of an index, or with the shortest only.
         cut: Whether embedded codecs code one stream that is truncated for each budget.
         codebooks: Names of shipped codebooks, or paths of others, for vq.
@@ -131,18 +139,36 @@ def create_codecs(
     packings = tuple(IndexPacking) if all_packings else (IndexPacking.BITS14,)
     found: list[CodecUnderTest] = []
     unavailable: list[str] = []
-    for name in registry.names() if names is None else dict.fromkeys(names):
+    for name in _names_with_models(registry) if names is None else dict.fromkeys(names):
+        codec_name, _, model = name.partition(":")
         try:
-            if registry.spec(name).needs_tiles:
-                found += _with_codebooks(registry, name, packings, codebooks)
+            if registry.spec(codec_name).needs_tiles:
+                found += _with_codebooks(registry, codec_name, packings, codebooks)
             else:
-                codec = registry.create(name, CodecResources())
-                found.append(CodecUnderTest(codec, is_embedded=cut and registry.is_embedded(name)))
+                is_embedded = cut and registry.is_embedded(codec_name)
+                found.append(CodecUnderTest(create_codec(name, registry), is_embedded=is_embedded, model=model))
         except ConfigError as error:
             if names is not None:
                 raise
             unavailable.append(str(error))
     return found, unavailable
+
+
+def create_codec(name: str, registry: CodecRegistry | None = None) -> Codec:
+    """Create a codec from `NAME` or `NAME:MODEL`.
+
+    Raises:
+        ConfigError: No codec or model has this name, or the codec needs a codebook.
+    """
+    codec_name, _, model = name.partition(":")
+    return (registry or default_registry()).create(codec_name, CodecResources(model=model or None))
+
+
+def _names_with_models(registry: CodecRegistry) -> list[str]:
+    names = list(registry.names())
+    if emb.NAME in names:
+        names += [f"{emb.NAME}:{model}" for model in emb.MODEL_FILES if model != emb.DEFAULT_MODEL]
+    return sorted(names)
 
 
 def _with_codebooks(

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.interface import Image
-from sonarpost.codec.quality import fom, psnr_db
+from sonarpost.codec.quality import psnr_db
+from sonarpost.codec.vq.builder import figure_of_merit
 from sonarpost.codec.vq.tiles import BASIS_SCALE, Tiles, cut_tiles, join_tiles, principal_basis
 
 TILE_PX: Final = 20
@@ -100,7 +101,7 @@ class RotatedTiles:
         rotated = self.rotate(tiles)
         if self._count == 0:
             self._add(tiles[0], rotated[0])
-        elif fom(image, self.encode_and_decode(image)) >= FOM_BELOW:
+        elif figure_of_merit(image, self.encode_and_decode(image)) >= FOM_BELOW:
             return
         _, squared = self.nearest(rotated)
         for number in np.flatnonzero(squared > DISTANCE_ABOVE**2):
@@ -143,7 +144,7 @@ def _point(training: Sequence[Image], test: Sequence[Image], all_tiles: Tiles, d
         rotation_bytes=database.rotation.nbytes,
         database_bytes=database.size_bytes,
         tiles=len(database),
-        fom=float(np.mean([fom(a, b) for a, b in zip(test, decoded, strict=True)])),
+        fom=float(np.mean([figure_of_merit(a, b) for a, b in zip(test, decoded, strict=True)])),
         psnr=float(np.mean([psnr_db(a, b) for a, b in zip(test, decoded, strict=True)])),
     )
 

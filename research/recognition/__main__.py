@@ -237,7 +237,7 @@ def _coded(
         results = [each[column] for each in coded]
         budget = None if tested.is_natural else budgets[column]
         yield (
-            _Coding(tested.label, tested.codec.name, budget, None),
+            _Coding(tested.label, tested.name, budget, None),
             [None if isinstance(r, str) else r.decoded for r in results],
             [None if isinstance(r, str) else r.stream for r in results],
             np.array([math.nan if isinstance(r, str) else float(len(r.stream)) for r in results]),

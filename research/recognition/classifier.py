@@ -39,7 +39,7 @@ SIMULATED_WEIGHT: Final = 0.25
 """Weight of all simulated images relative to all real ones: their targets and sonar differ."""
 _CONTRAST_FLOOR: Final = 10.0
 DEFAULT_GRAIN_STRENGTH: Final = 0.5
-"""Share of the strength that restores the power of the texture; the default of `decode_with_grain` of emb."""
+"""Share of the strength that restores the power of the texture; the default of `decode_with_speckle` of emb."""
 
 
 def features(images: Sequence[Image]) -> Features:
@@ -183,7 +183,7 @@ def _assign_folds(groups: Sequence[str], training: Sequence[SampleImage]) -> dic
 class GrainCodec(Protocol):
     """A codec whose streams may describe the texture of the bottom."""
 
-    def decode_grain(self, stream: bytes) -> npt.NDArray[np.int16]:
+    def speckle_layer(self, stream: bytes) -> npt.NDArray[np.int16]:
         """Return the synthetic texture to be added to the decoded image, shape (height, width), int16.
 
         Raises:
@@ -203,7 +203,7 @@ def with_grain(codec: Codec, stream: bytes, image: Image, strength: float = DEFA
     if not isinstance(codec, GrainCodec):
         return None
     try:
-        layer = codec.decode_grain(stream)
+        layer = codec.speckle_layer(stream)
     except StreamError:
         return None
     added = np.floor(layer * strength).astype(np.int32)
@@ -212,8 +212,8 @@ def with_grain(codec: Codec, stream: bytes, image: Image, strength: float = DEFA
 
 def codec_with_grain(codec: Codec) -> Codec | None:
     """Return the codec with a description of the texture in its streams, within the same budget; None if not emb."""
-    if codec.name not in (emb.NAME, emb.STRUCTURE_NAME):
+    if codec.name != emb.NAME:
         return None
     from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415  imported lazily: it loads numba
 
-    return replace(codec, grain=True) if isinstance(codec, EmbCodec) else None
+    return replace(codec, send_texture=True) if isinstance(codec, EmbCodec) else None

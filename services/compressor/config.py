@@ -13,6 +13,7 @@ class CompressorConfig(ServiceConfig):
 
     Attributes:
         codec: Name in the codec registry.
+        model: Model of the emb codec: standard (least squared error) or structure (structural similarity).
         codebook: Tile codebook: nominal-10, nominal-20 or a file. The vessel needs the same one.
         packing: Index format of the vq codec: 14bit, 2byte, 3byte, ascii5.
         budget_bytes: Maximum length of a stream, header included; 0 for the codec's natural length.
@@ -24,6 +25,7 @@ class CompressorConfig(ServiceConfig):
     """
 
     codec: str = "vq"
+    model: str = "standard"
     codebook: str = "nominal-10"
     packing: IndexPacking = IndexPacking.BITS14
     budget_bytes: Annotated[int, Field(ge=0, le=65542)] = 0

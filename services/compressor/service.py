@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from sonarpost import keys, wire
 from sonarpost.codec.interface import Codec
-from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.codec.registry import CodecResources, default_registry, present_name
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.config import PlatformConfig
 from sonarpost.link.frames.paper.frame import format_image_id
@@ -44,7 +44,9 @@ class CompressorService(Service[CompressorConfig]):
     def __init__(self, platform: PlatformConfig, config: CompressorConfig) -> None:
         # Before the store is opened, so that a configuration error leaves no open store.
         tiles = open_codebook(config.codebook).tiles
-        self._codec: Codec = default_registry().create(config.codec, CodecResources(tiles, config.packing))
+        self._codec: Codec = default_registry().create(
+            config.codec, CodecResources(tiles, config.packing, config.model)
+        )
         super().__init__(platform, config)
         self._cache = EncodeCache(self.store, config.cache_images, config.cache_s)
         log.info("Codec ready", extra=kv(codec=self._codec.name, model=self._codec.model_hash[:16]))
@@ -141,7 +143,7 @@ class CompressorService(Service[CompressorConfig]):
         """
         image = wire.decode(EncodedImage, cached.image, entry_location(image_id))
         # An image that was encoded with another codec is sent unchanged.
-        same_codec = (image.codec, image.model) == (self._codec.name, self._codec.model_hash)
+        same_codec = (present_name(image.codec), image.model) == (self._codec.name, self._codec.model_hash)
         if kind == "refine" and same_codec:
             snippet = wire.decode(Snippet, cached.snippet, entry_location(image_id))
             longer = refine(self._codec, image.stream, snippet.picture.to_array())
@@ -150,7 +152,8 @@ class CompressorService(Service[CompressorConfig]):
                 self._cache.put(effects, {image_id: replace(cached, image=wire.encode(image))}, time.time())
                 effects.count("images_refined")
         if same_codec:
-            image = image.model_copy(update={"stream": transmit_part(self._codec, image.stream)})
+            stream = transmit_part(self._codec, image.stream)
+            image = image.model_copy(update={"codec": self._codec.name, "stream": stream})
         effects.send(keys.image_encoded(self.platform.id), _CONSUMER, image, priority=_COMMAND_PRIORITY)
         effects.count("images_resent")
         log.info("Image sent again", extra=kv(image_id=image_id, kind=kind, bytes=len(image.stream)))

@@ -406,7 +406,7 @@ def test_crops_equal_those_of_the_published_table(data_dir: Path) -> None:
 
 def test_grain_is_added_only_for_codecs_that_support_it() -> None:
     class Grainy(Halving):
-        def decode_grain(self, stream: bytes) -> np.ndarray:
+        def speckle_layer(self, stream: bytes) -> np.ndarray:
             if len(stream) < 20:
                 raise StreamError("stream", "grain", stream, "grain in the stream")
             return np.array([[-300, -3], [10, 300]], np.int16)
@@ -437,3 +437,16 @@ def test_unavailable_codecs_are_listed_unless_requested_by_name(monkeypatch: pyt
     ]
     with pytest.raises(SonarpostError, match="pip install rare"):
         measuring.create_codecs(registry, ["rare"])
+
+
+def test_models_of_emb_are_measured_under_their_own_names() -> None:
+    registry = measuring_registry()
+    found, _ = measuring.create_codecs(registry, ["emb", "emb:structure"])
+    assert [(one.name, one.label, one.codec.codec_id) for one in found] == [
+        ("emb", "emb", 0x20),
+        ("emb:structure", "emb:structure", 0x21),
+    ]
+    everything, _ = measuring.create_codecs(registry, None, all_packings=False)
+    assert [one.name for one in everything if one.codec.name == "emb"] == ["emb", "emb:structure"]
+    with pytest.raises(SonarpostError, match='model = "structure"'):
+        measuring.create_codecs(registry, ["emb-structure"])

@@ -21,7 +21,7 @@ import optax
 
 from research.training.emb.train import write_model
 from sonarpost.codec.emb.codec import EmbCodec
-from sonarpost.codec.emb.model import CHANNELS, DILATIONS, GLOBALS, Model, parse, read_arrays
+from sonarpost.codec.emb.model import CHANNELS, DILATIONS, IMAGE_FEATURES, Model, parse, read_arrays
 
 SEED = 11
 BATCH = 10
@@ -30,27 +30,27 @@ Params = dict[str, jax.Array]
 
 
 def coded(codec: EmbCodec, pictures: np.ndarray, rng: np.random.Generator, streams: int) -> tuple[np.ndarray, ...]:
-    """Decode chance lengths of each picture: planes without enhancement (1/64 grey), means, situations.
+    """Decode chance lengths of each picture: planes without enhancement (1/64 grey), means, features.
 
     Every other stream is the beginning of a longer one, as a receiver has it that still waits for more.
     """
-    planes, means, situations = [], [], []
+    planes, means, features = [], [], []
     for picture in pictures:
         for i, size in enumerate(np.exp(rng.uniform(np.log(LEAST_BYTES), np.log(LARGEST_BYTES), streams))):
             length = int(size * picture.size / 6400)
             made = length if i % 2 == 0 else int(length * rng.uniform(1, 4))
-            stream = EmbCodec(codec.model, steps=(int(rng.integers(8)),)).encode(picture, made)
-            plain = codec.decode_plain(stream[:length])
+            stream = EmbCodec(codec.network, start_steps=(int(rng.integers(8)),)).encode(picture, made)
+            plain = codec.decode_before_enhancer(stream[:length])
             low, high = -64 * plain.mean, 64 * (255 - plain.mean)
             planes.append(np.clip(plain.plane, low, high).astype(np.int16))
             means.append(plain.mean)
-            situations.append(plain.situation)
-    return np.stack(planes), np.array(means), np.array(situations)
+            features.append(plain.features)
+    return np.stack(planes), np.array(means), np.array(features)
 
 
 def start(rng: np.random.Generator) -> Params:
     """He-initialised weights; the last layer begins near nothing."""
-    out: Params = {"s": jnp.zeros((GLOBALS, CHANNELS))}
+    out: Params = {"s": jnp.zeros((IMAGE_FEATURES, CHANNELS))}
     for i in range(len(DILATIONS)):
         inputs, outputs = (4 if i == 0 else CHANNELS), (4 if i == len(DILATIONS) - 1 else CHANNELS)
         scale = np.sqrt(2 / (9 * inputs)) * (0.02 if outputs == 4 else 1)
@@ -61,13 +61,13 @@ def start(rng: np.random.Generator) -> Params:
 
 def resumed(model: Model) -> Params:
     """The weights of a model file, as they were before rounding."""
-    out: Params = {"s": jnp.asarray(model.situation / (1 << 14))}
+    out: Params = {"s": jnp.asarray(model.image_weights / (1 << 14))}
     for i, (taps, bias) in enumerate(model.layers):
         out[f"w{i}"], out[f"b{i}"] = jnp.asarray(taps / (1 << 12)), jnp.asarray(bias / (1 << 20))
     return out
 
 
-def enhance(p: Params, blocks: jax.Array, situation: jax.Array) -> jax.Array:
+def enhance(p: Params, blocks: jax.Array, features: jax.Array) -> jax.Array:
     """Corrections in grey; the integer twin is `enhance.enhanced`. `blocks` in 64 grey."""
     x = blocks
     for i, d in enumerate(DILATIONS):
@@ -78,7 +78,7 @@ def enhance(p: Params, blocks: jax.Array, situation: jax.Array) -> jax.Array:
         )
         x = x + p[f"b{i}"]
         if i == 0:
-            x = x + (situation / 64 @ p["s"])[:, None, None, :]
+            x = x + (features / 64 @ p["s"])[:, None, None, :]
         if i < len(DILATIONS) - 1:
             x = jnp.clip(jnp.maximum(x, x / 8), -15.99, 15.99)
     return x * 16
@@ -149,19 +149,19 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
     began = time.time()
     sets = {}
     for name, source in (("train", pool["tp80"][-args.pictures :]), ("check", pool["vp80"][:100])):
-        plane, mean, situation = coded(codec, source, rng, args.streams if name == "train" else 2)
-        sets[name] = (source.repeat(len(plane) // len(source), 0), plane, mean, situation)
+        plane, mean, features = coded(codec, source, rng, args.streams if name == "train" else 2)
+        sets[name] = (source.repeat(len(plane) // len(source), 0), plane, mean, features)
     print(f"coded, {time.time() - began:.0f} s", flush=True)
-    params = resumed(codec.model) if args.resume else start(rng)
+    params = resumed(codec.network) if args.resume else start(rng)
 
     def parts(
-        p: Params, picture: jax.Array, plane: jax.Array, mean: jax.Array, situation: jax.Array
+        p: Params, picture: jax.Array, plane: jax.Array, mean: jax.Array, features: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         decoded = plane / 64
         # Blocks are made on the device, so that turned pictures need no second copy.
         n, h, w = decoded.shape
         blocks = decoded.reshape(n, h // 2, 2, w // 2, 2).transpose(0, 1, 3, 2, 4).reshape(n, h // 2, w // 2, 4) / 64
-        better = jnp.clip(decoded + to_pixels(enhance(p, blocks, situation)), -mean[:, None, None] - 3, 258)
+        better = jnp.clip(decoded + to_pixels(enhance(p, blocks, features)), -mean[:, None, None] - 3, 258)
         truth = picture - mean[:, None, None]
         before = ((decoded - truth) ** 2).mean((1, 2))
         after = ((better - truth) ** 2).mean((1, 2))
@@ -181,7 +181,7 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
 
     step, check = jax.jit(take_step), jax.jit(parts)
     state = optimiser.init(params)
-    pictures, planes, means, situations = sets["train"]
+    pictures, planes, means, features = sets["train"]
     began = time.time()
     for i in range(args.steps):
         rate = (args.rate * (1 - i / args.steps) ** 1.5 + 1e-5) * min(1, (i + 5) / 300)
@@ -195,7 +195,7 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
             x, y = x[:, :, ::-1], y[:, :, ::-1]
         if turn & 4:
             x, y = x.transpose(0, 2, 1), y.transpose(0, 2, 1)
-        params, state, _ = step(params, state, x, y, means[pick], situations[pick])
+        params, state, _ = step(params, state, x, y, means[pick], features[pick])
         if i % 250 == 249 or i == args.steps - 1:
             _report(check, params, sets["check"], i + 1, time.time() - began)
             write(args.out, args.model, params)
@@ -204,7 +204,7 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
 def write(out: Path, model: Path, params: Params) -> None:
     """Round the weights and write a model file with them and all else of another one."""
     arrays: dict[str, np.ndarray] = dict(read_arrays(model.read_bytes()))
-    arrays["situation"] = np.rint(np.asarray(params["s"], np.float64) * (1 << 14))
+    arrays["image_weights"] = np.rint(np.asarray(params["s"], np.float64) * (1 << 14))
     for i in range(len(DILATIONS)):
         taps = np.rint(np.asarray(params[f"w{i}"], np.float64) * (1 << 12))
         bias = np.rint(np.asarray(params[f"b{i}"], np.float64) * (1 << 20))

@@ -16,9 +16,9 @@ import numpy.typing as npt
 from PIL import Image
 from scipy.interpolate import PchipInterpolator
 
+from research.common.measurement import create_codec
 from research.common.quality import ms_ssim
 from sonarpost.codec.quality import psnr_db, ssim
-from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.errors import StreamError
 
 BUDGETS = (22, 44, 64, 88, 128, 192, 256, 384, 512)
@@ -65,7 +65,7 @@ def main() -> None:
     pictures = snippets(args.data)
     curves: dict[str, Curve] = {}
     for name in args.codecs:
-        codec, curves[name] = default_registry().create(name, CodecResources()), []
+        codec, curves[name] = create_codec(name), []
         for budget in BUDGETS:
             try:
                 streams = [codec.encode(p, budget) for p in pictures]

@@ -2,7 +2,7 @@
 
     python -m research.training.emb.sheets --data ../shared/data --out docs/explanation/codecs 22 64 192
     python -m research.training.emb.sheets --data ../shared/data --out docs/explanation/codecs \
-        --codecs emb emb-structure -- 64 128
+        --codecs emb emb:structure -- 64 128
 
 Only pictures that anybody may show: the public-domain Humminbird recording (its last fifth) and the simulator.
 """
@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from research.common.measurement import create_codec
 from research.training.emb.pool import cut, simulated_sheets, survey_sheets
-from sonarpost.codec.registry import CodecResources, default_registry
 
 SIDE_PX, GAP_PX, COLUMNS, SEED = 80, 4, 6, 4
 
@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("budgets", type=int, nargs="+")
     args = parser.parse_args()
     rng, pitch, rows = np.random.default_rng(SEED), SIDE_PX + GAP_PX, 1 + len(args.codecs)
-    codecs = [default_registry().create(name, CodecResources()) for name in args.codecs]
+    codecs = [create_codec(name) for name in args.codecs]
     real = [np.nan_to_num(s) for s, group in survey_sheets(args.data) if group.startswith("pyhum")]
     sources = ([s[s.shape[0] * 4 // 5 :] for s in real], simulated_sheets(range(100, 103)))
     pictures = [cut([(s, True) for s in sheets], (SIDE_PX, SIDE_PX), COLUMNS, rng) for sheets in sources]
@@ -42,7 +42,7 @@ def main() -> None:
                 sheet[y : y + SIDE_PX, x : x + SIDE_PX] = shown
                 y += pitch
         image = Image.fromarray(sheet).resize((2 * sheet.shape[1], 2 * sheet.shape[0]), Image.Resampling.NEAREST)
-        image.save(args.out / f"{args.codecs[-1]}-{budget}.png", optimize=True)
+        image.save(args.out / f"{args.codecs[-1].replace(':', '-')}-{budget}.png", optimize=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Make the model that training for `emb-structure` begins with: one of `emb`, and the aim beside it.
+"""Make the initial model for training `structure`: a `standard` model with perceptual weights.
 
     python -m research.training.emb.structure \
         --model common/sonarpost/codec/emb/data/emb-2.model --out /tmp/emb/structure.model
@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb.model import AIMED, read_arrays
-from sonarpost.codec.emb.perceptual_weights import CONTRASTS, STILL_GREY2
+from sonarpost.codec.emb.model import CONTRASTS, FORMAT_3, read_arrays
+from sonarpost.codec.emb.perceptual_weights import VARIANCE_OFFSET
 
 LEVELS = (0.9, 0.3, 0.6, 1.0, 1.0, 0.9, 0.9)
 """Of the lowest band, then of the other bands of level 1 (the finest) to 6."""
@@ -25,13 +25,13 @@ POWER = 0.25
 """The scale falls with this power of the local variance: half of what would make all errors relative ones."""
 
 
-def aim_arrays() -> dict[str, npt.NDArray[np.int32]]:
-    """The arrays that a model with an aim has beside the others."""
+def perceptual_arrays() -> dict[str, npt.NDArray[np.int32]]:
+    """Return the arrays of the perceptual weights."""
     total = 2.0 ** (np.arange(CONTRASTS) / 8)
-    contrast = 256 * ((EVEN_GREY2 + STILL_GREY2) / np.maximum(total, STILL_GREY2)) ** POWER
+    contrast = 256 * ((EVEN_GREY2 + VARIANCE_OFFSET) / np.maximum(total, VARIANCE_OFFSET)) ** POWER
     return {
-        "aim_levels": np.rint(256 * np.array(LEVELS)).astype(np.int32),
-        "aim_contrast": np.rint(contrast).astype(np.int32),
+        "perceptual_levels": np.rint(256 * np.array(LEVELS)).astype(np.int32),
+        "perceptual_contrast": np.rint(contrast).astype(np.int32),
     }
 
 
@@ -41,8 +41,10 @@ def main() -> None:
     parser.add_argument("--model", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    arrays = read_arrays(args.model.read_bytes()) | aim_arrays()
-    args.out.write_bytes(AIMED.magic + b"".join(arrays[name].astype(kind).tobytes() for name, _, kind in AIMED.arrays))
+    arrays = read_arrays(args.model.read_bytes()) | perceptual_arrays()
+    args.out.write_bytes(
+        FORMAT_3.magic + b"".join(arrays[name].astype(kind).tobytes() for name, _, kind in FORMAT_3.arrays)
+    )
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.codec.registry import CodecResources, default_registry
+from research.common.measurement import create_codec
 
 BUDGETS = (64, 256, 512)
 
@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=int, default=6)
     parser.add_argument("--codec", default="emb")
     args = parser.parse_args()
-    codec = default_registry().create(args.codec, CodecResources())
+    codec = create_codec(args.codec)
     pictures = np.load(args.pool)["vp140"][: args.pictures]
     for budget in BUDGETS:
         codec.decode(codec.encode(pictures[0], budget))  # compiles

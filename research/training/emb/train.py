@@ -19,7 +19,7 @@ import optax
 
 from research.training.emb.examples import Rows, blank_model, list_examples, measure_centres
 from sonarpost.codec.emb import kernel as k
-from sonarpost.codec.emb.model import AIMED, SECOND, Model, model_of, parse, read_arrays
+from sonarpost.codec.emb.model import FORMAT_2, FORMAT_3, Model, model_of, parse, read_arrays
 
 SEED = 7
 BATCH = 8192
@@ -109,7 +109,7 @@ def tables() -> dict[str, np.ndarray]:
     chance = 1 / (1 + np.exp(-logit))
     whole = np.clip(np.rint(chance * 65536), 6, 65530)
     return {
-        "chances": whole,
+        "probabilities": whole,
         "costs": np.rint(-256 * np.log2(whole / 65536)),
     }
 
@@ -128,7 +128,7 @@ def mean_tree(means: np.ndarray) -> np.ndarray:
 
 def write_model(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write the arrays in the file's order and types."""
-    form = AIMED if "aim_levels" in arrays else SECOND
+    form = FORMAT_3 if "perceptual_levels" in arrays else FORMAT_2
     raw = bytearray(form.magic)
     for name, shape, kind in form.arrays:
         array = np.asarray(arrays[name])
@@ -197,7 +197,7 @@ def main() -> None:
     arrays = integers(nets, signs) | tables()
     arrays["mean_tree"] = mean_tree(np.concatenate([pool[n].mean((1, 2)) for n in ("tp80", "tp140", "tp112")]))
     kept = read_arrays(args.order.read_bytes()) if args.order else {}
-    for name, shape, _ in (AIMED if order.aim is not None else SECOND).arrays:
+    for name, shape, _ in (FORMAT_2 if order.perceptual is None else FORMAT_3).arrays:
         arrays.setdefault(name, kept.get(name, np.zeros(shape)))  # an enhancer of zeros does nothing
     arrays["centres"] = order.centres
     whole = model_of({name: np.asarray(array, np.int32) for name, array in arrays.items()})

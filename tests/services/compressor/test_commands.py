@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import msgpack
 import pytest
 from builders.common import eventually
 from builders.records import command_record
 
-from sonarpost import keys
+from sonarpost import keys, wire
+from sonarpost.messages import EncodedImage
 
 IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
 
@@ -92,4 +94,21 @@ def test_an_image_of_another_codec_is_sent_unchanged(start_service, runner, atd,
     start_service(codec="vq")
     [_, repeated] = refine(runner.peer("uuv-1", "vehicle_commands"), modem, times=1)
     assert repeated.startswith(modem.received[0].stream)
+    assert modem.received[1].codec == "emb"
+
+
+def test_cached_image_of_a_retired_codec_name_is_refined(start_service, runner, atd, modem, snippet):
+    service = start_service(codec="emb", model="structure", budget_bytes=120)
+    atd.send(IN, "compressor", snippet("c1", 64, 64))
+    eventually(lambda: len(modem.received) == 1)
+    sent = modem.received[0]
+    assert (sent.codec, sent.stream[0]) == ("emb", 0x21)
+    name = f"kept/{sent.image_id}"
+    image, *others = msgpack.unpackb(service.store.get_state(name))
+    old = wire.decode(EncodedImage, image, name).model_copy(update={"codec": "emb-structure"})
+    with service.store.transaction() as tx:
+        tx.put_state(name, msgpack.packb([wire.encode(old), *others]))
+    [first, longer] = refine(runner.peer("uuv-1", "vehicle_commands"), modem, times=1)
+    assert longer.startswith(first)
+    assert len(longer) >= 1.9 * len(first)
     assert modem.received[1].codec == "emb"

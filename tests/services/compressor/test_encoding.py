@@ -172,6 +172,8 @@ def test_the_configured_packing_is_used(packing, start_service, atd, modem, snip
         ({"codebook": "/nowhere/own.tiles"}, CodebookError, "/nowhere/own.tiles"),
         ({"codebook": "nominal-11"}, CodebookError, "nominal-11"),
         ({"codec": "jpeg-of-the-future"}, ConfigError, "one of"),
+        ({"codec": "emb-structure"}, ConfigError, 'codec = "emb", model = "structure"'),
+        ({"codec": "emb", "model": "texture"}, ConfigError, "standard or structure"),
     ],
 )
 def test_a_configuration_error_is_raised_before_the_store_is_opened(options, error, expected, platform):

@@ -3,14 +3,13 @@
     python -m pip install 'sonarpost[fuzz]'       # x86-64 and Python 3.11 to 3.13: Atheris has no other wheels
     python tests/system/fuzz/run_atheris.py --codecs emb -max_total_time=180
 
-Options with one dash are libFuzzer's; without any it runs until it finds something or is stopped. It begins with the
-golden streams and new ones, whole and as bodies behind a good header. What it found of interest is kept in
-`build/fuzz/<codecs>`, an input that fails is written to the current folder: `run_atheris.py --codecs emb crash-…`
+Options with one dash are those of libFuzzer. Without options it runs until it finds a failure or is stopped. The seeds
+are golden and new streams, complete and as bodies after a valid header. Interesting inputs are stored in
+`build/fuzz/<codecs>`. An input that fails is written to the current folder; `run_atheris.py --codecs emb crash-…`
 repeats it.
 
-emb's machine code is compiled with bounds checks here, so that an index outside an array is an error and not a stray
-read; it is not instrumented, nor are the libraries behind the other codecs. libFuzzer holds each input to 10 s and the
-process to 2 GiB.
+The machine code of emb is compiled with bounds checks, so that an index outside an array is an error. It is not
+instrumented, nor are the libraries of the other codecs. libFuzzer limits each input to 10 s and the process to 2 GiB.
 """
 
 from __future__ import annotations
@@ -30,10 +29,13 @@ try:
 except ImportError:
     sys.exit("run_atheris: Atheris is not installed here: python -m pip install 'sonarpost[fuzz]'")
 
-# Functions that numba compiles must not be instrumented.
+# Functions compiled by numba must not be instrumented.
 COMPILED = [
     "sonarpost.codec.vq.tile_search",
-    *(f"sonarpost.codec.emb.{name}" for name in ("aim", "enhance", "fit", "kernel", "likeness", "transform")),
+    *(
+        f"sonarpost.codec.emb.{name}"
+        for name in ("decode", "encode", "kernel", "perceptual_weights", "rate_distortion_opt", "transform")
+    ),
 ]
 
 with atheris.instrument_imports(include=["sonarpost", "fuzz"], exclude=COMPILED):
@@ -65,7 +67,7 @@ def main() -> None:
                 (corpus / f"seed-{number:03}-{flags}").write_bytes(as_input(stream, flags, ids)[:MAX_INPUT_BYTES])
         arguments.append(str(corpus))
     for codec_id in ids:
-        codec_for(codec_id)  # what is loaded on first use is not an input's time
+        codec_for(codec_id)  # loading is not part of the time of an input
 
     def test_one_input(data: bytes) -> None:
         stream, received = stream_of(data, ids)

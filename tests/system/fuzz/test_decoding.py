@@ -1,4 +1,4 @@
-"""The fuzzer's check on a fixed set of inputs: damaged golden streams and random bodies, in bounded time and memory."""
+"""The rules of the fuzzer on fixed inputs: damaged golden streams and random bodies, in bounded time and memory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from builders.codec_oracle import check, codec_for, codec_ids, good_header, stream_of
+from builders.codec_oracle import check, codec_for, codec_ids, stream_of, valid_header
 from builders.fuzz_seeds import as_input, golden_streams, new_streams
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,14 +19,14 @@ from sonarpost.codec.registry import default_registry
 
 NAMES = default_registry().names()
 MUTATIONS = 6
-MOST_CPU_S = 5.0
-"""Of processor time that any input may take; the slowest codec takes a tenth of it for the largest picture."""
-MOST_MIB = 200.0
-"""That all inputs together may add to what the process held at its peak before."""
+MAX_CPU_S = 5.0
+"""Maximum processor time of an input. The slowest codec needs a tenth of it for the largest image."""
+MAX_GROWTH_MIB = 200.0
+"""Maximum growth of the peak memory of the process by all inputs."""
 
 
 def damaged(stream: bytes, rng: np.random.Generator, others: list[bytes]) -> Iterator[bytes]:
-    """Yield the stream cut, with bits and bytes changed, bytes left out, doubled, and joined with another's."""
+    """Yield the stream truncated, with changed, removed and repeated bytes, and joined with another one."""
     body = StreamHeader.unpack(stream).size
     for number in range(MUTATIONS):
         data = bytearray(stream)
@@ -48,9 +48,9 @@ def damaged(stream: bytes, rng: np.random.Generator, others: list[bytes]) -> Ite
 
 
 def random_bodies(codec_id: int, rng: np.random.Generator) -> Iterator[bytes]:
-    """Yield bodies of noise, zeros and ones behind good headers, of the smallest to the largest picture."""
+    """Yield bodies of noise, zeros and ones after valid headers, from the smallest to the largest image."""
     for height_px, width_px in ((16, 16), (33, 47), (MAX_SIDE_PX, MAX_SIDE_PX)):
-        header = good_header(codec_id, height_px, width_px).pack()
+        header = valid_header(codec_id, height_px, width_px).pack()
         for length in (0, 1, 2, 3, 7, 60, 700):
             yield header + rng.integers(0, 256, length, dtype=np.uint8).tobytes()
             yield header + bytes([int(rng.choice((0, 0x7F, 0x80, 0xFF)))]) * length
@@ -63,31 +63,31 @@ def peak_mib() -> float:
 def checked(stream: bytes, ids: tuple[int, ...], received: np.ndarray | None = None) -> str:
     start_s = time.process_time()
     outcome = check(stream, received, ids)
-    assert time.process_time() - start_s < MOST_CPU_S, (len(stream), stream[:16].hex())
+    assert time.process_time() - start_s < MAX_CPU_S, (len(stream), stream[:16].hex())
     return outcome
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_damaged_streams_are_refused_or_decode_in_bounded_time_and_memory(name: str) -> None:
+def test_damaged_streams_decode_or_are_rejected_in_bounded_time_and_memory(name: str) -> None:
     rng, ids = np.random.default_rng(0), codec_ids([name])
     streams = [stream for stream in (*golden_streams(ids), *new_streams(ids)) if len(stream) <= 1500]
     assert streams
-    largest = good_header(ids[0], MAX_SIDE_PX, MAX_SIDE_PX).pack()
-    for start in (streams[0], largest + bytes(range(1, 200))):  # libraries and machine code take their room here
+    largest = valid_header(ids[0], MAX_SIDE_PX, MAX_SIDE_PX).pack()
+    for start in (streams[0], largest + bytes(range(1, 200))):  # loads libraries and machine code
         check(start, None, ids)
     before_mib = peak_mib()
     outcomes = Counter(checked(bad, ids) for stream in streams for bad in damaged(stream, rng, streams))
     outcomes += Counter(checked(bad, ids) for codec_id in ids for bad in random_bodies(codec_id, rng))
-    assert peak_mib() - before_mib < MOST_MIB
-    assert outcomes["refused"] > 0
-    assert outcomes["whole"] + outcomes["concealed"] > 0
+    assert peak_mib() - before_mib < MAX_GROWTH_MIB
+    assert outcomes["rejected"] > 0
+    assert outcomes["complete"] + outcomes["concealed"] > 0
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_good_streams_are_whole_and_with_a_gap_never_raise_anything_else(name: str) -> None:
+def test_valid_streams_are_complete_and_with_a_gap_raise_stream_errors_only(name: str) -> None:
     rng, ids = np.random.default_rng(1), codec_ids([name])
     for stream in new_streams(ids):
-        assert check(stream, None, ids) == "whole"
+        assert check(stream, None, ids) == "complete"
         length = len(stream) - StreamHeader.unpack(stream).size
         first = int(rng.integers(0, length))
         received = np.ones(length, dtype=np.bool_)
@@ -97,13 +97,13 @@ def test_good_streams_are_whole_and_with_a_gap_never_raise_anything_else(name: s
 
 @given(data=st.binary(max_size=120))
 @settings(max_examples=300, deadline=None)
-def test_random_bytes_are_refused_or_decode(data: bytes) -> None:
+def test_random_bytes_decode_or_are_rejected(data: bytes) -> None:
     ids = codec_ids()
     stream, received = stream_of(data, ids)
     checked(stream, ids, received)
 
 
-def test_the_fuzzers_inputs_are_the_streams_they_are_made_from() -> None:
+def test_inputs_of_the_fuzzer_parse_to_their_streams() -> None:
     ids = codec_ids()
     for codec_id in ids:
         stream = next(s for s in new_streams([codec_id]) if StreamHeader.unpack(s).height_px != 17)
@@ -115,26 +115,30 @@ def test_the_fuzzers_inputs_are_the_streams_they_are_made_from() -> None:
                 assert np.flatnonzero(~received).tolist() == [3, 4]
 
 
-def test_the_check_finds_what_it_is_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A decoder that shows what it says is missing, one of another size, and one that raises anything else."""
+def test_check_detects_invalid_decoders(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A decoder with visible missing pixels, one with another size, and one that raises another exception."""
     from dataclasses import replace
 
     codec, (codec_id,) = type(codec_for(0x04)), codec_ids(["spiht"])
     stream = next(new_streams([codec_id]))
-    good = codec.decode
+    original = codec.decode
 
-    def shown(self: object, stream: bytes, received: object = None) -> object:
-        decoded = good(self, stream, received)
+    def with_visible_missing_pixels(self: object, stream: bytes, received: object = None) -> object:
+        decoded = original(self, stream, received)
         return replace(decoded, image=decoded.image | 1, missing=~decoded.missing)
 
-    def small(self: object, stream: bytes, received: object = None) -> object:
-        decoded = good(self, stream, received)
+    def of_another_size(self: object, stream: bytes, received: object = None) -> object:
+        decoded = original(self, stream, received)
         return replace(decoded, image=decoded.image[1:], missing=decoded.missing[1:])
 
     def crashing(self: object, stream: bytes, received: object = None) -> object:
         raise IndexError(len(stream))
 
-    for wrong, error in ((shown, AssertionError), (small, AssertionError), (crashing, IndexError)):
-        monkeypatch.setattr(codec, "decode", wrong)
+    for decode, error in (
+        (with_visible_missing_pixels, AssertionError),
+        (of_another_size, AssertionError),
+        (crashing, IndexError),
+    ):
+        monkeypatch.setattr(codec, "decode", decode)
         with pytest.raises(error):
             check(stream, None, [codec_id])
