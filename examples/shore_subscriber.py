@@ -1,4 +1,4 @@
-"""Prints what the shore accepts and saves pictures as PGM: shore_subscriber.py tcp/127.0.0.1:7447 [FOLDER]."""
+"""Prints the records of a shore site and saves images as PGM: shore_subscriber.py tcp/127.0.0.1:7447 [FOLDER]."""
 
 import json
 import pathlib
@@ -9,8 +9,8 @@ import zenoh
 
 folder = pathlib.Path(*sys.argv[2:3])
 config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": sys.argv[1:2]}}))
-with zenoh.open(config) as session, session.declare_subscriber("sonarpost/v1/shore/contact/**") as accepted:
-    for sample in accepted:
+with zenoh.open(config) as session, session.declare_subscriber("sonarpost/v1/shore/contact/**") as records:
+    for sample in records:
         r = msgpack.unpackb(sample.payload.to_bytes())
         print(r["type"], r["vehicle_id"], r["image_id"], r.get("verdict"), r.get("contact"), flush=True)
         if p := r.get("picture"):

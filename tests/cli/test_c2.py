@@ -18,7 +18,7 @@ from builders.records import decision_record, picture_record
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import router_config
-from sonarpost.cli.c2.stored import join_decisions, select_images, since_of
+from sonarpost.cli.c2.stored import RecordFilter, join_decisions, select_images, since_of
 from sonarpost.cli.main import main
 from sonarpost.cli.shared import printable
 from sonarpost.errors import ConfigError
@@ -124,11 +124,11 @@ def test_decision_matches_the_image_received_before_it(tmp_path):
         archive.flush()
     rows = join_decisions(archive.index().images(), archive.index().decisions())
     archive.close()
-    assert [(r.picture.first_frame_utc_s, r.decision and r.decision.decision_id) for r in rows] == [
+    assert [(r.image.first_frame_utc_s, r.decision and r.decision.decision_id) for r in rows] == [
         (1000.0, "d1"),
         (2000.0, "d2"),
     ]
-    assert len(select_images(rows)) == 2
+    assert len(select_images(rows, RecordFilter())) == 2
 
 
 def test_get_copies_the_newest_version(capsys, out, tmp_path):

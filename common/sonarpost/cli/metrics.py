@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import argparse
 import logging
-import signal
-import threading
-from types import FrameType
 
 from prometheus_client import start_http_server
 
 from sonarpost import logs
-from sonarpost.cli.shared import add_router_options, router_of
+from sonarpost.cli.shared import add_router_options, router_of, stop_on_signals
 from sonarpost.errors import PortError
 from sonarpost.monitoring.fleet import FleetTracker, FleetWatcher
 from sonarpost.monitoring.metrics import FleetCollector, registry_of
@@ -58,28 +55,20 @@ def run(parsed: argparse.Namespace) -> int:
     """
     endpoints, tls = router_of(parsed)
     logs.configure_logging("metrics", log_format=parsed.log_format)
-    stop = threading.Event()
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, on_signal)
-    watcher = FleetWatcher(endpoints, tls, FleetTracker(parsed.forget_after))
-    registry = registry_of(FleetCollector(watcher.state, parsed.stale_after))
-    try:
-        server, thread = start_http_server(parsed.port, parsed.address, registry)
-    except (OSError, OverflowError) as error:
-        raise PortError(f"{parsed.address}:{parsed.port}: {error}") from error
-    try:
-        with watcher:
-            log.info(
-                "Metrics served",
-                extra=logs.kv(address=parsed.address, port=server.server_port, router=", ".join(endpoints)),
-            )
-            stop.wait()
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join(timeout=5.0)
+    with stop_on_signals() as stop:
+        watcher = FleetWatcher(endpoints, tls, FleetTracker(parsed.forget_after))
+        registry = registry_of(FleetCollector(watcher.state, parsed.stale_after))
+        try:
+            server, thread = start_http_server(parsed.port, parsed.address, registry)
+        except (OSError, OverflowError) as error:
+            raise PortError(f"{parsed.address}:{parsed.port}: {error}") from error
+        try:
+            with watcher:
+                fields = logs.kv(address=parsed.address, port=server.server_port, router=", ".join(endpoints))
+                log.info("Metrics server started", extra=fields)
+                stop.wait()
+        finally:
+            server.shutdown()
+            server.server_close()
+            thread.join(timeout=5.0)
     return 0

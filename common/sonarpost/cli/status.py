@@ -5,14 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import signal
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from types import FrameType
 from typing import Literal
 
 from rich import box
@@ -21,7 +19,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sonarpost.cli.shared import add_router_options, printable, router_of
+from sonarpost.cli.shared import add_router_options, printable, router_of, stop_on_signals
 from sonarpost.errors import ConfigError
 from sonarpost.monitoring.fleet import FleetState, FleetWatcher, ServiceStatus
 
@@ -78,7 +76,7 @@ def run(parsed: argparse.Namespace, console: Console | None = None) -> int:
     console = console or Console(highlight=False)
     with (
         _logging_suppressed(),
-        _stop_on_signals() as stop,
+        stop_on_signals() as stop,
         FleetWatcher(endpoints, tls, poll_s=min(1.0, parsed.interval)) as watcher,
     ):
         if parsed.once:
@@ -129,22 +127,6 @@ def _logging_suppressed() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(before)
-
-
-@contextmanager
-def _stop_on_signals() -> Iterator[threading.Event]:
-    """Return an event that SIGINT and SIGTERM set, so that the terminal is restored before the process ends."""
-    stop = threading.Event()
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 # Rows

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 from urllib.parse import urlsplit
 
 from sonarpost.errors import ConfigError, PortError
@@ -90,14 +90,7 @@ class TlsFiles:
         return context
 
 
-class Wait(Protocol):
-    """Function that waits between attempts, for example `threading.Event.wait`."""
-
-    def __call__(self, timeout_s: float, /) -> bool:
-        """Wait for `timeout_s`; return True to stop trying."""
-
-
-def _sleep(timeout_s: float, /) -> bool:
+def _sleep(timeout_s: float) -> bool:
     time.sleep(timeout_s)
     return False
 
@@ -111,7 +104,7 @@ class CotSender:
         timeout_s: Time limit of a connection attempt and of each write.
         multicast_ttl: Hop limit of multicast datagrams; 1 keeps them on the local network.
         clock: Monotonic clock, seconds.
-        wait: Function that waits between attempts.
+        wait: Waits between attempts, argument in seconds; returns True to stop trying. `threading.Event.wait` fits.
 
     Raises:
         ConfigError: The endpoint or a file of `tls` is invalid.
@@ -125,7 +118,7 @@ class CotSender:
         timeout_s: float = 5.0,
         multicast_ttl: int = 1,
         clock: Callable[[], float] = time.monotonic,
-        wait: Wait = _sleep,
+        wait: Callable[[float], bool] = _sleep,
     ) -> None:
         self.endpoint = parse_endpoint(endpoint)
         self._tls = (tls or TlsFiles()).context() if self.endpoint.scheme == "tls" else None

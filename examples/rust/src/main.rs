@@ -1,4 +1,4 @@
-//! Prints what the shore accepts: shore_subscriber tcp/127.0.0.1:7447
+//! Prints the records of a shore site: shore_subscriber tcp/127.0.0.1:7447
 
 #[tokio::main]
 async fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {

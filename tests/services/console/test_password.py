@@ -1,4 +1,4 @@
-"""Changing the own password: errors, end of other sessions, the page, and no password in files or logs."""
+"""Password change by users: errors, end of other sessions, the page, and no password in files or logs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_new_password_ends_only_other_sessions_of_the_user(console):
 
 
 @pytest.mark.parametrize("user", ROLES_OF_USERS)
-def test_every_role_may_change_the_own_password(console, user):
+def test_users_of_every_role_may_change_their_password(console, user):
     browser = console.browser(user)
     assert browser.get("/password").status_code == 200
     assert browser.post("/api/password", {"old": PASSWORD, "new": NEW}).status_code == 204

@@ -109,7 +109,7 @@ def test_wrong_passwords_are_refused_and_limited(console):
     limited = browser.login("anna")
     assert limited.status_code == 429
     assert int(limited.headers["retry-after"]) > 200
-    assert browser.login("nobody").status_code == 401
+    assert browser.login("unknown").status_code == 401
     assert browser.login("bo").status_code == 200
 
 

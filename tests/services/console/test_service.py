@@ -142,14 +142,14 @@ def test_empty_relay_means_delivery_to_shore(start, client, runner, monkeypatch,
     eventually(lambda: anna.contact(ID)["contact"]["delivery"]["shore"] == "relay", what="acknowledgement of the relay")
     health = relay.health()
     # The health of the peer has no gauge for decisions, so that its own records change nothing.
-    for gauges, at, ashore in (
+    for gauges, at, shore_state in (
         ({"inbox": 0.0, "decisions_waiting": 1.0}, 60, "relay"),
         ({"inbox": 1.0, "decisions_waiting": 0.0}, 60, "relay"),
         ({"inbox": 0.0, "decisions_waiting": 0.0}, -60, "relay"),
         ({"inbox": 0.0, "decisions_waiting": 0.0}, 60, "delivered"),
     ):
         console._on_relay_health(health.model_copy(update={"gauges": gauges, "time_utc_s": time.time() + at}))
-        assert anna.contact(ID)["contact"]["delivery"]["shore"] == ashore
+        assert anna.contact(ID)["contact"]["delivery"]["shore"] == shore_state
 
 
 def test_request_is_sent_to_the_modem(runner, start, client, log_in):
@@ -203,9 +203,11 @@ def test_received_frames_are_assigned_to_their_vehicle(start, client, log_in):
     eventually(lambda: len(anna.get("/api/fleet").json()["vehicles"]) == 1, what="vehicle")
     [vehicle] = anna.get("/api/fleet").json()["vehicles"]
     assert (vehicle["vehicle_id"], vehicle["snr_in_db"], vehicle["loss"]) == ("uuv-1", 12.5, 0.333)
-    eventually(
-        lambda: any(s["service"] == "console" for s in anna.get("/api/fleet").json()["services"]), what="own health"
-    )
+
+    def services() -> set[str]:
+        return {service["service"] for service in anna.get("/api/fleet").json()["services"]}
+
+    eventually(lambda: "console" in services(), what="own health")
 
 
 def test_invalid_record_is_counted_and_ignored(start, client):
@@ -297,7 +299,7 @@ def test_missing_certificate_and_occupied_port_are_errors(platform, start):
     second.stop()
 
 
-def test_health_token_and_last_word(start, check_monitoring):
+def test_health_and_liveliness_token(start, check_monitoring):
     check_monitoring(start())
 
 

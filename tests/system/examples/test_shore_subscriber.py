@@ -1,4 +1,4 @@
-"""The example as a process of its own: a router, c2 and the example, as on shore; it knows nothing of sonarpost."""
+"""The example program as a separate process, with a router and c2."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ EXAMPLE = REPOSITORY / "examples" / "shore_subscriber.py"
 
 @pytest.fixture
 def router() -> Iterator[str]:
-    """A router in a process of its own."""
+    """A router in a separate process."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     command = [sys.executable, "-m", "sonarpost.bus.router", "--listen", endpoint]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
@@ -60,14 +60,14 @@ def relay(c2: C2Service, record: ReconstructedImage | Decision) -> None:
     c2.session.put(keys.shore_inbox("vessel-1"), wire.encode(envelope))
 
 
-def test_it_is_twenty_lines_with_zenoh_and_msgpack_alone() -> None:
+def test_example_has_twenty_lines_and_needs_only_zenoh_and_msgpack() -> None:
     text = EXAMPLE.read_text()
     assert len(text.splitlines()) <= 20
     modules = set(re.findall(r"^(?:import|from) (\w+)", text, re.MULTILINE))
     assert modules - set(sys.stdlib_module_names) == {"zenoh", "msgpack"}
 
 
-def test_it_prints_contacts_and_decisions_and_saves_pictures(router: str, c2: C2Service, tmp_path: Path) -> None:
+def test_example_prints_records_and_saves_images(router: str, c2: C2Service, tmp_path: Path) -> None:
     saved = tmp_path / "saved"
     saved.mkdir()
     wide = np.array([[0, 255, 256], [40_000, 65_535, 1]], np.uint16)
@@ -75,7 +75,7 @@ def test_it_prints_contacts_and_decisions_and_saves_pictures(router: str, c2: C2
     publisher = c2.session.declare_publisher(keys.shore_image("vessel-1"))
     command = [sys.executable, "-I", str(EXAMPLE), router, str(saved)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        eventually(lambda: publisher.matching_status.matching, what="the example's subscription")
+        eventually(lambda: publisher.matching_status.matching, what="subscription of the example")
         relay(c2, image("0001", picture=Pixels.from_array(wide)))
         relay(c2, image("0002", picture=Pixels.from_array(grey), version=2).model_copy(update={"contact": None}))
         relay(c2, decision("0001", verdict="mine_like"))

@@ -8,7 +8,7 @@ import re
 import sys
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from sonarpost.archive.shore_files import find_image, image_paths
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, TaskingRow
 from sonarpost.cli.shared import printable, time_text
 from sonarpost.errors import BadInputError, ConfigError, StoredFileError
-from sonarpost.export.contacts import ContactSet, ExportContact, load_contacts, match_start_time
+from sonarpost.export.contacts import ExportContact, load_contacts, match_start_time
 from sonarpost.export.cot import cot_events
 from sonarpost.export.cot_sender import CotSender, TlsFiles
 from sonarpost.export.kml import write_kml, write_kmz
@@ -37,10 +37,33 @@ _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 @dataclass(frozen=True, slots=True)
+class RecordFilter:
+    """Values of --vessel, --vehicle and --since; None for all."""
+
+    vessel: str | None = None
+    vehicle: str | None = None
+    since_utc_s: float = 0.0
+
+    @classmethod
+    def of(cls, parsed: argparse.Namespace) -> RecordFilter:
+        """Return the filter of a command line.
+
+        Raises:
+            ConfigError: `--since` is invalid.
+        """
+        return cls(parsed.vessel, parsed.vehicle, since_of(parsed.since))
+
+    def accepts(self, vessel_id: str, vehicle_id: str, time_utc_s: float) -> bool:
+        """Return whether a record passes the filter."""
+        names = self.vessel in (None, vessel_id) and self.vehicle in (None, vehicle_id)
+        return names and time_utc_s >= self.since_utc_s
+
+
+@dataclass(frozen=True, slots=True)
 class ListedImage:
     """An image and the latest decision about it."""
 
-    picture: ImageRow
+    image: ImageRow
     decision: DecisionRow | None
 
 
@@ -114,27 +137,20 @@ def run_ls(parsed: argparse.Namespace) -> int:
         StoredFileError: The folder has no index.
         ConfigError: `--since` is invalid.
     """
-    since_utc_s = since_of(parsed.since)
+    record_filter = RecordFilter.of(parsed)
     index = ShoreIndex(parsed.out_dir, writable=False)
     try:
         if parsed.tasking:
-            _print_tasking(index.tasking(), parsed, since_utc_s)
+            _print_tasking(index.tasking(), record_filter, as_json=parsed.json)
             return 0
         images = join_decisions(index.images(), index.decisions())
     finally:
         index.close()
-    rows = select_images(
-        images,
-        vessel=parsed.vessel,
-        vehicle=parsed.vehicle,
-        since_utc_s=since_utc_s,
-        undecided=parsed.undecided,
-        all_versions=parsed.all_versions,
-    )
+    rows = select_images(images, record_filter, undecided=parsed.undecided, all_versions=parsed.all_versions)
     if parsed.json:
         for row in rows:
             decision = None if row.decision is None else asdict(row.decision)
-            print(json.dumps({**asdict(row.picture), "decision": decision}))
+            print(json.dumps({**asdict(row.image), "decision": decision}))
     else:
         _print_images(rows)
     return 0
@@ -163,10 +179,8 @@ def _image_key(row: ImageRow) -> tuple[str, str, str, float]:
 
 def select_images(
     images: Iterable[ListedImage],
+    record_filter: RecordFilter,
     *,
-    vessel: str | None = None,
-    vehicle: str | None = None,
-    since_utc_s: float = 0.0,
     undecided: bool = False,
     all_versions: bool = False,
 ) -> list[ListedImage]:
@@ -174,17 +188,15 @@ def select_images(
     rows = [
         row
         for row in images
-        if vessel in (None, row.picture.vessel_id)
-        and vehicle in (None, row.picture.vehicle_id)
-        and row.picture.first_frame_utc_s >= since_utc_s
+        if record_filter.accepts(row.image.vessel_id, row.image.vehicle_id, row.image.first_frame_utc_s)
         and not (undecided and row.decision is not None)
     ]
     if all_versions:
         return rows
     newest: dict[tuple[str, str, str, float], ListedImage] = {}
     for row in rows:
-        key = _image_key(row.picture)
-        if key not in newest or newest[key].picture.version < row.picture.version:
+        key = _image_key(row.image)
+        if key not in newest or newest[key].image.version < row.image.version:
             newest[key] = row
     return list(newest.values())
 
@@ -193,7 +205,7 @@ def _print_images(rows: Sequence[ListedImage]) -> None:
     headings = ("vessel", "image", "v", "first received (UTC)", "missing", "position", "detector", "decision", "by")
     cells = []
     for row in rows:
-        image, decision = row.picture, row.decision
+        image, decision = row.image, row.decision
         located = image.lat_deg is not None and image.lon_deg is not None
         confidence = "" if image.atd_confidence is None else f"{image.atd_confidence:.2f}"
         cells.append(
@@ -212,15 +224,9 @@ def _print_images(rows: Sequence[ListedImage]) -> None:
     _print_table(headings, cells, "images")
 
 
-def _print_tasking(rows: Iterable[TaskingRow], parsed: argparse.Namespace, since_utc_s: float) -> None:
-    chosen = [
-        row
-        for row in rows
-        if parsed.vessel in (None, row.vessel_id)
-        and parsed.vehicle in (None, row.vehicle_id)
-        and row.issued_utc_s >= since_utc_s
-    ]
-    if parsed.json:
+def _print_tasking(rows: Iterable[TaskingRow], record_filter: RecordFilter, *, as_json: bool) -> None:
+    chosen = [row for row in rows if record_filter.accepts(row.vessel_id, row.vehicle_id, row.issued_utc_s)]
+    if as_json:
         for row in chosen:
             print(json.dumps(asdict(row)))
         return
@@ -291,7 +297,14 @@ def run_export(parsed: argparse.Namespace) -> int:
     if not any(getattr(parsed, name) for name in (*FORMATS, "cot")):
         options = ", ".join(f"--{name}" for name in (*FORMATS, "cot"))
         raise ConfigError("c2 export", "", "no output", f"at least one of {options}")
-    contacts = _filter_contacts(load_contacts(parsed.out_dir), parsed)
+    record_filter = RecordFilter.of(parsed)
+    contacts = load_contacts(parsed.out_dir)
+    chosen = tuple(
+        contact
+        for contact in contacts.contacts
+        if record_filter.accepts(contact.image.vessel_id, contact.image.vehicle_id, contact.image.first_frame_utc_s)
+    )
+    contacts = replace(contacts, contacts=chosen)
     problems = list(contacts.problems)
     for name, write in (("geojson", write_geojson), ("kml", write_kml), ("csv", write_csv), ("kmz", write_kmz)):
         path: Path | None = getattr(parsed, name)
@@ -307,18 +320,6 @@ def run_export(parsed: argparse.Namespace) -> int:
     for problem in problems:
         print(f"rejected: {problem}", file=sys.stderr)
     return EXIT_INCOMPLETE if problems else 0
-
-
-def _filter_contacts(contacts: ContactSet, parsed: argparse.Namespace) -> ContactSet:
-    since_utc_s = since_of(parsed.since)
-    chosen = tuple(
-        contact
-        for contact in contacts.contacts
-        if parsed.vessel in (None, contact.image.vessel_id)
-        and parsed.vehicle in (None, contact.image.vehicle_id)
-        and contact.image.first_frame_utc_s >= since_utc_s
-    )
-    return ContactSet(chosen, contacts.unmatched, contacts.problems)
 
 
 def _mark_exported(out_dir: Path, contacts: Sequence[ExportContact]) -> None:
