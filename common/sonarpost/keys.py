@@ -1,8 +1,8 @@
 """All Zenoh key expressions of sonarpost.
 
 Grammar: `sonarpost/v1/{platform}/…`. Each platform has one prefix, so that access control is a rule on a prefix.
-Identifiers of contacts and images are in the payloads. The paragraph `Record: … From: … To: … Delivery: …` of a
-docstring is a row of the generated table of keys.
+Identifiers of contacts and images are in the payloads. Each sentence group `Record: … From: … To: … Delivery: …`
+of a docstring is a row of the generated table of keys.
 """
 
 from __future__ import annotations
@@ -84,7 +84,9 @@ def acoustic_downlink(vessel: str) -> str:
 def message_received(vessel: str) -> str:
     """A message that a vehicle sent over the acoustic link.
 
-    Record: received_message. From: op_modem. To: the configured consumers of messages. Delivery: durable, priority 4.
+    Without configured consumers it is published only.
+
+    Record: received_message. From: op_modem. To: the configured consumers. Delivery: durable, priority 4.
     """
     return _of(vessel, "message/received")
 
@@ -108,7 +110,7 @@ def image_reconstructed(vessel: str) -> str:
 def contact_decision(vessel: str) -> str:
     """An operator's decision.
 
-    Record: decision. From: console, another operator's program. To: relay, op_modem. Delivery: durable, priority 4.
+    Record: decision. From: console, another operator's program. To: relay, op_modem. Delivery: durable, priority 2.
     """
     return _of(vessel, "contact/decision")
 
@@ -116,10 +118,11 @@ def contact_decision(vessel: str) -> str:
 def command(platform: str, kind: str) -> str:
     """A command for a vehicle.
 
-    On the vessel it goes from the shore site to op_modem, on the vehicle from uuv_modem to the services.
+    On the vehicle, the kind `decision` carries a record `decision`.
 
-    Record: command. From: c2, console, relay, uuv_modem. To: relay, op_modem, compressor, the configured consumers of
-    commands. Delivery: durable, priority 1.
+    Record: command. From: c2. To: relay. Delivery: durable, priority 1, not published.
+    Record: command. From: relay, console. To: op_modem. Delivery: durable, priority 1.
+    Record: command. From: uuv_modem. To: compressor, the configured consumers. Delivery: durable, priority 1.
     """
     return _of(platform, f"command/{_name('kind', kind)}")
 
@@ -132,8 +135,8 @@ def command_all(platform: str) -> str:
 def advice(vessel: str) -> str:
     """An expert's comment from the shore site.
 
-    Record: advice. From: c2, relay. To: relay, console, the configured consumers of advice. Delivery: durable, priority
-    2.
+    Record: advice. From: c2. To: relay. Delivery: durable, priority 2, not published.
+    Record: advice. From: relay. To: console, the configured consumers. Delivery: durable, priority 2.
     """
     return _of(vessel, "advice")
 
@@ -143,7 +146,7 @@ def shore_inbox(vessel: str, site: str = SHORE) -> str:
 
     Priority 2 for decisions, 5 for the first version of an image, 6 for later ones.
 
-    Record: relayed. From: relay. To: c2. Delivery: durable, priority 2, 5 or 6, not published for watchers.
+    Record: relayed. From: relay. To: c2. Delivery: durable, priority 2, 5 or 6, not published.
     """
     return _of(site, f"inbox/{_name('vessel', vessel)}")
 
@@ -187,7 +190,7 @@ def shore_contact_all(site: str = SHORE) -> str:
 def tasking_advice(vessel: str, site: str = SHORE) -> str:
     """An expert's comment for one vessel.
 
-    Record: advice. From: console, `sonarpost c2 comment`. To: c2. Delivery: durable, priority 4.
+    Record: advice. From: console, `sonarpost c2 comment`. To: c2. Delivery: durable, priority 2.
     """
     return _of(site, f"tasking/{_name('vessel', vessel)}/advice")
 
@@ -200,7 +203,7 @@ def tasking_advice_all(site: str = SHORE) -> str:
 def tasking_command(vessel: str, site: str = SHORE) -> str:
     """A command for a vehicle of one vessel.
 
-    Record: command. From: console, `sonarpost c2 command`. To: c2. Delivery: durable, priority 4.
+    Record: command. From: console, `sonarpost c2 command`. To: c2. Delivery: durable, priority 1.
     """
     return _of(site, f"tasking/{_name('vessel', vessel)}/command")
 

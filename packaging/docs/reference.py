@@ -50,9 +50,7 @@ NAMED_OTHERWISE = {
     "bytes_total": "B",
     "bytes_left": "B",
 }
-_FLOW = re.compile(
-    r"Record: (?P<record>.*?)\. From: (?P<source>.*?)\. To: (?P<to>.*?)\. Delivery: (?P<delivery>.*?)\.$"
-)
+_FLOW = re.compile(r"Record: (?P<record>\w+)\. From: (?P<source>.*?)\. To: (?P<to>.*?)\. Delivery: (?P<delivery>.*?)\.")
 _PARAMETERS = ("platform", "vehicle", "vessel", "site", "kind", "service")
 
 
@@ -150,11 +148,10 @@ def key_rows() -> list[KeyRow]:
             key = function(**{parameter: f"x{parameter}" for parameter in parameters})
             for parameter in _PARAMETERS:
                 key = re.sub(rf"\bx{parameter}\b", f"{{{parameter}}}", key)
-        summary, _, rest = inspect.cleandoc(function.__doc__ or "").partition("\n\n")
-        text, _, flow = rest.rpartition("\n\n") if "Record: " in rest else (rest, "", "")
-        found = _FLOW.fullmatch(" ".join(flow.split()))
-        parts = found.groupdict() if found else dict.fromkeys(("record", "source", "to", "delivery"), "")
-        rows.append(KeyRow(name, key, " ".join(f"{summary} {text}".split()), **parts))
+        summary, _, flows = " ".join(inspect.getdoc(function).split()).partition(" Record: ")
+        found = [flow.groupdict() for flow in _FLOW.finditer(f"Record: {flows}")]
+        none = dict.fromkeys(("record", "source", "to", "delivery"), "")
+        rows.extend(KeyRow(name, key, summary, **flow) for flow in found or [none])
     return rows
 
 
