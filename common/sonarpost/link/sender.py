@@ -5,16 +5,20 @@ A queue does no I/O. `now` is UTC in seconds, because another process can restor
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Protocol
+from typing import Annotated, Final
 
+from sonarpost.errors import FrameError
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
 from sonarpost.link.state import Bounds, Errors, Parts
 from sonarpost.modem.micromodem import RATES
 
 RateNumber = Annotated[int, Bounds(min(RATES), max(RATES))]
+
+_SMOOTHING: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,11 +52,6 @@ class OutgoingPacket:
     rate: RateNumber
     frames: tuple[bytes, ...]
 
-    def without(self, sent: Sequence[bytes]) -> OutgoingPacket | None:
-        """Return the packet with the frames that are not in `sent`, None if there are none."""
-        left = tuple(frame for frame in self.frames if frame not in sent)
-        return OutgoingPacket(self.rate, left) if left else None
-
 
 @dataclass(frozen=True, slots=True)
 class ExpectedDelivery:
@@ -73,51 +72,132 @@ class ExpectedDelivery:
     done_s: float
 
 
-class ImageSender(Protocol):
-    """A transmit queue.
+class ImageSender(ABC):
+    """A transmit queue. By default the wire format has no messages.
 
     Attributes:
         carries_messages: Whether the wire format has messages.
         packet_interval_s: Smoothed time from one packet to the next.
+        in_flight: The packet that `next_packet` returned last, without the frames that have been sent.
+
+    Args:
+        packet_interval_s: The first value.
     """
 
-    carries_messages: bool
-    packet_interval_s: float
+    carries_messages = False
+
+    def __init__(self, packet_interval_s: float) -> None:
+        self.packet_interval_s = packet_interval_s
+        self.in_flight: OutgoingPacket | None = None
 
     @property
+    @abstractmethod
     def rate(self) -> int:
         """Number of the rate in use."""
 
     @property
-    def measured_loss(self) -> float | None:
-        """Share of frames lost according to feedback, None while it is unknown."""
-
-    @property
-    def accepts_messages(self) -> bool:
-        """Whether the queue has room for another message."""
-
-    @property
-    def messages_waiting(self) -> int:
-        """Number of messages of which nothing has been sent."""
-
-    @property
-    def message_bytes(self) -> int:
-        """Total length of these messages."""
-
-    @property
+    @abstractmethod
     def is_idle(self) -> bool:
         """Whether there is nothing to send, and nothing that feedback can request."""
 
-    @property
-    def in_flight(self) -> OutgoingPacket | None:
-        """The packet that `next_packet` returned last, without the frames that have been sent."""
-
+    @abstractmethod
     def add_image(self, image: ImageToSend, now: float) -> bool:
         """Add an image; return False if nothing has to be sent for it.
 
         Raises:
             BadInputError: The wire format cannot carry the image.
         """
+
+    def next_packet(self, now: float) -> OutgoingPacket | None:
+        """Return the packet to send, None if there is nothing to send.
+
+        It is the same packet until `sent` removes its frames. Save the state before it is sent: then a restart repeats
+        at most one packet.
+        """
+        if self.in_flight is None:
+            self.in_flight = self._select_packet(now)
+        return self.in_flight
+
+    @abstractmethod
+    def _select_packet(self, now: float) -> OutgoingPacket | None:
+        """Return the next packet, None if there is nothing to send."""
+
+    def sent(self, frames: Sequence[bytes], interval_s: float) -> tuple[str, ...]:
+        """Record that frames of the packet have been sent.
+
+        Args:
+            frames: The frames.
+            interval_s: Time from the packet before to this one, or the length of this one after a silence.
+
+        Returns:
+            Identifiers of the images of which nothing is left to send now.
+        """
+        self.packet_interval_s += _SMOOTHING * (interval_s - self.packet_interval_s)
+        if self.in_flight is None:
+            return ()
+        left = tuple(frame for frame in self.in_flight.frames if frame not in frames)
+        self.in_flight = OutgoingPacket(self.in_flight.rate, left) if left else None
+        return () if left else self._packet_sent()
+
+    @abstractmethod
+    def _packet_sent(self) -> tuple[str, ...]:
+        """Return the identifiers of the images that the packet completes."""
+
+    @abstractmethod
+    def expected(self, now: float) -> list[ExpectedDelivery]:
+        """Return when each image is expected to be sent, the first to end first."""
+
+    @abstractmethod
+    def gauges(self) -> Mapping[str, float]:
+        """Return figures for the health record. Another thread may call this at any time."""
+
+    @abstractmethod
+    def parts(self) -> dict[str, bytes]:
+        """Return the state to save, see `sonarpost.link.state`."""
+
+    @abstractmethod
+    def restore(self, parts: Parts) -> Errors:
+        """Replace the state of a new queue by saved parts; the configuration stays. Return why parts were skipped."""
+
+    def image_id_of(self, number: int) -> str | None:
+        """Return the identifier of the image with a contact number, None if the queue does not have it."""
+        return None
+
+    def refine(self, number: int, stream_bytes: int, now: float) -> bool:
+        """Send more of an image, up to a length of its stream (0: all); return False if the queue has no more of it."""
+        return False
+
+    @property
+    def measured_loss(self) -> float | None:
+        """Share of frames lost according to feedback, None while it is unknown."""
+        return None
+
+    @abstractmethod
+    def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int) -> None:
+        """Process feedback or a request of the receiver with a modem address.
+
+        Raises:
+            FrameError: A request for an image that is not kept.
+        """
+
+    def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int) -> None:
+        """Process the feedback of a mini-packet, on one block."""
+        self.on_feedback(Feedback(block_number, 0, (missing_symbols,)), now, receiver)
+
+    @property
+    def accepts_messages(self) -> bool:
+        """Whether the queue has room for another message."""
+        return self.carries_messages
+
+    @property
+    def messages_waiting(self) -> int:
+        """Number of messages of which nothing has been sent."""
+        return 0
+
+    @property
+    def message_bytes(self) -> int:
+        """Total length of these messages."""
+        return 0
 
     def add_message(
         self, message_id: str, source: str, data: bytes, now: float, *, priority: int = 4, lifetime_s: float = 3600.0
@@ -131,50 +211,8 @@ class ImageSender(Protocol):
             now: UTC in seconds.
             priority: 1 first to 7 last.
             lifetime_s: Time from `now` on after which it is not sent any more.
-        """
-
-    def image_id_of(self, number: int) -> str | None:
-        """Return the identifier of the image with a contact number, None if the queue does not have it."""
-
-    def refine(self, number: int, stream_bytes: int, now: float) -> bool:
-        """Send more of an image, up to a length of its stream (0: all); return False if the queue has no more of it."""
-
-    def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int) -> None:
-        """Process feedback or a request of the receiver with a modem address.
 
         Raises:
-            FrameError: A request for an image that is not kept.
+            FrameError: The wire format has no messages.
         """
-
-    def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int) -> None:
-        """Process the feedback of a mini-packet."""
-
-    def next_packet(self, now: float) -> OutgoingPacket | None:
-        """Return the packet to send, None if there is nothing to send.
-
-        It is the same packet until `sent` removes its frames. Save the state before it is sent: then a restart repeats
-        at most one packet.
-        """
-
-    def sent(self, frames: Sequence[bytes], interval_s: float) -> tuple[str, ...]:
-        """Record that frames of the packet have been sent.
-
-        Args:
-            frames: The frames.
-            interval_s: Time from the packet before to this one, or the length of this one after a silence.
-
-        Returns:
-            Identifiers of the images of which nothing is left to send now.
-        """
-
-    def expected(self, now: float) -> list[ExpectedDelivery]:
-        """Return when each image is expected to be sent, the first to end first."""
-
-    def gauges(self) -> Mapping[str, float]:
-        """Return figures for the health record. Another thread may call this at any time."""
-
-    def parts(self) -> dict[str, bytes]:
-        """Return the state to save, see `sonarpost.link.state`."""
-
-    def restore(self, parts: Parts) -> Errors:
-        """Replace the state of a new queue by saved parts; return why parts were skipped."""
+        raise FrameError("transmit queue", "message", message_id, "none: this wire format carries images only")

@@ -134,7 +134,7 @@ class PartReader:
         return self._read(name, kind) if name in self else None
 
     def read_group(
-        self, group: str, kind: type[_T], *, progress: str = "", apply: Callable[[_T], None] | None = None
+        self, group: str, kind: type[_T], *, progress: str = "", apply: Callable[[_T], object] | None = None
     ) -> list[_T]:
         """Return the parts `group`/..., in the order of their names.
 
@@ -167,7 +167,9 @@ class PartReader:
             raise FrameError(self._where, "format version", version, str(FORMAT_VERSION))
         return _by_name(_schema(kind).names[part], values, self._where)
 
-    def _read(self, name: str, kind: type[_T], apply: Callable[[_T], None] | None = None, main: str = "") -> _T | None:
+    def _read(
+        self, name: str, kind: type[_T], apply: Callable[[_T], object] | None = None, main: str = ""
+    ) -> _T | None:
         """Return a part (with `main`, both together), None if it cannot be read."""
         try:
             plain = self._plain(name, kind, "progress" if main else "")

@@ -7,7 +7,7 @@ time, so that urgent content waits for one packet at most.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
@@ -20,13 +20,12 @@ from sonarpost.link.frames.v1.frame import FrameProtection
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, Feedback, RefineRequest
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.queue.messages import FILLER_PRIORITY, MessageQueue
-from sonarpost.link.sender import ExpectedDelivery, ImageToSend, OutgoingPacket, RateNumber
+from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket, RateNumber
 from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
 from sonarpost.modem.micromodem import RATES
 
 _SEGMENTS: Final = 2
 _MIN_LOSS_CHANGE: Final = 0.02
-_SMOOTHING: Final = 0.2
 _FRAMES_WITHOUT_FEEDBACK: Final = 64
 """After so many frames and a long time without feedback, no receiver is assumed to send any."""
 _URGENT: Final = 2
@@ -61,7 +60,7 @@ class QueueState:
     planned_loss: Annotated[float, Bounds(0, _MAX_LOSS)]
 
 
-class TransmitQueue:
+class TransmitQueue(ImageSender):
     """The queue of one vehicle; see `ImageSender`.
 
     Args:
@@ -76,6 +75,7 @@ class TransmitQueue:
     carries_messages = True
 
     def __init__(self, config: QueueConfig, *, first_block: int = 0, protection: FrameProtection | None = None) -> None:
+        super().__init__(RATES[config.first_rate].airtime_s)
         self.config = config
         self.rate_selector = RateSelector(config.rates, config.first_rate)
         self.sender = V1Sender(
@@ -93,11 +93,9 @@ class TransmitQueue:
             protection=protection,
         )
         self.messages = MessageQueue()
-        self.packet_interval_s = RATES[config.first_rate].airtime_s
         self.last_feedback_s: float | None = None
         self._frames_at_feedback = 0
         self._image_credit = 0.0
-        self._packet: OutgoingPacket | None = None
         self._open_before_packet: set[int] = set()
 
     @property
@@ -133,12 +131,7 @@ class TransmitQueue:
     @property
     def is_idle(self) -> bool:
         """Whether there is nothing to send, and nothing that feedback can request."""
-        return self.sender.is_idle and not self.messages.waiting and self._packet is None
-
-    @property
-    def in_flight(self) -> OutgoingPacket | None:
-        """The packet that is being sent."""
-        return self._packet
+        return self.sender.is_idle and not self.messages.waiting and self.in_flight is None
 
     def gauges(self) -> Mapping[str, float]:
         """Return figures for the health record."""
@@ -239,15 +232,8 @@ class TransmitQueue:
         if self.config.feedback == "auto":
             self.sender.expect_feedback(expected=True)
 
-    def next_packet(self, now: float) -> OutgoingPacket | None:
-        """Return the packet to send, see `ImageSender.next_packet`."""
-        if self._packet is None:
-            self._open_before_packet = self.open_numbers()
-            frames = self._select_frames(now)
-            self._packet = OutgoingPacket(self.rate, frames) if frames else None
-        return self._packet
-
-    def _select_frames(self, now: float) -> tuple[bytes, ...]:
+    def _select_packet(self, now: float) -> OutgoingPacket | None:
+        self._open_before_packet = self.open_numbers()
         self._update(now)
         frames: list[bytes] = []
         while len(frames) < RATES[self.rate].frames:
@@ -260,7 +246,7 @@ class TransmitQueue:
             if frame is None:
                 break
             frames.append(frame)
-        return tuple(frames)
+        return OutgoingPacket(self.rate, tuple(frames)) if frames else None
 
     def _next_frame(self, now: float) -> bytes | None:
         images_due = self.sender.images_are_due(now)
@@ -308,14 +294,7 @@ class TransmitQueue:
             )
             loaded += len(message.data)
 
-    def sent(self, frames: Sequence[bytes], interval_s: float) -> tuple[str, ...]:
-        """Record that frames of the packet have been sent, see `ImageSender.sent`."""
-        self.packet_interval_s += _SMOOTHING * (interval_s - self.packet_interval_s)
-        if self._packet is None:
-            return ()
-        self._packet = self._packet.without(frames)
-        if self._packet is not None:
-            return ()
+    def _packet_sent(self) -> tuple[str, ...]:
         ended = self._open_before_packet - self.open_numbers()
         return tuple(image_id for number in sorted(ended) if (image_id := self.image_id_of(number)) is not None)
 
@@ -385,7 +364,7 @@ class TransmitQueue:
             planned_loss=min(self.planned_loss, _MAX_LOSS),
         )
         parts = {"queue": pack_part(state), **self.messages.parts(), **self.sender.parts()}
-        return parts if self._packet is None else {**parts, "packet": pack_part(self._packet)}
+        return parts if self.in_flight is None else {**parts, "packet": pack_part(self.in_flight)}
 
     def restore(self, parts: Parts) -> Errors:
         """Replace the state of a new queue by saved parts; the configuration stays.
@@ -397,7 +376,7 @@ class TransmitQueue:
         """
         reader = PartReader(parts, "queue state")
         state = reader.read("queue", QueueState)
-        self._packet = reader.read("packet", OutgoingPacket)
+        self.in_flight = reader.read("packet", OutgoingPacket)
         self.messages = MessageQueue.restored(reader)
         if state is not None:
             self._restore_plan(state)

@@ -16,7 +16,7 @@ The top half always precedes the bottom half: embedded codecs put the coarse ima
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -33,14 +33,13 @@ from sonarpost.link.frames.paper.frame import (
     half_bounds,
 )
 from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
-from sonarpost.link.sender import ExpectedDelivery, ImageToSend, OutgoingPacket
+from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket
 from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
 from sonarpost.modem.micromodem import RATES
 
 Packet = tuple[bytes, ...]
 
 _MAX_BODY_BYTES: Final = 0xFFFF
-_SMOOTHING: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,133 +78,87 @@ class PaperProgress:
     packet_interval_s: Annotated[float, Bounds(0, 1e9)]
 
 
-class PaperSender:
-    """Transmit queue of the `paper` format: an `ImageSender` without messages and feedback.
-
-    Each image's packets are sent once, images in the order of arrival.
+class PaperSender(ImageSender):
+    """Transmit queue of the `paper` format: each image's packets are sent once, images in the order of arrival.
 
     Args:
         rate: Number of the modem's rate.
     """
 
-    carries_messages = False
-    accepts_messages = False
-    measured_loss = None
-    messages_waiting = 0
-    message_bytes = 0
-
     def __init__(self, rate: int) -> None:
-        self.rate = rate
-        self.packet_interval_s = RATES[rate].airtime_s
+        super().__init__(RATES[rate].airtime_s)
+        self._rate = rate
         self._images: list[WaitingImage] = []
         self._next_order = 1
-        self._packets: tuple[Packet, ...] = ()
         self._packets_sent = 0
-        self._packet: OutgoingPacket | None = None
+
+    @property
+    def rate(self) -> int:
+        """Number of the rate."""
+        return self._rate
 
     @property
     def is_idle(self) -> bool:
         """Whether there is nothing to send."""
         return not self._images
 
-    @property
-    def in_flight(self) -> OutgoingPacket | None:
-        """The packet that `next_packet` returned last, without the frames that have been sent."""
-        return self._packet
-
     def gauges(self) -> Mapping[str, float]:
         """Return figures for the health record."""
         return {"rate": float(self.rate)}
 
     def add_image(self, image: ImageToSend, now: float) -> bool:
-        """Add an image; always return True: an image that arrives again is sent again.
+        """Add an image and return True: an image that arrives again is sent again.
 
         Raises:
             FrameError: The identifier is invalid.
             StreamError: The stream is invalid or too long.
         """
-        self._plan(image.image_id, image.stream, image.contact)
-        added = WaitingImage(self._next_order, image.image_id, image.contact_id, image.contact.rounded(), image.stream)
+        contact = image.contact.rounded()
+        added = WaitingImage(self._next_order, image.image_id, image.contact_id, contact, image.stream)
+        self._plan(added)
         self._images.append(added)
         self._next_order += 1
         return True
 
-    def _plan(self, image_id: str, stream: bytes, contact: ContactSummary) -> tuple[Packet, ...]:
+    def _plan(self, image: WaitingImage) -> tuple[Packet, ...]:
         rate = RATES[self.rate]
-        return plan_packets(image_id, stream, contact, rate.frames, rate.frame_bytes)
+        return plan_packets(image.image_id, image.stream, image.contact, rate.frames, rate.frame_bytes)
 
-    def add_message(
-        self, message_id: str, source: str, data: bytes, now: float, *, priority: int = 4, lifetime_s: float = 3600.0
-    ) -> bool:
-        """Raise FrameError: this format has no messages."""
-        raise FrameError("paper format", "message", message_id, "none: this format carries images only")
+    def _select_packet(self, now: float) -> OutgoingPacket | None:
+        if not self._images:
+            return None
+        return OutgoingPacket(self.rate, self._plan(self._images[0])[self._packets_sent])
 
-    def image_id_of(self, number: int) -> str | None:
-        """Return None: this format has no contact numbers."""
-        return None
-
-    def refine(self, number: int, stream_bytes: int, now: float) -> bool:
-        """Return False: this format sends each stream completely."""
-        return False
-
-    def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int) -> None:
-        """Do nothing: this format has no feedback."""
-
-    def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int) -> None:
-        """Do nothing: this format has no feedback."""
-
-    def next_packet(self, now: float) -> OutgoingPacket | None:
-        """Return the packet to send, see `ImageSender.next_packet`."""
-        if self._packet is None and self._images:
-            first = self._images[0]
-            self._packets = self._packets or self._plan(first.image_id, first.stream, first.contact)
-            self._packet = OutgoingPacket(self.rate, self._packets[self._packets_sent])
-        return self._packet
-
-    def sent(self, frames: Sequence[bytes], interval_s: float) -> tuple[str, ...]:
-        """Record that frames of the packet have been sent; return the identifier of the image that this completes."""
-        self.packet_interval_s += _SMOOTHING * (interval_s - self.packet_interval_s)
-        if self._packet is None:
-            return ()
-        self._packet = self._packet.without(frames)
-        if self._packet is not None:
-            return ()
+    def _packet_sent(self) -> tuple[str, ...]:
         self._packets_sent += 1
-        if self._packets_sent < len(self._packets):
+        if self._packets_sent < len(self._plan(self._images[0])):
             return ()
-        self._packets, self._packets_sent = (), 0
+        self._packets_sent = 0
         return (self._images.pop(0).image_id,)
 
-    def _check(self, image: WaitingImage) -> None:
-        """Raise BadInputError if an image cannot be sent."""
-        self._plan(image.image_id, image.stream, image.contact)
+    def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int) -> None:
+        """Do nothing: the format has no feedback."""
 
     def expected(self, now: float) -> list[ExpectedDelivery]:
         """Return when each image is expected to be sent, in the order of sending."""
         found: list[ExpectedDelivery] = []
         packets_before = 0
         for place, image in enumerate(self._images):
-            packets = self._plan(image.image_id, image.stream, image.contact)
+            packets = self._plan(image)
             left = packets[self._packets_sent :] if place == 0 else packets
-            begun = len(left) < len(packets)
-            found.append(
-                ExpectedDelivery(
-                    image.image_id,
-                    image.contact_id,
-                    sum(len(frame) for packet in left for frame in packet),
-                    None if begun else now + (packets_before + 1) * self.packet_interval_s,
-                    now + (packets_before + len(left)) * self.packet_interval_s,
-                )
-            )
+            preview_s = now + (packets_before + 1) * self.packet_interval_s if len(left) == len(packets) else None
+            frame_bytes = sum(len(frame) for packet in left for frame in packet)
             packets_before += len(left)
+            done_s = now + packets_before * self.packet_interval_s
+            found.append(ExpectedDelivery(image.image_id, image.contact_id, frame_bytes, preview_s, done_s))
         return found
 
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`: the images, and the progress of the first."""
         parts = {f"image/{image.order}": pack_part(image) for image in self._images}
         order = self._images[0].order if self._images else self._next_order
-        parts["progress"] = pack_part(PaperProgress(order, self.rate, self._packets_sent, self.packet_interval_s))
-        return parts
+        progress = PaperProgress(order, self.rate, self._packets_sent, self.packet_interval_s)
+        return {**parts, "progress": pack_part(progress)}
 
     def restore(self, parts: Parts) -> Errors:
         """Replace the state by saved parts. An image that was planned for another rate is sent from its beginning.
@@ -214,17 +167,13 @@ class PaperSender:
             Why parts were skipped.
         """
         reader = PartReader(parts, "paper sender state")
-        self._images = sorted(
-            reader.read_group("image", WaitingImage, apply=self._check), key=lambda image: image.order
-        )
+        images = reader.read_group("image", WaitingImage, apply=self._plan)
+        self._images = sorted(images, key=lambda image: image.order)
         progress = reader.read("progress", PaperProgress) or PaperProgress(1, self.rate, 0, self.packet_interval_s)
-        self._next_order = max([progress.order, *(image.order + 1 for image in self._images)])
-        self._packets, self._packets_sent, self._packet = (), 0, None
+        self._next_order = max([progress.order, *(image.order + 1 for image in images)])
         self.packet_interval_s = progress.packet_interval_s
         if self._images and (progress.order, progress.rate) == (self._images[0].order, self.rate):
-            first = self._images[0]
-            self._packets = self._plan(first.image_id, first.stream, first.contact)
-            self._packets_sent = min(progress.packets_sent, len(self._packets) - 1)
+            self._packets_sent = min(progress.packets_sent, len(self._plan(self._images[0])) - 1)
         return reader.errors
 
 
