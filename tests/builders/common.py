@@ -1,4 +1,4 @@
-"""Paths, ports and waiting, used by many tests."""
+"""Paths, ports and wait functions for all tests."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    # The tests of codecs import this module where Zenoh is not installed (tests/system/arm64).
+    # The codec tests import this module without Zenoh (tests/system/arm64).
     import zenoh
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -26,7 +26,7 @@ def free_port() -> int:
 
 
 def eventually(condition: Callable[[], bool], timeout_s: float = 40.0, what: str = "condition") -> None:
-    """Wait until `condition()` holds; fail the test when it does not in time."""
+    """Wait until `condition()` is true; fail the test after the time-out."""
     deadline = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() > deadline:
@@ -35,7 +35,7 @@ def eventually(condition: Callable[[], bool], timeout_s: float = 40.0, what: str
 
 
 def publish_once(session: zenoh.Session, key: str, payload: bytes, encoding: str | None = None) -> None:
-    """Publish as a program without an outbox does, once somebody listens."""
+    """Publish like a program without an outbox, after a subscriber has appeared."""
     publisher = session.declare_publisher(key, encoding=encoding)
     eventually(lambda: publisher.matching_status.matching, what=f"subscriber of {key}")
     publisher.put(payload)

@@ -1,4 +1,4 @@
-"""A TCP link between two routers that a test cuts, stalls, or makes thin."""
+"""TCP link between two routers that a test can cut, stall or limit in bandwidth."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import struct
 import threading
 import time
 
-PIECE_BYTES = 4096
+CHUNK_BYTES = 4096
 POLL_S = 0.02
 _RESET_ON_CLOSE = struct.pack("ii", 1, 0)
 
@@ -18,12 +18,12 @@ class FaultyLink:
     """Forwards connections to a port of this host, in two directions: `up` to the target and `down` from it.
 
     - `cut` resets every connection (RST) and refuses new ones until `mend`.
-    - `stall` is a black hole: nothing passes and nobody is told. What was on its way arrives after `mend`, as it does
-      when TCP sends it again, unless an end has given the connection up.
+    - `stall` is a black hole: no data passes, without an error. Data in transit arrives after `mend`, as TCP
+      retransmits it, unless an end has closed the connection.
 
     Args:
-        target_port: Where connections go.
-        bytes_per_s: Of each direction; None for no limit.
+        target_port: Port of the target.
+        bytes_per_s: Bandwidth of each direction; None for no limit.
     """
 
     def __init__(self, target_port: int, bytes_per_s: float | None = None) -> None:
@@ -45,22 +45,22 @@ class FaultyLink:
         self._reset_all()
 
     def stall(self, *directions: str) -> None:
-        """Let nothing pass any more in these directions, by default in both."""
+        """Stop the data in these directions, by default in both."""
         for direction in directions or ("up", "down"):
             self._stalled[direction].set()
 
     def mend(self) -> None:
-        """Let everything pass again."""
+        """Restore the link."""
         for stalled in self._stalled.values():
             stalled.clear()
         self._refusing.clear()
 
-    def lose_what_is_on_its_way(self) -> None:
-        """Reset every connection; new ones are taken."""
+    def reset(self) -> None:
+        """Reset every connection, which loses the data in transit; new connections are accepted."""
         self._reset_all()
 
     def close(self) -> None:
-        """End the link."""
+        """Close the link."""
         self._closing.set()
         self._listener.close()
         self._reset_all()
@@ -113,7 +113,7 @@ class FaultyLink:
                 while not self._closing.is_set():
                     if not selector.select(0.5):
                         continue
-                    data = source.recv(PIECE_BYTES)
+                    data = source.recv(CHUNK_BYTES)
                     while self._stalled[direction].is_set() and not self._closing.is_set():
                         time.sleep(POLL_S)
                     if not data:
@@ -123,7 +123,7 @@ class FaultyLink:
                     if self._bytes_per_s is not None:
                         time.sleep(len(data) / self._bytes_per_s)
             except OSError:
-                pass  # an end is gone; the other is told below
+                pass  # one end is closed; the other one is closed below
         for end in (source, target):
             with contextlib.suppress(OSError):
                 end.shutdown(socket.SHUT_RDWR)

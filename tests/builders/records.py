@@ -1,4 +1,4 @@
-"""Records that the tests of several services share: a picture that has arrived, a decision on it, a command."""
+"""Records for the tests of several services: a reconstructed image, a decision, a command."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from sonarpost.messages import Command, Decision, Pixels, ReconstructedImage
 FIRST_S = 1_700_000_000.0
 
 
-def picture_record(picture: Pixels, **changes: object) -> ReconstructedImage:
-    """Return a picture that has arrived whole on vessel-1; any field may be given another value."""
+def image_record(picture: Pixels, **changes: object) -> ReconstructedImage:
+    """Return a complete image of vessel-1; `changes` override fields."""
     fields: dict[str, object] = {
         "vessel_id": "vessel-1",
         "vehicle_id": "uuv-1",
@@ -33,7 +33,7 @@ def picture_record(picture: Pixels, **changes: object) -> ReconstructedImage:
 
 
 def decision_record(decision_id: str = "d1", **changes: object) -> Decision:
-    """Return an operator's decision on that picture; any field may be given another value."""
+    """Return an operator's decision on that image; `changes` override fields."""
     fields: dict[str, object] = {
         "decision_id": decision_id,
         "vessel_id": "vessel-1",
@@ -48,7 +48,7 @@ def decision_record(decision_id: str = "d1", **changes: object) -> Decision:
 
 
 def command_record(kind: str, image_id: str) -> Command:
-    """Return what the vessel's operator asks of the vehicle about one of its pictures."""
+    """Return a command of the vessel's operator for one of its images."""
     return Command(
         command_id=f"{kind}-{image_id}",
         kind=kind,

@@ -1,7 +1,7 @@
-"""Runs a module under a clock that is set: `python shifted_clock.py OFFSET_FILE MODULE ARGUMENTS…`.
+"""Run a module with a shifted clock: `python shifted_clock.py OFFSET_FILE MODULE ARGUMENTS…`.
 
-`time.time` and `time.time_ns` are shifted by the number of seconds that the file holds at that moment; the monotonic
-clock is not, as the system's is not when the clock is set.
+`time.time` and `time.time_ns` are shifted by the number of seconds in the file at that moment. The monotonic clock is
+not affected, as if the system clock were set.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _TIME, _TIME_NS = time.time, time.time_ns
 
 
 def offset_s() -> float:
-    """Return by how much the clock is wrong now; the file is replaced in one step."""
+    """Return the present offset; the file is replaced atomically."""
     return float(_FILE.read_text())
 
 

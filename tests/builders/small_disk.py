@@ -1,4 +1,4 @@
-"""A disk of a few megabytes that a test fills."""
+"""A small file system that a test can fill."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pytest
 
 
 class SmallDisk:
-    """A tmpfs; mounting one needs root, and the test is skipped without.
+    """A tmpfs. Mounting it requires root; otherwise the test is skipped.
 
     Args:
-        folder: Where it is mounted.
-        size_kb: Its size at first.
+        folder: Mount point.
+        size_kb: Initial size.
     """
 
     def __init__(self, folder: Path, size_kb: int) -> None:
@@ -31,7 +31,7 @@ class SmallDisk:
         return subprocess.run(["mount", *arguments], capture_output=True, text=True, check=False)
 
     def fill(self) -> None:
-        """Take all the space that is left."""
+        """Use all free space."""
         with (self.folder / "ballast").open("wb", buffering=0) as file:
             for size in (65536, 4096):
                 try:
@@ -41,11 +41,11 @@ class SmallDisk:
                     continue
 
     def empty(self) -> None:
-        """Give back what `fill` took."""
+        """Release the space that `fill` uses."""
         (self.folder / "ballast").unlink()
 
     def grow(self, size_kb: int) -> None:
-        """Make the disk larger."""
+        """Increase the size."""
         done = self._mount("-o", f"remount,size={size_kb}k", str(self.folder))
         assert done.returncode == 0, done.stderr
 

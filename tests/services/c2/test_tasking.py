@@ -6,7 +6,7 @@ import msgpack
 import pytest
 import zenoh
 from builders.common import eventually, free_port
-from builders.tcp_proxy import TcpProxy
+from builders.faulty_link import FaultyLink
 
 from sonarpost import keys
 from sonarpost.archive.shore_index import ShoreIndex
@@ -122,10 +122,10 @@ def test_advice_waits_for_an_unreachable_vessel(begin, relay, expert, console, o
 
 
 def test_advice_arrives_once_after_a_link_cut(begin, runner, platform, expert, out, tmp_path, router):
-    """Two routers, linked through a proxy that can be cut."""
-    proxy = TcpProxy(int(router.rpartition(":")[2]))
+    """Two routers, linked through a connection that can be cut."""
+    link = FaultyLink(int(router.rpartition(":")[2]))
     vessel_endpoint = f"tcp/127.0.0.1:{free_port()}"
-    vessel_router = zenoh.open(router_config([vessel_endpoint], [f"tcp/127.0.0.1:{proxy.port}"]))
+    vessel_router = zenoh.open(router_config([vessel_endpoint], [f"tcp/127.0.0.1:{link.port}"]))
     aboard = platform("vessel-1").model_copy(update={"router": (vessel_endpoint,)})
     screen_type = type("Console", (type(expert),), {"NAME": "console"})
     try:
@@ -135,18 +135,18 @@ def test_advice_arrives_once_after_a_link_cut(begin, runner, platform, expert, o
         expert.send(ADVICE, "c2", advice("before"))
         eventually(lambda: [a.advice_id for a in screen.received] == ["before"])
         eventually(lambda: states(out).get(("vessel-1", "advice", "before")) == "delivered")
-        proxy.cut()
+        link.cut()
         expert.send(ADVICE, "c2", advice("meanwhile"))
         eventually(lambda: states(out).get(("vessel-1", "advice", "meanwhile")) == "waiting")
         eventually(lambda: not service.is_responding("relay@vessel-1"), timeout_s=20)
         assert [a.advice_id for a in screen.received] == ["before"]
-        proxy.mend()
+        link.mend()
         eventually(lambda: [a.advice_id for a in screen.received] == ["before", "meanwhile"], timeout_s=30)
         eventually(lambda: states(out).get(("vessel-1", "advice", "meanwhile")) == "delivered")
     finally:
         runner.stop_all()
         vessel_router.close()
-        proxy.close()
+        link.close()
 
 
 def test_unreachable_vessel_does_not_delay_others(begin, relay, expert, console, out):

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 from builders.chain import PICTURES, RunningChain
-from builders.tcp_proxy import TcpProxy
+from builders.faulty_link import FaultyLink
 
 from sonarpost.cli.demo.account import read_channel_log, read_pictures, settle
 from sonarpost.cli.demo.settings import PLATFORM_OF, free_ports
@@ -85,22 +85,22 @@ def modem_is_ready_since(run: RunningChain, service: str, since_utc_s: float) ->
 
 def test_a_link_cut_for_ten_seconds_loses_nothing(start_chain: StartChain) -> None:
     ports = free_ports(3)
-    proxy = TcpProxy(ports[2])
+    link = FaultyLink(ports[2])
     try:
-        run = start_chain(router_ports=ports, shore_port_for_vessel=proxy.port)
+        run = start_chain(router_ports=ports, shore_port_for_vessel=link.port)
         run.deposit()
         run.until(lambda: len(run.watcher.shore) >= 1, 60, "first picture ashore")
-        proxy.cut()
+        link.cut()
         time.sleep(10.0)
         ashore_when_mended = len(run.watcher.shore)
         assert len(run.watcher.vessel) == PICTURES
         assert ashore_when_mended < PICTURES
-        proxy.mend()
+        link.mend()
         run.until(lambda: len(run.watcher.shore) == PICTURES, 60, "all pictures ashore")
         run.until_idle()
         assert_everything_ashore_once(run)
     finally:
-        proxy.close()
+        link.close()
 
 
 def test_lost_frames_are_shown_as_missing_exactly_where_the_channel_lost_them(start_chain: StartChain) -> None:

@@ -1,4 +1,4 @@
-"""Coasts for tests: each is closed when its test ends."""
+"""Fixtures: a vessel and a shore site in real processes."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from builders.coast import Coast, Options
+from builders.vessel_and_shore import Options, VesselAndShore
 
 
 @pytest.fixture
-def start_coast(tmp_path: Path) -> Iterator[Callable[..., Coast]]:
-    """Starts a vessel and a shore; the arguments are those of `Options`."""
+def start_system(tmp_path: Path) -> Iterator[Callable[..., VesselAndShore]]:
+    """Starts a vessel and a shore site; the arguments are those of `Options`."""
     with ExitStack() as stack:
-        yield lambda **options: stack.enter_context(Coast(tmp_path / "coast", Options(**options)))
+        yield lambda **options: stack.enter_context(VesselAndShore(tmp_path / "system", Options(**options)))
 
 
 @pytest.fixture
-def coast(start_coast: Callable[..., Coast]) -> Coast:
-    """A vessel and a shore as they come."""
-    return start_coast()
+def system(start_system: Callable[..., VesselAndShore]) -> VesselAndShore:
+    """A vessel and a shore site with default options."""
+    return start_system()

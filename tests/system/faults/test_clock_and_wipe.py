@@ -1,4 +1,4 @@
-"""Clocks that jump, and a vessel whose disk is exchanged."""
+"""Clock jumps, and a vessel whose disk is replaced."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from builders.coast import PROCESSES, Coast
-from builders.feeder import make_image
+from builders.common import REPOSITORY
+from builders.image_source import make_image
+from builders.vessel_and_shore import PROCESSES, VesselAndShore
 
 COUNT = 200
 DAY_S = 86400.0
 
 
 class Clock:
-    """The clock of some processes; `jump` sets it while they run."""
+    """Clock of several processes; `jump` sets it while they run."""
 
     def __init__(self, file: Path, text: Callable[[float], str]) -> None:
         self._file = file
@@ -24,10 +25,10 @@ class Clock:
         self.jump(0.0)
 
     def jump(self, offset_s: float) -> None:
-        """Set the clock to so much more than the true time."""
-        hidden = self._file.with_suffix(".new")
-        hidden.write_text(self._text(offset_s))
-        hidden.replace(self._file)
+        """Set the offset from the true time."""
+        temporary = self._file.with_suffix(".new")
+        temporary.write_text(self._text(offset_s))
+        temporary.replace(self._file)
 
 
 def libfaketime() -> str:
@@ -40,19 +41,19 @@ def libfaketime() -> str:
 
 
 @pytest.fixture(params=["python", pytest.param("libfaketime", marks=pytest.mark.long)])
-def clocked(
-    request: pytest.FixtureRequest, tmp_path: Path, start_coast: Callable[..., Coast]
-) -> tuple[Coast, dict[str, Clock]]:
-    """A coast whose vessel and shore have a clock each: of relay and c2 in Python, or of all four processes in libc."""
+def system_with_clocks(
+    request: pytest.FixtureRequest, tmp_path: Path, start_system: Callable[..., VesselAndShore]
+) -> tuple[VesselAndShore, dict[str, Clock]]:
+    """A system with clocks of vessel and shore: of relay and c2 in Python, or of all four processes in libc."""
     clocks = {side: tmp_path / f"clock-{side}" for side in ("vessel", "shore")}
     if request.param == "python":
         made = {side: Clock(file, str) for side, file in clocks.items()}
-        script = str(Path(__file__).with_name("shifted_clock.py"))
+        script = str(REPOSITORY / "tests" / "builders" / "shifted_clock.py")
         launcher = {
             "relay": (sys.executable, script, str(clocks["vessel"])),
             "c2": (sys.executable, script, str(clocks["shore"])),
         }
-        return start_coast(launcher=launcher), made
+        return start_system(launcher=launcher), made
     library = libfaketime()
     made = {side: Clock(file, lambda offset_s: f"{offset_s:+.0f}s") for side, file in clocks.items()}
     environment = {
@@ -65,57 +66,57 @@ def clocked(
         }
         for name in PROCESSES
     }
-    return start_coast(environment=environment), made
+    return start_system(environment=environment), made
 
 
-def test_clocks_that_jump_lose_and_double_nothing(clocked: tuple[Coast, dict[str, Clock]]) -> None:
-    coast, clocks = clocked
-    coast.watch_health()
+def test_clock_jumps_lose_and_duplicate_nothing(system_with_clocks: tuple[VesselAndShore, dict[str, Clock]]) -> None:
+    system, clocks = system_with_clocks
+    system.watch_health()
     jumps = [("vessel", 30 * DAY_S), ("shore", -365 * DAY_S), ("vessel", -2 * DAY_S), ("shore", 3600.0)]
     for part, (side, offset_s) in enumerate(jumps):
         first = 50 * part
-        coast.owe([make_image(n) for n in range(first, first + 50)])
-        coast.until(lambda first=first: coast.ashore_count() > first, 60, "some of this part ashore")
+        system.send([make_image(n) for n in range(first, first + 50)])
+        system.wait_until(lambda first=first: system.shore_image_count() > first, 60, "some images at the shore")
         clocks[side].jump(offset_s)
         service = "relay" if side == "vessel" else "c2"
-        wanted_utc_s = time.time() + offset_s
-        coast.until(
-            lambda service=service, wanted=wanted_utc_s: (
-                service in coast.health and abs(coast.health[service].time_utc_s - wanted) < 120
+        expected_utc_s = time.time() + offset_s
+        system.wait_until(
+            lambda service=service, expected=expected_utc_s: (
+                service in system.health and abs(system.health[service].time_utc_s - expected) < 120
             ),
             30,
-            f"{service} has seen its clock jump",
+            f"{service} reports the new time",
         )
         if part == 1:
-            # A process that starts under the wrong clock finds what it has left in order, too.
+            # A process that starts with the wrong clock continues correctly.
             for name in ("relay", "c2"):
-                coast.kill(name)
-                coast.start(name)
-    coast.assert_all_ashore_once()
+                system.kill(name)
+                system.start(name)
+    system.assert_all_delivered_once()
 
 
-def test_a_vessel_with_a_new_disk_doubles_nothing_and_is_taken_as_new(coast: Coast) -> None:
+def test_vessel_with_a_new_disk_is_accepted_without_duplicates(system: VesselAndShore) -> None:
     old = [make_image(n) for n in range(COUNT)]
-    coast.owe(old)
-    coast.assert_all_ashore_once()
-    files = {p: (p.stat().st_ino, p.stat().st_mtime_ns) for p in coast.out.rglob("uuv-*")}
+    system.send(old)
+    system.assert_all_delivered_once()
+    files = {p: (p.stat().st_ino, p.stat().st_mtime_ns) for p in system.out.rglob("uuv-*")}
     assert len(files) == 3 * COUNT
-    coast.stop_feeder()
-    coast.kill("relay")
-    coast.wipe_vessel()
-    coast.start("relay")
-    coast.start_feeder()
-    # The new stores begin at number 1 again. Forty of the old pictures come a second time, as they would from a
-    # decompressor that kept its own disk; the others are new, of vehicles that begin their identifiers anew as well.
+    system.stop_source()
+    system.kill("relay")
+    system.delete_vessel_stores()
+    system.start("relay")
+    system.start_source()
+    # The new stores number from 1. 40 of the old images are sent again, as by a decompressor with its old disk; the
+    # others are new, from vehicles that also restart their identifiers.
     repeated = old[::5]
     new = [make_image(n, mission=1) for n in range(COUNT)]
-    coast.feeder.owe(repeated)
-    coast.feeder.owe(new)
-    coast.until(lambda: coast.ashore_count() >= 2 * COUNT, 60, "new pictures ashore")
-    coast.until(lambda: coast.accepted("c2") == 2 * COUNT + len(repeated), 60, "c2 has taken all")
-    coast.until(lambda: coast.depths("c2")["inbox"] == 0, 60, "c2 has handled all")
-    assert {p: (p.stat().st_ino, p.stat().st_mtime_ns) for p in files} == files, "the old files are untouched"
-    assert sum(1 for _ in coast.out.rglob("uuv-*")) == 6 * COUNT
-    found = coast.pixels_by_file()
+    system.source.send(repeated)
+    system.source.send(new)
+    system.wait_until(lambda: system.shore_image_count() >= 2 * COUNT, 60, "new images at the shore")
+    system.wait_until(lambda: system.accepted_count("c2") == 2 * COUNT + len(repeated), 60, "c2 has accepted all")
+    system.wait_until(lambda: system.depths("c2")["inbox"] == 0, 60, "c2 has handled all")
+    assert {p: (p.stat().st_ino, p.stat().st_mtime_ns) for p in files} == files, "the old files are unchanged"
+    assert sum(1 for _ in system.out.rglob("uuv-*")) == 6 * COUNT
+    found = system.pixels_by_file()
     assert sorted(found.values()) == sorted([i.picture_sha256 for i in (*old, *new)])
-    assert coast.log_text("c2").count("Image already stored") == len(repeated)
+    assert system.log_text("c2").count("Image already stored") == len(repeated)

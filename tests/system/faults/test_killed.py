@@ -1,4 +1,4 @@
-"""Processes between vessel and shore are killed (SIGKILL) at the worst moments: every picture arrives, once."""
+"""Processes of vessel and shore are killed (SIGKILL) at critical moments; every image arrives exactly once."""
 
 from __future__ import annotations
 
@@ -7,99 +7,99 @@ import time
 from collections.abc import Callable
 
 import pytest
-from builders.coast import PROCESSES, Coast
-from builders.feeder import make_image
+from builders.image_source import make_image
+from builders.vessel_and_shore import PROCESSES, VesselAndShore
 
 COUNT = 200
 
 
-def test_routers_killed_and_started_again_lose_nothing(coast: Coast) -> None:
+def test_killed_routers_lose_nothing(system: VesselAndShore) -> None:
     for part, router in enumerate(("router-vessel", "router-shore", "router-vessel", "router-shore")):
         first = 50 * part
-        coast.owe([make_image(n) for n in range(first, first + 50)])
-        coast.until(lambda first=first: coast.ashore_count() >= first + 5, 60, "first pictures of this part ashore")
-        coast.kill(router)
+        system.send([make_image(n) for n in range(first, first + 50)])
+        system.wait_until(lambda first=first: system.shore_image_count() >= first + 5, 60, "first images at the shore")
+        system.kill(router)
         time.sleep(0.5)
-        coast.start(router)
-    coast.assert_all_ashore_once()
+        system.start(router)
+    system.assert_all_delivered_once()
 
 
-def test_a_relay_killed_in_the_middle_of_a_picture_goes_on_from_there(start_coast: Callable[..., Coast]) -> None:
-    # 45 kB go in two pieces; the thin link makes the time between them long enough to be met.
-    coast = start_coast(link_bytes_per_s=1.5e6)
-    coast.owe([make_image(n, shape=(150, 300)) for n in range(COUNT)])
-    met = 0
+def test_relay_killed_during_an_image_resumes(start_system: Callable[..., VesselAndShore]) -> None:
+    # 45 kB need two chunks; on the slow link the time between them is long enough to kill the relay.
+    system = start_system(link_bytes_per_s=1.5e6)
+    system.send([make_image(n, shape=(150, 300)) for n in range(COUNT)])
+    interrupted = 0
     for _ in range(20):
-        coast.until(lambda: bool(coast.ask("c2", "SELECT COUNT(*) FROM partial")), 60, "c2 has a part of a picture")
-        coast.kill("relay")
-        met += bool(coast.ask("c2", "SELECT SUM(has) FROM partial"))  # else the rest came as the relay was killed
-        coast.start("relay")
-        if met == 3:
+        system.wait_until(lambda: bool(system.query("c2", "SELECT COUNT(*) FROM partial")), 60, "a part of an image")
+        system.kill("relay")
+        interrupted += bool(system.query("c2", "SELECT SUM(has) FROM partial"))  # else the rest arrived before the kill
+        system.start("relay")
+        if interrupted == 3:
             break
-        before = coast.ashore_count()
-        coast.until(lambda before=before: coast.ashore_count() > before + 5, 60, "the relay goes on")
-    assert met == 3, "killed in the middle of a picture"
-    coast.assert_all_ashore_once()
-    assert coast.depths("c2")["partial"] == 0
+        before = system.shore_image_count()
+        system.wait_until(lambda before=before: system.shore_image_count() > before + 5, 60, "the relay continues")
+    assert interrupted == 3, "killed during an image"
+    system.assert_all_delivered_once()
+    assert system.depths("c2")["partial"] == 0
 
 
-def test_c2_killed_between_commit_and_acknowledgement_has_each_once(coast: Coast) -> None:
-    link = coast.link
+def test_c2_killed_before_the_acknowledgement_stores_each_image_once(system: VesselAndShore) -> None:
+    link = system.link
     assert link is not None
-    coast.owe([make_image(n) for n in range(20)])
-    coast.assert_all_ashore_once()
+    system.send([make_image(n) for n in range(20)])
+    system.assert_all_delivered_once()
     for first in range(20, COUNT, 60):
-        # Nothing comes back from the shore: whatever c2 commits from now on is not acknowledged.
+        # No data returns from the shore: commits of c2 are not acknowledged from now on.
         link.stall("down")
-        coast.owe([make_image(n) for n in range(first, first + 60)])
-        coast.until(lambda first=first: (coast.accepted("c2") or 0) > first, 60, "c2 has committed")
-        coast.kill("c2")
-        accepted = coast.accepted("c2")
-        owed = coast.ask("relay", "SELECT COUNT(*) FROM outbox")
-        in_relay_or_before = coast.feeder.store.outbox_depth() + (coast.ask("relay", "SELECT COUNT(*) FROM inbox") or 0)
+        system.send([make_image(n) for n in range(first, first + 60)])
+        system.wait_until(lambda first=first: (system.accepted_count("c2") or 0) > first, 60, "c2 has committed")
+        system.kill("c2")
+        accepted = system.accepted_count("c2")
+        queued = system.query("relay", "SELECT COUNT(*) FROM outbox")
+        before_outbox = system.source.store.outbox_depth() + (system.query("relay", "SELECT COUNT(*) FROM inbox") or 0)
         assert accepted is not None
-        assert owed is not None
-        assert accepted + owed + in_relay_or_before > first + 60, "some are committed, and owed all the same"
-        link.lose_what_is_on_its_way()
+        assert queued is not None
+        assert accepted + queued + before_outbox > first + 60, "some are committed and still queued"
+        link.reset()
         link.mend()
-        coast.start("c2")
-        coast.assert_all_ashore_once()
+        system.start("c2")
+        system.assert_all_delivered_once()
 
 
 @pytest.mark.long
-def test_c2_killed_as_its_store_grows_has_each_once(coast: Coast) -> None:
-    coast.owe([make_image(n) for n in range(COUNT)])
-    wal = coast.shore_state / "c2.db-wal"
+def test_c2_killed_while_its_store_grows_stores_each_image_once(system: VesselAndShore) -> None:
+    system.send([make_image(n) for n in range(COUNT)])
+    wal = system.shore_state / "c2.db-wal"
     for kill in range(6):
-        coast.until(lambda kill=kill: coast.ashore_count() >= kill * COUNT // 8, 60, "some more ashore")
+        system.wait_until(lambda kill=kill: system.shore_image_count() >= kill * COUNT // 8, 60, "more images")
         size = wal.stat().st_size
-        coast.until(lambda size=size: wal.stat().st_size != size or coast.settled(), 60, "c2 writes")
-        coast.kill("c2")
-        coast.start("c2")
-        coast.until(wal.is_file, 30, "c2 has opened its store")
-    coast.assert_all_ashore_once()
+        system.wait_until(lambda size=size: wal.stat().st_size != size or system.is_complete(), 60, "c2 writes")
+        system.kill("c2")
+        system.start("c2")
+        system.wait_until(wal.is_file, 30, "c2 has opened its store")
+    system.assert_all_delivered_once()
 
 
 @pytest.mark.parametrize("seconds", [20.0, pytest.param(300.0, marks=[pytest.mark.long, pytest.mark.timeout(700)])])
-def test_everything_killed_at_random_loses_and_doubles_nothing(coast: Coast, seconds: float) -> None:
+def test_random_kills_of_all_processes_lose_and_duplicate_nothing(system: VesselAndShore, seconds: float) -> None:
     rng = random.Random(int(seconds))
     count = int(COUNT * max(1.0, seconds / 60))
-    began_s = time.monotonic()
+    start_s = time.monotonic()
     order: list[str] = []
     kills = 0
-    while (spent_s := time.monotonic() - began_s) < seconds:
-        done, wanted = len(coast.expected), min(count, 5 + int(count * spent_s / seconds))
+    while (elapsed_s := time.monotonic() - start_s) < seconds:
+        done, target = len(system.expected), min(count, 5 + int(count * elapsed_s / seconds))
         shape = rng.choice([(24, 32), (60, 80), (150, 300)])
-        coast.owe([make_image(n, shape) for n in range(done, wanted)])
-        # Each in turn, in an order that changes; sometimes while it or another one still starts.
+        system.send([make_image(n, shape) for n in range(done, target)])
+        # Each process in turn, in a changing order; sometimes while a process is still starting.
         order = order or rng.sample(PROCESSES, len(PROCESSES))
         name = order.pop()
         time.sleep(rng.uniform(0.05, 1.0))
-        coast.kill(name)
+        system.kill(name)
         kills += 1
         time.sleep(rng.uniform(0.0, 0.3))
-        coast.start(name)
+        system.start(name)
         time.sleep(rng.uniform(0.2, 2.5))
-    coast.owe([make_image(n) for n in range(len(coast.expected), count)])
+    system.send([make_image(n) for n in range(len(system.expected), count)])
     assert kills >= len(PROCESSES)
-    coast.assert_all_ashore_once(240)
+    system.assert_all_delivered_once(240)

@@ -1,12 +1,12 @@
-"""The link between vessel and shore is cut or swallows everything: every picture arrives, once, as it was."""
+"""The link between vessel and shore is cut or drops all data; every image arrives exactly once and unchanged."""
 
 from __future__ import annotations
 
 import time
 
 import pytest
-from builders.coast import Coast
-from builders.feeder import make_image
+from builders.image_source import make_image
+from builders.vessel_and_shore import VesselAndShore
 
 COUNT = 200
 LONG = [pytest.mark.long, pytest.mark.timeout(400)]
@@ -16,35 +16,35 @@ LONG = [pytest.mark.long, pytest.mark.timeout(400)]
     ("kind", "seconds"),
     [
         ("cut", 10.0),
-        ("stall", 5.0),  # longer than the lease of 3 s, after which the routers give the connection up
+        ("stall", 5.0),  # longer than the lease of 3 s, after which the routers close the connection
         pytest.param("cut", 60.0, marks=LONG),
         pytest.param("stall", 60.0, marks=LONG),
     ],
 )
-def test_an_outage_loses_doubles_and_corrupts_nothing(coast: Coast, kind: str, seconds: float) -> None:
-    link = coast.link
+def test_outage_loses_duplicates_and_corrupts_nothing(system: VesselAndShore, kind: str, seconds: float) -> None:
+    link = system.link
     assert link is not None
-    coast.owe([make_image(n) for n in range(60)])
-    coast.until(lambda: coast.ashore_count() >= 5, 60, "first pictures ashore")
+    system.send([make_image(n) for n in range(60)])
+    system.wait_until(lambda: system.shore_image_count() >= 5, 60, "first images at the shore")
     (link.cut if kind == "cut" else link.stall)()
     ends_s = time.monotonic() + seconds
     for first in range(60, COUNT, 20):
-        coast.owe([make_image(n) for n in range(first, first + 20)])
+        system.send([make_image(n) for n in range(first, first + 20)])
     time.sleep(max(0.0, ends_s - time.monotonic()))
-    assert coast.ashore_count() < COUNT, "the outage has kept some from the shore"
+    assert system.shore_image_count() < COUNT, "the outage has delayed some images"
     link.mend()
-    coast.assert_all_ashore_once()
+    system.assert_all_delivered_once()
 
 
 @pytest.mark.long
 @pytest.mark.timeout(400)
-def test_flaps_of_a_second_and_a_half_lose_nothing(coast: Coast) -> None:
-    link = coast.link
+def test_repeated_short_outages_lose_nothing(system: VesselAndShore) -> None:
+    link = system.link
     assert link is not None
-    for flap in range(8):
-        coast.owe([make_image(n) for n in range(25 * flap, 25 * flap + 25)])
+    for outage in range(8):
+        system.send([make_image(n) for n in range(25 * outage, 25 * outage + 25)])
         time.sleep(0.7)
-        (link.cut if flap % 2 else link.stall)()
+        (link.cut if outage % 2 else link.stall)()
         time.sleep(1.5)
         link.mend()
-    coast.assert_all_ashore_once(240)
+    system.assert_all_delivered_once(240)

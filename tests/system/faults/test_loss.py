@@ -1,8 +1,7 @@
-"""A thin link that loses every fifth packet, in the kernel: real TCP, real retransmissions.
+"""A slow link with 20 % packet loss in the kernel: real TCP retransmissions.
 
-The shore's processes run in a network namespace of their own, joined by a pair of interfaces. Both directions are
-limited by a token bucket filter, and packets are dropped at random by nftables inside the namespace (kernels without
-the netem scheduler have both).
+The processes of the shore run in a separate network namespace, connected by a pair of interfaces. A token bucket filter
+limits both directions, and nftables drops random packets inside the namespace. Kernels without netem have both.
 """
 
 from __future__ import annotations
@@ -14,17 +13,17 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import pytest
-from builders.coast import Coast
-from builders.feeder import make_image
+from builders.image_source import make_image
+from builders.vessel_and_shore import VesselAndShore
 
 COUNT = 200
 RATE_BITS_PER_S = 8 * 160_000
 LOSS_PERCENT = 20
-VESSEL_ADDRESS, SHORE_ADDRESS = "198.18.77.1", "198.18.77.2"  # RFC 2544: for measurements, routed nowhere
+VESSEL_ADDRESS, SHORE_ADDRESS = "198.18.77.1", "198.18.77.2"  # RFC 2544: reserved for measurements
 
 
 def run(*command: str) -> None:
-    """Run a command, or skip the test, saying what failed."""
+    """Run a command; skip the test with the reason if it fails."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         pytest.skip(f"{' '.join(command)}: {(done.stderr or done.stdout).strip()}")
@@ -32,12 +31,12 @@ def run(*command: str) -> None:
 
 @pytest.fixture
 def lossy_shore() -> Iterator[str]:
-    """A network namespace behind a thin and lossy link; the fixture is its name."""
+    """Name of a network namespace behind a slow and lossy link."""
     for program in ("ip", "tc", "nft"):
         if shutil.which(program) is None:
             pytest.skip(f"{program} is not installed")
     if os.geteuid() != 0:
-        pytest.skip("network namespaces can be made by root only")
+        pytest.skip("network namespaces require root")
     name = f"sonarpost{os.getpid()}"
     near, far = f"sn{os.getpid()}", f"sf{os.getpid()}"
     inside = ("ip", "netns", "exec", name)
@@ -63,12 +62,12 @@ def lossy_shore() -> Iterator[str]:
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_every_fifth_packet_lost_on_a_link_of_160_kilobytes_a_second(
-    lossy_shore: str, start_coast: Callable[..., Coast]
+def test_delivery_at_20_percent_packet_loss_and_160_kb_per_s(
+    lossy_shore: str, start_system: Callable[..., VesselAndShore]
 ) -> None:
-    coast = start_coast(shore_prefix=("ip", "netns", "exec", lossy_shore), shore_host=SHORE_ADDRESS)
-    coast.owe([make_image(n, (120, 160) if n % 2 else (24, 32)) for n in range(COUNT)])
-    coast.assert_all_ashore_once(500)
+    system = start_system(shore_prefix=("ip", "netns", "exec", lossy_shore), shore_host=SHORE_ADDRESS)
+    system.send([make_image(n, (120, 160) if n % 2 else (24, 32)) for n in range(COUNT)])
+    system.assert_all_delivered_once(500)
     counters = subprocess.run(
         ["ip", "netns", "exec", lossy_shore, "nft", "list", "table", "ip", "loss"],
         capture_output=True,

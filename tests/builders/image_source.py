@@ -1,4 +1,4 @@
-"""The test's own outbox, and pictures for it."""
+"""Outbox of a test that sends images to the relay, and images for it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from builders.records import picture_record
+from builders.records import image_record
 from sonarpost import keys
 from sonarpost.config import ServiceConfig
 from sonarpost.messages import Pixels, ReconstructedImage
@@ -18,11 +18,11 @@ VESSEL = "vessel-1"
 def make_image(
     number: int, shape: tuple[int, int] = (24, 32), mission: int = 0, version: int = 1
 ) -> ReconstructedImage:
-    """Return a picture of noise that no other number, mission or version has."""
+    """Return an image of noise, unique for number, mission and version."""
     rng = np.random.default_rng([mission, number, version])
-    raster = Pixels.from_array(rng.integers(0, 256, shape, dtype=np.uint8))
-    return picture_record(
-        raster,
+    pixels = Pixels.from_array(rng.integers(0, 256, shape, dtype=np.uint8))
+    return image_record(
+        pixels,
         vehicle_id=f"uuv-{number % 3 + 1}",
         image_id=f"{number:04d}",
         version=version,
@@ -31,16 +31,16 @@ def make_image(
     )
 
 
-class Feeder(Service[ServiceConfig]):
-    """The test's own outbox, in the decompressor's place."""
+class ImageSource(Service[ServiceConfig]):
+    """Outbox of a test in place of the decompressor."""
 
-    NAME = "feeder"
+    NAME = "source"
 
     def handle(self, key: str, record: object, effects: UnitOfWork) -> None:
-        raise AssertionError("the feeder takes nothing")
+        raise AssertionError("the source consumes nothing")
 
-    def owe(self, images: Iterable[ReconstructedImage]) -> None:
-        """Commit pictures for the relay."""
+    def send(self, images: Iterable[ReconstructedImage]) -> None:
+        """Queue images for the relay."""
         effects = UnitOfWork()
         for image in images:
             effects.send(keys.image_reconstructed(VESSEL), "relay", image, priority=5)

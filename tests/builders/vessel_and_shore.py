@@ -1,7 +1,7 @@
-"""A vessel and a shore in real processes, the link between them, and an exact account of what arrived.
+"""A vessel and a shore site in real processes, the link between them, and an exact account of the delivered images.
 
-Real are both routers, relay and c2, each a process with its own store. The test itself stands in for the decompressor:
-its outbox owes `image/reconstructed` to the relay.
+Both routers, relay and c2 are processes with their own stores. The test replaces the decompressor: its outbox sends
+`image/reconstructed` to the relay.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from PIL import Image
 
 from builders.common import REPOSITORY, free_port
 from builders.faulty_link import FaultyLink
-from builders.feeder import VESSEL, Feeder
+from builders.image_source import VESSEL, ImageSource
 from sonarpost import wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig, ServiceConfig
@@ -45,16 +45,16 @@ Name = tuple[str, str, int]
 
 @dataclass
 class Options:
-    """What a coast is made of.
+    """Options of the system.
 
     Attributes:
-        link_bytes_per_s: Of the link, each direction.
-        relay, c2: More lines for their tables.
-        vessel_state, shore_state, shore_out: Folders, by default in the coast's own.
-        launcher: What runs a process's module, by process; by default the interpreter.
-        environment: More of it, by process.
-        shore_prefix: Command that the shore's processes are run by (another network namespace).
-        shore_host: Address of the shore's router; with another than this host's there is no FaultyLink.
+        link_bytes_per_s: Bandwidth of the link in each direction.
+        relay, c2: Additional lines for their tables.
+        vessel_state, shore_state, shore_out: Folders, by default below the folder of the system.
+        launcher: Command that runs a module, by process; by default the interpreter.
+        environment: Additional environment variables, by process.
+        shore_prefix: Command that runs the processes of the shore, for example in another network namespace.
+        shore_host: Address of the shore's router; for another host there is no FaultyLink.
     """
 
     link_bytes_per_s: float | None = None
@@ -69,8 +69,8 @@ class Options:
     shore_host: str = "127.0.0.1"
 
 
-class Coast:
-    """Processes of a vessel and a shore; a context manager that leaves nothing running."""
+class VesselAndShore:
+    """Processes of a vessel and a shore; a context manager that stops all of them."""
 
     def __init__(self, folder: Path, options: Options | None = None) -> None:
         self.folder = folder
@@ -83,11 +83,11 @@ class Coast:
         self.expected: dict[Name, ReconstructedImage] = {}
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._logs: list[IO[bytes]] = []
-        self._feeder: Feeder | None = None
+        self._source: ImageSource | None = None
         self._watchers: list[zenoh.Session] = []
         self.health: dict[str, Health] = {}
 
-    def __enter__(self) -> Coast:
+    def __enter__(self) -> VesselAndShore:
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.options.shore_host == "127.0.0.1":
             self.link = FaultyLink(self.ports["router-shore"], self.options.link_bytes_per_s)
@@ -95,7 +95,7 @@ class Coast:
         try:
             for name in PROCESSES:
                 self.start(name)
-            self.start_feeder()
+            self.start_source()
         except BaseException:
             self.close()
             raise
@@ -164,38 +164,38 @@ class Coast:
         """Send a process a signal."""
         self._processes[name].send_signal(number)
 
-    def start_feeder(self, folder: str = "feeder") -> Feeder:
-        """Start the outbox in the decompressor's place, on a store of its own."""
+    def start_source(self, folder: str = "source") -> ImageSource:
+        """Start the outbox of the test, with its own store."""
         state = self.folder / "state" / folder
         platform = PlatformConfig(
             id=VESSEL, router=(self._endpoint("router-vessel"),), state_dir=state, health_interval_s=60.0
         )
-        self._feeder = Feeder(platform, ServiceConfig())
-        assert self._feeder.start()
-        return self._feeder
+        self._source = ImageSource(platform, ServiceConfig())
+        assert self._source.start()
+        return self._source
 
-    def stop_feeder(self) -> None:
-        """Stop it."""
-        if self._feeder is not None:
-            feeder, self._feeder = self._feeder, None
-            feeder.stop()
+    def stop_source(self) -> None:
+        """Stop the outbox of the test."""
+        if self._source is not None:
+            source, self._source = self._source, None
+            source.stop()
 
     @property
-    def feeder(self) -> Feeder:
-        """The running feeder."""
-        assert self._feeder is not None
-        return self._feeder
+    def source(self) -> ImageSource:
+        """The running outbox of the test."""
+        assert self._source is not None
+        return self._source
 
-    def owe(self, images: Sequence[ReconstructedImage]) -> None:
-        """Owe pictures, and expect them ashore."""
-        self.feeder.owe(images)
+    def send(self, images: Sequence[ReconstructedImage]) -> None:
+        """Send images, which are then expected at the shore."""
+        self.source.send(images)
         self.expected.update(((i.vehicle_id, i.image_id, i.version), i) for i in images)
 
     def close(self) -> None:
         """Stop everything."""
         for watcher in self._watchers:
             watcher.close()
-        self.stop_feeder()
+        self.stop_source()
         for name in reversed(PROCESSES):
             process = self._processes.get(name)
             if process is not None and process.poll() is None:
@@ -212,22 +212,22 @@ class Coast:
         for log in self._logs:
             log.close()
 
-    # What is seen
+    # Observation
 
     def watch_health(self) -> None:
-        """Follow the health of relay and c2, each at its own router."""
+        """Subscribe to the health of relay and c2, each at its own router."""
         for router in ("router-vessel", "router-shore"):
             session = open_with_retry([self._endpoint(router)], threading.Event())
             assert session is not None
             self._watchers.append(session)
-            session.declare_subscriber("sonarpost/v1/*/health/*", self._heard)
+            session.declare_subscriber("sonarpost/v1/*/health/*", self._on_health)
 
-    def _heard(self, sample: zenoh.Sample) -> None:
+    def _on_health(self, sample: zenoh.Sample) -> None:
         health = wire.decode(Health, sample.payload.to_bytes(), str(sample.key_expr))
         self.health[health.service] = health
 
-    def until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-        """Wait for a condition; fail with the state of everything when it does not come true."""
+    def wait_until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+        """Wait for a condition; fail with the state of all processes after the time-out."""
         deadline = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > deadline:
@@ -235,27 +235,27 @@ class Coast:
             time.sleep(0.02)
 
     def describe(self) -> str:
-        """Return the state of everything, for people."""
+        """Return the state of all processes as text."""
         tails = "".join(f"\n--- {name}\n{self.log_tail(name)}" for name in PROCESSES)
         return (
-            f"owed {len(self.expected)}, feeder {self.feeder.store.outbox_depth() if self._feeder else '-'}, relay "
-            f"{self.depths('relay')}, c2 {self.depths('c2')}, ashore {self.ashore_count()}{tails}"
+            f"sent {len(self.expected)}, source {self.source.store.outbox_depth() if self._source else '-'}, relay "
+            f"{self.depths('relay')}, c2 {self.depths('c2')}, at the shore {self.shore_image_count()}{tails}"
         )
 
     def log_tail(self, name: str, lines: int = 6) -> str:
-        """Return what a process wrote last."""
+        """Return the last lines of a process's log."""
         path = self.folder / f"{name}.log"
         return "\n".join(path.read_text(errors="replace").splitlines()[-lines:]) if path.is_file() else ""
 
     def log_text(self, name: str) -> str:
-        """Return all that a process wrote."""
+        """Return the log of a process."""
         return (self.folder / f"{name}.log").read_text(errors="replace")
 
     def database(self, service: str) -> Path:
         """Path of a service's store."""
         return (self.vessel_state if service == "relay" else self.shore_state) / f"{service}.db"
 
-    def ask(self, service: str, sql: str) -> int | None:
+    def query(self, service: str, sql: str) -> int | None:
         """Return one number of a store, None while it cannot be read."""
         try:
             with contextlib.closing(sqlite3.connect(f"file:{self.database(service)}?mode=ro", uri=True)) as db:
@@ -265,46 +265,46 @@ class Coast:
         return int(row[0]) if row and row[0] is not None else 0
 
     def depths(self, service: str) -> dict[str, int | None]:
-        """Return how much lies in a store's tables."""
-        return {t: self.ask(service, f"SELECT COUNT(*) FROM {t}") for t in ("inbox", "outbox", "refused", "partial")}
+        """Return the number of rows in a store's tables."""
+        return {t: self.query(service, f"SELECT COUNT(*) FROM {t}") for t in ("inbox", "outbox", "refused", "partial")}
 
-    def accepted(self, service: str) -> int | None:
-        """Return how many records a store has ever committed to its inbox: SQLite counts them, and never back."""
-        return self.ask(service, "SELECT seq FROM sqlite_sequence WHERE name = 'inbox'")
+    def accepted_count(self, service: str) -> int | None:
+        """Return the number of records ever committed to an inbox, from SQLite's autoincrement counter."""
+        return self.query(service, "SELECT seq FROM sqlite_sequence WHERE name = 'inbox'")
 
-    def ashore_count(self) -> int:
-        """Return how many side-cars c2 has written."""
+    def shore_image_count(self) -> int:
+        """Return the number of side-cars that c2 has written."""
         folder = self.out / VESSEL
         return sum(1 for p in folder.glob("*.json") if not p.name.startswith(".")) if folder.is_dir() else 0
 
-    # The account
+    # Account
 
-    def settled(self) -> bool:
-        """Tell whether everything owed is ashore and nobody owes anything any more."""
+    def is_complete(self) -> bool:
+        """Return whether all sent images are at the shore and all stores are empty."""
         return (
-            self.ashore_count() >= len(self.expected)
-            and self.feeder.store.outbox_depth() == 0
+            self.shore_image_count() >= len(self.expected)
+            and self.source.store.outbox_depth() == 0
             and all(self.depths(s)[t] == 0 for s in ("relay", "c2") for t in ("inbox", "outbox"))
         )
 
-    def assert_all_ashore_once(self, timeout_s: float = 120.0, *, records: int | None = None) -> None:
-        """Wait, then check: none lost, none doubled, none corrupted.
+    def assert_all_delivered_once(self, timeout_s: float = 120.0, *, records: int | None = None) -> None:
+        """Wait until all images are delivered, then check that none is lost, duplicated or corrupted.
 
         Args:
-            timeout_s: How long to wait at most.
-            records: How many records c2 has committed in its life; by default as many as pictures were owed.
+            timeout_s: Maximum wait.
+            records: Number of records that c2 has committed in total; by default the number of sent images.
         """
-        self.until(self.settled, timeout_s, "everything ashore")
+        self.wait_until(self.is_complete, timeout_s, "all images at the shore")
         wanted = len(self.expected) if records is None else records
-        assert self.accepted("c2") == wanted, "records committed by c2"
+        assert self.accepted_count("c2") == wanted, "records committed by c2"
         assert self.depths("c2")["refused"] == self.depths("relay")["refused"] == 0
         assert self._files() == {name: image.picture_sha256 for name, image in self.expected.items()}
         assert self._rows() == Counter(dict.fromkeys(self.expected, 1))
         left = [p.name for p in self.out.rglob(".*.tmp")]
-        assert left == [], "half-written files"
+        assert left == [], "temporary files"
 
     def pixels_by_file(self) -> dict[Path, str]:
-        """Return the sha256 of every picture's pixels by its side-car, read back from its files, both of them."""
+        """Return the SHA-256 of each image's pixels by side-car, read from its TIFF and PNG files."""
         found: dict[Path, str] = {}
         for path in (self.out / VESSEL).glob("[!.]*.json"):
             tiff = np.ascontiguousarray(tifffile.imread(path.with_suffix(".tiff")))
@@ -318,7 +318,7 @@ class Coast:
         for path, sha256 in self.pixels_by_file().items():
             side_car = json.loads(path.read_text())
             name = (side_car["vehicle_id"], side_car["image_id"], side_car["version"])
-            assert name not in found, f"{name} is there twice"
+            assert name not in found, f"{name} is stored twice"
             assert sha256 == side_car["picture_sha256"], path
             found[name] = sha256
         return found
@@ -328,7 +328,7 @@ class Coast:
             rows = db.execute("SELECT vehicle_id, image_id, version FROM picture").fetchall()
         return Counter((str(v), str(i), int(n)) for v, i, n in rows)
 
-    def wipe_vessel(self) -> None:
-        """Delete the vessel's stores, the relay's and the feeder's; both must be stopped."""
+    def delete_vessel_stores(self) -> None:
+        """Delete the stores of relay and source, which must be stopped."""
         shutil.rmtree(self.vessel_state)
-        shutil.rmtree(self.folder / "state" / "feeder")
+        shutil.rmtree(self.folder / "state" / "source")
