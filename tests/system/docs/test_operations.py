@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import ast
 import json
+import logging
 import re
+import shutil
+import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import reference
@@ -13,6 +17,7 @@ from builders.common import REPOSITORY
 from builders.fleet import FLEET, on_terminal
 
 from sonarpost.config import SERVICES, ServiceConfig
+from sonarpost.logs import JsonFormatter, TextFormatter, kv
 from sonarpost.runtime.modem_service import ModemServiceConfig
 from sonarpost.runtime.service import Service
 
@@ -52,6 +57,35 @@ def test_counters_and_gauges_of_a_service_are_in_its_page(name: str, service: Se
     documented = health_names(name)
     assert len(documented) == len(set(documented))
     assert set(documented) == names
+
+
+@pytest.mark.parametrize("log_format", ["json", "text"])
+def test_trace_of_one_contact_finds_its_lines(log_format: str, tmp_path: Path) -> None:
+    """The message of the documented commands is the compressor's, and they find the lines of one contact."""
+    if log_format == "json" and shutil.which("jq") is None:
+        pytest.skip("jq is not installed")
+    page = (DOCS / "operations.md").read_text(encoding="utf-8")
+    section = page.split("## One contact through the chain")[1]
+    with_json, with_text = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)
+    contact = with_json.splitlines()[0].split("'")[1]
+    assert '"Image encoded"' in (REPOSITORY / "services" / "compressor" / "service.py").read_text(encoding="utf-8")
+    formatter = {"json": JsonFormatter, "text": TextFormatter}[log_format]
+    for service, message, fields in (
+        ("compressor", "Image encoded", {"contact_id": contact, "image_id": "00A7"}),
+        ("compressor", "Image encoded", {"contact_id": "another", "image_id": "00A8"}),
+        ("relay", "Record queued", {"image_id": "00A7"}),
+    ):
+        record = logging.makeLogRecord({"msg": message, "levelname": "INFO", **kv(**fields)})
+        path = tmp_path / "logs" / f"{service}.log"
+        path.parent.mkdir(exist_ok=True)
+        with path.open("a", encoding="utf-8") as file:
+            file.write(formatter(service).format(record) + "\n")
+    script = with_json if log_format == "json" else f"contact='{contact}'\n{with_text}"
+    result = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert len(result.stdout.splitlines()) == 2
+    assert "00A8" not in result.stdout
 
 
 def test_documented_status_table_equals_the_output() -> None:
