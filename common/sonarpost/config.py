@@ -39,7 +39,7 @@ SERVICES = (
 # Inline tables of which environment variables can override single keys: SONARPOST_PLATFORM__TLS__KEY.
 NESTED_TABLES = {("platform", "tls")}
 
-# Keys of version 0.1 with their present names; `table.key` for a key that moved to another table. Old names are rejected.
+# Keys of version 0.1 with their present names, `table.key` for a key that moved to another table. Old names are errors.
 RENAMED_KEYS: Mapping[str, Mapping[str, str]] = {
     "atd_stub": {
         "max_on_the_way": "max_in_flight",

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from builders.records import image_record
+from builders.records import reconstructed_image
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.state import ConsoleState
@@ -63,7 +63,7 @@ def image_record(
     contact = Contact(
         contact_id=f"{vehicle}/{image_id}", vehicle_id=vehicle, lat_deg=lat, lon_deg=lon, **{**fields, **contact_fields}
     )
-    return image_record(
+    return reconstructed_image(
         Pixels.from_array(pixels),
         vessel_id=vessel,
         vehicle_id=vehicle,

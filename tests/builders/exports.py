@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from builders.records import decision_record, image_record
+from builders.records import decision_record, reconstructed_image
 from sonarpost.archive.image_files import write_image
 from sonarpost.archive.shore_files import decision_file_name
 from sonarpost.export.contacts import ContactSet
@@ -50,7 +50,7 @@ def image(image_id: str = "00A7", contact: dict[str, Any] | None = None, **chang
         "first_frame_utc_s": FIRST_UTC_S,
         "last_frame_utc_s": FIRST_UTC_S + 30,
     }
-    return image_record(picture, **(fields | changes))
+    return reconstructed_image(picture, **(fields | changes))
 
 
 def decision(image_id: str = "00A7", **changes: Any) -> Decision:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from builders.records import image_record
+from builders.records import reconstructed_image
 from sonarpost import keys
 from sonarpost.config import ServiceConfig
 from sonarpost.messages import Pixels, ReconstructedImage
@@ -21,7 +21,7 @@ def make_image(
     """Return an image of noise, unique for number, mission and version."""
     rng = np.random.default_rng([mission, number, version])
     pixels = Pixels.from_array(rng.integers(0, 256, shape, dtype=np.uint8))
-    return image_record(
+    return reconstructed_image(
         pixels,
         vehicle_id=f"uuv-{number % 3 + 1}",
         image_id=f"{number:04d}",

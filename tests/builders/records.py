@@ -7,7 +7,7 @@ from sonarpost.messages import Command, Decision, Pixels, ReconstructedImage
 FIRST_S = 1_700_000_000.0
 
 
-def image_record(picture: Pixels, **changes: object) -> ReconstructedImage:
+def reconstructed_image(picture: Pixels, **changes: object) -> ReconstructedImage:
     """Return a complete image of vessel-1; `changes` override fields."""
     fields: dict[str, object] = {
         "vessel_id": "vessel-1",

@@ -14,11 +14,7 @@ from xml.etree import ElementTree as ET
 import pytest
 import zenoh
 from builders.common import eventually, free_port, publish_once
-<<<<<<< HEAD
-from builders.records import decision_record, image_record
-=======
-from builders.records import image_record
->>>>>>> e1d4da8 (tests: name the fault tests in the field's terms, one faulty link)
+from builders.records import decision_record, reconstructed_image
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import router_config
@@ -36,7 +32,7 @@ FIRST_S = 1_700_000_000.0
 
 def image(image_id="AAAA", version=1, vehicle="uuv-1", vessel="vessel-1", first_frame_utc_s=FIRST_S):
     picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
-    return image_record(
+    return reconstructed_image(
         picture,
         vessel_id=vessel,
         vehicle_id=vehicle,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 from builders.common import eventually
-from builders.records import image_record
+from builders.records import reconstructed_image
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -22,7 +22,7 @@ DAY_S = 86400.0
 
 def image(image_id="AAAA", version=1, vessel="vessel-1", first_frame_utc_s=1_700_000_000.0):
     picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
-    return image_record(
+    return reconstructed_image(
         picture,
         vessel_id=vessel,
         image_id=image_id,

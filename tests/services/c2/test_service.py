@@ -9,7 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 from builders.common import eventually
-from builders.records import decision_record, image_record
+from builders.records import decision_record, reconstructed_image
 
 from sonarpost import keys, wire
 from sonarpost.files import AtomicFiles
@@ -40,7 +40,7 @@ def image(texture):
         picture = Pixels.from_array(texture(seed=seed))
         missing = np.zeros((40, 60), dtype=np.bool_)
         missing[30:, :] = True
-        return image_record(
+        return reconstructed_image(
             picture,
             vessel_id=vessel,
             image_id=image_id,

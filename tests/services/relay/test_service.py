@@ -7,7 +7,7 @@ import logging
 import msgpack
 import pytest
 from builders.common import eventually
-from builders.records import decision_record, image_record
+from builders.records import decision_record, reconstructed_image
 
 from sonarpost import keys, logs, wire
 from sonarpost.messages import Pixels, Relayed
@@ -36,7 +36,7 @@ def source(runner):
 @pytest.fixture
 def image(texture):
     def make(image_id="AAAA", vessel="vessel-1"):
-        return image_record(Pixels.from_array(texture()), vessel_id=vessel, image_id=image_id)
+        return reconstructed_image(Pixels.from_array(texture()), vessel_id=vessel, image_id=image_id)
 
     return make
 

@@ -9,7 +9,7 @@ import msgpack
 import pytest
 import zenoh
 from builders.common import eventually, free_port
-from builders.records import decision_record, image_record
+from builders.records import decision_record, reconstructed_image
 from pydantic import ValidationError
 
 from sonarpost import keys
@@ -43,7 +43,7 @@ def source(runner):
 
 def image(image_id="AAAA", version=1, height_px=40, **changes):
     picture = Pixels(height_px=height_px, width_px=100, bits=8, data=bytes([version]) * height_px * 100)
-    return image_record(picture, image_id=image_id, version=version, **changes)
+    return reconstructed_image(picture, image_id=image_id, version=version, **changes)
 
 
 def names(site):
