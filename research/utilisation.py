@@ -165,7 +165,7 @@ class _Vehicle:
             case PacketFailed():
                 self._asked = False
             case FrameDecoded():
-                self._medium.heard(now)
+                self._medium.channel_busy(now)
             case FrameReceived():
                 for found in self._receiver.accept(event.src, event.data, now):
                     if isinstance(found, FeedbackReceived):

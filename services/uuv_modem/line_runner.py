@@ -134,7 +134,7 @@ class LineRunner:
             case PacketFailed():
                 self._packet_failed(event, now)
             case FrameDecoded():
-                self._mac.heard(now)
+                self._mac.channel_busy(now)
             case FrameReceived(dest=dest) if dest == self._config.address:
                 self._line.hear(event.src, [event.data], now)
                 self._changed = True

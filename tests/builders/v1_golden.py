@@ -141,7 +141,7 @@ def codes() -> dict[str, Any]:
         made_symbols = layered_symbols(layering, objects, indices)
         layered.append(
             {
-                "needs": list(layering.needs),
+                "needs": list(layering.required_symbols),
                 "bounds": list(layering.bounds(27)),
                 "descriptor": layering.pack().hex(),
                 "objects": [data.hex() for data in objects],

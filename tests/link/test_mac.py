@@ -37,7 +37,7 @@ def test_continuous_without_listening_never_waits_but_for_others():
     for n in range(100):
         assert mac.wait_s(6.0, 6.0 * n) == 0.0
         mac.sent(6.0 * n, 6.0 * n + 6.0)
-    mac.heard(1000.0)
+    mac.channel_busy(1000.0)
     assert mac.wait_s(6.0, 1002.0) == 3.0
     assert mac.wait_s(6.0, 1005.0) == 0.0
     assert mac.wait_s(6.0, 900.0) == 0.0, "the clock was set back"
@@ -74,7 +74,7 @@ def test_a_slot_that_is_too_short_says_so():
 def test_who_is_polled_never_begins():
     mac = Polled()
     mac.sent(0.0, 1.0)
-    mac.heard(2.0)
+    mac.channel_busy(2.0)
     assert mac.wait_s(1.0, 1e6) is None
 
 
@@ -95,7 +95,7 @@ def test_random_access_waits_between_none_and_twice_the_mean(seed, mean_s):
 def test_random_access_defers_to_others_and_survives_a_clock_that_is_set_back():
     mac = Csma(1.0, holdoff_s=4.0, seed=1)
     mac.sent(0.0, 1000.0)
-    mac.heard(1003.0)
+    mac.channel_busy(1003.0)
     assert mac.wait_s(6.0, 1003.0) == 4.0
     assert mac.wait_s(6.0, 0.0) <= 2.0
 

@@ -312,7 +312,7 @@ def test_the_sender_goes_on_after_a_restart_at_every_frame() -> None:
         ("image-progress/1", {"delivered": [[9, 3]]}),
         ("block/0", {"objects": []}),
         ("block/0", {"kind": 2}),
-        ("block-progress/0", {"needs": {1: 256}}),
+        ("block-progress/0", {"missing": {1: 256}}),
     ],
     ids=str,
 )

@@ -148,7 +148,7 @@ def test_every_layer_comes_back_from_as_many_symbols_as_it_needs(
     order = [int(i) for i in rng.permutation(255)]
     made = dict(zip(order, layered_symbols(layering, objects, order), strict=True))
     assert recover_layering({i: made[i][0] for i in order[:4]}) == layering
-    for layer, need in enumerate(layering.needs):
+    for layer, need in enumerate(layering.required_symbols):
         symbols = {i: made[i][1] for i in order[-need:]}
         assert {len(s) for s in symbols.values()} == {symbol_bytes}
         assert recover_layer(layering, layer, symbols) == objects[layer]
@@ -180,8 +180,8 @@ def test_a_report_comes_back_and_fits_the_smallest_frame(newest: int, frames: in
     assert Feedback.unpack(report.pack()) == report
     assert 2 + 2 + len(report.pack()) <= 32
     for back, need in enumerate(needs):
-        assert report.need_of((newest - back) % 32) == need
-    assert report.need_of((newest + 1) % 32) is None
+        assert report.missing_of((newest - back) % 32) == need
+    assert report.missing_of((newest + 1) % 32) is None
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00\x01", b"\x20\x00\x00", bytes(20)])

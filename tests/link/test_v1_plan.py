@@ -15,7 +15,7 @@ from sonarpost.link.coding.redundancy_plan import (
     arrivals,
     copies,
     plan_layers,
-    plan_whole,
+    plan_unlayered,
     preview_frames,
     quality_curve,
     symbols_to_send,
@@ -70,12 +70,12 @@ def test_layers_are_used_where_it_is_uncertain_how_much_arrives() -> None:
     plan = plan_layers(gain, 59, arrive, 8, 6)
     assert plan is not None
     assert len(plan.layering.shares) > 1
-    assert plan.layering.needs[0] <= 20 < plan.layering.needs[-1] <= 60
+    assert plan.layering.required_symbols[0] <= 20 < plan.layering.required_symbols[-1] <= 60
     sure = np.zeros(81)
     sure[60] = 1.0
     one = plan_layers(gain, 59, sure, 8, 6)
     assert one is not None
-    assert one.layering.needs[-1] <= 60
+    assert one.layering.required_symbols[-1] <= 60
     assert one.expected_db > plan.expected_db
 
 
@@ -101,7 +101,7 @@ def test_the_plan_is_the_best_of_all_on_a_small_case() -> None:
 def test_without_layers_the_best_k_is_found() -> None:
     gain = GroupDistortion.of([curve(0.05, 800)], [0])
     arrive = arrivals(6, (LossChannel(0.3),), 1)
-    found = plan_whole(gain, 59, arrive, 12)
+    found = plan_unlayered(gain, 59, arrive, 12)
     assert found is not None
     at_least = np.cumsum(arrive[::-1])[::-1]
     values = [float(gain.gains(np.array(k * 59 - 12)) * at_least[k]) for k in range(1, 7)]

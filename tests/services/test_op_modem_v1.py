@@ -273,7 +273,7 @@ def test_reports_tell_the_vehicle_what_is_lacking(modem_pair, begin, vehicle, ru
     next_frames(far.sender, 2, time.time())  # lost
     far.send()
     eventually(lambda: len(far.reports) >= 1, timeout_s=60)
-    assert sum(far.reports[0].needs) > 0
+    assert sum(far.reports[0].missing) > 0
     assert len(decompressor.received) == 3
 
 

@@ -272,9 +272,9 @@ def _core_parts(maps: Mapping[str, _Map]) -> dict[str, bytes]:
             block = _read(
                 SendBlock,
                 {**maps[f"block/{entry['number']}"], **entry},
-                {"asked_at": "asked_s"},
+                {"asked_at": "last_activity_s"},
                 layering=maps[f"block/{entry['number']}"]["layering"] or None,
-                needs=dict(entry["needs"]),
+                missing=dict(entry["needs"]),
                 retired=retired,
             )
             parts[f"block/{block.number}"] = pack_part(block)

@@ -98,7 +98,7 @@ class BlockDecoder:
         if self.complete:
             return 0
         if self.kind == SymbolKind.LAYERED:
-            required = DESCRIPTOR_SYMBOLS if self.layering is None else self.layering.needs[-1]
+            required = DESCRIPTOR_SYMBOLS if self.layering is None else self.layering.required_symbols[-1]
         else:
             required = self.count
         return max(1, required - len(self.symbols))
@@ -154,8 +154,8 @@ class BlockDecoder:
         if self.layering is None and len(self.descriptor) >= DESCRIPTOR_SYMBOLS:
             self.layering = recover_layering(self.descriptor)
         found: list[PieceList] = []
-        while self.layering is not None and self.layers < len(self.layering.needs):
-            if len(self.symbols) < self.layering.needs[self.layers]:
+        while self.layering is not None and self.layers < len(self.layering.required_symbols):
+            if len(self.symbols) < self.layering.required_symbols[self.layers]:
                 break
             data = recover_layer(self.layering, self.layers, self.symbols)
             below = self.layer_ends if self.layers else None
@@ -165,7 +165,7 @@ class BlockDecoder:
             self.layers += 1
             self.layer_ends = pieces.ends
             found.append(pieces)
-        if self.layering is not None and self.layers == len(self.layering.needs):
+        if self.layering is not None and self.layers == len(self.layering.required_symbols):
             self._finish()
         yield from found
 

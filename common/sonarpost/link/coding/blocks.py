@@ -18,7 +18,7 @@ from sonarpost.link.coding.redundancy_plan import (
     GroupDistortion,
     arrivals,
     plan_layers,
-    plan_whole,
+    plan_unlayered,
     preview_frames,
     symbols_to_send,
 )
@@ -132,8 +132,8 @@ class SendBlock:
         planned: Symbols to send according to the current plan.
         sent: Symbols sent.
         reported: Whether feedback has mentioned the block.
-        asked_s: Time of its last symbol or feedback.
-        needs: Missing symbols by receiver, from the latest feedback.
+        last_activity_s: Time of its last symbol or feedback.
+        missing: Missing symbols by receiver, from the latest feedback.
         retired: Whether it was sent without feedback, and only feedback can continue it.
     """
 
@@ -148,8 +148,8 @@ class SendBlock:
     planned: Count = field(default=0, metadata=PROGRESS)
     sent: Count = field(default=0, metadata=PROGRESS)
     reported: bool = field(default=False, metadata=PROGRESS)
-    asked_s: float = field(default=0.0, metadata=PROGRESS)
-    needs: dict[int, Byte] = field(default_factory=dict, metadata=PROGRESS)
+    last_activity_s: float = field(default=0.0, metadata=PROGRESS)
+    missing: dict[int, Byte] = field(default_factory=dict, metadata=PROGRESS)
     retired: bool = field(default=False, metadata=PROGRESS)
     _symbols: dict[int, Symbol] = field(default_factory=dict, metadata=SEPARATE)
 
@@ -167,7 +167,7 @@ class SendBlock:
     @property
     def source_symbols(self) -> int:
         """Number of symbols from which the whole block can be recovered."""
-        return self.layering.needs[-1] if self.layering else len(self.objects[0]) // self.symbol_bytes
+        return self.layering.required_symbols[-1] if self.layering else len(self.objects[0]) // self.symbol_bytes
 
     @property
     def left(self) -> int:
@@ -252,13 +252,13 @@ def make_group(
         urgency=_PREVIEW_URGENCY,
         spans=tuple(image.span(0, image.sent) for image in images),
         planned=planned,
-        asked_s=now,
+        last_activity_s=now,
     )
     for image in images:
         if image.sent == shape.prefix_bytes == image.goal_bytes(config.stream_bytes):
             image.sent -= 1  # a full entry cannot say that the stream ends; a piece of one byte does
     if config.feedback:
-        return [previews, *whole_blocks(images, config, symbol_bytes, take_number, now)]
+        return [previews, *unlayered_blocks(images, config, symbol_bytes, take_number, now)]
     frames = min(round(config.frames_per_image * len(images)) - planned, erasure_code.MAX_SYMBOLS)
     return [previews, *_layered(images, config, symbol_bytes, frames, take_number, now)]
 
@@ -288,12 +288,12 @@ def _layered(
     first, later = guess.overhead_bytes(), 1 + len(images) + CHECK_BYTES
     arrive = arrivals(frames, config.planned_channels, config.depth)
     plan = plan_layers(distortion, symbol_bytes, arrive, first, later)
-    whole = plan_whole(distortion, symbol_bytes, arrive, first)
+    whole = plan_unlayered(distortion, symbol_bytes, arrive, first)
     if plan is None or (whole is not None and whole[1] >= plan.expected_db):
         if whole is not None:
             room = whole[0] * symbol_bytes
             stops = _fitted_stops(images, starts, distortion.stops(room - first), room, None)
-            yield _whole_block(images, stops, whole[0], symbol_bytes, take_number(), frames, now, final=True)
+            yield _unlayered_block(images, stops, whole[0], symbol_bytes, take_number(), frames, now, final=True)
         return
     if plan.expected_db <= 0:
         return
@@ -314,7 +314,7 @@ def _layered(
         urgency=1.0,
         spans=tuple(image.span(a, b) for image, a, b in zip(images, starts, stops, strict=True)),
         planned=frames,
-        asked_s=now,
+        last_activity_s=now,
     )
     for image, stop in zip(images, stops, strict=True):
         image.sent = stop
@@ -342,7 +342,7 @@ def _layers(
     return layers
 
 
-def whole_blocks(
+def unlayered_blocks(
     images: Sequence[OutgoingImage],
     config: SenderConfig,
     symbol_bytes: int,
@@ -365,11 +365,11 @@ def whole_blocks(
         stops = _fitted_stops(run, starts, stops, source * symbol_bytes, None)
         final = all(stop >= goals[image.number] for image, stop in zip(run, stops, strict=True))
         planned = symbols_to_send(source, config.worst, config.caution)
-        yield _whole_block(run, stops, source, symbol_bytes, take_number(), planned, now, final=final)
+        yield _unlayered_block(run, stops, source, symbol_bytes, take_number(), planned, now, final=final)
         rest = [image for image in rest if image.sent < goals[image.number]]
 
 
-def _whole_block(
+def _unlayered_block(
     run: Sequence[OutgoingImage],
     stops: Sequence[int],
     source: int,
@@ -394,7 +394,7 @@ def _whole_block(
         urgency=1.0,
         spans=tuple(image.span(a, b) for image, a, b in zip(run, starts, stops, strict=True)),
         planned=planned,
-        asked_s=now,
+        last_activity_s=now,
     )
 
 

@@ -79,19 +79,19 @@ class FeedbackTracker:
         return [block for block in blocks if block not in done], done
 
     def _is_done(self, block: SendBlock, feedback: Feedback, config: SenderConfig, now: float, receiver: int) -> bool:
-        need = feedback.need_of(block.number)
+        need = feedback.missing_of(block.number)
         if need is None:
             behind = (feedback.newest - block.number) % BLOCKS
-            if behind >= WINDOW or block.reported or len(feedback.needs) < 2:
+            if behind >= WINDOW or block.reported or len(feedback.missing) < 2:
                 return False  # newer than all received blocks, reported before, or feedback on one block only
             need = NEVER_RECEIVED
         block.reported = block.reported or need != NEVER_RECEIVED
-        block.asked_s = now
-        block.needs[receiver] = block.source_symbols if need == NEVER_RECEIVED else need
-        if max(block.needs.get(known, block.source_symbols) for known in self.receivers) == 0:
+        block.last_activity_s = now
+        block.missing[receiver] = block.source_symbols if need == NEVER_RECEIVED else need
+        if max(block.missing.get(known, block.source_symbols) for known in self.receivers) == 0:
             return True
         if need > 0:
-            more = symbols_to_send(block.needs[receiver], config.worst, config.caution)
+            more = symbols_to_send(block.missing[receiver], config.worst, config.caution)
             block.planned = max(block.sent + more, block.planned if len(self.receivers) > 1 else 0)
         return False
 
@@ -138,9 +138,9 @@ def deletion_order(images: Mapping[int, OutgoingImage], config: SenderConfig, ne
 
 def take_reported(retired: list[SendBlock], feedback: Feedback) -> list[SendBlock]:
     """Remove the blocks in a feedback from `retired`; return those of which the receiver has symbols."""
-    reported = [block for block in retired if feedback.need_of(block.number) is not None]
+    reported = [block for block in retired if feedback.missing_of(block.number) is not None]
     retired[:] = [block for block in retired if block not in reported]
-    return [block for block in reported if feedback.need_of(block.number) != NEVER_RECEIVED]
+    return [block for block in reported if feedback.missing_of(block.number) != NEVER_RECEIVED]
 
 
 def within_window(retired: Iterable[SendBlock], next_block: int) -> list[SendBlock]:

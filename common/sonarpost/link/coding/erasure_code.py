@@ -170,7 +170,7 @@ class Layering:
             raise FrameError("layered block", "layers", (self.first, self.step, self.shares), expected)
 
     @property
-    def needs(self) -> tuple[int, ...]:
+    def required_symbols(self) -> tuple[int, ...]:
         """Symbols required for each layer."""
         return tuple(self.first + i * self.step for i in range(len(self.shares)))
 
@@ -182,7 +182,7 @@ class Layering:
     def lengths(self, symbol_bytes: int) -> tuple[int, ...]:
         """Return the length of the object of each layer."""
         bounds = self.bounds(symbol_bytes)
-        return tuple(k * (b - a) for k, a, b in zip(self.needs, bounds, bounds[1:], strict=False))
+        return tuple(k * (b - a) for k, a, b in zip(self.required_symbols, bounds, bounds[1:], strict=False))
 
     def pack(self) -> bytes:
         """Return the four bytes of the descriptor."""
@@ -229,7 +229,7 @@ def layered_symbols(layering: Layering, objects: Sequence[bytes], indices: Seque
     descriptor = encode(np.frombuffer(layering.pack(), np.uint8)[:, None], indices)[:, 0]
     slices = [
         encode(np.frombuffer(data, np.uint8).reshape(need, -1), indices)
-        for need, data in zip(layering.needs, objects, strict=True)
+        for need, data in zip(layering.required_symbols, objects, strict=True)
     ]
     rows = np.concatenate(slices, axis=1)
     return [(int(value), row.tobytes()) for value, row in zip(descriptor, rows, strict=True)]
@@ -248,7 +248,7 @@ def recover_layering(symbols: Mapping[int, int]) -> Layering:
 
 def recover_layer(layering: Layering, layer: int, symbols: Mapping[int, bytes]) -> bytes:
     """Return the object of a layer from symbols by index, at least as many as it requires; the last are used."""
-    need = layering.needs[layer]
+    need = layering.required_symbols[layer]
     indices = list(symbols)[-need:]
     size = len(symbols[indices[0]])
     start, stop = layering.bounds(size)[layer : layer + 2]

@@ -192,7 +192,7 @@ def plan_layers(
     return None if best is None else LayerPlan(best[1], best[0])
 
 
-def plan_whole(
+def plan_unlayered(
     distortion: GroupDistortion, symbol_bytes: int, arrive: Values, overhead: int
 ) -> tuple[int, float] | None:
     """Return k and the expected gain of a block without layers (for groups that are too small for layers), or None.

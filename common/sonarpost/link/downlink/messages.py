@@ -12,13 +12,13 @@ from __future__ import annotations
 import hashlib
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final, Literal, TypeVar
+from typing import Final, Literal
 
 from sonarpost.errors import FrameError
-from sonarpost.link.frames.paper.frame import format_image_id
+from sonarpost.link.frames.paper.frame import format_image_id, is_image_id
 from sonarpost.link.frames.v1.payload_objects import MAX_NUMBER
 from sonarpost.messages import Verdict
 
@@ -76,7 +76,6 @@ class CommandOutcome(IntEnum):
     UNSUPPORTED = 2
 
 
-_T = TypeVar("_T")
 _VERDICTS: Final[tuple[Verdict, ...]] = ("mine_like", "not_mine_like", "unsure")
 
 
@@ -101,43 +100,35 @@ class CommandMessage:
 
 
 @dataclass(frozen=True, slots=True)
-class RefineMessage(CommandMessage):
-    """Send more detail of an image.
-
-    Attributes:
-        number: Number of the contact, 1..65535.
-        stream_bytes: Length of its stream to send, 1..65535; `ALL_BYTES` for all.
-    """
+class ImageCommandMessage(CommandMessage):
+    """Base of the commands for an image. `number`: of its contact, 1..65535."""
 
     number: int
-    stream_bytes: int = ALL_BYTES
 
     def __post_init__(self) -> None:
         CommandMessage.__post_init__(self)
         _check("number", self.number, 1, MAX_NUMBER)
+
+
+@dataclass(frozen=True, slots=True)
+class RefineMessage(ImageCommandMessage):
+    """Send more detail. `stream_bytes`: length of the stream to send, 1..65535; `ALL_BYTES` for all."""
+
+    stream_bytes: int = ALL_BYTES
+
+    def __post_init__(self) -> None:
+        ImageCommandMessage.__post_init__(self)
         _check("stream_bytes", self.stream_bytes, 0, 65535)
 
 
 @dataclass(frozen=True, slots=True)
-class ResendMessage(CommandMessage):
-    """Send an image again, from its beginning. `number`: of the contact, 1..65535."""
-
-    number: int
-
-    def __post_init__(self) -> None:
-        CommandMessage.__post_init__(self)
-        _check("number", self.number, 1, MAX_NUMBER)
+class ResendMessage(ImageCommandMessage):
+    """Send the image again, from its beginning."""
 
 
 @dataclass(frozen=True, slots=True)
-class ExpandMessage(CommandMessage):
-    """Send more of the seabed around a contact, as a new image. `number`: of the contact, 1..65535."""
-
-    number: int
-
-    def __post_init__(self) -> None:
-        CommandMessage.__post_init__(self)
-        _check("number", self.number, 1, MAX_NUMBER)
+class ExpandMessage(ImageCommandMessage):
+    """Send more of the seabed around the contact, as a new image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,26 +150,23 @@ class RevisitMessage(CommandMessage):
 
 
 @dataclass(frozen=True, slots=True)
-class DecisionMessage(CommandMessage):
+class DecisionMessage(ImageCommandMessage):
     """An operator's verdict on a contact. The comment and the operator's name are not sent.
 
     Attributes:
-        number: Number of the contact, 1..65535.
         version: Version of the image, from 1; sent as 255 if above 254.
         verdict: The verdict.
         confidence: 0..1 in steps of 1/254, None if not given.
         mlo_class: Class of mine-like object, empty if not classified. Cut between characters if it does not fit.
     """
 
-    number: int
     version: int
     verdict: Verdict
     confidence: float | None = None
     mlo_class: str = ""
 
     def __post_init__(self) -> None:
-        CommandMessage.__post_init__(self)
-        _check("number", self.number, 1, MAX_NUMBER)
+        ImageCommandMessage.__post_init__(self)
         _check("version", self.version, 1, 2**63)
         if self.confidence is not None:
             _check("confidence", self.confidence, 0, 1)
@@ -264,39 +252,47 @@ def unpack(data: bytes, where: str = _WHERE) -> Content:
     Raises:
         FrameError: An unknown kind, a wrong length, or a value out of range.
     """
-    kind = data[0] if data else -1
+    try:
+        return _content(data)
+    except FrameError as error:
+        raise FrameError(where, error.field, error.value, error.expected) from error
+
+
+def _content(data: bytes) -> Content:
+    kind, body = data[0] if data else -1, data[1:]
     if kind == MessageKind.DATA:
-        return _with_where(where, lambda: DataMessage(data[1:]))
+        return DataMessage(body)
     if kind == MessageKind.CONFIRMATION:
-        return _confirmation(data[1:], where)
+        return _confirmation(body)
     if kind not in _COMMANDS:
-        raise FrameError(where, "kind", kind, ", ".join(f"{int(known):#04x}" for known in MessageKind))
+        raise FrameError(_WHERE, "kind", kind, ", ".join(f"{int(known):#04x}" for known in MessageKind))
     if len(data) < _HEAD.size:
-        raise FrameError(where, "length", len(data), f"at least {_HEAD.size} bytes")
+        raise FrameError(_WHERE, "length", len(data), f"at least {_HEAD.size} bytes")
     _, token, issued = _HEAD.unpack_from(data)
-    body = data[_HEAD.size :]
-    return _with_where(where, lambda: _command(MessageKind(kind), token, issued, body))
+    return _command(MessageKind(kind), token, issued, data[_HEAD.size :])
 
 
 def _command(kind: MessageKind, token: int, issued: int, body: bytes) -> DownlinkCommand:
-    if kind == MessageKind.REFINE:
-        number, stream_bytes = _fields(_REFINE, body)
-        return RefineMessage(token, issued, number, stream_bytes)
-    if kind in (MessageKind.RESEND, MessageKind.EXPAND):
-        (number,) = _fields(_NUMBER, body)
-        return (ResendMessage if kind == MessageKind.RESEND else ExpandMessage)(token, issued, number)
-    if kind == MessageKind.REVISIT:
-        lat, lon = _fields(_REVISIT, body)
-        return RevisitMessage(token, issued, lat / _DEGREE_STEPS, lon / _DEGREE_STEPS)
+    match kind:
+        case MessageKind.REFINE:
+            number, stream_bytes = _fields(_REFINE, body)
+            return RefineMessage(token, issued, number, stream_bytes)
+        case MessageKind.RESEND:
+            return ResendMessage(token, issued, *_fields(_NUMBER, body))
+        case MessageKind.EXPAND:
+            return ExpandMessage(token, issued, *_fields(_NUMBER, body))
+        case MessageKind.REVISIT:
+            lat, lon = _fields(_REVISIT, body)
+            return RevisitMessage(token, issued, lat / _DEGREE_STEPS, lon / _DEGREE_STEPS)
     number, version, verdict, confidence = _fields(_DECISION, body[: _DECISION.size])
     if verdict >= len(_VERDICTS):
         raise FrameError(_WHERE, "verdict", verdict, f"0..{len(_VERDICTS) - 1}")
     probability = None if confidence == _NO_CONFIDENCE else confidence / _CONFIDENCE_STEPS
     try:
-        text = body[_DECISION.size :].decode()
+        mlo_class = body[_DECISION.size :].decode()
     except UnicodeDecodeError as error:
         raise FrameError(_WHERE, "mlo_class", body[_DECISION.size :], "UTF-8") from error
-    return DecisionMessage(token, issued, number, version, _VERDICTS[verdict], probability, text)
+    return DecisionMessage(token, issued, number, version, _VERDICTS[verdict], probability, mlo_class)
 
 
 def _fields(layout: struct.Struct, body: bytes) -> tuple[int, ...]:
@@ -305,23 +301,15 @@ def _fields(layout: struct.Struct, body: bytes) -> tuple[int, ...]:
     return layout.unpack(body)
 
 
-def _confirmation(body: bytes, where: str) -> ConfirmationMessage:
+def _confirmation(body: bytes) -> ConfirmationMessage:
     if not body or len(body) % _OUTCOME.size:
-        raise FrameError(where, "length", len(body), f"a multiple of {_OUTCOME.size} bytes after the kind")
+        raise FrameError(_WHERE, "length", len(body), f"a multiple of {_OUTCOME.size} bytes after the kind")
     found: list[tuple[int, CommandOutcome]] = []
     for token, outcome in _OUTCOME.iter_unpack(body):
         if outcome not in tuple(CommandOutcome):
-            raise FrameError(where, "outcome", outcome, "0..2")
+            raise FrameError(_WHERE, "outcome", outcome, "0..2")
         found.append((token, CommandOutcome(outcome)))
-    return _with_where(where, lambda: ConfirmationMessage(tuple(found)))
-
-
-def _with_where(where: str, make: Callable[[], _T]) -> _T:
-    """Return `make()`; its errors name `where`."""
-    try:
-        return make()
-    except FrameError as error:
-        raise FrameError(where, error.field, error.value, error.expected) from error
+    return ConfirmationMessage(tuple(found))
 
 
 def confirmations(
@@ -358,7 +346,7 @@ def number_of_image(image_id: str) -> int:
     Raises:
         FrameError: Not a valid identifier.
     """
-    if len(image_id) != 4 or not all(c in "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ" for c in image_id):
+    if not is_image_id(image_id):
         raise FrameError(_WHERE, "image_id", image_id, "four of 0-9 and A-Z")
     return (int(image_id, 36) - 1) % MAX_NUMBER + 1
 

@@ -1,9 +1,8 @@
-"""The contact record in 25 bytes: what is known of a contact, in physical units, for an acoustic frame.
+"""The contact record: position, time and size of a contact in 25 bytes, in physical units.
 
-The record is small enough that, with a frame type, an image identifier and a checksum around it, it fills exactly
-the 32 bytes of a rate-0 frame. Every value that may be unknown has a code that says so; a value the field cannot
-hold is sent as unknown, never as the nearest one it can. docs/specifications/acoustic-paper.md gives the table bit by
-bit.
+With a frame type, an image identifier and a checksum it fills the 32 bytes of a rate-0 frame. Every value that can be
+unknown has a code for it. A value that its field cannot hold is sent as unknown, never as the nearest possible one.
+docs/specifications/acoustic-paper.md specifies every bit.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _LAST_U8 = 0xFE
 
 _DEGREE_STEPS = 10_000_000  # 1e-7 degree is 11 mm on the equator
 _CONFIDENCE_STEPS = 127  # 0..254 is 0.0..2.0
-_HEADING_STEPS = 255  # the circle has 255 codes, the 256th says unknown
+_HEADING_STEPS = 255  # 255 codes for the circle, one for unknown
 _ALTITUDE_STEPS = 2  # 0.5 m
 _DEPTH_STEPS = 10  # 0.1 m
 _RANGE_STEPS = 10  # 0.1 m
@@ -43,28 +42,27 @@ _SIGMA_MIN_M, _SIGMA_STEPS_PER_OCTAVE = 0.1, 16  # 0.1 m to 6.0 km, steps of 4.4
 
 @dataclass(frozen=True, slots=True)
 class ContactSummary:
-    """What the vehicle knows of a contact. None means unknown.
+    """Data of a contact. None means unknown.
 
     Attributes:
-        height_px: Height of the picture that belongs to the contact (16..512), together with `width_px`.
-        width_px: Its width (16..512).
-        lat_deg: WGS 84 latitude of the contact (-90..90), together with `lon_deg`; None without a fix.
+        height_px: Height of its image (16..512), together with `width_px`.
+        width_px: Width of its image (16..512).
+        lat_deg: WGS 84 latitude of the contact (-90..90), together with `lon_deg`; None without a position.
         lon_deg: WGS 84 longitude of the contact (-180..180).
-        time_utc_s: When it was seen, seconds since 1970-01-01 UTC (whole seconds travel).
-        confidence: Of the target detection, 0.0..2.0.
-        heading_deg: Of the vehicle at that time, true; any finite value, taken modulo 360.
-        altitude_m: Of the vehicle above the seabed (0..127 m travel).
-        depth_m: Of the vehicle below the surface (0..6553.4 m travel).
-        side: Side of the vehicle the contact lies on.
-        ground_range_m: From the vehicle's track to the contact (0..3276.5 m travel); needs `side`.
-        pixel_along_m: Size of a picture pixel along the track (5 mm to 2.69 m travel).
-        pixel_across_m: Size of a picture pixel across the track.
-        position_sigma_m: Standard deviation of the position along its worse horizontal axis; needs a fix. It
-            travels rounded up, so that a position never looks better than it is.
+        time_utc_s: Time of the detection, seconds since 1970-01-01 UTC (sent as whole seconds).
+        confidence: Confidence of the detection, 0.0..2.0.
+        heading_deg: True heading of the vehicle at that time; any finite value, modulo 360.
+        altitude_m: Altitude of the vehicle above the seabed (0..127 m can be sent).
+        depth_m: Depth of the vehicle below the surface (0..6553.4 m can be sent).
+        side: Side of the vehicle on which the contact lies.
+        ground_range_m: Distance from the track to the contact (0..3276.5 m can be sent); requires `side`.
+        pixel_along_m: Size of a pixel along the track (5 mm to 2.69 m can be sent).
+        pixel_across_m: Size of a pixel across the track.
+        position_sigma_m: Standard deviation of the position along its worse horizontal axis; requires a position. It is
+            rounded up, so that a position never appears better than it is.
 
     Raises:
-        FrameError: A value is not finite, outside the limits named as such above, or present without the one it
-            needs.
+        FrameError: A value is not finite, out of range, or present without the value that it requires.
     """
 
     height_px: int | None = None
@@ -95,13 +93,13 @@ class ContactSummary:
             _check_within(name, getattr(self, name), -math.inf, math.inf)
         for name in ("ground_range_m", "pixel_along_m", "pixel_across_m", "position_sigma_m"):
             _check_within(name, getattr(self, name), 0, math.inf)
-        # A word that is neither would travel as port, and the contact would lie on the wrong side of the track.
+        # Any other value would be sent as port: the contact would lie on the wrong side of the track.
         if self.side not in (None, Side.PORT, Side.STARBOARD):
             raise FrameError(_WHERE, "side", self.side, "port, starboard or None")
         if self.ground_range_m is not None and self.side is None:
-            raise FrameError(_WHERE, "side", None, "port or starboard where there is a ground_range_m")
+            raise FrameError(_WHERE, "side", None, "port or starboard with a ground_range_m")
         if self.position_sigma_m is not None and self.lat_deg is None:
-            raise FrameError(_WHERE, "lat_deg", None, "a fix where there is a position_sigma_m")
+            raise FrameError(_WHERE, "lat_deg", None, "a position with a position_sigma_m")
 
     def pack(self) -> bytes:
         """Return the 25 bytes."""
@@ -126,7 +124,7 @@ class ContactSummary:
         """Parse exactly 25 bytes.
 
         Raises:
-            FrameError: Another length, a code without a meaning, or values that exclude each other.
+            FrameError: Another length, an invalid code, or values that contradict each other.
         """
         if len(data) != RECORD_SIZE:
             raise FrameError(where, "length", len(data), f"{RECORD_SIZE} bytes")
@@ -155,7 +153,7 @@ class ContactSummary:
         )
 
     def rounded(self) -> ContactSummary:
-        """Return the record as the far end will read it: rounded to the steps that travel."""
+        """Return the record as the receiver reads it: rounded to the steps of its fields."""
         return ContactSummary.unpack(self.pack())
 
 
@@ -174,7 +172,7 @@ def _linear_code(value: float | None, steps_per_unit: int, last: int, unknown: i
     if value is None:
         return unknown
     scaled = value * steps_per_unit
-    if not -1 < scaled < last + 1:  # also where a huge value has become infinite
+    if not -1 < scaled < last + 1:  # also for a product that is infinite
         return unknown
     code = round(scaled)
     return code if 0 <= code <= last else unknown
@@ -197,14 +195,14 @@ def _side_range_value(code: int) -> tuple[Side | None, float | None]:
     if code == _SIDE_UNKNOWN:
         return None, None
     if code == _SIDE_UNKNOWN | _STARBOARD_BIT:
-        raise FrameError(_WHERE, "side and ground range", code, "a code other than 0xFFFE, which is reserved")
+        raise FrameError(_WHERE, "side and ground range", code, "not 0xFFFE, which is reserved")
     side = Side.STARBOARD if code & _STARBOARD_BIT else Side.PORT
     range_code = code & ~_STARBOARD_BIT
     return side, None if range_code == _RANGE_UNKNOWN else range_code / _RANGE_STEPS
 
 
 def _pixel_code(size_m: float | None) -> int:
-    if not size_m:  # a pixel without a size is as good as one of unknown size
+    if not size_m:  # a size of 0 means unknown
         return _UNKNOWN_U8
     code = round(_PIXEL_STEPS_PER_OCTAVE * (math.log2(size_m) - math.log2(_PIXEL_MIN_M)))
     return code if 0 <= code <= _LAST_U8 else _UNKNOWN_U8
@@ -218,6 +216,6 @@ def _sigma_code(sigma_m: float | None) -> int:
     if sigma_m is None:
         return _UNKNOWN_U8
     octaves = math.log2(max(sigma_m, _SIGMA_MIN_M)) - math.log2(_SIGMA_MIN_M)
-    # Rounded up, but a value read from a record must give its own code again in spite of the logarithm's last bit.
+    # Rounded up; the tolerance lets a decoded value give its own code again despite rounding of the logarithm.
     code = math.ceil(_SIGMA_STEPS_PER_OCTAVE * octaves - 1e-9)
     return code if code <= _LAST_U8 else _UNKNOWN_U8

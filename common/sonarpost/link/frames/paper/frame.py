@@ -1,9 +1,9 @@
 """The `paper` acoustic wire format: half-image frames and contact frames, each decodable alone.
 
-After Fig. 6 and section III-D of the paper: a message starts with one character that says top or bottom half and
-four characters that identify the image. The paper's five bytes assume one half in one message; here an offset, the
-body's length and the stream header (six to eleven bytes more) let a half be spread over many frames, and let either
-half be placed when the other is lost. docs/specifications/acoustic-paper.md is the specification.
+As in Fig. 6 and section III-D of the paper, a message starts with one character for top or bottom half and four
+characters for the image. The paper's format assumes one half per message. Here an offset, the body length and the
+stream header (six to eleven bytes) allow several frames per half, and give each half its place if the other is lost.
+docs/specifications/acoustic-paper.md is the specification.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _CONTACT_TYPE = b"C"
 
 
 def format_image_id(counter: int) -> str:
-    """Return the identifier of the sender's image number `counter`: four base-36 digits, modulo 36**4."""
+    """Return the image identifier of a counter: four base-36 digits, modulo 36**4."""
     number = counter % IMAGE_ID_COUNT
     digits = []
     for _ in range(4):
@@ -63,19 +63,18 @@ def frame_checksum(data: bytes) -> int:
 
 @dataclass(frozen=True, slots=True)
 class HalfFrame:
-    """A piece of the top or bottom half of an encoded picture.
+    """A piece of the top or bottom half of an encoded image.
 
     Attributes:
         half: "top" or "bottom".
         image_id: Four characters 0-9A-Z.
-        offset: Position of the first payload byte in the whole body, inside the half; the half's start when the
-            half is empty.
+        offset: Position of the first payload byte in the whole body, within the half; the start of an empty half.
         body_length: Length of the whole body.
-        header: The codec stream's header, the same in every frame of the image.
-        payload: Body bytes, none beyond the half's end; may be empty.
+        header: The header of the stream, the same in every frame of the image.
+        payload: Bytes of the body, not beyond the end of the half; can be empty.
 
     Raises:
-        FrameError: A field breaks the rules above or does not fit its place.
+        FrameError: A field is out of range.
     """
 
     half: HalfName
@@ -104,7 +103,7 @@ class HalfFrame:
         return self.offset + len(self.payload)
 
     def pack(self) -> bytes:
-        """Return the frame without padding: nine bytes, the stream header, the payload."""
+        """Return the frame without padding."""
         head = _TYPE_OF_HALF[self.half] + self.image_id.encode("ascii")
         return head + struct.pack(">HH", self.offset, self.body_length) + self.header.pack() + self.payload
 
@@ -115,7 +114,7 @@ class ContactFrame:
 
     Attributes:
         image_id: Four characters 0-9A-Z.
-        contact: The record; rounded to the steps of the wire format when it came from a frame.
+        contact: The record.
 
     Raises:
         FrameError: The identifier is not four characters 0-9A-Z.
@@ -134,17 +133,17 @@ class ContactFrame:
 
 
 def parse_frame(data: bytes, where: str = "acoustic frame") -> HalfFrame | ContactFrame:
-    """Parse one acoustic frame as the modem delivered it.
+    """Parse a frame as the modem delivered it.
 
-    Bytes after the half's end (or after a contact frame's 32) are padding and dropped. A frame that was cut short
-    keeps what it has.
+    Bytes after the end of the half (or after the 32 bytes of a contact frame) are padding. A frame that was cut keeps
+    the bytes that it has.
 
     Args:
-        data: The frame's bytes.
-        where: What the error message calls the frame.
+        data: The frame.
+        where: Name of the frame in errors.
 
     Raises:
-        FrameError: Unknown type, too short, a field out of its limits, or a contact frame whose checksum is wrong.
+        FrameError: Unknown type, too short, a field out of range, or a contact frame with a wrong checksum.
     """
     kind = data[:1]
     try:
@@ -164,8 +163,8 @@ def _parse_half(half: HalfName, data: bytes) -> HalfFrame:
     offset, body_length = struct.unpack_from(">HH", data, 5)
     header = StreamHeader.unpack(data[HALF_PREFIX_SIZE:])
     payload = data[HALF_PREFIX_SIZE + header.size :]
-    wanted = max(0, half_bounds(body_length, half)[1] - offset)
-    return HalfFrame(half, _parse_image_id(data), offset, body_length, header, payload[:wanted])
+    length = max(0, half_bounds(body_length, half)[1] - offset)
+    return HalfFrame(half, _parse_image_id(data), offset, body_length, header, payload[:length])
 
 
 def _parse_contact(data: bytes) -> ContactFrame:

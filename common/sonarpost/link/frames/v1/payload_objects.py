@@ -364,17 +364,17 @@ class Feedback:
     Attributes:
         newest: Number of the newest block received, 0..31.
         frames: Frames received from this sender since the first start, modulo 65536, to measure the loss.
-        needs: Missing symbols of the block `newest`, the one before it, and so on, at most 16: 0 complete, 1..254
+        missing: Missing symbols of the block `newest`, the one before it, and so on, at most 16: 0 complete, 1..254
             (254: or more), 255 no symbol has arrived.
     """
 
     newest: int
     frames: int
-    needs: tuple[int, ...]
+    missing: tuple[int, ...]
 
     def pack(self) -> bytes:
         """Return the data of a FEEDBACK segment, 3 to 19 bytes."""
-        return bytes([self.newest, self.frames >> 8 & 255, self.frames & 255, *self.needs])
+        return bytes([self.newest, self.frames >> 8 & 255, self.frames & 255, *self.missing])
 
     @classmethod
     def unpack(cls, data: bytes, where: str = "feedback") -> Feedback:
@@ -384,13 +384,13 @@ class Feedback:
             FrameError: Too short or too long, or an invalid block number.
         """
         if not 3 <= len(data) <= 3 + WINDOW or data[0] >= BLOCKS:
-            raise FrameError(where, "data", data, f"a block below {BLOCKS}, a count, and at most {WINDOW} needs")
+            raise FrameError(where, "data", data, f"a block below {BLOCKS}, a count, and at most {WINDOW} numbers")
         return cls(data[0], int.from_bytes(data[1:3], "big"), tuple(data[3:]))
 
-    def need_of(self, block: int) -> int | None:
+    def missing_of(self, block: int) -> int | None:
         """Return the missing symbols of a block, None if the feedback does not include it."""
         back = (self.newest - block) % BLOCKS
-        return self.needs[back] if back < len(self.needs) else None
+        return self.missing[back] if back < len(self.missing) else None
 
 
 @dataclass(frozen=True, slots=True)

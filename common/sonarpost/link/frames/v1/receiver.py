@@ -268,11 +268,11 @@ class PeerState:
     @property
     def is_incomplete(self) -> bool:
         """Whether a block is incomplete, or no symbol of one within the span has arrived."""
-        return self.newest_block >= 0 and any(self.needs)
+        return self.newest_block >= 0 and any(self.missing_symbols)
 
     @property
-    def needs(self) -> tuple[int, ...]:
-        """Missing symbols of each block, the newest first; see `Feedback.needs`."""
+    def missing_symbols(self) -> tuple[int, ...]:
+        """Missing symbols of each block, the newest first; see `Feedback.missing`."""
         numbers = [(self.newest_block - back) % BLOCKS for back in range(self.block_span)]
         return tuple(
             min(self.blocks[n].missing_symbols, NEVER_RECEIVED - 1) if n in self.blocks else NEVER_RECEIVED
@@ -284,7 +284,7 @@ class PeerState:
         if self.newest_block < 0:
             return None
         self.feedback_s, self.feedback_frames, self.redundant_symbols = now, self.frames, 0
-        return Feedback(self.newest_block, self.frames % 65536, self.needs)
+        return Feedback(self.newest_block, self.frames % 65536, self.missing_symbols)
 
     def feedback_is_due(self, now: float, config: ReceiverConfig) -> bool:
         """Whether feedback is useful now and the last one is long ago, in frames or seconds.
@@ -441,9 +441,9 @@ class V1Receiver:
         peer = self._sources.get(source)
         if peer is None or not peer.is_incomplete:
             return None
-        needs = peer.needs
-        back = max(i for i, need in enumerate(needs) if need)
-        return pack_mini((peer.newest_block - back) % BLOCKS, needs[back])
+        missing = peer.missing_symbols
+        back = max(i for i, number in enumerate(missing) if number)
+        return pack_mini((peer.newest_block - back) % BLOCKS, missing[back])
 
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`: counters, senders, their images and blocks."""

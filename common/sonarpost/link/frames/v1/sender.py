@@ -17,7 +17,7 @@ from sonarpost.link.coding.blocks import (
     group_limit,
     make_group,
     numbers_needed,
-    whole_blocks,
+    unlayered_blocks,
 )
 from sonarpost.link.coding.channel_capacity import LossChannel, Values
 from sonarpost.link.coding.delivery_ledger import (
@@ -305,7 +305,7 @@ class V1Sender:
             return
         for image, start in found:
             image.goal, image.sent = image.goal_bytes(self.config.stream_bytes), start
-        make = make_group if found[0][1] == 0 else whole_blocks
+        make = make_group if found[0][1] == 0 else unlayered_blocks
         self.blocks += make(group, self.config, self.symbol_bytes, self._take_number, now)
 
     def _free_numbers(self) -> int:
@@ -338,7 +338,7 @@ class V1Sender:
                 contacts=(),
                 urgency=_MESSAGE_URGENCY,
                 planned=min(255, symbols_to_send(source, self.config.worst, _NO_FEEDBACK_CAUTION)),
-                asked_s=now,
+                last_activity_s=now,
             )
             self.blocks.append(block)
 
@@ -411,11 +411,11 @@ class V1Sender:
     def _send_reminders(self, now: float) -> None:
         """With feedback, send a few symbols more of blocks without feedback for long: they trigger feedback."""
         for block in self._overdue_blocks(now):
-            block.asked_s = now
+            block.last_activity_s = now
             block.planned += max(1, block.source_symbols // 16)
 
     def _overdue_blocks(self, now: float) -> list[SendBlock]:
-        return [b for b in self.blocks if b.left <= 0 and now - b.asked_s >= self.config.max_defer_s]
+        return [b for b in self.blocks if b.left <= 0 and now - b.last_activity_s >= self.config.max_defer_s]
 
     def images_are_due(self, now: float) -> bool:
         """Whether there is something to send of images, including reminders."""
@@ -481,7 +481,7 @@ class V1Sender:
         image.goal = max(image.goal, image.sent, min(request.stream_bytes, len(image.stream)))
         if any(waiting.number == image.number for waiting in self.waiting):
             return True
-        made = list(whole_blocks([image], self.config, self.symbol_bytes, self._take_number, now))
+        made = list(unlayered_blocks([image], self.config, self.symbol_bytes, self._take_number, now))
         for block in made:
             if not self.config.feedback:
                 block.planned = min(255, symbols_to_send(block.source_symbols, self.config.worst, _NO_FEEDBACK_CAUTION))
