@@ -200,7 +200,7 @@ export class ContactView {
   measurementLock() {
     if (!this.shown) return "no image was received";
     if (!state.session.may.measure) return "your role may not measure";
-    if (!this.shownLayer?.measurable) return this.shownLayer?.reason || `the layer ${this.layer} is synthesised`;
+    if (!this.shownLayer?.measurable) return this.shownLayer?.reason || `the layer ${this.layer} is synthetic`;
     if (!this.views[0].scale) return "the pixel size is unknown";
     return "";
   }

@@ -8,8 +8,8 @@ import { MAPS } from "./image_data.js";
 
 export const COMPARE = { off: "one image", versions: "first and newest", layers: "raw and enhanced" };
 
-function button(label, key, handler, props = {}) {
-  return h("button", { type: "button", title: `${label} (${key})`, "aria-label": `${label} (${key})`, on: { click: handler }, ...props }, props.text ?? label, " ", h("kbd", { text: key }));
+function button(label, key, handler, { text = label, ...props } = {}) {
+  return h("button", { type: "button", title: `${label} (${key})`, "aria-label": `${label} (${key})`, on: { click: handler }, ...props }, text, " ", h("kbd", { text: key }));
 }
 
 /** Draw the toolbar; the focused button keeps the focus. */

@@ -20,7 +20,7 @@ export function integrityStrip(version, layer) {
     item("air time", airtime),
     item("received", received(version), { class: version.complete ? "" : "part" }),
     item("missing", percent(missing, missing > 0 && missing < 1 ? 1 : 0), { class: missing > 0 ? "missing" : "" }),
-    item("synthesised", layer?.synthesised ? "all" : percent(guessed, guessed > 0 && guessed < 1 ? 1 : 0), { class: guessed > 0 || layer?.synthesised ? "guessed" : "" }));
+    item("synthetic", layer?.synthesised ? "all" : percent(guessed, guessed > 0 && guessed < 1 ? 1 : 0), { class: guessed > 0 || layer?.synthesised ? "guessed" : "" }));
   const source = version.complete ? "decoded from the complete stream." : missing > 0 ? "decoded from the received part; hatched areas were never received." : "decoded from the received part; more detail follows.";
   const notes = version.notes.length ? h("span", { class: "muted", text: ` ${version.notes.join(" · ")}` }) : null;
   const statement = layer?.synthesised
