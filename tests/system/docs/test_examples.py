@@ -88,10 +88,8 @@ def commands(text: str) -> Iterator[list[str]]:
             if word.startswith(">") and words and words[-1] in ("1", "2"):
                 words.pop()
             for number, name in enumerate(words):
-                is_command = name in ("sonarpost", "/opt/sonarpost/bin/sonarpost") and words[number - 1] not in (
-                    "-o",
-                    "-g",
-                )
+                is_user = words[number - 1] in ("-o", "-g", "-u")
+                is_command = name in ("sonarpost", "/opt/sonarpost/bin/sonarpost") and not is_user
                 if is_command or name.startswith("research."):
                     yield words[number:]
                     break
