@@ -13,6 +13,7 @@ from sonarpost.detection.structures import find_structures, is_part_of_structure
 from sonarpost.sonar.bottom_track import altitudes_m
 from sonarpost.sonar.geometry import Position, georeference, sample_slant_range_m, slant_to_ground_range_m
 from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.source import SurveySource, load_survey
 from sonarpost.sonar.survey import Side, Survey
 
 MINE_LIKE = "mine-like"
@@ -84,19 +85,26 @@ class Detection:
 
 
 def detect(
-    survey: Survey, settings: DetectorSettings | None = None, options: SurveyOptions | None = None
+    survey: Survey | SurveySource, settings: DetectorSettings | None = None, options: SurveyOptions | None = None
 ) -> tuple[Detection, ...]:
     """Detect the contacts of a survey.
 
     Args:
-        survey: The recording; both sides, any sample type.
+        survey: The recording; both sides, any sample type. An open recording is loaded into memory (at most 1 GiB of
+            samples).
         settings: None for the defaults.
         options: The options with which the survey was opened, for the error budget; None for the defaults.
 
     Returns:
         The contacts of both sides at or above the confidence threshold, most confident first. Empty for a survey
         without samples.
+
+    Raises:
+        SurveyFileError: An open recording is larger, or its file cannot be read.
     """
+    if isinstance(survey, SurveySource):
+        options = options if options is not None else survey.options
+        survey = load_survey(survey)
     settings = settings if settings is not None else DetectorSettings()
     options = options if options is not None else SurveyOptions()
     altitude_m = altitudes_m(survey)

@@ -49,7 +49,7 @@ def supported_suffixes() -> tuple[str, ...]:
     return tuple(sorted({*_READERS, *_plug_ins()}))
 
 
-def open_survey(path: Path, options: SurveyOptions | None = None) -> SurveySource:
+def open_survey(path: Path | str, options: SurveyOptions | None = None) -> SurveySource:
     """Open a survey file of any supported format for reading ping by ping. The suffix selects the reader.
 
     Args:
@@ -62,6 +62,7 @@ def open_survey(path: Path, options: SurveyOptions | None = None) -> SurveySourc
     Raises:
         SurveyFileError: No reader for the suffix, or the file is invalid.
     """
+    path = Path(path)
     return _reader(path)(path, options or SurveyOptions())
 
 

@@ -1,0 +1,79 @@
+"""The public names of the package: complete, few, imported on first use."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sonarpost
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.xtf_writer import write_xtf
+
+HEAVY = ("numba", "numpy", "scipy", "pydantic", "zenoh", "serial", "PIL")
+
+
+@pytest.mark.parametrize("name", sonarpost.__all__)
+def test_every_public_name_exists_and_is_documented(name: str) -> None:
+    assert getattr(sonarpost, name).__doc__
+    assert name in dir(sonarpost)
+
+
+def test_there_are_at_most_40_public_names() -> None:
+    assert len(sonarpost.__all__) + 1 <= 40  # and __version__
+
+
+def test_type_checkers_and_imports_on_first_use_agree() -> None:
+    tree = ast.parse(Path(sonarpost.__file__).read_text(encoding="utf-8"))
+    checked = {
+        alias.asname or alias.name: (node.module, alias.name)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sonarpost.")
+        for alias in node.names
+    }
+    assert checked.keys() == set(sonarpost.__all__)
+    for name, (module, original) in checked.items():
+        assert getattr(sonarpost, name) is getattr(sys.modules[module or ""], original)
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="'sonarpost' has no attribute 'compress'"):
+        _ = sonarpost.compress
+
+
+def test_import_alone_loads_no_library() -> None:
+    code = f"import sys, sonarpost; print([name for name in {HEAVY!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_three_lines_encode_and_decode_an_image() -> None:
+    image = np.random.default_rng(1).gamma(4.0, 25.0, (80, 140)).clip(0, 255).astype(np.uint8)
+    stream = sonarpost.encode(image, budget=64)
+    decoded = sonarpost.decode(stream)
+    assert len(stream) <= 64
+    assert decoded.shape == image.shape
+    # A codebook is found by the tag of its identity in the stream.
+    for codebook in ("nominal-10", "nominal-20"):
+        assert sonarpost.decode(sonarpost.encode(image, codec="vq", codebook=codebook)).shape == image.shape
+
+
+def test_a_survey_is_opened_and_searched_for_contacts(tmp_path: Path) -> None:
+    simulated = simulate_survey(SurveySpec(seed=3, targets=4, clutter=2))
+    path = tmp_path / "line.xtf"
+    write_xtf(simulated.survey, path)
+    with sonarpost.open_survey(str(path)) as survey:
+        found = sonarpost.detect(survey)
+    assert found == sonarpost.detect(sonarpost.open_survey(path))
+    assert len(found) >= 4
+
+
+def test_records_are_packed_and_unpacked() -> None:
+    message = sonarpost.OutgoingMessage(
+        message_id="m1", source="autonomy", priority=3, lifetime_s=60.0, created_utc_s=1.0, data=b"status"
+    )
+    assert sonarpost.decode_record(sonarpost.OutgoingMessage, sonarpost.encode_record(message), "test") == message
