@@ -17,13 +17,7 @@ BUFFERED_EVENTS = 2000
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One event of the HTTP interface.
-
-    Attributes:
-        number: Number within one run of the server, from 1.
-        name: Type of the event.
-        data: JSON text.
-    """
+    """One event of the HTTP interface: number within one run of the server, type, JSON text."""
 
     number: int
     name: str
@@ -34,9 +28,6 @@ class EventHub:
     """Distributes events to subscribers, from any thread.
 
     Events are numbered within one run. A page with an event identifier of another run reloads all data.
-
-    Args:
-        buffered: Number of buffered events.
     """
 
     def __init__(self, buffered: int = BUFFERED_EVENTS) -> None:

@@ -55,12 +55,8 @@ class ConsoleState:
 
     Every method that changes the state raises DeliveryError if the database refuses the change.
 
-    Args:
-        config: Configuration of the console.
-        database: The database.
-        clock: UTC seconds.
-
     Attributes:
+        clock: UTC seconds.
         on_unsent: Called after an action has stored a record to send.
     """
 

@@ -50,11 +50,7 @@ _ZIP_TIME: Final = (1980, 1, 1, 0, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class _Overlay:
-    """Image on the map: a KML LatLonBox and its counter-clockwise rotation about the centre of the box.
-
-    Attributes:
-        png: Image whose top points along the vehicle's heading.
-    """
+    """Image on the map, top along the heading: a KML LatLonBox and its counter-clockwise rotation about its centre."""
 
     png: bytes
     north_deg: float

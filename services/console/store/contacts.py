@@ -34,20 +34,13 @@ _IMAGE_COLUMNS: Final = ("version", "codec", "bytes_received", "bytes_total", "f
 
 @dataclass(frozen=True, slots=True)
 class ContactFilter:
-    """Filter, order and page of a contact list.
+    """Filter, order and page of a contact list; None means no restriction.
 
     Attributes:
-        review: One of `REVIEW_FILTERS`; None for all.
-        vehicle: Name of the vehicle; None for all.
-        vessel: Name of the vessel; None for all.
-        min_confidence: Minimum confidence of the detector, 0 to 2; None for all.
-        complete: Whether the image is complete; None for both.
-        group: Name of a group; None for all.
-        text: Part of a name, class or remark; None for all.
+        review: One of `REVIEW_FILTERS`.
+        min_confidence: Minimum confidence of the detector, 0 to 2.
+        text: Part of a name, class or remark.
         sort: A key of `SORT_COLUMNS`.
-        descending: Order.
-        offset: Number of contacts to skip.
-        limit: Maximum number of contacts.
     """
 
     review: str | None = None

@@ -207,13 +207,7 @@ class Actor:
 
 @dataclass(frozen=True, slots=True)
 class DisplayedImage:
-    """Image on the screen during an action.
-
-    Attributes:
-        version: Version of the image.
-        sha256: SHA-256 of its pixels.
-        layer: Displayed layer.
-    """
+    """Image version on the screen during an action, with the SHA-256 of its pixels and the displayed layer."""
 
     version: int | None = None
     sha256: str | None = None

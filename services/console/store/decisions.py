@@ -33,15 +33,11 @@ class ConflictError(SonarpostError):
 
 @dataclass(frozen=True, slots=True)
 class DecisionInput:
-    """A decision as an operator enters it.
+    """A decision as an operator enters it, with the revision of the contact and the image on the screen.
 
     Attributes:
-        revision: Revision of the displayed contact.
-        displayed: Displayed image.
-        verdict: Verdict.
-        confidence: Confidence of the operator, 0 to 1; None if not stated.
+        confidence: 0 to 1; None if not stated.
         mlo_class: Class of mine-like object; None if not stated.
-        remark: Free text.
     """
 
     revision: int
@@ -68,14 +64,6 @@ def add_decision(
     delivery: DeliveryStates,
 ) -> str:
     """Store a decision of this console; return its identifier.
-
-    Args:
-        db: Connection in a transaction.
-        contact_id: Identifier of an existing contact.
-        entered: The decision.
-        actor: The operator.
-        now_utc_s: Time of the decision.
-        delivery: Initial delivery state.
 
     Raises:
         ConflictError: Another decision was stored after the contact was displayed.

@@ -53,13 +53,7 @@ def add_request(
 ) -> str:
     """Store a request; return its identifier.
 
-    Args:
-        db: Connection in a transaction.
-        contact_id: Identifier of an existing contact.
-        kind: Kind of the request.
-        airtime_s: Displayed estimate of the air time.
-        actor: The user.
-        now_utc_s: Time of the request.
+    `airtime_s` is the displayed estimate, for the audit.
 
     Raises:
         BadInputError: The request is not possible, or one of this kind is in progress.

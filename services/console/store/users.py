@@ -48,8 +48,6 @@ class Session:
 
     Attributes:
         token: Value of the browser's cookie. Only its hash is stored.
-        name: Name of the user.
-        role: Role of the user.
         csrf: Token that the page sends with each POST request.
         expires_utc_s: Time at which an unused session ends.
     """

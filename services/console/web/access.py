@@ -41,15 +41,7 @@ _LOCAL_NAMES: Final = ("127.0.0.1", "localhost", "[::1]")
 
 
 class ApiError(Exception):
-    """An error response of the HTTP interface.
-
-    Args:
-        status: HTTP status.
-        code: Code of the error; see docs/specifications/console-api.md.
-        message: Text for the user.
-        field: Invalid field of the request.
-        headers: Additional HTTP headers.
-    """
+    """An error response of the HTTP interface; docs/specifications/console-api.md lists the codes."""
 
     def __init__(
         self, status: int, code: str, message: str, field: str | None = None, headers: Mapping[str, str] | None = None
@@ -72,14 +64,7 @@ B = TypeVar("B", bound=RequestBody)
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One permitted request.
-
-    Attributes:
-        request: The Starlette request.
-        body: Body of a POST request, otherwise empty.
-        session: Session of the user; None for requests without a log-in.
-        address: Network address of the browser.
-    """
+    """One permitted request, with the network address of the browser. `session` is None without a log-in."""
 
     request: Request
     body: bytes

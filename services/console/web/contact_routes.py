@@ -132,11 +132,7 @@ def contact_filter(call: Call) -> ContactFilter:
 
 
 class ContactRoutes:
-    """Routes of contacts.
-
-    Args:
-        state: State of the console.
-    """
+    """Routes of contacts."""
 
     def __init__(self, state: ConsoleState) -> None:
         self._state = state

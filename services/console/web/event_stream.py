@@ -21,12 +21,7 @@ MAX_STREAMS_OF_SESSION = 4
 
 
 class EventStream:
-    """Route of the event stream.
-
-    Args:
-        state: State of the console.
-        training: Whether the contacts are simulated.
-    """
+    """Route of the event stream."""
 
     def __init__(self, state: ConsoleState, *, training: bool) -> None:
         self._state = state

@@ -48,11 +48,7 @@ _FORMATS: Final[Mapping[str, tuple[Callable[[ContactSet], bytes], str]]] = {
 
 
 class ExportRoutes:
-    """Routes of exports and reports.
-
-    Args:
-        state: State of the console.
-    """
+    """Routes of exports and reports."""
 
     def __init__(self, state: ConsoleState) -> None:
         self._state = state

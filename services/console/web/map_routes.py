@@ -17,11 +17,7 @@ MAX_CONTACTS = 10_000
 
 
 class MapRoutes:
-    """Routes of the map, its tiles, and the fleet.
-
-    Args:
-        state: State of the console.
-    """
+    """Routes of the map, its tiles, and the fleet."""
 
     def __init__(self, state: ConsoleState) -> None:
         self._state = state

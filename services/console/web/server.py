@@ -59,14 +59,7 @@ _MEDIA_TYPES: Final = {
 
 
 class ConsoleApp:
-    """The console's web application.
-
-    Args:
-        state: State of the console.
-        users: Users and sessions.
-        platform_id: Name of the platform.
-        training: Whether the contacts are simulated.
-    """
+    """The console's web application; `training` marks all contacts as simulated."""
 
     def __init__(self, state: ConsoleState, users: Users, platform_id: str, *, training: bool = False) -> None:
         config = state.config

@@ -32,8 +32,6 @@ class SessionRoutes:
     """Routes of sessions.
 
     Args:
-        users: Users and sessions.
-        side: Whether the console is on a vessel or at a shore site.
         tls: Whether the cookie is restricted to TLS.
         max_age_s: Lifetime of the cookie.
     """
