@@ -282,12 +282,12 @@ def service_of(key: str) -> tuple[str, str]:
 
 
 def delivery_query(key: str, consumer: str) -> str:
-    """Queries by which records of `key` are handed over to the named consumer."""
+    """Delivery queries for records of `key` to the named consumer."""
     return f"{key}/handoff/{_name('consumer', consumer)}"
 
 
 def delivery_query_any(key: str) -> str:
-    """Hand-over queries for records of `key`, for every consumer."""
+    """Delivery queries for records of `key` to every consumer."""
     return f"{key}/handoff/*"
 
 
@@ -324,6 +324,6 @@ def everything() -> str:
     return f"{ROOT}/**"
 
 
-# Zenoh's own tools and REST interface ask a router about itself there; `**` does not match it.
+# Keys of a router's administration, for Zenoh's tools and REST interface; `**` does not match them.
 ROUTER_ADMINISTRATION = "@/**"
 ANY = "**"

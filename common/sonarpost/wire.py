@@ -1,8 +1,8 @@
-"""Records to msgpack bytes and back.
+"""Encoding of records as msgpack.
 
-A payload is one plain msgpack map: the record's fields plus `type` (which record) and `v` (schema version). Any
-msgpack library reads it without sonarpost. Fields that are unknown are ignored, a field that is missing, of another
-type or out of range is refused with the key and the field's name.
+A payload is a plain msgpack map: the fields of the record, `type` (name of the record) and `v` (schema version). Any
+msgpack library can read it without sonarpost. Unknown fields are ignored. A field that is missing, of another type or
+out of range is an error with the key and the name of the field.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ def encoding_of(record_type: type[Record]) -> str:
 
 
 def encode(record: Record) -> bytes:
-    """Return the record as msgpack bytes: `type`, `v`, then its fields in the order of their definition.
+    """Return the record as msgpack: `type`, `v`, then its fields in the order of their definition.
 
-    The same values give the same bytes, on every platform.
+    Equal records give equal bytes on every platform.
     """
     fields = {"type": record.TYPE, "v": record.VERSION, **record.model_dump()}
     packed: bytes = msgpack.packb(fields, use_bin_type=True)
@@ -37,10 +37,10 @@ def encode(record: Record) -> bytes:
 
 
 def unpack_map(payload: bytes, where: str) -> dict[str, object]:
-    """Return the payload's map, without looking into it.
+    """Return the map of a payload, without validation of its fields.
 
     Raises:
-        PayloadError: Not msgpack, trailing bytes, or not a map with text keys.
+        PayloadError: The payload is not msgpack, has trailing bytes, or is not a map with text keys.
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise PayloadError(where, "payload", f"{len(payload)} bytes", f"at most {MAX_PAYLOAD_BYTES} bytes")
@@ -56,19 +56,19 @@ def unpack_map(payload: bytes, where: str) -> dict[str, object]:
 
 
 def decode(record_type: type[R], payload: bytes, where: str) -> R:
-    """Return the record that `payload` holds.
+    """Decode and validate a record.
 
     Args:
-        record_type: What the key promises.
+        record_type: Expected type.
         payload: msgpack bytes.
-        where: Key expression (or file) named in errors.
+        where: Key expression or file, for errors.
 
     Raises:
-        PayloadError: Not that record; names key, field, value and what was expected.
+        PayloadError: The payload is not a valid record of this type.
     """
     fields = unpack_map(payload, where)
     for name, expected in (("type", record_type.TYPE), ("v", record_type.VERSION)):
-        # 1.0 and true are equal to 1 in Python, and are not what other languages read as a version.
+        # In Python 1.0 and true equal 1; other languages distinguish them.
         if type(fields.get(name)) is not type(expected) or fields[name] != expected:
             raise PayloadError(where, name, fields.get(name), repr(expected))
     try:
@@ -81,7 +81,7 @@ def decode(record_type: type[R], payload: bytes, where: str) -> R:
 
 
 def expected_text(kind: str, message: str) -> str:
-    """Turn pydantic's kind of error and its sentence into what stands after 'expected'."""
+    """Return the text after 'expected' for an error of pydantic."""
     if kind == "missing":
         return "a value"
     for prefix in ("Input should be ", "Value error, "):

@@ -230,7 +230,7 @@ class ConsoleService(Service[ConsoleConfig]):
         if sample.kind != zenoh.SampleKind.PUT:
             return
         key, payload = str(sample.key_expr), sample.payload.to_bytes()
-        self.state.fleet.services.take(key, payload, time.monotonic())
+        self.state.fleet.services.add(key, payload, time.monotonic())
         if self._on_vessel and key == keys.health(self.platform.id, "relay"):
             try:
                 self._on_relay_health(wire.decode(Health, payload, key))

@@ -1,4 +1,4 @@
-"""Pictures on the disk: three files that agree, the same bytes wherever they are written."""
+"""Files of reconstructed images: three consistent files with reproducible bytes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from builders.record_samples import COMPLETE_IMAGE, DAMAGED_IMAGE
 from builders.record_strategies import images
 from hypothesis import given, settings
 
-from sonarpost.archive import image_files as picture_files
 from sonarpost.archive.image_files import image_file_name, side_car, write_image
 from sonarpost.messages import Pixels, ReconstructedImage
 from sonarpost.sonar.image_files import read_image
@@ -21,7 +20,7 @@ from sonarpost.sonar.image_files import read_image
 NAME = "uuv-1_20161012T090001Z_00A7_v1"
 
 
-def with_picture(pixels: np.ndarray, **more: object) -> ReconstructedImage:  # type: ignore[type-arg]
+def with_pixels(pixels: np.ndarray, **more: object) -> ReconstructedImage:  # type: ignore[type-arg]
     picture = Pixels.from_array(pixels)
     fields = COMPLETE_IMAGE.model_dump() | {"picture": picture, "picture_sha256": picture.sha256} | more
     return ReconstructedImage(**fields)
@@ -31,35 +30,40 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_a_name_tells_vehicle_time_image_and_version_apart() -> None:
+def test_name_holds_vehicle_time_image_and_version() -> None:
     assert image_file_name(COMPLETE_IMAGE) == NAME
     assert image_file_name(DAMAGED_IMAGE) == "uuv-1_20161012T090001Z_00A7_v2"
     assert (
-        image_file_name(with_picture(np.zeros((1, 1), np.uint8), first_frame_utc_s=0.0)).split("_")[1]
+        image_file_name(with_pixels(np.zeros((1, 1), np.uint8), first_frame_utc_s=0.0)).split("_")[1]
         == "19700101T000000Z"
     )
-    last = with_picture(np.zeros((1, 1), np.uint8), first_frame_utc_s=253402300799.0)
+    last = with_pixels(np.zeros((1, 1), np.uint8), first_frame_utc_s=253402300799.0)
     assert image_file_name(last).split("_")[1] == "99991231T235959Z"
 
 
-def test_a_picture_is_three_files_that_agree(tmp_path: Path) -> None:
+def test_image_is_three_consistent_files(tmp_path: Path) -> None:
     tiff, new = write_image(tmp_path / "a" / "b", COMPLETE_IMAGE)
     assert new
     assert tiff == tmp_path / "a" / "b" / f"{NAME}.tiff"
     assert sorted(contents(tiff.parent)) == [f"{NAME}.json", f"{NAME}.png", f"{NAME}.tiff"]
     for suffix in (".tiff", ".png"):
         np.testing.assert_array_equal(read_image(tiff.with_suffix(suffix)), COMPLETE_IMAGE.picture.to_array())
-    said = json.loads(tiff.with_suffix(".json").read_text())
-    assert said == json.loads(json.dumps(side_car(COMPLETE_IMAGE)))
-    assert said["contact"]["lat_deg"] == 41.5251
-    assert (said["height_px"], said["width_px"], said["bits"]) == (2, 3, 8)
-    assert (said["type"], said["v"], said["image_id"], said["complete"]) == ("reconstructed_image", 1, "00A7", True)
-    assert "picture" not in said
+    stored = json.loads(tiff.with_suffix(".json").read_text())
+    assert stored == json.loads(json.dumps(side_car(COMPLETE_IMAGE)))
+    assert stored["contact"]["lat_deg"] == 41.5251
+    assert (stored["height_px"], stored["width_px"], stored["bits"]) == (2, 3, 8)
+    assert (stored["type"], stored["v"], stored["image_id"], stored["complete"]) == (
+        "reconstructed_image",
+        1,
+        "00A7",
+        True,
+    )
+    assert "picture" not in stored
 
 
-def test_sixteen_bits_are_kept_in_tiff_and_png(tmp_path: Path) -> None:
+def test_tiff_and_png_hold_16_bits(tmp_path: Path) -> None:
     pixels = np.array([[0, 255, 256], [40_000, 65_535, 1]], np.uint16)
-    tiff, _ = write_image(tmp_path, with_picture(pixels))
+    tiff, _ = write_image(tmp_path, with_pixels(pixels))
     for suffix in (".tiff", ".png"):
         back = read_image(tiff.with_suffix(suffix))
         assert back.dtype == np.uint16
@@ -75,16 +79,16 @@ def test_sixteen_bits_are_kept_in_tiff_and_png(tmp_path: Path) -> None:
         ([[1, 0], [0, 0], [0, 1]], 2, [0, 3]),
     ],
 )
-def test_the_side_car_says_how_much_is_missing_and_where(mask: list[list[int]], pixels: int, rows: list[int]) -> None:
+def test_side_car_holds_the_missing_pixels_and_rows(mask: list[list[int]], pixels: int, rows: list[int]) -> None:
     missing = np.array(mask, np.bool_)
-    said = side_car(with_picture(np.zeros((3, 2), np.uint8), missing_mask=np.packbits(missing).tobytes()))
-    assert (said["missing_pixels"], said["missing_rows"]) == (pixels, rows)
-    assert "missing_mask" not in said
+    stored = side_car(with_pixels(np.zeros((3, 2), np.uint8), missing_mask=np.packbits(missing).tobytes()))
+    assert (stored["missing_pixels"], stored["missing_rows"]) == (pixels, rows)
+    assert "missing_mask" not in stored
 
 
 @given(images())
 @settings(max_examples=20)
-def test_any_picture_is_written_once_and_alike_everywhere(
+def test_files_are_written_once_and_reproducible(
     tmp_path_factory: pytest.TempPathFactory, image: ReconstructedImage
 ) -> None:
     here, there = tmp_path_factory.mktemp("vessel"), tmp_path_factory.mktemp("shore")
@@ -98,7 +102,7 @@ def test_any_picture_is_written_once_and_alike_everywhere(
     assert {path.name: path.stat().st_mtime_ns for path in here.iterdir()} == before
 
 
-def test_a_version_does_not_replace_another(tmp_path: Path) -> None:
+def test_versions_do_not_replace_each_other(tmp_path: Path) -> None:
     write_image(tmp_path, COMPLETE_IMAGE)
     kept = contents(tmp_path)
     write_image(tmp_path, DAMAGED_IMAGE)
@@ -107,7 +111,7 @@ def test_a_version_does_not_replace_another(tmp_path: Path) -> None:
     assert kept.items() <= now.items()
 
 
-def test_a_picture_that_was_cut_short_is_written_again(tmp_path: Path) -> None:
+def test_damaged_files_are_written_again(tmp_path: Path) -> None:
     tiff, _ = write_image(tmp_path, COMPLETE_IMAGE)
     whole = contents(tmp_path)
     for damage in (
@@ -121,10 +125,10 @@ def test_a_picture_that_was_cut_short_is_written_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("after", [0, 1, 2, 3])
-def test_a_disk_that_fills_up_leaves_no_side_car_without_its_picture(
+def test_full_disk_leaves_no_side_car_without_its_image(
     after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The disk takes `after` of the three files, and with 3 their folder does not."""
+    """The disk accepts `after` of the three files; with 3 it rejects their folder."""
     synced = 0
     fsync = os.fsync
 
@@ -145,7 +149,7 @@ def test_a_disk_that_fills_up_leaves_no_side_car_without_its_picture(
     assert len(contents(tmp_path)) == 3
 
 
-def test_the_side_car_is_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_side_car_is_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     order: list[str] = []
     replace = Path.replace
 
@@ -154,6 +158,6 @@ def test_the_side_car_is_written_last(tmp_path: Path, monkeypatch: pytest.Monkey
         return replace(self, target)
 
     monkeypatch.setattr(Path, "replace", rename)
-    picture_files.write_image(tmp_path, COMPLETE_IMAGE)
+    write_image(tmp_path, COMPLETE_IMAGE)
     assert order[-1] == ".json"
     assert sorted(order) == [".json", ".png", ".tiff"]

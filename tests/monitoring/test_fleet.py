@@ -1,4 +1,4 @@
-"""A fleet's state: by the clock of this host, in the name of nobody else, bounded, and forgotten in time."""
+"""Fleet state: ages by the host's clock, validation of sources, limits, expiry."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ def health(platform: str = "uuv-1", service: str = "c2", **changes: Any) -> Heal
     return Health(platform_id=platform, service=service, **(fields | changes))
 
 
-def tell(fleet: FleetTracker, record: Health, now_s: float, key: str = "") -> None:
-    fleet.take(key or keys.health(record.platform_id, record.service), wire.encode(record), now_s)
+def add(fleet: FleetTracker, record: Health, now_s: float, key: str = "") -> None:
+    fleet.add(key or keys.health(record.platform_id, record.service), wire.encode(record), now_s)
 
 
-def test_ages_count_from_arrival() -> None:
+def test_age_counts_from_arrival() -> None:
     fleet = FleetTracker()
-    tell(fleet, health(time_utc_s=4e9), 100.0)
+    add(fleet, health(time_utc_s=4e9), 100.0)
     fleet.set_alive([keys.alive("uuv-1", "c2"), keys.alive("uuv-1", "relay")], 101.0)
     c2, relay = fleet.state(103.0).services
     assert (c2.age_s, c2.alive, relay.health, relay.age_s, relay.alive) == (3.0, True, None, None, True)
 
 
-def test_without_a_router_nobody_is_known_to_live() -> None:
+def test_liveliness_is_unknown_without_a_router() -> None:
     fleet = FleetTracker()
-    tell(fleet, health(), 0.0)
+    add(fleet, health(), 0.0)
     assert fleet.state(1.0).services[0].alive is None
     fleet.set_alive([], 1.0)
     assert fleet.state(1.0).services[0].alive is False
@@ -50,39 +50,39 @@ def test_without_a_router_nobody_is_known_to_live() -> None:
         ("other/v1/uuv-1/health/c2", wire.encode(health())),
     ],
 )
-def test_what_cannot_be_used_is_counted_and_dropped(key: str, payload: bytes, caplog: pytest.LogCaptureFixture) -> None:
+def test_invalid_record_is_counted_and_dropped(key: str, payload: bytes, caplog: pytest.LogCaptureFixture) -> None:
     fleet = FleetTracker()
-    fleet.take(key, payload, 0.0)
+    fleet.add(key, payload, 0.0)
     assert (fleet.state(0.0).services, fleet.state(0.0).rejected) == ((), 1)
     assert "expected" in vars(caplog.records[0])["fields"]["reason"]
 
 
-def test_strangers_tokens_are_ignored() -> None:
+def test_invalid_tokens_are_ignored() -> None:
     fleet = FleetTracker()
     fleet.set_alive(["sonarpost/v1/uuv-1/alive/c2", "sonarpost/v1/uuv-1/alive/a/b", "x"], 0.0)
     assert [(s.platform, s.service) for s in fleet.state(0.0).services] == [("uuv-1", "c2")]
 
 
-def test_who_is_gone_is_forgotten_and_who_lives_is_not() -> None:
-    fleet = FleetTracker(forget_after_s=60.0)
+def test_service_without_a_token_expires() -> None:
+    fleet = FleetTracker(expire_after_s=60.0)
     for service in ("c2", "relay"):
-        tell(fleet, health(service=service), 0.0)
+        add(fleet, health(service=service), 0.0)
     fleet.set_alive([keys.alive("uuv-1", "c2")], 60.0)
     assert len(fleet.state(60.0).services) == 2
     fleet.set_alive([keys.alive("uuv-1", "c2")], 61.0)
     assert [s.service for s in fleet.state(61.0).services] == ["c2"]
 
 
-def test_names_without_end_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_services_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fleet_module, "MAX_SERVICES", 3)
     fleet = FleetTracker()
     for number in range(5):
-        tell(fleet, health(service=f"s{number}"), 0.0)
+        add(fleet, health(service=f"s{number}"), 0.0)
     fleet.set_alive([keys.alive("uuv-1", f"t{number}") for number in range(9)], 0.0)
     state = fleet.state(0.0)
     assert state.rejected == 2
     assert len(state.services) <= 6
-    tell(fleet, health(service="s1", state="degraded"), 1.0)
+    add(fleet, health(service="s1", state="degraded"), 1.0)
     assert next(s for s in fleet.state(1.0).services if s.service == "s1").health == health(
         service="s1", state="degraded"
     )

@@ -1,4 +1,4 @@
-"""A service's heartbeat file, and the check that a container engine makes of it."""
+"""Heartbeat file of a service, and the health check that reads it."""
 
 from __future__ import annotations
 
@@ -46,39 +46,39 @@ def heart(path: Path, tmp_path: Path) -> Heartbeat:
     return Heartbeat(path, tmp_path, 5.0)
 
 
-def test_both_modules_name_the_same_variable() -> None:
+def test_both_modules_use_the_same_variable() -> None:
     assert heartbeat.VARIABLE == healthcheck.VARIABLE
 
 
-def test_a_service_that_beats_is_well(heart: Heartbeat, path: Path) -> None:
+def test_service_with_a_heartbeat_is_healthy(heart: Heartbeat, path: Path) -> None:
     heart.beat(health(), NOW_S)
     assert health_problem(path, NOW_S + 1) == ""
-    assert check({"SONARPOST_HEARTBEAT": str(path)}, NOW_S + 1) == (0, "well")
+    assert check({"SONARPOST_HEARTBEAT": str(path)}, NOW_S + 1) == (0, "healthy")
 
 
-def test_no_heartbeat_is_a_service_that_has_not_started(path: Path) -> None:
+def test_missing_heartbeat_means_not_started(path: Path) -> None:
     assert "has not started" in health_problem(path, NOW_S)
 
 
-def test_an_old_heartbeat_is_a_process_that_hangs(heart: Heartbeat, path: Path) -> None:
+def test_old_heartbeat_means_a_hanging_process(heart: Heartbeat, path: Path) -> None:
     heart.beat(health(), NOW_S)
     assert health_problem(path, NOW_S + 15.0) == ""
     assert health_problem(path, NOW_S + 15.1).startswith("hangs: last heartbeat 15 s ago")
 
 
-def test_slow_beats_are_given_their_time(path: Path, tmp_path: Path) -> None:
+def test_limit_follows_the_heartbeat_interval(path: Path, tmp_path: Path) -> None:
     Heartbeat(path, tmp_path, 60.0).beat(health(), NOW_S)
     assert health_problem(path, NOW_S + 180.0) == ""
     assert health_problem(path, NOW_S + 181.0).startswith("hangs")
 
 
 @pytest.mark.parametrize("state", ["degraded", "stopping"])
-def test_a_service_that_says_it_cannot_work_is_ill_with_its_own_words(heart: Heartbeat, path: Path, state: str) -> None:
+def test_degraded_service_is_unhealthy_with_its_reason(heart: Heartbeat, path: Path, state: str) -> None:
     heart.beat(health(state, "records cannot be stored"), NOW_S)
     assert health_problem(path, NOW_S) == f"{state}: records cannot be stored"
 
 
-def test_records_that_wait_while_none_is_finished_are_a_stall(heart: Heartbeat, path: Path) -> None:
+def test_waiting_records_without_progress_are_a_stall(heart: Heartbeat, path: Path) -> None:
     heart.beat(health(inbox=3, handled=1), NOW_S)
     heart.beat(health(inbox=3, handled=1), NOW_S + 1800.0)
     assert health_problem(path, NOW_S + 1800.0) == ""
@@ -88,26 +88,26 @@ def test_records_that_wait_while_none_is_finished_are_a_stall(heart: Heartbeat, 
     assert health_problem(path, NOW_S + 1810.0) == ""
 
 
-def test_an_idle_service_has_not_stalled(heart: Heartbeat, path: Path) -> None:
+def test_idle_service_is_not_stalled(heart: Heartbeat, path: Path) -> None:
     heart.beat(health(handled=1), NOW_S)
     heart.beat(health(handled=1), NOW_S + 9000.0)
     heart.beat(health(inbox=1, handled=1), NOW_S + 9005.0)
     assert health_problem(path, NOW_S + 9005.0) == ""
 
 
-def test_how_long_a_stall_may_last_is_configurable(heart: Heartbeat, path: Path) -> None:
+def test_stall_limit_is_configurable(heart: Heartbeat, path: Path) -> None:
     heart.beat(health(inbox=1), NOW_S)
     heart.beat(health(inbox=1), NOW_S + 10.0)
     environment = {"SONARPOST_HEARTBEAT": str(path), "SONARPOST_STALLED_AFTER_S": "9"}
     status, line = check(environment, NOW_S + 10.0)
     assert (status, line[:8]) == (1, "stalled:")
-    assert check({**environment, "SONARPOST_STALLED_AFTER_S": "11"}, NOW_S + 10.0) == (0, "well")
+    assert check({**environment, "SONARPOST_STALLED_AFTER_S": "11"}, NOW_S + 10.0) == (0, "healthy")
     assert check({**environment, "SONARPOST_STALLED_AFTER_S": "soon"}, NOW_S)[1].endswith(
         "got 'soon', expected seconds"
     )
 
 
-def test_a_full_disk_is_told_before_a_record_meets_it(
+def test_full_disk_is_reported_before_a_record_fails(
     heart: Heartbeat, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     heart.beat(health(), NOW_S)
@@ -115,7 +115,7 @@ def test_a_full_disk_is_told_before_a_record_meets_it(
     assert "B free, expected at least" in health_problem(path, NOW_S)
 
 
-def test_a_store_that_went_away_is_named(path: Path, tmp_path: Path) -> None:
+def test_error_names_a_missing_store_folder(path: Path, tmp_path: Path) -> None:
     Heartbeat(path, tmp_path / "gone", 5.0).beat(health(), NOW_S)
     assert health_problem(path, NOW_S) == f"{tmp_path / 'gone'}: No such file or directory"
 
@@ -123,21 +123,19 @@ def test_a_store_that_went_away_is_named(path: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"[]", b"{}", b"\xff", b'{"beat_monotonic_s": "x"}', b'{"beat_monotonic_s": []}']
 )
-def test_a_file_that_is_no_heartbeat_is_named(path: Path, content: bytes) -> None:
+def test_error_names_an_invalid_heartbeat_file(path: Path, content: bytes) -> None:
     path.write_bytes(content)
     assert str(path) in health_problem(path, NOW_S)
     assert "expected a heartbeat file" in health_problem(path, NOW_S)
 
 
-def test_without_a_file_there_is_nothing_to_check() -> None:
+def test_missing_variable_is_an_error() -> None:
     status, line = check({}, NOW_S)
     assert status == 1
     assert line.startswith("SONARPOST_HEARTBEAT is not set")
 
 
-def test_a_heartbeat_that_cannot_be_written_is_told_once_and_stops_nothing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_unwritable_heartbeat_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     heart = Heartbeat(tmp_path / "no" / "heartbeat", tmp_path, 5.0)
     heart.beat(health(), NOW_S)
     heart.beat(health(), NOW_S + 5)
@@ -145,7 +143,7 @@ def test_a_heartbeat_that_cannot_be_written_is_told_once_and_stops_nothing(
 
 
 class Idle(Service[ServiceConfig]):
-    """Does nothing."""
+    """A service without records."""
 
     NAME = "relay"
 
@@ -153,7 +151,7 @@ class Idle(Service[ServiceConfig]):
         raise AssertionError(key)
 
 
-def test_a_running_service_beats_and_the_command_finds_it_well(
+def test_command_reports_a_running_service_as_healthy(
     platform: Callable[[str], PlatformConfig], path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(heartbeat.VARIABLE, str(path))
@@ -168,10 +166,10 @@ def test_a_running_service_beats_and_the_command_finds_it_well(
             text=True,
             check=False,
         )
-        assert (done.returncode, done.stdout) == (0, "well\n")
+        assert (done.returncode, done.stdout) == (0, "healthy\n")
         service.set_degraded("the disk is full")
         eventually(
-            lambda: health_problem(path, time.monotonic()) == "degraded: the disk is full", 10, "the problem told"
+            lambda: health_problem(path, time.monotonic()) == "degraded: the disk is full", 10, "the degraded state"
         )
     finally:
         service.stop()

@@ -1,4 +1,4 @@
-"""Metrics of a fleet: scraped over HTTP, read by Prometheus's own parser."""
+"""Metrics of a fleet, scraped over HTTP and parsed with Prometheus's parser."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Samples = dict[tuple[str, ...], float]
 
 
 def samples(text: str) -> Samples:
-    """Values by name and label values; a series that comes twice is an error."""
+    """Values by name and label values; a duplicate series is an error."""
     found: Samples = {}
     for family in text_string_to_metric_families(text):
         for sample in family.samples:
@@ -53,7 +53,7 @@ def scraped(*services: ServiceStatus, connected: bool = True, rejected: int = 0)
     return samples(generate_latest(registry).decode())
 
 
-def test_a_service_in_metrics() -> None:
+def test_metrics_of_a_service() -> None:
     found = scraped(ServiceStatus("vessel-1", "op_modem", health(), 1.5, True), rejected=3)
     who = ("vessel-1", "op_modem")
     assert found["sonarpost_up", *who] == 1
@@ -73,19 +73,19 @@ def test_a_service_in_metrics() -> None:
     assert found["sonarpost_exporter_records_rejected_total",] == 3
 
 
-def test_stale_values_end_and_what_alerts_ask_stays() -> None:
+def test_stale_values_are_omitted_except_those_for_alerts() -> None:
     found = scraped(ServiceStatus("vessel-1", "op_modem", health(), 30.1, False))
     assert {name for name, *who in found if who} == {"sonarpost_up", "sonarpost_health_age_seconds"}
     assert found["sonarpost_up", "vessel-1", "op_modem"] == 0
 
 
-def test_without_a_router_nothing_is_said_about_who_lives() -> None:
+def test_no_liveliness_metric_without_a_router() -> None:
     found = scraped(ServiceStatus("vessel-1", "op_modem", health(), 1.0, None), connected=False)
     assert found["sonarpost_exporter_router_connected",] == 0
     assert not [name for name, *_ in found if name == "sonarpost_up"]
 
 
-def test_names_that_are_no_metrics_and_names_without_end_are_left_out() -> None:
+def test_invalid_and_excess_names_are_omitted() -> None:
     hostile = {"a b": 1, 'x{y="z"}': 1, "": 1, "A": 1, "up": 1, "x_total": 1, "n\n# TYPE": 1, "fine": 1}
     many = {f"gauge_{n:04}": 1.0 for n in range(1000)} | {"fine": 2.0}
     found = scraped(ServiceStatus("vessel-1", "op_modem", health(counters=hostile, gauges=many), 1.0, True))
@@ -96,7 +96,7 @@ def test_names_that_are_no_metrics_and_names_without_end_are_left_out() -> None:
 
 @pytest.fixture
 def exporter(router: str) -> Iterator[str]:
-    """`sonarpost metrics` as a process; the fixture is its address."""
+    """Address of `sonarpost metrics`, run as a process."""
     port = free_port()
     command = [sys.executable, "-m", "sonarpost.cli.main", "metrics", "--router", router, "--port", str(port)]
     with subprocess.Popen([*command, "--stale-after", "1"], stderr=subprocess.PIPE, env=os.environ) as process:
@@ -109,11 +109,11 @@ def scrape(url: str) -> Samples:
     try:
         with urllib.request.urlopen(url, timeout=5) as reply:
             return samples(reply.read().decode())
-    except OSError:  # not there yet
+    except OSError:  # not started yet
         return {}
 
 
-def test_a_real_service_is_scraped_and_its_series_end_with_it(
+def test_running_service_is_scraped_and_its_series_end_with_it(
     exporter: str, platform: Callable[[str], PlatformConfig], tmp_path: object
 ) -> None:
     service = C2Service(platform("shore-1"), C2Config(out_dir=platform("shore-1").state_dir / "out"))
@@ -131,7 +131,7 @@ def test_a_real_service_is_scraped_and_its_series_end_with_it(
     assert scrape(exporter)["sonarpost_up", *who] == 0
 
 
-def test_a_port_that_is_taken_is_one_line(exporter: str, router: str) -> None:
+def test_port_in_use_is_reported_in_one_line(exporter: str, router: str) -> None:
     eventually(lambda: scrape(exporter) != {})
     port = exporter.rpartition(":")[2].removesuffix("/metrics")
     command = [sys.executable, "-m", "sonarpost.cli.main", "metrics", "--router", router, "--port", port]

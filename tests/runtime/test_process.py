@@ -1,4 +1,4 @@
-"""A service as a process of its own: it ends when told to, says what is wrong in one line, and dies with its parent."""
+"""Service process: stops on a signal, reports errors in one line, ends with its parent."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from sonarpost.runtime.process import main
 from sonarpost.runtime.service import UnitOfWork, Service
 
 class TinyConfig(ServiceConfig):
-    loops_forever_on_stop: bool = False
-    breaks: bool = False
+    hangs_on_stop: bool = False
+    raises: bool = False
 
 class Tiny(Service[TinyConfig]):
-    '''Takes decisions.'''
+    '''Consumes decisions.'''
     NAME = "relay"
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
@@ -43,11 +43,11 @@ class Tiny(Service[TinyConfig]):
         effects.count("decisions")
 
     def on_start(self) -> None:
-        if self.config.breaks:
-            self.start_thread(lambda: 1 // 0, "breaks")
+        if self.config.raises:
+            self.start_thread(lambda: 1 // 0, "raises")
 
     def on_stop(self) -> None:
-        if self.config.loops_forever_on_stop:
+        if self.config.hangs_on_stop:
             threading.Event().wait()
 
 sys.exit(main(Tiny, TinyConfig))
@@ -58,7 +58,7 @@ Start = Callable[..., subprocess.Popen[str]]
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Starts the tiny service with a configuration file of the given text."""
+    """Starts the tiny service with the given configuration."""
     started: list[subprocess.Popen[str]] = []
 
     def start_one(configuration: str, **environment: str) -> subprocess.Popen[str]:
@@ -94,7 +94,7 @@ def configuration(tmp_path: Path, router: str, own: str = "") -> str:
 
 
 def read_until(process: subprocess.Popen[str], text: str) -> str:
-    """Return the log up to the line that holds `text`."""
+    """Return the log up to the line with `text`."""
     assert process.stderr is not None
     lines = []
     for line in process.stderr:
@@ -113,7 +113,7 @@ def end(process: subprocess.Popen[str], number: signal.Signals) -> tuple[int, fl
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_a_running_service_soon_and_well(
+def test_signal_stops_a_running_service_quickly(
     number: signal.Signals, start: Start, tmp_path: Path, router: str
 ) -> None:
     process = start(configuration(tmp_path, router))
@@ -127,9 +127,7 @@ def test_a_signal_ends_a_running_service_soon_and_well(
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_a_service_that_waits_for_its_router(
-    number: signal.Signals, start: Start, tmp_path: Path
-) -> None:
+def test_signal_stops_a_service_that_waits_for_its_router(number: signal.Signals, start: Start, tmp_path: Path) -> None:
     process = start(configuration(tmp_path, "tcp/127.0.0.1:1"))
     read_until(process, "Zenoh router not reached")
     status, seconds, log = end(process, number)
@@ -137,7 +135,7 @@ def test_a_signal_ends_a_service_that_waits_for_its_router(
     assert seconds < 3
 
 
-def test_a_signal_ends_a_service_whose_record_nobody_takes(start: Start, tmp_path: Path, router: str) -> None:
+def test_signal_stops_a_service_whose_consumer_does_not_reply(start: Start, tmp_path: Path, router: str) -> None:
     (tmp_path / "state").mkdir()
     store = Store(tmp_path / "state" / "relay.db")
     with store.transaction() as tx:
@@ -154,17 +152,17 @@ def test_a_signal_ends_a_service_whose_record_nobody_takes(start: Start, tmp_pat
     store.close()
 
 
-def test_a_shutdown_that_hangs_is_cut_short(start: Start, tmp_path: Path, router: str) -> None:
-    process = start(configuration(tmp_path, router, "loops_forever_on_stop = true"))
+def test_hanging_shutdown_is_ended(start: Start, tmp_path: Path, router: str) -> None:
+    process = start(configuration(tmp_path, router, "hangs_on_stop = true"))
     read_until(process, "Service started")
     status, seconds, log = end(process, signal.SIGTERM)
     assert status == 3
     assert seconds < 5
-    assert "Shutdown takes too long" in log
+    assert "Shutdown timed out" in log
 
 
-def test_a_defect_in_a_thread_ends_the_service_with_its_traceback(start: Start, tmp_path: Path, router: str) -> None:
-    process = start(configuration(tmp_path, router, "breaks = true"))
+def test_exception_in_a_thread_stops_the_service_with_its_traceback(start: Start, tmp_path: Path, router: str) -> None:
+    process = start(configuration(tmp_path, router, "raises = true"))
     _, log = process.communicate(timeout=20)
     assert process.returncode == 1
     assert "ZeroDivisionError" in log
@@ -179,7 +177,7 @@ def test_a_defect_in_a_thread_ends_the_service_with_its_traceback(start: Start, 
         ("[platform\n", "expected valid TOML"),
     ],
 )
-def test_a_wrong_configuration_is_status_2_and_one_line(start: Start, text: str, message: str) -> None:
+def test_invalid_configuration_is_status_2_and_one_line(start: Start, text: str, message: str) -> None:
     process = start(text)
     out, err = process.communicate(timeout=20)
     assert process.returncode == 2
@@ -189,16 +187,16 @@ def test_a_wrong_configuration_is_status_2_and_one_line(start: Start, text: str,
     assert err.count("\n") == 1
 
 
-def test_a_wrong_override_is_status_2_and_one_line(start: Start, tmp_path: Path, router: str) -> None:
-    process = start(configuration(tmp_path, router), SONARPOST_RELAY__BREAKS="often")
+def test_invalid_override_is_status_2_and_one_line(start: Start, tmp_path: Path, router: str) -> None:
+    process = start(configuration(tmp_path, router), SONARPOST_RELAY__RAISES="often")
     _, err = process.communicate(timeout=20)
     assert process.returncode == 2
-    assert err == "relay: environment: SONARPOST_RELAY__BREAKS: got 'often', expected a valid boolean\n"
+    assert err == "relay: environment: SONARPOST_RELAY__RAISES: got 'often', expected a valid boolean\n"
 
 
-def test_a_store_that_cannot_be_opened_is_status_2_and_one_line(start: Start, tmp_path: Path, router: str) -> None:
+def test_unreadable_store_is_status_2_and_one_line(start: Start, tmp_path: Path, router: str) -> None:
     (tmp_path / "state").mkdir()
-    (tmp_path / "state" / "relay.db").write_bytes(b"somebody's file" * 100)
+    (tmp_path / "state" / "relay.db").write_bytes(b"of another program" * 100)
     process = start(configuration(tmp_path, router))
     _, err = process.communicate(timeout=20)
     assert process.returncode == 2
@@ -207,7 +205,7 @@ def test_a_store_that_cannot_be_opened_is_status_2_and_one_line(start: Start, tm
     assert "cannot be opened as a sonarpost store" in err
 
 
-def test_logs_are_json_when_asked_for(start: Start, tmp_path: Path, router: str) -> None:
+def test_logs_are_json_if_configured(start: Start, tmp_path: Path, router: str) -> None:
     process = start(configuration(tmp_path, router), SONARPOST_PLATFORM__LOG_FORMAT="json")
     log = read_until(process, "Service started")
     assert all(
@@ -215,7 +213,7 @@ def test_logs_are_json_when_asked_for(start: Start, tmp_path: Path, router: str)
     )
 
 
-def test_a_running_service_shows_that_it_is_alive_and_well(
+def test_running_service_publishes_health_and_liveliness(
     start: Start, tmp_path: Path, router: str, client: zenoh.Session
 ) -> None:
     seen: list[Health] = []
@@ -243,10 +241,10 @@ def test_help_names_the_service(start: Start) -> None:
     )
     assert done.returncode == 0
     assert "usage: python -m sonarpost.services.relay" in done.stdout
-    assert "Takes decisions." in done.stdout
+    assert "Consumes decisions." in done.stdout
 
 
-# Ending with the parent
+# End with the parent process
 
 PARENT = """
 import os, subprocess, sys
@@ -255,11 +253,11 @@ child = subprocess.Popen(sys.argv[1:], env={**os.environ, "SONARPOST_EXIT_WITH_P
 print(child.pid, flush=True)
 child.wait()
 """
-on_linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a Linux call makes it so")
+on_linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="requires prctl of Linux")
 
 
 def running(pid: int) -> bool:
-    """Tell whether a process runs (one that ended and was not collected by its new parent does not)."""
+    """Return whether a process runs; a zombie does not."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except FileNotFoundError:
@@ -268,7 +266,7 @@ def running(pid: int) -> bool:
 
 
 @on_linux
-def test_a_service_ends_when_the_process_that_started_it_is_killed(tmp_path: Path, router: str) -> None:
+def test_service_ends_when_its_parent_is_killed(tmp_path: Path, router: str) -> None:
     path = tmp_path / "vessel.toml"
     path.write_text(configuration(tmp_path, router))
     parent = subprocess.Popen(
@@ -284,7 +282,7 @@ def test_a_service_ends_when_the_process_that_started_it_is_killed(tmp_path: Pat
         assert running(child)
     finally:
         parent.kill()
-        # The child has the other end of this pipe: it reads empty once both are gone.
+        # The child holds the other end of this pipe, which ends with both processes.
         _, log = parent.communicate(timeout=20)
     eventually(lambda: not running(child), 5, "the end of the service")
     assert "Stopping signal=SIGTERM" in log
@@ -292,14 +290,14 @@ def test_a_service_ends_when_the_process_that_started_it_is_killed(tmp_path: Pat
 
 
 @on_linux
-def test_a_service_whose_starter_is_gone_already_does_not_start(start: Start, tmp_path: Path, router: str) -> None:
+def test_service_without_its_parent_does_not_start(start: Start, tmp_path: Path, router: str) -> None:
     process = start(configuration(tmp_path, router), SONARPOST_EXIT_WITH_PARENT=str(os.getpid() + 1_000_000))
     _, log = process.communicate(timeout=20)
     assert process.returncode == 1
     assert log == ""
 
 
-def test_without_the_variable_a_service_outlives_its_starter(tmp_path: Path, router: str) -> None:
+def test_service_outlives_its_parent_without_the_variable(tmp_path: Path, router: str) -> None:
     path = tmp_path / "vessel.toml"
     path.write_text(configuration(tmp_path, router))
     log_path = tmp_path / "log"
@@ -321,7 +319,7 @@ def test_without_the_variable_a_service_outlives_its_starter(tmp_path: Path, rou
     eventually(lambda: "Service stopped" in log_path.read_text())
 
 
-# The embedded router
+# Embedded router
 
 
 def router_process(*arguments: str) -> subprocess.Popen[str]:
@@ -334,7 +332,7 @@ def router_process(*arguments: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_the_router_ends_on_a_signal(number: signal.Signals) -> None:
+def test_router_stops_on_a_signal(number: signal.Signals) -> None:
     process = router_process("--listen", "tcp/127.0.0.1:0")
     read_until(process, "Router started")
     status, seconds, _ = end(process, number)
@@ -342,7 +340,7 @@ def test_the_router_ends_on_a_signal(number: signal.Signals) -> None:
     assert seconds < 3
 
 
-def test_a_router_that_cannot_listen_is_status_2(router: str) -> None:
+def test_router_that_cannot_listen_is_status_2(router: str) -> None:
     process = router_process("--listen", router)
     _, log = process.communicate(timeout=20)
     assert process.returncode == 2

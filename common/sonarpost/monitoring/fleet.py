@@ -1,7 +1,7 @@
-"""What is known of every service of every platform: its last health record, when it came, and whether it lives.
+"""State of all services of all platforms: last health record, its age, and liveliness.
 
-`FleetTracker` holds it, with the clock as an argument; `FleetWatcher` fills it from a router. Ages are measured by the
-clock of this host from the arrival of a record, never by the record's own: clocks of platforms differ.
+`FleetTracker` holds the state, with the time as an argument; `FleetWatcher` updates it from a router. Ages are measured
+with the clock of this host from the arrival of a record, because the clocks of platforms differ.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from sonarpost.messages import Health
 log = logging.getLogger(__name__)
 
 MAX_SERVICES: Final = 1000
-"""Whoever may publish could invent names without end."""
+"""Limit of the memory that publishers can use with invented names."""
 
 Name = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceStatus:
-    """What is known of one service.
+    """State of one service.
 
     Attributes:
-        platform: Its platform.
-        service: Its name.
-        health: Its last record, None before the first.
-        age_s: Since that record came; None before the first.
-        alive: Whether its liveliness token is there; None while the router is not reached.
+        platform: Platform of the service.
+        service: Name of the service.
+        health: Last health record; None before the first.
+        age_s: Time since its arrival; None before the first.
+        alive: Whether its liveliness token exists; None while the router is not reached.
     """
 
     platform: str
@@ -51,12 +51,12 @@ class ServiceStatus:
 
 @dataclass(frozen=True, slots=True)
 class FleetState:
-    """Everything known at one moment.
+    """State of the fleet at one moment.
 
     Attributes:
-        services: Ordered by platform and service.
+        services: Services, ordered by platform and name.
         connected: Whether a router is reached.
-        rejected: Records that could not be used since the start.
+        rejected: Number of invalid records since the start.
     """
 
     services: tuple[ServiceStatus, ...]
@@ -65,14 +65,14 @@ class FleetState:
 
 
 class FleetTracker:
-    """Collects health records and tokens, from any thread.
+    """Collects health records and liveliness tokens; safe for several threads.
 
     Args:
-        forget_after_s: A service that is not alive is forgotten when nothing came from it for this long.
+        expire_after_s: Time without a record after which a service without a token is removed.
     """
 
-    def __init__(self, forget_after_s: float = 3600.0) -> None:
-        self._forget_after_s = forget_after_s
+    def __init__(self, expire_after_s: float = 3600.0) -> None:
+        self._expire_after_s = expire_after_s
         self._lock = threading.Lock()
         self._health: dict[Name, Health] = {}
         self._last_s: dict[Name, float] = {}
@@ -80,11 +80,11 @@ class FleetTracker:
         self._connected = False
         self._rejected = 0
 
-    def take(self, key: str, payload: bytes, now_s: float) -> None:
-        """Take a health record; what cannot be used is logged, counted and dropped.
+    def add(self, key: str, payload: bytes, now_s: float) -> None:
+        """Add a health record; an invalid one is logged, counted and dropped.
 
         Args:
-            key: It came on; what it says of platform and service must agree, as nobody speaks for another.
+            key: Key of the record; its platform and service must be those of the record.
             payload: The record.
             now_s: Time of arrival, monotonic.
         """
@@ -104,7 +104,7 @@ class FleetTracker:
             log.warning("Health record rejected", extra=kv(reason=str(error)))
 
     def set_alive(self, tokens: Iterable[str] | None, now_s: float) -> None:
-        """Take the keys of all liveliness tokens there are; None when the router is not reached."""
+        """Set the keys of all present liveliness tokens; None if the router is not reached."""
         names: set[Name] = set()
         for token in tokens or ():
             try:
@@ -115,33 +115,33 @@ class FleetTracker:
             self._connected = tokens is not None
             self._alive = frozenset(sorted(names)[:MAX_SERVICES])
             for name in self._alive:
-                # A service that was never heard counts from when its token was met.
+                # The age of a service without a record counts from its token.
                 self._last_s.setdefault(name, now_s)
-            for name in [n for n, last_s in self._last_s.items() if now_s - last_s > self._forget_after_s]:
+            for name in [n for n, last_s in self._last_s.items() if now_s - last_s > self._expire_after_s]:
                 if name not in self._alive:
                     del self._last_s[name]
                     self._health.pop(name, None)
 
     def state(self, now_s: float) -> FleetState:
-        """Return everything known at `now_s`, monotonic."""
+        """Return the state at `now_s`, monotonic."""
         with self._lock:
-            services = tuple(self._seen(name, now_s) for name in sorted(self._last_s))
+            services = tuple(self._status(name, now_s) for name in sorted(self._last_s))
             return FleetState(services, self._connected, self._rejected)
 
-    def _seen(self, name: Name, now_s: float) -> ServiceStatus:
+    def _status(self, name: Name, now_s: float) -> ServiceStatus:
         health = self._health.get(name)
         age_s = None if health is None else max(0.0, now_s - self._last_s[name])
         return ServiceStatus(*name, health, age_s, name in self._alive if self._connected else None)
 
 
 class FleetWatcher:
-    """Fills a fleet from a router: subscribes to health, asks for tokens now and then, comes back after cuts.
+    """Updates a tracker from a router: subscribes to health, polls the liveliness tokens, reconnects.
 
     Args:
-        endpoints: The router's, tried in turn.
-        tls: Certificate, for `tls/…` endpoints.
-        fleet: Where everything goes.
-        poll_s: How often tokens are asked for.
+        endpoints: Endpoints of the router, tried in turn.
+        tls: Certificate for `tls/...` endpoints.
+        fleet: The tracker.
+        poll_s: Interval of the polls.
     """
 
     def __init__(
@@ -168,33 +168,33 @@ class FleetWatcher:
         self._thread.join(timeout=5.0)
 
     def state(self) -> FleetState:
-        """Return everything known now."""
+        """Return the present state."""
         return self.fleet.state(self._clock())
 
     def _run(self) -> None:
         session = open_with_retry(self._endpoints, self._stop, self._tls)
         if session is None:
             return
-        # `with` closes it: a session that is only dropped keeps the process from ending.
+        # A session that is not closed would keep the process from exiting.
         with session:
             session.declare_subscriber(keys.health_everywhere(), self._on_health)
             while True:
-                self._ask(session)
+                self._poll(session)
                 if self._stop.wait(self._poll_s):
                     return
 
     def _on_health(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            self.fleet.take(str(sample.key_expr), sample.payload.to_bytes(), self._clock())
+            self.fleet.add(str(sample.key_expr), sample.payload.to_bytes(), self._clock())
 
-    def _ask(self, session: zenoh.Session) -> None:
-        """Ask for the tokens; a token that ends while the link is cut is then found to be gone by itself."""
+    def _poll(self, session: zenoh.Session) -> None:
+        """Query the tokens; this also finds tokens that ended during a link cut."""
         try:
             tokens: list[str] | None = None
             if session.info.routers_zid():
                 replies = session.liveliness().get(keys.alive_everywhere(), timeout=2.0)
                 tokens = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
         except zenoh.ZError as error:
-            log.warning("Tokens not told", extra=kv(error=str(error)))
+            log.warning("Liveliness tokens not received", extra=kv(error=str(error)))
             tokens = None
         self.fleet.set_alive(tokens, self._clock())

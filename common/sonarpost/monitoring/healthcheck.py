@@ -1,14 +1,14 @@
-"""`python -m sonarpost.monitoring.healthcheck`: tells whether the service that writes the heartbeat file is well.
+"""`python -m sonarpost.monitoring.healthcheck`: check of the service that writes the heartbeat file.
 
-Exit status 0 when it is, 1 with the reason on standard output when it is not:
+Exit status 0 if it is healthy, else 1 with the reason on standard output:
 
-- no heartbeat: the service has not started, because its router is not reached for example;
+- no heartbeat: the service has not started, for example because its router is not reached;
 - an old heartbeat: the process hangs;
-- degraded: the service says that something keeps it from its work (it cannot store, its modem does not answer);
-- stalled: records wait and for a long time none was finished;
-- no room: the disk of its store is full.
+- degraded: the service reports that it cannot work (it cannot store records, its modem does not reply);
+- stalled: records wait and none was finished for a long time;
+- the disk of its store is full.
 
-Nothing heavy is imported: a container engine runs this every few seconds for every service.
+The module has no heavy imports: a container engine runs it every few seconds for every service.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from pathlib import Path
 
 VARIABLE = "SONARPOST_HEARTBEAT"
 STALLED_VARIABLE = "SONARPOST_STALLED_AFTER_S"
-# A picture of 8 kB takes seven minutes at rate 1; half an hour without anything finished is no picture.
+# An image of 8 kB takes seven minutes at rate 1, so half an hour without progress is a stall.
 STALLED_AFTER_S = 1800.0
-# Missed beats until a service counts as hanging, and the least time for that on a busy machine.
+# Missed heartbeats after which a service counts as hanging, and the minimum time on a busy machine.
 MISSED_BEATS = 3
 HANGS_AFTER_S = 15.0
-# A store commits into its write-ahead log: with less than this the next record may not fit.
+# The store commits to its write-ahead log: with less space the next record can fail.
 MIN_FREE_BYTES = 1 << 20
 
 
 def health_problem(path: Path, now_s: float, stalled_after_s: float = STALLED_AFTER_S) -> str:
-    """Return what is wrong with the service, an empty text when nothing is.
+    """Return why the service is not healthy, empty if it is.
 
     Args:
-        path: Its heartbeat file.
-        now_s: Seconds of the monotonic clock.
-        stalled_after_s: Longest time without a finished record while some wait.
+        path: The heartbeat file.
+        now_s: Time of the monotonic clock.
+        stalled_after_s: Maximum time without a finished record while records wait.
     """
     try:
         beat = json.loads(path.read_bytes())
@@ -55,20 +55,20 @@ def health_problem(path: Path, now_s: float, stalled_after_s: float = STALLED_AF
         return f"{state}: {detail}" if detail else state
     if waiting and stalled_s > stalled_after_s:
         return f"stalled: {waiting} records wait and none was finished for {stalled_s:.0f} s"
-    return _no_room(folder)
+    return _disk_full(folder)
 
 
-def _no_room(folder: Path) -> str:
+def _disk_full(folder: Path) -> str:
     try:
-        room = os.statvfs(folder)
+        usage = os.statvfs(folder)
     except OSError as error:
         return f"{folder}: {error.strerror or error}"
-    free = room.f_bavail * room.f_frsize
+    free = usage.f_bavail * usage.f_frsize
     return "" if free >= MIN_FREE_BYTES else f"{folder}: {free} B free, expected at least {MIN_FREE_BYTES} B"
 
 
 def check(environment: Mapping[str, str], now_s: float) -> tuple[int, str]:
-    """Return the exit status and the line to print."""
+    """Return exit status and output line."""
     name = environment.get(VARIABLE, "")
     if not name:
         return 1, f"{VARIABLE} is not set, expected the service's heartbeat file"
@@ -78,7 +78,7 @@ def check(environment: Mapping[str, str], now_s: float) -> tuple[int, str]:
     except ValueError:
         return 1, f"{STALLED_VARIABLE}: got {text!r}, expected seconds"
     reason = health_problem(Path(name), now_s, stalled_after_s)
-    return (1, reason) if reason else (0, "well")
+    return (1, reason) if reason else (0, "healthy")
 
 
 def main() -> int:

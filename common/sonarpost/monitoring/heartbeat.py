@@ -1,8 +1,8 @@
-"""A service's sign of life as a small file, for whatever supervises the process: a container engine, systemd, a script.
+"""Heartbeat file of a service, for supervisors: a container engine, systemd, a script.
 
-Where `SONARPOST_HEARTBEAT` names a file, the service replaces it with every health record; `healthcheck` reads it. A
-file and not the router is asked, so that a check costs milliseconds, needs no Zenoh session, and does not call a
-service ill because its router is. The file belongs on a memory file system: a full or worn disk must not silence it.
+The service replaces the file in `SONARPOST_HEARTBEAT` with every health record; `healthcheck` reads it. A check of a
+file takes milliseconds, needs no Zenoh session, and does not depend on the router. The file belongs on a memory file
+system, so that a full or worn disk does not prevent it.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from sonarpost.messages import Health
 log = logging.getLogger(__name__)
 
 VARIABLE = "SONARPOST_HEARTBEAT"
-# What a service has finished with, for better or worse; while one of these grows it is at work.
+# Counters of finished records; a service makes progress while one of them increases.
 _FINISHED = ("records_handled", "records_refused", "records_failed")
 
 
 class Heartbeat:
-    """Writes the file.
+    """Writer of the heartbeat file.
 
     Args:
-        path: The file; None writes none.
-        state_dir: Where the service keeps its store; the check looks whether there is room.
-        interval_s: How often `beat` is called.
+        path: The file; None disables it.
+        state_dir: Folder of the service's store, whose free space is checked.
+        interval_s: Interval of the calls of `beat`.
     """
 
     def __init__(self, path: Path | None, state_dir: Path, interval_s: float) -> None:
@@ -39,20 +39,20 @@ class Heartbeat:
         self._interval_s = interval_s
         self._finished = -1
         self._progress_s = 0.0
-        self._complained = False
+        self._warned = False
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str], state_dir: Path, interval_s: float) -> Heartbeat:
-        """Return one that writes to the file that the environment names, if it does."""
+        """Return a heartbeat with the file from the environment."""
         name = environment.get(VARIABLE, "")
         return cls(Path(name) if name else None, state_dir, interval_s)
 
     def beat(self, health: Health, now_s: float) -> None:
-        """Write the state of this moment.
+        """Write the present state.
 
         Args:
-            health: The service's health.
-            now_s: Seconds of the monotonic clock, which all processes of a host share.
+            health: Health of the service.
+            now_s: Time of the monotonic clock, which all processes of a host share.
         """
         if self._path is None:
             return
@@ -73,6 +73,6 @@ class Heartbeat:
         try:
             write_atomically(self._path, json.dumps(content).encode())
         except OSError as error:
-            if not self._complained:
+            if not self._warned:
                 log.warning("Heartbeat not written", extra=kv(file=self._path, error=str(error)))
-            self._complained = True
+            self._warned = True

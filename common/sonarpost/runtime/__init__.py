@@ -1,1 +1,1 @@
-"""What makes a service a process: configuration, Zenoh session, durable hand-off, health, logs."""
+"""Base class and main function of a service, and the modem port."""

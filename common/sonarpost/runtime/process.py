@@ -1,4 +1,4 @@
-"""Running a service as a process: command line, signals, exit status."""
+"""Main function of a service process: command line, signals, exit status."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from sonarpost.runtime.service import C, Service
 log = logging.getLogger(__name__)
 
 SHUTDOWN_S = 2.5
-EXIT_DEFECT = 1
+EXIT_FAILURE = 1
 EXIT_CONFIG = 2
 EXIT_STUCK = 3
 
 
 def main(service_type: type[Service[C]], config_type: type[C], arguments: Sequence[str] | None = None) -> int:
-    """Run a service until SIGTERM or SIGINT; return the exit status (2: wrong configuration).
+    """Run a service until SIGTERM or SIGINT; return the exit status (2: invalid configuration).
 
     Args:
-        service_type: The service's class.
+        service_type: Class of the service.
         config_type: Type of its configuration table.
-        arguments: Command line, normally the process's own.
+        arguments: Command line; by default that of the process.
     """
     parser = argparse.ArgumentParser(
         prog=f"python -m sonarpost.services.{service_type.NAME}", description=service_type.__doc__
@@ -67,16 +67,16 @@ def _run(service: Service[C]) -> int:
         log.error("Service cannot start", extra=logs.kv(reason=str(error)))
         service.failed = True
     finally:
-        guard = threading.Timer(SHUTDOWN_S, _give_up)
+        guard = threading.Timer(SHUTDOWN_S, _exit_at_once)
         guard.daemon = True
         guard.start()
         service.stop()
         guard.cancel()
-    return EXIT_DEFECT if service.failed else 0
+    return EXIT_FAILURE if service.failed else 0
 
 
-def _give_up() -> None:
-    """End a process whose shutdown hangs: everything accepted is on the disk, so nothing is lost by it."""
-    log.error("Shutdown takes too long, leaving at once")
+def _exit_at_once() -> None:
+    """End a process whose shutdown hangs; all accepted records are on the disk."""
+    log.error("Shutdown timed out; exiting")
     logging.shutdown()
     os._exit(EXIT_STUCK)

@@ -251,7 +251,7 @@ class TrainingSimulator:
                 counters={},
                 gauges={},
             )
-            self._state.fleet.services.take(keys.health(VESSEL, service), wire.encode(health), time.monotonic())
+            self._state.fleet.services.add(keys.health(VESSEL, service), wire.encode(health), time.monotonic())
 
     # Downlink
 
