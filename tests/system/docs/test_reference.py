@@ -12,6 +12,7 @@ from builders.common import REPOSITORY
 from pydantic_core import to_jsonable_python
 from reference import Command
 
+import sonarpost
 from sonarpost.config import SERVICES, PlatformConfig, ServiceConfig
 from sonarpost.messages import Record
 from sonarpost.runtime.service import Service
@@ -103,6 +104,11 @@ def test_fixed_metrics_are_described() -> None:
 
 def test_rates() -> None:
     assert "| 1 | PSK BCH 128:8 | 3 x 64 | 192 | 6.1 | 252 |" in reference.rates()
+
+
+def test_every_public_name_is_in_the_api_page() -> None:
+    page = (REPOSITORY / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^::: sonarpost\.(\w+)$", page, re.MULTILINE)) == sorted(sonarpost.__all__)
 
 
 def test_every_mark_in_a_page_has_a_generator() -> None:
