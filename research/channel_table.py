@@ -1,6 +1,6 @@
-"""Delivery by range and rate as a table: `python -m research.channel_table --preset sea-trial`.
+"""`python -m research.channel_table --preset sea-trial`: received packets and frames by range and rate, as a table.
 
-Every figure is a count over packets sent through the water one after the other, nothing is computed beside it.
+All figures are counts of packets sent one after the other through the simulated channel.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ GAP_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """What arrived of the packets sent over one range: whole packets and frames, as fractions."""
+    """Fractions of complete packets and of frames received at one range."""
 
     range_m: float
     snr_db: float
@@ -31,39 +31,41 @@ class Delivery:
 
 
 def deliver(config: ChannelParameters, rate: int, range_m: float, packets: int) -> Delivery:
-    """Send full packets of a rate over a range, a few seconds apart, and count what arrives."""
-    water = ChannelModel(config, {1: LocalPosition(), 2: LocalPosition(east_m=range_m)})
-    shape = RATES[rate]
-    frames = tuple(bytes([number]) * shape.frame_bytes for number in range(1, shape.frames + 1))
-    whole = good = 0
+    """Send full packets at a rate over a range, ten seconds apart, and count the received ones."""
+    channel = ChannelModel(config, {1: LocalPosition(), 2: LocalPosition(east_m=range_m)})
+    packet_format = RATES[rate]
+    frames = tuple(bytes([number]) * packet_format.frame_bytes for number in range(1, packet_format.frames + 1))
+    complete = received = 0
     for number in range(packets):
-        water.transmit(1, AcousticPacket(PacketKind.DATA, 1, 2, rate, shape.airtime_s, frames), number * GAP_S)
-        for event in water.poll((number + 1) * GAP_S):
+        channel.transmit(
+            1, AcousticPacket(PacketKind.DATA, 1, 2, rate, packet_format.airtime_s, frames), number * GAP_S
+        )
+        for event in channel.poll((number + 1) * GAP_S):
             if isinstance(event, ArrivalEnded):
                 arrived = sum(frame.outcome in {FrameOutcome.DELIVERED, FrameOutcome.DAMAGED} for frame in event.frames)
-                good += arrived
-                whole += arrived == shape.frames
-    return Delivery(range_m, water.snr_db(range_m), whole / packets, good / packets / shape.frames)
+                received += arrived
+                complete += arrived == packet_format.frames
+    return Delivery(range_m, channel.snr_db(range_m), complete / packets, received / packets / packet_format.frames)
 
 
 def table(config: ChannelParameters, packets: int) -> str:
-    """Return the table: whole packets and frames that arrive, in percent, for each range and rate."""
+    """Return the table: complete packets and frames received, in percent, for each range and rate."""
     lines = [
         "| range m | SNR dB | " + " | ".join(f"rate {rate}" for rate in RATES) + " |",
         "|" + "---|" * (len(RATES) + 2),
     ]
     for range_m in RANGES_M:
         cells: Mapping[int, Delivery] = {rate: deliver(config, rate, range_m, packets) for rate in RATES}
-        shown = [f"{100 * cell.packets:.0f} / {100 * cell.frames:.0f}" for cell in cells.values()]
-        lines.append(f"| {range_m} | {cells[0].snr_db:.1f} | " + " | ".join(shown) + " |")
+        percentages = [f"{100 * cell.packets:.0f} / {100 * cell.frames:.0f}" for cell in cells.values()]
+        lines.append(f"| {range_m} | {cells[0].snr_db:.1f} | " + " | ".join(percentages) + " |")
     return "\n".join(lines)
 
 
 def main() -> None:
     """Run from the command line."""
-    parser = argparse.ArgumentParser(description="Whole packets / frames that arrive, in percent.")
+    parser = argparse.ArgumentParser(description="Complete packets / frames received, in percent.")
     parser.add_argument("--preset", choices=list(PRESETS), default="still")
-    parser.add_argument("--water", type=Path, metavar="FILE", help="TOML file of parameters, over the preset")
+    parser.add_argument("--water", type=Path, metavar="FILE", help="TOML file with parameters that override the preset")
     parser.add_argument("--packets", type=int, default=500, help="packets for each cell (500)")
     parsed = parser.parse_args()
     values = {"preset": parsed.preset} | (read_parameters(parsed.water) if parsed.water else {})

@@ -1,12 +1,12 @@
-"""What adapting the shipped codebooks to real seabeds gains on pieces of them that nothing was learned from.
+"""`python -m research.codebook_adapt`: gain of adapting the shipped codebooks to real seabeds, on held-out images.
 
     python -m research.codebook_adapt [--data ../shared/data]
 
-Three sets of real images are cut into pieces of 140 x 80 px that do not overlap: a Marine Sonic survey line of 2013,
-a survey line of a river bed of 2009, and synthetic-aperture tiles. Both sides of a line are cut at the same pings and
-in their order, so what is held out, the last quarter, is the end of the line on either side. Each is adapted to from
-both codebooks; a row of the table in `docs/specifications/codebook-file.md` is printed for each. Times are processor
-time, which does not depend on the load of the machine.
+Three sets of real images are cut into windows of 140 x 80 px without overlap: a Marine Sonic survey line of 2013, a
+survey line of a river bed of 2009, and synthetic-aperture tiles. Both sides of a line are cut at the same pings, so the
+held-out last quarter is the end of the line on both sides. Both codebooks are adapted to each set; each result is a row
+of the table in `docs/specifications/codebook-file.md`. Times are processor time, which does not depend on the load of
+the machine.
 """
 
 from __future__ import annotations
@@ -36,38 +36,38 @@ SETS = {
 
 
 def main() -> int:
-    """Run; return 1 if an adapted codebook is no better than its base on what was held out."""
+    """Run; return 1 if an adapted codebook is no better than its base on the held-out images."""
     parser = argparse.ArgumentParser(description="gain of adapted codebooks on real images")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR", help="default: %(default)s")
     args = parser.parse_args()
     if os.environ.get("OMP_NUM_THREADS") != "1":
-        # Libraries read this when they are loaded, so the program starts itself anew, on one core.
+        # The libraries read this when they are loaded, so the program restarts itself.
         os.environ.update({f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")})
         os.execv(sys.executable, [sys.executable, "-m", "research.codebook_adapt", *sys.argv[1:]])
     print("| images | base | PSNR before / after | FOM before / after | better in | time, one core |")
     print("|---|---|---|---|---|---|")
-    good = True
+    improved = True
     for title, pattern in SETS.items():
-        images = list(_pieces(sorted(args.data.glob(pattern))))
+        images = list(_windows(sorted(args.data.glob(pattern))))
         if not images:
             print(f"codebook_adapt: no {pattern} in {args.data}", file=sys.stderr)
             return 2
         for tile_px in DEFAULT_TILE_PX:
-            good &= _row(title, images, tile_px)
-    return 0 if good else 1
+            improved &= _row(title, images, tile_px)
+    return 0 if improved else 1
 
 
-def _pieces(paths: list[Path]) -> Iterator[TrainingImage]:
-    """Cut files from the top down, both sides of a line in step, other images one after the other."""
+def _windows(paths: list[Path]) -> Iterator[TrainingImage]:
+    """Cut images from top to bottom: both sides of a line together, other images one after the other."""
     views = [(path.name, read_image(path).astype(np.float64)) for path in paths]
     is_line = any("xtf" in path.name for path in paths)
     for group in [views] if is_line else [[view] for view in views]:
         for top in range(0, max(view.shape[0] for _, view in group) - HEIGHT_PX + 1, HEIGHT_PX):
             for name, view in group:
                 for left in range(0, view.shape[1] - WIDTH_PX + 1, WIDTH_PX):
-                    piece = view[top : top + HEIGHT_PX, left : left + WIDTH_PX]
-                    if piece.shape[0] == HEIGHT_PX and piece.min() < piece.max():
-                        yield _image(f"{name} {top} {left}", stretch(piece))
+                    window = view[top : top + HEIGHT_PX, left : left + WIDTH_PX]
+                    if window.shape[0] == HEIGHT_PX and window.min() < window.max():
+                        yield _image(f"{name} {top} {left}", stretch(window))
 
 
 def _image(name: str, pixels: npt.NDArray[np.uint8]) -> TrainingImage:
@@ -79,13 +79,13 @@ def _row(title: str, images: list[TrainingImage], tile_px: int) -> bool:
     training, held_out = split(images)
     start_s = time.process_time()
     adapted = adapt(base, training)
-    took_s = time.process_time() - start_s
+    duration_s = time.process_time() - start_s
     before, after = measure(base, held_out), measure(adapted.tiles, held_out)
     (psnr, fom), (new_psnr, new_fom) = _means(before), _means(after)
     better = sum(new.psnr_db > old.psnr_db for old, new in zip(before, after, strict=True))
     print(
         f"| {title}: {len(training)} + {len(held_out)} | nominal-{tile_px} | {psnr:.2f} / {new_psnr:.2f} dB "
-        f"| {fom:.1f} / {new_fom:.1f} | {better} of {len(held_out)} | {took_s:.0f} s |",
+        f"| {fom:.1f} / {new_fom:.1f} | {better} of {len(held_out)} | {duration_s:.0f} s |",
         flush=True,
     )
     return new_psnr > psnr

@@ -1,11 +1,10 @@
-"""Build a codebook of 16,000 tiles from 500 simulated images, on one core: time and peak memory.
+"""`python -m research.codebook_build`: time and memory to build a codebook of 16,000 tiles on one core.
 
     python -m research.codebook_build [--tile 10] [--refine 2]
 
-The images, 100 to 200 px a side, are cut from simulated survey lines over every kind of bottom, written as TIFF, and
-learned from by the command `sonarpost codebook build` in a process of its own, whose time and peak resident memory
-are those printed. The process is bound to one core, and its libraries to one thread. Simulating is not counted.
-Besides the time on the clock, processor time is printed, which other users of the machine do not lengthen.
+500 images of 100 to 200 px a side are cut from simulated survey lines over every kind of seabed and written as TIFF.
+The command `sonarpost codebook build` runs in its own process, bound to one core and one thread; its time, processor
+time and peak resident memory are printed. The simulation is not included.
 """
 
 from __future__ import annotations
@@ -28,11 +27,11 @@ from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import write_tiff
 
 LIMIT_S = 300.0
-PER_SIDE = 25
+IMAGES_PER_SIDE = 25
 
 
 def main() -> int:
-    """Run; return 1 if it took five minutes or more, or the codebook is not full."""
+    """Run; return 1 if the build takes five minutes or more, or the codebook is not full."""
     parser = argparse.ArgumentParser(description="time and memory of a codebook build")
     parser.add_argument("--images", type=int, default=500, metavar="N", help="default: 500")
     parser.add_argument("--max-tiles", type=int, default=16_000, metavar="N", help="default: 16000")
@@ -64,14 +63,14 @@ def main() -> int:
     return 0 if seconds < LIMIT_S and len(tiles) >= 0.99 * args.max_tiles else 1
 
 
-def _write_images(folder: Path, wanted: int) -> int:
-    """Write the images; return their pixels in all."""
+def _write_images(folder: Path, count: int) -> int:
+    """Write the images; return their total number of pixels."""
     rng = np.random.default_rng(0)
     kinds = list(SeabedKind)
     pixels = 0
-    for number in range(wanted):
-        if number % PER_SIDE == 0:
-            line = number // PER_SIDE
+    for number in range(count):
+        if number % IMAGES_PER_SIDE == 0:
+            line = number // IMAGES_PER_SIDE
             spec = SurveySpec(seed=920_000 + line // 2, seabed=kinds[line // 2 % len(kinds)], targets=8, clutter=8)
             survey = simulate_survey(spec).survey
             waterfall = survey.waterfall(survey.sides()[line % 2])
@@ -85,7 +84,7 @@ def _write_images(folder: Path, wanted: int) -> int:
 
 
 def _run(arguments: list[str]) -> tuple[float, float, float]:
-    """Run the command on one core; return seconds, seconds of processor time and peak resident memory in MiB."""
+    """Run the command on one core; return elapsed and processor time in seconds, and peak resident memory in MiB."""
     environment = os.environ | {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
     start = time.perf_counter()
     child = subprocess.Popen([sys.executable, "-m", "sonarpost.cli.main", *arguments], env=environment)
@@ -94,7 +93,7 @@ def _run(arguments: list[str]) -> tuple[float, float, float]:
     _, status, usage = os.wait4(child.pid, 0)
     seconds = time.perf_counter() - start
     if status != 0:
-        sys.exit(f"codebook_build: the build ended with status {os.waitstatus_to_exitcode(status)}")
+        sys.exit(f"codebook_build: the build exited with status {os.waitstatus_to_exitcode(status)}")
     peak_mib = usage.ru_maxrss / (1024 if sys.platform != "darwin" else 1 << 20)
     return seconds, usage.ru_utime + usage.ru_stime, peak_mib
 

@@ -1,10 +1,10 @@
-"""The console with thousands of contacts: how fast lists are, how long from a frame to a page, how much memory.
+"""`python -m research.console_scale`: the console with thousands of contacts: time for lists and events, memory.
 
     python -m research.console_scale --contacts 5000
 
-Runs the real service on an in-process Zenoh router, fills it with simulated contacts, and plays a browser: asks for
-lists by HTTP, and follows the stream of events while new versions of pictures are published as the decompressor does.
-The time on the screen itself is not in it: that is measured by research/console_screen.py.
+Runs the service with an in-process Zenoh router and simulated contacts. A client requests lists by HTTP and follows the
+event stream while new versions of images are published, as the decompressor does.
+The time to draw the page is not included: `python -m research.console_screen` measures it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sonarpost.services.console.service import ConsoleService
 from sonarpost.services.console.training.contacts import simulated_contacts
 from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator
 
-PASSWORD = "a password for the bench"
+PASSWORD = "a password for the benchmark"
 LISTS = (
     "limit=100",
     "limit=500",
@@ -43,10 +43,10 @@ LISTS = (
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--contacts", type=int, default=5000)
-    parser.add_argument("--versions", type=int, default=200, help="new versions that are published, one after another")
+    parser.add_argument("--versions", type=int, default=200, help="number of new versions, published one after another")
     parsed = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="sonarpost-bench-") as folder:
         endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
@@ -55,15 +55,15 @@ def main() -> None:
 
 
 def measure(endpoint: str, folder: Path, contacts: int, versions: int) -> None:
-    """Run the service and play a browser."""
+    """Run the service and a client."""
     service = ConsoleService(PlatformConfig(id=VESSEL, router=(endpoint,), state_dir=folder), ConsoleConfig(port=0))
     assert service.start()
     try:
         service._users.add("bench", "operator", PASSWORD)  # noqa: SLF001
         empty_mb = resident_mb()
-        begun = time.perf_counter()
+        started_s = time.perf_counter()
         TrainingSimulator(service.state, contacts).load_backlog(contacts)
-        print(f"{contacts} contacts in {time.perf_counter() - begun:.0f} s")
+        print(f"{contacts} contacts in {time.perf_counter() - started_s:.0f} s")
         print(f"memory: {empty_mb:.0f} MB empty, {resident_mb():.0f} MB filled (codecs and simulation included)")
         browser = Browser(service.address)
         for query in LISTS:
@@ -77,7 +77,7 @@ def measure(endpoint: str, folder: Path, contacts: int, versions: int) -> None:
 
 
 class Browser:
-    """Somebody who is logged in."""
+    """A logged-in client."""
 
     def __init__(self, address: str) -> None:
         self._address = address
@@ -86,21 +86,21 @@ class Browser:
             self._headers = {"Cookie": answer.headers["set-cookie"].partition(";")[0]}
 
     def open(self, path: str) -> HTTPResponse:
-        """Ask for something."""
+        """Send a request."""
         request = urllib.request.Request(self._address + path, None, self._headers)
         found: HTTPResponse = urllib.request.urlopen(request, timeout=60)
         return found
 
     def timed(self, path: str) -> float:
-        """Return how long an answer takes, read to its end, in seconds."""
-        begun = time.perf_counter()
+        """Return the time of a complete response in seconds."""
+        started_s = time.perf_counter()
         with self.open(path) as answer:
             answer.read()
-        return time.perf_counter() - begun
+        return time.perf_counter() - started_s
 
 
 def latencies(endpoint: str, browser: Browser, versions: int) -> list[float]:
-    """Return the times from the publication of a picture to the line of its event in the stream, in seconds."""
+    """Return the times from the publication of an image to its event in the stream, in seconds."""
     arrived: dict[str, float] = {}
     changed = threading.Condition()
     stream = browser.open("events")
@@ -125,23 +125,23 @@ def latencies(endpoint: str, browser: Browser, versions: int) -> list[float]:
             record = simulated.record(VESSEL, 0, time.time(), time.time())
             image_id = f"Z{number:03d}"
             payload = wire.encode(record.model_copy(update={"image_id": image_id}))
-            begun = time.perf_counter()
+            started_s = time.perf_counter()
             session.put(keys.image_reconstructed(VESSEL), payload, encoding=wire.encoding_of(type(record)))
             with changed:
                 assert changed.wait_for(partial(arrived.__contains__, image_id), timeout=30), image_id
-            found.append(arrived[image_id] - begun)
+            found.append(arrived[image_id] - started_s)
     stream.close()
     return found
 
 
 def resident_mb() -> float:
-    """Return the memory of this process."""
+    """Return the resident memory of this process in MB."""
     [line] = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmRSS:")]
     return int(line.split()[1]) / 1024
 
 
 def show(name: str, times_s: list[float]) -> None:
-    """Print median and the slow end."""
+    """Print median, 95th percentile and maximum."""
     ordered = sorted(1e3 * at for at in times_s)
     slow_ms = ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))]
     print(f"{name}: p50 {statistics.median(ordered):.1f} ms, p95 {slow_ms:.1f} ms, most {ordered[-1]:.1f} ms")

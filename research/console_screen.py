@@ -1,10 +1,10 @@
-"""The console's page with thousands of contacts: until the list can be used, and from a frame's picture to the screen.
+"""`python -m research.console_screen`: time to draw the console's list and new images, with thousands of contacts.
 
     python -m research.console_screen --contacts 5000
 
-Runs the real service on an in-process Zenoh router, fills it with simulated contacts, opens the page in Debian's
-Chromium and measures there. Pictures are published as the decompressor does; what is counted ends with the animation
-frame after the change was drawn. Both clocks are this host's.
+Runs the service with an in-process Zenoh router and simulated contacts, and opens the page in Debian's Chromium. Images
+are published as the decompressor does. A time ends with the animation frame after the change is drawn. Both clocks are
+those of this host.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.training.contacts import simulated_contacts
 from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator
 
-# When the first row was drawn, in ms since the navigation began; and when a wanted change was, in ms since 1970.
+# Time of the first row, in ms since the start of the navigation; time of an awaited change, in ms since 1970.
 WATCH = """() => {
   window.firstRow_ms = null;
   const drawn = () => performance.timeOrigin + performance.now();
@@ -52,14 +52,14 @@ WATCH = """() => {
   });
 }"""
 ROW = "document.querySelector('.row[data-id*=\".' + argument + '\"]')"
-PICTURE = "document.querySelector('canvas').dataset.shows?.includes(argument)"
+IMAGE = "document.querySelector('canvas').dataset.shows?.includes(argument)"
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--contacts", type=int, default=5000)
-    parser.add_argument("--changes", type=int, default=50, help="new contacts, and new versions, one after another")
+    parser.add_argument("--changes", type=int, default=50, help="number of new contacts and of new versions")
     parsed = parser.parse_args()
     chromium = os.environ.get("SONARPOST_CHROMIUM") or shutil.which("chromium")
     if chromium is None:
@@ -72,7 +72,7 @@ def main() -> None:
         if not service.start():
             raise SystemExit("the service did not start")
         users = Users(Path(folder) / FILE_NAME)
-        users.add("bench", "operator", "a password for the bench")
+        users.add("bench", "operator", "a password for the benchmark")
         TrainingSimulator(service.state, parsed.contacts).load_backlog(parsed.contacts)
         arguments = ["--enable-precise-memory-info", *(["--no-sandbox"] if os.geteuid() == 0 else [])]
         browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
@@ -92,7 +92,7 @@ def main() -> None:
 
 
 def measure(page: Page, address: str, session: zenoh.Session, changes: int) -> None:
-    """Open the page ten times, then let contacts come and refine."""
+    """Open the page ten times, then publish new contacts and newer versions."""
     opened = []
     for _ in range(10):
         page.goto(address)
@@ -102,7 +102,7 @@ def measure(page: Page, address: str, session: zenoh.Session, changes: int) -> N
     page.wait_for_function("() => document.getElementById('live')?.textContent === 'live'")
     simulated = next(simulated_contacts(7, time.time()))
     first = simulated.record(VESSEL, 0, time.time(), time.time())
-    rows, pictures = [], []
+    rows, images = [], []
     for number in range(changes):
         image_id = f"Z{number:03d}"
         record = first.model_copy(update={"image_id": image_id, "first_frame_utc_s": time.time()})
@@ -112,9 +112,9 @@ def measure(page: Page, address: str, session: zenoh.Session, changes: int) -> N
     page.wait_for_function("id => document.querySelector('canvas').dataset.shows?.includes(id)", arg=image_id)
     for version in range(2, changes + 2):
         newer = record.model_copy(update={"version": version, "last_frame_utc_s": time.time()})
-        pictures.append(published_to(page, session, newer, PICTURE, f" {version} raw"))
-    show("picture of a new contact published to its row drawn", rows)
-    show("newer picture of the shown contact published to it drawn", pictures)
+        images.append(published_to(page, session, newer, IMAGE, f" {version} raw"))
+    show("publish the image of a new contact until its row is drawn", rows)
+    show("publish a newer image of the shown contact until it is drawn", images)
     page.evaluate("""async () => {
       const list = document.getElementById('queue');
       for (let at = 0; at < list.scrollHeight; at += 20000) {
@@ -131,16 +131,16 @@ def measure(page: Page, address: str, session: zenoh.Session, changes: int) -> N
 
 
 def published_to(page: Page, session: zenoh.Session, record: ReconstructedImage, test: str, argument: str) -> float:
-    """Publish a picture; return after how many ms its change was on the screen."""
+    """Publish an image; return the time in ms until its change is drawn."""
     payload = wire.encode(record)
     handle = page.evaluate_handle("([test, argument]) => ({drawn: window.whenDrawn(test, argument)})", [test, argument])
-    begun = time.time()
+    started_s = time.time()
     session.put(keys.image_reconstructed(VESSEL), payload, encoding=wire.encoding_of(ReconstructedImage))
-    return float(handle.evaluate("one => one.drawn")) - 1000 * begun
+    return float(handle.evaluate("one => one.drawn")) - 1000 * started_s
 
 
 def show(name: str, times_ms: list[float]) -> None:
-    """Print median and the slow end."""
+    """Print median, 95th percentile and maximum."""
     ordered = sorted(times_ms)
     slow_ms = ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))]
     print(f"{name}: p50 {statistics.median(ordered):.0f} ms, p95 {slow_ms:.0f} ms, most {ordered[-1]:.0f} ms")

@@ -1,8 +1,13 @@
-"""The recipe of the codebooks shipped with the package.
+"""`python -m research.default_codebooks`: builds the shipped codebooks; the same input gives the same bytes.
 
-A codebook holds pieces of the images it was built from, so what goes in must be free to pass on: the project's own
-survey simulator, and the public-domain Humminbird recording that comes with the source distribution of PyHum 1.4.6 (US
-Geological Survey). Nothing else. The simulated lines are made by the command `python -m research.default_codebooks`.
+A codebook contains parts of the images it was built from, so its sources must be free to redistribute: the survey
+simulator of the project, and the public-domain Humminbird recording of the PyHum 1.4.6 source distribution (US
+Geological Survey).
+
+Layout of a Humminbird channel, checked ping by ping in that recording: `B002.IDX` contains (time, offset) pairs, u32
+big endian, one a ping. At each offset of `B002.SON` a header of 67 bytes begins with C0 DE AB 21 and ends with the tag
+A0, the number of samples (u32, big endian) and the byte 21. The samples follow, one byte each, nearest first. B002 is
+port, B003 is starboard.
 """
 
 from __future__ import annotations
@@ -36,14 +41,14 @@ SOURCES = (
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a shipped codebook is made from training images.
+    """Parameters of a shipped codebook.
 
     Attributes:
         tile_px: Side of a tile.
         max_tiles: Size of the codebook.
-        rounds: Table IV's passes: first poorly rebuilt images and their most unusual tiles (targets, shadows, edges),
-            then what comes until the codebook is full.
-        passes: Passes of `refine` afterwards.
+        rounds: Rounds of Table IV: first poorly coded images and their most unusual tiles (targets, shadows, edges),
+            then further tiles until the codebook is full.
+        passes: Passes of refinement afterwards.
     """
 
     tile_px: int
@@ -53,9 +58,9 @@ class Recipe:
 
 
 def _rounds(tile_px: int) -> tuple[Round, ...]:
-    # The first round takes the unusual from everywhere (highlights, shadows, edges). An image of speckle is never
-    # rebuilt with a figure of merit of 100, so the second takes in order what comes until the codebook is full:
-    # measured, thresholds in between spend the places on rare grains and rebuild ordinary bottom worse.
+    # The first round adds unusual tiles of all images (highlights, shadows, edges). A figure of merit of 100 is never
+    # reached for speckle, so the second round adds tiles in order until the codebook is full. Thresholds in between
+    # were measured: they add rare speckle and code ordinary seabed worse.
     return (Round(39.0, rms_distance(56.0, tile_px), 500), Round(100.0, rms_distance(6.0, tile_px)))
 
 
@@ -63,7 +68,7 @@ RECIPES = (Recipe(10, 15_992, _rounds(10), 2), Recipe(20, 15_992, _rounds(20), 2
 
 
 def humminbird_images(folder: Path) -> list[TrainingImage]:
-    """Cut the recording into training images (see `humminbird_lines` for the folder and the errors)."""
+    """Cut the recording into training images; folder and errors as for `humminbird_lines`."""
     plan = PatchPlan(copies=2)
     return [image for name, line in humminbird_lines(folder).items() for image in cut_line(name, line, plan)]
 
@@ -73,7 +78,7 @@ def build_nominal(
     images: Sequence[TrainingImage],
     progress: ProgressCallback | None = None,
 ) -> Codebook:
-    """Build one of the shipped codebooks; the same images, in any order, give the same bytes."""
+    """Build one of the shipped codebooks; the same images in any order give the same bytes."""
     images = shuffled(images)
     tiles = build(
         images, recipe.tile_px, recipe.rounds, max_tiles=recipe.max_tiles, passes=recipe.passes, progress=progress
@@ -100,18 +105,18 @@ _MAX_SAMPLES = 1 << 16
 
 
 def humminbird_lines(folder: Path) -> dict[str, SonarLine]:
-    """Read both channels, from the recording itself or from images made of it.
+    """Read both channels, from the recording or from images of it.
 
     Args:
-        folder: Holds, directly or in one of its folders, `B002.SON` and `B002.IDX`, or else one grey PNG with `B002`
-            in its name (row = ping, column = sample); the same for `B003`.
+        folder: Contains, directly or in a subfolder, `B002.SON` and `B002.IDX`, or one grey PNG with `B002` in its
+            name (row = ping, column = sample); the same for `B003`.
 
     Returns:
         Name to line, shape (pings, samples), float32; NaN beyond the end of a ping. The recording and an image of it
         give the same lines.
 
     Raises:
-        CodebookError: A channel is not there, or the recording is damaged.
+        CodebookError: A channel is missing, or the recording is damaged.
         SurveyFileError: An image cannot be read.
     """
     return {f"humminbird {channel}": _without_padding(_channel(folder, channel)) for channel in CHANNELS}
@@ -121,13 +126,13 @@ def read_channel(son: Path) -> npt.NDArray[np.uint8]:
     """Read one channel of a recording.
 
     Args:
-        son: The `.SON` file; its `.IDX` file lies beside it.
+        son: The `.SON` file, with its `.IDX` file beside it.
 
     Returns:
         Shape (pings, samples of the longest), uint8, zeros after the end of a shorter ping.
 
     Raises:
-        CodebookError: A file cannot be read or is damaged; the message names the ping.
+        CodebookError: A file cannot be read or is damaged; the message contains the number of the ping.
     """
     data, index = _read(son), _read(son.with_suffix(".IDX"))
     if len(index) % 8 or not index:
@@ -159,8 +164,8 @@ def _channel(folder: Path, channel: str) -> npt.NDArray[np.generic]:
         return read_channel(recordings[0])
     images = sorted(folder.glob(f"*{channel}*.png"))
     if recordings or len(images) != 1:
-        met = [path.name for path in (*recordings, *images)]
-        raise CodebookError(str(folder), channel, met, f"one {channel}.SON, or one PNG with {channel} in its name")
+        found = [path.name for path in (*recordings, *images)]
+        raise CodebookError(str(folder), channel, found, f"one {channel}.SON, or one PNG with {channel} in its name")
     return read_image(images[0])
 
 
@@ -178,7 +183,7 @@ def _read(path: Path) -> bytes:
         raise CodebookError(str(path), "", error.strerror or str(error), "a file of the recording") from error
 
 
-# A simulated ping is 10 cm of track and a sample 3 cm of range: averaging three samples makes pixels square.
+# Simulated pings are 10 cm apart and samples 3 cm: the mean of three samples gives square pixels.
 SIMULATED_REDUCTIONS = ((1, 1), (1, 2), (1, 3), (2, 3), (2, 6), (1, 4), (3, 6))
 SIMULATED_SURVEYS = tuple(
     SurveySpec(seed=7000 + 10 * number + copy, seabed=kind, targets=12, clutter=12)
@@ -189,24 +194,20 @@ SIMULATED_SURVEYS = tuple(
 
 def new_parser() -> argparse.ArgumentParser:
     """Return the parser of this command."""
-    parser = command_parser("default_codebooks", "rebuild the shipped codebooks: same input, same bytes")
+    parser = command_parser("default_codebooks", "Build the shipped codebooks; the same input gives the same bytes.")
     parser.add_argument(
-        "--humminbird", type=Path, required=True, metavar="DIR", help="folder with the PyHum recording's channels"
+        "--humminbird", type=Path, required=True, metavar="DIR", help="folder with the channels of the PyHum recording"
     )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the codebooks, made where absent"
-    )
-    parser.add_argument(
-        "--refine", type=int, metavar="N", help="passes of refinement, other than the recipe's 2; 0: Table IV alone"
-    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder, created if missing")
+    parser.add_argument("--refine", type=int, metavar="N", help="passes of refinement (default: 2); 0: Table IV alone")
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
-    """Rebuild the shipped codebooks; return 0.
+    """Build the shipped codebooks; return 0.
 
     Raises:
-        SonarpostError: The recording cannot be read or a codebook not be written.
+        SonarpostError: The recording cannot be read, or a codebook cannot be written.
     """
     if args.refine is not None and args.refine < 0:
         raise ConfigError("--refine", "", args.refine, "zero or more passes")
@@ -224,7 +225,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def simulated_images(console: Console) -> Iterator[TrainingImage]:
-    """Yield windows of simulated lines over every kind of bottom, and of the objects that lie there."""
+    """Yield windows of simulated lines over every kind of seabed, and windows of their objects."""
     bottom = PatchPlan(reductions=SIMULATED_REDUCTIONS, per_reduction=16, least_std=4.0)
     objects = PatchPlan(reductions=SIMULATED_REDUCTIONS[:5], copies=2)
     for spec in SIMULATED_SURVEYS:

@@ -1,22 +1,17 @@
-"""A fleet on one host: many vehicles over a few vessels into one shore, for minutes.
+"""`python -m research.fleet`: many vehicles over several vessels into one shore site, on one host.
 
     python -m research.fleet [--vehicles 100] [--vessels 4] [--seconds 600] [--every 10] [--grow 10,30] [--dir DIR]
 
-Real, each a process of its own with its own store: a router and a relay for each vessel, the shore's router, and c2,
-which writes every picture's files. Simulated: the vehicles, the water and the decompressor. One load process a vessel
-stands in for these: it owes a reconstructed picture of 100 x 300 px to the relay through a durable outbox of its own,
-for each of its vehicles once every `--every` seconds at a random phase. (By sound, a picture of the paper takes two
-packets and more than that.) All run on this host, so there is one clock: a picture's latency is from the moment it is
-owed, before it is on the disk of the load process, until a plain subscriber ashore has it from c2, after c2 has written
-its files.
+Real processes, each with its own store: a router and a relay for each vessel, the router of the shore site, and c2,
+which writes the files of every image. Vehicles, acoustic channel and decompressor are replaced by one load process a
+vessel: it queues a reconstructed image of 100 x 300 px for the relay in its durable outbox, for each of its vehicles
+once every `--every` seconds at a random phase. All processes run on this host and share one clock. The latency of an
+image is the time from queueing it, before it is written to disk, until a subscriber at the shore site receives it from
+c2, after c2 has written its files.
 
-One JSON object a run, with the host's load average during it (mean of samples of the one-minute average) and how much
-of the host's CPU was in use by all that ran on it, and by the bench's own processes. The exit status is 0 where every
-picture is ashore once, with the right sha256.
-
-
-## research.fleet
-Pictures for the benches: noise, so that nothing on the way can make them smaller, and none twice.
+Each run prints one JSON object, including the load average of the host (mean of samples of the one-minute average) and
+the CPU usage of all processes of the host and of this benchmark. The exit status is 0 if every image arrived once at
+the shore site with the correct sha256.
 """
 
 from __future__ import annotations
@@ -50,43 +45,72 @@ from sonarpost.messages import Pixels, ReconstructedImage, Record
 from sonarpost.parent_process import EXIT_WITH_PARENT
 from sonarpost.runtime.service import Service, UnitOfWork
 
-SETTLE_S = 120.0
+DRAIN_TIMEOUT_S = 120.0
 SAMPLE_S = 5.0
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+SHAPE = (100, 300)
+"""Height and width in pixels: 30 kB."""
 
 
 class Load(Service[ServiceConfig]):
-    """Vehicles, water and decompressor of one vessel: an outbox that owes pictures."""
+    """Load of one vessel: an outbox with reconstructed images."""
 
     NAME = "load"
     PUBLISH = False
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """It takes nothing."""
+        """No records are consumed."""
         raise NotImplementedError
 
 
-def picture(vessel: str, vehicle: int, number: int, now_utc_s: float) -> ReconstructedImage:
-    """Return a picture of noise, 30 kB, that no other number has."""
-    return noise_picture(vessel, f"uuv-{vehicle}", f"{number:04X}", [vehicle, number], now_utc_s)
+def noise_image(
+    vessel_id: str, vehicle_id: str, image_id: str, seed: int | Sequence[int], first_frame_utc_s: float
+) -> ReconstructedImage:
+    """Return a completely received image of noise, which is not compressible; the same seed gives the same pixels."""
+    pixels = Pixels.from_array(np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8))
+    return ReconstructedImage(
+        vessel_id=vessel_id,
+        vehicle_id=vehicle_id,
+        image_id=image_id,
+        version=1,
+        contact=None,
+        codec="vq",
+        model="",
+        picture=pixels,
+        picture_sha256=pixels.sha256,
+        complete=True,
+        missing_fraction=0.0,
+        missing_mask=b"",
+        missing_halves=(),
+        bytes_received=232,
+        bytes_total=232,
+        frames_received=6,
+        first_frame_utc_s=first_frame_utc_s,
+        last_frame_utc_s=first_frame_utc_s,
+    )
+
+
+def new_image(vessel: str, vehicle: int, number: int, now_utc_s: float) -> ReconstructedImage:
+    """Return an image of noise, 30 kB, different for every vehicle and number."""
+    return noise_image(vessel, f"uuv-{vehicle}", f"{number:04X}", [vehicle, number], now_utc_s)
 
 
 def run_load(endpoint: str, folder: Path, vessel: str, vehicles: Sequence[int], seconds: float, every_s: float) -> None:
-    """Owe pictures for a time, then wait until the relay has them; print how many there were."""
+    """Queue images for a time, then wait until the relay has accepted them; print their number."""
     platform = PlatformConfig(id=vessel, router=(endpoint,), state_dir=folder / vessel, health_interval_s=60.0)
     load = Load(platform, ServiceConfig())
     load.start()
     rng = random.Random(vehicles[0])
-    began_s = time.monotonic()
+    started_s = time.monotonic()
     due = sorted((rng.uniform(0, every_s) + n * every_s, v, n) for v in vehicles for n in range(int(seconds / every_s)))
     for at_s, vehicle, number in due:
-        load.stopping.wait(max(0.0, began_s + at_s - time.monotonic()))
+        load.stopping.wait(max(0.0, started_s + at_s - time.monotonic()))
         effects = UnitOfWork()
         effects.send(
-            keys.image_reconstructed(vessel), "relay", picture(vessel, vehicle, number, time.time()), priority=5
+            keys.image_reconstructed(vessel), "relay", new_image(vessel, vehicle, number, time.time()), priority=5
         )
         load.commit(effects)
-    ends_s = time.monotonic() + SETTLE_S
+    ends_s = time.monotonic() + DRAIN_TIMEOUT_S
     while load.store.outbox_depth() and time.monotonic() < ends_s:
         load.stopping.wait(0.1)
     print(len(due), flush=True)
@@ -94,11 +118,14 @@ def run_load(endpoint: str, folder: Path, vessel: str, vehicles: Sequence[int], 
 
 
 @dataclass
-class Seen:
-    """What a plain subscriber ashore has seen.
+class ReceivedImages:
+    """Images received by a subscriber at the shore site.
 
     Attributes:
-        latency_s: By picture, of the first time it was shown.
+        latency_s: Latency of the first reception, by image.
+        wrong: Number of images with a wrong sha256.
+        again: Number of repeated images.
+        lock: Protects the other attributes.
     """
 
     latency_s: dict[tuple[str, str, float], float] = field(default_factory=dict)
@@ -106,10 +133,10 @@ class Seen:
     again: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def take(self, sample: zenoh.Sample) -> None:
-        """Note a picture."""
+    def receive(self, sample: zenoh.Sample) -> None:
+        """Record an image."""
         now_utc_s = time.time()
-        image = msgpack.unpackb(sample.payload.to_bytes())  # no more than that: this process has the services' cores
+        image = msgpack.unpackb(sample.payload.to_bytes())  # not validated: this process shares cores with c2
         name = (image["vehicle_id"], image["image_id"], image["first_frame_utc_s"])
         with self.lock:
             if hashlib.sha256(image["picture"]["data"]).hexdigest() != image["picture_sha256"]:
@@ -121,7 +148,7 @@ class Seen:
 
 
 class HostLoad:
-    """How busy the whole host is: samples of its load average, and its CPU time."""
+    """Load of the whole host: samples of its load average, and its CPU time."""
 
     def __init__(self) -> None:
         self._samples: list[float] = []
@@ -144,10 +171,10 @@ class HostLoad:
             self._stop.wait(SAMPLE_S)
 
     def stop(self, services_s: float) -> dict[str, float]:
-        """Return load average (mean, highest) and CPU in use (percent of all cores) since the beginning.
+        """Return load average (mean, maximum) and CPU usage (percent of all cores) since the start.
 
         Args:
-            services_s: CPU time the services have used; this process and those of the load are added.
+            services_s: CPU time of the services; this process and the load processes are added.
         """
         self._stop.set()
         self._thread.join()
@@ -162,14 +189,14 @@ class HostLoad:
 
 
 class Processes:
-    """The processes of one run, and what they have used."""
+    """The processes of one run, with their CPU time and memory."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self.running: dict[str, subprocess.Popen[str]] = {}
 
     def start(self, name: str, *command: str) -> None:
-        """Start a process of this interpreter; what it logs goes to a file."""
+        """Start a process of this interpreter with a log file."""
         environment = {**os.environ, EXIT_WITH_PARENT: str(os.getpid()), "OMP_NUM_THREADS": "1"}
         with (self._folder / f"{name}.log").open("ab") as log:
             self.running[name] = subprocess.Popen(
@@ -177,19 +204,19 @@ class Processes:
             )
 
     def cpu_s(self, name: str) -> float:
-        """Return the CPU time a process has used, user's and system's."""
+        """Return user and system CPU time of a process."""
         stat = Path(f"/proc/{self.running[name].pid}/stat").read_text()
         fields = stat.rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
 
     def rss_mb(self, name: str) -> float:
-        """Return the memory a process has in use, MB."""
+        """Return the resident memory of a process, MB."""
         status = Path(f"/proc/{self.running[name].pid}/status").read_text()
         [line] = [text for text in status.splitlines() if text.startswith("VmRSS")]
         return int(line.split()[1]) / 1024
 
     def stop(self) -> None:
-        """Stop all."""
+        """Stop all processes."""
         for process in reversed(self.running.values()):
             if process.poll() is None:
                 process.send_signal(signal.SIGTERM)
@@ -203,7 +230,7 @@ class Processes:
 
 @contextmanager
 def fleet(folder: Path, vessels: Sequence[str]) -> Iterator[tuple[Processes, dict[str, str], str]]:
-    """Routers, relays and c2; gives the processes, each vessel's endpoint and the shore's."""
+    """Start routers, relays and c2; yield the processes, the endpoint of each vessel, and that of the shore site."""
     ports = free_ports(len(vessels) + 1)
     shore = f"tcp/127.0.0.1:{ports[0]}"
     endpoints = {vessel: f"tcp/127.0.0.1:{port}" for vessel, port in zip(vessels, ports[1:], strict=True)}
@@ -228,7 +255,7 @@ def fleet(folder: Path, vessels: Sequence[str]) -> Iterator[tuple[Processes, dic
 
 
 def open_session(endpoint: str) -> zenoh.Session:
-    """Return a client's session with a router that may still be starting."""
+    """Return a client session; the router may still be starting."""
     deadline = time.monotonic() + 30
     while True:
         try:
@@ -240,13 +267,13 @@ def open_session(endpoint: str) -> zenoh.Session:
 
 
 def wait_until_ready(session: zenoh.Session, vessels: Sequence[str]) -> None:
-    """Wait until c2 and every relay are there, seen from the shore."""
-    wanted = {keys.alive("shore-1", "c2"), *(keys.alive(vessel, "relay") for vessel in vessels)}
+    """Wait until the shore site reaches c2 and every relay."""
+    expected = {keys.alive("shore-1", "c2"), *(keys.alive(vessel, "relay") for vessel in vessels)}
     deadline = time.monotonic() + 60
     alive: set[str] = set()
-    while not wanted <= alive:
+    while not expected <= alive:
         if time.monotonic() > deadline:
-            sys.exit(f"fleet: not started: {sorted(wanted - alive)}")
+            sys.exit(f"fleet: not started: {sorted(expected - alive)}")
         time.sleep(0.2)
         replies = session.liveliness().get(keys.alive_everywhere(), timeout=2.0)
         alive = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
@@ -255,37 +282,40 @@ def wait_until_ready(session: zenoh.Session, vessels: Sequence[str]) -> None:
 def run(folder: Path, vehicles: int, vessels: int, seconds: float, every_s: float) -> dict[str, object]:
     """Run once; return the figures."""
     names = [f"vessel-{n + 1}" for n in range(vessels)]
-    seen = Seen()
+    received = ReceivedImages()
     with fleet(folder, names) as (processes, endpoints, shore):
         session = open_session(shore)
-        session.declare_subscriber(keys.shore_contact_all(), seen.take)
+        session.declare_subscriber(keys.shore_contact_all(), received.receive)
         wait_until_ready(session, names)
         services = tuple(processes.running)
         before = {name: processes.cpu_s(name) for name in services}
         host = HostLoad()
-        began_s = time.monotonic()
+        started_s = time.monotonic()
         for n, name in enumerate(names):
-            mine = ",".join(str(v) for v in range(n, vehicles, vessels))
-            options = (endpoints[name], str(folder / "load"), name, mine, str(seconds), str(every_s))
+            own_vehicles = ",".join(str(v) for v in range(n, vehicles, vessels))
+            options = (endpoints[name], str(folder / "load"), name, own_vehicles, str(seconds), str(every_s))
             processes.start(f"load-{name}", "-m", "research.fleet", "--load", *options)
-        owed = 0
+        queued = 0
         for name in names:
-            output, _ = processes.running[f"load-{name}"].communicate(timeout=seconds + SETTLE_S + 60)
-            owed += int(output)
-        deadline = time.monotonic() + SETTLE_S
-        # A plain subscriber may miss some under load; the files are what counts.
-        while rows_ashore(folder / "out") < owed and time.monotonic() < deadline:
+            output, _ = processes.running[f"load-{name}"].communicate(timeout=seconds + DRAIN_TIMEOUT_S + 60)
+            queued += int(output)
+        deadline = time.monotonic() + DRAIN_TIMEOUT_S
+        # The subscriber may miss images under load; the index of c2 is authoritative.
+        while images_at_shore(folder / "out") < queued and time.monotonic() < deadline:
             time.sleep(0.1)
-        took_s = time.monotonic() - began_s
+        duration_s = time.monotonic() - started_s
         used = {name: processes.cpu_s(name) - before[name] for name in services}
         host_load = host.stop(sum(used.values()))
         memory = {name: processes.rss_mb(name) for name in services}
         session.close()
-    return {**figures(vehicles, vessels, owed, took_s, seen, rows_ashore(folder / "out"), used, memory), **host_load}
+    return {
+        **figures(vehicles, vessels, queued, duration_s, received, images_at_shore(folder / "out"), used, memory),
+        **host_load,
+    }
 
 
-def rows_ashore(out_dir: Path) -> int:
-    """Return how many pictures c2 has in its index, each once."""
+def images_at_shore(out_dir: Path) -> int:
+    """Return the number of images in the index of c2."""
     index = ShoreIndex(out_dir, writable=False)
     try:
         return len(index.images())
@@ -296,15 +326,15 @@ def rows_ashore(out_dir: Path) -> int:
 def figures(
     vehicles: int,
     vessels: int,
-    owed: int,
-    took_s: float,
-    seen: Seen,
+    queued: int,
+    duration_s: float,
+    received: ReceivedImages,
     rows: int,
     used: dict[str, float],
     memory: dict[str, float],
 ) -> dict[str, object]:
-    """Return what a run has shown; processes of one kind are given by their largest."""
-    latency_ms = 1000 * np.array(sorted(seen.latency_s.values()) or [float("nan")])
+    """Return the figures of a run; for processes of one kind the largest value."""
+    latency_ms = 1000 * np.array(sorted(received.latency_s.values()) or [float("nan")])
     kinds = {
         "c2": ("c2",),
         "relay": ("relay-",),
@@ -315,78 +345,47 @@ def figures(
     return {
         "vehicles": vehicles,
         "vessels": vessels,
-        "images": owed,
+        "images": queued,
         "ashore": rows,
-        "shown": len(seen.latency_s),
-        "shown_again": seen.again,
-        "sha256_wrong": seen.wrong,
-        "seconds": round(took_s, 1),
-        "images_per_s": round(owed / took_s, 2),
+        "shown": len(received.latency_s),
+        "shown_again": received.again,
+        "sha256_wrong": received.wrong,
+        "seconds": round(duration_s, 1),
+        "images_per_s": round(queued / duration_s, 2),
         "latency_p50_ms": round(float(np.percentile(latency_ms, 50)), 1),
         "latency_p99_ms": round(float(np.percentile(latency_ms, 99)), 1),
         "latency_max_ms": round(float(latency_ms[-1]), 1),
-        "cpu_percent": {k: round(100 * max(used[n] for n in ns) / took_s, 1) for k, ns in by_kind.items()},
-        "cpu_ms_per_image": {k: round(1000 * sum(used[n] for n in ns) / owed, 2) for k, ns in by_kind.items()},
+        "cpu_percent": {k: round(100 * max(used[n] for n in ns) / duration_s, 1) for k, ns in by_kind.items()},
+        "cpu_ms_per_image": {k: round(1000 * sum(used[n] for n in ns) / queued, 2) for k, ns in by_kind.items()},
         "rss_mb": {k: round(max(memory[n] for n in ns)) for k, ns in by_kind.items()},
-        "good": rows == owed and not seen.wrong and not seen.again,
+        "good": rows == queued and not received.wrong and not received.again,
     }
 
 
 def main() -> int:
-    """Run; return 1 if a picture is missing or wrong."""
-    parser = argparse.ArgumentParser(description="many vehicles over a few vessels into one shore")
+    """Run; return 1 if an image is missing or wrong."""
+    parser = argparse.ArgumentParser(description="many vehicles over several vessels into one shore site")
     parser.add_argument("--vehicles", type=int, default=100, metavar="N", help="default: 100")
     parser.add_argument("--vessels", type=int, default=4, metavar="N", help="default: 4")
-    parser.add_argument("--seconds", type=float, default=600.0, metavar="S", help="of each run; default: 600")
-    parser.add_argument("--every", type=float, default=10.0, metavar="S", help="a picture a vehicle; default: 10 s")
-    parser.add_argument("--grow", metavar="N,N", help="several runs, with these numbers of vehicles")
-    parser.add_argument("--dir", type=Path, metavar="DIR", help="where stores and files are (default: temporary)")
+    parser.add_argument("--seconds", type=float, default=600.0, metavar="S", help="duration of each run; default: 600")
+    parser.add_argument("--every", type=float, default=10.0, metavar="S", help="interval of a vehicle; default: 10 s")
+    parser.add_argument("--grow", metavar="N,N", help="several runs with these numbers of vehicles")
+    parser.add_argument("--dir", type=Path, metavar="DIR", help="folder for stores and files (default: temporary)")
     parser.add_argument("--load", nargs=6, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.load:
         endpoint, folder, vessel, vehicles, seconds, every = args.load
-        mine = [int(v) for v in vehicles.split(",")]
-        run_load(endpoint, Path(folder), vessel, mine, float(seconds), float(every))
+        own_vehicles = [int(v) for v in vehicles.split(",")]
+        run_load(endpoint, Path(folder), vessel, own_vehicles, float(seconds), float(every))
         return 0
-    good = True
+    passed = True
     for count in [int(n) for n in args.grow.split(",")] if args.grow else [args.vehicles]:
         with tempfile.TemporaryDirectory(dir=args.dir) as name:
             result = run(Path(name), count, args.vessels, args.seconds, args.every)
         print(json.dumps(result), flush=True)
-        good = good and bool(result["good"])
-    return 0 if good else 1
+        passed = passed and bool(result["good"])
+    return 0 if passed else 1
 
 
 if __name__ == "__main__":
     sys.exit(main())
-
-
-SHAPE = (100, 300)
-"""Height and width in pixels: 30 kB."""
-
-
-def noise_picture(
-    vessel_id: str, vehicle_id: str, image_id: str, seed: int | Sequence[int], first_frame_utc_s: float
-) -> ReconstructedImage:
-    """Return a picture that has arrived whole; the same seed gives the same pixels."""
-    raster = Pixels.from_array(np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8))
-    return ReconstructedImage(
-        vessel_id=vessel_id,
-        vehicle_id=vehicle_id,
-        image_id=image_id,
-        version=1,
-        contact=None,
-        codec="vq",
-        model="",
-        picture=raster,
-        picture_sha256=raster.sha256,
-        complete=True,
-        missing_fraction=0.0,
-        missing_mask=b"",
-        missing_halves=(),
-        bytes_received=232,
-        bytes_total=232,
-        frames_received=6,
-        first_frame_utc_s=first_frame_utc_s,
-        last_frame_utc_s=first_frame_utc_s,
-    )

@@ -1,7 +1,7 @@
-"""A day of several vehicles and one vessel in one water, on simulated time: queues, slots, losses, reports, restarts.
+"""`python -m research.mission`: a day of traffic of several vehicles to one vessel, on simulated time.
 
-Everything but the modems and the processes is the real thing: each vehicle's `TransmitQueue`, medium access by slots,
-the vessel's v1 receiver. Frames are lost in bursts by a chain of two states.
+Each vehicle has its `TransmitQueue` with TDMA, the vessel has its v1 receiver; modems and processes are not simulated.
+Frames are lost in bursts (Gilbert-Elliott), feedback is sent in the vessel's slot, and vehicles restart.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ _SLOT_S: Final = 7.5
 _GUARD_S: Final = 1.0
 _RATE: Final = 1
 _HOUR_S: Final = 3600.0
-_REPORTS_A_SLOT: Final = 2
-_KEPT: Final = 16
-"""Pictures a vehicle remembers: few, so that a day shows whether memory is bounded."""
+_FEEDBACK_PER_SLOT: Final = 2
+_KEPT_IMAGES: Final = 16
+"""Images kept by a vehicle: few, so that a day shows whether memory is bounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +42,11 @@ class Traffic:
     """Messages of one program.
 
     Attributes:
-        source: The program.
+        source: Name of the program.
         every_s: Mean time between messages, exponentially distributed.
-        size_bytes: Of each.
+        size_bytes: Size of a message.
         priority: See `TransmitQueue.add_message`.
-        lifetime_s: See there.
+        lifetime_s: See `TransmitQueue.add_message`.
     """
 
     source: str
@@ -56,7 +56,7 @@ class Traffic:
     lifetime_s: float
 
 
-USUAL: Final = (
+DEFAULT_TRAFFIC: Final = (
     Traffic("alarm", 7200.0, 8, 1, 1800.0),
     Traffic("status", 600.0, 24, 4, 1800.0),
     Traffic("log", 1800.0, 50, 7, 21600.0),
@@ -65,18 +65,18 @@ USUAL: Final = (
 
 @dataclass(frozen=True, slots=True)
 class MissionSpec:
-    """A mission.
+    """Parameters of a mission.
 
     Attributes:
-        vehicles: How many, 1..16.
-        hours: How long.
-        loss: Share of frames lost, both ways.
+        vehicles: Number of vehicles, 1..16.
+        hours: Duration.
+        loss: Share of frames lost in both directions.
         burst_frames: Mean length of a run of lost frames.
         contact_every_s: Mean time between contacts of a vehicle.
-        stream_bytes: Of a picture.
-        deaf_hours: How long from the beginning the vehicles hear nothing of the vessel.
-        traffic: Other messages of every vehicle.
-        seed: Of everything drawn.
+        stream_bytes: Length of an image's stream.
+        no_downlink_hours: Time from the start in which the vehicles receive nothing from the vessel.
+        traffic: Messages of every vehicle.
+        seed: Seed of all random draws.
 
     Raises:
         ConfigError: A value out of range.
@@ -88,8 +88,8 @@ class MissionSpec:
     burst_frames: float = 2.0
     contact_every_s: float = 1800.0
     stream_bytes: int = 300
-    deaf_hours: float = 0.0
-    traffic: tuple[Traffic, ...] = USUAL
+    no_downlink_hours: float = 0.0
+    traffic: tuple[Traffic, ...] = DEFAULT_TRAFFIC
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -98,7 +98,7 @@ class MissionSpec:
             ("hours", 0.1, 240),
             ("loss", 0.0, 0.9),
             ("burst_frames", 1, 100),
-            ("deaf_hours", 0, 240),
+            ("no_downlink_hours", 0, 240),
         ):
             value = getattr(self, name)
             if not low <= value <= high:
@@ -106,12 +106,12 @@ class MissionSpec:
 
 
 @dataclass(slots=True)
-class Account:
-    """What became of one kind of traffic.
+class TrafficResult:
+    """Result of one kind of traffic.
 
     Attributes:
-        offered: How many there were.
-        delays_s: Of those that arrived, from being offered to arriving.
+        offered: Number of messages or images offered.
+        delays_s: Delays of those that arrived.
     """
 
     offered: int = 0
@@ -119,29 +119,29 @@ class Account:
 
     @property
     def delivered(self) -> float:
-        """Share that arrived, 1 where there were none."""
+        """Share that arrived; 1 if none was offered."""
         return len(self.delays_s) / self.offered if self.offered else 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class MissionResult:
-    """What became of everything.
+    """Result of a mission.
 
     Attributes:
-        messages: By program.
-        previews: Contacts of which at least record and coarse picture arrived.
-        pictures: Those of which all that the vehicle had arrived.
-        unfinished_at: When those that are not whole were offered, hours of the mission.
-        left: Pictures and messages still waiting at the end.
-        expired: Messages dropped because their time was over.
-        frames_sent: By the vehicles.
-        state_bytes: Of all queues and the receiver together, every hour.
-        restarts: How often a vehicle's queue was saved and taken up by another.
+        messages: Results by program.
+        previews: Contacts of which at least the record and a coarse image arrived.
+        images: Images that arrived completely.
+        unfinished_at: Offer times of incomplete images, in hours of the mission.
+        left: Images and messages still queued at the end.
+        expired: Messages deleted after their lifetime.
+        frames_sent: Frames sent by the vehicles.
+        state_bytes: State of all queues and the receiver, every hour.
+        restarts: Number of restarts of a vehicle.
     """
 
-    messages: Mapping[str, Account]
-    previews: Account
-    pictures: Account
+    messages: Mapping[str, TrafficResult]
+    previews: TrafficResult
+    images: TrafficResult
     unfinished_at: Sequence[float]
     left: int
     expired: int
@@ -150,20 +150,20 @@ class MissionResult:
     restarts: int
 
 
-class _Water:
-    """Loses frames in bursts, each path by itself."""
+class _LossyChannel:
+    """Frame losses in bursts (Gilbert-Elliott), independent for each path."""
 
     def __init__(self, loss: float, burst_frames: float, rng: np.random.Generator) -> None:
         self._end = 1.0 / burst_frames
         self._begin = min(1.0, self._end * loss / (1.0 - loss))
-        self._bad: dict[int, bool] = {}
+        self._in_burst: dict[int, bool] = {}
         self._rng = rng
 
     def loses(self, path: int) -> bool:
-        bad = self._bad.get(path, False)
-        chance = 1.0 - self._end if bad else self._begin
-        self._bad[path] = bool(self._rng.random() < chance)
-        return self._bad[path]
+        in_burst = self._in_burst.get(path, False)
+        probability = 1.0 - self._end if in_burst else self._begin
+        self._in_burst[path] = bool(self._rng.random() < probability)
+        return self._in_burst[path]
 
 
 class _Vehicle:
@@ -172,48 +172,48 @@ class _Vehicle:
         self._spec = spec
         self._rng = rng
         self.config = QueueConfig(
-            rates=(_RATE,), first_rate=_RATE, expected_loss=spec.loss, group_delay_s=60.0, kept_images=_KEPT
+            rates=(_RATE,), first_rate=_RATE, expected_loss=spec.loss, group_delay_s=60.0, kept_images=_KEPT_IMAGES
         )
         self.queue = TransmitQueue(self.config)
         self.number = 0
         self.due = [rng.exponential(t.every_s) for t in spec.traffic]
         self.contact_due = float(rng.exponential(spec.contact_every_s))
-        self.last_due = spec.hours * _HOUR_S - 2 * _HOUR_S  # the rest of the time is for what still waits
+        self.last_due = spec.hours * _HOUR_S - 2 * _HOUR_S  # afterwards the queues are emptied
 
     def restart(self) -> None:
-        """Save the queue and take it up as another process does."""
+        """Save the state of the queue and restore it into a new one."""
         parts = self.queue.parts()
         self.queue = TransmitQueue(self.config)
         assert not self.queue.restore(parts)
 
-    def work(self, now: float, mission: _Mission) -> None:
-        for place, traffic in enumerate(self._spec.traffic):
-            while self.due[place] <= now and self.due[place] < self.last_due:
-                data = mission.offer(traffic.source, self.due[place], traffic.size_bytes)
+    def add_due_traffic(self, now: float, mission: _Mission) -> None:
+        for index, traffic in enumerate(self._spec.traffic):
+            while self.due[index] <= now and self.due[index] < self.last_due:
+                data = mission.offer(traffic.source, self.due[index], traffic.size_bytes)
                 name = data[:6].hex()
                 self.queue.add_message(
                     name, traffic.source, data, now, priority=traffic.priority, lifetime_s=traffic.lifetime_s
                 )
-                self.due[place] += float(self._rng.exponential(traffic.every_s))
+                self.due[index] += float(self._rng.exponential(traffic.every_s))
         while self.contact_due <= now and self.contact_due < self.last_due:
             self.number += 1
             contact = ContactSummary(height_px=80, width_px=80, time_utc_s=round(self.contact_due))
             stream = self._rng.bytes(self._spec.stream_bytes)
             image_id, contact_id = image_of_number(self.number), f"{self.address}-{self.number}"
             self.queue.add_image(ImageToSend(image_id, contact_id, contact, stream), now)
-            mission.offer_picture((self.address, self.number), self.contact_due, stream)
+            mission.offer_image((self.address, self.number), self.contact_due, stream)
             self.contact_due += float(self._rng.exponential(self._spec.contact_every_s))
 
 
 class _Mission:
     def __init__(self, spec: MissionSpec) -> None:
         self._rng = np.random.default_rng(spec.seed)
-        self.water = _Water(spec.loss, spec.burst_frames, self._rng)
-        self.messages = {t.source: Account() for t in spec.traffic}
-        self.previews, self.pictures = Account(), Account()
+        self.channel = _LossyChannel(spec.loss, spec.burst_frames, self._rng)
+        self.messages = {t.source: TrafficResult() for t in spec.traffic}
+        self.previews, self.images = TrafficResult(), TrafficResult()
         self._offered: dict[bytes, tuple[str, float]] = {}
-        self._pictures: dict[tuple[int, int], tuple[float, bytes]] = {}
-        self._seen: set[tuple[int, int]] = set()
+        self._open_images: dict[tuple[int, int], tuple[float, bytes]] = {}
+        self._with_preview: set[tuple[int, int]] = set()
         self._count = 0
 
     def offer(self, source: str, at: float, size_bytes: int) -> bytes:
@@ -223,42 +223,41 @@ class _Mission:
         self.messages[source].offered += 1
         return data
 
-    def offer_picture(self, name: tuple[int, int], at: float, stream: bytes) -> None:
-        self._pictures[name] = (at, stream)
+    def offer_image(self, name: tuple[int, int], at: float, stream: bytes) -> None:
+        self._open_images[name] = (at, stream)
         self.previews.offered += 1
-        self.pictures.offered += 1
+        self.images.offered += 1
 
     def unfinished_at(self) -> list[float]:
-        return sorted(at / _HOUR_S for at, _ in self._pictures.values())
+        return sorted(at / _HOUR_S for at, _ in self._open_images.values())
 
-    def arrived(self, event: Event, now: float) -> None:
+    def handle(self, event: Event, now: float) -> None:
         if isinstance(event, MessageReceived) and event.data in self._offered:
             source, at = self._offered.pop(event.data)
             self.messages[source].delays_s.append(now - at)
         elif isinstance(event, ImageUpdate):
             name = (event.source, number_of_image(event.image_id))
-            if name not in self._pictures:
+            if name not in self._open_images:
                 return
-            at, stream = self._pictures[name]
-            if name not in self._seen:
-                self._seen.add(name)
+            at, stream = self._open_images[name]
+            if name not in self._with_preview:
+                self._with_preview.add(name)
                 self.previews.delays_s.append(now - at)
             if event.stream == stream:
-                self.pictures.delays_s.append(now - at)
-                del self._pictures[name]
+                self.images.delays_s.append(now - at)
+                del self._open_images[name]
 
 
 def run_mission(spec: MissionSpec) -> MissionResult:
     """Run a mission; the same specification gives the same result.
 
-    The first vehicle's slot is first in a frame of slots, the vessel's reports have the last. Once an hour one of the
-    vehicles is restarted in the middle of its traffic.
+    In each TDMA cycle the vehicles have the first slots, the vessel the last one. Once an hour one vehicle restarts.
     """
     rng = np.random.default_rng([spec.seed, 1])
     mission = _Mission(spec)
     vehicles = [_Vehicle(n + 1, spec, rng) for n in range(spec.vehicles)]
-    frame_s = (spec.vehicles + 1) * _SLOT_S
-    slots = [Tdma(frame_s, n * _SLOT_S, _SLOT_S, _GUARD_S) for n in range(spec.vehicles)]
+    cycle_s = (spec.vehicles + 1) * _SLOT_S
+    slots = [Tdma(cycle_s, n * _SLOT_S, _SLOT_S, _GUARD_S) for n in range(spec.vehicles)]
     receiver = V1Receiver(ReceiverConfig(max_sources=16))
     now, hour, restarts = 0.0, 0, 0
     state_bytes: list[int] = []
@@ -270,21 +269,21 @@ def run_mission(spec: MissionSpec) -> MissionResult:
             state_bytes.append(_state_bytes(vehicles, receiver))
         for vehicle, slot in zip(vehicles, slots, strict=True):
             now += slot.wait_s(RATES[_RATE].airtime_s, now) or 0.0
-            vehicle.work(now, mission)
+            vehicle.add_due_traffic(now, mission)
             packet = vehicle.queue.next_packet(now)
             now += RATES[_RATE].airtime_s
             frames = packet.frames if packet else ()
             for frame in frames:
-                if not mission.water.loses(vehicle.address):
+                if not mission.channel.loses(vehicle.address):
                     for event in receiver.accept(vehicle.address, frame, now):
-                        mission.arrived(event, now)
-            vehicle.queue.sent(frames, frame_s)
-        _report(vehicles, receiver, mission.water, now, deaf=now < spec.deaf_hours * _HOUR_S)
-        now = (now // frame_s + 1) * frame_s
+                        mission.handle(event, now)
+            vehicle.queue.sent(frames, cycle_s)
+        _send_feedback(vehicles, receiver, mission.channel, now, is_lost=now < spec.no_downlink_hours * _HOUR_S)
+        now = (now // cycle_s + 1) * cycle_s
     return MissionResult(
         messages=mission.messages,
         previews=mission.previews,
-        pictures=mission.pictures,
+        images=mission.images,
         unfinished_at=mission.unfinished_at(),
         left=sum(len(v.queue.open_numbers()) + len(v.queue.messages.waiting) for v in vehicles),
         expired=sum(v.queue.messages.expired for v in vehicles),
@@ -294,18 +293,20 @@ def run_mission(spec: MissionSpec) -> MissionResult:
     )
 
 
-def _report(vehicles: Sequence[_Vehicle], receiver: V1Receiver, water: _Water, now: float, *, deaf: bool) -> None:
-    """Let the vessel report to the vehicles that need it most, as many as its slot holds."""
+def _send_feedback(
+    vehicles: Sequence[_Vehicle], receiver: V1Receiver, channel: _LossyChannel, now: float, *, is_lost: bool
+) -> None:
+    """Send feedback to the vehicles with the oldest feedback, as many as fit into the slot."""
     sent = 0
     for vehicle in sorted(vehicles, key=lambda v: v.queue.last_feedback_s or -1.0):
-        if sent == _REPORTS_A_SLOT:
+        if sent == _FEEDBACK_PER_SLOT:
             return
         if not receiver.feedback_is_due(vehicle.address, now):
             continue
-        report = receiver.feedback(vehicle.address, now)
+        feedback = receiver.feedback(vehicle.address, now)
         sent += 1
-        if isinstance(report, Feedback) and not water.loses(-vehicle.address) and not deaf:
-            vehicle.queue.on_feedback(report, now, 100)
+        if isinstance(feedback, Feedback) and not channel.loses(-vehicle.address) and not is_lost:
+            vehicle.queue.on_feedback(feedback, now, 100)
 
 
 def _state_bytes(vehicles: Sequence[_Vehicle], receiver: V1Receiver) -> int:
@@ -315,32 +316,32 @@ def _state_bytes(vehicles: Sequence[_Vehicle], receiver: V1Receiver) -> int:
 
 def new_parser() -> argparse.ArgumentParser:
     """Return the parser of this command."""
-    usual = MissionSpec()
-    parser = command_parser("mission", "a day of several vehicles' traffic through one water, simulated")
-    parser.add_argument("--vehicles", type=int, default=usual.vehicles, help="1 to 16 (%(default)s)")
-    parser.add_argument("--hours", type=float, default=usual.hours, help="how long (%(default)s)")
-    parser.add_argument("--loss", type=float, default=usual.loss, help="share of frames lost (%(default)s)")
-    parser.add_argument("--burst", type=float, default=usual.burst_frames, help="mean run of lost frames (%(default)s)")
-    parser.add_argument("--seed", type=int, default=usual.seed, help="of everything drawn (%(default)s)")
+    default = MissionSpec()
+    parser = command_parser("mission", "a day of traffic of several vehicles, simulated")
+    parser.add_argument("--vehicles", type=int, default=default.vehicles, help="1 to 16 (%(default)s)")
+    parser.add_argument("--hours", type=float, default=default.hours, help="duration (%(default)s)")
+    parser.add_argument("--loss", type=float, default=default.loss, help="share of frames lost (%(default)s)")
+    parser.add_argument("--burst", type=float, default=default.burst_frames, help="mean length of a loss (%(default)s)")
+    parser.add_argument("--seed", type=int, default=default.seed, help="seed of all random draws (%(default)s)")
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run a mission and print what became of it."""
+    """Run a mission and print its results."""
     spec = MissionSpec(args.vehicles, args.hours, args.loss, args.burst, seed=args.seed)
     result = run_mission(spec)
     print(f"{'':12} {'offered':>8} {'arrived':>8} {'median s':>9} {'longest s':>10}")
-    for name, account in (*result.messages.items(), ("previews", result.previews), ("pictures", result.pictures)):
-        print(_line(name, account))
+    for name, traffic in (*result.messages.items(), ("previews", result.previews), ("images", result.images)):
+        print(_line(name, traffic))
     print(f"{result.frames_sent} frames sent, {result.restarts} restarts, {result.expired} messages expired")
     print(f"{result.left} left; state {max(result.state_bytes) / 1000:.0f} kB at most")
     return 0
 
 
-def _line(name: str, account: Account) -> str:
-    delays_s = account.delays_s or [0.0]
+def _line(name: str, traffic: TrafficResult) -> str:
+    delays_s = traffic.delays_s or [0.0]
     times = f"{statistics.median(delays_s):9.0f} {max(delays_s):10.0f}"
-    return f"{name:12} {account.offered:8} {account.delivered:8.4f} {times}"
+    return f"{name:12} {traffic.offered:8} {traffic.delivered:8.4f} {times}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,24 +1,23 @@
-"""Relay throughput, beside bare acknowledged Zenoh queries in the same run, and beside what the disk can do.
+"""`python -m research.relay_throughput`: throughput of the relay, compared with bare Zenoh queries and with the disk.
 
     python -m research.relay_throughput [--decisions 20000] [--pictures 2000] [--dir DIR]
 
-Two processes: the far side, with the router, and this one. For records of two sizes (a decision, and a picture of
-100 x 300 px) it measures
+There are two processes: the far side with the router, and this one. For records of two sizes (a decision, and an image
+of 100 x 300 px) these are measured:
 
-- sequential: bare acknowledged queries as a program without further thought makes them: one is asked, its answer is
-  waited for, then the next. The same bytes, through the router, to a queryable that answers at once and stores nothing;
-- pipelined: the same with as many queries in flight as the hand-off has, a record (or a piece of 32 kB) each;
-- relay: a RelayService with the records in its inbox, on the disk: it puts each into its outbox, hands it over to a c2
-  that commits it, and forgets it; until both its tables are empty. It logs to a file as a vessel's does, a line a
-  record; "unlogged" is the same with warnings only. The far side is a durable c2 that does nothing else with a record
-  ("sink"), so that what is measured is the hand-off and not the writing of TIFF files. This process does nothing
-  else meanwhile;
-- disk: how often a second a 4 kB write to the same folder reaches the disk, and how many bytes a second do, 2 MB at a
-  time. From both follows the bound: every record is committed three times (outbox, c2's inbox, forgotten), at most 512
-  with one write, and its bytes are written four times (the log and the table of either side).
+- sequential: acknowledged queries without storage, one at a time, through the router to a queryable that replies at
+  once;
+- pipelined: the same with as many queries in flight as the delivery protocol has, a record (or a chunk of 32 kB) each;
+- relay: a RelayService with the records in its inbox on disk. It moves each record to its outbox, delivers it to a c2
+  that commits it, and deletes it, until both tables are empty. It logs one line a record to a file, as on a vessel;
+  "unlogged" is the same with warnings only. The far side is a durable c2 that only stores records ("sink"), so that
+  the delivery is measured and not the writing of TIFF files. This process has no other load;
+- disk: the number of 4 kB writes a second that reach the disk, and the bytes a second with writes of 2 MB. The bound
+  follows from both: every record is committed three times (outbox, inbox of c2, deletion), up to 512 records with one
+  write, and its bytes are written four times (log and table on both sides).
 
-One JSON object a line. The exit status is 0 where the relay, logging, reaches half of the pipelined rate or of the
-disk's bound.
+One JSON object a line. The exit status is 0 if the relay, with logging, reaches half of the pipelined rate or of the
+bound of the disk.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from pathlib import Path
 
 import zenoh
 
-from research.fleet import noise_picture
+from research.fleet import noise_image
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.demo.settings import free_ports
@@ -60,21 +59,21 @@ BARE_KEY = "bench/bare"
 
 
 class Sink(Service[ServiceConfig]):
-    """A c2 that commits records and does nothing else with them."""
+    """A c2 that only commits records."""
 
     NAME = "c2"
     BATCH = 512
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """What vessels relay."""
+        """Return the records of the relays."""
         return {keys.shore_inbox_all(): Relayed}
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """Nothing: the record is on the disk already."""
+        """Do nothing: the record is on disk already."""
 
 
 def far_side(endpoint: str, folder: Path) -> None:
-    """Router, sink and bare queryable, until standard input ends."""
+    """Run router, sink and bare queryable until standard input ends."""
     router = zenoh.open(router_config([endpoint]))
     sink = Sink(platform("shore-1", endpoint, folder), ServiceConfig())
     sink.start()
@@ -93,7 +92,7 @@ def far_side(endpoint: str, folder: Path) -> None:
 
 
 def platform(name: str, endpoint: str, folder: Path) -> PlatformConfig:
-    """Return a platform of this bench."""
+    """Return the configuration of a platform."""
     return PlatformConfig(id=name, router=(endpoint,), state_dir=folder / name, health_interval_s=60.0)
 
 
@@ -111,14 +110,14 @@ def decision(number: int) -> Decision:
     )
 
 
-def picture(number: int) -> ReconstructedImage:
-    """Return a picture of 100 x 300 px, 30 kB."""
-    return noise_picture(VESSEL, "uuv-1", f"{number:04d}", number, float(number))
+def image(number: int) -> ReconstructedImage:
+    """Return an image of 100 x 300 px, 30 kB."""
+    return noise_image(VESSEL, "uuv-1", f"{number:04d}", number, float(number))
 
 
 @contextmanager
 def bare_session(endpoint: str) -> Iterator[zenoh.Session]:
-    """Return a client's session that reaches the queryable."""
+    """Yield a client session that reaches the queryable."""
     session = zenoh.open(client_config([endpoint]))
     try:
         while not any(reply.ok is not None for reply in session.get(BARE_KEY, timeout=1.0)):
@@ -128,13 +127,13 @@ def bare_session(endpoint: str) -> Iterator[zenoh.Session]:
         session.close()
 
 
-def ask(session: zenoh.Session, piece: bytes) -> zenoh.handlers.Handler[zenoh.Reply]:
+def query(session: zenoh.Session, chunk: bytes) -> zenoh.handlers.Handler[zenoh.Reply]:
     """Send one bare query."""
-    return session.get(BARE_KEY, payload=piece, timeout=5, congestion_control=zenoh.CongestionControl.BLOCK)
+    return session.get(BARE_KEY, payload=chunk, timeout=5, congestion_control=zenoh.CongestionControl.BLOCK)
 
 
 def measure_bare(endpoint: str, payloads: Sequence[bytes], window: int) -> float:
-    """Return records a second of plain acknowledged queries, in pieces as the relay's are, `window` in flight."""
+    """Return records a second of bare acknowledged queries, in chunks like the relay's, `window` in flight."""
     in_flight: deque[zenoh.handlers.Handler[zenoh.Reply]] = deque()
     with bare_session(endpoint) as session:
         started = time.perf_counter()
@@ -142,16 +141,18 @@ def measure_bare(endpoint: str, payloads: Sequence[bytes], window: int) -> float
             for offset in range(0, len(payload), CHUNK_BYTES):
                 if len(in_flight) >= window:
                     in_flight.popleft().recv()
-                in_flight.append(ask(session, payload[offset : offset + CHUNK_BYTES]))
+                in_flight.append(query(session, payload[offset : offset + CHUNK_BYTES]))
         while in_flight:
             in_flight.popleft().recv()
         return len(payloads) / (time.perf_counter() - started)
 
 
 def measure_relay(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes], level: str) -> tuple[float, float]:
-    """Return records a second from the relay's inbox to c2's store, acknowledged and forgotten, and CPU time of each.
+    """Return records a second from the relay's inbox to the store of c2, and CPU time of each.
 
-    The CPU time, in microseconds, is this process's: the relay's.
+    A record counts when it is acknowledged and deleted.
+
+    The CPU time, in microseconds, is that of this process, which runs the relay.
     """
     relay = RelayService(platform(VESSEL, endpoint, folder), RelayConfig())
     with relay.store.transaction() as tx:
@@ -171,7 +172,7 @@ def measure_relay(endpoint: str, folder: Path, key: str, payloads: Sequence[byte
 
 @contextmanager
 def logged_to(path: Path, level: str) -> Iterator[None]:
-    """Log as the services do, to a file in the place of standard error."""
+    """Log like a service, to a file in place of standard error."""
     with path.open("w", buffering=1) as file, redirect_stderr(file):
         configure_logging("relay", level)
         try:
@@ -181,7 +182,7 @@ def logged_to(path: Path, level: str) -> Iterator[None]:
 
 
 def measure_disk(folder: Path, size: int, seconds: float = 1.0) -> float:
-    """Return how many writes of `size` bytes a second reach the disk one after the other."""
+    """Return the number of sequential writes of `size` bytes a second that reach the disk."""
     path = folder / "fsync"
     count = 0
     data = os.urandom(size)
@@ -192,9 +193,9 @@ def measure_disk(folder: Path, size: int, seconds: float = 1.0) -> float:
             file.write(data)
             os.fsync(file.fileno())
             count += 1
-        took = time.perf_counter() - started
+        elapsed_s = time.perf_counter() - started
     path.unlink()
-    return count / took
+    return count / elapsed_s
 
 
 def main() -> int:
@@ -202,7 +203,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="relay throughput against bare acknowledged queries")
     parser.add_argument("--decisions", type=int, default=20000, metavar="N", help="default: 20000")
     parser.add_argument("--pictures", type=int, default=2000, metavar="N", help="default: 2000")
-    parser.add_argument("--dir", type=Path, metavar="DIR", help="where the stores are (default: a temporary folder)")
+    parser.add_argument("--dir", type=Path, metavar="DIR", help="folder for the stores (default: a temporary folder)")
     parser.add_argument("--far-side", nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.far_side:
@@ -213,7 +214,7 @@ def main() -> int:
 
 
 def measure(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes]) -> dict[str, float]:
-    """Measure one kind of record; the bare rate before and after the relay's, as other work on the host varies."""
+    """Measure one kind of record; the bare rate before and after the relay, because the load of the host varies."""
     size = len(payloads[0])
     window = max(1, min(WINDOW, WINDOW_BYTES // size))
     sequential = measure_bare(endpoint, payloads[:SEQUENTIAL], 1)
@@ -244,7 +245,7 @@ def measure(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes]) ->
     }
 
 
-def compare(folder: Path, decisions: int, pictures: int) -> int:
+def compare(folder: Path, decisions: int, images: int) -> int:
     """Measure both kinds of records; return 1 if a rate is below the goal."""
     endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     child = subprocess.Popen(
@@ -255,22 +256,24 @@ def compare(folder: Path, decisions: int, pictures: int) -> int:
     )
     assert child.stdout is not None
     assert child.stdin is not None
-    good = True
+    passed = True
     try:
         if child.stdout.readline().strip() != "ready":
             sys.exit("relay_throughput: the far side did not start")
         kinds: list[tuple[str, str, list[bytes]]] = [
             ("decision", keys.contact_decision(VESSEL), [wire.encode(decision(n)) for n in range(decisions)]),
-            ("picture", keys.image_reconstructed(VESSEL), [wire.encode(picture(n)) for n in range(pictures)]),
+            ("picture", keys.image_reconstructed(VESSEL), [wire.encode(image(n)) for n in range(images)]),
         ]
         for name, key, payloads in kinds:
             result = measure(endpoint, folder, key, payloads)
             print(json.dumps({"record": name, **result}), flush=True)
-            good = good and result["relay_per_s"] >= GOAL * min(result["pipelined_per_s"], result["disk_bound_per_s"])
+            passed = passed and result["relay_per_s"] >= GOAL * min(
+                result["pipelined_per_s"], result["disk_bound_per_s"]
+            )
     finally:
         child.stdin.close()
         child.wait(timeout=10)
-    return 0 if good else 1
+    return 0 if passed else 1
 
 
 if __name__ == "__main__":

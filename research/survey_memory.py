@@ -1,11 +1,10 @@
-"""Memory that reading a survey takes, by the length of the file.
+"""`python -m research.survey_memory`: memory needed to read surveys, by file size.
 
     python -m research.survey_memory [--sizes-mb 100,2048] [--actions read,plot,detect] [--folder DIR]
 
-Writes XTF recordings of the given sizes (the same simulated pings over and over, with numbers and times that go on),
-then walks through each in a process of its own: opened and read ping by ping, drawn as a waterfall, and looked through
-for contacts as the vehicle does (at most 20 contacts a file). Prints the process's peak resident memory and the time.
-The files are removed afterwards; the disk must have room.
+Writes XTF recordings of the given sizes: repeated simulated pings with consecutive numbers and times. A separate
+process then reads each file ping by ping, draws it as a waterfall, or detects contacts in it as on the vehicle (at most
+20 contacts a file). Prints the peak resident memory and the time of the process. Deletes the files afterwards.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ from sonarpost.sonar.xtf_writer import write_xtf
 
 HEADER_BYTES = 1024
 PINGS = 200
-NUMBER_AT, TIME_AT = 28, 14
+NUMBER_OFFSET, TIME_OFFSET = 28, 14
 START = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 def write_long(path: Path, size_bytes: int) -> int:
-    """Write a recording of about this size; return its pings."""
+    """Write a recording of about this size; return its number of pings."""
     write_xtf(simulate_survey(SurveySpec(seed=3, pings=PINGS, samples=1024)).survey, path)
     raw = path.read_bytes()
     ping_bytes = (len(raw) - HEADER_BYTES) // PINGS
@@ -44,16 +43,16 @@ def write_long(path: Path, size_bytes: int) -> int:
         for number in range(count):
             ping = pings[number % PINGS]
             when = START + timedelta(milliseconds=100 * number)
-            ping[NUMBER_AT : NUMBER_AT + 4] = number.to_bytes(4, "little")
+            ping[NUMBER_OFFSET : NUMBER_OFFSET + 4] = number.to_bytes(4, "little")
             stamp = (when.month, when.day, when.hour, when.minute, when.second, when.microsecond // 10_000)
-            ping[TIME_AT : TIME_AT + 8] = when.year.to_bytes(2, "little") + bytes(stamp)
+            ping[TIME_OFFSET : TIME_OFFSET + 8] = when.year.to_bytes(2, "little") + bytes(stamp)
             file.write(ping)
     return count
 
 
-def walk(path: Path, action: str) -> None:
-    """Do one action on a file and print what it took."""
-    began = time.perf_counter()
+def process(path: Path, action: str) -> None:
+    """Perform one action on a file; print peak memory and time."""
+    start = time.perf_counter()
     if action == "detect":
         count = detect_in_survey(path, "0" * 64, "uuv-1", AtdStubConfig(max_contacts=20)).contact_count
     else:
@@ -62,11 +61,11 @@ def walk(path: Path, action: str) -> None:
                 count = sum(1 for _ in source.pings())
             else:
                 count = draw_waterfall(reduce_survey(source, over_ground=False), "long", over_ground=False).height
-    taken_s = time.perf_counter() - began
+    duration_s = time.perf_counter() - start
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     size_mb = path.stat().st_size / 1e6
-    what = {"read": "pings", "plot": "rows", "detect": "contacts"}[action]
-    print(f"{size_mb:8.0f} MB  {action:6} {count:8} {what:8} {peak_mib:6.0f} MiB peak {taken_s:7.1f} s", flush=True)
+    unit = {"read": "pings", "plot": "rows", "detect": "contacts"}[action]
+    print(f"{size_mb:8.0f} MB  {action:6} {count:8} {unit:8} {peak_mib:6.0f} MiB peak {duration_s:7.1f} s", flush=True)
 
 
 def main() -> None:
@@ -77,10 +76,10 @@ def main() -> None:
     parser.add_argument(
         "--folder", type=Path, help="where the files are written (default: the system's temporary folder)"
     )
-    parser.add_argument("--walk", nargs=2, metavar=("FILE", "ACTION"), help=argparse.SUPPRESS)
+    parser.add_argument("--process", nargs=2, metavar=("FILE", "ACTION"), help=argparse.SUPPRESS)
     parsed = parser.parse_args()
-    if parsed.walk:
-        walk(Path(parsed.walk[0]), parsed.walk[1])
+    if parsed.process:
+        process(Path(parsed.process[0]), parsed.process[1])
         return
     with tempfile.TemporaryDirectory(dir=parsed.folder) as folder:
         for size_mb in map(int, parsed.sizes_mb.split(",")):
@@ -88,7 +87,7 @@ def main() -> None:
             write_long(path, size_mb * 1_000_000)
             for action in parsed.actions.split(","):
                 subprocess.run(
-                    [sys.executable, "-m", "research.survey_memory", "--walk", str(path), action], check=True
+                    [sys.executable, "-m", "research.survey_memory", "--process", str(path), action], check=True
                 )
 
 

@@ -1,17 +1,17 @@
-"""The VQ encode search against FAISS `IndexFlatL2`, on one core, alternately in one run.
+"""`python -m research.tile_search`: the VQ encode search against FAISS `IndexFlatL2` on one core.
 
     python -m venv somewhere && somewhere/bin/pip install . faiss-cpu
     somewhere/bin/python -m research.tile_search
 
-Both search the 70 coordinates of the 15,992 tiles of `nominal-10` for the tiles of a 140 x 80 px picture (112 tiles):
-the nearest (the paper's search), and the eight nearest (what the codec `vq` compares in all pixels afterwards).
-Projecting the picture's tiles is part of both. Each picture is searched by one and then the other, in turns as to
-which is first,
-so a machine that others use slows both; what counts is the ratio of the two times of a pair.
+Both programs search the 15,992 tiles of `nominal-10`, in 70 coordinates, for the tiles of an image of 140 x 80 px
+(112 tiles). They search for the nearest tile (as in the paper), and for the eight nearest (which the codec `vq` then
+compares in all pixels). The time includes the projection of the tiles of the image. Each image is searched by both
+programs, one after the other, in alternating order. Other load of the host therefore slows both, and the result is the
+median of the ratio of the two times.
 
-FAISS searches in single precision, so of nearly equal tiles it may return the other; sonarpost is checked against
-distances in integers and must be exact. FAISS is given the better of its two ways to search (with and without a
-matrix product), tried beforehand.
+FAISS searches in single precision, so it may return the wrong one of two nearly equal tiles. The result of sonarpost is
+compared with integer distances and must be exact. FAISS runs with the faster of its two methods (with and without a
+matrix product), which is measured beforehand.
 """
 
 from __future__ import annotations
@@ -43,38 +43,36 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="VQ encode search against FAISS IndexFlatL2")
     parser.add_argument("--pictures", type=int, default=48, metavar="N", help="default: 48")
     parser.add_argument("--rounds", type=int, default=8, metavar="N", help="default: 8")
-    parser.add_argument("--images", type=Path, metavar="DIR", help="folder of pictures (default: simulated ones)")
+    parser.add_argument("--images", type=Path, metavar="DIR", help="folder of images (default: simulated ones)")
     args = parser.parse_args()
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
-        # Libraries read this when they are loaded, so the program starts itself anew, on one core.
+        # The libraries read this when they are loaded, so the program restarts itself, on one core.
         os.environ.update({f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")})
         if hasattr(os, "sched_setaffinity"):
             os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
         os.execv(sys.executable, [sys.executable, "-m", "research.tile_search", *sys.argv[1:]])
     try:
-        import faiss  # type: ignore[import-not-found,unused-ignore]  # noqa: PLC0415 - no dependency: its absence is explained
+        import faiss  # type: ignore[import-not-found,unused-ignore]  # noqa: PLC0415 - not a dependency
     except ImportError:
         print("tile_search: faiss is not installed here: pip install faiss-cpu", file=sys.stderr)
         return 2
     faiss.omp_set_num_threads(1)
     database = load_default(10).tiles
-    pictures = [cut_tiles(picture, 10) for picture in _pictures(args.images, args.pictures)]
-    if not pictures:
-        print(f"tile_search: no picture of {HEIGHT_PX} x {WIDTH_PX} px or more in {args.images}", file=sys.stderr)
+    images = [cut_tiles(image, 10) for image in _images(args.images, args.pictures)]
+    if not images:
+        print(f"tile_search: no image of {HEIGHT_PX} x {WIDTH_PX} px or more in {args.images}", file=sys.stderr)
         return 2
     index = faiss.IndexFlatL2(database.dims)
     index.add(_coordinates(database, database.tiles))
-    _choose_way(faiss, index, database, pictures)
-    print(
-        f"{len(pictures)} pictures of {pictures[0].shape[0]} tiles, {len(database)} tiles, {database.dims} dimensions"
-    )
-    good = True
+    _choose_method(faiss, index, database, images)
+    print(f"{len(images)} images of {images[0].shape[0]} tiles, {len(database)} tiles, {database.dims} dimensions")
+    passed = True
     for count in (1, SHORTLIST):
-        good &= _compare(f"{count} nearest", database, index, pictures, args.rounds, count)
-    return 0 if good else 1
+        passed &= _compare(f"{count} nearest", database, index, images, args.rounds, count)
+    return 0 if passed else 1
 
 
-def _compare(title: str, database: TileDatabase, index: object, pictures: list[Tiles], rounds: int, count: int) -> bool:
+def _compare(title: str, database: TileDatabase, index: object, images: list[Tiles], rounds: int, count: int) -> bool:
     def ours(tiles: Tiles) -> npt.NDArray[np.int64]:
         return database.nearest_in_basis(tiles, count)[0]
 
@@ -82,10 +80,10 @@ def _compare(title: str, database: TileDatabase, index: object, pictures: list[T
         found: npt.NDArray[np.int64] = index.search(_coordinates(database, tiles), count)[1]  # type: ignore[attr-defined]
         return found
 
-    exact = [_exact(database, tiles, count) for tiles in pictures]
-    ours_wrong = sum(int((ours(t) != e).any(axis=1).sum()) for t, e in zip(pictures, exact, strict=True))
-    theirs_other = sum(int((theirs(t) != e).any(axis=1).sum()) for t, e in zip(pictures, exact, strict=True))
-    times = np.array([_pair(ours, theirs, tiles, turn) for turn in range(rounds) for tiles in pictures])
+    exact = [_exact(database, tiles, count) for tiles in images]
+    sonarpost_inexact = sum(int((ours(t) != e).any(axis=1).sum()) for t, e in zip(images, exact, strict=True))
+    faiss_inexact = sum(int((theirs(t) != e).any(axis=1).sum()) for t, e in zip(images, exact, strict=True))
+    times = np.array([_pair(ours, theirs, tiles, turn) for turn in range(rounds) for tiles in images])
     ratios = times[:, 0] / times[:, 1]
     rng = np.random.default_rng(0)
     medians = [np.median(rng.choice(ratios, ratios.size)) for _ in range(2000)]
@@ -93,9 +91,9 @@ def _compare(title: str, database: TileDatabase, index: object, pictures: list[T
     print(
         f"{title}: sonarpost {np.median(times[:, 0]) * 1e3:.2f} ms, FAISS {np.median(times[:, 1]) * 1e3:.2f} ms; "
         f"ratio {np.median(ratios):.3f} ({low:.3f} to {high:.3f}, 95 %, {ratios.size} pairs); "
-        f"not exact: sonarpost {ours_wrong}, FAISS {theirs_other} of {len(pictures) * pictures[0].shape[0]} tiles"
+        f"not exact: sonarpost {sonarpost_inexact}, FAISS {faiss_inexact} of {len(images) * images[0].shape[0]} tiles"
     )
-    return ours_wrong == 0 and float(np.median(ratios)) <= 1.0
+    return sonarpost_inexact == 0 and float(np.median(ratios)) <= 1.0
 
 
 def _pair(ours: Search, theirs: Search, tiles: Tiles, turn: int) -> tuple[float, float]:
@@ -112,7 +110,7 @@ def _seconds(search: Search, tiles: Tiles) -> float:
 
 
 def _exact(database: TileDatabase, tiles: Tiles, count: int) -> npt.NDArray[np.int64]:
-    """Every distance in integers, sorted whole: slow and plain."""
+    """Return the exact neighbours from all distances in integers."""
     queries, stored = database.project(tiles).astype(np.int64), database.projections.astype(np.int64)
     found = np.empty((tiles.shape[0], count), dtype=np.int64)
     for row, query in enumerate(queries):
@@ -125,40 +123,39 @@ def _coordinates(database: TileDatabase, tiles: Tiles) -> npt.NDArray[np.float32
     return (database.project(tiles) / BASIS_SCALE).astype(np.float32)
 
 
-def _choose_way(faiss: object, index: object, database: TileDatabase, pictures: list[Tiles]) -> None:
-    """Let FAISS search by matrix product or by plain loops, whichever is faster here."""
+def _choose_method(faiss: object, index: object, database: TileDatabase, images: list[Tiles]) -> None:
+    """Select the faster search of FAISS: matrix product or loops."""
     settings = faiss.cvar  # type: ignore[attr-defined]
-    taken = {}
+    times_s = {}
     for threshold in (1, 1 << 30):
         settings.distance_compute_blas_threshold = threshold
-        queries = [_coordinates(database, tiles) for tiles in pictures]
+        queries = [_coordinates(database, tiles) for tiles in images]
         start = time.perf_counter()
         for query in queries:
             index.search(query, 1)  # type: ignore[attr-defined]
-        taken[threshold] = time.perf_counter() - start
-    settings.distance_compute_blas_threshold = min(taken, key=lambda threshold: taken[threshold])
+        times_s[threshold] = time.perf_counter() - start
+    settings.distance_compute_blas_threshold = min(times_s, key=lambda threshold: times_s[threshold])
 
 
-def _pictures(folder: Path | None, wanted: int) -> list[npt.NDArray[np.uint8]]:
-    """Pieces of 140 x 80 px: the middles of a folder's images, or of simulated lines over every kind of bottom."""
+def _images(folder: Path | None, count: int) -> list[npt.NDArray[np.uint8]]:
+    """Return images of 140 x 80 px: centres of the images of a folder, or parts of simulated lines."""
     if folder is not None:
         paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".tif", ".tiff"))
         images = (to_uint8(read_image(path)) for path in paths)
-        return [_middle(image) for image in images if image.shape[0] >= HEIGHT_PX and image.shape[1] >= WIDTH_PX][
-            :wanted
-        ]
-    pictures: list[npt.NDArray[np.uint8]] = []
-    for number in range(wanted):
+        usable = (image for image in images if image.shape[0] >= HEIGHT_PX and image.shape[1] >= WIDTH_PX)
+        return [_centre(image) for image in usable][:count]
+    cut: list[npt.NDArray[np.uint8]] = []
+    for number in range(count):
         if number % 8 == 0:
             kind = list(SeabedKind)[number // 8 % len(SeabedKind)]
             survey = simulate_survey(SurveySpec(seed=910_000 + number, pings=600, seabed=kind)).survey
         line = survey.waterfall(survey.sides()[number % 2])
         top, left = 140 * (number % 8 // 2), 300 + 100 * (number % 4)
-        pictures.append(stretch(line[top : top + HEIGHT_PX, left : left + WIDTH_PX].astype(np.float64)))
-    return pictures
+        cut.append(stretch(line[top : top + HEIGHT_PX, left : left + WIDTH_PX].astype(np.float64)))
+    return cut
 
 
-def _middle(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+def _centre(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     top, left = (image.shape[0] - HEIGHT_PX) // 2, (image.shape[1] - WIDTH_PX) // 2
     return image[top : top + HEIGHT_PX, left : left + WIDTH_PX]
 

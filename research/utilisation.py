@@ -1,7 +1,8 @@
-"""How much of the time a vehicle that has data keeps the water busy: queue, medium access, driver, modem, serial line.
+"""`python -m research.utilisation`: share of the time in which a vehicle with data transmits, simulated.
 
-Everything runs as on a vehicle and a vessel, on a simulated clock: the vehicle's `TransmitQueue` and `Continuous`
-medium, drivers on emulated modems with serial lines of a given speed, and a vessel that reports in the pauses.
+Transmit queue, medium access, driver, modem and serial line are those of a vehicle, on a simulated clock: a
+`TransmitQueue` with the `Continuous` MAC, drivers on emulated modems with serial lines of a given speed, and a vessel
+that sends feedback in the receive windows.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Final
 import numpy as np
 
 from research.common.command import command_parser, run_command
+from research.common.modem_pair import VESSEL, ModemPair
 from sonarpost.errors import ConfigError
 from sonarpost.link.config import QueueConfig
 from sonarpost.link.downlink.commands import CommandTracker
@@ -31,39 +33,33 @@ from sonarpost.modem.micromodem import (
     FrameDecoded,
     FrameReceived,
     MicroModem,
-    MicroModemConfig,
     ModemEvent,
     PacketFailed,
     PacketSent,
 )
-from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.events import Transmission
 from sonarpost.simulation.channel.parameters import ChannelParameters
-from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
-from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
-_VESSEL: Final = 1
 _VEHICLE: Final = 3
-_STEP_S: Final = 0.001
 _DOWNLINK_RATE: Final = 0
-_QUIET_S: Final = 2.0
-_TICK_S: Final = 0.25
-_ALWAYS_WAITING: Final = 12
+_FEEDBACK_HOLDOFF_S: Final = 2.0
+_MAX_STEP_S: Final = 0.25
+_MIN_WAITING: Final = 12
 _STREAM_BYTES: Final = 400
 
 
 @dataclass(frozen=True, slots=True)
-class BusySpec:
-    """What is measured.
+class UtilisationSpec:
+    """Parameters of a measurement.
 
     Attributes:
-        rate: Of the vehicle, 0..6.
-        serial_baud: Of both serial lines; 0 for lines without delay.
+        rate: Rate of the vehicle's modem, 0..6.
+        serial_baud: Speed of both serial lines; 0 for no delay.
         tx_burst_s: See `Continuous`.
         rx_window_s: See `Continuous`.
-        range_m: Between the modems.
+        range_m: Distance of the modems.
         frame_loss: Share of frames lost.
-        seconds: For how long, simulated.
+        seconds: Simulated duration.
 
     Raises:
         ConfigError: A value out of range.
@@ -79,200 +75,168 @@ class BusySpec:
 
     def __post_init__(self) -> None:
         if self.rate not in RATES:
-            raise ConfigError("busy", "rate", self.rate, f"{min(RATES)}..{max(RATES)}")
+            raise ConfigError("utilisation", "rate", self.rate, f"{min(RATES)}..{max(RATES)}")
         limits = (("serial_baud", 0, 4e6), ("range_m", 1, 2e4), ("frame_loss", 0, 0.9), ("seconds", 60, 864000))
         for name, low, high in limits:
             if not low <= getattr(self, name) <= high:
-                raise ConfigError("busy", name, getattr(self, name), f"{low}..{high}")
+                raise ConfigError("utilisation", name, getattr(self, name), f"{low}..{high}")
 
 
 @dataclass(frozen=True, slots=True)
-class BusyResult:
-    """What was measured.
+class UtilisationResult:
+    """Result of a measurement.
 
     Attributes:
-        busy: Share of the time in which the vehicle's packets were in the water.
+        busy: Share of the time in which the vehicle transmitted.
         packets: Packets of the vehicle.
-        frames_full: Share of the frames of its packets that it filled.
-        reports: Reports of the vessel that the vehicle heard.
-        reports_sent: Reports of the vessel.
+        frames_full: Share of the frames of its packets that contained data.
+        feedback_received: Feedback messages received by the vehicle.
+        feedback_sent: Feedback messages sent by the vessel.
     """
 
     busy: float
     packets: int
     frames_full: float
-    reports: int
-    reports_sent: int
-
-
-class _Rig:
-    def __init__(self, spec: BusySpec) -> None:
-        places = {
-            n: PlacedModem(EmulatedModemConfig(n), LocalPosition(e))
-            for n, e in ((_VESSEL, 0.0), (_VEHICLE, spec.range_m))
-        }
-        water = ChannelParameters(frame_loss=spec.frame_loss)
-        self.world = ChannelSimulator(water, places, spec.serial_baud or None)
-        self.drivers = {n: MicroModem(MicroModemConfig(n)) for n in places}
-        self.now = 0.0
-        for driver in self.drivers.values():
-            driver.start(0.0)
-        self.sent: list[Transmission] = []
-
-    @property
-    def ready(self) -> bool:
-        """Whether both modems are configured."""
-        return all(driver.ready for driver in self.drivers.values())
-
-    def wait(self, stop_s: float) -> None:
-        """Go to when something happens next, to `stop_s` at the latest."""
-        times_s = [self.world.next_deadline_s(), *(d.next_wakeup() or stop_s for d in self.drivers.values())]
-        self.now = min(stop_s, max(min(times_s), self.now + _STEP_S))
-
-    def step(self) -> list[tuple[int, ModemEvent]]:
-        """Let happen what happens now; return the drivers' events."""
-        events: list[tuple[int, ModemEvent]] = []
-        for number, driver in self.drivers.items():
-            events += [(number, event) for event in driver.poll(self.now)]
-            self.world.receive(number, driver.bytes_to_send(), self.now)
-        self.sent += [t for t in self.world.advance(self.now) if isinstance(t, Transmission)]
-        for number, driver in self.drivers.items():
-            for output in self.world.take_outputs(number):
-                events += [(number, event) for event in driver.receive(output.data, self.now)]
-            self.world.receive(number, driver.bytes_to_send(), self.now)
-        return events
+    feedback_received: int
+    feedback_sent: int
 
 
 class _Vehicle:
-    """Does what `uuv_modem` does."""
+    """The vehicle: transmit queue and medium access like those of `uuv_modem`."""
 
-    def __init__(self, spec: BusySpec) -> None:
+    def __init__(self, spec: UtilisationSpec) -> None:
         self._rate = spec.rate
         self.queue = TransmitQueue(QueueConfig(rates=(spec.rate,), first_rate=spec.rate, expected_loss=spec.frame_loss))
-        self._medium = Continuous(spec.tx_burst_s, spec.rx_window_s, holdoff_s=2.0)
+        self._mac = Continuous(spec.tx_burst_s, spec.rx_window_s, holdoff_s=2.0)
         self._receiver = V1Receiver()
-        self._asked = False
+        self._is_sending = False
         self._rng = np.random.default_rng(1)
         self._number = 0
-        self.frames = self.reports = 0
+        self.frames = self.feedback_received = 0
 
-    def take(self, event: ModemEvent, now: float) -> None:
+    def handle(self, event: ModemEvent, now: float) -> None:
         match event:
             case PacketSent():
-                self._medium.sent(event.started_s, now)
+                self._mac.sent(event.started_s, now)
                 self.queue.sent(event.frames, now - event.started_s)
-                self._asked = False
+                self._is_sending = False
             case PacketFailed():
-                self._asked = False
+                self._is_sending = False
             case FrameDecoded():
-                self._medium.channel_busy(now)
+                self._mac.channel_busy(now)
             case FrameReceived():
                 for found in self._receiver.accept(event.src, event.data, now):
                     if isinstance(found, FeedbackReceived):
                         self.queue.on_feedback(found.feedback, now, event.src)
-                        self.reports += 1
+                        self.feedback_received += 1
 
-    def work(self, driver: MicroModem, now: float) -> float:
-        """Send where it may; return for how long it may not."""
-        while len(self.queue.sender.waiting) < _ALWAYS_WAITING:
+    def send(self, driver: MicroModem, now: float) -> float:
+        """Send a packet if the MAC allows it; return the remaining wait."""
+        while len(self.queue.sender.waiting) < _MIN_WAITING:
             self._number = self._number % 65535 + 1
             contact = ContactSummary(80, 80, time_utc_s=self._number)
             image_id, stream = image_of_number(self._number), self._rng.bytes(_STREAM_BYTES)
             self.queue.add_image(ImageToSend(image_id, str(self._number), contact, stream), now)
-        if self._asked:
+        if self._is_sending:
             return 0.0
-        wait_s = self._medium.wait_s(RATES[self._rate].airtime_s, now) or 0.0
+        wait_s = self._mac.wait_s(RATES[self._rate].airtime_s, now) or 0.0
         if wait_s == 0.0 and driver.ready and (packet := self.queue.next_packet(now)):
-            driver.send_packet(_VESSEL, self._rate, packet.frames, now=now)
-            self._asked = True
+            driver.send_packet(VESSEL, self._rate, packet.frames, now=now)
+            self._is_sending = True
             self.frames += len(packet.frames)
         return wait_s
 
 
 class _Vessel:
-    """Does what `op_modem` does: it reports when it has heard nothing for a while."""
+    """The vessel: it sends feedback after a pause without reception, like `op_modem`."""
 
     def __init__(self) -> None:
         self._link = VesselEndpoint(CommandTracker(60.0))
-        self._heard_s = 0.0
-        self._under_way: DownlinkPacket | None = None
-        self.reports = 0
+        self._last_received_s = 0.0
+        self._in_flight: DownlinkPacket | None = None
+        self.feedback_sent = 0
 
-    def take(self, event: ModemEvent, now: float) -> None:
+    def handle(self, event: ModemEvent, now: float) -> None:
         match event:
             case FrameReceived():
                 self._link.accept(event.src, event.data, now)
-                self._heard_s = now
-            case PacketSent() if self._under_way is not None:
-                self._link.sent(self._under_way, now)
-                self._under_way = None
-            case PacketFailed() if self._under_way is not None:
-                self._link.failed(self._under_way)
-                self._under_way = None
+                self._last_received_s = now
+            case PacketSent() if self._in_flight is not None:
+                self._link.sent(self._in_flight, now)
+                self._in_flight = None
+            case PacketFailed() if self._in_flight is not None:
+                self._link.failed(self._in_flight)
+                self._in_flight = None
 
-    def work(self, driver: MicroModem, now: float) -> None:
-        quiet = now - self._heard_s >= _QUIET_S and not driver.receiving and driver.ready
-        if self._under_way is None and quiet and self._link.due_address(now) is not None:
+    def send(self, driver: MicroModem, now: float) -> None:
+        is_quiet = now - self._last_received_s >= _FEEDBACK_HOLDOFF_S and not driver.receiving and driver.ready
+        if self._in_flight is None and is_quiet and self._link.due_address(now) is not None:
             rate = RATES[_DOWNLINK_RATE]
             packet = self._link.next_packet(rate.frames, rate.frame_bytes, now)
             if packet is not None:
                 driver.send_packet(packet.address, rate.number, packet.frames, now=now)
-                self._under_way = packet
-                self.reports += packet.has_feedback
+                self._in_flight = packet
+                self.feedback_sent += packet.has_feedback
 
 
-def run_busy(spec: BusySpec) -> BusyResult:
-    """Measure; the same specification gives the same result.
+def measure_utilisation(spec: UtilisationSpec) -> UtilisationResult:
+    """Run a measurement; the same specification gives the same result.
 
-    The clock starts when both modems are configured. The vehicle always has pictures to send.
+    It starts when both modems are configured. The vehicle always has images to send.
     """
-    rig, vehicle, vessel = _Rig(spec), _Vehicle(spec), _Vessel()
-    while not rig.ready:
-        rig.step()
-        rig.wait(rig.now + _TICK_S)
-    begun, end = rig.now, rig.now + spec.seconds
-    while rig.now < end:
-        for number, event in rig.step():
-            (vehicle if number == _VEHICLE else vessel).take(event, rig.now)
-        wait_s = vehicle.work(rig.drivers[_VEHICLE], rig.now)
-        vessel.work(rig.drivers[_VESSEL], rig.now)
-        rig.step()  # what they asked for goes at once; it leads to no event but later ones
-        rig.wait(min(end, rig.now + (min(wait_s, _TICK_S) or _TICK_S)))
-    mine = [sent for sent in rig.sent if sent.transmitter == _VEHICLE]
-    return BusyResult(
-        busy=_within(mine, begun, end) / spec.seconds,
-        packets=len(mine),
-        frames_full=vehicle.frames / max(1, len(mine) * RATES[spec.rate].frames),
-        reports=vehicle.reports,
-        reports_sent=vessel.reports,
+    channel = ChannelParameters(frame_loss=spec.frame_loss)
+    modems = ModemPair(channel, _VEHICLE, spec.range_m, serial_baud=spec.serial_baud or None)
+    vehicle, vessel = _Vehicle(spec), _Vessel()
+    while not modems.ready:
+        modems.step()
+        modems.advance(modems.now + _MAX_STEP_S)
+    start_s, end_s = modems.now, modems.now + spec.seconds
+    while modems.now < end_s:
+        for number, event in modems.step():
+            (vehicle if number == _VEHICLE else vessel).handle(event, modems.now)
+        wait_s = vehicle.send(modems.drivers[_VEHICLE], modems.now)
+        vessel.send(modems.drivers[VESSEL], modems.now)
+        modems.step()  # commands are sent at once; their events follow later
+        modems.advance(min(end_s, modems.now + (min(wait_s, _MAX_STEP_S) or _MAX_STEP_S)))
+    transmissions = [t for t in modems.transmissions if t.transmitter == _VEHICLE]
+    return UtilisationResult(
+        busy=_airtime_s(transmissions, start_s, end_s) / spec.seconds,
+        packets=len(transmissions),
+        frames_full=vehicle.frames / max(1, len(transmissions) * RATES[spec.rate].frames),
+        feedback_received=vehicle.feedback_received,
+        feedback_sent=vessel.feedback_sent,
     )
 
 
-def _within(sent: Sequence[Transmission], start_s: float, stop_s: float) -> float:
-    return sum(max(0.0, min(t.ended_s, stop_s) - max(t.started_s, start_s)) for t in sent)
+def _airtime_s(transmissions: Sequence[Transmission], start_s: float, stop_s: float) -> float:
+    return sum(max(0.0, min(t.ended_s, stop_s) - max(t.started_s, start_s)) for t in transmissions)
 
 
 def new_parser() -> argparse.ArgumentParser:
     """Return the parser of this command."""
-    usual = BusySpec()
-    parser = command_parser("utilisation", "share of the time that a vehicle with data keeps the water busy, simulated")
-    parser.add_argument("--rate", type=int, default=usual.rate, help="0 to 6 (%(default)s)")
-    parser.add_argument("--baud", type=float, default=usual.serial_baud, help="serial lines; 0 no delay (%(default)s)")
-    parser.add_argument("--listen", type=float, default=usual.rx_window_s, metavar="S", help="each pause (%(default)s)")
-    parser.add_argument("--every", type=float, default=usual.tx_burst_s, metavar="S", help="between (%(default)s)")
-    parser.add_argument("--range", type=float, default=usual.range_m, metavar="M", help="in metres (%(default)s)")
-    parser.add_argument("--loss", type=float, default=usual.frame_loss, help="share of frames lost (%(default)s)")
-    parser.add_argument("--seconds", type=float, default=usual.seconds, help="for how long (%(default)s)")
+    default = UtilisationSpec()
+    parser = command_parser("utilisation", "share of the time in which a vehicle with data transmits, simulated")
+    parser.add_argument("--rate", type=int, default=default.rate, help="0 to 6 (%(default)s)")
+    parser.add_argument(
+        "--baud", type=float, default=default.serial_baud, help="serial speed; 0: no delay (%(default)s)"
+    )
+    parser.add_argument("--listen", type=float, default=default.rx_window_s, metavar="S", help="window (%(default)s)")
+    parser.add_argument(
+        "--every", type=float, default=default.tx_burst_s, metavar="S", help="between windows (%(default)s)"
+    )
+    parser.add_argument("--range", type=float, default=default.range_m, metavar="M", help="distance (%(default)s)")
+    parser.add_argument("--loss", type=float, default=default.frame_loss, help="share of frames lost (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=default.seconds, help="simulated duration (%(default)s)")
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
-    spec = BusySpec(args.rate, args.baud, args.every, args.listen, args.range, args.loss, args.seconds)
-    result = run_busy(spec)
+    spec = UtilisationSpec(args.rate, args.baud, args.every, args.listen, args.range, args.loss, args.seconds)
+    result = measure_utilisation(spec)
     print(
         f"busy {result.busy:.4f}: {result.packets} packets, {result.frames_full:.3f} of their frames filled; "
-        f"{result.reports} of {result.reports_sent} reports heard"
+        f"{result.feedback_received} of {result.feedback_sent} feedback messages received"
     )
     return 0
 

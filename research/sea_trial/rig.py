@@ -6,10 +6,11 @@ format, NMEA on both serial lines, the receiver of the paper's format. The clock
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from research.common.modem_pair import VESSEL, ModemPair
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.link.frames.paper.receiver import PaperReceiver
@@ -18,18 +19,11 @@ from sonarpost.link.receiver import Event, ImageUpdate
 from sonarpost.modem.micromodem import (
     RATES,
     FrameReceived,
-    MicroModem,
-    MicroModemConfig,
-    ModemReady,
     PacketFailed,
     PacketSent,
 )
-from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.parameters import ChannelParameters
-from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
-from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
-VESSEL: Final = 1
 VEHICLE: Final = 2
 
 _SERIAL_BAUD: Final = 19_200.0
@@ -37,7 +31,6 @@ _DEPTH_M: Final = 6.4
 _PAUSE_S: Final = 5.0
 """Time between packets, so that a fade does not affect the same packets in every run."""
 _TIMEOUT_S: Final = 120.0
-_STEP_S: Final = 0.001
 _PAIRING_TIMEOUT_S: Final = 600.0
 
 
@@ -82,7 +75,7 @@ class DeliveryCounts:
 
 
 class Rig:
-    """Two drivers, two emulated modems and the channel.
+    """A vehicle that sends packets to a vessel.
 
     Args:
         channel: Parameters of the channel.
@@ -93,26 +86,17 @@ class Rig:
     """
 
     def __init__(self, channel: ChannelParameters, range_m: float) -> None:
-        modems = {
-            number: PlacedModem(EmulatedModemConfig(number), LocalPosition(east_m, depth_m=_DEPTH_M))
-            for number, east_m in ((VESSEL, 0.0), (VEHICLE, range_m))
-        }
-        self._simulator = ChannelSimulator(channel, modems, serial_baud=_SERIAL_BAUD)
-        self._drivers = {number: MicroModem(MicroModemConfig(number)) for number in modems}
-        self._now = 0.0
-        self._ready: set[int] = set()
+        self._modems = ModemPair(channel, VEHICLE, range_m, depth_m=_DEPTH_M, serial_baud=_SERIAL_BAUD)
         self._finished: list[PacketSent | PacketFailed] = []
         self._received: list[FrameReceived] = []
-        for driver in self._drivers.values():
-            driver.start(0.0)
-        self._run(_TIMEOUT_S, until_ready=True)
-        if len(self._ready) != len(self._drivers):
-            raise RuntimeError(f"modems {sorted(self._ready)} are ready, expected {sorted(self._drivers)}")
+        self._run(_TIMEOUT_S, lambda: self._modems.ready)
+        if not self._modems.ready:
+            raise RuntimeError("the modems are not ready")
 
     @property
     def now(self) -> float:
         """Simulated time, in seconds."""
-        return self._now
+        return self._modems.now
 
     def send(self, packet: Packet, rate: int) -> list[FrameReceived]:
         """Send one packet from the vehicle; return the frames received by the vessel's driver.
@@ -121,44 +105,25 @@ class Rig:
             RuntimeError: The vehicle's modem did not send it.
         """
         self._finished, self._received = [], []
-        self._drivers[VEHICLE].send_packet(VESSEL, rate, packet, now=self._now)
-        self._run(self._now + _TIMEOUT_S, until_sent=True)
+        self._modems.drivers[VEHICLE].send_packet(VESSEL, rate, packet, now=self.now)
+        self._run(self.now + _TIMEOUT_S, lambda: bool(self._finished))
         if not self._finished or isinstance(self._finished[0], PacketFailed):
             raise RuntimeError(f"a packet was not sent: {self._finished}")
         # Reception ends after transmission; the sentences of the modem arrive over the serial line after that.
-        self._run(self._now + _PAUSE_S)
+        self._run(self.now + _PAUSE_S, lambda: False)
         return self._received
 
-    def _run(self, stop_s: float, *, until_ready: bool = False, until_sent: bool = False) -> None:
+    def _run(self, stop_s: float, is_done: Callable[[], bool]) -> None:
         while True:
-            self._exchange()
-            done = (until_ready and len(self._ready) == len(self._drivers)) or (until_sent and self._finished)
-            if done or self._now >= stop_s:
+            for number, event in self._modems.step():
+                match event:
+                    case PacketSent() | PacketFailed() if number == VEHICLE:
+                        self._finished.append(event)
+                    case FrameReceived() if number == VESSEL:
+                        self._received.append(event)
+            if is_done() or self.now >= stop_s:
                 return
-            times_s = [driver.next_wakeup() for driver in self._drivers.values()]
-            next_s = min([self._simulator.next_deadline_s(), *(time_s for time_s in times_s if time_s is not None)])
-            self._now = min(stop_s, max(next_s, self._now + _STEP_S))
-
-    def _exchange(self) -> None:
-        for number, driver in self._drivers.items():
-            self._collect(number, driver.poll(self._now))
-            self._simulator.receive(number, driver.bytes_to_send(), self._now)
-        self._simulator.advance(self._now)
-        for number, driver in self._drivers.items():
-            for output in self._simulator.take_outputs(number):
-                self._collect(number, driver.receive(output.data, self._now))
-            # The answer to the modem is sent at once: the modem requires it within a short time.
-            self._simulator.receive(number, driver.bytes_to_send(), self._now)
-
-    def _collect(self, number: int, events: Sequence[object]) -> None:
-        for event in events:
-            match event:
-                case ModemReady():
-                    self._ready.add(number)
-                case PacketSent() | PacketFailed() if number == VEHICLE:
-                    self._finished.append(event)
-                case FrameReceived() if number == VESSEL:
-                    self._received.append(event)
+            self._modems.advance(stop_s)
 
 
 def send_images(

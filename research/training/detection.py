@@ -1,4 +1,4 @@
-"""Fit the weights of the detector's fusion to simulated surveys, and to nothing else.
+"""Fit the weights of the detector's fusion to simulated surveys.
 
     python -m research.training.detection --cache /tmp/detect --out common/sonarpost/detection/fusion.json
 
@@ -6,11 +6,11 @@
 and sample type vary. Seeds 1000 to 1007; the evaluation (`python -m research.detection`) uses seeds from 5000 on. The
 result is the same, number for number, on the same versions of numpy and scipy.
 
-Four rounds: with the weights at hand every side's places are fused, each place of the bottom keeps its best, and a
-logistic regression of "is an object" on the logarithms of the scores and on the clutter's level gives the next weights
-(none below 0). Other objects than mine-like ones weigh less, so that the order is set by mines against the bottom. Last
-the scale and offset of the log odds are fitted with all objects weighing the same: that is what makes the confidence a
-share.
+There are four rounds. In each, the candidates of every side are fused with the current weights, and the most confident
+candidate of each place is kept. A logistic regression of "is an object" on the log scores and the clutter level gives
+the next weights, none negative. Objects that are not mine-like have less weight, so that the order of the confidences
+separates mines from seabed. Finally, scale and offset of the log odds are fitted with equal weight for all objects;
+they make the confidence a share of objects.
 """
 
 from __future__ import annotations
@@ -66,77 +66,77 @@ _VARIATIONS: tuple[dict[str, Any], ...] = (
 
 
 @dataclass(frozen=True)
-class SideTable:
-    """One side's places: its grid without the levels, the places, and the object that each is, if any."""
+class SideCandidates:
+    """The candidates of one side: its grid without the levels, the candidates, and the object of each, if any."""
 
     grid: LevelGrid
-    places: list[Candidate]
+    candidates: list[Candidate]
     objects: list[TruthObject | None]
 
 
 def simulated(seed: int, seabed: SeabedKind, cache: Path | None) -> SimulatedSurvey:
-    """Simulate one training survey, or take it from the cache of an earlier run (a folder of one's own)."""
-    kept = None if cache is None else cache / f"{seed}_{seabed}.pkl"
-    if kept is not None and kept.is_file():
-        found: SimulatedSurvey = pickle.loads(kept.read_bytes())
+    """Simulate one training survey, or load it from the cache (pickles: use a private folder)."""
+    cached = None if cache is None else cache / f"{seed}_{seabed}.pkl"
+    if cached is not None and cached.is_file():
+        found: SimulatedSurvey = pickle.loads(cached.read_bytes())
         return found
     changes = _VARIATIONS[(seed - FIRST_SEED) % len(_VARIATIONS)]
-    made = simulate_survey(replace(SurveySpec(seed=seed, seabed=seabed, targets=4, clutter=6), **changes))
-    if kept is not None:
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(kept, pickle.dumps(made))
-    return made
+    simulated_survey = simulate_survey(replace(SurveySpec(seed=seed, seabed=seabed, targets=4, clutter=6), **changes))
+    if cached is not None:
+        cached.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(cached, pickle.dumps(simulated_survey))
+    return simulated_survey
 
 
-def tables(made: SimulatedSurvey) -> list[SideTable]:
-    """Find the places of both sides and what each truly is."""
-    survey, found = made.survey, []
+def side_candidates(simulated_survey: SimulatedSurvey) -> list[SideCandidates]:
+    """Return the candidates of both sides with their true objects."""
+    survey, found = simulated_survey.survey, []
     altitude_m = altitudes_m(survey)
     for side in survey.sides():
         grid = normalise_side(survey, side, SETTINGS, altitude_m)
         if grid is None:
             continue
-        places = find_candidates(grid, SETTINGS)
+        candidates = find_candidates(grid, SETTINGS)
         scale = Scale(grid.row_along_m, grid.cell_across_m / grid.samples_per_cell)
         objects = []
-        for place in places:
-            sample = (place.measurement.cell + 0.5) * grid.samples_per_cell
-            index = object_at(made.truth, side, place.measurement.row, sample, scale)
-            objects.append(None if index is None else made.truth[index])
-        nothing = np.broadcast_to(np.float32(0.0), grid.level.shape)
-        found.append(SideTable(replace(grid, level=nothing, ratio=nothing), places, objects))
+        for candidate in candidates:
+            sample = (candidate.measurement.cell + 0.5) * grid.samples_per_cell
+            index = object_at(simulated_survey.truth, side, candidate.measurement.row, sample, scale)
+            objects.append(None if index is None else simulated_survey.truth[index])
+        no_levels = np.broadcast_to(np.float32(0.0), grid.level.shape)
+        found.append(SideCandidates(replace(grid, level=no_levels, ratio=no_levels), candidates, objects))
     return found
 
 
-def kept_rows(sides: list[SideTable], model: FusionModel) -> tuple[Floats, npt.NDArray[np.int64]]:
-    """Return logarithms of scores and the clutter's level, shape (places, 6), and the kinds, of the places kept.
+def kept_rows(sides: list[SideCandidates], model: FusionModel) -> tuple[Floats, npt.NDArray[np.int64]]:
+    """Return log scores with clutter level, shape (candidates, 6), and the kinds, of the candidates kept.
 
-    A kind is 2 (mine-like), 1 (other object) or 0 (bottom). Of an object's places only the most confident is its own;
-    the others are left out, being neither the object nor a false alarm.
+    A kind is 2 (mine-like), 1 (other object) or 0 (seabed). Only the most confident candidate of an object is kept;
+    the others are neither objects nor false alarms.
     """
     rows: list[list[float]] = []
     kinds: list[int] = []
     for side in sides:
-        evidence = np.array([model.evidence(p.scores) for p in side.places])
+        evidence = np.array([model.evidence(p.scores) for p in side.candidates])
         levels = clutter_levels(
-            [p.measurement for p in side.places], evidence, side.grid, SETTINGS, model.clutter_floor
+            [p.measurement for p in side.candidates], evidence, side.grid, SETTINGS, model.clutter_floor
         )
-        met: set[int] = set()
-        row_of = {id(p): i for i, p in enumerate(side.places)}
-        fused = fused_confidences(side.places, side.grid, SETTINGS, model)
-        for _, place in suppress_duplicates(list(zip(fused, side.places, strict=True)), side.grid, SETTINGS):
+        assigned: set[int] = set()
+        row_of = {id(p): i for i, p in enumerate(side.candidates)}
+        fused = fused_confidences(side.candidates, side.grid, SETTINGS, model)
+        for _, place in suppress_duplicates(list(zip(fused, side.candidates, strict=True)), side.grid, SETTINGS):
             index = row_of[id(place)]
             thing = side.objects[index]
-            if thing is not None and id(thing) in met:
+            if thing is not None and id(thing) in assigned:
                 continue
-            met.add(id(thing))
+            assigned.add(id(thing))
             rows.append([*log_scores(place.scores), -levels[index]])
             kinds.append(0 if thing is None else 2 if thing.is_mine_like else 1)
     return np.array(rows), np.array(kinds)
 
 
 def logistic(seen: Floats, is_object: npt.NDArray[np.bool_], weights: Floats) -> Floats:
-    """Fit a logistic regression with slopes of 0 or more; return the slopes and the offset."""
+    """Fit a logistic regression without negative slopes; return the slopes and the offset."""
     signs, shares = np.where(is_object, 1.0, -1.0), weights / weights.sum()
 
     def loss(parameters: Floats) -> tuple[float, Floats]:
@@ -151,35 +151,35 @@ def logistic(seen: Floats, is_object: npt.NDArray[np.bool_], weights: Floats) ->
     return found
 
 
-def fitted(sides: list[SideTable]) -> tuple[FusionModel, npt.NDArray[np.int64]]:
-    """Return the model, and the kinds of the places that its scale and offset were fitted to."""
+def fitted(sides: list[SideCandidates]) -> tuple[FusionModel, npt.NDArray[np.int64]]:
+    """Return the model, and the kinds of the candidates used for scale and offset."""
     model = START
     for _ in range(ROUNDS):
-        evidence = [model.evidence(p.scores) for side in sides for p in side.places]
+        evidence = [model.evidence(p.scores) for side in sides for p in side.candidates]
         model = replace(model, clutter_floor=float(np.percentile(evidence, FLOOR_PERCENTILE)))
         rows, kinds = kept_rows(sides, model)
         slopes = logistic(rows, kinds > 0, np.where(kinds == 1, OTHER_OBJECT_WEIGHT, 1.0))
         model = replace(
             model, offset=float(slopes[-1]), weights=tuple(slopes[:-2].tolist()), clutter_weight=float(slopes[-2])
         )
-    evidence = [model.evidence(p.scores) for side in sides for p in side.places]
+    evidence = [model.evidence(p.scores) for side in sides for p in side.candidates]
     model = replace(model, clutter_floor=float(np.percentile(evidence, FLOOR_PERCENTILE)))
     rows, kinds = kept_rows(sides, model)
     odds = rows[:, :-1] @ np.array(model.weights) + model.clutter_weight * rows[:, -1]
     scale, offset = logistic(odds[:, None], kinds > 0, np.ones(len(kinds))).tolist()
     weights = tuple(scale * w for w in model.weights)
-    # The clutter's level is evidence too and scales with it, so its weight stays.
+    # The clutter level is in units of evidence and scales with it, so its weight does not change.
     return FusionModel(offset, weights, model.clutter_weight, scale * model.clutter_floor), kinds
 
 
 def main() -> None:
-    """Simulate, fit, write."""
+    """Simulate the surveys, fit the model, write it."""
     parser = argparse.ArgumentParser(description="Fit the detector's fusion to simulated surveys.")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--cache", type=Path, help="folder for the simulated surveys, to fit again at once")
+    parser.add_argument("--cache", type=Path, help="folder for the simulated surveys, to repeat the fit quickly")
     parsed = parser.parse_args()
     jobs = [(FIRST_SEED + i, kind) for i in range(SEEDS) for kind in SeabedKind]
-    sides = [side for seed, kind in jobs for side in tables(simulated(seed, kind, parsed.cache))]
+    sides = [side for seed, kind in jobs for side in side_candidates(simulated(seed, kind, parsed.cache))]
     model, kinds = fitted(sides)
     text = json.dumps(
         {

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from research.common.command import command_parser, run_command
-from research.user_study.server import Answers, Folders, PanelApp
+from research.user_study.server import Answers, Folders, StudyApp
 from research.user_study.trials import results, table
 from sonarpost.errors import ConfigError
 from sonarpost.services.console.web.server import WebServer
@@ -21,29 +21,36 @@ FILE_NAME = "panel.db"
 
 def new_parser() -> argparse.ArgumentParser:
     """Return the parser of this command."""
-    parser = command_parser("user_study", "how well people recognise decoded pictures: a blind forced choice")
-    parser.add_argument("--originals", type=Path, metavar="DIR", help="original pictures (PNG, TIFF)")
-    parser.add_argument(
-        "--decoded", type=Path, metavar="DIR", help="decoded ones of the same names, in one folder a group if you like"
+    parser = command_parser(
+        "user_study", "Measure how well people recognise decoded images: blind forced choice among originals."
     )
-    parser.add_argument("--state", type=Path, default=Path("panel"), metavar="DIR", help="answers (default: panel)")
-    parser.add_argument("--choices", type=int, default=4, metavar="N", help="originals offered at a time (default: 4)")
-    parser.add_argument("--title", default="Which original is it?", help="of the page")
-    parser.add_argument("--seed", type=int, default=1, help="of the order (default: 1)")
+    parser.add_argument("--originals", type=Path, metavar="DIR", help="original images (PNG, TIFF)")
+    parser.add_argument(
+        "--decoded",
+        type=Path,
+        metavar="DIR",
+        help="decoded images of the same names, or one folder a group",
+    )
+    parser.add_argument(
+        "--state", type=Path, default=Path("panel"), metavar="DIR", help="folder of the answers (default: panel)"
+    )
+    parser.add_argument("--choices", type=int, default=4, metavar="N", help="originals in a trial (default: 4)")
+    parser.add_argument("--title", default="Which original is it?", help="title of the page")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the order (default: 1)")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
     parser.add_argument("--port", type=int, default=8472, help="default: 8472; 0: any")
-    parser.add_argument("--results", action="store_true", help="print the results so far and end")
+    parser.add_argument("--results", action="store_true", help="print the results and exit")
     parser.add_argument("--json", action="store_true", help="results as JSON")
     return parser
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Serve the panel until it is ended, or print its results; return the exit status.
+    """Serve the study until it is stopped, or print its results; return the exit status.
 
     Raises:
-        ConfigError: A folder or number is wrong.
-        HandoffError: The answers cannot be opened.
-        PortError: The address cannot be listened on.
+        ConfigError: A folder or number is invalid.
+        DeliveryError: The answers cannot be opened.
+        PortError: The address is not available.
     """
     if parsed.results:
         return _print_results(parsed.state / FILE_NAME, as_json=parsed.json)
@@ -52,9 +59,9 @@ def run(parsed: argparse.Namespace) -> int:
     folders = Folders.read(parsed.originals, parsed.decoded)
     answers = Answers(parsed.state / FILE_NAME)
     try:
-        app = PanelApp(folders, answers, parsed.title, parsed.choices, parsed.seed, parsed.host)
+        app = StudyApp(folders, answers, parsed.title, parsed.choices, parsed.seed, parsed.host)
         server = WebServer(app.asgi, parsed.host, parsed.port)
-        print(f"{server.address}panel  {len(folders.decoded)} pictures", flush=True)
+        print(f"{server.address}panel  {len(folders.decoded)} images", flush=True)
         _serve(server)
     finally:
         answers.close()
@@ -75,13 +82,13 @@ def _print_results(path: Path, *, as_json: bool) -> int:
 
 
 def _serve(server: WebServer) -> None:
-    ended = threading.Event()
+    stopped = threading.Event()
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: ended.set())
+            signal.signal(number, lambda *_: stopped.set())
     server.start()
     try:
-        while server.running and not ended.wait(0.5):
+        while server.running and not stopped.wait(0.5):
             pass
     finally:
         server.stop()

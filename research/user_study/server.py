@@ -1,4 +1,4 @@
-"""The recognition survey's pages: who answers, what was answered, pictures under names that tell nothing."""
+"""Web application of the user study: participants, answers, and images under names without information."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ CREATE TABLE IF NOT EXISTS answer (
 
 @dataclass(frozen=True, slots=True)
 class Folders:
-    """The pictures of a panel.
+    """Image files of the study.
 
     Attributes:
-        originals: Files by name without suffix.
-        decoded: Files of the decoded ones.
+        originals: Files of the originals, by name without suffix.
+        decoded: Files of the decoded images.
     """
 
     originals: dict[str, Path]
@@ -58,37 +58,37 @@ class Folders:
 
     @classmethod
     def read(cls, originals: Path, decoded: Path) -> Folders:
-        """Find the pictures: decoded ones have the names of their originals, in `decoded` or in one folder a group.
+        """Find the images: decoded ones have the names of their originals, in `decoded` or in one folder a group.
 
         Raises:
-            ConfigError: A folder has no pictures, or a decoded one no original.
+            ConfigError: A folder contains no images, or a decoded image has no original.
         """
-        known = {path.stem: path for path in _pictures(originals)}
+        known = {path.stem: path for path in _images(originals)}
         found: dict[Decoded, Path] = {}
-        for path in _pictures(decoded):
+        for path in _images(decoded):
             found[Decoded("", path.stem)] = path
         if decoded.is_dir():
             for folder in sorted(path for path in decoded.iterdir() if path.is_dir()):
-                found |= {Decoded(folder.name, path.stem): path for path in _pictures(folder)}
-        for name, folder, pictures in (("--originals", originals, known), ("--decoded", decoded, found)):
-            if not pictures:
-                raise ConfigError("user_study", name, str(folder), "a folder with PNG or TIFF pictures")
+                found |= {Decoded(folder.name, path.stem): path for path in _images(folder)}
+        for name, folder, images in (("--originals", originals, known), ("--decoded", decoded, found)):
+            if not images:
+                raise ConfigError("user_study", name, str(folder), "a folder with PNG or TIFF images")
         for one in found:
             if one.name not in known:
                 raise ConfigError(
-                    "user_study", "--decoded", str(found[one]), f"a picture with an original in {originals}"
+                    "user_study", "--decoded", str(found[one]), f"an image with an original in {originals}"
                 )
         return cls(known, found)
 
 
-def _pictures(folder: Path) -> list[Path]:
+def _images(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
 
 
 class Answers:
-    """What was answered, on the disk; nothing is answered twice.
+    """Durable storage of the answers; each question has one answer.
 
     Raises:
         DeliveryError: The file cannot be opened.
@@ -103,25 +103,25 @@ class Answers:
             self._db.execute("PRAGMA synchronous=FULL")
             self._db.executescript(f"BEGIN; {_SCHEMA} COMMIT;")
         except (OSError, sqlite3.Error) as error:
-            raise DeliveryError(f"{path}: cannot be opened as a panel: {error}") from error
+            raise DeliveryError(f"{path}: cannot be opened as a user study: {error}") from error
 
     def setting(self, name: str, initial: bytes) -> bytes:
-        """Return what the panel was begun with, `initial` for a new one."""
+        """Return a setting of the study, `initial` for a new study."""
         with self._lock:
             self._db.execute("INSERT OR IGNORE INTO panel VALUES (?, ?)", (name, initial))
             return bytes(self._db.execute("SELECT value FROM panel WHERE name = ?", (name,)).fetchone()[0])
 
     def answered(self, person: str) -> int:
-        """Return how many a person has answered: they are answered in order."""
+        """Return the number of answers of a participant; questions are answered in order."""
         with self._lock:
             row = self._db.execute("SELECT COUNT(*) FROM answer WHERE person = ?", (person,)).fetchone()
             return int(row[0])
 
     def add(self, person: str, number: int, trial: Trial, choice: int, sure: float | None, seconds: float) -> bool:
-        """Keep an answer; False where there is one already.
+        """Store an answer; return False if the question was already answered.
 
         Raises:
-            DeliveryError: It cannot be kept now.
+            DeliveryError: The answer cannot be stored.
         """
         chosen = "" if choice == NONE_OF_THEM else trial.choices[choice]
         row = (
@@ -166,23 +166,23 @@ class _Answered(RequestBody):
 
 
 @dataclass
-class _Person:
+class _Participant:
     name: str
     trials: tuple[Trial, ...]
-    pictures: dict[str, Path] = field(default_factory=dict)
+    images: dict[str, Path] = field(default_factory=dict)
 
 
-class PanelApp:
-    """A panel as a web application.
+class StudyApp:
+    """Web application of a user study.
 
     Args:
-        folders: Its pictures.
-        answers: Where answers are kept.
-        title: For the page.
-        choices: How many originals are offered at a time.
-        seed: Of the order.
-        host: Where it is served; its own name in browsers.
-        static: Folder of the page.
+        folders: The images.
+        answers: Storage of the answers.
+        title: Title of the page.
+        choices: Number of originals in a trial.
+        seed: Seed of the order.
+        host: Host name of the server.
+        static: Folder with the shared files of the console's page.
     """
 
     def __init__(
@@ -202,25 +202,25 @@ class PanelApp:
         self._seed = int(answers.setting("seed", str(seed).encode()))
         self._secret = answers.setting("secret", secrets.token_bytes(32))
         self._lock = threading.Lock()
-        self._people: dict[str, _Person] = {}
-        # Wrong choices are told before anybody sits down.
+        self._people: dict[str, _Participant] = {}
+        # Report an invalid number of choices at the start.
         trials_for("", self._seed, tuple(folders.originals), folders.decoded, self._choices)
         self._static = static
         access = AccessControl(None, "vessel", behind_proxy=False)
 
-        def let(handler: Handler) -> Endpoint:
+        def endpoint(handler: Handler) -> Endpoint:
             return access.endpoint(handler, needs_session=False)
 
         routes = [
             Route("/", lambda _: RedirectResponse("/panel", 303)),
             Route("/panel", lambda _: static_file(OWN_STATIC, "panel.html")),
             Route("/panel/{path:path}", lambda request: static_file(OWN_STATIC, str(request.path_params["path"]))),
-            Route("/api/panel", let(self._info)),
-            Route("/api/panel/start", let(self._start), methods=["POST"]),
-            Route("/api/panel/next", let(self._next)),
-            Route("/api/panel/answers", let(self._answer), methods=["POST"]),
-            Route("/api/panel/results", let(self._results)),
-            Route("/api/panel/pictures/{token}.png", let(self._picture)),
+            Route("/api/panel", endpoint(self._info)),
+            Route("/api/panel/start", endpoint(self._start), methods=["POST"]),
+            Route("/api/panel/next", endpoint(self._next)),
+            Route("/api/panel/answers", endpoint(self._answer), methods=["POST"]),
+            Route("/api/panel/results", endpoint(self._results)),
+            Route("/api/panel/pictures/{token}.png", endpoint(self._image)),
             *static_routes(static),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: routing_error})
@@ -236,10 +236,10 @@ class PanelApp:
         token = self._signed(f"person {name}")
         trials = trials_for(name, self._seed, tuple(self._folders.originals), self._folders.decoded, self._choices)
         with self._lock:
-            self._people.setdefault(token, _Person(name, trials))
+            self._people.setdefault(token, _Participant(name, trials))
         return JSONResponse({"panel": token, "answered": self._answers.answered(name)}, 201)
 
-    def _person(self, call: Call) -> _Person:
+    def _person(self, call: Call) -> _Participant:
         with self._lock:
             person = self._people.get(call.request.headers.get("x-panel", ""))
         if person is None:
@@ -267,38 +267,38 @@ class PanelApp:
             }
         )
 
-    def _address(self, person: _Person, number: int, what: str, path: Path) -> str:
-        """Return where a picture is for this person and question: a name that says nothing of the file's."""
+    def _address(self, person: _Participant, number: int, what: str, path: Path) -> str:
+        """Return the address of an image for this participant and question; it does not contain the file name."""
         token = self._signed(f"{person.name}/{number}/{what}")
         with self._lock:
-            person.pictures[token] = path
+            person.images[token] = path
         return f"/api/panel/pictures/{token}.png"
 
-    def _picture(self, call: Call) -> Response:
+    def _image(self, call: Call) -> Response:
         token = str(call.request.path_params["token"])
         with self._lock:
-            paths = [person.pictures[token] for person in self._people.values() if token in person.pictures]
+            paths = [person.images[token] for person in self._people.values() if token in person.images]
         if not paths:
-            raise ApiError(404, "not_found", "no such picture")
-        # Drawn anew: a file's own remarks and dates stay here.
+            raise ApiError(404, "not_found", "no such image")
+        # Encoded again, so that metadata of the file is not sent.
         data = rendering.encode_png(rendering.eight_bits(read_image(paths[0])))
         return Response(data, media_type="image/png")
 
     def _answer(self, call: Call) -> Response:
-        person, given = self._person(call), call.parse_body(_Answered)
+        person, answer = self._person(call), call.parse_body(_Answered)
         answered = self._answers.answered(person.name)
-        if given.choice >= self._choices:
+        if answer.choice >= self._choices:
             raise ApiError(400, "bad_request", f"-1 to {self._choices - 1}", "choice")
-        if given.number > len(person.trials) or given.number > answered + 1:
+        if answer.number > len(person.trials) or answer.number > answered + 1:
             raise ApiError(400, "bad_request", f"{answered + 1}, the next question", "number")
-        trial = person.trials[given.number - 1]
-        if not self._answers.add(person.name, given.number, trial, given.choice, given.sure, given.seconds):
+        trial = person.trials[answer.number - 1]
+        if not self._answers.add(person.name, answer.number, trial, answer.choice, answer.sure, answer.seconds):
             raise ApiError(409, "conflict", "this question has been answered", "number")
         return JSONResponse({"answered": self._answers.answered(person.name)}, 201)
 
     def _results(self, call: Call) -> Response:
         if call.address not in ("127.0.0.1", "::1"):
-            raise ApiError(403, "forbidden", "results are shown on this host only")
+            raise ApiError(403, "forbidden", "results are available on this host only")
         return JSONResponse(results(self._answers.all(), self._choices))
 
     def _signed(self, text: str) -> str:

@@ -1,4 +1,7 @@
-"""A blind forced choice: people see decoded pictures and say of which original each is."""
+"""Trials of the user study and the evaluation of its answers.
+
+A participant sees each decoded image once, in random order, and selects its original among several.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,8 @@ import random
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from research.user_study.intervals import clopper_pearson, wilson
+from scipy.stats import binomtest
+
 from sonarpost.errors import ConfigError
 
 NONE_OF_THEM = -1
@@ -14,11 +18,11 @@ NONE_OF_THEM = -1
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """A decoded picture.
+    """A decoded image.
 
     Attributes:
-        group: What it is counted with, for example a codec at a length; empty for all that are in no folder.
-        name: Of the original.
+        group: Group in the results, for example a codec at a length; empty for images without a folder.
+        name: Name of the original.
     """
 
     group: str
@@ -30,8 +34,8 @@ class Trial:
     """One question.
 
     Attributes:
-        shown: The decoded picture.
-        choices: Names of the originals offered, in the order of the page; one is right.
+        shown: The decoded image.
+        choices: Names of the originals on the page, in order; one is right.
     """
 
     shown: Decoded
@@ -46,44 +50,43 @@ class Trial:
 def trials_for(
     person: str, seed: int, originals: Sequence[str], decoded: Iterable[Decoded], choices: int
 ) -> tuple[Trial, ...]:
-    """Return the questions for a person in their order; the same person and seed get the same ones.
+    """Return the trials of a participant in order; the same participant and seed give the same trials.
 
     Args:
-        person: Everybody gets an order of their own.
-        seed: Of the panel.
+        person: Name of the participant, which determines the order.
+        seed: Seed of the study.
         originals: Names of the originals.
-        decoded: What is shown; each is shown once.
-        choices: How many originals are offered at a time.
+        decoded: The decoded images; each appears once.
+        choices: Number of originals in a trial.
 
     Raises:
-        ConfigError: There are fewer originals than choices, or a decoded picture has no original.
+        ConfigError: There are fewer originals than choices, or a decoded image has no original.
     """
     known = sorted(set(originals))
     if not 2 <= choices <= len(known):
         raise ConfigError("user_study", "--choices", choices, f"2 to {len(known)}, the number of originals")
-    chance = random.Random(f"{seed}/{person}")
-    wanted = sorted(set(decoded), key=lambda one: (one.group, one.name))
-    found = []
-    for one in wanted:
+    rng = random.Random(f"{seed}/{person}")
+    trials = []
+    for one in sorted(set(decoded), key=lambda one: (one.group, one.name)):
         if one.name not in known:
-            raise ConfigError("user_study", "--decoded", f"{one.group}/{one.name}", "a picture with an original")
-        others = chance.sample([name for name in known if name != one.name], choices - 1)
+            raise ConfigError("user_study", "--decoded", f"{one.group}/{one.name}", "an image with an original")
+        others = rng.sample([name for name in known if name != one.name], choices - 1)
         offered = [one.name, *others]
-        chance.shuffle(offered)
-        found.append(Trial(one, tuple(offered)))
-    chance.shuffle(found)
-    return tuple(found)
+        rng.shuffle(offered)
+        trials.append(Trial(one, tuple(offered)))
+    rng.shuffle(trials)
+    return tuple(trials)
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a person chose.
+    """An answer of a participant.
 
     Attributes:
-        person: Who.
-        group: Of the decoded picture.
-        right: Whether it was the right one.
-        seconds: How long it took.
+        person: Name of the participant.
+        group: Group of the decoded image.
+        right: Whether the choice was right.
+        seconds: Response time.
     """
 
     person: str
@@ -93,24 +96,27 @@ class Answer:
 
 
 def share(answers: Sequence[Answer]) -> dict[str, object]:
-    """Return how many answers were right, with both intervals of 95 % and the median time."""
+    """Return the share of right answers with the 95 % intervals of Wilson and of Clopper and Pearson (exact)."""
     right, number = sum(answer.right for answer in answers), len(answers)
     times = sorted(answer.seconds for answer in answers)
+    intervals = {
+        method: list(binomtest(right, number).proportion_ci(method=method)) if number else [0.0, 1.0]
+        for method in ("wilson", "exact")
+    }
     return {
         "answered": number,
         "right": right,
         "share": right / number if number else None,
-        "wilson": list(wilson(right, number)),
-        "exact": list(clopper_pearson(right, number)),
+        **intervals,
         "median_s": times[number // 2] if number else None,
     }
 
 
 def results(answers: Sequence[Answer], choices: int) -> dict[str, object]:
-    """Return the table of a panel: by person, by group, and pooled.
+    """Return the results by participant, by group, and pooled.
 
-    Pooled answers of several people are not independent of one another where they saw the same pictures: its intervals
-    are too narrow for a claim about other people, which `people` is for.
+    Pooled answers are not independent, because the participants saw the same images. Their intervals are too narrow
+    for statements about other people; use those of `people`.
     """
     by_person: dict[str, list[Answer]] = {}
     by_group: dict[str, list[Answer]] = {}
@@ -126,7 +132,7 @@ def results(answers: Sequence[Answer], choices: int) -> dict[str, object]:
 
 
 def table(found: Mapping[str, object]) -> str:
-    """Return what `results` found as text, a row a line."""
+    """Return the results as a text table."""
     rows = [("", "right", "of", "share", "95 % (Wilson)", "95 % (exact)")]
     people, groups = found["people"], found["by_group"]
     assert isinstance(people, list)

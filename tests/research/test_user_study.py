@@ -1,4 +1,4 @@
-"""The recognition survey: blind, in each person's own order, answered once, counted with intervals."""
+"""User study: blind trials in an order of each participant, one answer a question, results with intervals."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from PIL.PngImagePlugin import PngInfo
 from starlette.testclient import TestClient
 
 from research.user_study.__main__ import main
-from research.user_study.intervals import clopper_pearson, wilson
-from research.user_study.server import Answers, Folders, PanelApp
-from research.user_study.trials import Decoded, trials_for
+from research.user_study.server import Answers, Folders, StudyApp
+from research.user_study.trials import Answer, Decoded, share, trials_for
 from sonarpost.errors import ConfigError
 
 NAMES = [f"contact-{number}" for number in range(6)]
@@ -36,7 +35,7 @@ def folders(tmp_path):
 @pytest.fixture
 def panel(folders, tmp_path):
     answers = Answers(tmp_path / "state" / "panel.db")
-    app = PanelApp(Folders.read(*folders), answers, "Which?", choices=3, seed=1)
+    app = StudyApp(Folders.read(*folders), answers, "Which?", choices=3, seed=1)
     with TestClient(app.asgi, base_url="http://127.0.0.1", client=("127.0.0.1", 1)) as client:
         yield client
     answers.close()
@@ -47,12 +46,12 @@ def grey_of(client, address) -> int:
 
 
 def right_choice(client, question) -> int:
-    """What somebody would choose who recognises everything; `small` is 13 long and `large` too, `originals` 9."""
+    """The right choice by grey level; the folder names `decoded/small` and `decoded/large` have 13 characters."""
     shown = grey_of(client, question["shown"]) - len("decoded/small")
     return [grey_of(client, address) - len("originals") for address in question["choices"]].index(shown)
 
 
-def test_from_the_first_question_to_the_table(panel, tmp_path, capsys):
+def test_study_from_the_first_trial_to_the_results(panel, tmp_path, capsys):
     assert panel.get("/api/panel").json() == {"title": "Which?", "trials": 12, "choices": 3}
     assert panel.get("/api/panel/next").status_code == 401
     headers = {"X-Panel": panel.post("/api/panel/start", json={"name": "Anna"}).json()["panel"]}
@@ -80,7 +79,7 @@ def test_from_the_first_question_to_the_table(panel, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out) == found
 
 
-def test_nothing_gives_the_answer_away(panel):
+def test_responses_do_not_reveal_the_answer(panel):
     headers = {"X-Panel": panel.post("/api/panel/start", json={"name": "Anna"}).json()["panel"]}
     question = panel.get("/api/panel/next", headers=headers)
     assert not any(name in question.text for name in (*NAMES, "small", "large"))
@@ -92,7 +91,7 @@ def test_nothing_gives_the_answer_away(panel):
     assert set(panel.post("/api/panel/answers", json=body, headers=headers).json()) == {"answered"}
 
 
-def test_a_person_goes_on_where_they_were_and_another_has_another_order(panel):
+def test_participant_continues_and_another_has_another_order(panel):
     start = panel.post("/api/panel/start", json={"name": "Anna"}).json()
     headers = {"X-Panel": start["panel"]}
     first = panel.get("/api/panel/next", headers=headers).json()
@@ -111,14 +110,14 @@ def test_a_person_goes_on_where_they_were_and_another_has_another_order(panel):
     ("change", "field"),
     [({"choice": 3}, "choice"), ({"number": 2}, "number"), ({"seconds": -1.0}, "seconds"), ({"sure": 2}, "sure")],
 )
-def test_a_wrong_answer_form_is_named(panel, change, field):
+def test_error_names_the_invalid_field(panel, change, field):
     headers = {"X-Panel": panel.post("/api/panel/start", json={"name": "Anna"}).json()["panel"]}
     body = {"number": 1, "choice": 0, "sure": None, "seconds": 1.0, **change}
     answer = panel.post("/api/panel/answers", json=body, headers=headers)
     assert (answer.status_code, answer.json()["error"]["field"]) == (400, field)
 
 
-def test_the_right_one_is_anywhere_and_once():
+def test_right_choice_is_unique_and_at_a_random_position():
     decoded = [Decoded("", name) for name in NAMES]
     places = [0, 0, 0]
     for person in range(200):
@@ -129,7 +128,7 @@ def test_the_right_one_is_anywhere_and_once():
     assert all(abs(number - 400) < 5 * 16.4 for number in places)
 
 
-def test_wrong_folders_and_numbers_are_named(folders, tmp_path, capsys):
+def test_error_names_the_invalid_folder_or_number(folders, tmp_path, capsys):
     originals, decoded = folders
     (tmp_path / "empty").mkdir()
     with pytest.raises(ConfigError, match="--originals"):
@@ -144,18 +143,23 @@ def test_wrong_folders_and_numbers_are_named(folders, tmp_path, capsys):
     assert "--originals DIR" in capsys.readouterr().err
 
 
-def test_results_are_for_this_host(folders, tmp_path):
+def test_results_are_available_on_this_host_only(folders, tmp_path):
     answers = Answers(tmp_path / "panel.db")
-    app = PanelApp(Folders.read(*folders), answers, "Which?", choices=3, seed=1)
+    app = StudyApp(Folders.read(*folders), answers, "Which?", choices=3, seed=1)
     with TestClient(app.asgi, base_url="http://127.0.0.1", client=("10.0.0.7", 1)) as client:
         assert client.get("/api/panel/results").status_code == 403
     answers.close()
 
 
+def interval(method, right, number):
+    answers = [Answer("ann", "small", n < right, 1.0) for n in range(number)]
+    return share(answers)[method]
+
+
 def test_confidence_intervals():
     # Published values for 18 of 20 at 95 %.
-    assert wilson(18, 20) == (pytest.approx(0.699, abs=1e-3), pytest.approx(0.972, abs=1e-3))
-    assert clopper_pearson(18, 20) == (pytest.approx(0.683, abs=1e-3), pytest.approx(0.988, abs=1e-3))
-    assert wilson(0, 0) == clopper_pearson(0, 0) == (0.0, 1.0)
-    assert clopper_pearson(20, 20)[1] == 1.0
-    assert wilson(0, 5)[0] == 0.0
+    assert interval("wilson", 18, 20) == [pytest.approx(0.699, abs=1e-3), pytest.approx(0.972, abs=1e-3)]
+    assert interval("exact", 18, 20) == [pytest.approx(0.683, abs=1e-3), pytest.approx(0.988, abs=1e-3)]
+    assert interval("wilson", 0, 0) == interval("exact", 0, 0) == [0.0, 1.0]
+    assert interval("exact", 20, 20)[1] == 1.0
+    assert interval("wilson", 0, 5)[0] == 0.0

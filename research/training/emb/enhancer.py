@@ -1,9 +1,9 @@
-"""Train the decoder's enhancer on pictures that were coded and decoded, and write its weights.
+"""Train the enhancer of the decoder on decoded images, and write its weights.
 
     python -m research.training.emb.enhancer --pool /tmp/emb/pool.npz \
         --model /tmp/emb/contexts.model --out common/sonarpost/codec/emb/data/emb.model --steps 12000
 
-Loss: squared error relative to that of the picture as decoded, minus a little of the multi-scale structural similarity.
+Loss: squared error relative to that before enhancement, minus the weighted multi-scale structural similarity.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from sonarpost.codec.emb.model import CHANNELS, DILATIONS, IMAGE_FEATURES, Model
 
 SEED = 11
 BATCH = 10
-LEAST_BYTES, LARGEST_BYTES = 18, 640
+MIN_BYTES, MAX_BYTES = 18, 640
 Params = dict[str, jax.Array]
 
 
-def coded(codec: EmbCodec, pictures: np.ndarray, rng: np.random.Generator, streams: int) -> tuple[np.ndarray, ...]:
-    """Decode chance lengths of each picture: planes without enhancement (1/64 grey), means, features.
+def coded(codec: EmbCodec, images: np.ndarray, rng: np.random.Generator, streams: int) -> tuple[np.ndarray, ...]:
+    """Decode random lengths of each image; return planes without enhancement (1/64 grey), means, features.
 
-    Every other stream is the beginning of a longer one, as a receiver has it that still waits for more.
+    Every other stream is the beginning of a longer one, like a partly received stream.
     """
     planes, means, features = [], [], []
-    for picture in pictures:
-        for i, size in enumerate(np.exp(rng.uniform(np.log(LEAST_BYTES), np.log(LARGEST_BYTES), streams))):
-            length = int(size * picture.size / 6400)
-            made = length if i % 2 == 0 else int(length * rng.uniform(1, 4))
-            stream = EmbCodec(codec.network, start_steps=(int(rng.integers(8)),)).encode(picture, made)
+    for image in images:
+        for i, size in enumerate(np.exp(rng.uniform(np.log(MIN_BYTES), np.log(MAX_BYTES), streams))):
+            length = int(size * image.size / 6400)
+            full_length = length if i % 2 == 0 else int(length * rng.uniform(1, 4))
+            stream = EmbCodec(codec.network, start_steps=(int(rng.integers(8)),)).encode(image, full_length)
             plain = codec.decode_before_enhancer(stream[:length])
             low, high = -64 * plain.mean, 64 * (255 - plain.mean)
             planes.append(np.clip(plain.plane, low, high).astype(np.int16))
@@ -49,7 +49,7 @@ def coded(codec: EmbCodec, pictures: np.ndarray, rng: np.random.Generator, strea
 
 
 def start(rng: np.random.Generator) -> Params:
-    """He-initialised weights; the last layer begins near nothing."""
+    """Return initial weights (He initialisation); the last layer starts near zero."""
     out: Params = {"s": jnp.zeros((IMAGE_FEATURES, CHANNELS))}
     for i in range(len(DILATIONS)):
         inputs, outputs = (4 if i == 0 else CHANNELS), (4 if i == len(DILATIONS) - 1 else CHANNELS)
@@ -60,7 +60,7 @@ def start(rng: np.random.Generator) -> Params:
 
 
 def resumed(model: Model) -> Params:
-    """The weights of a model file, as they were before rounding."""
+    """Return the weights of a model file as floating-point numbers."""
     out: Params = {"s": jnp.asarray(model.image_weights / (1 << 14))}
     for i, (taps, bias) in enumerate(model.layers):
         out[f"w{i}"], out[f"b{i}"] = jnp.asarray(taps / (1 << 12)), jnp.asarray(bias / (1 << 20))
@@ -68,7 +68,7 @@ def resumed(model: Model) -> Params:
 
 
 def enhance(p: Params, blocks: jax.Array, features: jax.Array) -> jax.Array:
-    """Corrections in grey; the integer twin is `enhance.enhanced`. `blocks` in 64 grey."""
+    """Return the corrections in grey; the integer version is `enhance.enhanced`. `blocks` is in 64 grey."""
     x = blocks
     for i, d in enumerate(DILATIONS):
         w = p[f"w{i}"].reshape(3, 3, *p[f"w{i}"].shape[1:])
@@ -85,7 +85,7 @@ def enhance(p: Params, blocks: jax.Array, features: jax.Array) -> jax.Array:
 
 
 def to_pixels(b: jax.Array) -> jax.Array:
-    """Blocks of 2 x 2 back to pixels."""
+    """Convert blocks of 2 x 2 to pixels."""
     n, r, c, _ = b.shape
     return b.reshape(n, r, c, 2, 2).transpose(0, 1, 3, 2, 4).reshape(n, 2 * r, 2 * c)
 
@@ -110,7 +110,7 @@ def _blur(x: jax.Array) -> jax.Array:
 
 
 def similarity(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Structural similarity over three scales, weights .0448, .2856, .3001 made to add up to 1."""
+    """Return the structural similarity over three scales, weights .0448, .2856, .3001 scaled to a sum of 1."""
     weights = np.array([0.0448, 0.2856, 0.3001])
     weights /= weights.sum()
     total = 1.0
@@ -118,7 +118,7 @@ def similarity(a: jax.Array, b: jax.Array) -> jax.Array:
         if scale:
             a, b = _halved(a), _halved(b)
         if weights[scale] < 0.1:
-            continue  # costs four fifths of the work for a thirteenth of the weight
+            continue  # four fifths of the computing time for a thirteenth of the weight
         ma, mb = _blur(a), _blur(b)
         va, vb, c = _blur(a * a) - ma * ma, _blur(b * b) - mb * mb, _blur(a * b) - ma * mb
         term = (2 * c + 58.5225) / (va + vb + 58.5225)
@@ -128,16 +128,16 @@ def similarity(a: jax.Array, b: jax.Array) -> jax.Array:
     return total
 
 
-def main() -> None:  # noqa: PLR0915  a script, top to bottom
-    """Code, train, write."""
+def main() -> None:  # noqa: PLR0915  a script
+    """Code the images, train, write the model."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pool", type=Path, required=True)
     parser.add_argument("--model", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=12000)
-    parser.add_argument("--streams", type=int, default=3, help="streams of each picture")
+    parser.add_argument("--streams", type=int, default=3, help="streams of each image")
     parser.add_argument("--pictures", type=int, default=3000)
-    parser.add_argument("--resume", action="store_true", help="begin with the enhancer of --model")
+    parser.add_argument("--resume", action="store_true", help="start with the enhancer of --model")
     parser.add_argument("--rate", type=float, default=1.5e-3)
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--likeness", type=float, default=0.1, help="weight of structural similarity")
@@ -146,23 +146,23 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
     rng = np.random.default_rng(args.seed)
     pool = np.load(args.pool)
     codec = EmbCodec(parse(args.model.read_bytes()))
-    began = time.time()
+    started_s = time.time()
     sets = {}
     for name, source in (("train", pool["tp80"][-args.pictures :]), ("check", pool["vp80"][:100])):
         plane, mean, features = coded(codec, source, rng, args.streams if name == "train" else 2)
         sets[name] = (source.repeat(len(plane) // len(source), 0), plane, mean, features)
-    print(f"coded, {time.time() - began:.0f} s", flush=True)
+    print(f"coded, {time.time() - started_s:.0f} s", flush=True)
     params = resumed(codec.network) if args.resume else start(rng)
 
     def parts(
-        p: Params, picture: jax.Array, plane: jax.Array, mean: jax.Array, features: jax.Array
+        p: Params, image: jax.Array, plane: jax.Array, mean: jax.Array, features: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         decoded = plane / 64
-        # Blocks are made on the device, so that turned pictures need no second copy.
+        # Blocks are computed on the device, so that rotated images need no second copy.
         n, h, w = decoded.shape
         blocks = decoded.reshape(n, h // 2, 2, w // 2, 2).transpose(0, 1, 3, 2, 4).reshape(n, h // 2, w // 2, 4) / 64
         better = jnp.clip(decoded + to_pixels(enhance(p, blocks, features)), -mean[:, None, None] - 3, 258)
-        truth = picture - mean[:, None, None]
+        truth = image - mean[:, None, None]
         before = ((decoded - truth) ** 2).mean((1, 2))
         after = ((better - truth) ** 2).mean((1, 2))
         level = mean[:, None, None]
@@ -181,13 +181,13 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
 
     step, check = jax.jit(take_step), jax.jit(parts)
     state = optimiser.init(params)
-    pictures, planes, means, features = sets["train"]
-    began = time.time()
+    images, planes, means, features = sets["train"]
+    started_s = time.time()
     for i in range(args.steps):
         rate = (args.rate * (1 - i / args.steps) ** 1.5 + 1e-5) * min(1, (i + 5) / 300)
         state[1].hyperparams["learning_rate"] = jnp.asarray(rate)
-        pick = rng.integers(len(pictures), size=BATCH)
-        x, y = pictures[pick].astype(np.float32), planes[pick].astype(np.float32)
+        pick = rng.integers(len(images), size=BATCH)
+        x, y = images[pick].astype(np.float32), planes[pick].astype(np.float32)
         turn = int(rng.integers(8))
         if turn & 1:
             x, y = x[:, ::-1], y[:, ::-1]
@@ -197,12 +197,12 @@ def main() -> None:  # noqa: PLR0915  a script, top to bottom
             x, y = x.transpose(0, 2, 1), y.transpose(0, 2, 1)
         params, state, _ = step(params, state, x, y, means[pick], features[pick])
         if i % 250 == 249 or i == args.steps - 1:
-            _report(check, params, sets["check"], i + 1, time.time() - began)
+            _report(check, params, sets["check"], i + 1, time.time() - started_s)
             write(args.out, args.model, params)
 
 
 def write(out: Path, model: Path, params: Params) -> None:
-    """Round the weights and write a model file with them and all else of another one."""
+    """Round the weights and write a model file with them and the other arrays of `model`."""
     arrays: dict[str, np.ndarray] = dict(read_arrays(model.read_bytes()))
     arrays["image_weights"] = np.rint(np.asarray(params["s"], np.float64) * (1 << 14))
     for i in range(len(DILATIONS)):

@@ -1,10 +1,10 @@
-"""Make the pictures the model learns from and those it is tuned on.
+"""Create the training and validation images.
 
     python -m research.training.emb.pool --data ../shared/data --out /tmp/emb/pool.npz
 
-Sources: surveys (file values, and the same mapped to grey as a snippet is), synthetic-aperture tiles, simulations.
-Highlight-and-shadow objects are painted into half of the pictures. The validation pictures come from parts of the same
-sources that no training picture touches: the last fifth of every recording, every sixth tile, other simulator seeds.
+Sources are surveys (file values, and the same mapped to grey like a snippet), synthetic-aperture tiles and simulations.
+Highlights with shadows are added to half of the images. Validation images come from separate parts of the same sources:
+the last fifth of every recording, every sixth tile, other seeds of the simulator.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ VALIDATION_COUNTS = {"p80": 150, "p140": 40, "p112": 0}
 
 
 def survey_sheets(root: Path) -> list[tuple[Floats, str]]:
-    """Waterfalls of the recordings, one a side, file values; and the group each belongs to."""
+    """Return the waterfalls of the recordings, one a side, in file values, with the name of the recording."""
     sheets = []
     for path in sorted(root.glob("surveys/*.xtf")):
         survey = read_survey(path)
@@ -41,7 +41,7 @@ def survey_sheets(root: Path) -> list[tuple[Floats, str]]:
 
 
 def simulated_sheets(seeds: range) -> list[Floats]:
-    """Waterfalls of simulated surveys over every kind of seabed."""
+    """Return the waterfalls of simulated surveys over every kind of seabed."""
     kinds = list(SeabedKind)
     sheets = []
     for seed in seeds:
@@ -54,13 +54,13 @@ def simulated_sheets(seeds: range) -> list[Floats]:
 
 
 def stretched(sheet: Floats) -> Floats:
-    """The sheet as a whole mapped to 0..255: percentiles 1 and 99.5, power 0.6."""
+    """Map a sheet to 0..255: percentiles 1 and 99.5, power 0.6."""
     low, high = np.nanpercentile(sheet, (1, 99.5))
     return np.asarray(np.clip((np.nan_to_num(sheet) - low) / max(high - low, 1e-9), 0, 1) ** 0.6 * 255)
 
 
 def sheets_of(root: Path, *, validation: bool) -> list[tuple[Floats, bool]]:
-    """Every sheet to cut from, and whether its windows are mapped to grey one by one."""
+    """Return all sheets, and whether their windows are mapped to grey separately."""
     sheets: list[tuple[Floats, bool]] = []
     for sheet, _ in survey_sheets(root):
         rows = sheet.shape[0] * 4 // 5
@@ -83,7 +83,7 @@ def _resized(sheet: Floats, factor: float) -> Floats:
 
 
 def cut(sheets: list[tuple[Floats, bool]], size: tuple[int, int], count: int, rng: np.random.Generator) -> Floats:
-    """Windows at chance places, turned, mirrored, and with chance contrast, brightness and a little noise."""
+    """Cut windows at random places, rotated, mirrored, with random contrast, brightness and noise."""
     height, width = size
     usable = [s for s in sheets if s[0].shape[0] >= height and s[0].shape[1] >= width]
     weight = np.array([s.size for s, _ in usable]) ** 0.5
@@ -110,14 +110,14 @@ def cut(sheets: list[tuple[Floats, bool]], size: tuple[int, int], count: int, rn
     return out
 
 
-def paint_objects(pictures: Floats, rng: np.random.Generator, share: float = 0.5) -> None:
-    """Multiply highlight-and-shadow pairs into a share of the pictures."""
-    _, height, width = pictures.shape
+def paint_objects(images: Floats, rng: np.random.Generator, share: float = 0.5) -> None:
+    """Add highlights with shadows to a share of the images, by multiplication."""
+    _, height, width = images.shape
     yy, xx = np.mgrid[:height, :width].astype(np.float64)
-    for i in range(len(pictures)):
+    for i in range(len(images)):
         if rng.random() > share:
             continue
-        pictures[i] *= rng.uniform(45, 110) / max(pictures[i].mean(), 1)
+        images[i] *= rng.uniform(45, 110) / max(images[i].mean(), 1)
         for _ in range(rng.integers(1, 3)):
             row, column = rng.uniform(0.15, 0.85) * height, rng.uniform(0.15, 0.85) * width
             turn, long, wide = rng.uniform(0, np.pi), rng.uniform(2, 20), rng.uniform(1.5, 8)
@@ -128,10 +128,10 @@ def paint_objects(pictures: Floats, rng: np.random.Generator, share: float = 0.5
             )
             light = _blob(yy - row, xx - column, turn + rng.normal(0, 0.2), long, wide, boxy)
             if rng.random() < 0.85:
-                pictures[i] *= 1 - shadow * rng.uniform(0.5, 0.95)
+                images[i] *= 1 - shadow * rng.uniform(0.5, 0.95)
             if rng.random() < 0.9:
-                pictures[i] *= 1 + light * rng.uniform(0.2, 4)
-    np.clip(pictures, 0, 255, out=pictures)
+                images[i] *= 1 + light * rng.uniform(0.2, 4)
+    np.clip(images, 0, 255, out=images)
 
 
 def _blob(dy: Floats, dx: Floats, turn: float, long: float, wide: float, boxy: bool) -> Floats:  # noqa: FBT001
@@ -153,9 +153,9 @@ def main() -> None:
         sheets = sheets_of(args.data, validation=validation)
         for name, size in SIZES_PX.items():
             if counts[name]:
-                pictures = cut(sheets, size, counts[name], rng)
-                paint_objects(pictures, rng)
-                out[("v" if validation else "t") + name] = np.rint(pictures).astype(np.uint8)
+                images = cut(sheets, size, counts[name], rng)
+                paint_objects(images, rng)
+                out[("v" if validation else "t") + name] = np.rint(images).astype(np.uint8)
     np.savez(args.out, allow_pickle=False, **out)
 
 

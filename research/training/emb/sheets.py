@@ -4,7 +4,7 @@
     python -m research.training.emb.sheets --data ../shared/data --out docs/explanation/codecs \
         --codecs emb emb:structure -- 64 128
 
-Only pictures that anybody may show: the public-domain Humminbird recording (its last fifth) and the simulator.
+The images may be published: they are from the public-domain Humminbird recording (its last fifth) and the simulator.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ SIDE_PX, GAP_PX, COLUMNS, SEED = 80, 4, 6, 4
 
 
 def main() -> None:
-    """Write a sheet for each budget, called after the last codec."""
+    """Write a sheet for each budget, named after the last codec."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--codecs", nargs="+", default=["emb"], help="one row of pictures each")
+    parser.add_argument("--codecs", nargs="+", default=["emb"], help="one row of images each")
     parser.add_argument("budgets", type=int, nargs="+")
     args = parser.parse_args()
     rng, pitch, rows = np.random.default_rng(SEED), SIDE_PX + GAP_PX, 1 + len(args.codecs)
     codecs = [create_codec(name) for name in args.codecs]
     real = [np.nan_to_num(s) for s, group in survey_sheets(args.data) if group.startswith("pyhum")]
     sources = ([s[s.shape[0] * 4 // 5 :] for s in real], simulated_sheets(range(100, 103)))
-    pictures = [cut([(s, True) for s in sheets], (SIDE_PX, SIDE_PX), COLUMNS, rng) for sheets in sources]
+    images = [cut([(s, True) for s in sheets], (SIDE_PX, SIDE_PX), COLUMNS, rng) for sheets in sources]
     for budget in args.budgets:
         sheet = np.full((2 * rows * pitch + GAP_PX, COLUMNS * pitch + GAP_PX), 255, np.uint8)
-        for i, picture in enumerate(np.rint(np.concatenate(pictures)).astype(np.uint8)):
+        for i, image in enumerate(np.rint(np.concatenate(images)).astype(np.uint8)):
             y, x = GAP_PX + i // COLUMNS * rows * pitch, GAP_PX + i % COLUMNS * pitch
-            for shown in (picture, *(codec.decode(codec.encode(picture, budget)).image for codec in codecs)):
-                sheet[y : y + SIDE_PX, x : x + SIDE_PX] = shown
+            for cell in (image, *(codec.decode(codec.encode(image, budget)).image for codec in codecs)):
+                sheet[y : y + SIDE_PX, x : x + SIDE_PX] = cell
                 y += pitch
-        image = Image.fromarray(sheet).resize((2 * sheet.shape[1], 2 * sheet.shape[0]), Image.Resampling.NEAREST)
-        image.save(args.out / f"{args.codecs[-1].replace(':', '-')}-{budget}.png", optimize=True)
+        enlarged = Image.fromarray(sheet).resize((2 * sheet.shape[1], 2 * sheet.shape[0]), Image.Resampling.NEAREST)
+        enlarged.save(args.out / f"{args.codecs[-1]}-{budget}.png", optimize=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Time the codec on the validation pictures of 140 x 80 px, the processor's own time of one thread.
+"""Measure the time of a codec on the validation images of 140 x 80 px: processor time of one thread.
 
 OMP_NUM_THREADS=1 python -m research.training.emb.timing --pool /tmp/emb/pool.npz
 """
@@ -24,16 +24,16 @@ def main() -> None:
     parser.add_argument("--codec", default="emb")
     args = parser.parse_args()
     codec = create_codec(args.codec)
-    pictures = np.load(args.pool)["vp140"][: args.pictures]
+    images = np.load(args.pool)["vp140"][: args.pictures]
     for budget in BUDGETS:
-        codec.decode(codec.encode(pictures[0], budget))  # compiles
-        began = time.process_time()
-        streams = [codec.encode(picture, budget) for picture in pictures]
-        between = time.process_time()
+        codec.decode(codec.encode(images[0], budget))  # compiles
+        started_s = time.process_time()
+        streams = [codec.encode(image, budget) for image in images]
+        encoded_s = time.process_time()
         for stream in streams:
             codec.decode(stream)
-        spent_ms = [1e3 * (b - a) / len(pictures) for a, b in ((began, between), (between, time.process_time()))]
-        print(f"{budget} B: encode {spent_ms[0]:.0f} ms, decode {spent_ms[1]:.0f} ms")
+        times_ms = [1e3 * (b - a) / len(images) for a, b in ((started_s, encoded_s), (encoded_s, time.process_time()))]
+        print(f"{budget} B: encode {times_ms[0]:.0f} ms, decode {times_ms[1]:.0f} ms")
 
 
 if __name__ == "__main__":

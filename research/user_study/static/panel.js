@@ -1,4 +1,4 @@
-// The recognition panel: which original is it? Right and wrong are not told, so that nobody learns on the way.
+// The page of the user study. Whether an answer was right is not shown, so that participants do not learn.
 
 import { fill, h, toast } from "/static/js/dom.js";
 import { duration, percent } from "/static/js/format.js";
@@ -28,8 +28,8 @@ function start(info) {
   });
   fill(main,
     h("h1", { text: info.title }),
-    h("p", { text: `${info.trials} pictures that came by sound, one at a time. For each, choose which of ${info.choices} originals it was. Whether you were right is not shown. You may stop and go on later under the same name.` }),
-    h("form", { on: { submit: (event) => { event.preventDefault(); begin(); } } }, h("label", { for: "name", text: "Your name or number" }), name, h("button", { type: "submit", class: "primary", text: "Begin" })),
+    h("p", { text: `You will see ${info.trials} images that were sent over an acoustic link, one at a time. Select the original of each among ${info.choices}. The page does not show whether you were right. You can stop and continue later with the same name.` }),
+    h("form", { on: { submit: (event) => { event.preventDefault(); begin(); } } }, h("label", { for: "name", text: "Your name or number" }), name, h("button", { type: "submit", class: "primary", text: "Start" })),
     h("p", {}, h("button", { type: "button", text: "Results (on this computer only)", on: { click: guarded(results) } })));
   name.focus();
 }
@@ -38,7 +38,7 @@ async function next() {
   const trial = await call("GET", "/api/panel/next");
   Object.assign(panel, { trial, choice: null, sure: null });
   if (trial.done) {
-    fill(main, h("h1", { text: "That was all of it." }), h("p", { text: `${trial.answered} pictures answered. Thank you.` }), h("button", { type: "button", text: "Results (on this computer only)", on: { click: guarded(results) } }));
+    fill(main, h("h1", { text: "All images are answered." }), h("p", { text: `${trial.answered} images answered. Thank you.` }), h("button", { type: "button", text: "Results (on this computer only)", on: { click: guarded(results) } }));
     return;
   }
   draw();
@@ -65,11 +65,11 @@ const answer = guarded(async () => {
 function draw() {
   const { number, of, shown, choices } = panel.trial;
   const sure = h("input", { type: "range", min: 0, max: 100, step: 10, "aria-label": "How sure" });
-  const words = h("output", { text: "not said" });
+  const words = h("output", { text: "not given" });
   sure.addEventListener("input", () => { panel.sure = Number(sure.value) / 100; words.textContent = percent(Number(sure.value)); });
   fill(main,
-    h("div", { class: "top" }, h("h1", { text: `Picture ${number} of ${of}` }), h("progress", { max: of, value: number - 1, "aria-label": "progress" })),
-    h("figure", { class: "shown" }, h("img", { src: shown, alt: "the picture as it came by sound" }), h("figcaption", { text: "as it came by sound" })),
+    h("div", { class: "top" }, h("h1", { text: `Image ${number} of ${of}` }), h("progress", { max: of, value: number - 1, "aria-label": "progress" })),
+    h("figure", { class: "shown" }, h("img", { src: shown, alt: "the received image" }), h("figcaption", { text: "as received" })),
     h("p", { text: "Which original is it?" }),
     h("div", { class: "choices" }, choices.map((url, index) => h("button", { type: "button", "aria-pressed": "false", data: { choice: String(index) }, on: { click: () => choose(index) } },
       h("img", { src: url, alt: `original ${index + 1}` }), h("kbd", { text: String(index + 1) })))),
@@ -105,6 +105,6 @@ document.documentElement.dataset.theme = theme;
 guarded(async () => {
   const info = await call("GET", "/api/panel");
   panel.title = info.title;
-  document.title = `${info.title} · recognition panel`;
+  document.title = `${info.title} · user study`;
   start(info);
 })();

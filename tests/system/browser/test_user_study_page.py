@@ -1,4 +1,4 @@
-"""The recognition survey in a real browser: from the name to the table, by keys alone."""
+"""The page of the user study in a browser: from the name to the results, with the keyboard."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from research.user_study.server import Answers, Folders, PanelApp
+from research.user_study.server import Answers, Folders, StudyApp
 from sonarpost.services.console.web.server import WebServer
 
-PICTURES = 4
+IMAGES = 4
 
 
 @pytest.fixture
 def address(tmp_path):
     for folder in ("originals", "decoded"):
         (tmp_path / folder).mkdir()
-        for number in range(PICTURES):
+        for number in range(IMAGES):
             grey = np.random.default_rng(number).integers(0, 255, (24, 40), dtype=np.uint8)
             Image.fromarray(grey).save(tmp_path / folder / f"contact-{number}.png")
     answers = Answers(tmp_path / "panel.db")
-    app = PanelApp(Folders.read(tmp_path / "originals", tmp_path / "decoded"), answers, "Which one?", choices=3, seed=1)
+    app = StudyApp(Folders.read(tmp_path / "originals", tmp_path / "decoded"), answers, "Which one?", choices=3, seed=1)
     server = WebServer(app.asgi, "127.0.0.1", 0)
     server.start()
     yield server.address
@@ -28,19 +28,19 @@ def address(tmp_path):
     answers.close()
 
 
-def test_a_person_answers_all_of_it(address, visit):
+def test_participant_answers_all_trials(address, visit):
     there = visit(address, path="panel")
     there.wait("#name")
     assert there.text("h1") == "Which one?"
     there.page.keyboard.type("Anna")
     there.press("Enter")
-    for number in range(1, PICTURES + 1):
-        there.wait(f"h1 >> text=Picture {number} of {PICTURES}")
+    for number in range(1, IMAGES + 1):
+        there.wait(f"h1 >> text=Image {number} of {IMAGES}")
         there.until("() => [...document.images].every(one => one.complete && one.naturalWidth > 0)")
         assert there.page.locator(".choices img").count() == 3
         # The last one is none of them.
-        there.press("0" if number == PICTURES else str(1 + right(there)), "Enter")
-    there.wait("h1 >> text=That was all of it")
+        there.press("0" if number == IMAGES else str(1 + right(there)), "Enter")
+    there.wait("h1 >> text=All images are answered")
     there.page.get_by_role("button", name="Results").click()
     there.wait("h1 >> text=Results")
     row = there.text("tr:has(th:text-is('Anna'))")
@@ -49,7 +49,7 @@ def test_a_person_answers_all_of_it(address, visit):
 
 
 def right(there):
-    """Which of the choices is the very picture that is shown, by its pixels."""
+    """Return the index of the choice with the pixels of the shown image."""
     return there.page.evaluate(
         """() => {
           const pixels = image => {
