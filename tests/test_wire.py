@@ -11,7 +11,7 @@ import msgpack
 import pytest
 from builders.record_samples import RECORD_TYPES, SAMPLES
 from builders.record_strategies import STRATEGIES, any_record
-from builders.record_vectors import BATCH, batch_samples, handoff_samples, plain
+from builders.record_vectors import BATCH, batch_samples, delivery_samples, plain
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -72,7 +72,7 @@ def test_samples_match_their_vectors(name: str) -> None:
 
 
 def test_golden_delivery_messages_parse_and_encode_unchanged() -> None:
-    made = handoff_samples()
+    made = delivery_samples()
     for name, vector in vectors("handoff-reply").items():
         payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
         reply = AckReply.unpack(payload, KEY)

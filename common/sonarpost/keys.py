@@ -217,7 +217,7 @@ def tasking_vessel(key: str) -> str:
     """Return the vessel that a key made by `tasking_advice` or `tasking_command` names.
 
     Raises:
-        BadInputError: It is no such key.
+        BadInputError: It is another key.
     """
     parts = key.split("/")
     if len(parts) != 6 or not key.startswith(f"{ROOT}/") or parts[3] != "tasking":

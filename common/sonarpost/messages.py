@@ -75,7 +75,7 @@ class Pixels(Record):
     @classmethod
     def _length_fits(cls, data: bytes, info: ValidationInfo) -> bytes:
         if not {"height_px", "width_px", "bits"} <= info.data.keys():
-            return data  # one of them is wrong itself, and is what the error is about
+            return data  # one of these fields is invalid, and the error is about it
         height_px, width_px, bits = info.data["height_px"], info.data["width_px"], info.data["bits"]
         expected = height_px * width_px * bits // 8
         if len(data) != expected:
@@ -84,13 +84,13 @@ class Pixels(Record):
 
     @classmethod
     def from_array(cls, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> Pixels:
-        """Make a raster of an array.
+        """Return the pixels of an array.
 
         Args:
             image: Shape (height_px, width_px), uint8 or uint16 of any byte order and memory layout.
 
         Raises:
-            BadInputError: Another shape or type: a cast would change values without a word.
+            BadInputError: Another shape or type; a cast would change values silently.
         """
         if image.ndim != 2 or image.dtype.kind != "u" or image.dtype.itemsize not in (1, 2):
             raise BadInputError(
@@ -109,7 +109,7 @@ class Pixels(Record):
 
     @property
     def sha256(self) -> str:
-        """Hex digest of the pixel bytes, by which two platforms compare pictures."""
+        """Hexadecimal SHA-256 digest of the pixel bytes, equal for the same image on every platform."""
         return hashlib.sha256(self.data).hexdigest()
 
 
@@ -518,7 +518,7 @@ class Command(Record):
         kind: refine: more detail. resend: the same again. wider: more seabed around the contact, as an image of its
             own. revisit: survey a position again.
         vehicle_id: Vehicle that receives it.
-        image_id: Image to refine, resend or show more around. None only for revisit.
+        image_id: Image of the request; None only for `revisit`.
         lat_deg: Position to revisit. None for the other kinds.
         lon_deg: Position to revisit. None for the other kinds.
         issued_by: Name of the person.

@@ -1,4 +1,4 @@
-"""One example of every record: what the tests of the wire share, and golden vectors are made of."""
+"""Samples of every record type, for the wire tests and the golden vectors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hypothesis strategies for all records: any values that the wire can hold."""
+"""Hypothesis strategies for all records, with all values that the wire can hold."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _maybe(strategy: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
 
 
 def _text(low: int, high: int) -> st.SearchStrategy[str]:
-    # Surrogates are no characters: UTF-8 has no bytes for them.
+    # UTF-8 cannot encode surrogates.
     return st.text(st.characters(exclude_categories=("Cs",)), min_size=low, max_size=min(high, 60))
 
 
@@ -88,7 +88,7 @@ contacts = st.builds(
 
 
 @st.composite
-def rasters(draw: st.DrawFn) -> Pixels:
+def pixels(draw: st.DrawFn) -> Pixels:
     height_px, width_px, bits = draw(st.integers(1, 12)), draw(st.integers(1, 12)), draw(st.sampled_from([8, 16]))
     size = height_px * width_px * bits // 8
     return Pixels(height_px=height_px, width_px=width_px, bits=bits, data=draw(st.binary(min_size=size, max_size=size)))
@@ -108,7 +108,7 @@ qualities = st.builds(
 
 @st.composite
 def images(draw: st.DrawFn) -> ReconstructedImage:
-    picture = draw(rasters())
+    picture = draw(pixels())
     size = (picture.height_px * picture.width_px + 7) // 8
     return ReconstructedImage(
         vessel_id=draw(_name),
@@ -151,8 +151,8 @@ def commands(draw: st.DrawFn) -> Command:
 
 STRATEGIES: dict[type[Record], st.SearchStrategy[Any]] = {
     Contact: contacts,
-    Pixels: rasters(),
-    Snippet: st.builds(Snippet, contact=contacts, picture=rasters(), source=_text(0, 2000), wide=_maybe(rasters())),
+    Pixels: pixels(),
+    Snippet: st.builds(Snippet, contact=contacts, picture=pixels(), source=_text(0, 2000), wide=_maybe(pixels())),
     EncodedImage: st.builds(
         EncodedImage,
         vehicle_id=_name,

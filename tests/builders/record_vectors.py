@@ -1,8 +1,8 @@
-"""Adds golden vectors of the Zenoh wire: `PYTHONPATH=tests python -m builders.record_vectors` from the repository root.
+"""Add golden vectors of the Zenoh wire: `PYTHONPATH=tests python -m builders.record_vectors` from the repository root.
 
-A vector says what bytes a record had when the vector was made. Programs of that time are still out there, so a vector
-is never changed or removed: this script adds those of `samples.py` and `handoff_samples()` that are not there yet, and
-stops when one that is there would come out otherwise. When a record gains a field, give the sample a new name.
+A vector holds the bytes of a record at the time of its creation. Older programs still use these bytes, so a vector is
+never changed or removed. This script adds missing vectors of `record_samples.py` and `delivery_samples()`, and fails if
+an existing one would change. When a record gains a field, give the sample a new name.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FOLDER = GOLDEN_FOLDER / "zenoh"
 
 
 def plain(value: object) -> object:
-    """Return a msgpack value as JSON can hold it: bytes become {"$hex": "…"}."""
+    """Return a msgpack value for JSON: bytes become {"$hex": "…"}."""
     if isinstance(value, bytes):
         return {"$hex": value.hex()}
     if isinstance(value, dict):
@@ -34,7 +34,7 @@ def plain(value: object) -> object:
     return value
 
 
-def handoff_samples() -> dict[str, dict[str, bytes]]:
+def delivery_samples() -> dict[str, dict[str, bytes]]:
     """Return attachments and replies by file and name."""
     item = OutboxItem("c2", 7, "k", "", 4, b"\x80", bytes.fromhex("11" * 32))
     large = OutboxItem("relay", 2**40, "k", "", 4, b"\x00" * 100_000, bytes.fromhex("22" * 32))
@@ -72,7 +72,7 @@ def batch_samples() -> dict[str, dict[str, bytes]]:
 
 
 def add(path: Path, name: str, payload: bytes) -> bool:
-    """Add one vector to its file; tell whether it was new."""
+    """Add a vector to its file; return whether it is new."""
     vectors = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     vector = {"hex": payload.hex(), "fields": plain(msgpack.unpackb(payload))}
     if name in vectors:
@@ -85,11 +85,11 @@ def add(path: Path, name: str, payload: bytes) -> bool:
 
 
 def main() -> None:
-    """Add what is missing."""
+    """Add missing vectors."""
     added = 0
     for name, record in SAMPLES.items():
         added += add(FOLDER / f"{record.TYPE}.json", name, wire.encode(record))
-    for file, payloads in (handoff_samples() | batch_samples()).items():
+    for file, payloads in (delivery_samples() | batch_samples()).items():
         for name, payload in payloads.items():
             added += add(FOLDER / f"{file}.json", name, payload)
     print(f"{added} vectors added")

@@ -1,4 +1,4 @@
-"""Transactions of the durable store: state and records whole or not at all, after kills, full disks, among threads."""
+"""Transactions of the durable store: atomicity after kills and full disks, and with several threads."""
 
 from __future__ import annotations
 

@@ -27,6 +27,9 @@ MAX_BATCH_RECORDS = 128
 BATCH_RECORD_OVERHEAD_BYTES = 48
 """Size of the entries of one more record in attachment and reply."""
 
+DONE_UP_TO = "settled"
+"""Field of the attachment: the producer no longer holds this sequence number and all below it."""
+
 AckStatus = Literal["stored", "more", "refused", "later"]
 _STATUSES: Final[tuple[AckStatus, ...]] = ("stored", "more", "refused", "later")
 
@@ -89,7 +92,7 @@ def attachment(origin: bytes, item: OutboxItem, offset: int = 0, done_up_to: int
         "sha256": item.sha256,
         "offset": offset,
     }
-    return _pack(fields | ({"settled": done_up_to} if done_up_to else {}))
+    return _pack(fields | ({DONE_UP_TO: done_up_to} if done_up_to else {}))
 
 
 def batch_attachment(origin: bytes, items: Sequence[OutboxItem], done_up_to: int = 0) -> bytes:
@@ -106,7 +109,7 @@ def batch_attachment(origin: bytes, items: Sequence[OutboxItem], done_up_to: int
         "consumer": consumer_of(items[0].queue),
         "records": [(item.seq, len(item.payload), item.sha256) for item in items],
     }
-    return _pack(fields | ({"settled": done_up_to} if done_up_to else {}))
+    return _pack(fields | ({DONE_UP_TO: done_up_to} if done_up_to else {}))
 
 
 def parse_query(attached: bytes, data: bytes, where: str) -> tuple[ReceivedChunk, ...] | ReceivedChunk:
@@ -126,14 +129,14 @@ def parse_query(attached: bytes, data: bytes, where: str) -> tuple[ReceivedChunk
         sha256=_binary(fields, "sha256", 32, where),
         offset=_integer(fields, "offset", where),
         data=data,
-        done_up_to=_integer(fields, "settled", where) if "settled" in fields else 0,
+        done_up_to=_integer(fields, DONE_UP_TO, where) if DONE_UP_TO in fields else 0,
     )
     if chunk.size > MAX_RECORD_BYTES:
         raise PayloadError(where, "size", chunk.size, f"at most {MAX_RECORD_BYTES} bytes")
     if chunk.seq < 1:
         raise PayloadError(where, "seq", chunk.seq, "at least 1")
     if chunk.done_up_to >= chunk.seq:
-        raise PayloadError(where, "settled", chunk.done_up_to, "a number below seq")
+        raise PayloadError(where, DONE_UP_TO, chunk.done_up_to, "a number below seq")
     if len(data) > CHUNK_BYTES or chunk.offset + len(data) > chunk.size:
         expected = f"a chunk of at most {CHUNK_BYTES} bytes inside size"
         raise PayloadError(where, "payload", f"{len(data)} bytes", expected)
@@ -142,7 +145,7 @@ def parse_query(attached: bytes, data: bytes, where: str) -> tuple[ReceivedChunk
 
 def _parse_batch(fields: Mapping[str, object], data: bytes, where: str) -> tuple[ReceivedChunk, ...]:
     origin = _binary(fields, "origin", 16, where)
-    done_up_to = _integer(fields, "settled", where) if "settled" in fields else 0
+    done_up_to = _integer(fields, DONE_UP_TO, where) if DONE_UP_TO in fields else 0
     records = fields.get("records")
     if not isinstance(records, tuple) or not 0 < len(records) <= MAX_BATCH_RECORDS:
         raise PayloadError(where, "records", records, f"an array of 1 to {MAX_BATCH_RECORDS} records")
@@ -160,7 +163,7 @@ def _parse_batch(fields: Mapping[str, object], data: bytes, where: str) -> tuple
     if len(numbers) < len(chunks):
         raise PayloadError(where, "records", sorted(chunk.seq for chunk in chunks), "each seq once")
     if done_up_to >= min(numbers):
-        raise PayloadError(where, "settled", done_up_to, "a number below every seq")
+        raise PayloadError(where, DONE_UP_TO, done_up_to, "a number below every seq")
     return tuple(chunks)
 
 

@@ -71,7 +71,7 @@ class ReceivedChunk:
         sha256: SHA-256 digest of the whole record.
         offset: Position of the chunk in the record, in bytes.
         data: Bytes of the chunk.
-        done_up_to: The producer no longer holds this sequence number and all below it (`settled` on the wire).
+        done_up_to: The producer no longer holds this sequence number and all below it.
     """
 
     origin: bytes

@@ -1,1 +1,1 @@
-"""The fleet's certificates, and who may say what to a router: X.509, Zenoh access control, checks of key files."""
+"""Certificates of a fleet, access control of its routers, and checks of key files."""
