@@ -1,11 +1,11 @@
 """`python -m research.codebook_adapt`: gain of adapting the shipped codebooks to real seabeds, on held-out images.
 
-    python -m research.codebook_adapt [--data ../shared/data]
+    python -m research.codebook_adapt [--data DIR]
 
 Three sets of real images are cut into windows of 140 x 80 px without overlap: a Marine Sonic survey line of 2013, a
 survey line of a river bed of 2009, and synthetic-aperture tiles. Both sides of a line are cut at the same pings, so the
 held-out last quarter is the end of the line on both sides. Both codebooks are adapted to each set; each result is a row
-of the table in `docs/specifications/codebook-file.md`. Times are processor time, which does not depend on the load of
+of the table in `docs/research/codebooks.md`. Times are processor time, which does not depend on the load of
 the machine.
 """
 
@@ -38,7 +38,15 @@ SETS = {
 def main() -> int:
     """Run; return 1 if an adapted codebook is no better than its base on the held-out images."""
     parser = argparse.ArgumentParser(description="gain of adapted codebooks on real images")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR", help="default: %(default)s")
+    folder = os.environ.get("SONARPOST_DATA")
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=folder,
+        required=folder is None,
+        metavar="DIR",
+        help="folder of recordings (default: the environment variable SONARPOST_DATA)",
+    )
     args = parser.parse_args()
     if os.environ.get("OMP_NUM_THREADS") != "1":
         # The libraries read this when they are loaded, so the program restarts itself.

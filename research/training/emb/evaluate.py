@@ -1,6 +1,6 @@
 """Measure codecs on the crops of the SDVD test split, which are not used for training.
 
-    python -m research.training.emb.evaluate --data ../shared/data
+    python -m research.training.emb.evaluate --data DIR
 
 The figures are those of `python -m research.codecs --sdvd`, without misses and intervals.
 """

@@ -1,6 +1,6 @@
 """Create the training and validation images.
 
-    python -m research.training.emb.pool --data ../shared/data --out /tmp/emb/pool.npz
+    python -m research.training.emb.pool --data DIR --out /tmp/emb/pool.npz
 
 Sources are surveys (file values, and the same mapped to grey like a snippet), synthetic-aperture tiles and simulations.
 Highlights with shadows are added to half of the images. Validation images come from separate parts of the same sources:

@@ -1,7 +1,7 @@
 """Draw the contact sheets of docs/explanation/codecs.md: originals above, decoded below.
 
-    python -m research.training.emb.sheets --data ../shared/data --out docs/explanation/codecs 22 64 192
-    python -m research.training.emb.sheets --data ../shared/data --out docs/explanation/codecs \
+    python -m research.training.emb.sheets --data DIR --out docs/explanation/codecs 22 64 192
+    python -m research.training.emb.sheets --data DIR --out docs/explanation/codecs \
         --codecs emb emb:structure -- 64 128
 
 The images may be published: they are from the public-domain Humminbird recording (its last fifth) and the simulator.
