@@ -111,6 +111,16 @@ def test_every_public_name_is_in_the_api_page() -> None:
     assert sorted(re.findall(r"^::: sonarpost\.(\w+)$", page, re.MULTILINE)) == sorted(sonarpost.__all__)
 
 
+def test_pages_that_the_code_names_exist() -> None:
+    named = set()
+    for folder in ("common", "services", "research", "packaging", "config"):
+        for path in (REPOSITORY / folder).rglob("*"):
+            if path.suffix in (".py", ".toml", ".sh", ".yml"):
+                named |= set(re.findall(r"\bdocs/[\w/-]+\.md\b", path.read_text(encoding="utf-8")))
+    assert len(named) > 8
+    assert {name for name in named if not (REPOSITORY / name).exists()} == set()
+
+
 def test_every_mark_in_a_page_has_a_generator() -> None:
     marks = set()
     for page in [*REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("services/*/README.md")]:
