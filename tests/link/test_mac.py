@@ -14,7 +14,7 @@ from sonarpost.link.mac import Continuous, Csma, Polled, Tdma
 TIMES = st.floats(1e9, 2e9)
 
 
-def test_continuous_listens_now_and_then_and_a_silence_counts():
+def test_continuous_pauses_after_each_burst():
     mac, now = Continuous(60.0, 8.0), 1000.0
     begun, pauses = now, []
     for _ in range(40):
@@ -32,7 +32,7 @@ def test_continuous_listens_now_and_then_and_a_silence_counts():
     assert mac.wait_s(6.0, now + 6.0) == 0.0
 
 
-def test_continuous_without_listening_never_waits_but_for_others():
+def test_continuous_without_pauses_waits_only_for_other_stations():
     mac = Continuous(1.0, 0.0, holdoff_s=5.0)
     for n in range(100):
         assert mac.wait_s(6.0, 6.0 * n) == 0.0
@@ -44,7 +44,7 @@ def test_continuous_without_listening_never_waits_but_for_others():
 
 
 @given(now=TIMES, packet_s=st.floats(0.5, 9.0), start_s=st.floats(0, 40.0))
-def test_a_packet_in_a_slot_ends_before_its_guard(now, packet_s, start_s):
+def test_tdma_packet_ends_before_the_guard_time(now, packet_s, start_s):
     mac = Tdma(60.0, start_s, 12.0, 2.0)
     wait_s = mac.wait_s(packet_s, now)
     assert wait_s is not None
@@ -56,7 +56,7 @@ def test_a_packet_in_a_slot_ends_before_its_guard(now, packet_s, start_s):
 
 
 @given(now=TIMES, packet_s=st.floats(0.5, 6.0), stations=st.integers(2, 8))
-def test_no_two_stations_in_slots_meet(now, packet_s, stations):
+def test_tdma_stations_never_collide(now, packet_s, stations):
     slot_s, travel_s = 8.0, 1.0
     sent = []
     for n in range(stations):
@@ -67,11 +67,11 @@ def test_no_two_stations_in_slots_meet(now, packet_s, stations):
     assert all(first[1] <= second[0] + 1e-5 for first, second in pairwise(sent))
 
 
-def test_a_slot_that_is_too_short_says_so():
+def test_tdma_slot_too_short_for_the_packet_returns_none():
     assert Tdma(60.0, 0.0, 5.0, 1.0).wait_s(6.0, 0.0) is None
 
 
-def test_who_is_polled_never_begins():
+def test_polled_station_never_starts():
     mac = Polled()
     mac.sent(0.0, 1.0)
     mac.channel_busy(2.0)
@@ -79,7 +79,7 @@ def test_who_is_polled_never_begins():
 
 
 @given(seed=st.integers(0, 1000), mean_s=st.floats(0.1, 100.0))
-def test_random_access_waits_between_none_and_twice_the_mean(seed, mean_s):
+def test_csma_waits_up_to_twice_the_mean(seed, mean_s):
     mac = Csma(mean_s, holdoff_s=0.0, seed=seed)
     now, waits = 1e9, []
     for _ in range(60):
@@ -92,7 +92,7 @@ def test_random_access_waits_between_none_and_twice_the_mean(seed, mean_s):
     assert 0.5 * mean_s < sum(waits) / 60 < 1.5 * mean_s
 
 
-def test_random_access_defers_to_others_and_survives_a_clock_that_is_set_back():
+def test_csma_defers_to_others_and_tolerates_a_clock_set_back():
     mac = Csma(1.0, holdoff_s=4.0, seed=1)
     mac.sent(0.0, 1000.0)
     mac.channel_busy(1003.0)
@@ -111,6 +111,6 @@ def test_random_access_defers_to_others_and_survives_a_clock_that_is_set_back():
         lambda: Csma(float("nan")),
     ],
 )
-def test_times_out_of_range_are_named(make):
+def test_times_out_of_range_are_rejected(make):
     with pytest.raises(ConfigError, match="medium access: "):
         make()

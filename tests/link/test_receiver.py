@@ -99,7 +99,7 @@ def test_all_frames_give_a_complete_image(wire: Format) -> None:
 
 
 @each_format
-def test_versions_count_up_and_say_more(wire: Format) -> None:
+def test_versions_count_up_and_hold_more_bytes(wire: Format) -> None:
     frames = wire.frames("00A7", image_stream())
     receiver = wire.receiver()
     found = updates(receive(receiver, frames[:3]))

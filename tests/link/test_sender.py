@@ -158,7 +158,7 @@ def test_an_unreadable_image_is_reported_and_the_others_are_sent(new: NewSender)
 
 @each_sender
 @pytest.mark.parametrize("wrong", [{"image_id": "no"}, {"stream": b""}, {"stream": b"\x10" + bytes(70_000)}], ids=str)
-def test_an_image_that_cannot_be_sent_is_refused(new: NewSender, wrong: dict[str, Any]) -> None:
+def test_invalid_image_is_rejected(new: NewSender, wrong: dict[str, Any]) -> None:
     fields = {name: getattr(image(1), name) for name in ("image_id", "contact_id", "contact", "stream")}
     sender = new()
     with pytest.raises(BadInputError):

@@ -45,7 +45,7 @@ def refusal(seal: FrameAuthenticator, sealed: bytes, source: int = VEHICLE) -> s
 
 
 @pytest.mark.parametrize("settings", ALL_SETTINGS, ids=str)
-def test_a_sealed_frame_opens_and_costs_what_it_says(settings: AuthenticationSettings) -> None:
+def test_protected_frame_round_trip_and_overhead(settings: AuthenticationSettings) -> None:
     vehicle, vessel = vehicle_seal(settings), vessel_seal(settings)
     for covered in (COVERED, b"\x80", b"\x80" + bytes(300)):
         sealed = vehicle.protect(covered)
@@ -61,7 +61,7 @@ def test_a_sealed_frame_opens_and_costs_what_it_says(settings: AuthenticationSet
 
 
 @pytest.mark.parametrize("settings", [AuthenticationSettings(), AuthenticationSettings(encrypt=True)], ids=str)
-def test_every_bit_is_covered(settings: AuthenticationSettings) -> None:
+def test_all_bits_are_authenticated(settings: AuthenticationSettings) -> None:
     sealed = vehicle_seal(settings).protect(COVERED)
     vessel = vessel_seal(settings)
     for bit in range(8 * len(sealed)):
@@ -72,7 +72,7 @@ def test_every_bit_is_covered(settings: AuthenticationSettings) -> None:
     assert vessel.verify(VEHICLE, sealed) == COVERED
 
 
-def test_who_may_have_sealed_it_matters() -> None:
+def test_frame_of_another_sender_key_or_setting_is_forged() -> None:
     sealed = vehicle_seal().protect(COVERED)
     vessel = vessel_seal()
     assert refusal(vessel, sealed, VEHICLE + 1) == "tag"  # another vehicle's
@@ -89,7 +89,7 @@ def test_who_may_have_sealed_it_matters() -> None:
     assert vessel.verify(VEHICLE, sealed) == COVERED
 
 
-def test_a_replay_is_told_from_a_forgery_however_old() -> None:
+def test_replay_is_distinguished_from_forgery_at_any_age() -> None:
     vehicle, vessel = vehicle_seal(), vessel_seal()
     recorded = [vehicle.protect(COVERED) for _ in range(3000)]
     for sealed in recorded:
@@ -100,7 +100,7 @@ def test_a_replay_is_told_from_a_forgery_however_old() -> None:
     assert vessel.counts == AuthenticationCounts(genuine=3000, replayed=100, forged=1)
 
 
-def test_late_frames_pass_once_if_the_window_still_knows_them() -> None:
+def test_late_frames_within_the_window_pass_once() -> None:
     vehicle, vessel = vehicle_seal(), vessel_seal()
     sealed = [vehicle.protect(bytes([0x80, n])) for n in range(WINDOW + 1)]
     vessel.verify(VEHICLE, sealed[WINDOW])
@@ -114,7 +114,7 @@ def test_late_frames_pass_once_if_the_window_still_knows_them() -> None:
 @pytest.mark.parametrize(
     ("settings", "bridged"), [(AuthenticationSettings(), 191), (AuthenticationSettings(2), 65471)], ids=str
 )
-def test_losses_cost_nothing_up_to_a_bound_and_one_frame_beyond(settings: AuthenticationSettings, bridged: int) -> None:
+def test_long_losses_cost_one_frame_at_most(settings: AuthenticationSettings, bridged: int) -> None:
     assert bridged + 1 == settings.counter_step - WINDOW
     vehicle, vessel = vehicle_seal(settings), vessel_seal(settings)
     vessel.verify(VEHICLE, vehicle.protect(COVERED))
@@ -130,7 +130,7 @@ def test_losses_cost_nothing_up_to_a_bound_and_one_frame_beyond(settings: Authen
     assert vessel.counts == AuthenticationCounts(genuine=4, unconfirmed=2)
 
 
-def test_a_receiver_without_memory_finds_any_counter_of_the_key() -> None:
+def test_receiver_without_state_finds_any_counter() -> None:
     last = AuthenticationSettings().lifetime_frames - 2
     vehicle, vessel = vehicle_seal(first_counter=last), vessel_seal()
     assert refusal(vessel, vehicle.protect(COVERED)) == "counter"
@@ -140,7 +140,7 @@ def test_a_receiver_without_memory_finds_any_counter_of_the_key() -> None:
     assert (vehicle.frames_left, vehicle.requested_limit) == (0, None)
 
 
-def test_counters_are_used_once_whenever_the_sender_crashes() -> None:
+def test_counters_are_used_once_over_crashes() -> None:
     durable, used = 0, []
     for frames_until_crash in (0, 1, 31, 32, 33, 64, 65, 200, 0, 5):
         seal = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=durable)
@@ -158,7 +158,7 @@ def test_counters_are_used_once_whenever_the_sender_crashes() -> None:
     assert RESERVED < WINDOW * 2
 
 
-def test_without_a_reservation_nothing_is_sealed() -> None:
+def test_protection_requires_a_reservation() -> None:
     seal = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
     with pytest.raises(FrameError, match="a granted limit above it"):
         seal.protect(COVERED)
@@ -171,7 +171,7 @@ def test_without_a_reservation_nothing_is_sealed() -> None:
             seal.grant(wrong)
 
 
-def test_a_restarted_receiver_still_knows_what_it_took() -> None:
+def test_restarted_receiver_rejects_replays() -> None:
     vehicle, before = vehicle_seal(), vessel_seal()
     taken = [vehicle.protect(COVERED) for _ in range(50)]
     for sealed in taken[::2]:
@@ -185,7 +185,7 @@ def test_a_restarted_receiver_still_knows_what_it_took() -> None:
         after.verify(VEHICLE, sealed)
 
 
-def test_a_restored_sender_goes_on_behind_its_reservation() -> None:
+def test_restored_sender_continues_after_its_reservation() -> None:
     vehicle = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
     vehicle.grant(64)
     vessel = vessel_seal()
@@ -244,7 +244,7 @@ def test_a_limit_beyond_the_lifetime_leaves_no_counter() -> None:
     assert restored.frames_left == 0
 
 
-def test_memory_is_of_genuine_senders_only() -> None:
+def test_forged_frames_use_no_memory() -> None:
     vessel = vessel_seal(AuthenticationSettings(2))
     for source in range(128):
         assert refusal(vessel, COVERED + b"\0\0fake", source) == "tag"
@@ -256,7 +256,7 @@ def test_memory_is_of_genuine_senders_only() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"counter_bytes": 3}, {"counter_bytes": 0}, {"tag_bytes": 5}, {"tag_bytes": 16}])
-def test_settings_out_of_range_are_refused(wrong: dict[str, int]) -> None:
+def test_settings_out_of_range_are_rejected(wrong: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         AuthenticationSettings(**wrong)  # type: ignore[arg-type]
     for address, first in ((-1, 0), (128, 0), (1, -1), (1, 2**20 + 1)):
@@ -264,7 +264,7 @@ def test_settings_out_of_range_are_refused(wrong: dict[str, int]) -> None:
             FrameAuthenticator(key("fleet"), address, Direction.FROM_VEHICLE, first_counter=first)
 
 
-def test_damage_is_told_from_a_wrong_seal() -> None:
+def test_damage_is_distinguished_from_forgery() -> None:
     vehicle, vessel = vehicle_seal(), vessel_seal()
     frame = pack_symbol(Symbol(SymbolKind.OBJECT, 1, 2, 3, bytes(54)), vehicle)
     assert len(frame) == 64
@@ -283,7 +283,7 @@ def test_damage_is_told_from_a_wrong_seal() -> None:
 
 @pytest.mark.parametrize("frame_bytes", [32, 64, 256])
 @pytest.mark.parametrize("settings", [AuthenticationSettings(), AuthenticationSettings(encrypt=True)], ids=str)
-def test_pictures_and_reports_travel_sealed(frame_bytes: int, settings: AuthenticationSettings) -> None:
+def test_images_and_feedback_with_authentication(frame_bytes: int, settings: AuthenticationSettings) -> None:
     up, down = vehicle_seal(settings), vessel_seal(settings)
     down.grant(1000)
     config = SenderConfig(frame_bytes=frame_bytes, channels=(LossChannel(0.2),), feedback=True, stream_bytes=200)

@@ -51,13 +51,13 @@ def ccm(key: bytes, nonce: bytes, head: bytes, data: bytes, tag_bytes: int) -> b
     return hidden + exclusive_or(state, stream(0))[:tag_bytes]
 
 
-def test_the_file_is_what_the_code_makes() -> None:
+def test_protected_frames_equal_the_golden_file() -> None:
     assert json.loads(json.dumps(seal_golden.make())) == GOLDEN
     assert hkdf(bytes.fromhex(GOLDEN["key"]), b"sonarpost acoustic v1 fingerprint", 4).hex() == GOLDEN["fingerprint"]
 
 
 @pytest.mark.parametrize("case", GOLDEN["frames"], ids=str)
-def test_another_implementation_seals_the_same(case: dict[str, Any]) -> None:
+def test_independent_implementation_gives_the_same_frames(case: dict[str, Any]) -> None:
     frame = bytes.fromhex(case["frame"])
     settings = AuthenticationSettings(case["counter_bytes"], case["tag_bytes"], case["encrypt"])
     seal = FrameAuthenticator(parse_key(GOLDEN["key"], "golden"), 99, Direction(case["direction"]).opposite, settings)

@@ -119,7 +119,7 @@ TestAttack = Attack.TestCase
 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.one_of(st.integers(-80, 80), st.integers(-80, 80), st.integers(100, 5000)), max_size=200))
-def test_the_window_agrees_with_a_set(steps: list[int]) -> None:
+def test_replay_window_agrees_with_a_set(steps: list[int]) -> None:
     window, taken = ReplayWindow(), set[int]()
     for step in steps:
         counter = max(0, max(taken, default=-1) + step)
@@ -132,7 +132,7 @@ def test_the_window_agrees_with_a_set(steps: list[int]) -> None:
         assert window.seen < 1 << WINDOW
 
 
-def test_a_leap_forgets_what_was_before_it() -> None:
+def test_large_step_clears_the_window() -> None:
     window = ReplayWindow()
     for counter in range(WINDOW):
         window.accept(counter)
@@ -143,14 +143,14 @@ def test_a_leap_forgets_what_was_before_it() -> None:
 
 @settings(max_examples=300, deadline=None)
 @given(st.integers(-1, 2**20), st.sampled_from([256, 65536]), st.data())
-def test_the_nearest_counter_is_the_one_sent(newest: int, step: int, data: st.DataObject) -> None:
+def test_nearest_counter_is_the_one_sent(newest: int, step: int, data: st.DataObject) -> None:
     sent = newest + data.draw(st.integers(1 - WINDOW, step - WINDOW))
     assert ReplayWindow(newest).nearest(sent % step, step) == sent
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=300), st.integers(-5, 200), st.booleans())
-def test_any_bytes_are_refused(sealed: bytes, source: int, encrypt: bool) -> None:
+def test_any_bytes_are_rejected(sealed: bytes, source: int, encrypt: bool) -> None:
     chosen = AuthenticationSettings(encrypt=encrypt)
     vessel = vessel_seal(chosen)
     assert offered(vessel, source, sealed) == (b"", "tag")

@@ -18,14 +18,14 @@ from sonarpost.link.coding.channel_capacity import (
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.5, 0.9])
-def test_independent_losses_follow_the_binomial_law(loss: float) -> None:
+def test_independent_losses_are_binomial(loss: float) -> None:
     found = received_distribution(20, LossChannel(loss))
     law = [math.comb(20, k) * (1 - loss) ** k * loss ** (20 - k) for k in range(21)]
     assert found == pytest.approx(law, abs=1e-12)
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.3, 4.0), (0.5, 8.0), (0.1, 2.0)])
-def test_bursts_have_the_length_and_the_share_they_say(loss: float, burst: float) -> None:
+def test_bursts_have_the_configured_length_and_share(loss: float, burst: float) -> None:
     channel, rng = LossChannel(loss, burst), np.random.default_rng(3)
     draws, steps = rng.random((4000, 60)), []
     lost = rng.random(4000) < loss
@@ -40,7 +40,7 @@ def test_bursts_have_the_length_and_the_share_they_say(loss: float, burst: float
     assert np.abs(np.cumsum(seen) - np.cumsum(received_distribution(60, channel))).max() < 0.03
 
 
-def test_frames_sent_apart_meet_shorter_bursts() -> None:
+def test_interleaved_frames_see_shorter_bursts() -> None:
     channel = LossChannel(0.3, 8.0)
     assert channel.spread(2).memory == pytest.approx(channel.memory**2)
     assert channel.spread(50).memory < 1e-3
@@ -52,7 +52,7 @@ def test_no_frames_and_no_loss() -> None:
     assert received_distribution(3, LossChannel(0.0)).tolist() == [0, 0, 0, 1]
 
 
-def test_a_systematic_block_leaves_unseen_only_what_was_lost_and_not_recovered() -> None:
+def test_unseen_share_of_a_systematic_block() -> None:
     # One source symbol sent twice: unseen when both are lost.
     assert unseen_share(1, 2, LossChannel(0.3)) == pytest.approx(0.09)
     # Two sent once: each unseen when lost, and when only one came nothing else is known.
@@ -61,11 +61,11 @@ def test_a_systematic_block_leaves_unseen_only_what_was_lost_and_not_recovered()
     assert frames_for(1, LossChannel(0.3), 1e-9, 5) == 5
 
 
-def test_the_erasure_bound() -> None:
+def test_erasure_bound() -> None:
     assert erasure_bound_frames(640, 64, 0.5) == 20
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(-0.1, 1), (1.0, 1), (float("nan"), 1), (0.3, 0.5)])
-def test_a_channel_out_of_range_is_refused(loss: float, burst: float) -> None:
+def test_channel_out_of_range_is_rejected(loss: float, burst: float) -> None:
     with pytest.raises(ConfigError, match="acoustic channel"):
         LossChannel(loss, burst)

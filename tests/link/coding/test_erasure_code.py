@@ -13,7 +13,7 @@ from sonarpost.link.coding import erasure_code as fec
 
 
 @pytest.mark.parametrize("count", [1, 2, 16, 100, 223, 254])
-def test_symbols_are_those_of_reedsolo(count: int) -> None:
+def test_symbols_equal_reedsolo(count: int) -> None:
     source = np.random.default_rng(count).integers(0, 256, (count, 2), dtype=np.uint8)
     oracle = reedsolo.RSCodec(255 - count, nsize=255, fcr=1, prim=0x11D)
     symbols = fec.encode(source, range(255))
@@ -22,7 +22,7 @@ def test_symbols_are_those_of_reedsolo(count: int) -> None:
 
 
 @pytest.mark.parametrize("count", [3, 40, 120])
-def test_erasures_are_filled_as_reedsolo_fills_them(count: int) -> None:
+def test_recovery_equals_reedsolo(count: int) -> None:
     rng = np.random.default_rng(count)
     source = rng.integers(0, 256, (count, 1), dtype=np.uint8)
     symbols = fec.encode(source, range(255))
@@ -38,7 +38,7 @@ def test_erasures_are_filled_as_reedsolo_fills_them(count: int) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_any_k_symbols_in_any_order_give_the_source(data: st.DataObject) -> None:
+def test_any_k_symbols_recover_the_source(data: st.DataObject) -> None:
     count = data.draw(st.integers(1, 60))
     indices = data.draw(st.lists(st.integers(0, 254), min_size=count, max_size=count, unique=True))
     source = np.frombuffer(data.draw(st.binary(min_size=2 * count, max_size=2 * count)), np.uint8).reshape(count, 2)
@@ -48,7 +48,7 @@ def test_any_k_symbols_in_any_order_give_the_source(data: st.DataObject) -> None
 @pytest.mark.parametrize(
     ("count", "indices"), [(0, []), (256, range(256)), (2, [1, 1]), (2, [1]), (2, [0, 255]), (2, [-1, 0])]
 )
-def test_what_cannot_be_recovered_is_refused(count: int, indices: list[int]) -> None:
+def test_invalid_symbols_are_rejected(count: int, indices: list[int]) -> None:
     with pytest.raises(FrameError, match="erasure code"):
         fec.recover(count, list(indices), np.zeros((len(indices), 1), np.uint8))
     with pytest.raises(FrameError, match="erasure code"):

@@ -27,7 +27,7 @@ def curve(scale: float, length: int = 400) -> np.ndarray:
     return quality_curve(length, 60.0**2 / (1 + np.arange(length + 1) * scale))
 
 
-def test_bytes_go_where_they_gain_most() -> None:
+def test_bytes_go_to_the_steepest_slope() -> None:
     curves = [curve(0.1), curve(0.001), curve(0.03)]
     gain = GroupDistortion.of(curves, [10, 10, 10])
     for total in (0, 5, 60, 200, 700):
@@ -47,7 +47,7 @@ def test_bytes_go_where_they_gain_most() -> None:
         assert gain.gains(np.array(total)) == pytest.approx(found, abs=0.05)
 
 
-def test_a_curve_with_steps_is_used_by_its_hull() -> None:
+def test_curve_with_steps_is_replaced_by_its_hull() -> None:
     steps = quality_curve(100, np.repeat([4000.0, 3000.0, 1000.0, 900.0], [20, 30, 30, 21]))
     gain = GroupDistortion.of([steps], [0])
     slopes = np.diff(gain.gain_by_step) / np.diff(gain.bytes_by_step)
@@ -56,14 +56,14 @@ def test_a_curve_with_steps_is_used_by_its_hull() -> None:
 
 
 @pytest.mark.parametrize("error", [[1.0], [-1.0] * 11, [float("nan")] * 11])
-def test_estimates_that_make_no_sense_are_refused(error: list[float]) -> None:
+def test_invalid_estimates_are_rejected(error: list[float]) -> None:
     with pytest.raises(StreamError, match="image"):
         quality_curve(10, error)
     with pytest.raises(StreamError):
         quality_curve(70000)
 
 
-def test_layers_are_used_where_it_is_uncertain_how_much_arrives() -> None:
+def test_uncertain_loss_leads_to_layers() -> None:
     gain = GroupDistortion.of([curve(0.05, 2000)], [0])
     arrive = np.zeros(81)
     arrive[[20, 60]] = 0.5
@@ -79,7 +79,7 @@ def test_layers_are_used_where_it_is_uncertain_how_much_arrives() -> None:
     assert one.expected_db > plan.expected_db
 
 
-def test_the_plan_is_the_best_of_all_on_a_small_case() -> None:
+def test_plan_equals_brute_force_on_a_small_case() -> None:
     gain = GroupDistortion.of([curve(0.05, 800)], [0])
     arrive = arrivals(12, (LossChannel(0.3), LossChannel(0.6)), 1)
     plan = plan_layers(gain, 32, arrive, 8, 6)
@@ -98,7 +98,7 @@ def test_the_plan_is_the_best_of_all_on_a_small_case() -> None:
     assert plan.expected_db >= best - 1e-9
 
 
-def test_without_layers_the_best_k_is_found() -> None:
+def test_unlayered_plan_finds_the_best_k() -> None:
     gain = GroupDistortion.of([curve(0.05, 800)], [0])
     arrive = arrivals(6, (LossChannel(0.3),), 1)
     found = plan_unlayered(gain, 59, arrive, 12)
@@ -114,7 +114,7 @@ def test_too_few_frames_give_no_layers() -> None:
     assert plan_layers(gain, 12, arrivals(30, (LossChannel(0.1),), 1), 8, 6) is None
 
 
-def test_planning_a_group_takes_less_than_fifty_milliseconds_a_picture() -> None:
+def test_planning_takes_less_than_50_ms_per_image() -> None:
     curves = [curve(0.01 * (1 + n), 700) for n in range(24)]
     arrive = arrivals(120, (LossChannel(0.3, 4.0),), 2)
     plan_layers(GroupDistortion.of(curves[:2], [30] * 2), 59, arrive, 80, 29)
@@ -123,7 +123,7 @@ def test_planning_a_group_takes_less_than_fifty_milliseconds_a_picture() -> None
     assert (time.process_time() - started) / 24 < 0.05
 
 
-def test_previews_get_more_frames_the_worse_the_water() -> None:
+def test_previews_get_more_frames_at_higher_loss() -> None:
     found = [preview_frames(24, LossChannel(loss)) for loss in (0.0, 0.1, 0.3, 0.5)]
     assert found[0] == 24
     assert found == sorted(found)
@@ -131,7 +131,7 @@ def test_previews_get_more_frames_the_worse_the_water() -> None:
     assert preview_frames(24, LossChannel(0.9), limit=30) == 30
 
 
-def test_copies() -> None:
+def test_number_of_copies() -> None:
     assert [copies(LossChannel(loss)) for loss in (0.0, 0.1, 0.3, 0.5)] == [1, 2, 4, 7]
     assert copies(LossChannel(0.95)) == 8
 
@@ -143,7 +143,7 @@ def test_symbols_to_send() -> None:
     assert 50 <= symbols_to_send(50, LossChannel(0.5), 2.0) < 100 < symbols_to_send(50, LossChannel(0.5), -2.0)
 
 
-def test_the_rate_that_carries_most() -> None:
+def test_best_rate() -> None:
     assert best_rate({0: 0.0, 1: 0.0, 5: 0.0}, RATES).number == 5
     assert best_rate({0: 0.0, 1: 0.1, 5: 0.98}, RATES).number == 1
     assert best_rate({0: 0.1, 1: 0.95, 5: 1.0}, RATES).number == 0

@@ -64,7 +64,7 @@ orders = st.one_of(
 
 
 @given(orders)
-def test_every_order_fits_a_frame_of_32_bytes_and_comes_back(order: dl.DownlinkCommand) -> None:
+def test_command_round_trip_in_32_bytes(order: dl.DownlinkCommand) -> None:
     message = Segment(SegmentKind.MESSAGE, b"\x05" + dl.pack(order))
     (segment,) = parse_frame(pack_segments([message], 32))
     assert isinstance(segment, Segment)
@@ -72,7 +72,7 @@ def test_every_order_fits_a_frame_of_32_bytes_and_comes_back(order: dl.DownlinkC
 
 
 @given(st.text(max_size=60), st.integers(14, 60))
-def test_a_class_is_cut_between_characters(text: str, room_bytes: int) -> None:
+def test_class_is_cut_between_characters(text: str, room_bytes: int) -> None:
     packed = dl.pack(dl.DecisionMessage(1, 2, 3, 1, "unsure", None, text), room_bytes)
     found = dl.unpack(packed)
     assert isinstance(found, dl.DecisionMessage)
@@ -83,7 +83,7 @@ def test_a_class_is_cut_between_characters(text: str, room_bytes: int) -> None:
 
 
 @given(st.binary(max_size=40))
-def test_hostile_bytes_parse_or_are_refused_by_name(data: bytes) -> None:
+def test_hostile_bytes_parse_or_raise_frame_error(data: bytes) -> None:
     try:
         content = dl.unpack(data, "modem 3")
     except FrameError as error:
@@ -114,7 +114,7 @@ def test_hostile_bytes_parse_or_are_refused_by_name(data: bytes) -> None:
         (b"\x10", "data"),
     ],
 )
-def test_wrong_messages_name_the_field(packed: bytes, field: str) -> None:
+def test_error_names_the_invalid_field(packed: bytes, field: str) -> None:
     with pytest.raises(FrameError) as caught:
         dl.unpack(packed)
     assert caught.value.field == field
@@ -128,7 +128,7 @@ def test_confirmations_fill_messages() -> None:
     assert max(len(dl.pack(each)) for each in made) <= dl.SMALLEST_ROOM_BYTES
 
 
-def test_tokens_are_of_a_record_and_an_attempt() -> None:
+def test_token_depends_on_record_and_attempt() -> None:
     assert dl.token_of("c-1", "command") == dl.token_of("c-1", "command")
     assert len({dl.token_of("c-1", "command", n) for n in range(9)} | {dl.token_of("c-1", "decision")}) == 10
     assert dl.record_id_of(1, 0xAB) == "a1-000000ab"

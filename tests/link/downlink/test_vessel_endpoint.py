@@ -59,7 +59,7 @@ def restarted(link):
 
 
 @pytest.mark.parametrize("frame_bytes", [32, 64])
-def test_orders_reach_the_vehicle_once_through_half_lost_frames_and_restarts(frame_bytes):
+def test_commands_arrive_once_at_50_percent_loss_and_restarts(frame_bytes):
     rng = np.random.default_rng(frame_bytes)
     link, vehicle = VesselEndpoint(CommandTracker(30.0)), Vehicle()
     for n in range(20):
@@ -88,7 +88,7 @@ def test_orders_reach_the_vehicle_once_through_half_lost_frames_and_restarts(fra
     assert max(change.times_sent for change in changes) > 1
 
 
-def test_an_order_nobody_hears_is_sent_more_and_more_rarely_and_expires():
+def test_unanswered_command_is_retried_less_often_and_expires():
     link = VesselEndpoint(CommandTracker(60.0))
     link.commands.add(order(link.commands, "c-1"), 0.0)
     sent_at = []
@@ -105,7 +105,7 @@ def test_an_order_nobody_hears_is_sent_more_and_more_rarely_and_expires():
     assert [o.state for o in link.commands.confirm(UUV, late.outcomes)] == [CommandState.CONFIRMED]
 
 
-def test_what_failed_is_due_at_once_and_what_was_sent_is_not():
+def test_failed_packet_is_due_at_once():
     link = VesselEndpoint(CommandTracker(60.0))
     link.commands.add(order(link.commands, "c-1"), 0.0)
     packet = link.next_packet(1, 32, 0.0)
@@ -118,7 +118,7 @@ def test_what_failed_is_due_at_once_and_what_was_sent_is_not():
     assert link.due_address(59.0) is None
 
 
-def test_confirmations_count_from_the_vehicle_that_was_asked_and_once():
+def test_only_the_addressed_vehicle_confirms_a_command_once():
     book = CommandTracker(60.0)
     asked = book.add(order(book, "c-1"), 0.0)
     outcome = (asked.token, dl.CommandOutcome.UNKNOWN_IMAGE)
@@ -128,7 +128,7 @@ def test_confirmations_count_from_the_vehicle_that_was_asked_and_once():
     assert (refused.state, refused.reason) == (CommandState.REFUSED, "unknown image")
 
 
-def test_a_record_that_comes_again_is_known_and_tokens_are_free():
+def test_repeated_record_is_found_and_tokens_are_unique():
     book = CommandTracker(60.0)
     first = book.add(order(book, "c-1"), 0.0)
     assert book.find("resend", "c-1") == first
@@ -138,7 +138,7 @@ def test_a_record_that_comes_again_is_known_and_tokens_are_free():
         book.add(first, 0.0)
 
 
-def test_the_book_is_bounded():
+def test_tracker_memory_is_bounded():
     book = CommandTracker(60.0)
     for n in range(MAX_PENDING):
         book.add(order(book, f"c-{n}"), 0.0)
@@ -175,7 +175,7 @@ PICTURE = bytes([0x20]) + bytes(range(200))
 CONTACT = ContactSummary(height_px=40, width_px=60, lat_deg=56.4, lon_deg=-5.6, time_utc_s=1_475_568_000.0)
 
 
-def test_reports_make_the_vehicle_complete_what_was_lost():
+def test_feedback_completes_lost_images():
     rng = np.random.default_rng(5)
     vehicle = Vehicle(SenderConfig(frame_bytes=64, channels=(LossChannel(0.1),), feedback=True, max_defer_s=120.0))
     for number in range(1, 9):
@@ -198,7 +198,7 @@ def test_reports_make_the_vehicle_complete_what_was_lost():
     assert 1 <= reports <= 20
 
 
-def test_reports_into_silence_become_rare_and_end():
+def test_unanswered_feedback_becomes_rare_and_ends():
     vehicle = Vehicle(SenderConfig(frame_bytes=64, feedback=True))
     for number in range(1, 5):
         vehicle.sender.add_image(number, CONTACT, PICTURE, 0.0)
@@ -215,7 +215,7 @@ def test_reports_into_silence_become_rare_and_end():
     assert link.due_address(3000.0 + 400) == UUV
 
 
-def test_a_report_that_failed_comes_again_and_none_without_feedback():
+def test_failed_feedback_is_repeated():
     vehicle = Vehicle(SenderConfig(frame_bytes=64, feedback=True))
     for number in range(1, 5):
         vehicle.sender.add_image(number, CONTACT, PICTURE, 0.0)
@@ -231,7 +231,7 @@ def test_a_report_that_failed_comes_again_and_none_without_feedback():
     assert mute.next_packet(1, 32, 61.0) is None
 
 
-def test_other_traffic_is_given_out_once_and_nonsense_is_refused():
+def test_messages_are_returned_once_and_invalid_ones_rejected():
     link = VesselEndpoint(CommandTracker(30.0))
     sender = V1Sender(SenderConfig(channels=(LossChannel(0.3),)))
     sender.add_message(dl.pack(dl.DataMessage(b"status"), 4096), 0.0, times=2)
@@ -243,7 +243,7 @@ def test_other_traffic_is_given_out_once_and_nonsense_is_refused():
     assert link.accept(UUV, b"not a frame", 0.0).rejected[0].field == "checksum"
 
 
-def test_an_order_that_fits_no_frame_is_an_error_that_says_so():
+def test_command_longer_than_a_frame_is_an_error():
     link = VesselEndpoint(CommandTracker(30.0))
     long = replace(order(link.commands, "c-1"), message=bytes(40))
     link.commands.add(long, 0.0)

@@ -67,7 +67,7 @@ HALF_STEPS = {
 
 
 @given(contacts())
-def test_every_value_arrives_within_half_a_step(sent: ContactSummary) -> None:
+def test_values_round_trip_within_half_a_step(sent: ContactSummary) -> None:
     packed = sent.pack()
     assert len(packed) == RECORD_SIZE
     read = ContactSummary.unpack(packed)
@@ -89,7 +89,7 @@ def test_every_value_arrives_within_half_a_step(sent: ContactSummary) -> None:
 
 
 @given(contacts())
-def test_rounding_is_done_once(sent: ContactSummary) -> None:
+def test_rounding_is_idempotent(sent: ContactSummary) -> None:
     once = sent.rounded()
     assert once.rounded() == once
     assert once.pack() == sent.pack()
@@ -105,7 +105,7 @@ def test_any_record_that_parses_packs_to_the_same_bytes(data: bytes) -> None:
 
 
 @pytest.mark.parametrize("position", [20, 21, 22, 27, 28, 29])
-def test_every_code_of_the_one_byte_fields_survives(position: int) -> None:
+def test_all_codes_of_one_byte_fields_round_trip(position: int) -> None:
     # Random records rarely have a picture size and a position in range, so the codes are walked through here.
     base = bytearray(ContactSummary(height_px=80, width_px=140, lat_deg=1, lon_deg=2).pack())
     values = []
@@ -118,7 +118,7 @@ def test_every_code_of_the_one_byte_fields_survives(position: int) -> None:
 
 
 @pytest.mark.parametrize("start", [18, 20])
-def test_every_code_of_the_two_byte_fields_survives(start: int) -> None:
+def test_all_codes_of_two_byte_fields_round_trip(start: int) -> None:
     base = bytearray(ContactSummary().pack())
     refused = []
     for code in range(65536):
@@ -151,7 +151,7 @@ def test_every_code_of_the_two_byte_fields_survives(start: int) -> None:
         ("position_sigma_m", 1.7e308),
     ],
 )
-def test_a_value_the_field_cannot_hold_travels_as_unknown(name: str, value: float) -> None:
+def test_value_out_of_the_field_range_is_sent_as_unknown(name: str, value: float) -> None:
     contact = dataclasses.replace(ContactSummary(lat_deg=1, lon_deg=2, side=Side.STARBOARD), **{name: value})
     read = contact.rounded()
     assert getattr(read, name) is None
@@ -181,18 +181,18 @@ def test_a_value_the_field_cannot_hold_travels_as_unknown(name: str, value: floa
         ({"position_sigma_m": 1.0}, "lat_deg"),
     ],
 )
-def test_values_that_cannot_be_meant_are_refused(fields: dict[str, Any], named: str) -> None:
+def test_impossible_values_are_rejected(fields: dict[str, Any], named: str) -> None:
     with pytest.raises(FrameError) as caught:
         ContactSummary(**fields)
     assert caught.value.field == named
 
 
-def test_a_small_accuracy_never_looks_better_than_the_first_step() -> None:
+def test_small_sigma_is_rounded_up_to_the_first_step() -> None:
     contact = ContactSummary(lat_deg=1, lon_deg=2, position_sigma_m=0.0).rounded()
     assert contact.position_sigma_m == pytest.approx(0.1)
 
 
-def test_the_last_bit_of_a_logarithm_does_not_round_an_accuracy_up() -> None:
+def test_decoded_sigma_gives_the_same_code() -> None:
     for code in range(255):
         value = 0.1 * 2 ** (code / 16)
         for near in (value, math.nextafter(value, 0), math.nextafter(value, math.inf), value * (1 + 1e-13)):
@@ -201,11 +201,11 @@ def test_the_last_bit_of_a_logarithm_does_not_round_an_accuracy_up() -> None:
 
 
 @pytest.mark.parametrize("length", [0, RECORD_SIZE - 1, RECORD_SIZE + 1])
-def test_another_length_is_refused(length: int) -> None:
+def test_other_length_is_rejected(length: int) -> None:
     with pytest.raises(FrameError, match="25 bytes"):
         ContactSummary.unpack(bytes(length))
 
 
-def test_a_side_by_its_plain_name_is_that_side() -> None:
+def test_side_may_be_given_as_text() -> None:
     plain: Any = "starboard"
     assert ContactSummary(side=plain).rounded().side is Side.STARBOARD

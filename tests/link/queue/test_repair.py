@@ -74,7 +74,7 @@ def settled(exchange: Exchange) -> bool:
     return all(count_positions(kept[n].delivered) == len(data) for n, data in exchange.streams.items())
 
 
-def test_pictures_cut_while_nobody_reported_become_whole_when_reports_come() -> None:
+def test_images_sent_without_feedback_are_completed_with_feedback() -> None:
     exchange = Exchange()
     for number in range(1, 25):
         exchange.add(number)
@@ -86,7 +86,7 @@ def test_pictures_cut_while_nobody_reported_become_whole_when_reports_come() -> 
     assert settled(exchange)
 
 
-def test_pictures_of_which_nothing_arrived_become_whole_when_the_vessel_comes() -> None:
+def test_images_sent_before_contact_are_completed_with_feedback() -> None:
     exchange = Exchange()
     for number in range(1, 41):
         exchange.add(number)
@@ -98,7 +98,7 @@ def test_pictures_of_which_nothing_arrived_become_whole_when_the_vessel_comes() 
     assert settled(exchange)
 
 
-def test_what_is_settled_is_not_sent_again() -> None:
+def test_delivered_images_are_not_sent_again() -> None:
     exchange = Exchange()
     for number in range(1, 6):
         exchange.add(number)
@@ -111,7 +111,7 @@ def test_what_is_settled_is_not_sent_again() -> None:
     assert exchange.queue.is_idle
 
 
-def test_what_receivers_have_of_a_block_sent_before_they_reported_is_not_sent_again() -> None:
+def test_received_parts_of_retired_blocks_are_not_sent_again() -> None:
     exchange = Exchange(loss=0.0)
     for number in range(1, 8):
         exchange.add(number)
@@ -129,7 +129,7 @@ def test_what_receivers_have_of_a_block_sent_before_they_reported_is_not_sent_ag
 
 
 @pytest.mark.parametrize("reports", [True, False])
-def test_a_restart_at_any_time_forgets_nothing_that_is_owed(reports: bool) -> None:
+def test_restart_at_any_time_loses_no_image(reports: bool) -> None:
     exchange = Exchange(loss=0.4)
     for number in range(1, 21):
         exchange.add(number)
@@ -142,7 +142,7 @@ def test_a_restart_at_any_time_forgets_nothing_that_is_owed(reports: bool) -> No
     assert settled(exchange)
 
 
-def test_a_break_in_the_reports_and_another_frame_length_cost_no_picture() -> None:
+def test_feedback_gaps_and_other_frame_lengths_lose_no_image() -> None:
     exchange = Exchange(rates=(1, 0), first_rate=1)
     for number in range(1, 31):
         exchange.add(number)
@@ -153,7 +153,7 @@ def test_a_break_in_the_reports_and_another_frame_length_cost_no_picture() -> No
     assert settled(exchange)
 
 
-def test_pictures_beyond_the_limit_are_forgotten_settled_ones_first() -> None:
+def test_delivered_images_are_deleted_first() -> None:
     exchange = Exchange(loss=0.0, kept_images=8)
     for number in range(1, 5):
         exchange.add(number)
@@ -166,7 +166,7 @@ def test_pictures_beyond_the_limit_are_forgotten_settled_ones_first() -> None:
     assert set(exchange.queue.sender.kept) == set(range(5, 13)), "what may still have to be sent is kept"
 
 
-def test_a_refinement_asked_for_before_reports_came_is_sent_and_repaired() -> None:
+def test_refinement_without_feedback_is_repaired_later() -> None:
     exchange = Exchange(stream_bytes=200)
     exchange.add(1, length=900)
     exchange.run(200.0, reports=False)
@@ -180,7 +180,7 @@ def test_a_refinement_asked_for_before_reports_came_is_sent_and_repaired() -> No
 
 
 @pytest.mark.parametrize("length", [28, 29, 30, 31, 32])
-def test_a_stream_that_just_fills_its_preview_becomes_complete(length: int) -> None:
+def test_stream_that_just_fills_its_preview_is_completed(length: int) -> None:
     exchange = Exchange(loss=0.0)
     exchange.add(1, length)
     exchange.run(600.0, reports=True)
@@ -188,7 +188,7 @@ def test_a_stream_that_just_fills_its_preview_becomes_complete(length: int) -> N
     assert exchange.receiver.counts.complete == 1
 
 
-def test_a_block_that_was_lost_altogether_is_reminded_of_through_a_flood_of_messages() -> None:
+def test_reminders_of_a_lost_block_are_sent_among_many_messages() -> None:
     exchange = Exchange(loss=0.0)
     exchange.add(1)
     exchange.run(600.0, reports=True)

@@ -62,7 +62,7 @@ def messages(events) -> list[bytes]:
     return [e.data for e in events if isinstance(e, MessageReceived)]
 
 
-def test_every_contact_is_seen_before_the_detail_of_any():
+def test_all_contacts_precede_detail():
     queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0)), 120)
     receiver, now, first = V1Receiver(), 0.0, None
     seen: set[str] = set()
@@ -78,7 +78,7 @@ def test_every_contact_is_seen_before_the_detail_of_any():
     assert first is None, f"detail of {first} before all contacts were seen"
 
 
-def test_messages_go_by_priority_and_an_urgent_one_waits_for_one_packet_at_most():
+def test_urgent_message_waits_for_one_packet_at_most():
     queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0)), 20)
     for n in range(200):
         queue.add_message(f"m{n}", "status", b"%4d" % n * 10, 0.0, priority=5)
@@ -89,7 +89,7 @@ def test_messages_go_by_priority_and_an_urgent_one_waits_for_one_packet_at_most(
     assert b"leak" in messages(first)
 
 
-def test_programs_of_one_priority_share_the_water_whatever_they_send():
+def test_programs_of_one_priority_share_the_airtime():
     queue = TransmitQueue(QueueConfig(expected_loss=0.0))
     for n in range(600):
         queue.add_message(f"m{n}", "chatty", b"C" * 50, 0.0, priority=4, lifetime_s=1e5)
@@ -103,7 +103,7 @@ def test_programs_of_one_priority_share_the_water_whatever_they_send():
     assert before <= 40 * 22 + 8 * 64, "half of the bytes, and what was loaded already"
 
 
-def test_pictures_keep_their_share_in_a_flood_and_a_flood_is_not_starved():
+def test_images_keep_their_share_among_many_messages():
     queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0, image_airtime_share=0.25)), 4)
     for n in range(1500):
         queue.add_message(f"m{n}", "flood", b"F" * 55, 0.0, priority=1, lifetime_s=1e5)
@@ -117,7 +117,7 @@ def test_pictures_keep_their_share_in_a_flood_and_a_flood_is_not_starved():
     assert 0.15 < pictures / frames < 0.3
 
 
-def test_what_fills_only_gets_through_when_it_has_aged():
+def test_filler_message_is_sent_after_aging():
     def frames_until_it_goes(priority: int) -> float:
         queue = TransmitQueue(QueueConfig(expected_loss=0.0, aging_s=600.0))
         queue.add_message("log", "logger", b"L" * 55, 0.0, priority=priority, lifetime_s=1e6)
@@ -136,7 +136,7 @@ def test_what_fills_only_gets_through_when_it_has_aged():
     assert 1100 < frames_until_it_goes(7) < 1400
 
 
-def test_what_has_expired_is_not_sent_and_counted():
+def test_expired_message_is_counted_and_not_sent():
     queue = TransmitQueue(QueueConfig())
     queue.add_message("old", "s", b"old", 0.0, lifetime_s=10.0)
     assert not queue.add_message("older", "s", b"older", 0.0, lifetime_s=-1.0)
@@ -147,7 +147,7 @@ def test_what_has_expired_is_not_sent_and_counted():
     assert queue.is_idle
 
 
-def test_a_message_given_twice_goes_once_and_two_programs_may_use_one_name():
+def test_message_identifier_is_unique_per_program():
     queue = TransmitQueue(QueueConfig(expected_loss=0.0))
     assert queue.add_message("1", "a", b"one", 0.0)
     assert not queue.add_message("1", "a", b"one", 0.0)
@@ -157,7 +157,7 @@ def test_a_message_given_twice_goes_once_and_two_programs_may_use_one_name():
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.5])
-def test_with_reports_everything_arrives_whatever_is_lost(share):
+def test_feedback_delivers_everything_at_any_loss(share):
     queue = filled(TransmitQueue(QueueConfig(expected_loss=0.3)), 12)
     for n in range(60):
         queue.add_message(f"m{n}", "s", b"%3d" % n * 5, 0.0, priority=4, lifetime_s=1e5)
@@ -170,7 +170,7 @@ def test_with_reports_everything_arrives_whatever_is_lost(share):
         assert abs(queue.planned_loss - share) < 0.15
 
 
-def test_a_receiver_that_falls_silent_stops_nothing():
+def test_queue_continues_when_feedback_stops():
     queue = filled(TransmitQueue(QueueConfig(rates=(0, 1), first_rate=1, feedback_memory_s=300.0)), 30)
     receiver = V1Receiver()
     _, now = run(queue, 300.0, receiver=receiver, reports=True)
@@ -183,7 +183,7 @@ def test_a_receiver_that_falls_silent_stops_nothing():
     assert not queue.open_numbers()
 
 
-def test_the_rate_follows_the_loss():
+def test_rate_follows_the_loss():
     queue = filled(TransmitQueue(QueueConfig(rates=(1, 5), first_rate=5, stream_bytes=4000)), 0)
     receiver, now = V1Receiver(), 0.0
     rates = []
@@ -202,7 +202,7 @@ def test_the_rate_follows_the_loss():
     assert rates.count(1) > 150
 
 
-def test_expected_times_come_true():
+def test_expected_times_match_the_transmission():
     queue = filled(TransmitQueue(QueueConfig(expected_loss=0.2)), 10)
     queue.next_packet(0.0)
     told = {e.image_id: e for e in queue.expected(0.0)}
@@ -230,7 +230,7 @@ def copy_of(queue: TransmitQueue, protection=None) -> TransmitQueue:
 
 @settings(max_examples=25)
 @given(st.data())
-def test_a_queue_that_was_saved_and_taken_up_sends_what_it_would_have_sent(data):
+def test_restored_queue_sends_the_same(data):
     queue = filled(TransmitQueue(QueueConfig(rates=(0, 1), first_rate=1)), data.draw(st.integers(0, 30)))
     for n in range(data.draw(st.integers(0, 20))):
         priority = data.draw(st.integers(1, 7))
@@ -315,7 +315,7 @@ def test_a_malformed_part_is_reported_and_the_rest_restored(name, change):
     assert {part: data for part, data in again.parts().items() if part in kept} == kept
 
 
-def test_parts_of_something_else_are_reported_and_nothing_is_restored():
+def test_foreign_parts_are_reported_and_nothing_is_restored():
     again = TransmitQueue(QueueConfig())
     junk = {"queue": b"junk", "sender": b"", "image/1": b"\x80", "block/7": b"\xc1", "message/x": b"\x01"}
     assert set(again.restore(junk)) == set(junk)
@@ -333,7 +333,7 @@ def test_images_are_sent_again_when_their_progress_is_unknown():
     assert {e.image_id for e in events if isinstance(e, ImageUpdate)} == {image_of_number(n) for n in range(1, 6)}
 
 
-def test_a_rate_that_is_no_longer_configured_is_left():
+def test_rate_that_is_not_configured_any_more_is_replaced():
     queue = filled(TransmitQueue(QueueConfig(rates=(5,), first_rate=5)), 5)
     take_packet(queue, 0.0)
     again = TransmitQueue(QueueConfig(rates=(1,), first_rate=1))
@@ -354,17 +354,17 @@ def test_a_rate_that_is_no_longer_configured_is_left():
         {"max_messages": 0},
     ],
 )
-def test_values_out_of_range_are_named(wrong):
+def test_error_names_the_invalid_value(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         QueueConfig(**wrong)
 
 
-def test_a_rate_that_there_is_not_is_named():
+def test_error_names_an_unknown_rate():
     with pytest.raises(ConfigError, match="rate"):
         TransmitQueue(QueueConfig(rates=(1,), first_rate=4))
 
 
-def test_a_longer_stream_of_a_picture_that_has_gone_brings_only_what_is_new():
+def test_longer_stream_of_a_sent_image_sends_only_the_new_part():
     queue = TransmitQueue(QueueConfig(expected_loss=0.0))
     whole = stream(1, 1200)
     receiver = V1Receiver()
@@ -379,7 +379,7 @@ def test_a_longer_stream_of_a_picture_that_has_gone_brings_only_what_is_new():
     assert queue.sender.state.frames_sent - before < 900 / 50 + 8
 
 
-def test_a_picture_that_is_given_again_goes_again_unless_it_waits():
+def test_repeated_image_is_sent_again_unless_it_waits():
     queue = TransmitQueue(QueueConfig(expected_loss=0.0))
     assert queue.add_image(image(1), 0.0)
     assert not queue.add_image(image(1), 0.0)
@@ -389,7 +389,7 @@ def test_a_picture_that_is_given_again_goes_again_unless_it_waits():
     assert [e for e in events if isinstance(e, ImageUpdate)]
 
 
-def test_a_picture_of_which_more_is_here_is_refined_at_once():
+def test_refine_sends_more_of_a_kept_stream():
     queue = TransmitQueue(QueueConfig(expected_loss=0.0, frames_per_image=3.0))
     queue.add_image(image(1, stream(1, 900)), 0.0)
     receiver = V1Receiver()
@@ -399,7 +399,7 @@ def test_a_picture_of_which_more_is_here_is_refined_at_once():
     assert max(len(e.stream) for e in events if isinstance(e, ImageUpdate)) == 900
 
 
-def test_a_longer_stream_that_does_not_continue_what_was_sent_is_not_mixed_with_it():
+def test_longer_stream_with_another_beginning_is_not_sent():
     queue = TransmitQueue(QueueConfig(expected_loss=0.0))
     queue.add_image(image(1, stream(1, 300)), 0.0)
     _, now = run(queue, 200.0)

@@ -107,7 +107,7 @@ def test_plausible_bytes_parse_or_raise_frame_error(
     st.binary(min_size=CONTACT_FRAME_SIZE - 7, max_size=CONTACT_FRAME_SIZE - 7),
     st.text("0123456789AZ", min_size=4, max_size=4),
 )
-def test_contact_bytes_with_a_right_checksum_parse_or_raise_frame_error(record: bytes, image_id: str) -> None:
+def test_contact_bytes_with_a_correct_checksum_parse_or_raise_frame_error(record: bytes, image_id: str) -> None:
     body = b"C" + image_id.encode() + record
     data = body + frame_checksum(body).to_bytes(2, "big")
     try:
@@ -131,7 +131,7 @@ def half_frames(draw: st.DrawFn) -> HalfFrame:
 
 
 @given(half_frames(), st.binary(max_size=40))
-def test_half_frames_round_trip_and_drop_what_follows_the_half(frame: HalfFrame, tail: bytes) -> None:
+def test_half_frame_round_trip_without_padding(frame: HalfFrame, tail: bytes) -> None:
     packed = frame.pack()
     assert len(packed) == HALF_PREFIX_SIZE + frame.header.size + len(frame.payload)
     assert len(packed) <= MAX_HALF_HEADER_SIZE + len(frame.payload)
@@ -142,7 +142,7 @@ def test_half_frames_round_trip_and_drop_what_follows_the_half(frame: HalfFrame,
 
 
 @given(half_frames(), st.integers(0, 300))
-def test_a_half_frame_cut_short_keeps_what_it_has(frame: HalfFrame, length: int) -> None:
+def test_cut_half_frame_keeps_its_bytes(frame: HalfFrame, length: int) -> None:
     head = HALF_PREFIX_SIZE + frame.header.size
     assume(length < head + len(frame.payload))
     cut = frame.pack()[:length]
@@ -154,7 +154,7 @@ def test_a_half_frame_cut_short_keeps_what_it_has(frame: HalfFrame, length: int)
 
 
 @given(half_frames())
-def test_a_half_frame_cut_anywhere_in_its_header_says_where(frame: HalfFrame) -> None:
+def test_half_frame_cut_in_its_header_is_rejected(frame: HalfFrame) -> None:
     packed = frame.pack()
     for length in range(HALF_PREFIX_SIZE + frame.header.size):
         with pytest.raises(FrameError) as caught:
@@ -164,7 +164,7 @@ def test_a_half_frame_cut_anywhere_in_its_header_says_where(frame: HalfFrame) ->
 
 
 @given(st.integers(0, 8 * CONTACT_FRAME_SIZE - 1), st.integers(1, 16), st.integers(1, 2**16 - 1))
-def test_any_burst_of_up_to_16_wrong_bits_is_seen_in_a_contact_frame(first_bit: int, length: int, pattern: int) -> None:
+def test_contact_frame_detects_bursts_of_up_to_16_wrong_bits(first_bit: int, length: int, pattern: int) -> None:
     frame = ContactFrame("00A7", ContactSummary(height_px=80, width_px=140, lat_deg=44.7, lon_deg=-63.6)).pack()
     burst = (pattern & ((1 << length) - 1)) << first_bit
     assume(burst)
@@ -177,7 +177,7 @@ def test_any_burst_of_up_to_16_wrong_bits_is_seen_in_a_contact_frame(first_bit: 
 
 
 @pytest.mark.parametrize("length", [0, 1, 2, 9, 10, 65535])
-def test_the_halves_are_the_whole_body(length: int) -> None:
+def test_halves_cover_the_body(length: int) -> None:
     top, bottom = half_bounds(length, "top"), half_bounds(length, "bottom")
     assert top[0] == 0
     assert top[1] == bottom[0]
@@ -185,7 +185,7 @@ def test_the_halves_are_the_whole_body(length: int) -> None:
     assert 0 <= (top[1] - top[0]) - (bottom[1] - bottom[0]) <= 1
 
 
-def test_image_identifiers_count_in_base_36_and_start_again() -> None:
+def test_image_identifiers_count_in_base_36_and_wrap_around() -> None:
     assert [format_image_id(n) for n in (0, 35, 36, 36**4 - 1, 36**4)] == ["0000", "000Z", "0010", "ZZZZ", "0000"]
     assert all(int(format_image_id(n), 36) == n for n in range(0, 36**4, 9973))
     assert not any(
@@ -212,20 +212,20 @@ def test_image_identifiers_count_in_base_36_and_start_again() -> None:
         ({"body_length": -1}, "body_length"),
     ],
 )
-def test_a_half_frame_that_cannot_be_packed_cannot_be_made(change: dict[str, Any], named: str) -> None:
+def test_invalid_half_frame_is_rejected(change: dict[str, Any], named: str) -> None:
     frame = HalfFrame("top", "00A7", 0, 9, HEADER, bytes(5))
     with pytest.raises(FrameError) as caught:
         dataclasses.replace(frame, **change)
     assert caught.value.field == named
 
 
-def test_a_half_frames_header_is_13_bytes_for_a_common_picture_and_16_at_most() -> None:
+def test_half_frame_header_has_13_bytes_for_common_sizes_and_at_most_16() -> None:
     common, other = StreamHeader(0x10, 0xBEEF, 140, 80), HEADER
     assert [len(HalfFrame("top", "00A7", 0, 9, header, b"").pack()) for header in (common, other)] == [13, 16]
     assert MAX_HALF_HEADER_SIZE == 16
 
 
-def test_a_contact_frame_fills_a_rate_0_frame_exactly() -> None:
+def test_contact_frame_fills_a_rate_0_frame() -> None:
     assert CONTACT_FRAME_SIZE == 32
     assert len(ContactFrame("00A7", ContactSummary()).pack()) == 32
     with pytest.raises(FrameError, match="four characters"):

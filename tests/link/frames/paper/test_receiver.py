@@ -96,7 +96,7 @@ def test_golden_scenarios(case: dict[str, Any]) -> None:
         assert [describe(e) for e in events] == step["events"], step
 
 
-def test_an_event_carries_times_stream_and_mask_for_the_decoder() -> None:
+def test_update_has_times_stream_and_mask() -> None:
     receiver = PaperReceiver(60)
     assert receiver.accept(2, piece(0, 2), 10) == []
     assert receiver.accept(2, contact(), 11) == []
@@ -111,7 +111,7 @@ def test_an_event_carries_times_stream_and_mask_for_the_decoder() -> None:
     assert receiver.next_deadline() is None
 
 
-def test_the_wait_counts_from_the_last_frame_that_added_something() -> None:
+def test_timeout_starts_at_the_last_frame_with_new_content() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, piece(0, 2), 0)
     receiver.accept(2, piece(2, 3), 50)
@@ -123,7 +123,7 @@ def test_the_wait_counts_from_the_last_frame_that_added_something() -> None:
     assert receiver.counts.duplicates == 1
 
 
-def test_accept_first_gives_out_what_is_due() -> None:
+def test_accept_reports_due_images_first() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, half("top"), 0)
     first, second = images(receiver.accept(2, half("bottom"), 1000))
@@ -131,7 +131,7 @@ def test_accept_first_gives_out_what_is_due() -> None:
     assert (second.version, second.complete, body_of(second)) == (2, True, BODY)
 
 
-def test_a_late_frame_does_not_push_out_the_image_that_waits() -> None:
+def test_late_frame_does_not_report_the_open_image() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, half("top", "00A7"), 0)
     (old,) = images(receiver.accept(2, half("top", "00A8"), 1))
@@ -142,7 +142,7 @@ def test_a_late_frame_does_not_push_out_the_image_that_waits() -> None:
     assert (new.image_id, new.version, new.complete) == ("00A8", 1, True)
 
 
-def test_an_image_reopened_by_a_late_frame_is_given_out_with_the_next_image() -> None:
+def test_image_reopened_by_a_late_frame_is_reported_with_the_next_image() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, piece(0, 2), 0)
     assert [e.version for e in images(receiver.accept(2, half("top", "00A8"), 1))] == [1]
@@ -152,13 +152,13 @@ def test_an_image_reopened_by_a_late_frame_is_given_out_with_the_next_image() ->
 
 
 @pytest.mark.parametrize("image_ids", [["00A7"], ["00A8"]])
-def test_a_contact_frame_pushes_nothing_out(image_ids: list[str]) -> None:
+def test_contact_frame_reports_no_other_image(image_ids: list[str]) -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, half("top"), 0)
     assert [e for i in image_ids for e in receiver.accept(2, contact(i), 1)] == []
 
 
-def test_a_half_of_another_image_leaves_a_contact_record_waiting_for_its_picture() -> None:
+def test_half_frame_of_another_image_does_not_report_a_contact_record() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, contact("00A7"), 0)
     assert receiver.accept(2, half("top", "00A8"), 1) == []
@@ -166,7 +166,7 @@ def test_a_half_of_another_image_leaves_a_contact_record_waiting_for_its_picture
     assert event.image_id == "00A7"
 
 
-def test_a_second_different_contact_record_is_counted_and_the_first_stays() -> None:
+def test_different_second_contact_record_is_a_conflict() -> None:
     receiver = PaperReceiver(60)
     other = dataclasses.replace(CONTACT, lat_deg=45.0)
     receiver.accept(2, contact(), 0)
@@ -178,7 +178,7 @@ def test_a_second_different_contact_record_is_counted_and_the_first_stays() -> N
     assert receiver.counts == PaperReceiverCounts(frames=3, duplicates=2, conflicts=1, contacts_only=1)
 
 
-def test_bytes_that_are_there_stay_when_a_repetition_says_otherwise() -> None:
+def test_received_bytes_stay_when_a_repetition_differs() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, piece(0, 3), 0)
     damaged = HalfFrame("top", "00A7", 1, 9, HEADER, b"\xa2\x00\xa4\xa5").pack()
@@ -188,7 +188,7 @@ def test_bytes_that_are_there_stay_when_a_repetition_says_otherwise() -> None:
     assert (event.frames, event.conflicts) == (2, 1)
 
 
-def test_the_checked_contact_record_decides_between_stream_headers() -> None:
+def test_contact_record_decides_between_stream_headers() -> None:
     wrong = StreamHeader(0x10, 0xBEEF, 113, 48)
     receiver = PaperReceiver(60)
     receiver.accept(2, HalfFrame("top", "00A7", 0, 9, wrong, BODY[:2]).pack(), 0)
@@ -200,7 +200,7 @@ def test_the_checked_contact_record_decides_between_stream_headers() -> None:
     assert event.frames == 1
 
 
-def test_more_frames_outvote_more_bytes() -> None:
+def test_more_frames_win_over_more_bytes() -> None:
     wrong = StreamHeader(0x10, 0xBEEF, 113, 48)
     receiver = PaperReceiver(60)
     receiver.accept(2, half("top", header=wrong), 0)
@@ -210,7 +210,7 @@ def test_more_frames_outvote_more_bytes() -> None:
     assert (header_of(event), received_of(event)) == (HEADER, ((0, 2),))
 
 
-def test_a_header_outvoted_after_it_was_given_out_is_corrected_by_a_new_version() -> None:
+def test_outvoted_header_is_corrected_by_a_new_version() -> None:
     wrong = StreamHeader(0x10, 0xBEEF, 113, 48)
     receiver = PaperReceiver(60)
     receiver.accept(2, half("top", header=wrong), 0)
@@ -221,7 +221,7 @@ def test_a_header_outvoted_after_it_was_given_out_is_corrected_by_a_new_version(
     assert (event.version, header_of(event), body_of(event), event.complete) == (2, HEADER, BODY, True)
 
 
-def test_a_fourth_stream_header_is_refused() -> None:
+def test_fourth_stream_header_is_rejected() -> None:
     receiver = PaperReceiver(60)
     for width in (49, 50, 51):
         assert receiver.accept(2, half("top", header=dataclasses.replace(HEADER, width_px=width)), 0) == []
@@ -232,7 +232,7 @@ def test_a_fourth_stream_header_is_refused() -> None:
     assert receiver.counts == PaperReceiverCounts(frames=4, rejected=1, conflicts=3)
 
 
-def test_frames_that_disagree_on_the_body_length_are_kept_apart() -> None:
+def test_different_body_lengths_form_separate_candidates() -> None:
     receiver = PaperReceiver(60)
     longer = HalfFrame("top", "00A7", 0, 300, HEADER, bytes(16)).pack()
     assert receiver.accept(2, longer, 0) == []
@@ -243,7 +243,7 @@ def test_frames_that_disagree_on_the_body_length_are_kept_apart() -> None:
     assert receiver.counts.rejected == 0
 
 
-def test_a_fourth_body_length_is_refused() -> None:
+def test_fourth_body_length_is_rejected() -> None:
     receiver = PaperReceiver(60)
     for length in (9, 10, 11):
         assert receiver.accept(2, HalfFrame("top", "00A7", 0, length, HEADER, b"x").pack(), 0) == []
@@ -253,13 +253,13 @@ def test_a_fourth_body_length_is_refused() -> None:
 
 
 @pytest.mark.parametrize("length", [0, 1])
-def test_an_image_without_a_bottom_half_is_complete_with_its_top(length: int) -> None:
+def test_image_without_a_bottom_half_is_complete_with_its_top(length: int) -> None:
     receiver = PaperReceiver(60)
     (event,) = images(receiver.accept(2, half("top", body=BODY[:length]), 0))
     assert (event.complete, body_of(event), event.missing_halves) == (True, BODY[:length], ())
 
 
-def test_a_frame_without_body_bytes_announces_the_picture() -> None:
+def test_frame_without_body_bytes_announces_the_image() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, half("bottom")[:16], 0)
     (event,) = images(receiver.poll(60))
@@ -267,7 +267,7 @@ def test_a_frame_without_body_bytes_announces_the_picture() -> None:
     assert event.received_mask().tolist() == [False] * 9
 
 
-def test_an_identifier_used_again_much_later_is_a_new_image() -> None:
+def test_identifier_reused_after_memory_s_is_a_new_image() -> None:
     receiver = PaperReceiver(60, memory_s=3600)
     receiver.accept(2, half("top"), 0)
     receiver.accept(2, half("bottom"), 1)
@@ -278,7 +278,7 @@ def test_an_identifier_used_again_much_later_is_a_new_image() -> None:
     assert (event.version, event.first_frame_s, event.complete) == (1, 7202, True)
 
 
-def test_a_clock_that_is_set_back_does_not_hold_an_image() -> None:
+def test_clock_set_back_does_not_delay_an_image() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, half("top"), 1_000_000)
     assert receiver.poll(500) == []
@@ -286,7 +286,7 @@ def test_a_clock_that_is_set_back_does_not_hold_an_image() -> None:
     assert len(images(receiver.poll(560))) == 1
 
 
-def test_a_clock_that_was_set_back_stays_so_over_a_restart() -> None:
+def test_clock_set_back_before_a_restart_does_not_delay_an_image() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, half("top"), 1_000_000)
     receiver.poll(500)
@@ -295,7 +295,7 @@ def test_a_clock_that_was_set_back_stays_so_over_a_restart() -> None:
     assert other.next_deadline() == 560
 
 
-def test_a_clock_that_is_set_back_does_not_make_the_memory_longer() -> None:
+def test_clock_set_back_does_not_extend_the_memory() -> None:
     receiver = PaperReceiver(60, memory_s=3600)
     receiver.accept(2, half("top"), 1_000_000)
     receiver.accept(2, half("bottom"), 1_000_000)
@@ -305,7 +305,7 @@ def test_a_clock_that_is_set_back_does_not_make_the_memory_longer() -> None:
     assert event.version == 1
 
 
-def test_memory_is_bounded_and_nothing_is_dropped_unsaid() -> None:
+def test_memory_is_bounded_and_deleted_images_are_reported() -> None:
     receiver = PaperReceiver(60, max_images=4)
     events: list[Event] = []
     for number in range(50):
@@ -317,7 +317,7 @@ def test_memory_is_bounded_and_nothing_is_dropped_unsaid() -> None:
     assert sorted(e.source for e in images(receiver.poll(100))) == [46, 47, 48, 49]
 
 
-def test_making_room_forgets_what_was_given_out_before_what_waits() -> None:
+def test_reported_images_are_deleted_before_open_ones() -> None:
     receiver = PaperReceiver(60, max_images=2)
     receiver.accept(1, half("top"), 0)
     receiver.accept(2, half("top"), 1)
@@ -327,7 +327,7 @@ def test_making_room_forgets_what_was_given_out_before_what_waits() -> None:
     assert (event.source, event.version, event.complete) == (1, 1, True)
 
 
-def test_contact_frames_alone_are_bounded_too() -> None:
+def test_memory_of_contact_records_is_bounded() -> None:
     receiver = PaperReceiver(60, max_images=3)
     events = [e for n in range(10) for e in receiver.accept(2, contact(format_image_id(n)), n / 10)]
     assert [e.image_id for e in contacts_only(events)] == [format_image_id(n) for n in range(7)]
@@ -343,7 +343,7 @@ def test_contact_frames_alone_are_bounded_too() -> None:
         {"timeout_s": 60, "max_images": 0},
     ],
 )
-def test_settings_that_cannot_work_are_refused(settings: dict[str, Any]) -> None:
+def test_invalid_settings_are_rejected(settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="timeout_s > 0"):
         PaperReceiver(**settings)
 
@@ -359,7 +359,7 @@ def busy_receiver() -> PaperReceiver:
     return receiver
 
 
-def test_a_restored_state_is_the_same() -> None:
+def test_restored_state_is_equal() -> None:
     receiver = busy_receiver()
     other = PaperReceiver(60)
     assert other.restore(receiver.parts()) == {}

@@ -155,7 +155,7 @@ def knowledge(event: ImageUpdate) -> tuple[int, ...]:
 
 @settings(max_examples=250, deadline=None)
 @given(deliveries())
-def test_any_frames_in_any_order_give_right_bytes_and_every_version_once(
+def test_any_frames_in_any_order_give_correct_bytes_and_each_version_once(
     delivery: tuple[list[Sent], list[Step]],
 ) -> None:
     images, steps = delivery
@@ -216,7 +216,7 @@ def hostile_frames(draw: st.DrawFn) -> bytes:
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(-1, 2), hostile_frames(), st.floats(-100, 1e6)), max_size=40))
-def test_hostile_frames_at_wild_times_never_raise_and_memory_stays_bounded(
+def test_hostile_frames_and_times_never_raise_and_memory_is_bounded(
     arrivals: list[tuple[int, bytes, float]],
 ) -> None:
     receiver = PaperReceiver(TIMEOUT_S, max_images=3)

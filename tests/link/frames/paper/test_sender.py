@@ -65,7 +65,7 @@ def fewest_packets(length: int, frames_per_packet: int, payload_bytes: int) -> i
 )
 @example(65535, 0, True, 7)
 @example(306, 1, True, 4)
-def test_a_plan_keeps_every_rule(length: int, rate: int, with_contact: bool, header_bytes: int) -> None:
+def test_plan_keeps_all_rules(length: int, rate: int, with_contact: bool, header_bytes: int) -> None:
     frames_per_packet, frame_bytes = RATES[rate]
     stream = make_stream(length, header_bytes)
     plan = plan_packets("0K3P", stream, CONTACT if with_contact else None, frames_per_packet, frame_bytes)
@@ -131,7 +131,7 @@ def check_contact_leads(parsed: list[list[HalfFrame | ContactFrame]], frames_per
 @pytest.mark.parametrize("header_bytes", sorted(HEADERS))
 @pytest.mark.parametrize("with_contact", [True, False])
 @pytest.mark.parametrize("rate", sorted(RATES))
-def test_capacity_is_the_longest_body_with_one_packet_a_half(rate: int, with_contact: bool, header_bytes: int) -> None:
+def test_capacity_is_the_longest_body_with_one_packet_per_half(rate: int, with_contact: bool, header_bytes: int) -> None:
     frames_per_packet, frame_bytes = RATES[rate]
     contact = CONTACT if with_contact else None
     capacity = body_capacity_bytes(frames_per_packet, frame_bytes, with_contact=with_contact, header_bytes=header_bytes)
@@ -144,26 +144,26 @@ def test_capacity_is_the_longest_body_with_one_packet_a_half(rate: int, with_con
     assert len(beyond) > len(plan) or sum(frame[:1] == b"C" for frame in beyond[0]) == 0
 
 
-def test_capacity_never_exceeds_what_a_half_frame_can_say() -> None:
+def test_capacity_never_exceeds_the_body_length_field() -> None:
     assert body_capacity_bytes(8, 2**16, with_contact=False) == 65535
 
 
 @pytest.mark.parametrize("with_contact", [True, False])
 @pytest.mark.parametrize("rate", sorted(RATES))
-def test_capacity_without_a_header_is_what_fits_any_picture(rate: int, with_contact: bool) -> None:
+def test_default_capacity_fits_every_header(rate: int, with_contact: bool) -> None:
     capacities = [body_capacity_bytes(*RATES[rate], with_contact=with_contact, header_bytes=n) for n in HEADERS]
     assert body_capacity_bytes(*RATES[rate], with_contact=with_contact) == min(capacities)
 
 
 @pytest.mark.parametrize("header_bytes", [-1, 0, 1, 8])
-def test_capacity_for_a_header_that_there_is_not_is_refused(header_bytes: int) -> None:
+def test_capacity_rejects_an_impossible_header_length(header_bytes: int) -> None:
     with pytest.raises(FrameError) as caught:
         body_capacity_bytes(3, 64, with_contact=False, header_bytes=header_bytes)
     assert caught.value.field == "header_bytes"
 
 
 @given(st.integers(0, 700), st.sampled_from(sorted(RATES)), st.sampled_from(sorted(HEADERS)))
-def test_a_picture_sent_without_loss_is_complete_with_its_position(length: int, rate: int, header_bytes: int) -> None:
+def test_all_frames_give_one_complete_image_with_contact(length: int, rate: int, header_bytes: int) -> None:
     stream = make_stream(length, header_bytes)
     receiver = PaperReceiver(60)
     plan = plan_packets("0K3P", stream, CONTACT, *RATES[rate])
@@ -184,7 +184,7 @@ def test_a_picture_sent_without_loss_is_complete_with_its_position(length: int, 
         ("0K3P", CONTACT, 3, 31, "frame_bytes"),
     ],
 )
-def test_impossible_plans_are_refused(
+def test_impossible_plans_are_rejected(
     image_id: str, contact: ContactSummary | None, frames_per_packet: int, frame_bytes: int, named: str
 ) -> None:
     with pytest.raises(FrameError) as caught:
@@ -204,17 +204,17 @@ def test_impossible_plans_are_refused(
     ],
     ids=["empty", "cut", "size cut", "no size", "reserved", "too long"],
 )
-def test_a_stream_that_cannot_be_sent_is_refused(stream: bytes, field: str) -> None:
+def test_invalid_stream_is_rejected(stream: bytes, field: str) -> None:
     with pytest.raises(StreamError) as caught:
         plan_packets("0K3P", stream, None, 3, 64)
     assert caught.value.field == field
 
 
-def test_one_body_byte_a_frame_is_enough_to_send() -> None:
+def test_plan_with_one_body_byte_per_frame() -> None:
     plan = plan_packets("0K3P", make_stream(3, 7), None, 1, 17)
     assert [len(packet[0]) for packet in plan] == [17, 17, 17]
 
 
-def test_a_shorter_header_leaves_more_of_each_frame_to_the_body() -> None:
+def test_shorter_header_leaves_more_room_for_the_body() -> None:
     longest = {n: len(plan_packets("0K3P", make_stream(700, n), None, 3, 64)[0][0]) - 9 - n for n in HEADERS}
     assert longest == {2: 53, 3: 52, 4: 51, 5: 50, 6: 49, 7: 48}

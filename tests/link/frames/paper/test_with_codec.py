@@ -44,7 +44,7 @@ def send(packets: tuple[Packet, ...], lost: set[int]) -> ImageUpdate:
     [((), slice(0, HEIGHT_PX)), ((1,), slice(0, HEIGHT_PX // 2)), ((0,), slice(HEIGHT_PX // 2, HEIGHT_PX))],
     ids=["nothing lost", "bottom lost", "top lost"],
 )
-def test_a_half_that_arrived_is_seen_where_it_belongs(
+def test_received_half_is_decoded_at_its_place(
     picture: np.ndarray, codec: VqCodec, lost: tuple[int, ...], there: slice
 ) -> None:
     packets = plan_packets("0001", codec.encode(picture), CONTACT, 3, 64)

@@ -32,7 +32,7 @@ SIZES = (32, 64, 256, 100)
 
 
 @pytest.mark.parametrize("frame_bytes", SIZES)
-def test_a_broadcast_without_loss_delivers_every_contact_and_costs_what_was_planned(frame_bytes: int) -> None:
+def test_broadcast_without_loss_delivers_all_contacts_with_the_planned_frames(frame_bytes: int) -> None:
     world = World.make(0.0, frame_bytes=frame_bytes, frames_per_image=6.0)
     world.add(30, 700)
     world.run()
@@ -43,7 +43,7 @@ def test_a_broadcast_without_loss_delivers_every_contact_and_costs_what_was_plan
 
 @pytest.mark.parametrize("frame_bytes", SIZES)
 @pytest.mark.parametrize("count", [1, 2, 7, 30])
-def test_a_broadcast_for_a_third_lost_shows_contacts_and_most_pictures(frame_bytes: int, count: int) -> None:
+def test_broadcast_at_30_percent_loss_delivers_contacts_and_most_images(frame_bytes: int, count: int) -> None:
     world = World.make(0.3, seed=count, frame_bytes=frame_bytes, frames_per_image=8.0)
     world.add(count, 900)
     world.run()
@@ -52,7 +52,7 @@ def test_a_broadcast_for_a_third_lost_shows_contacts_and_most_pictures(frame_byt
         assert sum(e.complete for e in world.latest.values()) >= 24
 
 
-def test_previews_of_every_contact_go_before_the_detail_of_any() -> None:
+def test_previews_precede_detail() -> None:
     sender = V1Sender(SenderConfig())
     for number in range(1, 25):
         sender.add_image(number, contact(number), stream(number, 500), 0.0)
@@ -62,7 +62,7 @@ def test_previews_of_every_contact_go_before_the_detail_of_any() -> None:
     assert SymbolKind.OBJECT in first[24:]
 
 
-def test_receivers_with_good_and_bad_water_both_get_what_their_water_allows() -> None:
+def test_receivers_with_different_loss_get_different_layers() -> None:
     channels = (LossChannel(0.05), LossChannel(0.6))
     config = SenderConfig(channels=channels, frames_per_image=9.0)
     sender, receivers = V1Sender(config), [V1Receiver(), V1Receiver()]
@@ -83,7 +83,7 @@ def test_receivers_with_good_and_bad_water_both_get_what_their_water_allows() ->
     assert sum(got[0].values()) > 1.5 * sum(got[1].values()) > 1.5 * 24 * 30
 
 
-def test_one_frame_shows_a_contact_and_a_coarse_picture() -> None:
+def test_one_frame_gives_a_contact_and_a_coarse_image() -> None:
     sender, receiver = V1Sender(SenderConfig()), V1Receiver()
     for number in range(1, 11):
         sender.add_image(number, contact(number), stream(number, 500), 0.0)
@@ -97,7 +97,7 @@ def test_one_frame_shows_a_contact_and_a_coarse_picture() -> None:
 
 
 @pytest.mark.parametrize(("loss", "limit"), [(0.1, 1.15), (0.5, 1.15)])
-def test_with_feedback_all_is_complete_close_to_the_erasure_bound(loss: float, limit: float) -> None:
+def test_feedback_completes_all_images_close_to_the_erasure_bound(loss: float, limit: float) -> None:
     ratios = []
     for seed in range(3):
         world = World.make(
@@ -119,7 +119,7 @@ def test_with_feedback_all_is_complete_close_to_the_erasure_bound(loss: float, l
 
 
 @pytest.mark.parametrize("frame_bytes", [32, 256])
-def test_feedback_completes_at_other_frame_sizes_and_with_bursts(frame_bytes: int) -> None:
+def test_feedback_completes_all_images_at_other_frame_lengths_and_with_bursts(frame_bytes: int) -> None:
     world = World.make(
         0.5, 9, channels=(LossChannel(0.5, 4.0),), feedback=True, stream_bytes=300, frame_bytes=frame_bytes
     )
@@ -129,7 +129,7 @@ def test_feedback_completes_at_other_frame_sizes_and_with_bursts(frame_bytes: in
     assert world.sender.measured_loss == pytest.approx(0.5, abs=0.25)
 
 
-def test_messages_come_through_once_and_share_frames() -> None:
+def test_messages_arrive_once() -> None:
     world = World.make(0.4, 5, channels=(LossChannel(0.4),))
     world.add(4, 300)
     small = [b"status %d" % n for n in range(8)]
@@ -141,7 +141,7 @@ def test_messages_come_through_once_and_share_frames() -> None:
     assert sorted(world.messages) == sorted([*small, long])
 
 
-def test_several_messages_go_in_one_frame_and_contacts_fill_it() -> None:
+def test_messages_and_contacts_share_a_frame() -> None:
     sender = V1Sender(SenderConfig(frame_bytes=128, group_delay_s=100.0))
     sender.add_image(1, contact(1), stream(1, 300), 0.0)
     for data in (b"one", b"two"):
@@ -156,7 +156,7 @@ def test_several_messages_go_in_one_frame_and_contacts_fill_it() -> None:
     assert len(event.stream) > 60
 
 
-def test_priorities_and_lifetimes() -> None:
+def test_message_priorities_and_lifetimes() -> None:
     sender = V1Sender(SenderConfig())
     sender.add_image(1, contact(1), stream(1, 300), 0.0)
     sender.add_message(b"late", 0.0, priority=-1, times=1)
@@ -170,7 +170,7 @@ def test_priorities_and_lifetimes() -> None:
     assert isinstance(frames[0], tuple)
 
 
-def test_copies_of_a_message_are_apart() -> None:
+def test_copies_of_a_message_keep_a_distance() -> None:
     sender = V1Sender(SenderConfig(channels=(LossChannel(0.3, 3.0),)))
     for number in range(1, 11):
         sender.add_image(number, contact(number), stream(number, 600), 0.0)
@@ -180,7 +180,7 @@ def test_copies_of_a_message_are_apart() -> None:
     assert min(b - a for a, b in pairwise(places)) > 12
 
 
-def test_more_detail_than_planned_can_be_asked_for() -> None:
+def test_refine_request_sends_more_detail() -> None:
     world = World.make(0.0, feedback=True, stream_bytes=100, channels=(LossChannel(0.0),))
     world.add(3, 900)
     world.run()
@@ -194,7 +194,7 @@ def test_more_detail_than_planned_can_be_asked_for() -> None:
         world.sender.refine(RefineRequest(77, 100), world.now)
 
 
-def test_a_minipacket_asks_for_symbols() -> None:
+def test_mini_packet_requests_symbols() -> None:
     sender, receiver = V1Sender(SenderConfig(feedback=True, channels=(LossChannel(0.0),))), V1Receiver()
     sender.add_image(1, contact(1), stream(1, 400), 0.0)
     frames = []
@@ -212,7 +212,7 @@ def test_a_minipacket_asks_for_symbols() -> None:
     assert receiver.mini_feedback(VEHICLE) is None
 
 
-def test_a_new_frame_size_keeps_what_fits_and_starts_again_what_does_not() -> None:
+def test_another_frame_length_restarts_only_blocks_that_do_not_fit() -> None:
     for before, after in ((64, 256), (256, 64), (64, 32)):
         world = World.make(0.0, frame_bytes=before, feedback=True, stream_bytes=300, channels=(LossChannel(0.0),))
         world.add(12, 300)
@@ -222,7 +222,7 @@ def test_a_new_frame_size_keeps_what_fits_and_starts_again_what_does_not() -> No
         assert all(world.latest[n].stream == world.sent[n] for n in range(1, 13)), (before, after)
 
 
-def test_numbers_of_blocks_and_contacts_wrap() -> None:
+def test_block_and_contact_numbers_wrap_around() -> None:
     world = World.make(0.2, 3, channels=(LossChannel(0.2),), group_images=2, frames_per_image=9.0)
     number = 65500
     for _ in range(60):
@@ -234,7 +234,7 @@ def test_numbers_of_blocks_and_contacts_wrap() -> None:
     assert len(world.latest) >= 116
 
 
-def test_a_vehicle_that_starts_anew_does_not_mix_pictures() -> None:
+def test_restarted_contact_numbers_do_not_mix_images() -> None:
     receiver = V1Receiver()
     first, second = (
         V1Sender(SenderConfig(channels=(LossChannel(0.0),))),
@@ -259,7 +259,7 @@ def test_a_vehicle_that_starts_anew_does_not_mix_pictures() -> None:
     assert all(e.complete for e in latest.values())
 
 
-def test_vehicles_do_not_disturb_each_other() -> None:
+def test_vehicles_are_independent() -> None:
     receiver, senders = V1Receiver(), {}
     for address in (3, 4, 5):
         senders[address] = V1Sender(SenderConfig(channels=(LossChannel(0.0),)))
@@ -275,7 +275,7 @@ def test_vehicles_do_not_disturb_each_other() -> None:
     assert all(stream(10 * a + n, 300).startswith(e.stream) and e.complete for (a, n), e in latest.items())
 
 
-def test_the_sender_goes_on_after_a_restart_at_every_frame() -> None:
+def test_sender_continues_after_a_restart_at_every_frame() -> None:
     def add_all(sender: V1Sender) -> None:
         for number in range(1, 6):
             sender.add_image(number, contact(number), stream(number, 300), 0.0)
@@ -316,7 +316,7 @@ def test_the_sender_goes_on_after_a_restart_at_every_frame() -> None:
     ],
     ids=str,
 )
-def test_the_sender_reports_a_malformed_part_and_sends_everything_else_again(
+def test_sender_reports_a_malformed_part_and_sends_the_rest_again(
     name: str, change: dict[str, object]
 ) -> None:
     sender = V1Sender(SenderConfig(group_images=1, depth=1))
@@ -336,7 +336,7 @@ def test_the_sender_reports_a_malformed_part_and_sends_everything_else_again(
     assert set(world.latest) == left
 
 
-def test_what_the_sender_refuses() -> None:
+def test_invalid_images_messages_and_configurations_are_rejected() -> None:
     sender = V1Sender(SenderConfig())
     sender.add_image(1, contact(1), b"x", 0.0)
     with pytest.raises(FrameError, match="contact number"):
@@ -370,7 +370,7 @@ def test_memory_is_bounded() -> None:
     assert receiver.counts.evicted_sources == 4
 
 
-def test_old_blocks_and_contacts_are_forgotten() -> None:
+def test_old_blocks_and_contacts_are_deleted() -> None:
     config = ReceiverConfig(block_memory_s=10.0, contact_memory_s=100.0)
     sender, receiver = V1Sender(SenderConfig()), V1Receiver(config)
     sender.add_image(1, contact(1), stream(1, 300), 0.0)
@@ -383,7 +383,7 @@ def test_old_blocks_and_contacts_are_forgotten() -> None:
     assert event.version == 1
 
 
-def test_unknown_segments_are_told_and_do_not_hide_the_others() -> None:
+def test_unknown_segment_is_reported_and_the_others_are_used() -> None:
     frame = pack_segments([Segment(25, b"new"), Segment(SegmentKind.MESSAGE, b"\x01hello")], 64)
     refused, message = V1Receiver().accept(VEHICLE, frame, 0.0)
     assert isinstance(refused, FrameRejected)
@@ -391,7 +391,7 @@ def test_unknown_segments_are_told_and_do_not_hide_the_others() -> None:
     assert getattr(message, "data", None) == b"hello"
 
 
-def test_one_frame_that_passed_damaged_does_not_replace_a_block() -> None:
+def test_one_damaged_frame_does_not_replace_a_block() -> None:
     sender, receiver = V1Sender(SenderConfig(channels=(LossChannel(0.0),), frames_per_image=20.0)), V1Receiver()
     sender.add_image(1, contact(1), stream(1, 900), 0.0)
     frames = []
@@ -409,7 +409,7 @@ def test_one_frame_that_passed_damaged_does_not_replace_a_block() -> None:
     assert stream(1, 900).startswith(events[-1].stream)
 
 
-def test_a_block_goes_on_until_every_receiver_has_it() -> None:
+def test_block_continues_until_all_receivers_have_it() -> None:
     sender = V1Sender(SenderConfig(feedback=True, channels=(LossChannel(0.4),), stream_bytes=300))
     receivers = {address: V1Receiver() for address in (1, 2, 9)}
     latest: dict[tuple[int, int], ImageUpdate] = {}

@@ -33,7 +33,7 @@ def symbols(draw: st.DrawFn) -> Symbol:
 
 @settings(max_examples=150, deadline=None)
 @given(symbols())
-def test_a_symbol_comes_back(symbol: Symbol) -> None:
+def test_symbol_round_trip(symbol: Symbol) -> None:
     frame = pack_symbol(symbol)
     assert len(frame) == len(symbol.data) + 5
     assert parse_frame(frame) == symbol
@@ -41,13 +41,13 @@ def test_a_symbol_comes_back(symbol: Symbol) -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(symbols(), st.sampled_from([n for n in PADDED_LENGTHS if n >= 32]), st.integers(0, 300))
-def test_padding_is_recognised_whatever_the_symbol_ends_with(symbol: Symbol, length: int, padding: int) -> None:
+def test_padding_is_detected_after_any_symbol(symbol: Symbol, length: int, padding: int) -> None:
     data = symbol.data.ljust(length - 5, b"\0")[: length - 5]
     whole = Symbol(symbol.kind, symbol.block, symbol.index, symbol.parameter, data)
     assert parse_frame(pack_symbol(whole) + bytes(padding)) == whole
 
 
-def test_segments_share_a_frame_and_the_smallest_frame_holds_a_contact() -> None:
+def test_segments_share_a_frame_and_32_bytes_hold_a_contact() -> None:
     contact = Segment(SegmentKind.CONTACT, bytes(range(29)))
     assert contact.size == segments_room(32) == 30
     frame = pack_segments([contact], 32)
@@ -65,13 +65,13 @@ def test_segments_share_a_frame_and_the_smallest_frame_holds_a_contact() -> None
         st.builds(Segment, st.sampled_from([1, 3, 4, 5, 6, 17, 31]), st.binary(max_size=30)), min_size=1, max_size=6
     )
 )
-def test_segments_come_back(listed: list[Segment]) -> None:
+def test_segments_round_trip(listed: list[Segment]) -> None:
     assert parse_frame(pack_segments(listed, 256)) == tuple(listed)
 
 
 @settings(max_examples=100, deadline=None)
 @given(symbols(), st.data())
-def test_a_burst_of_up_to_sixteen_wrong_bits_never_passes(symbol: Symbol, data: st.DataObject) -> None:
+def test_burst_of_up_to_16_wrong_bits_is_detected(symbol: Symbol, data: st.DataObject) -> None:
     frame = bytearray(pack_symbol(symbol))
     start, length = data.draw(st.integers(0, 8 * len(frame) - 16)), data.draw(st.integers(1, 16))
     pattern = data.draw(st.integers(0, 2 ** (length - 1) - 1)) << 1 | 1
@@ -84,13 +84,13 @@ def test_a_burst_of_up_to_sixteen_wrong_bits_never_passes(symbol: Symbol, data: 
 
 
 @pytest.mark.parametrize("length", [0, 1, 4, 5])
-def test_too_short(length: int) -> None:
+def test_short_frame_is_rejected(length: int) -> None:
     with pytest.raises(FrameError):
         parse_frame(bytes(length))
 
 
 @pytest.mark.parametrize("frame", [bytes(64), b"\xff" * 64, b"T0000" + bytes(59)])
-def test_what_is_no_frame_is_refused(frame: bytes) -> None:
+def test_random_bytes_are_rejected(frame: bytes) -> None:
     with pytest.raises(FrameError, match="checksum"):
         parse_frame(frame)
 
@@ -105,7 +105,7 @@ def test_what_is_no_frame_is_refused(frame: bytes) -> None:
         ([Segment(1, bytes(60))], 32),
     ],
 )
-def test_segments_that_cannot_be_packed(listed: list[Segment], frame_bytes: int) -> None:
+def test_invalid_segments_are_rejected(listed: list[Segment], frame_bytes: int) -> None:
     with pytest.raises(FrameError):
         pack_segments(listed, frame_bytes)
 
@@ -127,7 +127,7 @@ def with_checksum(covered: bytes) -> bytes:
         b"\x41\x01a\x40aa",  # a kind above 31
     ],
 )
-def test_fields_without_meaning_are_refused(covered: bytes) -> None:
+def test_invalid_fields_are_rejected(covered: bytes) -> None:
     with pytest.raises(FrameError, match="acoustic frame"):
         parse_frame(with_checksum(covered))
 
@@ -149,7 +149,7 @@ class Keyed:
         return sealed[:-4]
 
 
-def test_a_seal_lets_only_its_own_frames_pass() -> None:
+def test_protection_accepts_only_its_own_frames() -> None:
     seal, other = Keyed(b"one"), Keyed(b"two")
     symbol = Symbol(SymbolKind.OBJECT, 3, 4, 5, bytes(55))
     frame = pack_symbol(symbol, seal)

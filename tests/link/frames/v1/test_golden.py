@@ -22,11 +22,11 @@ def golden(name: str) -> Any:
 
 
 @pytest.mark.parametrize("name", ["frames", "codes", "objects"])
-def test_the_code_packs_what_the_files_say(name: str) -> None:
+def test_packed_bytes_equal_the_golden_files(name: str) -> None:
     assert json.loads(json.dumps(v1_golden.MAKERS[name]())) == golden(name)
 
 
-def test_the_frames_parse() -> None:
+def test_golden_frames_parse() -> None:
     read = golden("frames")
     for entry in read["frames"]:
         said = {key: value for key, value in entry.items() if key != "frame"}
@@ -36,7 +36,7 @@ def test_the_frames_parse() -> None:
             parse_frame(bytes.fromhex(frame))
 
 
-def test_the_codes_recover() -> None:
+def test_golden_codes_recover() -> None:
     read = golden("codes")
     for block in read["blocks"]:
         source = np.frombuffer(bytes.fromhex(block["source"]), np.uint8).reshape(block["k"], -1)
@@ -49,7 +49,7 @@ def test_the_codes_recover() -> None:
     assert found.hex() == read["layered"][0]["objects"][0]
 
 
-def test_the_objects_parse() -> None:
+def test_golden_objects_parse() -> None:
     read = golden("objects")
     for entry in read["previews"]:
         preview = Preview.unpack(bytes.fromhex(entry["entry"]))
@@ -70,7 +70,7 @@ def test_the_objects_parse() -> None:
     assert unpack_object(bytes.fromhex(entry["object"])) == MessageObject(entry["number"], bytes.fromhex(entry["data"]))
 
 
-def test_the_receiver_reports_what_the_file_says() -> None:
+def test_golden_exchange_gives_the_same_events() -> None:
     read, receiver = golden("exchange"), V1Receiver()
     for step in read["steps"]:
         events = receiver.accept(step["source"], bytes.fromhex(step["frame"]), step["at"])

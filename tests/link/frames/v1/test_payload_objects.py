@@ -33,7 +33,7 @@ CONTACT = ContactSummary(lat_deg=44.7, lon_deg=-63.6, confidence=1.0).rounded()
 
 @settings(max_examples=100, deadline=None)
 @given(st.integers(1, 65535), st.binary(max_size=60), st.integers(29, 100))
-def test_a_preview_comes_back(number: int, stream: bytes, entry_bytes: int) -> None:
+def test_preview_round_trip(number: int, stream: bytes, entry_bytes: int) -> None:
     room = entry_bytes - 29
     preview = Preview(number, CONTACT, stream[:room], ended=len(stream) < room)
     entry = preview.pack(entry_bytes)
@@ -41,14 +41,14 @@ def test_a_preview_comes_back(number: int, stream: bytes, entry_bytes: int) -> N
     assert Preview.unpack(entry) == preview
 
 
-def test_a_preview_with_a_wrong_byte_is_refused() -> None:
+def test_preview_with_a_wrong_byte_is_rejected() -> None:
     entry = Preview(7, CONTACT, bytes(range(30))).pack(59)
     for place in range(59):
         with pytest.raises(FrameError):
             Preview.unpack(entry[:place] + bytes([entry[place] ^ 1]) + entry[place + 1 :])
 
 
-def test_a_preview_must_fill_its_entry_or_end() -> None:
+def test_preview_must_fill_its_entry_or_end() -> None:
     with pytest.raises(FrameError):
         Preview(7, CONTACT, b"short").pack(59)
     with pytest.raises(FrameError):
@@ -59,7 +59,7 @@ def test_a_preview_must_fill_its_entry_or_end() -> None:
     ("symbol_bytes", "entries", "symbols", "entry_bytes"),
     [(27, 1, 2, 54), (43, 1, 2, 86), (44, 1, 1, 44), (59, 1, 1, 59), (112, 2, 1, 56), (251, 4, 1, 62)],
 )
-def test_how_entries_lie(symbol_bytes: int, entries: int, symbols: int, entry_bytes: int) -> None:
+def test_entry_layout_by_symbol_length(symbol_bytes: int, entries: int, symbols: int, entry_bytes: int) -> None:
     shape = entry_shape(symbol_bytes)
     assert (shape.entries, shape.symbols, shape.entry_bytes) == (entries, symbols, entry_bytes)
     assert shape.source_symbols(5) == -(-5 * symbols // entries)
@@ -75,7 +75,7 @@ pieces = st.lists(
 
 @settings(max_examples=150, deadline=None)
 @given(pieces, st.booleans(), st.integers(0, 50), st.data())
-def test_pieces_and_the_layer_above_come_back(
+def test_pieces_and_the_layer_above_round_trip(
     listed: list[StreamPiece], final: bool, spare: int, data: st.DataObject
 ) -> None:
     group = PieceList(tuple(listed), final)
@@ -105,7 +105,7 @@ def test_consecutive_contacts_with_one_start_cost_three_bytes_each() -> None:
     assert unpack_object(group.pack(group.overhead_bytes() + 800)) == group
 
 
-def test_an_object_with_any_wrong_byte_is_refused() -> None:
+def test_object_with_a_wrong_byte_is_rejected() -> None:
     packed = MessageObject(3, b"status: fine").pack(30)
     assert unpack_object(packed) == MessageObject(3, b"status: fine")
     for place in range(30):
@@ -116,7 +116,7 @@ def test_an_object_with_any_wrong_byte_is_refused() -> None:
 @pytest.mark.parametrize(
     "body", [b"\x30", b"\x20\x01\x00\x09abc", b"\x10\x00\x00\x01", b"\x18\x01\x00\x05\x09\xff\xff\xff\x7f"]
 )
-def test_objects_without_meaning_are_refused(body: bytes) -> None:
+def test_invalid_objects_are_rejected(body: bytes) -> None:
     import zlib
 
     with pytest.raises(FrameError):
@@ -139,7 +139,7 @@ def layerings(draw: st.DrawFn) -> Layering:
 
 @settings(max_examples=80, deadline=None)
 @given(layerings(), st.integers(16, 80), st.randoms(use_true_random=False))
-def test_every_layer_comes_back_from_as_many_symbols_as_it_needs(
+def test_each_layer_is_recovered_from_its_required_symbols(
     layering: Layering, symbol_bytes: int, random: np.random.Generator
 ) -> None:
     assert Layering.unpack(layering.pack()) == layering
@@ -158,12 +158,12 @@ def test_every_layer_comes_back_from_as_many_symbols_as_it_needs(
     ("first", "step", "shares"),
     [(3, 0, (16,)), (4, 1, (16,)), (4, 0, (8, 8)), (4, 1, (8, 9)), (200, 60, (8, 8)), (4, 1, (4, 4, 4, 2, 2))],
 )
-def test_layers_that_cannot_be_told_are_refused(first: int, step: int, shares: tuple[int, ...]) -> None:
+def test_invalid_layers_are_rejected(first: int, step: int, shares: tuple[int, ...]) -> None:
     with pytest.raises(FrameError, match="layered block"):
         Layering(first, step, shares)
 
 
-def test_most_descriptors_at_random_are_refused() -> None:
+def test_most_random_descriptors_are_rejected() -> None:
     rng, taken = np.random.default_rng(0), 0
     for _ in range(4000):
         try:
@@ -175,7 +175,7 @@ def test_most_descriptors_at_random_are_refused() -> None:
 
 
 @given(st.integers(0, 31), st.integers(0, 65535), st.lists(st.integers(0, 255), max_size=16))
-def test_a_report_comes_back_and_fits_the_smallest_frame(newest: int, frames: int, needs: list[int]) -> None:
+def test_feedback_round_trip_fits_the_smallest_frame(newest: int, frames: int, needs: list[int]) -> None:
     report = Feedback(newest, frames, tuple(needs))
     assert Feedback.unpack(report.pack()) == report
     assert 2 + 2 + len(report.pack()) <= 32
@@ -185,33 +185,33 @@ def test_a_report_comes_back_and_fits_the_smallest_frame(newest: int, frames: in
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00\x01", b"\x20\x00\x00", bytes(20)])
-def test_reports_without_meaning_are_refused(data: bytes) -> None:
+def test_invalid_feedback_is_rejected(data: bytes) -> None:
     with pytest.raises(FrameError):
         Feedback.unpack(data)
 
 
 @given(st.integers(0, 31), st.integers(0, 255))
-def test_thirteen_bits_ask_for_symbols(block: int, needed: int) -> None:
+def test_mini_packet_round_trip(block: int, needed: int) -> None:
     bits = pack_mini(block, needed)
     assert bits < 1 << 13
     assert unpack_mini(bits) == (block, needed)
 
 
-def test_thirteen_bits_only() -> None:
+def test_mini_packet_has_13_bits() -> None:
     with pytest.raises(FrameError):
         unpack_mini(1 << 13)
     with pytest.raises(FrameError):
         pack_mini(32, 0)
 
 
-def test_a_request_comes_back() -> None:
+def test_refine_request_round_trip() -> None:
     assert RefineRequest.unpack(RefineRequest(9, 700).pack()) == RefineRequest(9, 700)
     for data in (b"", b"\0\0\0\5", bytes(5)):
         with pytest.raises(FrameError):
             RefineRequest.unpack(data)
 
 
-def test_loss_is_measured_between_reports() -> None:
+def test_loss_is_measured_between_feedback_messages() -> None:
     meter = LossMeter()
     meter.update(Feedback(0, 65500, ()), 100)
     assert meter.loss is None

@@ -60,7 +60,7 @@ def comparable(events: list[Event]) -> list[Any]:
 
 @settings(max_examples=40, deadline=None)
 @given(deliveries())
-def test_what_is_shown_was_sent_and_grows(delivery: list[tuple[float, bytes]]) -> None:
+def test_updates_hold_only_sent_bytes_and_grow(delivery: list[tuple[float, bytes]]) -> None:
     receiver, known = V1Receiver(), dict[int, ImageUpdate]()
     for now, frame in delivery:
         for event in receiver.accept(VEHICLE, frame, now):
@@ -98,11 +98,11 @@ def test_a_restart_at_every_frame_changes_nothing(delivery: list[tuple[float, by
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.binary(max_size=120), max_size=30).map(lambda parts: b"".join(bytes([len(p)]) + p for p in parts)))
-def test_any_bytes_with_right_checksums_raise_nothing(data: bytes) -> None:
+def test_any_bytes_with_correct_checksums_raise_nothing(data: bytes) -> None:
     v1_fuzz.one_input(data)
 
 
-def test_a_bounded_run_of_hostile_frames_shows_nothing_wrong() -> None:
+def test_hostile_frames_give_no_wrong_image_or_message() -> None:
     counts = v1_fuzz.run(5_000, seed=1)
     assert counts["wrong"] == 0
     assert counts["shown"] > 400
