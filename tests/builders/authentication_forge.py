@@ -1,7 +1,7 @@
-"""Forged frames by the million: `PYTHONPATH=tests python -m builders.authentication_forge --frames 1000000`.
+"""Forge frames in large numbers: `PYTHONPATH=tests python -m builders.authentication_forge --frames 1000000`.
 
-The receiver is at the middle of its key's life and knows the vehicle. Frames are forged as an attacker would who has
-recorded genuine ones: changed payloads under recorded tags, guessed tags, recorded tags under other counters.
+The receiver has a window of the vehicle, in the middle of the key's lifetime. The attacker has recorded genuine frames.
+Forged frames are changed payloads with recorded tags, guessed tags, and recorded tags with other counters.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import random
 import sys
 import time
 
-from builders.authentication_world import VEHICLE, vehicle_seal, vessel_seal
+from builders.authentication_world import VEHICLE, vehicle_authenticator, vessel_authenticator
 from builders.link_state import group
 from sonarpost.errors import FrameError
 from sonarpost.link.auth.key import AuthenticationSettings
 
 
 def forge(rng: random.Random, recorded: list[bytes], added: int) -> bytes:
-    """One frame that was never sealed."""
-    sealed = rng.choice(recorded)
-    covered, ending = sealed[:-added], sealed[-added:]
+    """Return a frame that the vehicle never sent."""
+    protected = rng.choice(recorded)
+    covered, ending = protected[:-added], protected[-added:]
     match rng.randrange(3):
         case 0:
             at = rng.randrange(1, len(covered))
@@ -34,27 +34,27 @@ def forge(rng: random.Random, recorded: list[bytes], added: int) -> bytes:
 
 
 def run(frames: int, seed: int, *, encrypt: bool, farther: int) -> dict[str, float]:
-    """Forge frames; return what became of them.
+    """Forge frames; return how the receiver counted them.
 
     Args:
-        frames: How many.
-        seed: Of the attacker.
+        frames: Number of forged frames.
+        seed: Seed of the attacker.
         encrypt: Whether frames are encrypted.
-        farther: How many counters farther ahead the receiver has left to try for each frame.
+        farther: Counters beyond the window that the receiver tries for each frame.
     """
     rng = random.Random(seed)
     settings = AuthenticationSettings(encrypt=encrypt)
     start = settings.lifetime_frames - settings.counter_step * (farther + 1)
-    vehicle, vessel = vehicle_seal(settings, first_counter=start), vessel_seal(settings)
+    vehicle, vessel = vehicle_authenticator(settings, first_counter=start), vessel_authenticator(settings)
     recorded = [vehicle.protect(b"\x80" + rng.randbytes(56)) for _ in range(100)]
-    for n, sealed in enumerate(recorded):
+    for n, protected in enumerate(recorded):
         try:
-            vessel.verify(VEHICLE, sealed)
+            vessel.verify(VEHICLE, protected)
         except FrameError:
-            assert n == 0  # the first waits to be confirmed
+            assert n == 0  # the first frame waits for confirmation
     before, began = vessel.counts, time.process_time()
     windows = group(vessel.parts(), "window")
-    genuine = {sealed[-5:]: sealed for sealed in recorded}
+    genuine = {protected[-5:]: protected for protected in recorded}
     passed = 0
     for _ in range(frames):
         forged = forge(rng, recorded, settings.overhead_bytes)
@@ -71,19 +71,19 @@ def run(frames: int, seed: int, *, encrypt: bool, farther: int) -> dict[str, flo
     return {
         "forged": after.forged - before.forged,
         "passed": passed,
-        "taken_for_replays": after.replayed - before.replayed,
+        "counted_as_replays": after.replayed - before.replayed,
         "unconfirmed": after.unconfirmed - before.unconfirmed,
         "ms_a_frame": round(1000 * seconds / frames, 3),
     }
 
 
 def main() -> None:
-    """Run from the command line; the exit status is 1 when a forged frame passed."""
-    parser = argparse.ArgumentParser(description="Forge sealed frames and count what passes.")
+    """Run from the command line; the exit status is 1 if a forged frame passes."""
+    parser = argparse.ArgumentParser(description="Forge authenticated frames and count those that pass.")
     parser.add_argument("--frames", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--encrypt", action="store_true")
-    parser.add_argument("--farther", type=int, default=16, help="counters farther ahead to try for each frame (16)")
+    parser.add_argument("--farther", type=int, default=16, help="counters beyond the window to try for each frame (16)")
     parsed = parser.parse_args()
     found = run(parsed.frames, parsed.seed, encrypt=parsed.encrypt, farther=parsed.farther)
     print(json.dumps(found))

@@ -1,4 +1,7 @@
-"""Makes tests/golden/acoustic-v1/sealed.json: `PYTHONPATH=tests .venv/bin/python -m link.seal_golden`, once."""
+"""Content of tests/golden/acoustic-v1/sealed.json.
+
+`PYTHONPATH=tests python -m builders.authentication_golden` writes it.
+"""
 
 from __future__ import annotations
 
@@ -22,17 +25,17 @@ CASES = (
 
 
 def make() -> dict[str, object]:
-    """Return what the file holds."""
+    """Return the content of the file."""
     key = parse_key(KEY, "golden")
     frames = []
     for settings, source, direction, counter in CASES:
-        seal = FrameAuthenticator(key, source, direction, settings, first_counter=counter)
-        seal.grant(counter + 1)
+        authenticator = FrameAuthenticator(key, source, direction, settings, first_counter=counter)
+        authenticator.grant(counter + 1)
         if direction == Direction.FROM_VEHICLE:
             symbol = Symbol(SymbolKind.OBJECT, 5, 17, 40, bytes(range(59 - settings.overhead_bytes)))
-            frame = pack_symbol(symbol, seal)
+            frame = pack_symbol(symbol, authenticator)
         else:
-            frame = pack_segments([Segment(SegmentKind.MESSAGE, b"\x09go to 12")], 32, seal)
+            frame = pack_segments([Segment(SegmentKind.MESSAGE, b"\x09go to 12")], 32, authenticator)
         frames.append(
             asdict(settings) | {"source": source, "direction": int(direction), "counter": counter, "frame": frame.hex()}
         )

@@ -1,4 +1,4 @@
-"""A vehicle and a vessel with one key, for the tests of seals."""
+"""Authenticators of a vehicle and a vessel with one key."""
 
 from __future__ import annotations
 
@@ -14,25 +14,27 @@ def key(name: str) -> AcousticKey:
     return AcousticKey(hashlib.sha256(name.encode()).digest())
 
 
-def vehicle_seal(
+def vehicle_authenticator(
     settings: AuthenticationSettings | None = None,
     *,
     name: str = "fleet",
     address: int = VEHICLE,
     first_counter: int = 0,
 ) -> FrameAuthenticator:
-    seal = FrameAuthenticator(key(name), address, Direction.FROM_VEHICLE, settings, first_counter=first_counter)
-    seal.grant(seal.settings.lifetime_frames)
-    return seal
+    authenticator = FrameAuthenticator(
+        key(name), address, Direction.FROM_VEHICLE, settings, first_counter=first_counter
+    )
+    authenticator.grant(authenticator.settings.lifetime_frames)
+    return authenticator
 
 
-def vessel_seal(
+def vessel_authenticator(
     settings: AuthenticationSettings | None = None, *, name: str = "fleet", address: int = VESSEL
 ) -> FrameAuthenticator:
     return FrameAuthenticator(key(name), address, Direction.TO_VEHICLE, settings)
 
 
-def skip(seal: FrameAuthenticator, frames: int) -> None:
-    """Let so many frames be lost."""
+def skip(authenticator: FrameAuthenticator, frames: int) -> None:
+    """Protect frames that are lost."""
     for _ in range(frames):
-        seal.protect(b"\x80lost")
+        authenticator.protect(b"\x80lost")

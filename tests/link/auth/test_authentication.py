@@ -1,4 +1,4 @@
-"""Seals of acoustic frames: what passes, what does not and why, restarts, the end of a key, the whole link."""
+"""Authentication of frames: accepted and rejected frames, restarts, the lifetime of a key, the complete link."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import random
 import re
 
 import pytest
-from builders.authentication_world import VEHICLE, VESSEL, key, skip, vehicle_seal, vessel_seal
+from builders.authentication_world import VEHICLE, VESSEL, key, skip, vehicle_authenticator, vessel_authenticator
 from builders.link_state import group, with_fields
 from builders.v1_world import contact, feedback_frame, stream
 
@@ -37,77 +37,77 @@ ALL_SETTINGS = [
 COVERED = b"\x80 a frame after its checksum"
 
 
-def refusal(seal: FrameAuthenticator, sealed: bytes, source: int = VEHICLE) -> str:
-    """The field of the error with which a frame is refused."""
+def rejected_field(authenticator: FrameAuthenticator, protected: bytes, source: int = VEHICLE) -> str:
+    """Return the field of the error of a rejected frame."""
     with pytest.raises(FrameError) as caught:
-        seal.verify(source, sealed)
+        authenticator.verify(source, protected)
     return caught.value.field
 
 
 @pytest.mark.parametrize("settings", ALL_SETTINGS, ids=str)
 def test_protected_frame_round_trip_and_overhead(settings: AuthenticationSettings) -> None:
-    vehicle, vessel = vehicle_seal(settings), vessel_seal(settings)
+    vehicle, vessel = vehicle_authenticator(settings), vessel_authenticator(settings)
     for covered in (COVERED, b"\x80", b"\x80" + bytes(300)):
-        sealed = vehicle.protect(covered)
+        protected = vehicle.protect(covered)
         assert (
-            len(sealed)
+            len(protected)
             == len(covered) + settings.counter_bytes + settings.tag_bytes
             == len(covered) + vehicle.overhead_bytes
         )
-        assert sealed[0] == 0x80
-        assert (covered[1:] in sealed) == (not settings.encrypt or len(covered) == 1)
-        assert vessel.verify(VEHICLE, sealed) == covered
+        assert protected[0] == 0x80
+        assert (covered[1:] in protected) == (not settings.encrypt or len(covered) == 1)
+        assert vessel.verify(VEHICLE, protected) == covered
     assert (vehicle.counts, vessel.counts) == (AuthenticationCounts(protected=3), AuthenticationCounts(genuine=3))
 
 
 @pytest.mark.parametrize("settings", [AuthenticationSettings(), AuthenticationSettings(encrypt=True)], ids=str)
 def test_all_bits_are_authenticated(settings: AuthenticationSettings) -> None:
-    sealed = vehicle_seal(settings).protect(COVERED)
-    vessel = vessel_seal(settings)
-    for bit in range(8 * len(sealed)):
-        damaged = bytearray(sealed)
+    protected = vehicle_authenticator(settings).protect(COVERED)
+    vessel = vessel_authenticator(settings)
+    for bit in range(8 * len(protected)):
+        damaged = bytearray(protected)
         damaged[bit // 8] ^= 1 << bit % 8
-        assert refusal(vessel, bytes(damaged)) == "tag"
-    assert vessel.counts.forged == 8 * len(sealed)
-    assert vessel.verify(VEHICLE, sealed) == COVERED
+        assert rejected_field(vessel, bytes(damaged)) == "tag"
+    assert vessel.counts.forged == 8 * len(protected)
+    assert vessel.verify(VEHICLE, protected) == COVERED
 
 
 def test_frame_of_another_sender_key_or_setting_is_forged() -> None:
-    sealed = vehicle_seal().protect(COVERED)
-    vessel = vessel_seal()
-    assert refusal(vessel, sealed, VEHICLE + 1) == "tag"  # another vehicle's
-    assert refusal(vessel_seal(name="another key"), sealed) == "tag"
-    assert refusal(vessel_seal(AuthenticationSettings(encrypt=True)), sealed) == "tag"
-    assert refusal(vessel_seal(AuthenticationSettings(tag_bytes=6)), sealed) == "tag"
+    protected = vehicle_authenticator().protect(COVERED)
+    vessel = vessel_authenticator()
+    assert rejected_field(vessel, protected, VEHICLE + 1) == "tag"  # another vehicle's
+    assert rejected_field(vessel_authenticator(name="another key"), protected) == "tag"
+    assert rejected_field(vessel_authenticator(AuthenticationSettings(encrypt=True)), protected) == "tag"
+    assert rejected_field(vessel_authenticator(AuthenticationSettings(tag_bytes=6)), protected) == "tag"
     own = FrameAuthenticator(key("fleet"), VEHICLE, Direction.TO_VEHICLE)
     own.grant(10)
-    assert refusal(own, own.protect(COVERED)) == "tag"  # its own, come back
+    assert rejected_field(own, own.protect(COVERED)) == "tag"  # its own frame, returned
     for source in (-1, 128, 2**40):
-        assert refusal(vessel, sealed, source) == "tag"
-    for short in (b"", b"\x80", sealed[: vessel.overhead_bytes]):
-        assert refusal(vessel, short) == "tag"
-    assert vessel.verify(VEHICLE, sealed) == COVERED
+        assert rejected_field(vessel, protected, source) == "tag"
+    for short in (b"", b"\x80", protected[: vessel.overhead_bytes]):
+        assert rejected_field(vessel, short) == "tag"
+    assert vessel.verify(VEHICLE, protected) == COVERED
 
 
 def test_replay_is_distinguished_from_forgery_at_any_age() -> None:
-    vehicle, vessel = vehicle_seal(), vessel_seal()
+    vehicle, vessel = vehicle_authenticator(), vessel_authenticator()
     recorded = [vehicle.protect(COVERED) for _ in range(3000)]
-    for sealed in recorded:
-        vessel.verify(VEHICLE, sealed)
-    for sealed in recorded[::100] + recorded[-70:]:
-        assert refusal(vessel, sealed) == "counter"
-    assert refusal(vessel, COVERED + b"\x07guess") == "tag"
+    for protected in recorded:
+        vessel.verify(VEHICLE, protected)
+    for protected in recorded[::100] + recorded[-70:]:
+        assert rejected_field(vessel, protected) == "counter"
+    assert rejected_field(vessel, COVERED + b"\x07guess") == "tag"
     assert vessel.counts == AuthenticationCounts(genuine=3000, replayed=100, forged=1)
 
 
 def test_late_frames_within_the_window_pass_once() -> None:
-    vehicle, vessel = vehicle_seal(), vessel_seal()
-    sealed = [vehicle.protect(bytes([0x80, n])) for n in range(WINDOW + 1)]
-    vessel.verify(VEHICLE, sealed[WINDOW])
-    assert refusal(vessel, sealed[0]) == "counter"
-    for late in reversed(sealed[1:WINDOW]):
+    vehicle, vessel = vehicle_authenticator(), vessel_authenticator()
+    protected = [vehicle.protect(bytes([0x80, n])) for n in range(WINDOW + 1)]
+    vessel.verify(VEHICLE, protected[WINDOW])
+    assert rejected_field(vessel, protected[0]) == "counter"
+    for late in reversed(protected[1:WINDOW]):
         vessel.verify(VEHICLE, late)
-        assert refusal(vessel, late) == "counter"
+        assert rejected_field(vessel, late) == "counter"
     assert vessel.counts.genuine == WINDOW
 
 
@@ -116,15 +116,15 @@ def test_late_frames_within_the_window_pass_once() -> None:
 )
 def test_long_losses_cost_one_frame_at_most(settings: AuthenticationSettings, bridged: int) -> None:
     assert bridged + 1 == settings.counter_step - WINDOW
-    vehicle, vessel = vehicle_seal(settings), vessel_seal(settings)
+    vehicle, vessel = vehicle_authenticator(settings), vessel_authenticator(settings)
     vessel.verify(VEHICLE, vehicle.protect(COVERED))
     skip(vehicle, bridged)
     assert vessel.verify(VEHICLE, vehicle.protect(COVERED)) == COVERED
     skip(vehicle, bridged + 1)
     first = vehicle.protect(COVERED)
-    assert refusal(vessel, first) == "counter"
-    assert refusal(vessel, first) == "counter"  # the same again confirms nothing
-    skip(vehicle, bridged)  # nor need the second be the very next
+    assert rejected_field(vessel, first) == "counter"
+    assert rejected_field(vessel, first) == "counter"  # a repetition confirms nothing
+    skip(vehicle, bridged)  # the second need not follow directly
     assert vessel.verify(VEHICLE, vehicle.protect(COVERED)) == COVERED
     assert vessel.verify(VEHICLE, vehicle.protect(COVERED)) == COVERED
     assert vessel.counts == AuthenticationCounts(genuine=4, unconfirmed=2)
@@ -132,8 +132,8 @@ def test_long_losses_cost_one_frame_at_most(settings: AuthenticationSettings, br
 
 def test_receiver_without_state_finds_any_counter() -> None:
     last = AuthenticationSettings().lifetime_frames - 2
-    vehicle, vessel = vehicle_seal(first_counter=last), vessel_seal()
-    assert refusal(vessel, vehicle.protect(COVERED)) == "counter"
+    vehicle, vessel = vehicle_authenticator(first_counter=last), vessel_authenticator()
+    assert rejected_field(vessel, vehicle.protect(COVERED)) == "counter"
     assert vessel.verify(VEHICLE, vehicle.protect(COVERED)) == COVERED
     with pytest.raises(FrameError, match="a new key after 1048576 frames"):
         vehicle.protect(COVERED)
@@ -143,52 +143,52 @@ def test_receiver_without_state_finds_any_counter() -> None:
 def test_counters_are_used_once_over_crashes() -> None:
     durable, used = 0, []
     for frames_until_crash in (0, 1, 31, 32, 33, 64, 65, 200, 0, 5):
-        seal = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=durable)
+        authenticator = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=durable)
         for _ in range(frames_until_crash):
-            if (limit := seal.requested_limit) is not None:
+            if (limit := authenticator.requested_limit) is not None:
                 durable = limit
-                seal.grant(limit)
-            used.append(seal.protect(COVERED)[-5:])
-        if (limit := seal.requested_limit) is not None:
-            durable = limit  # crashed between writing it down and granting it
+                authenticator.grant(limit)
+            used.append(authenticator.protect(COVERED)[-5:])
+        if (limit := authenticator.requested_limit) is not None:
+            durable = limit  # a crash between saving and granting
     assert len(set(used)) == len(used)
-    vessel = vessel_seal()
+    vessel = vessel_authenticator()
     for ending in used:
         assert vessel.verify(VEHICLE, COVERED + ending) == COVERED
     assert RESERVED < WINDOW * 2
 
 
 def test_protection_requires_a_reservation() -> None:
-    seal = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
+    authenticator = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
     with pytest.raises(FrameError, match="a granted limit above it"):
-        seal.protect(COVERED)
-    seal.grant(1)
-    seal.protect(COVERED)
+        authenticator.protect(COVERED)
+    authenticator.grant(1)
+    authenticator.protect(COVERED)
     with pytest.raises(FrameError):
-        seal.protect(COVERED)
+        authenticator.protect(COVERED)
     for wrong in (0, AuthenticationSettings().lifetime_frames + 1):
         with pytest.raises(ConfigError, match="limit"):
-            seal.grant(wrong)
+            authenticator.grant(wrong)
 
 
 def test_restarted_receiver_rejects_replays() -> None:
-    vehicle, before = vehicle_seal(), vessel_seal()
-    taken = [vehicle.protect(COVERED) for _ in range(50)]
-    for sealed in taken[::2]:
-        before.verify(VEHICLE, sealed)
-    after = vessel_seal()
+    vehicle, before = vehicle_authenticator(), vessel_authenticator()
+    accepted = [vehicle.protect(COVERED) for _ in range(50)]
+    for protected in accepted[::2]:
+        before.verify(VEHICLE, protected)
+    after = vessel_authenticator()
     assert not after.restore(before.parts())
     assert after.parts() == before.parts()
-    for sealed in taken[::2]:
-        assert refusal(after, sealed) == "counter"
-    for sealed in taken[1:-2:2]:
-        after.verify(VEHICLE, sealed)
+    for protected in accepted[::2]:
+        assert rejected_field(after, protected) == "counter"
+    for protected in accepted[1:-2:2]:
+        after.verify(VEHICLE, protected)
 
 
 def test_restored_sender_continues_after_its_reservation() -> None:
     vehicle = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
     vehicle.grant(64)
-    vessel = vessel_seal()
+    vessel = vessel_authenticator()
     vessel.verify(VEHICLE, vehicle.protect(COVERED))
     older = vehicle.parts()
     again = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=128)
@@ -216,9 +216,9 @@ def test_restored_sender_continues_after_its_reservation() -> None:
     ],
 )
 def test_a_malformed_part_is_reported_and_skipped(name: str, change: dict[str, object]) -> None:
-    vehicle, vessel = vehicle_seal(), vessel_seal()
+    vehicle, vessel = vehicle_authenticator(), vessel_authenticator()
     vessel.verify(VEHICLE, vehicle.protect(COVERED))
-    restored = vessel_seal()
+    restored = vessel_authenticator()
     errors = restored.restore(
         with_fields(vessel.parts(), name, SavedWindow if "window" in name else AuthenticationState, change)
     )
@@ -229,15 +229,15 @@ def test_a_malformed_part_is_reported_and_skipped(name: str, change: dict[str, o
 
 
 def test_a_state_of_another_key_has_no_effect() -> None:
-    vehicle, vessel = vehicle_seal(name="another key"), vessel_seal(name="another key")
+    vehicle, vessel = vehicle_authenticator(name="another key"), vessel_authenticator(name="another key")
     vessel.verify(VEHICLE, vehicle.protect(COVERED))
-    restored = vessel_seal()
+    restored = vessel_authenticator()
     assert restored.restore(vessel.parts()) == {}
-    assert restored.parts() == vessel_seal().parts()
+    assert restored.parts() == vessel_authenticator().parts()
 
 
 def test_a_limit_beyond_the_lifetime_leaves_no_counter() -> None:
-    vehicle = vehicle_seal()
+    vehicle = vehicle_authenticator()
     parts = with_fields(vehicle.parts(), "authentication", AuthenticationState, {"limit": 2**20 + 1})
     restored = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
     assert restored.restore(parts) == {}
@@ -245,9 +245,9 @@ def test_a_limit_beyond_the_lifetime_leaves_no_counter() -> None:
 
 
 def test_forged_frames_use_no_memory() -> None:
-    vessel = vessel_seal(AuthenticationSettings(2))
+    vessel = vessel_authenticator(AuthenticationSettings(2))
     for source in range(128):
-        assert refusal(vessel, COVERED + b"\0\0fake", source) == "tag"
+        assert rejected_field(vessel, COVERED + b"\0\0fake", source) == "tag"
     assert group(vessel.parts(), "window") == {}
     window = ReplayWindow()
     for counter in (0, 10**6, 10**9):
@@ -265,7 +265,7 @@ def test_settings_out_of_range_are_rejected(wrong: dict[str, int]) -> None:
 
 
 def test_damage_is_distinguished_from_forgery() -> None:
-    vehicle, vessel = vehicle_seal(), vessel_seal()
+    vehicle, vessel = vehicle_authenticator(), vessel_authenticator()
     frame = pack_symbol(Symbol(SymbolKind.OBJECT, 1, 2, 3, bytes(54)), vehicle)
     assert len(frame) == 64
     damaged = bytes([*frame[:20], frame[20] ^ 1, *frame[21:]])
@@ -284,35 +284,35 @@ def test_damage_is_distinguished_from_forgery() -> None:
 @pytest.mark.parametrize("frame_bytes", [32, 64, 256])
 @pytest.mark.parametrize("settings", [AuthenticationSettings(), AuthenticationSettings(encrypt=True)], ids=str)
 def test_images_and_feedback_with_authentication(frame_bytes: int, settings: AuthenticationSettings) -> None:
-    up, down = vehicle_seal(settings), vessel_seal(settings)
+    up, down = vehicle_authenticator(settings), vessel_authenticator(settings)
     down.grant(1000)
     config = SenderConfig(frame_bytes=frame_bytes, channels=(LossChannel(0.2),), feedback=True, stream_bytes=200)
-    vehicle, hears = V1Sender(config, protection=up), V1Receiver(protection=up)
+    vehicle, feedback_receiver = V1Sender(config, protection=up), V1Receiver(protection=up)
     vessel = V1Receiver(protection=down)
-    pictures = {number: stream(number, 200) for number in range(1, 5)}
-    for number, data in pictures.items():
+    images = {number: stream(number, 200) for number in range(1, 5)}
+    for number, data in images.items():
         vehicle.add_image(number, contact(number), data, 0.0)
     vehicle.add_message(b"status", 0.0)
-    shown: dict[int, bytes] = {}
-    now, water = 0.0, random.Random(1)
+    received: dict[int, bytes] = {}
+    now, channel = 0.0, random.Random(1)
     while not vehicle.is_idle and now < 20_000:
         now += 1
         frame = vehicle.next_frame(now)
         if frame is not None:
             assert len(frame) == frame_bytes
-            if water.random() < 0.8:
+            if channel.random() < 0.8:
                 events = vessel.accept(VEHICLE, frame, now)
                 assert not [e for e in events if isinstance(e, FrameRejected)]
-                shown |= {number_of_image(e.image_id): e.stream for e in events if isinstance(e, ImageUpdate)}
+                received |= {number_of_image(e.image_id): e.stream for e in events if isinstance(e, ImageUpdate)}
                 (again,) = vessel.accept(VEHICLE, frame, now)
                 assert isinstance(again, FrameRejected)
                 assert again.reason.field == "counter"
         if vessel.feedback_is_due(VEHICLE, now):
-            told = vessel.feedback(VEHICLE, now)
-            assert told is not None
-            (report,) = hears.accept(VESSEL, feedback_frame(told, down), now)
-            assert isinstance(report, FeedbackReceived)
-            vehicle.on_feedback(report.feedback, now)
+            feedback = vessel.feedback(VEHICLE, now)
+            assert feedback is not None
+            (event,) = feedback_receiver.accept(VESSEL, feedback_frame(feedback, down), now)
+            assert isinstance(event, FeedbackReceived)
+            vehicle.on_feedback(event.feedback, now)
     assert vehicle.is_idle
-    assert shown == pictures
+    assert received == images
     assert up.counts.protected > down.counts.genuine == down.counts.replayed > 0

@@ -1,4 +1,4 @@
-"""The golden sealed frames, checked with another implementation: HKDF and CCM from hashes and AES blocks alone."""
+"""Golden authenticated frames, checked with an independent HKDF and CCM from hashes and AES blocks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import json
 from typing import Any
 
 import pytest
-from builders import authentication_golden as seal_golden
+from builders import authentication_golden
 from builders.v1_golden import FOLDER
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
@@ -20,7 +20,7 @@ from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.state import pack_part
 from sonarpost.modem.micromodem import RATES
 
-SEAL = FrameAuthenticator(parse_key(seal_golden.KEY, "golden"), 3, Direction.FROM_VEHICLE)
+AUTHENTICATOR = FrameAuthenticator(parse_key(authentication_golden.KEY, "golden"), 3, Direction.FROM_VEHICLE)
 GOLDEN: dict[str, Any] = json.loads((FOLDER / "sealed.json").read_text(encoding="utf-8"))
 
 
@@ -41,9 +41,9 @@ def ccm(key: bytes, nonce: bytes, head: bytes, data: bytes, tag_bytes: int) -> b
         return block.update(bytes([1]) + nonce + number.to_bytes(2, "big"))
 
     flags = 0x40 | (tag_bytes - 2) // 2 << 3 | 1
-    told = len(head).to_bytes(2, "big") + head
+    coded_head = len(head).to_bytes(2, "big") + head
     blocks = bytes([flags]) + nonce + len(data).to_bytes(2, "big")
-    blocks += told + bytes(-len(told) % 16) + data + bytes(-len(data) % 16)
+    blocks += coded_head + bytes(-len(coded_head) % 16) + data + bytes(-len(data) % 16)
     state = bytes(16)
     for at in range(0, len(blocks), 16):
         state = block.update(exclusive_or(state, blocks[at : at + 16]))
@@ -52,7 +52,7 @@ def ccm(key: bytes, nonce: bytes, head: bytes, data: bytes, tag_bytes: int) -> b
 
 
 def test_protected_frames_equal_the_golden_file() -> None:
-    assert json.loads(json.dumps(seal_golden.make())) == GOLDEN
+    assert json.loads(json.dumps(authentication_golden.make())) == GOLDEN
     assert hkdf(bytes.fromhex(GOLDEN["key"]), b"sonarpost acoustic v1 fingerprint", 4).hex() == GOLDEN["fingerprint"]
 
 
@@ -60,16 +60,18 @@ def test_protected_frames_equal_the_golden_file() -> None:
 def test_independent_implementation_gives_the_same_frames(case: dict[str, Any]) -> None:
     frame = bytes.fromhex(case["frame"])
     settings = AuthenticationSettings(case["counter_bytes"], case["tag_bytes"], case["encrypt"])
-    seal = FrameAuthenticator(parse_key(GOLDEN["key"], "golden"), 99, Direction(case["direction"]).opposite, settings)
-    # A receiver without memory takes a first frame only of a counter that is near; its neighbour's seal tells it that.
+    authenticator = FrameAuthenticator(
+        parse_key(GOLDEN["key"], "golden"), 99, Direction(case["direction"]).opposite, settings
+    )
+    # A receiver without a window accepts only counters near 0, so it gets a window near this one.
     newest = max(0, case["counter"] - 1)
     window = SavedWindow(case["source"], ReplayWindow(newest))
-    assert not seal.restore({**seal.parts(), "window/0": pack_part(window)})
-    content = parse_frame(frame, case["source"], seal)
+    assert not authenticator.restore({**authenticator.parts(), "window/0": pack_part(window)})
+    content = parse_frame(frame, case["source"], authenticator)
     assert isinstance(content, Symbol) or content == (Segment(SegmentKind.MESSAGE, b"\x09go to 12"),)
 
-    way = bytes([case["direction"], case["source"], case["counter_bytes"], case["tag_bytes"], case["encrypt"]])
-    key = hkdf(bytes.fromhex(GOLDEN["key"]), b"sonarpost acoustic v1 seal" + way, 32)
+    inputs = bytes([case["direction"], case["source"], case["counter_bytes"], case["tag_bytes"], case["encrypt"]])
+    key = hkdf(bytes.fromhex(GOLDEN["key"]), b"sonarpost acoustic v1 seal" + inputs, 32)
     plain = (
         bytes([0x80 | content.head()[0]]) + content.head()[1:] + content.data
         if isinstance(content, Symbol)
@@ -93,7 +95,8 @@ def test_sizes_and_forgery_probability_of_the_specification() -> None:
         assert years < 1 / (chance * frames_per_s) / (365.25 * 86400) < years + 1
         assert 0.7 * percent < 100 * chance * frames_per_s * 30 * 86400 < percent
     for frame_bytes, symbol_bytes in ((32, (22, 27)), (64, (54, 59)), (256, (246, 251))):
-        sealed, bare = (
-            V1Sender(SenderConfig(frame_bytes=frame_bytes), protection=seal).symbol_bytes for seal in (SEAL, None)
+        protected, bare = (
+            V1Sender(SenderConfig(frame_bytes=frame_bytes), protection=authenticator).symbol_bytes
+            for authenticator in (AUTHENTICATOR, None)
         )
-        assert (sealed, bare) == symbol_bytes
+        assert (protected, bare) == symbol_bytes

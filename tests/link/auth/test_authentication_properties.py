@@ -1,8 +1,8 @@
-"""Whatever an attacker and the water do with recorded frames: nothing is taken twice, nothing foreign once."""
+"""Recorded, changed and lost frames in any order: no frame is accepted twice, and no forged frame once."""
 
 from __future__ import annotations
 
-from builders.authentication_world import VEHICLE, key, vehicle_seal, vessel_seal
+from builders.authentication_world import VEHICLE, key, vehicle_authenticator, vessel_authenticator
 from builders.link_state import group
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,24 +15,24 @@ from sonarpost.link.auth.key import AuthenticationSettings, Direction
 NEAR = AuthenticationSettings().counter_step - WINDOW
 
 
-def offered(seal: FrameAuthenticator, source: int, sealed: bytes) -> tuple[bytes, str]:
-    """What a frame opens to, or the field of the error with which it is refused."""
+def verified(authenticator: FrameAuthenticator, source: int, protected: bytes) -> tuple[bytes, str]:
+    """Return the verified frame, or the field of the error."""
     try:
-        return seal.verify(source, sealed), ""
+        return authenticator.verify(source, protected), ""
     except FrameError as error:
         return b"", error.field
 
 
 class Attack(RuleBasedStateMachine):
-    """A vehicle, a vessel that may restart, and water in which everything is recorded and sent again."""
+    """A vehicle, a vessel that can restart, and an attacker who records and replays all frames."""
 
     def __init__(self) -> None:
         super().__init__()
         self.durable = 0
         self.vehicle = self.start_vehicle()
-        self.vessel = vessel_seal()
-        self.recorded: list[tuple[int, bytes, bytes]] = []  # counter, plain, sealed
-        self.taken: set[int] = set()
+        self.vessel = vessel_authenticator()
+        self.recorded: list[tuple[int, bytes, bytes]] = []  # counter, plain, protected
+        self.accepted: set[int] = set()
         self.newest = -1
 
     def start_vehicle(self) -> FrameAuthenticator:
@@ -47,14 +47,14 @@ class Attack(RuleBasedStateMachine):
         self.recorded.append((counter, covered, self.vehicle.protect(covered)))
         return self.recorded[-1]
 
-    def offer(self, counter: int, covered: bytes, sealed: bytes) -> bool:
-        opened, field = offered(self.vessel, VEHICLE, sealed)
+    def receive(self, counter: int, covered: bytes, protected: bytes) -> bool:
+        plain, field = verified(self.vessel, VEHICLE, protected)
         assert field in {"", "counter"}
         if field:
             return False
-        assert opened == covered
-        assert counter not in self.taken
-        self.taken.add(counter)
+        assert plain == covered
+        assert counter not in self.accepted
+        self.accepted.add(counter)
         self.newest = max(self.newest, counter)
         return True
 
@@ -62,7 +62,7 @@ class Attack(RuleBasedStateMachine):
     def a_frame_arrives(self, data: bytes) -> None:
         frame = self.record(data)
         gap = frame[0] - self.newest
-        assert self.offer(*frame) or gap > NEAR
+        assert self.receive(*frame) or gap > NEAR
 
     @rule(lost=st.one_of(st.integers(1, 3), st.integers(NEAR - 3, NEAR + 3), st.integers(250, 1500)))
     def frames_are_lost(self, lost: int) -> None:
@@ -71,21 +71,21 @@ class Attack(RuleBasedStateMachine):
 
     @precondition(lambda self: self.recorded)
     @rule(data=st.data())
-    def a_recorded_frame_comes(self, data: st.DataObject) -> None:
+    def a_recorded_frame_arrives(self, data: st.DataObject) -> None:
         back = data.draw(st.one_of(st.integers(1, 80), st.integers(1, len(self.recorded))))
         frame = self.recorded[-min(back, len(self.recorded))]
         behind = self.newest - frame[0]
-        due = frame[0] not in self.taken and -NEAR <= behind < WINDOW
-        assert self.offer(*frame) == due or behind < -NEAR
+        due = frame[0] not in self.accepted and -NEAR <= behind < WINDOW
+        assert self.receive(*frame) == due or behind < -NEAR
 
     @precondition(lambda self: self.recorded)
     @rule(data=st.data(), at=st.integers(0, 12), bit=st.integers(0, 7))
-    def a_changed_frame_comes(self, data: st.DataObject, at: int, bit: int) -> None:
-        _, _, sealed = data.draw(st.sampled_from(self.recorded[-20:]))
-        forged = bytearray(sealed)
+    def a_changed_frame_arrives(self, data: st.DataObject, at: int, bit: int) -> None:
+        _, _, protected = data.draw(st.sampled_from(self.recorded[-20:]))
+        forged = bytearray(protected)
         forged[at % len(forged)] ^= 1 << bit
         before = group(self.vessel.parts(), "window")
-        assert offered(self.vessel, VEHICLE, bytes(forged)) == (b"", "tag")
+        assert verified(self.vessel, VEHICLE, bytes(forged)) == (b"", "tag")
         assert group(self.vessel.parts(), "window") == before
 
     @rule()
@@ -95,22 +95,22 @@ class Attack(RuleBasedStateMachine):
     @rule()
     def the_vessel_restarts(self) -> None:
         state = self.vessel.parts()
-        self.vessel = vessel_seal()
+        self.vessel = vessel_authenticator()
         assert not self.vessel.restore(state)
 
     @invariant()
-    def no_counter_is_sealed_twice(self) -> None:
+    def no_counter_is_used_twice(self) -> None:
         last = [counter for counter, _, _ in self.recorded[-2 * RESERVED :]]
         assert last == sorted(set(last))
 
     @invariant()
-    def what_was_taken_is_counted(self) -> None:
-        assert self.vessel.counts.genuine == len(self.taken)
+    def accepted_frames_are_counted(self) -> None:
+        assert self.vessel.counts.genuine == len(self.accepted)
 
     def teardown(self) -> None:
-        """After any attack two more frames are enough to be heard again."""
-        self.offer(*self.record(b"one"))
-        assert self.offer(*self.record(b"two"))
+        """Two more frames are accepted after any attack."""
+        self.receive(*self.record(b"one"))
+        assert self.receive(*self.record(b"two"))
 
 
 Attack.TestCase.settings = settings(max_examples=80, stateful_step_count=30, deadline=None)
@@ -120,15 +120,15 @@ TestAttack = Attack.TestCase
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.one_of(st.integers(-80, 80), st.integers(-80, 80), st.integers(100, 5000)), max_size=200))
 def test_replay_window_agrees_with_a_set(steps: list[int]) -> None:
-    window, taken = ReplayWindow(), set[int]()
+    window, accepted = ReplayWindow(), set[int]()
     for step in steps:
-        counter = max(0, max(taken, default=-1) + step)
-        expected = counter > max(taken, default=-1) - WINDOW and counter not in taken
+        counter = max(0, max(accepted, default=-1) + step)
+        expected = counter > max(accepted, default=-1) - WINDOW and counter not in accepted
         assert window.is_new(counter) == expected
         if expected:
             window.accept(counter)
-            taken.add(counter)
-        assert window.newest == max(taken)
+            accepted.add(counter)
+        assert window.newest == max(accepted)
         assert window.seen < 1 << WINDOW
 
 
@@ -150,9 +150,9 @@ def test_nearest_counter_is_the_one_sent(newest: int, step: int, data: st.DataOb
 
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=300), st.integers(-5, 200), st.booleans())
-def test_any_bytes_are_rejected(sealed: bytes, source: int, encrypt: bool) -> None:
+def test_any_bytes_are_rejected(protected: bytes, source: int, encrypt: bool) -> None:
     chosen = AuthenticationSettings(encrypt=encrypt)
-    vessel = vessel_seal(chosen)
-    assert offered(vessel, source, sealed) == (b"", "tag")
+    vessel = vessel_authenticator(chosen)
+    assert verified(vessel, source, protected) == (b"", "tag")
     assert vessel.counts.forged == 1
-    assert vessel.verify(VEHICLE, vehicle_seal(chosen).protect(b"\x80ok")) == b"\x80ok"
+    assert vessel.verify(VEHICLE, vehicle_authenticator(chosen).protect(b"\x80ok")) == b"\x80ok"

@@ -41,7 +41,7 @@ def test_golden_bytes(name: str) -> None:
 
 numbers = st.integers(1, 65535)
 heads = {"token": st.integers(0, 2**32 - 1), "issued_utc_s": st.integers(0, 2**32 - 1)}
-orders = st.one_of(
+commands = st.one_of(
     st.builds(dl.RefineMessage, **heads, number=numbers, stream_bytes=st.integers(0, 65535)),
     st.builds(dl.ResendMessage, **heads, number=numbers),
     st.builds(dl.ExpandMessage, **heads, number=numbers),
@@ -63,12 +63,12 @@ orders = st.one_of(
 )
 
 
-@given(orders)
-def test_command_round_trip_in_32_bytes(order: dl.DownlinkCommand) -> None:
-    message = Segment(SegmentKind.MESSAGE, b"\x05" + dl.pack(order))
+@given(commands)
+def test_command_round_trip_in_32_bytes(command: dl.DownlinkCommand) -> None:
+    message = Segment(SegmentKind.MESSAGE, b"\x05" + dl.pack(command))
     (segment,) = parse_frame(pack_segments([message], 32))
     assert isinstance(segment, Segment)
-    assert dl.unpack(segment.data[1:]) == order
+    assert dl.unpack(segment.data[1:]) == command
 
 
 @given(st.text(max_size=60), st.integers(14, 60))

@@ -1,4 +1,4 @@
-"""The vessel's end of the link: orders repeated until confirmed, reports when they help, all over a restart."""
+"""The vessel's end of the link: commands until they are confirmed, feedback when it is useful, restarts."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ UUV, VESSEL = 3, 1
 LASTING_S = 3600.0
 
 
-def order(book, record_id, kind="resend", address=UUV, now=0.0):
-    token = book.free_token(kind, record_id)
+def command(tracker, record_id, kind="resend", address=UUV, now=0.0):
+    token = tracker.free_token(kind, record_id)
     content = dl.ResendMessage(token, 0, 7)
     return PendingCommand(kind, record_id, "uuv-1", address, token, dl.pack(content), now, now + LASTING_S)
 
 
 class Vehicle:
-    """Takes orders as a vehicle does: each once, and confirms every copy."""
+    """Executes each command once and confirms every copy, as a vehicle does."""
 
     def __init__(self, config=None):
         self.receiver = V1Receiver()
         self.sender = V1Sender(config or SenderConfig(channels=(LossChannel(0.5),)))
-        self.taken = []
+        self.accepted = []
 
-    def hear(self, frame, now):
+    def receive(self, frame, now):
         for event in self.receiver.accept(VESSEL, frame, now):
             if isinstance(event, FeedbackReceived):
                 self.sender.on_feedback(event.feedback, now, VESSEL)
             elif isinstance(event, MessageReceived):
                 content = dl.unpack(event.data)
-                if content not in self.taken:
-                    self.taken.append(content)
+                if content not in self.accepted:
+                    self.accepted.append(content)
                 answer = dl.ConfirmationMessage(((content.token, dl.CommandOutcome.ACCEPTED),))
                 self.sender.add_message(dl.pack(answer), now, times=1)
 
 
 def restarted(link):
-    """The same link in another process."""
+    """Return the endpoint restored in another process."""
     again = VesselEndpoint(CommandTracker(link.commands.retry_s), link.v1.config)
     assert not again.restore(link.parts())
     return again
@@ -63,7 +63,7 @@ def test_commands_arrive_once_at_50_percent_loss_and_restarts(frame_bytes):
     rng = np.random.default_rng(frame_bytes)
     link, vehicle = VesselEndpoint(CommandTracker(30.0)), Vehicle()
     for n in range(20):
-        link.commands.add(order(link.commands, f"c-{n}"), 0.0)
+        link.commands.add(command(link.commands, f"c-{n}"), 0.0)
     changes = []
     now = 0.0
     while link.commands.open_commands:
@@ -75,13 +75,13 @@ def test_commands_arrive_once_at_50_percent_loss_and_restarts(frame_bytes):
             assert {len(frame) for frame in packet.frames} == {frame_bytes}
             for frame in packet.frames:
                 if rng.random() >= 0.5:
-                    vehicle.hear(frame, now)
+                    vehicle.receive(frame, now)
             changes += link.sent(packet, now)
         link = restarted(link)
         answer = vehicle.sender.next_frame(now)
         if answer is not None and rng.random() >= 0.5:
             changes += link.accept(UUV, answer, now).commands
-    assert len(vehicle.taken) == 20
+    assert len(vehicle.accepted) == 20
     final = {change.record_id: change.state for change in changes}
     assert set(final.values()) == {CommandState.CONFIRMED}
     assert len(final) == 20
@@ -90,7 +90,7 @@ def test_commands_arrive_once_at_50_percent_loss_and_restarts(frame_bytes):
 
 def test_unanswered_command_is_retried_less_often_and_expires():
     link = VesselEndpoint(CommandTracker(60.0))
-    link.commands.add(order(link.commands, "c-1"), 0.0)
+    link.commands.add(command(link.commands, "c-1"), 0.0)
     sent_at = []
     for now in np.arange(0.0, LASTING_S + 10, 5.0):
         packet = link.next_packet(1, 32, float(now))
@@ -107,71 +107,71 @@ def test_unanswered_command_is_retried_less_often_and_expires():
 
 def test_failed_packet_is_due_at_once():
     link = VesselEndpoint(CommandTracker(60.0))
-    link.commands.add(order(link.commands, "c-1"), 0.0)
+    link.commands.add(command(link.commands, "c-1"), 0.0)
     packet = link.next_packet(1, 32, 0.0)
     link.failed(packet)
     assert link.due_address(0.0) == UUV
     again = link.next_packet(1, 32, 0.0)
     assert again.tokens == packet.tokens
-    assert again.frames != packet.frames  # another number: to the vehicle's link it is another message
+    assert again.frames != packet.frames  # a new message number, so that the vehicle's link does not drop it
     link.sent(again, 0.0)
     assert link.due_address(59.0) is None
 
 
 def test_only_the_addressed_vehicle_confirms_a_command_once():
-    book = CommandTracker(60.0)
-    asked = book.add(order(book, "c-1"), 0.0)
-    outcome = (asked.token, dl.CommandOutcome.UNKNOWN_IMAGE)
-    assert book.confirm(UUV + 1, [outcome]) == ()
-    assert book.confirm(UUV, [(asked.token ^ 1, dl.CommandOutcome.ACCEPTED)]) == ()
-    [refused] = book.confirm(UUV, [outcome, (asked.token, dl.CommandOutcome.ACCEPTED)])
-    assert (refused.state, refused.reason) == (CommandState.REFUSED, "unknown image")
+    tracker = CommandTracker(60.0)
+    added = tracker.add(command(tracker, "c-1"), 0.0)
+    outcome = (added.token, dl.CommandOutcome.UNKNOWN_IMAGE)
+    assert tracker.confirm(UUV + 1, [outcome]) == ()
+    assert tracker.confirm(UUV, [(added.token ^ 1, dl.CommandOutcome.ACCEPTED)]) == ()
+    [rejected] = tracker.confirm(UUV, [outcome, (added.token, dl.CommandOutcome.ACCEPTED)])
+    assert (rejected.state, rejected.reason) == (CommandState.REFUSED, "unknown image")
 
 
 def test_repeated_record_is_found_and_tokens_are_unique():
-    book = CommandTracker(60.0)
-    first = book.add(order(book, "c-1"), 0.0)
-    assert book.find("resend", "c-1") == first
-    assert book.find("refine", "c-1") is None
-    assert book.free_token("resend", "c-1") == dl.token_of("c-1", "command", 1)
+    tracker = CommandTracker(60.0)
+    first = tracker.add(command(tracker, "c-1"), 0.0)
+    assert tracker.find("resend", "c-1") == first
+    assert tracker.find("refine", "c-1") is None
+    assert tracker.free_token("resend", "c-1") == dl.token_of("c-1", "command", 1)
     with pytest.raises(FrameError, match="token"):
-        book.add(first, 0.0)
+        tracker.add(first, 0.0)
 
 
 def test_tracker_memory_is_bounded():
-    book = CommandTracker(60.0)
+    tracker = CommandTracker(60.0)
     for n in range(MAX_PENDING):
-        book.add(order(book, f"c-{n}"), 0.0)
+        tracker.add(command(tracker, f"c-{n}"), 0.0)
     with pytest.raises(FrameError, match="open"):
-        book.add(order(book, "one more"), 0.0)
+        tracker.add(command(tracker, "one more"), 0.0)
     for n in range(1500):
-        book.expire(1e9 + n + LASTING_S)
-        book.add(order(book, f"d-{n}", now=1e9 + n), 1e9 + n)
-    assert len(book.parts()) <= 1000 + MAX_PENDING
+        tracker.expire(1e9 + n + LASTING_S)
+        tracker.add(command(tracker, f"d-{n}", now=1e9 + n), 1e9 + n)
+    assert len(tracker.parts()) <= 1000 + MAX_PENDING
 
 
 @pytest.mark.parametrize("field", ["format version", "state", "address", "message", "due_s"])
 def test_a_malformed_command_is_reported_and_the_others_restored(field):
-    book = CommandTracker(60.0)
-    first, second = (book.add(order(book, f"c-{n}"), 0.0) for n in (1, 2))
+    tracker = CommandTracker(60.0)
+    first, second = (tracker.add(command(tracker, f"c-{n}"), 0.0) for n in (1, 2))
     again = CommandTracker(60.0)
     name = f"command/{first.token}"
-    errors = again.restore(with_fields(book.parts(), name, PendingCommand, {field: None}))
+    errors = again.restore(with_fields(tracker.parts(), name, PendingCommand, {field: None}))
     assert [(part, error.field) for part, error in errors.items()] == [(name, field)]
     assert again.open_commands == (second,)
 
 
 def test_the_endpoint_reports_malformed_parts_by_name():
     link = VesselEndpoint(CommandTracker(30.0))
-    command = link.commands.add(order(link.commands, "c-1"), 0.0)
+    added = link.commands.add(command(link.commands, "c-1"), 0.0)
     link.accept(UUV, Vehicle().sender.next_frame(0.0) or b"", 0.0)
-    for name in ("endpoint", "v1/counts", "paper/counts", f"commands/command/{command.token}"):
+    for name in ("endpoint", "v1/counts", "paper/counts", f"commands/command/{added.token}"):
         again = VesselEndpoint(CommandTracker(30.0))
         assert set(again.restore(with_fields(link.parts(), name, PendingCommand, {"format version": 1}))) == {name}
         assert len(again.commands.open_commands) == (not name.startswith("commands/"))
 
 
-PICTURE = bytes([0x20]) + bytes(range(200))
+STREAM = bytes([0x20]) + bytes(range(200))
 CONTACT = ContactSummary(height_px=40, width_px=60, lat_deg=56.4, lon_deg=-5.6, time_utc_s=1_475_568_000.0)
 
 
@@ -179,9 +179,9 @@ def test_feedback_completes_lost_images():
     rng = np.random.default_rng(5)
     vehicle = Vehicle(SenderConfig(frame_bytes=64, channels=(LossChannel(0.1),), feedback=True, max_defer_s=120.0))
     for number in range(1, 9):
-        vehicle.sender.add_image(number, replace(CONTACT, time_utc_s=float(number)), PICTURE, 0.0)
+        vehicle.sender.add_image(number, replace(CONTACT, time_utc_s=float(number)), STREAM, 0.0)
     link = VesselEndpoint(CommandTracker(30.0), ReceiverConfig(feedback_interval_s=60.0))
-    now, reports = 0.0, 0
+    now, feedback_sent = 0.0, 0
     while vehicle.sender.blocks or vehicle.sender.waiting:
         now += 6.0
         assert now < 3600
@@ -190,18 +190,18 @@ def test_feedback_completes_lost_images():
                 link.accept(UUV, frame, now)
         packet = link.next_packet(1, 32, now)
         if packet is not None:
-            reports += packet.has_feedback
+            feedback_sent += packet.has_feedback
             link.sent(packet, now)
             for frame in packet.frames:
-                vehicle.hear(frame, now)
+                vehicle.receive(frame, now)
     assert link.v1.counts.complete >= 8
-    assert 1 <= reports <= 20
+    assert 1 <= feedback_sent <= 20
 
 
 def test_unanswered_feedback_becomes_rare_and_ends():
     vehicle = Vehicle(SenderConfig(frame_bytes=64, feedback=True))
     for number in range(1, 5):
-        vehicle.sender.add_image(number, CONTACT, PICTURE, 0.0)
+        vehicle.sender.add_image(number, CONTACT, STREAM, 0.0)
     link = VesselEndpoint(CommandTracker(30.0), ReceiverConfig(feedback_interval_s=10.0))
     link.accept(UUV, vehicle.sender.next_frame(0.0), 0.0)
     at = []
@@ -218,7 +218,7 @@ def test_unanswered_feedback_becomes_rare_and_ends():
 def test_failed_feedback_is_repeated():
     vehicle = Vehicle(SenderConfig(frame_bytes=64, feedback=True))
     for number in range(1, 5):
-        vehicle.sender.add_image(number, CONTACT, PICTURE, 0.0)
+        vehicle.sender.add_image(number, CONTACT, STREAM, 0.0)
     frame = vehicle.sender.next_frame(0.0)
     link, mute = VesselEndpoint(CommandTracker(30.0)), VesselEndpoint(CommandTracker(30.0), feedback=False)
     for each in (link, mute):
@@ -236,8 +236,8 @@ def test_messages_are_returned_once_and_invalid_ones_rejected():
     sender = V1Sender(SenderConfig(channels=(LossChannel(0.3),)))
     sender.add_message(dl.pack(dl.DataMessage(b"status"), 4096), 0.0, times=2)
     frames = [sender.next_frame(float(n)) for n in range(2)]
-    heard = [link.accept(UUV, frame, 0.0) for frame in frames if frame is not None]
-    assert [each.messages for each in heard] in ([(b"status",)], [(b"status",), ()])
+    received = [link.accept(UUV, frame, 0.0) for frame in frames if frame is not None]
+    assert [each.messages for each in received] in ([(b"status",)], [(b"status",), ()])
     nonsense = pack_segments([Segment(SegmentKind.MESSAGE, b"\x01\x7f")], 32)
     assert [error.field for error in link.accept(UUV, nonsense, 0.0).rejected] == ["kind"]
     assert link.accept(UUV, b"not a frame", 0.0).rejected[0].field == "checksum"
@@ -245,7 +245,7 @@ def test_messages_are_returned_once_and_invalid_ones_rejected():
 
 def test_command_longer_than_a_frame_is_an_error():
     link = VesselEndpoint(CommandTracker(30.0))
-    long = replace(order(link.commands, "c-1"), message=bytes(40))
+    long = replace(command(link.commands, "c-1"), message=bytes(40))
     link.commands.add(long, 0.0)
     with pytest.raises(FrameError, match="room for a command"):
         link.next_packet(1, 32, 0.0)

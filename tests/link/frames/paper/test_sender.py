@@ -131,7 +131,9 @@ def check_contact_leads(parsed: list[list[HalfFrame | ContactFrame]], frames_per
 @pytest.mark.parametrize("header_bytes", sorted(HEADERS))
 @pytest.mark.parametrize("with_contact", [True, False])
 @pytest.mark.parametrize("rate", sorted(RATES))
-def test_capacity_is_the_longest_body_with_one_packet_per_half(rate: int, with_contact: bool, header_bytes: int) -> None:
+def test_capacity_is_the_longest_body_with_one_packet_per_half(
+    rate: int, with_contact: bool, header_bytes: int
+) -> None:
     frames_per_packet, frame_bytes = RATES[rate]
     contact = CONTACT if with_contact else None
     capacity = body_capacity_bytes(frames_per_packet, frame_bytes, with_contact=with_contact, header_bytes=header_bytes)

@@ -316,9 +316,7 @@ def test_sender_continues_after_a_restart_at_every_frame() -> None:
     ],
     ids=str,
 )
-def test_sender_reports_a_malformed_part_and_sends_the_rest_again(
-    name: str, change: dict[str, object]
-) -> None:
+def test_sender_reports_a_malformed_part_and_sends_the_rest_again(name: str, change: dict[str, object]) -> None:
     sender = V1Sender(SenderConfig(group_images=1, depth=1))
     for number in (1, 2):
         sender.add_image(number, contact(number), stream(number, 50), 0.0)
