@@ -1,6 +1,6 @@
-"""What must hold of the acoustic link whatever bytes come: the v1 receiver, and the driver of the modem.
+"""Properties of the acoustic link for any bytes: the v1 receiver, and the modem driver.
 
-An input is a list of steps. Every step begins with a byte that says what it is and one that says how long it is.
+An input is a list of steps. Every step begins with one byte for its kind and one for its length.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ def _genuine() -> tuple[bytes, ...]:
 
 
 def check_receiver(data: bytes) -> int:
-    """Give frames to a receiver; return how many pictures and messages it showed.
+    """Pass frames to a receiver; return the number of image updates and messages.
 
-    A stranger says whatever the input says, with checksums put right or not. Between that, genuine frames of a vehicle
-    come in any order and as often as the input wants: what is shown of it must have been sent. Reports, the state and
-    its bounds are checked at the end.
+    A stranger sends the input's bytes, with correct checksums or without. Between them, genuine frames of a vehicle
+    arrive in any order and number; updates of the vehicle must hold what it sent. Feedback, the state and its bounds
+    are checked at the end.
 
     Raises:
-        AssertionError: Something that must hold does not.
+        AssertionError: A property does not hold.
     """
-    receiver, now, shown = V1Receiver(v1_fuzz.SMALL), 0.0, 0
+    receiver, now, reported = V1Receiver(v1_fuzz.SMALL), 0.0, 0
     for kind, body in _steps(data):
         now += (0.0, 1.0, 70.0, 4000.0)[kind >> 2 & 3]
         if kind & 3 == 0:
@@ -58,18 +58,18 @@ def check_receiver(data: bytes) -> int:
             frames = [(STRANGER, bytes(v1_fuzz.with_checksum(body)))]
         for source, frame in frames:
             for event in receiver.accept(source, frame, now):
-                assert source == STRANGER or v1_fuzz.is_right(event), f"shown though never sent: {event}"
-                shown += isinstance(event, ImageUpdate | MessageReceived)
+                assert source == STRANGER or v1_fuzz.is_right(event), f"reported but never sent: {event}"
+                reported += isinstance(event, ImageUpdate | MessageReceived)
         for source in receiver.sources:
             if receiver.feedback_is_due(source, now):
-                report = receiver.feedback(source, now)
-                assert report is None or len(report.pack()) <= 19
+                feedback = receiver.feedback(source, now)
+                assert feedback is None or len(feedback.pack()) <= 19
             receiver.mini_feedback(source)
     v1_fuzz.check_bounds(receiver)
     restored = V1Receiver(v1_fuzz.SMALL)
     assert not restored.restore(receiver.parts())
     assert restored.parts() == receiver.parts()
-    return shown
+    return reported
 
 
 @cache
@@ -78,15 +78,15 @@ def _real_lines() -> tuple[bytes, ...]:
 
 
 def check_driver(data: bytes) -> int:
-    """Give lines to a driver and to the parser alone; return how many were sentences.
+    """Pass lines to a driver and to the parser alone; return the number of sentences.
 
-    Lines are raw, or made of the input's fields with a right checksum, or from real exchanges; packets are asked for in
-    between. Whatever was asked for ends once, and a modem that answers again is used again.
+    Lines are raw, or built from the input's fields with a correct checksum, or from real exchanges. Packets are
+    requested between them. Each request ends once, and a modem that answers again is used again.
 
     Raises:
-        AssertionError: Something that must hold does not.
+        AssertionError: A property does not hold.
     """
-    fuzz = Fuzz.__new__(Fuzz)  # for its checks; its lines are drawn, ours are given
+    fuzz = Fuzz.__new__(Fuzz)  # for its checks only: the lines come from the input
     driver, parser = MicroModem(MicroModemConfig(1)), nmea.LineAssembler()
     now, taken, asked, ended = 0.0, 0, [], []
     driver.start(now)
@@ -121,7 +121,7 @@ def _line(kind: int, body: bytes) -> bytes | None:
 
 
 def _checked(start: bytes) -> bytes:
-    """Return a line with its checksum, where its text can have one."""
+    """Return a line with its checksum if its text can have one."""
     total = 0
     for byte in start[1:]:
         total ^= byte
@@ -146,7 +146,7 @@ CHECKS: Final = {"receiver": check_receiver, "driver": check_driver}
 
 
 def seeds(name: str) -> Iterator[bytes]:
-    """Yield inputs to begin with, which reach what genuine traffic reaches."""
+    """Yield first inputs that cover genuine traffic."""
     if name == "receiver":
         frames = _genuine()
         for first in range(0, _GENUINE_FRAMES, 25):

@@ -1,4 +1,4 @@
-"""Hostile frames for the v1 receiver, a bounded run and a long one; `run_atheris_link.py` does it by coverage.
+"""Hostile frames for the v1 receiver, as a short and a long run; `run_atheris_link.py` is guided by coverage.
 
 PYTHONPATH=tests python -m builders.v1_fuzz FRAMES [SEED]
 """
@@ -24,7 +24,7 @@ SMALL = ReceiverConfig(max_sources=3, max_contacts=20, block_memory_s=300.0, con
 MESSAGE = b"status: "
 
 
-def picture_stream(number: int) -> bytes:
+def image_stream(number: int) -> bytes:
     return np.random.default_rng(number).integers(0, 256, 40 + number % 400, dtype=np.uint8).tobytes()
 
 
@@ -33,7 +33,7 @@ def record(number: int) -> ContactSummary:
 
 
 def genuine(seed: int) -> Iterator[bytes]:
-    """Yield frames of a vehicle that goes on for ever, with every kind of content, sizes and settings changing."""
+    """Yield endless frames of a vehicle with all kinds of content and changing frame lengths and settings."""
     rng, number = np.random.default_rng(seed), 0
     while True:
         sender = V1Sender(
@@ -46,7 +46,7 @@ def genuine(seed: int) -> Iterator[bytes]:
         )
         for _ in range(int(rng.integers(1, 12))):
             number = number % 5000 + 1
-            sender.add_image(number, record(number), picture_stream(number), 0.0)
+            sender.add_image(number, record(number), image_stream(number), 0.0)
             if rng.random() < 0.3:
                 sender.add_message(MESSAGE + bytes([number % 256]) * int(rng.integers(1, 150)), 0.0)
         while (frame := sender.next_frame(0.0)) is not None:
@@ -54,7 +54,7 @@ def genuine(seed: int) -> Iterator[bytes]:
 
 
 def mangled(frame: bytes, rng: np.random.Generator, kind: int) -> bytes:
-    """Return a frame as bad modems, water and strangers make it: one of nine kinds, 6 and 7 are forgeries."""
+    """Return a frame that a modem, the channel or an attacker changed, in one of nine ways; 6 and 7 are forgeries."""
     data, cut = bytearray(frame), int(rng.integers(0, len(frame)))
     match kind:
         case 0:
@@ -70,10 +70,10 @@ def mangled(frame: bytes, rng: np.random.Generator, kind: int) -> bytes:
                 data[int(rng.integers(0, len(data)))] ^= 1 << int(rng.integers(0, 8))
         case 5:
             data += bytes(int(rng.integers(1, 200)))
-        case 6:  # a right checksum over nonsense: only the checks inside stand between it and the operator
+        case 6:  # a correct checksum over random content: only the inner checks can reject it
             head = bytes([int(rng.integers(0, 128)), int(rng.integers(0, 8)), int(rng.integers(0, 6))])
             data = with_checksum(head + rng.bytes(int(rng.choice([27, 59, 251]))))
-        case 7:  # a right checksum over a damaged frame
+        case 7:  # a correct checksum over a damaged frame
             for _ in range(int(rng.integers(1, 4))):
                 data[2 + int(rng.integers(0, len(data) - 2))] = int(rng.integers(0, 256))
             data = with_checksum(bytes(data[2:]))
@@ -87,21 +87,21 @@ def with_checksum(covered: bytes) -> bytearray:
 
 
 def is_right(event: object) -> bool:
-    """Whether what the receiver shows was sent."""
+    """Whether the vehicle sent what the event reports."""
     if isinstance(event, ImageUpdate):
         number = number_of_image(event.image_id)
-        return event.contact == record(number) and picture_stream(number).startswith(event.stream)
+        return event.contact == record(number) and image_stream(number).startswith(event.stream)
     if isinstance(event, MessageReceived):
         return event.data.startswith(MESSAGE)
     return True
 
 
 def run(frames: int, seed: int = 0) -> dict[str, int]:
-    """Feed that many frames, a third of them genuine, replayed or out of order; return counts.
+    """Pass frames to a receiver, a third of them genuine, replayed or out of order; return counts.
 
-    `forged` counts what was shown though never sent. A forger who computes checksums can make messages, contacts and
-    reports (there is no authentication without a seal), so frames with right checksums over nonsense are kept to a
-    source of their own, whose events are counted apart; of all others none may be wrong.
+    `forged` counts reported content that was never sent. An attacker who computes checksums can forge messages,
+    contacts and feedback without authentication. So frames with correct checksums over random content have a source of
+    their own, which is counted separately; no event of the other source may be wrong.
     """
     rng = np.random.default_rng(seed)
     source, receiver, now = genuine(seed), V1Receiver(SMALL), 0.0
@@ -145,7 +145,7 @@ def check_bounds(receiver: V1Receiver) -> None:
 
 
 def one_input(data: bytes) -> None:
-    """Take frames from one string: a length byte, then a frame, with its checksum put right."""
+    """Pass the frames in one string (a length byte, then a frame), with and without a correct checksum."""
     receiver, at, now = V1Receiver(SMALL), 0, 0.0
     while at < len(data):
         covered = data[at + 1 : at + 1 + data[at]]

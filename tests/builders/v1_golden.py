@@ -1,6 +1,6 @@
 """Content of the v1 golden files; `PYTHONPATH=tests python -m builders.v1_golden` adds missing ones.
 
-Files that exist are not written again: bytes of a wire format may be added, never changed.
+Existing files are not written again: bytes of a wire format can be added, never changed.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ def describe_event(event: Event) -> dict[str, Any]:
             }
         case MessageReceived():
             return {"message": event.number, "data": event.data.hex()}
-        case FeedbackReceived(feedback=report):
-            return {"report": type(report).__name__, "data": report.pack().hex()}
+        case FeedbackReceived(feedback=feedback):
+            return {"report": type(feedback).__name__, "data": feedback.pack().hex()}
         case FrameRejected():
             return {"refused": event.reason.field}
 
@@ -145,7 +145,9 @@ def codes() -> dict[str, Any]:
                 "bounds": list(layering.bounds(27)),
                 "descriptor": layering.pack().hex(),
                 "objects": [data.hex() for data in objects],
-                "symbols": [[i, told, data.hex()] for i, (told, data) in zip(indices, made_symbols, strict=True)],
+                "symbols": [
+                    [i, descriptor, data.hex()] for i, (descriptor, data) in zip(indices, made_symbols, strict=True)
+                ],
             }
         )
     return {"blocks": blocks, "layered": layered}
@@ -177,7 +179,7 @@ def objects() -> dict[str, Any]:
 
 
 def exchange() -> dict[str, Any]:
-    """Frames with times, and what a receiver must report of them."""
+    """Return frames with times, and the events of a receiver."""
     steps: list[dict[str, Any]] = []
     receiver, rng = V1Receiver(), np.random.default_rng(1)
     for channels, size in (
@@ -201,12 +203,12 @@ def exchange() -> dict[str, Any]:
             steps.append(
                 {"at": now, "source": source, "frame": frame.hex(), "events": [describe_event(e) for e in events]}
             )
-    reports = {
-        str(source): report.pack().hex()
+    feedback = {
+        str(source): message.pack().hex()
         for source in sorted({s["source"] for s in steps})
-        if (report := receiver.feedback(source, float(len(steps)))) is not None
+        if (message := receiver.feedback(source, float(len(steps)))) is not None
     }
-    return {"steps": steps, "reports": reports}
+    return {"steps": steps, "reports": feedback}
 
 
 MAKERS = {"frames": frames, "codes": codes, "objects": objects, "exchange": exchange}

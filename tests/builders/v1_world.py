@@ -1,4 +1,4 @@
-"""A sender, a receiver and water between them, for the tests of the v1 link."""
+"""A sender, a receiver and a channel between them, for the tests of the v1 format."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def stream(number: int, length: int) -> bytes:
 
 
 def take_packet(queue: ImageSender, now: float) -> tuple[bytes, ...]:
-    """Return the frames of the next packet, which counts as sent, none if there is none."""
+    """Return the frames of the next packet and count it as sent; none if there is no packet."""
     packet = queue.next_packet(now)
     frames = () if packet is None else packet.frames
     queue.sent(frames, queue.packet_interval_s)
@@ -38,7 +38,7 @@ def take_packet(queue: ImageSender, now: float) -> tuple[bytes, ...]:
 
 
 def next_frames(sender: V1Sender, count: int, now: float) -> tuple[bytes, ...]:
-    """Return the next frames of a sender, fewer if there are not so many."""
+    """Return the next frames of a sender, at most `count`."""
     frames = (sender.next_frame(now) for _ in range(count))
     return tuple(frame for frame in frames if frame is not None)
 
@@ -50,7 +50,11 @@ def feedback_frame(feedback: Feedback, protection: FrameProtection | None = None
 
 @dataclass
 class World:
-    """Sends frames of 1 s through water that loses those it says."""
+    """Sends a frame every second through a channel that loses some.
+
+    Attributes:
+        passes: Decides whether a frame arrives.
+    """
 
     sender: V1Sender
     receiver: V1Receiver
@@ -58,7 +62,7 @@ class World:
     feedback: bool = False
     now: float = 0.0
     frames: int = 0
-    reports: int = 0
+    feedback_frames: int = 0
     events: list[Event] = field(default_factory=list)
     sent: dict[int, bytes] = field(default_factory=dict)
 
@@ -86,11 +90,11 @@ class World:
                     self.take(frame)
             if not (self.feedback and self.receiver.feedback_is_due(VEHICLE, self.now)):
                 continue
-            report = self.receiver.feedback(VEHICLE, self.now)
-            assert report is not None
-            self.reports += 1
+            feedback = self.receiver.feedback(VEHICLE, self.now)
+            assert feedback is not None
+            self.feedback_frames += 1
             if self.passes():
-                (event,) = back.accept(VESSEL, feedback_frame(report), self.now)
+                (event,) = back.accept(VESSEL, feedback_frame(feedback), self.now)
                 assert isinstance(event, FeedbackReceived)
                 self.sender.on_feedback(event.feedback, self.now)
 

@@ -1,4 +1,4 @@
-"""Ranges against plain sets of positions."""
+"""Byte ranges, compared with sets of positions."""
 
 from __future__ import annotations
 

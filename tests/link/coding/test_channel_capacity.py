@@ -1,4 +1,4 @@
-"""How many frames arrive: against the binomial law and against simulated chains."""
+"""The loss model, compared with the binomial distribution and with simulated chains."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ def test_no_frames_and_no_loss() -> None:
 
 
 def test_unseen_share_of_a_systematic_block() -> None:
-    # One source symbol sent twice: unseen when both are lost.
+    # One source symbol sent twice: unseen if both are lost.
     assert unseen_share(1, 2, LossChannel(0.3)) == pytest.approx(0.09)
-    # Two sent once: each unseen when lost, and when only one came nothing else is known.
+    # Two source symbols sent once: each is unseen if it is lost.
     assert unseen_share(2, 2, LossChannel(0.3)) == pytest.approx(0.3)
     assert frames_for(1, LossChannel(0.3), 0.05, 99) == 3
     assert frames_for(1, LossChannel(0.3), 1e-9, 5) == 5

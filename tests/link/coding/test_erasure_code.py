@@ -1,4 +1,4 @@
-"""The erasure code against reedsolo, and any k of n."""
+"""The erasure code: equal to reedsolo, and recovery from any k symbols."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the planner chooses, against brute force and against what must hold."""
+"""The redundancy plan, compared with brute force, and its properties."""
 
 from __future__ import annotations
 

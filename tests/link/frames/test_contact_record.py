@@ -1,4 +1,4 @@
-"""The contact record: what travels is what was meant, within the step of each field, or is unknown."""
+"""The contact record: values round trip within the step of their field, or become unknown."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PLACES = st.none() | st.tuples(st.sampled_from(Side), maybe(st.floats(0, 3276)))
 
 @st.composite
 def contacts(draw: st.DrawFn) -> ContactSummary:
-    """Any contact whose every known value the record can hold."""
+    """Draw a contact with values that the record can hold."""
     height_px, width_px = draw(SIZES) or (None, None)
     lat_deg, lon_deg, sigma_m = draw(FIXES) or (None, None, None)
     side, ground_range_m = draw(PLACES) or (None, None)
@@ -106,7 +106,7 @@ def test_any_record_that_parses_packs_to_the_same_bytes(data: bytes) -> None:
 
 @pytest.mark.parametrize("position", [20, 21, 22, 27, 28, 29])
 def test_all_codes_of_one_byte_fields_round_trip(position: int) -> None:
-    # Random records rarely have a picture size and a position in range, so the codes are walked through here.
+    # Random records rarely have an image size and a position in range, so this test covers all codes.
     base = bytearray(ContactSummary(height_px=80, width_px=140, lat_deg=1, lon_deg=2).pack())
     values = []
     for code in range(256):
@@ -120,16 +120,16 @@ def test_all_codes_of_one_byte_fields_round_trip(position: int) -> None:
 @pytest.mark.parametrize("start", [18, 20])
 def test_all_codes_of_two_byte_fields_round_trip(start: int) -> None:
     base = bytearray(ContactSummary().pack())
-    refused = []
+    rejected = []
     for code in range(65536):
         base[start : start + 2] = struct.pack(">H", code)
         try:
             contact = ContactSummary.unpack(bytes(base))
         except FrameError:
-            refused.append(code)
+            rejected.append(code)
             continue
         assert contact.pack() == bytes(base)
-    assert refused == ([] if start == 18 else [0xFFFE])
+    assert rejected == ([] if start == 18 else [0xFFFE])
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What was given up is repaired: sent while nobody reported, pushed out, of another frame length, before a restart."""
+"""Repair of images: sent without feedback, in blocks that left the window or have another frame length, restarts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ VESSEL = 1
 
 
 class Exchange:
-    """A vehicle and a vessel; what the vessel has of each picture."""
+    """A vehicle and a vessel, and the stream of each image as far as the vessel received it."""
 
     def __init__(self, loss: float = 0.3, **config: object) -> None:
         rng = np.random.default_rng(5)
@@ -38,14 +38,14 @@ class Exchange:
         image = ImageToSend(image_of_number(number), f"c{number}", contact(number), self.streams[number])
         self.queue.add_image(image, self.now)
 
-    def run(self, seconds: float, *, reports: bool, water: bool = True) -> None:
-        """Send for so long, or until there is nothing to send."""
+    def run(self, seconds: float, *, feedback: bool, reception: bool = True) -> None:
+        """Send for `seconds`, or until there is nothing to send."""
         end = self.now + seconds
         while self.now < end:
             frames = take_packet(self.queue, self.now)
             self.now += RATES[self.queue.rate].airtime_s
             for frame in frames:
-                if not water or self.lost():
+                if not reception or self.lost():
                     continue
                 for event in self.receiver.accept(VEHICLE, frame, self.now):
                     if isinstance(event, MessageReceived):
@@ -54,10 +54,10 @@ class Exchange:
                     number = number_of_image(event.image_id)
                     assert self.streams[number].startswith(event.stream)
                     self.shown[number] = event.stream
-            if reports and self.receiver.feedback_is_due(VEHICLE, self.now):
-                report = self.receiver.feedback(VEHICLE, self.now)
-                if report is not None and not self.lost():
-                    self.queue.on_feedback(report, self.now, VESSEL)
+            if feedback and self.receiver.feedback_is_due(VEHICLE, self.now):
+                feedback_message = self.receiver.feedback(VEHICLE, self.now)
+                if feedback_message is not None and not self.lost():
+                    self.queue.on_feedback(feedback_message, self.now, VESSEL)
 
     def restart(self) -> None:
         parts = self.queue.parts()
@@ -65,11 +65,11 @@ class Exchange:
         assert not self.queue.restore(parts)
 
     @property
-    def whole(self) -> list[int]:
+    def complete(self) -> list[int]:
         return [n for n, data in self.streams.items() if self.shown.get(n) == data]
 
 
-def settled(exchange: Exchange) -> bool:
+def all_delivered(exchange: Exchange) -> bool:
     kept = exchange.queue.sender.kept
     return all(count_positions(kept[n].delivered) == len(data) for n, data in exchange.streams.items())
 
@@ -78,35 +78,35 @@ def test_images_sent_without_feedback_are_completed_with_feedback() -> None:
     exchange = Exchange()
     for number in range(1, 25):
         exchange.add(number)
-        exchange.run(300.0, reports=False)
+        exchange.run(300.0, feedback=False)
     assert len(exchange.shown) == 24
-    assert len(exchange.whole) < 24
-    exchange.run(3 * 3600.0, reports=True)
-    assert len(exchange.whole) == 24
-    assert settled(exchange)
+    assert len(exchange.complete) < 24
+    exchange.run(3 * 3600.0, feedback=True)
+    assert len(exchange.complete) == 24
+    assert all_delivered(exchange)
 
 
 def test_images_sent_before_contact_are_completed_with_feedback() -> None:
     exchange = Exchange()
     for number in range(1, 41):
         exchange.add(number)
-        exchange.run(200.0, reports=False, water=False)
+        exchange.run(200.0, feedback=False, reception=False)
     assert not exchange.shown
     exchange.add(41)
-    exchange.run(4 * 3600.0, reports=True)
-    assert len(exchange.whole) == 41
-    assert settled(exchange)
+    exchange.run(4 * 3600.0, feedback=True)
+    assert len(exchange.complete) == 41
+    assert all_delivered(exchange)
 
 
 def test_delivered_images_are_not_sent_again() -> None:
     exchange = Exchange()
     for number in range(1, 6):
         exchange.add(number)
-    exchange.run(3600.0, reports=True)
-    assert len(exchange.whole) == 5
-    assert settled(exchange)
+    exchange.run(3600.0, feedback=True)
+    assert len(exchange.complete) == 5
+    assert all_delivered(exchange)
     sent = exchange.queue.sender.state.frames_sent
-    exchange.run(3600.0, reports=True)
+    exchange.run(3600.0, feedback=True)
     assert exchange.queue.sender.state.frames_sent == sent
     assert exchange.queue.is_idle
 
@@ -115,90 +115,90 @@ def test_received_parts_of_retired_blocks_are_not_sent_again() -> None:
     exchange = Exchange(loss=0.0)
     for number in range(1, 8):
         exchange.add(number)
-        exchange.run(60.0, reports=False)
+        exchange.run(60.0, feedback=False)
     first = exchange.queue.sender.state.frames_sent
     assert len(exchange.queue.sender.retired) == 14
     there = sum(len(data) for data in exchange.shown.values())
     exchange.add(8)
-    exchange.run(7200.0, reports=True)
-    assert len(exchange.whole) == 8
-    assert settled(exchange)
-    # What had been cut from seven, and the eighth.
+    exchange.run(7200.0, feedback=True)
+    assert len(exchange.complete) == 8
+    assert all_delivered(exchange)
+    # The missing parts of seven images, and the eighth image.
     cut = 8 * 300 - there
     assert exchange.queue.sender.state.frames_sent - first <= 2 + 1.25 * cut / exchange.queue.sender.symbol_bytes
 
 
-@pytest.mark.parametrize("reports", [True, False])
-def test_restart_at_any_time_loses_no_image(reports: bool) -> None:
+@pytest.mark.parametrize("feedback", [True, False])
+def test_restart_at_any_time_loses_no_image(feedback: bool) -> None:
     exchange = Exchange(loss=0.4)
     for number in range(1, 21):
         exchange.add(number)
-        exchange.run(90.0, reports=reports and number % 3 == 0)
+        exchange.run(90.0, feedback=feedback and number % 3 == 0)
         exchange.restart()
     for _ in range(12):
-        exchange.run(1200.0, reports=True)
+        exchange.run(1200.0, feedback=True)
         exchange.restart()
-    assert len(exchange.whole) == 20
-    assert settled(exchange)
+    assert len(exchange.complete) == 20
+    assert all_delivered(exchange)
 
 
 def test_feedback_gaps_and_other_frame_lengths_lose_no_image() -> None:
     exchange = Exchange(rates=(1, 0), first_rate=1)
     for number in range(1, 31):
         exchange.add(number)
-        # Thirteen minutes with, twenty without anything that is heard: the rate falls back, blocks are given up.
-        exchange.run(200.0, reports=number % 10 < 4, water=number % 10 < 4)
-    exchange.run(6 * 3600.0, reports=True)
-    assert len(exchange.whole) == 30
-    assert settled(exchange)
+        # 13 minutes with feedback, 20 without reception: the rate falls back, blocks are given up.
+        exchange.run(200.0, feedback=number % 10 < 4, reception=number % 10 < 4)
+    exchange.run(6 * 3600.0, feedback=True)
+    assert len(exchange.complete) == 30
+    assert all_delivered(exchange)
 
 
 def test_delivered_images_are_deleted_first() -> None:
     exchange = Exchange(loss=0.0, kept_images=8)
     for number in range(1, 5):
         exchange.add(number)
-    exchange.run(3600.0, reports=True)
-    assert settled(exchange)
-    exchange.run(5400.0, reports=False, water=False)
+    exchange.run(3600.0, feedback=True)
+    assert all_delivered(exchange)
+    exchange.run(5400.0, feedback=False, reception=False)
     for number in range(5, 13):
         exchange.add(number)
-        exchange.run(2000.0, reports=False, water=False)
+        exchange.run(2000.0, feedback=False, reception=False)
     assert set(exchange.queue.sender.kept) == set(range(5, 13)), "what may still have to be sent is kept"
 
 
 def test_refinement_without_feedback_is_repaired_later() -> None:
     exchange = Exchange(stream_bytes=200)
     exchange.add(1, length=900)
-    exchange.run(200.0, reports=False)
+    exchange.run(200.0, feedback=False)
     assert exchange.queue.refine(1, 700, exchange.now)
-    exchange.run(60.0, reports=False, water=False)
-    exchange.run(3600.0, reports=True)
+    exchange.run(60.0, feedback=False, reception=False)
+    exchange.run(3600.0, feedback=True)
     assert 700 <= len(exchange.shown[1]) < 760
     assert exchange.queue.refine(1, 0, exchange.now)
-    exchange.run(3600.0, reports=True)
-    assert exchange.whole == [1]
+    exchange.run(3600.0, feedback=True)
+    assert exchange.complete == [1]
 
 
 @pytest.mark.parametrize("length", [28, 29, 30, 31, 32])
 def test_stream_that_just_fills_its_preview_is_completed(length: int) -> None:
     exchange = Exchange(loss=0.0)
     exchange.add(1, length)
-    exchange.run(600.0, reports=True)
-    assert exchange.whole == [1]
+    exchange.run(600.0, feedback=True)
+    assert exchange.complete == [1]
     assert exchange.receiver.counts.complete == 1
 
 
 def test_reminders_of_a_lost_block_are_sent_among_many_messages() -> None:
     exchange = Exchange(loss=0.0)
     exchange.add(1)
-    exchange.run(600.0, reports=True)
-    assert exchange.whole == [1]
+    exchange.run(600.0, feedback=True)
+    assert exchange.complete == [1]
     exchange.add(2)
     count = 0
     for minutes in range(10):
-        for _ in range(30):  # more than there is room for
+        for _ in range(30):  # more than fits
             count += 1
             exchange.queue.add_message(f"m{count}", "flood", bytes([count % 256]) * 55, exchange.now, lifetime_s=600.0)
-        # Of the second picture nothing comes at first, so that the receiver does not even know that something lacks.
-        exchange.run(60.0, reports=True, water=minutes >= 3)
-    assert exchange.whole == [1, 2]
+        # At first no frame of the second image arrives, so the receiver cannot feedback_message it as missing.
+        exchange.run(60.0, feedback=True, reception=minutes >= 3)
+    assert exchange.complete == [1, 2]

@@ -171,7 +171,7 @@ def test_contact_frame_detects_bursts_of_up_to_16_wrong_bits(first_bit: int, len
     assume(burst < 1 << (8 * CONTACT_FRAME_SIZE))
     damaged = (int.from_bytes(frame, "big") ^ burst).to_bytes(CONTACT_FRAME_SIZE, "big")
     if damaged[:1] in b"TB":
-        return  # read as a half frame, which carries no position
+        return  # parsed as a half frame, which has no checksum
     with pytest.raises(FrameError):
         parse_frame(damaged)
 

@@ -1,4 +1,4 @@
-"""The pairing receiver: golden scenarios, and single rules."""
+"""The receiver of the paper format: golden scenarios, and each rule."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def contacts_only(events: list[Event]) -> list[ImageUpdate]:
 
 
 def describe(event: Event) -> dict[str, Any]:
-    """The event as the golden files write it."""
+    """Return the event as in the golden files."""
     match event:
         case ImageUpdate() if event.stream:
             return {
@@ -115,7 +115,7 @@ def test_timeout_starts_at_the_last_frame_with_new_content() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, piece(0, 2), 0)
     receiver.accept(2, piece(2, 3), 50)
-    receiver.accept(2, piece(0, 3), 100)  # nothing new
+    receiver.accept(2, piece(0, 3), 100)  # a duplicate
     assert receiver.next_deadline() == 110
     assert receiver.poll(109.9) == []
     (event,) = images(receiver.poll(110))
@@ -215,7 +215,7 @@ def test_outvoted_header_is_corrected_by_a_new_version() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, half("top", header=wrong), 0)
     assert [header_of(e) for e in images(receiver.poll(60))] == [wrong]
-    assert receiver.accept(2, half("top"), 61) == []  # a draw: the first one stays, nothing new to give out
+    assert receiver.accept(2, half("top"), 61) == []  # a draw: the first header stays, nothing to report
     assert receiver.next_deadline() is None
     (event,) = images(receiver.accept(2, half("bottom"), 62))
     assert (event.version, header_of(event), body_of(event), event.complete) == (2, HEADER, BODY, True)
@@ -272,7 +272,7 @@ def test_identifier_reused_after_memory_s_is_a_new_image() -> None:
     receiver.accept(2, half("top"), 0)
     receiver.accept(2, half("bottom"), 1)
     assert receiver.accept(2, half("top"), 3601) == []
-    assert receiver.counts.duplicates == 1  # heard again, so remembered from here
+    assert receiver.counts.duplicates == 1  # memory_s starts again here
     assert receiver.accept(2, half("top"), 7202) == []
     (event,) = images(receiver.accept(2, half("bottom"), 7203))
     assert (event.version, event.first_frame_s, event.complete) == (1, 7202, True)
@@ -311,7 +311,7 @@ def test_memory_is_bounded_and_deleted_images_are_reported() -> None:
     for number in range(50):
         frame = HalfFrame("top", format_image_id(number), 0, 65535, HEADER, b"x").pack()
         events += receiver.accept(number, frame, number / 100)
-    assert [e.source for e in images(events)] == list(range(46))  # the longest unheard first
+    assert [e.source for e in images(events)] == list(range(46))  # the least recently seen first
     assert len(group(receiver.parts(), "image")) == 4
     assert receiver.counts.evicted == 46
     assert sorted(e.source for e in images(receiver.poll(100))) == [46, 47, 48, 49]
@@ -322,7 +322,9 @@ def test_reported_images_are_deleted_before_open_ones() -> None:
     receiver.accept(1, half("top"), 0)
     receiver.accept(2, half("top"), 1)
     assert len(images(receiver.accept(2, half("bottom"), 2))) == 1
-    assert receiver.accept(3, half("top"), 3) == []  # source 2's image made room, although heard later than 1's
+    assert (
+        receiver.accept(3, half("top"), 3) == []
+    )  # deletes the image of source 2, although it was seen after that of source 1
     (event,) = images(receiver.accept(1, half("bottom"), 4))
     assert (event.source, event.version, event.complete) == (1, 1, True)
 
@@ -372,7 +374,7 @@ IMAGE = "image/2/00A7"
 
 
 def _wrong_fields() -> list[tuple[str, dict[str, Any]]]:
-    """One wrong value for every field of a state, as (part, fields)."""
+    """Return wrong values for the fields of a state, as part and fields."""
     plain = plain_of(busy_receiver().parts(), IMAGE)
     candidates = plain[field_names(PendingImage).index("candidates")]
     candidate = dict(zip(field_names(ImageCandidate)[1:], candidates[0], strict=True))

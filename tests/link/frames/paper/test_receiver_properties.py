@@ -1,4 +1,4 @@
-"""What holds for any frames in any order: right bytes at the right place, every version once, restarts unseen."""
+"""The paper receiver with any frames in any order: correct bytes, each version once, restarts without effect."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Key = tuple[int, str]
 
 @dataclass(frozen=True)
 class Sent:
-    """One image of one source: its body, and its frames."""
+    """One image of one source, with its frames."""
 
     source: int
     image_id: str
@@ -40,7 +40,7 @@ class Sent:
 
 @dataclass(frozen=True)
 class Step:
-    """A frame that arrives, or None for a look at the clock."""
+    """A frame that arrives, or None for a poll."""
 
     at: float
     source: int
@@ -68,11 +68,11 @@ def sent_images(draw: st.DrawFn) -> list[Sent]:
 
 @st.composite
 def deliveries(draw: st.DrawFn) -> tuple[list[Sent], list[Step]]:
-    """Images, and any selection of their frames in any order, repeated, padded or cut, at any pace."""
+    """Draw images and deliveries of their frames: lost, reordered, repeated, padded or cut, at any times."""
     images = draw(sent_images())
     frames = [(image.source, frame) for image in images for frame in image.frames]
     chosen = draw(st.lists(st.sampled_from(frames), max_size=25))
-    if draw(st.booleans()):  # mostly in order, as real packets come, so that images do get complete
+    if draw(st.booleans()):  # mostly in order, as real packets arrive, so that images become complete
         chosen = sorted(chosen, key=frames.index) + draw(st.lists(st.sampled_from(frames), max_size=5))
     steps, now = [], 0.0
     for source, frame in chosen:
@@ -85,7 +85,7 @@ def deliveries(draw: st.DrawFn) -> tuple[list[Sent], list[Step]]:
 
 @st.composite
 def as_it_arrives(draw: st.DrawFn, frame: bytes) -> bytes:
-    how = draw(st.sampled_from(["whole"] * 6 + ["padded", "cut"]))
+    how = draw(st.sampled_from(["complete"] * 6 + ["padded", "cut"]))
     if how == "padded" and reaches_the_end(frame):
         return frame + bytes(draw(st.integers(1, 40)))
     if how == "cut":
@@ -109,7 +109,7 @@ def positions(ranges: Ranges) -> set[int]:
 
 
 class Ledger:
-    """What has really been delivered, kept without any of the receiver's code but the parser."""
+    """An independent record of the delivered bytes, which uses only the parser of the receiver."""
 
     def __init__(self, images: list[Sent]) -> None:
         self.images = {(image.source, image.image_id): image for image in images}
@@ -118,7 +118,7 @@ class Ledger:
         self.versions: dict[Key, list[ImageUpdate]] = defaultdict(list)
 
     def deliver(self, step: Step) -> bool:
-        """Note what the frame brings; return whether it parses."""
+        """Record the content of a frame; return whether it parses."""
         try:
             parsed = parse_frame(step.frame or b"")
         except Exception:  # noqa: BLE001 - which exceptions there are is another test's matter
@@ -142,7 +142,7 @@ class Ledger:
             assert event.complete == (len(there) == len(image.body))
             assert event.conflicts == 0
             assert event.contact in (None, CONTACT.rounded())
-        if earlier:  # a new version says more than the one before
+        if earlier:  # a new version holds more than the one before
             assert knowledge(event) > knowledge(earlier[-1])
         earlier.append(event)
 
@@ -172,7 +172,7 @@ def test_any_frames_in_any_order_give_correct_bytes_and_each_version_once(
         assert isinstance(event, ImageUpdate)
         ledger.check(event)
     assert receiver.next_deadline() is None
-    # Nothing that arrived is held back: the last version of each image tells all of it.
+    # The last version of each image holds everything that arrived.
     for key, there in ledger.bytes_there.items():
         last = ledger.versions[key][-1]
         assert last.stream
@@ -198,7 +198,7 @@ def test_a_restart_at_every_point_changes_nothing(delivery: tuple[list[Sent], li
 
 
 def comparable(events: list[Event]) -> list[Any]:
-    """Errors have no equality of their own."""
+    """Return the events with errors as text, because errors cannot be compared."""
     return [(e.source, e.received_s, str(e.reason)) if isinstance(e, FrameRejected) else e for e in events]
 
 
@@ -221,22 +221,22 @@ def test_hostile_frames_and_times_never_raise_and_memory_is_bounded(
 ) -> None:
     receiver = PaperReceiver(TIMEOUT_S, max_images=3)
     versions: dict[Key, int] = {}
-    told: dict[Key, set[tuple[StreamHeader, int]]] = defaultdict(set)
+    announced: dict[Key, set[tuple[StreamHeader, int]]] = defaultdict(set)
     for source, frame, now in arrivals:
         with suppress(FrameError):
             if isinstance(parsed := parse_frame(frame), HalfFrame):
-                told[source, parsed.image_id].add((parsed.header, parsed.body_length))
+                announced[source, parsed.image_id].add((parsed.header, parsed.body_length))
         for event in receiver.accept(source, frame, now):
             if not isinstance(event, ImageUpdate):
                 assert isinstance(event, FrameRejected)
                 continue
             key = (event.source, event.image_id)
-            # Forgotten images start again at 1; otherwise versions count up one by one.
+            # Deleted images start again at 1; otherwise versions count up one by one.
             assert event.version in (1, versions.get(key, 0) + 1)
             versions[key] = event.version
             if event.stream:
                 there = positions(received_of(event))
-                assert (header_of(event), len(body_of(event))) in told[key]
+                assert (header_of(event), len(body_of(event))) in announced[key]
                 assert all(byte == 0 for i, byte in enumerate(body_of(event)) if i not in there)
         parts = receiver.parts()
         stored = group(parts, "image")

@@ -1,4 +1,4 @@
-"""Packet plans: golden plans, and the rules held to for any picture at any rate."""
+"""Packet plans: golden plans, and the rules for any image at any rate."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RATES = {0: (1, 32), 1: (3, 64), 2: (3, 64), 3: (2, 256), 4: (2, 256), 5: (8, 25
 CONTACT = ContactSummary(height_px=80, width_px=140, lat_deg=44.7, lon_deg=-63.6, confidence=1.5)
 
 
-# By their length: no model, a small one, a codebook; each with common sides and with another height.
+# By length: no model, a small model, a codebook; each with common sides and with another height.
 HEADERS = {
     header.size: header
     for height_px in (80, 81)
@@ -50,7 +50,7 @@ def test_golden_plans(case: dict[str, Any]) -> None:
 
 
 def fewest_packets(length: int, frames_per_packet: int, payload_bytes: int) -> int:
-    """Packets needed when nothing but the count matters and halves may share."""
+    """Return the number of packets if halves may share packets freely."""
     step = payload_bytes
     top, bottom = half_bounds(length, "top")[1], length // 2
     frames = max(1, -(-top // step)) + -(-bottom // step)
@@ -74,7 +74,7 @@ def test_plan_keeps_all_rules(length: int, rate: int, with_contact: bool, header
     assert all(len(frame) <= frame_bytes for packet in plan for frame in packet)
     parsed = [[parse_frame(frame) for frame in packet] for packet in plan]
     halves = [f for packet in parsed for f in packet if isinstance(f, HalfFrame)]
-    assert b"".join(f.payload for f in halves) == stream[header_bytes:]  # in order, once, top before bottom
+    assert b"".join(f.payload for f in halves) == stream[header_bytes:]  # in order, each once, top before bottom
     assert all(f.header == HEADERS[header_bytes] and f.body_length == length for f in halves)
     assert [f.half for f in halves] == sorted((f.half for f in halves), reverse=True)
 
@@ -107,18 +107,18 @@ def check_contact(
     assert all(f == ContactFrame("0K3P", CONTACT.rounded()) for packet in records for f in packet)
     alone = [i for i, packet in enumerate(parsed) if len(records[i]) == len(packet)]
     if alone:
-        assert alone == [0]  # a packet of its own only where no other has a free frame
+        assert alone == [0]  # a packet of its own only if no other packet has a free frame
         assert plan[0] == (ContactFrame("0K3P", CONTACT).pack(),)
         assert all(len(packet) == frames_per_packet and not records[i] for i, packet in enumerate(parsed) if i)
     else:
-        assert all(len(packet) == frames_per_packet for packet in plan)  # every frame left free is used
+        assert all(len(packet) == frames_per_packet for packet in plan)  # every free frame is used
         leading = next(i for i, packet in enumerate(records) if packet)
         assert isinstance(parsed[leading][0], ContactFrame)
         check_contact_leads(parsed, frames_per_packet)
 
 
 def check_contact_leads(parsed: list[list[HalfFrame | ContactFrame]], frames_per_packet: int) -> None:
-    """The record comes first in each half (in both, where they share) that leaves a frame free, other copies last."""
+    """Check that the record goes first in each half (in both if they share) with a free frame, further copies last."""
     kinds = ["".join("C" if isinstance(f, ContactFrame) else f.half[0] for f in packet) for packet in parsed]
     shared = any("t" in kind and "b" in kind for kind in kinds)
     groups = ["".join(kinds)] if shared else ["".join(k for k in kinds if half in k) for half in "tb"]
@@ -170,7 +170,7 @@ def test_all_frames_give_one_complete_image_with_contact(length: int, rate: int,
     receiver = PaperReceiver(60)
     plan = plan_packets("0K3P", stream, CONTACT, *RATES[rate])
     events = [e for packet in plan for frame in packet for e in receiver.accept(2, frame, 0)]
-    (event,) = events  # one version: nothing that comes later was worth another
+    (event,) = events  # one version: later frames add nothing
     assert isinstance(event, ImageUpdate)
     assert event.complete
     assert event.stream == stream

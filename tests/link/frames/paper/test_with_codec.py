@@ -1,4 +1,4 @@
-"""The paper's chain without water: a picture through codec, packets and receiver; what is lost is black and marked."""
+"""The paper's chain without a channel: image, codec, packets, receiver. Lost parts are black and marked as missing."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ CONTACT = ContactSummary(height_px=HEIGHT_PX, width_px=WIDTH_PX, lat_deg=44.7, l
 
 
 @pytest.fixture(scope="module")
-def picture() -> np.ndarray:
+def image() -> np.ndarray:
     return np.random.default_rng(7).integers(1, 256, (HEIGHT_PX, WIDTH_PX), dtype=np.uint8)
 
 
 @pytest.fixture(scope="module")
-def codec(picture: np.ndarray) -> VqCodec:
-    return VqCodec(TileDatabase.from_tiles(TILE_PX, cut_tiles(picture, TILE_PX)))
+def codec(image: np.ndarray) -> VqCodec:
+    return VqCodec(TileDatabase.from_tiles(TILE_PX, cut_tiles(image, TILE_PX)))
 
 
 def send(packets: tuple[Packet, ...], lost: set[int]) -> ImageUpdate:
-    """Hand over every packet but the lost ones, each as long after the one before as at rate 1."""
+    """Deliver all packets except the lost ones, at the interval of rate 1."""
     receiver = PaperReceiver(60)
     events = []
     for number, packet in enumerate(packets):
@@ -40,21 +40,21 @@ def send(packets: tuple[Packet, ...], lost: set[int]) -> ImageUpdate:
 
 
 @pytest.mark.parametrize(
-    ("lost", "there"),
+    ("lost", "received_rows"),
     [((), slice(0, HEIGHT_PX)), ((1,), slice(0, HEIGHT_PX // 2)), ((0,), slice(HEIGHT_PX // 2, HEIGHT_PX))],
     ids=["nothing lost", "bottom lost", "top lost"],
 )
 def test_received_half_is_decoded_at_its_place(
-    picture: np.ndarray, codec: VqCodec, lost: tuple[int, ...], there: slice
+    image: np.ndarray, codec: VqCodec, lost: tuple[int, ...], received_rows: slice
 ) -> None:
-    packets = plan_packets("0001", codec.encode(picture), CONTACT, 3, 64)
+    packets = plan_packets("0001", codec.encode(image), CONTACT, 3, 64)
     assert len(packets) == 2
     event = send(packets, set(lost))
-    assert event.contact == CONTACT.rounded()  # in both packets, so it survives the loss of either
+    assert event.contact == CONTACT.rounded()  # in both packets
     decoded = codec.decode(event.stream, event.received_mask())
-    assert np.array_equal(decoded.image[there], picture[there])
-    gone = np.ones(HEIGHT_PX, dtype=bool)
-    gone[there] = False
-    assert not decoded.image[gone].any()
-    assert decoded.missing[gone].all()
-    assert not decoded.missing[there].any()
+    assert np.array_equal(decoded.image[received_rows], image[received_rows])
+    lost_rows = np.ones(HEIGHT_PX, dtype=bool)
+    lost_rows[received_rows] = False
+    assert not decoded.image[lost_rows].any()
+    assert decoded.missing[lost_rows].all()
+    assert not decoded.missing[received_rows].any()

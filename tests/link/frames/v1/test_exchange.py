@@ -1,4 +1,4 @@
-"""The v1 sender and receiver over simulated water."""
+"""The v1 sender and receiver over a simulated channel."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_feedback_completes_all_images_close_to_the_erasure_bound(loss: float, l
         assert len(world.latest) == 120
         assert all(e.complete and len(e.stream) >= 420 for e in world.latest.values())
         payload = sum(25 + len(e.stream) for e in world.latest.values())
-        ratios.append((world.frames + world.reports) / erasure_bound_frames(payload, 64, loss))
+        ratios.append((world.frames + world.feedback_frames) / erasure_bound_frames(payload, 64, loss))
     assert sum(ratios) / len(ratios) <= limit
 
 
@@ -375,7 +375,7 @@ def test_old_blocks_and_contacts_are_deleted() -> None:
     frame = sender.next_frame(0.0)
     assert frame is not None
     assert len(receiver.accept(VEHICLE, frame, 0.0)) == 1
-    assert receiver.accept(VEHICLE, frame, 50.0) == []  # known, though the block was forgotten
+    assert receiver.accept(VEHICLE, frame, 50.0) == []  # a duplicate, although the block was deleted
     (event,) = receiver.accept(VEHICLE, frame, 200.0)
     assert isinstance(event, ImageUpdate)
     assert event.version == 1
@@ -383,9 +383,9 @@ def test_old_blocks_and_contacts_are_deleted() -> None:
 
 def test_unknown_segment_is_reported_and_the_others_are_used() -> None:
     frame = pack_segments([Segment(25, b"new"), Segment(SegmentKind.MESSAGE, b"\x01hello")], 64)
-    refused, message = V1Receiver().accept(VEHICLE, frame, 0.0)
-    assert isinstance(refused, FrameRejected)
-    assert "segment kind" in str(refused.reason)
+    rejected, message = V1Receiver().accept(VEHICLE, frame, 0.0)
+    assert isinstance(rejected, FrameRejected)
+    assert "segment kind" in str(rejected.reason)
     assert getattr(message, "data", None) == b"hello"
 
 
@@ -421,9 +421,9 @@ def test_block_continues_until_all_receivers_have_it() -> None:
             for event in receiver.accept(VEHICLE, frame, now) if frame and rng.random() >= 0.4 else []:
                 assert isinstance(event, ImageUpdate)
                 latest[address, number_of_image(event.image_id)] = event
-            report = receiver.feedback(VEHICLE, now) if receiver.feedback_is_due(VEHICLE, now) else None
-            if report is not None and rng.random() >= 0.4:
-                sender.on_feedback(report, now, receiver=address)
+            feedback = receiver.feedback(VEHICLE, now) if receiver.feedback_is_due(VEHICLE, now) else None
+            if feedback is not None and rng.random() >= 0.4:
+                sender.on_feedback(feedback, now, receiver=address)
     assert len(latest) == 60
     assert all(e.complete and e.stream == stream(number_of_image(e.image_id), 300) for e in latest.values())
     assert sender.measured_loss == pytest.approx(0.4, abs=0.2)

@@ -43,8 +43,8 @@ def test_symbol_round_trip(symbol: Symbol) -> None:
 @given(symbols(), st.sampled_from([n for n in PADDED_LENGTHS if n >= 32]), st.integers(0, 300))
 def test_padding_is_detected_after_any_symbol(symbol: Symbol, length: int, padding: int) -> None:
     data = symbol.data.ljust(length - 5, b"\0")[: length - 5]
-    whole = Symbol(symbol.kind, symbol.block, symbol.index, symbol.parameter, data)
-    assert parse_frame(pack_symbol(whole) + bytes(padding)) == whole
+    symbol_sent = Symbol(symbol.kind, symbol.block, symbol.index, symbol.parameter, data)
+    assert parse_frame(pack_symbol(symbol_sent) + bytes(padding)) == symbol_sent
 
 
 def test_segments_share_a_frame_and_32_bytes_hold_a_contact() -> None:
@@ -78,7 +78,7 @@ def test_burst_of_up_to_16_wrong_bits_is_detected(symbol: Symbol, data: st.DataO
     value = int.from_bytes(frame, "big") ^ pattern << start
     damaged = value.to_bytes(len(frame), "big")
     if damaged.endswith(b"\0"):
-        return  # then shorter lengths are tried, which the guarantee does not cover
+        return  # the parser then tries shorter lengths, which the guarantee excludes
     with pytest.raises(FrameError, match="checksum"):
         parse_frame(damaged)
 
@@ -122,7 +122,7 @@ def with_checksum(covered: bytes) -> bytes:
         b"\x00\xff\x05data",  # index 255
         b"\x00\x00\x00data",  # k = 0
         b"\x41\x09abc",  # a message longer than the frame
-        b"\x42abcde",  # a contact cut short
+        b"\x42abcde",  # a contact that is cut
         b"\x40aaaa",  # no segment
         b"\x41\x01a\x40aa",  # a kind above 31
     ],
@@ -133,7 +133,7 @@ def test_invalid_fields_are_rejected(covered: bytes) -> None:
 
 
 class Keyed:
-    """A seal for tests: four bytes of a keyed hash."""
+    """A protection for tests: four bytes of a keyed hash."""
 
     overhead_bytes = 4
 
@@ -143,22 +143,27 @@ class Keyed:
     def protect(self, covered: bytes) -> bytes:
         return covered + hashlib.blake2s(covered, key=self.key, digest_size=4).digest()
 
-    def verify(self, source: int, sealed: bytes, where: str) -> bytes:
-        if source != 3 or self.protect(sealed[:-4]) != sealed:
-            raise FrameError(where, "tag", sealed[-4:], "a tag made with the common key")
-        return sealed[:-4]
+    def verify(self, source: int, protected: bytes, where: str) -> bytes:
+        if source != 3 or self.protect(protected[:-4]) != protected:
+            raise FrameError(where, "tag", protected[-4:], "a tag made with the common key")
+        return protected[:-4]
 
 
 def test_protection_accepts_only_its_own_frames() -> None:
-    seal, other = Keyed(b"one"), Keyed(b"two")
+    protection, other = Keyed(b"one"), Keyed(b"two")
     symbol = Symbol(SymbolKind.OBJECT, 3, 4, 5, bytes(55))
-    frame = pack_symbol(symbol, seal)
+    frame = pack_symbol(symbol, protection)
     assert len(frame) == 64
-    assert parse_frame(frame, 3, seal) == symbol
-    for found, source, used in ((frame, 3, other), (frame, 4, seal), (pack_symbol(symbol), 3, seal), (frame, 3, None)):
+    assert parse_frame(frame, 3, protection) == symbol
+    for found, source, used in (
+        (frame, 3, other),
+        (frame, 4, protection),
+        (pack_symbol(symbol), 3, protection),
+        (frame, 3, None),
+    ):
         with pytest.raises(FrameError, match="tag"):
             parse_frame(found, source, used)
     listed = [Segment(SegmentKind.MESSAGE, b"\x00go")]
-    sealed = pack_segments(listed, 64, seal)
-    assert len(sealed) == 64 == segments_room(64, seal) + 6
-    assert parse_frame(sealed, 3, seal) == tuple(listed)
+    protected = pack_segments(listed, 64, protection)
+    assert len(protected) == 64 == segments_room(64, protection) + 6
+    assert parse_frame(protected, 3, protection) == tuple(listed)

@@ -1,4 +1,4 @@
-"""The golden files: what they say is what the code packs, parses and reports."""
+"""Golden files of the v1 format: packed bytes, parsed fields, events."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def test_packed_bytes_equal_the_golden_files(name: str) -> None:
 def test_golden_frames_parse() -> None:
     read = golden("frames")
     for entry in read["frames"]:
-        said = {key: value for key, value in entry.items() if key != "frame"}
-        assert v1_golden.describe_content(parse_frame(bytes.fromhex(entry["frame"]))) == said
+        expected = {key: value for key, value in entry.items() if key != "frame"}
+        assert v1_golden.describe_content(parse_frame(bytes.fromhex(entry["frame"]))) == expected
     for frame in read["refused"]:
         with pytest.raises(FrameError):
             parse_frame(bytes.fromhex(frame))
@@ -44,7 +44,7 @@ def test_golden_codes_recover() -> None:
             assert fec.encode(source, [index])[0].tobytes().hex() == symbol
     layering = Layering.unpack(bytes.fromhex(read["layered"][0]["descriptor"]))
     symbols = read["layered"][0]["symbols"]
-    assert recover_layering({i: told for i, told, _ in symbols}) == layering
+    assert recover_layering({i: value for i, value, _ in symbols}) == layering
     found = recover_layer(layering, 0, {i: bytes.fromhex(data) for i, _, data in symbols})
     assert found.hex() == read["layered"][0]["objects"][0]
 
@@ -75,7 +75,7 @@ def test_golden_exchange_gives_the_same_events() -> None:
     for step in read["steps"]:
         events = receiver.accept(step["source"], bytes.fromhex(step["frame"]), step["at"])
         assert [v1_golden.describe_event(e) for e in events] == step["events"], step["at"]
-    for source, report in read["reports"].items():
+    for source, feedback in read["reports"].items():
         found = receiver.feedback(int(source), float(len(read["steps"])))
         assert found is not None
-        assert found.pack().hex() == report
+        assert found.pack().hex() == feedback

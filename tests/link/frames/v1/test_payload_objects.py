@@ -1,4 +1,4 @@
-"""Previews, pieces, messages, layers and reports of the v1 format."""
+"""Payloads of the v1 format: previews, pieces, messages, layers and feedback."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_pieces_and_the_layer_above_round_trip(
     length = above.overhead_bytes(group.ends) + sum(len(p.data) for p in above.pieces)
     assert unpack_object(above.pack(length, group.ends), group.ends) == above
     with pytest.raises(FrameError):
-        unpack_object(above.pack(length, group.ends))  # nobody knows of whom
+        unpack_object(above.pack(length, group.ends))  # without the layer below
     with pytest.raises(FrameError, match="at most"):
         group.pack(group.overhead_bytes() + sum(len(p.data) for p in listed) - 1)
 
@@ -176,12 +176,12 @@ def test_most_random_descriptors_are_rejected() -> None:
 
 @given(st.integers(0, 31), st.integers(0, 65535), st.lists(st.integers(0, 255), max_size=16))
 def test_feedback_round_trip_fits_the_smallest_frame(newest: int, frames: int, needs: list[int]) -> None:
-    report = Feedback(newest, frames, tuple(needs))
-    assert Feedback.unpack(report.pack()) == report
-    assert 2 + 2 + len(report.pack()) <= 32
+    feedback = Feedback(newest, frames, tuple(needs))
+    assert Feedback.unpack(feedback.pack()) == feedback
+    assert 2 + 2 + len(feedback.pack()) <= 32
     for back, need in enumerate(needs):
-        assert report.missing_of((newest - back) % 32) == need
-    assert report.missing_of((newest + 1) % 32) is None
+        assert feedback.missing_of((newest - back) % 32) == need
+    assert feedback.missing_of((newest + 1) % 32) is None
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00\x01", b"\x20\x00\x00", bytes(20)])
@@ -215,7 +215,7 @@ def test_loss_is_measured_between_feedback_messages() -> None:
     meter = LossMeter()
     meter.update(Feedback(0, 65500, ()), 100)
     assert meter.loss is None
-    meter.update(Feedback(0, 65501, ()), 110)  # too short a stretch
+    meter.update(Feedback(0, 65501, ()), 110)  # an interval that is too short
     assert meter.loss is None
     meter.update(Feedback(0, (65500 + 70) % 65536, ()), 200)
     assert meter.loss == pytest.approx(0.3)

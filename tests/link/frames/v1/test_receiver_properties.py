@@ -1,4 +1,4 @@
-"""Whatever arrives, in whatever order: nothing wrong is shown, nothing raises, a restart changes nothing."""
+"""The v1 receiver with any frames in any order: correct images, no exceptions, restarts without effect."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sonarpost.link.receiver import Event, FrameRejected, ImageUpdate, MessageRe
 
 @st.composite
 def deliveries(draw: st.DrawFn) -> list[tuple[float, bytes]]:
-    """Frames of a sender with pictures and messages, some of them, in any order, some twice, some padded or cut."""
+    """Draw frames of a sender with images and messages: lost, reordered, repeated, padded or cut."""
     channels = draw(st.sampled_from([(LossChannel(0.0),), (LossChannel(0.3),), (LossChannel(0.05), LossChannel(0.6))]))
     sender = V1Sender(
         SenderConfig(
@@ -54,7 +54,7 @@ def deliveries(draw: st.DrawFn) -> list[tuple[float, bytes]]:
 
 
 def comparable(events: list[Event]) -> list[Any]:
-    """Errors have no equality of their own."""
+    """Return the events with errors as text, because errors cannot be compared."""
     return [(e.source, e.received_s, str(e.reason)) if isinstance(e, FrameRejected) else e for e in events]
 
 
@@ -109,7 +109,7 @@ def test_hostile_frames_give_no_wrong_image_or_message() -> None:
 
 
 def busy_receiver() -> tuple[V1Sender, V1Receiver]:
-    """A receiver with images, a block with layers in it, and messages, and the sender of more."""
+    """Return a receiver with images, a layered block and messages, and its sender."""
     sender, receiver = V1Sender(SenderConfig(channels=(LossChannel(0.05), LossChannel(0.6)))), V1Receiver()
     for number in (1, 2, 3):
         sender.add_image(number, contact(number), stream(number, 300), 0.0)
