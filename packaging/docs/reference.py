@@ -117,8 +117,8 @@ def key_table(service: str = "") -> str:
     """Return the table of keys, of all or of those that one service sends or receives."""
     rows = [row for row in key_rows() if row.record]
     if not service:
-        header = ("key", "record", "from", "to", "delivery", "meaning")
-        return table(header, [(f"`{r.key}`", _record(r), r.source, r.to, r.delivery, r.summary) for r in rows])
+        header = ("key and meaning", "record", "from", "to", "delivery")
+        return table(header, [(f"`{r.key}`<br>{r.summary}", _record(r), r.source, r.to, r.delivery) for r in rows])
     cells = []
     for row in rows:
         for direction, names in (("in", row.to), ("out", row.source)):
