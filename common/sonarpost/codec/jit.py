@@ -16,7 +16,7 @@ from typing import Final, ParamSpec, Protocol, TypeVar, cast
 P = ParamSpec("P")
 R = TypeVar("R")
 
-COMPILE_S: Final = {"emb": 20, "vq": 5}
+COMPILE_S: Final = {"emb": 20, "vq": 2}
 """Time to compile all functions of a codec, measured on a 2.5 GHz core."""
 
 log = logging.getLogger(__name__)
