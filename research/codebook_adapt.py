@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from research.common.patches import stretch
 from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split
 from sonarpost.codec.vq.builder import TrainingImage
 from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, load_default
-from sonarpost.codec.vq.patches import stretch
 from sonarpost.sonar.image_files import read_image
 
 HEIGHT_PX, WIDTH_PX = 140, 80

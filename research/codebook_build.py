@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
+from research.common.patches import stretch
 from sonarpost.codec.vq.codebook import load
-from sonarpost.codec.vq.patches import stretch
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import write_tiff

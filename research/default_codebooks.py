@@ -24,10 +24,10 @@ import numpy.typing as npt
 from rich.console import Console
 
 from research.common.command import command_parser, run_command
+from research.common.patches import PatchPlan, SonarLine, cut_around, cut_line, shuffled
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.vq.builder import ProgressCallback, Round, TrainingImage, build, rms_distance
 from sonarpost.codec.vq.codebook import Codebook, load, save
-from sonarpost.codec.vq.patches import PatchPlan, SonarLine, cut_around, cut_line, shuffled
 from sonarpost.errors import CodebookError, ConfigError
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind

@@ -26,9 +26,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from research.common.patches import stretch
 from sonarpost.codec.interface import to_uint8
 from sonarpost.codec.vq.codebook import load_default
-from sonarpost.codec.vq.patches import stretch
 from sonarpost.codec.vq.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, Tiles, cut_tiles
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind

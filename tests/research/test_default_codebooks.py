@@ -11,10 +11,10 @@ import pytest
 from builders.common import REPOSITORY
 
 from research import default_codebooks
+from research.common.patches import PatchPlan, cut_line
 from research.default_codebooks import RECIPES, Recipe, build_nominal, humminbird_images, humminbird_lines, read_channel
 from sonarpost.codec.vq.builder import Round
 from sonarpost.codec.vq.codebook import load, to_bytes
-from sonarpost.codec.vq.patches import PatchPlan, cut_line
 from sonarpost.codec.vq.tiles import cut_tiles
 from sonarpost.errors import CodebookError, SonarpostError
 from sonarpost.sonar.image_files import write_png

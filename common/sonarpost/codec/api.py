@@ -45,8 +45,7 @@ def get_codec(name: str = "emb", **options: Unpack[CodecOptions]) -> Codec:
     """
     registry = default_registry()
     spec = registry.spec(name)
-    allowed = [option for option, has in (("model", spec.has_models), ("codebook", spec.needs_tiles)) if has]
-    allowed += ["packing"] if name == "vq" else []
+    allowed = ["model"] * spec.has_models + ["codebook", "packing"] * spec.needs_tiles
     for option in options:
         if option not in allowed:
             raise ConfigError(f"codec {name}", "option", option, " or ".join(allowed) or "no options")

@@ -195,9 +195,18 @@ class ExtensibleCodec(Protocol):
         """
 
 
-def received_body(
-    stream: bytes, received: Mask | None, codec_id: int, name: str
-) -> tuple[StreamHeader, bytes, list[str]]:
+def encoder_input(codec: Codec, image: SnippetPixels) -> tuple[Image, StreamHeader]:
+    """Check a snippet; return its pixels in 8 bits and the header of its stream.
+
+    Raises:
+        StreamError: Size or dtype is not supported.
+    """
+    check_image(image)
+    tag = model_tag(codec.codec_id, codec.model_hash)
+    return to_uint8(image), StreamHeader(codec.codec_id, tag, image.shape[0], image.shape[1])
+
+
+def decoder_input(codec: Codec, stream: bytes, received: Mask | None) -> tuple[StreamHeader, bytes, list[str]]:
     """Return the header of a stream, its body before the first missing byte, and notes.
 
     For codecs that cannot decode data after a gap.
@@ -207,8 +216,9 @@ def received_body(
             for each body byte.
     """
     header = StreamHeader.unpack(stream)
-    if header.codec_id != codec_id:
-        raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", f"{codec_id:#04x} ({name})")
+    if header.codec_id != codec.codec_id:
+        expected = f"{codec.codec_id:#04x} ({codec.name})"
+        raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", expected)
     return header, *before_gap(stream[header.size :], received)
 
 

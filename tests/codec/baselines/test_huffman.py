@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.codec.baselines.huffman import MAX_CODE_BITS, HuffmanCodec, canonical_codes, code_lengths
-from sonarpost.codec.interface import StreamHeader, received_body
+from sonarpost.codec.interface import StreamHeader, decoder_input
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError, StreamError
 
@@ -211,7 +211,7 @@ def test_bytes_after_a_gap_are_not_used() -> None:
     received = np.ones(len(stream) - 5, np.bool_)
     received[100:110] = False
     stream = codec.encode(image)
-    header, body, notes = received_body(stream, None, 0x01, "huffman")
+    header, body, notes = decoder_input(codec, stream, None)
     received = np.ones(len(body), np.bool_)
     received[100:110] = False
     decoded = codec.decode(stream, received)

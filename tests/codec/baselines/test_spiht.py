@@ -18,8 +18,7 @@ from sonarpost.codec.baselines.spiht import (
     FRACTION_BITS,
     MAX_PLANES,
     PHASE_STEP,
-    DecoderTests,
-    EncoderTests,
+    CoderState,
     SpihtCodec,
     forward_transform,
     inverse_transform,
@@ -101,13 +100,22 @@ def test_error_after_a_plane_is_below_its_step(size: tuple[int, int], seed: int,
     image = (np.random.default_rng(seed).rayleigh(40, size)).clip(0, 255).astype(np.uint8)
     trees = wavelet_trees(*size)
     flat = forward_transform(image, 100, trees)
-    encoder = EncoderTests(flat, phase, trees, None)
+    encoder, decoder = CoderState.for_encoding(flat, phase, trees), CoderState.for_decoding(trees)
     planes = range(encoder.planes - 1, max(encoder.planes - 1 - loops, -1), -1)
-    run_passes(trees, planes, encoder)
-    decoder = DecoderTests(bytes(encoder.bits), trees)
-    run_passes(trees, planes, decoder)
+    bits: list[int] = []
+
+    def write(bit: int) -> int:
+        bits.append(bit)
+        return bit
+
+    run_passes(trees, planes, encoder, write)
+    assert set(bits) <= {0, 1}
+    written = iter(bits)
+    run_passes(trees, planes, decoder, lambda _: next(written))
+    assert next(written, None) is None
     step = (4 + phase) * PHASE_STEP << planes[-1]
-    decoded = decoder.coefficients(phase)
+    decoded = decoder.reconstructed(phase)
+    assert np.array_equal(encoder.reconstructed(phase), decoded)
     assert (np.abs(decoded - flat) <= step).all()
     assert ((decoded == 0) == (np.abs(flat) < step)).all()
     assert (np.sign(decoded[decoded != 0]) == np.sign(flat[decoded != 0])).all()

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from sonarpost.codec.emb import MODEL_FILES, transform
 from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.codec.emb.decode import read_body
 from sonarpost.codec.emb.model import parse, shipped_models
 from sonarpost.codec.emb.transform import layout_of
 from sonarpost.codec.interface import StreamHeader, model_tag
@@ -63,7 +64,8 @@ def test_decisions_of_a_prefix_hold_for_every_continuation() -> None:
 
 
 def _coefficients(stream: bytes) -> tuple[np.ndarray, np.ndarray]:
-    state, _ = CODEC.read_coefficients(stream)
+    header = StreamHeader.unpack(stream)
+    state, _ = read_body(stream[header.size :], layout_of(header.height_px, header.width_px), CODEC.network)
     return state.lower, state.signs
 
 

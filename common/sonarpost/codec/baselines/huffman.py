@@ -26,16 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image as Pillow
 
-from sonarpost.codec.interface import (
-    DecodedImage,
-    Image,
-    Mask,
-    SnippetPixels,
-    StreamHeader,
-    check_image,
-    received_body,
-    to_uint8,
-)
+from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decoder_input, encoder_input
 from sonarpost.errors import ConfigError, StreamError
 
 DEFAULT_LEVELS = 4
@@ -69,19 +60,17 @@ class HuffmanCodec:
 
     def encode(self, image: SnippetPixels, budget_bytes: int | None = None) -> bytes:
         """Return the stream (see `Codec.encode`); without a budget, `levels` grey levels in full resolution."""
-        check_image(image)
-        grey = to_uint8(image)
-        header = StreamHeader(self.codec_id, 0, grey.shape[0], grey.shape[1]).pack()
+        grey, header = encoder_input(self, image)
         if budget_bytes is None:
-            return header + next(_chosen_levels(grey, FULL_SCALE, [self.levels])).body()
-        best = _best_candidate(grey, 8 * (budget_bytes - len(header)))
+            return header.pack() + next(_chosen_levels(grey, FULL_SCALE, [self.levels])).body()
+        best = _best_candidate(grey, 8 * (budget_bytes - header.size))
         if best is None:
-            raise StreamError("codec huffman", "budget_bytes", budget_bytes, f"at least {len(header) + 3} B")
-        return header + best.body()
+            raise StreamError("codec huffman", "budget_bytes", budget_bytes, f"at least {header.size + 3} B")
+        return header.pack() + best.body()
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
         """Reconstruct the image (see `Codec.decode`). Pixels after the first gap are missing."""
-        header, body, notes = received_body(stream, received, self.codec_id, self.name)
+        header, body, notes = decoder_input(self, stream, received)
         shape = (header.height_px, header.width_px)
         bits = BitReader(body)
         try:

@@ -25,16 +25,7 @@ from typing import ClassVar
 import numpy as np
 from PIL import Image as Pillow
 
-from sonarpost.codec.interface import (
-    DecodedImage,
-    Image,
-    Mask,
-    SnippetPixels,
-    StreamHeader,
-    check_image,
-    received_body,
-    to_uint8,
-)
+from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decoder_input, encoder_input
 from sonarpost.errors import ConfigError, StreamError
 
 RAW_CODEC_ID = 0x02
@@ -139,21 +130,19 @@ class Jpeg2000Codec:
 
     def encode(self, image: SnippetPixels, budget_bytes: int | None = None) -> bytes:
         """Return the stream (see `Codec.encode`); without a budget, at `quality_db`."""
-        check_image(image)
-        grey = to_uint8(image)
-        header = StreamHeader(self.codec_id, 0, grey.shape[0], grey.shape[1]).pack()
-        best = min(self._candidates(grey, header, budget_bytes), key=lambda c: c.error, default=None)
+        grey, header = encoder_input(self, image)
+        best = min(self._candidates(grey, header.size, budget_bytes), key=lambda c: c.error, default=None)
         if best is None:
             expected = "a larger budget: the coarsest quality does not fit"
             raise StreamError(f"codec {self.name}", "budget_bytes", budget_bytes, expected)
-        return header + self._body(best, grey.shape)
+        return header.pack() + self._body(best, grey.shape)
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
         """Reconstruct the image (see `Codec.decode`).
 
         If the bytes before the first gap do not decode, all pixels are missing.
         """
-        header, body, notes = received_body(stream, received, self.codec_id, self.name)
+        header, body, notes = decoder_input(self, stream, received)
         try:
             return DecodedImage.without_gaps(self._decode_body(body, (header.height_px, header.width_px)), notes)
         except StreamError as error:
@@ -176,7 +165,7 @@ class Jpeg2000Codec:
         parameters = (chosen.decompositions - MIN_DECOMPOSITIONS) << 6 | (chosen.shift // _SHIFT_STEP + 32)
         return bytes([parameters]) + chosen.packets
 
-    def _candidates(self, grey: Image, header: bytes, budget_bytes: int | None) -> Iterator[_Candidate]:
+    def _candidates(self, grey: Image, header_bytes: int, budget_bytes: int | None) -> Iterator[_Candidate]:
         """Yield the best candidate within the budget for each number of decompositions and each brightness offset."""
         height_px, width_px = grey.shape
         shifts = {0}
@@ -187,7 +176,7 @@ class Jpeg2000Codec:
         # OpenJPEG rejects decompositions below one sample a side.
         for decompositions in (number for number in allowed if 1 << number <= min(grey.shape)):
             for shift in sorted(shifts):
-                overhead = len(header) + len(self._body(_Candidate(decompositions, shift, b"", 0), grey.shape))
+                overhead = header_bytes + len(self._body(_Candidate(decompositions, shift, b"", 0), grey.shape))
                 shifted = _shifted(grey, shift)
                 if budget_bytes is None:
                     packets: bytes | None = _encode(shifted, decompositions, self.quality_db)

@@ -16,25 +16,17 @@ gains about 0.1 dB.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.interface import (
-    DecodedImage,
-    Image,
-    Mask,
-    SnippetPixels,
-    StreamHeader,
-    check_image,
-    received_body,
-    to_uint8,
-)
+from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decoder_input, encoder_input
 from sonarpost.errors import ConfigError, StreamError
 
 Integers = npt.NDArray[np.int64]
@@ -77,20 +69,18 @@ class SpihtCodec:
 
     def encode(self, image: SnippetPixels, budget_bytes: int | None = None) -> bytes:
         """Return the stream (see `Codec.encode`). It uses the whole budget unless it reaches `maxloop` or plane 0."""
-        check_image(image)
-        grey = to_uint8(image)
-        header = StreamHeader(self.codec_id, 0, grey.shape[0], grey.shape[1]).pack()
-        if budget_bytes is not None and budget_bytes < len(header) + 2:
-            raise StreamError("codec spiht", "budget_bytes", budget_bytes, f"at least {len(header) + 2} B")
+        grey, header = encoder_input(self, image)
+        if budget_bytes is not None and budget_bytes < header.size + 2:
+            raise StreamError("codec spiht", "budget_bytes", budget_bytes, f"at least {header.size + 2} B")
         trees = wavelet_trees(*grey.shape)
         mean = (int(grey.sum(dtype=np.int64)) // grey.size) // _MEAN_STEP
         coefficients = forward_transform(grey, _MEAN_STEP * mean + _MEAN_STEP // 2, trees)
         if budget_bytes is None:
-            return header + _write_body(coefficients, mean, 0, trees, self.maxloop or DEFAULT_MAXLOOP, None)
-        loops, length = self.maxloop or MAX_PLANES, budget_bytes - len(header)
+            return header.pack() + _write_body(coefficients, mean, 0, trees, self.maxloop or DEFAULT_MAXLOOP, None)
+        loops, length = self.maxloop or MAX_PLANES, budget_bytes - header.size
         bodies = [_write_body(coefficients, mean, phase, trees, loops, length) for phase in range(4)]
         errors = [int(((_read_body(body, trees).astype(np.int64) - grey) ** 2).sum()) for body in bodies]
-        return header + bodies[errors.index(min(errors))]
+        return header.pack() + bodies[errors.index(min(errors))]
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
         """Reconstruct the image (see `Codec.decode`).
@@ -98,11 +88,10 @@ class SpihtCodec:
         A truncated stream gives a coarser image without missing pixels. If the first two body bytes did not arrive, all
         pixels are missing.
         """
-        header, body, notes = received_body(stream, received, self.codec_id, self.name)
+        header, body, notes = decoder_input(self, stream, received)
         if 8 * len(body) < _PREFIX_BITS:
-            return DecodedImage.all_missing(
-                header, [*notes, f"{len(body)} B of the body arrived, at least 2 are needed"]
-            )
+            notes.append(f"{len(body)} B of the body arrived, at least 2 are needed")
+            return DecodedImage.all_missing(header, notes)
         return DecodedImage.without_gaps(_read_body(body, wavelet_trees(header.height_px, header.width_px)), notes)
 
 
@@ -110,57 +99,109 @@ def _write_body(
     coefficients: Integers, mean: int, phase: int, trees: WaveletTrees, loops: int, length: int | None
 ) -> bytes:
     """Return a body of at most `length` bytes and at most `loops` planes."""
-    tests = EncoderTests(coefficients, phase, trees, None if length is None else 8 * length - _PREFIX_BITS)
-    top = tests.planes - 1
+    state = CoderState.for_encoding(coefficients, phase, trees)
+    top = state.planes - 1
+    bits = bytearray()
+    limit = MAX_PLANES * trees.size * 4 if length is None else 8 * length - _PREFIX_BITS
+
+    def write(bit: int) -> int:
+        if len(bits) >= limit:
+            raise EndOfBits
+        bits.append(bit)
+        return bit
+
     with suppress(EndOfBits):
-        run_passes(trees, range(top, max(top - loops, -1), -1), tests)
+        run_passes(trees, range(top, max(top - loops, -1), -1), state, write)
     prefix = f"{mean:05b}{phase:02b}{top:05b}".encode()
-    bits = np.concatenate((np.frombuffer(prefix, np.uint8) - ord("0"), np.frombuffer(tests.bits, np.uint8)))
-    return np.packbits(bits).tobytes()
+    return np.packbits(np.frombuffer(bytes(bit - ord("0") for bit in prefix) + bits, np.uint8)).tobytes()
 
 
 def _read_body(body: bytes, trees: WaveletTrees) -> Image:
     """Return the image of a body of at least 2 bytes."""
-    bits = np.unpackbits(np.frombuffer(body, np.uint8)).tobytes()
     mean, phase, top = (body[0] >> 3), (body[0] >> 1) & 3, (body[0] & 1) << 4 | body[1] >> 4
     if top >= MAX_PLANES:
         raise StreamError("spiht body", "highest plane", top, f"0..{MAX_PLANES - 1}")
-    tests = DecoderTests(bits[_PREFIX_BITS:], trees)
+    bits = iter(np.unpackbits(np.frombuffer(body, np.uint8)).tolist()[_PREFIX_BITS:])
+
+    def read(_: int) -> int:
+        bit = next(bits, None)
+        if bit is None:
+            raise EndOfBits
+        return bit
+
+    state = CoderState.for_decoding(trees)
     with suppress(EndOfBits):
-        run_passes(trees, range(top, -1, -1), tests)
-    return inverse_transform(tests.coefficients(phase), _MEAN_STEP * mean + _MEAN_STEP // 2, trees)
+        run_passes(trees, range(top, -1, -1), state, read)
+    return inverse_transform(state.reconstructed(phase), _MEAN_STEP * mean + _MEAN_STEP // 2, trees)
 
 
 class EndOfBits(Exception):  # noqa: N818  (no error: the budget is used up, or the stream ends)
     """The budget is used up, or the stream ends."""
 
 
-class SignificanceTests(Protocol):
-    """The tests of SPIHT. The encoder answers them from the coefficients, the decoder from the stream.
+@dataclass
+class CoderState:
+    """The coefficients that the encoder codes (zeros in the decoder), and what is coded so far.
 
-    Every method raises EndOfBits when no bit is left.
+    Attributes:
+        magnitudes: Quantised magnitude of each coefficient.
+        negative: 1 for a negative coefficient.
+        below: Largest magnitude among the descendants of each coefficient.
+        below_children: Largest magnitude among the descendants of its children.
+        lower: Coded lower bound of each magnitude; 0 for insignificant coefficients.
+        width: Width of the interval above the lower bound.
+        sign: 1 or -1.
     """
 
-    def significant(self, node: int, plane: int) -> bool:
-        """Return whether a coefficient is significant in a plane."""
+    magnitudes: list[int]
+    negative: list[int]
+    below: list[int]
+    below_children: list[int]
+    lower: list[int]
+    width: list[int]
+    sign: list[int]
 
-    def negative(self, node: int) -> bool:
-        """Return the sign of a coefficient that has just become significant."""
+    @classmethod
+    def for_decoding(cls, trees: WaveletTrees) -> CoderState:
+        """Return the initial state of the decoder."""
+        zeros = [0] * trees.size
+        return cls(zeros, zeros, zeros, zeros, zeros.copy(), zeros.copy(), [1] * trees.size)
 
-    def descendants(self, node: int, plane: int) -> bool:
-        """Return whether a coefficient has significant descendants."""
+    @classmethod
+    def for_encoding(cls, coefficients: Integers, phase: int, trees: WaveletTrees) -> CoderState:
+        """Return the initial state of the encoder."""
+        quantised = np.abs(coefficients) // ((4 + phase) * PHASE_STEP)
+        below, below_children = np.zeros_like(quantised), np.zeros_like(quantised)
+        ends = [trees.roots, *(start + h * w for start, h, w in trees.bands[2::3])]
+        for start, stop in reversed(list(pairwise(ends))):
+            parents = trees.parents[start:stop]
+            np.maximum.at(below_children, parents, below[start:stop])
+            np.maximum.at(below, parents, np.maximum(quantised[start:stop], below[start:stop]))
+        state = cls.for_decoding(trees)
+        state.magnitudes, state.negative = quantised.tolist(), (coefficients < 0).astype(int).tolist()
+        state.below, state.below_children = below.tolist(), below_children.tolist()
+        return state
 
-    def grandchildren(self, node: int, plane: int) -> bool:
-        """Return whether a coefficient has significant descendants below its children."""
+    @property
+    def planes(self) -> int:
+        """Number of bit planes."""
+        return max(max(self.magnitudes).bit_length(), 1)
 
-    def refine(self, node: int, plane: int) -> None:
-        """Code the bit of a plane of a significant coefficient."""
+    def reconstructed(self, phase: int) -> Integers:
+        """Return the reconstructed coefficients, shape (trees.size,), in 2**-8 grey levels."""
+        lower, width, sign = (np.array(values, dtype=np.int64) for values in (self.lower, self.width, self.sign))
+        # Small coefficients are more frequent than large ones within an interval too: 3/8 of the width, not 1/2.
+        return sign * ((8 * lower + 3 * width) * ((4 + phase) * PHASE_STEP) >> 3)
 
 
-def run_passes(trees: WaveletTrees, planes: range, tests: SignificanceTests) -> None:
-    """Run all tests in the order of SPIHT, plane by plane, until a test raises EndOfBits.
+def run_passes(trees: WaveletTrees, planes: range, state: CoderState, code: Callable[[int], int]) -> None:
+    """Code plane by plane in the order of SPIHT until `code` raises EndOfBits. Encoder and decoder share this function.
 
-    Encoder and decoder share this function, so their order is the same.
+    Args:
+        trees: The trees.
+        planes: Bit planes in order.
+        state: Coefficients; what is coded is stored in it.
+        code: Writes its argument, or reads a bit and ignores its argument; returns the bit.
     """
     children = trees.children
     insignificant = list(range(trees.roots))
@@ -170,16 +211,18 @@ def run_passes(trees: WaveletTrees, planes: range, tests: SignificanceTests) -> 
         found: list[int] = []
 
         def classify(node: int, plane: int = plane, found: list[int] = found) -> bool:
-            if tests.significant(node, plane):
-                found.append(node)
-                tests.negative(node)
-                return True
-            return False
+            if not code(state.magnitudes[node] >> plane & 1):
+                return False
+            found.append(node)
+            # A coefficient without a coded sign stays zero.
+            state.sign[node] = -1 if code(state.negative[node]) else 1
+            state.lower[node] = state.width[node] = 1 << plane
+            return True
 
         insignificant = [node for node in insignificant if not classify(node)]
         remaining: list[tuple[int, bool]] = []
         for node, is_type_b in sets:  # the loop appends to the list
-            if not (tests.grandchildren if is_type_b else tests.descendants)(node, plane):
+            if not code((state.below_children if is_type_b else state.below)[node] >> plane & 1):
                 remaining.append((node, is_type_b))
             elif is_type_b:
                 sets.extend((child, False) for child in children[node] if children[child])
@@ -189,102 +232,9 @@ def run_passes(trees: WaveletTrees, planes: range, tests: SignificanceTests) -> 
                     sets.append((node, True))
         sets = remaining
         for node in significant:
-            tests.refine(node, plane)
+            state.lower[node] += code(state.magnitudes[node] >> plane & 1) << plane
+            state.width[node] = 1 << plane
         significant += found
-
-
-class EncoderTests:
-    """Answers from the quantised coefficients; writes every answer to `bits`."""
-
-    def __init__(self, coefficients: Integers, phase: int, trees: WaveletTrees, limit_bits: int | None) -> None:
-        quantised = np.abs(coefficients) // ((4 + phase) * PHASE_STEP)
-        below = np.zeros(trees.size, dtype=np.int64)
-        below_children = np.zeros(trees.size, dtype=np.int64)
-        ends = [trees.roots, *(start + h * w for start, h, w in trees.bands[2::3])]
-        for start, stop in reversed(list(pairwise(ends))):
-            parents = trees.parents[start:stop]
-            np.maximum.at(below_children, parents, below[start:stop])
-            np.maximum.at(below, parents, np.maximum(quantised[start:stop], below[start:stop]))
-        self.planes = max(int(quantised.max()).bit_length(), 1)
-        self.bits = bytearray()
-        self._limit_bits = MAX_PLANES * trees.size * 4 if limit_bits is None else limit_bits
-        self._levels = quantised.tolist()
-        self._below, self._below_children = below.tolist(), below_children.tolist()
-        self._signs = (coefficients < 0).tolist()
-
-    def significant(self, node: int, plane: int) -> bool:
-        """See `SignificanceTests`."""
-        return self._write(bool(self._levels[node] >> plane))
-
-    def negative(self, node: int) -> bool:
-        """See `SignificanceTests`."""
-        return self._write(self._signs[node])
-
-    def descendants(self, node: int, plane: int) -> bool:
-        """See `SignificanceTests`."""
-        return self._write(bool(self._below[node] >> plane))
-
-    def grandchildren(self, node: int, plane: int) -> bool:
-        """See `SignificanceTests`."""
-        return self._write(bool(self._below_children[node] >> plane))
-
-    def refine(self, node: int, plane: int) -> None:
-        """See `SignificanceTests`."""
-        self._write(bool(self._levels[node] >> plane & 1))
-
-    def _write(self, answer: bool) -> bool:  # noqa: FBT001  (the answer is the bit)
-        if len(self.bits) >= self._limit_bits:
-            raise EndOfBits
-        self.bits.append(answer)
-        return answer
-
-
-class DecoderTests:
-    """Answers from the stream; stores the lower bound and the interval width of each coefficient."""
-
-    def __init__(self, bits: bytes, trees: WaveletTrees) -> None:
-        self._bits = iter(bits)
-        self._lower = [0] * trees.size
-        self._width = [0] * trees.size
-        self._sign = [1] * trees.size
-        self._plane = 0
-
-    def significant(self, node: int, plane: int) -> bool:
-        """See `SignificanceTests`."""
-        self._plane = plane
-        return self._read()
-
-    def negative(self, node: int) -> bool:
-        """See `SignificanceTests`. A coefficient without a sign stays zero."""
-        is_negative = self._read()
-        self._sign[node] = -1 if is_negative else 1
-        self._lower[node] = self._width[node] = 1 << self._plane
-        return is_negative
-
-    def descendants(self, node: int, plane: int) -> bool:
-        """See `SignificanceTests`."""
-        return self._read()
-
-    def grandchildren(self, node: int, plane: int) -> bool:
-        """See `SignificanceTests`."""
-        return self._read()
-
-    def refine(self, node: int, plane: int) -> None:
-        """See `SignificanceTests`."""
-        self._lower[node] += self._read() << plane
-        self._width[node] = 1 << plane
-
-    def coefficients(self, phase: int) -> Integers:
-        """Return the reconstructed coefficients, shape (trees.size,), in 2**-8 grey levels."""
-        lower, width, sign = (np.array(values, dtype=np.int64) for values in (self._lower, self._width, self._sign))
-        # Small coefficients are more frequent than large ones within an interval too: 3/8 of the width, not 1/2.
-        return sign * ((8 * lower + 3 * width) * ((4 + phase) * PHASE_STEP) >> 3)
-
-    def _read(self) -> bool:
-        bit = next(self._bits, None)
-        if bit is None:
-            raise EndOfBits
-        return bool(bit)
 
 
 @dataclass(frozen=True)

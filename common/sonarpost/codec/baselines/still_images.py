@@ -29,16 +29,7 @@ import numpy as np
 from PIL import Image as Pillow
 from PIL import features
 
-from sonarpost.codec.interface import (
-    DecodedImage,
-    Image,
-    Mask,
-    SnippetPixels,
-    StreamHeader,
-    check_image,
-    received_body,
-    to_uint8,
-)
+from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decoder_input, encoder_input
 from sonarpost.errors import ConfigError, StreamError
 
 DEFAULT_QUALITY = 30
@@ -110,23 +101,21 @@ class StillImageCodec:
 
     def encode(self, image: SnippetPixels, budget_bytes: int | None = None) -> bytes:
         """Return the stream (see `Codec.encode`); without a budget, at `quality`."""
-        check_image(image)
-        grey = to_uint8(image)
-        header = StreamHeader(self.codec_id, 0, grey.shape[0], grey.shape[1]).pack()
+        grey, header = encoder_input(self, image)
         if budget_bytes is None:
-            return header + _encode(self.format, grey, self.quality)
-        body = _search_quality(self.format, grey, budget_bytes - len(header))
+            return header.pack() + _encode(self.format, grey, self.quality)
+        body = _search_quality(self.format, grey, budget_bytes - header.size)
         if body is None:
             expected = "a larger budget: the lowest quality does not fit"
             raise StreamError(f"codec {self.name}", "budget_bytes", budget_bytes, expected)
-        return header + body
+        return header.pack() + body
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
         """Reconstruct the image (see `Codec.decode`).
 
         If the bytes before the first gap do not decode, all pixels are missing.
         """
-        header, body, notes = received_body(stream, received, self.codec_id, self.name)
+        header, body, notes = decoder_input(self, stream, received)
         try:
             image = _decode(self.format, body, (header.height_px, header.width_px))
             return DecodedImage.without_gaps(image, notes)

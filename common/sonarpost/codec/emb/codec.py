@@ -30,9 +30,8 @@ from sonarpost.codec.interface import (
     SnippetPixels,
     StreamHeader,
     before_gap,
-    check_image,
+    encoder_input,
     model_tag,
-    to_uint8,
 )
 from sonarpost.errors import StreamError
 
@@ -119,11 +118,10 @@ class EmbCodec:
         Raises:
             StreamError: As for `encode`, or `valid` has another shape.
         """
-        check_image(image)
-        grey = to_uint8(image) if valid is None else fill_invalid(to_uint8(image), valid)
-        height_px, width_px = (int(n) for n in grey.shape)
-        header = StreamHeader(self.codec_id, model_tag(self.codec_id, self.model_hash), height_px, width_px)
-        budget = max(64, height_px * width_px // 25) if budget_bytes is None else budget_bytes
+        grey, header = encoder_input(self, image)
+        if valid is not None:
+            grey = fill_invalid(grey, valid)
+        budget = max(64, grey.size // 25) if budget_bytes is None else budget_bytes
         limit = min(budget - header.size, MAX_BODY_BYTES)
         if limit < MIN_BODY_BYTES:
             raise StreamError("codec emb", "budget_bytes", budget, f"at least {header.size + MIN_BODY_BYTES} B")
@@ -147,9 +145,10 @@ class EmbCodec:
         Raises:
             StreamError: As for `encode` and `decode`, or the sizes of snippet and stream differ.
         """
-        check_image(image)
+        grey, _ = encoder_input(self, image)
+        if valid is not None:
+            grey = fill_invalid(grey, valid)
         model, header = _model_of(stream, self.network)
-        grey = to_uint8(image) if valid is None else fill_invalid(to_uint8(image), valid)
         if grey.shape != (header.height_px, header.width_px):
             raise StreamError("image", "shape", grey.shape, f"the stream's {(header.height_px, header.width_px)}")
         state, side = read_body(stream[header.size :], layout_of(header.height_px, header.width_px), model)
@@ -204,15 +203,6 @@ class EmbCodec:
         if side.mean_index < 0:
             raise StreamError("stream", "length", len(stream), "enough bytes for a mean level")
         return image_before_enhancer(state, side, model)
-
-    def read_coefficients(self, stream: bytes) -> tuple[CoefficientState, SideInfo]:
-        """Return the coefficients and the side information of a stream.
-
-        Raises:
-            StreamError: As for `decode`.
-        """
-        _, state, side = self._read(stream)
-        return state, side
 
     def _read(self, stream: bytes) -> tuple[Model, CoefficientState, SideInfo]:
         model, header = _model_of(stream, self.network)

@@ -48,23 +48,8 @@ BORDER: Final = 2
 LL, HL, LH, HH = 0, 1, 2, 3
 
 # Columns of the band table.
-(
-    OFFSET,
-    STRIDE,
-    HEIGHT,
-    WIDTH,
-    LEVEL,
-    ORIENT,
-    PARENT,
-    SIBLING_1,
-    SIBLING_2,
-    CHILD,
-    LOW,
-    NEXT_1,
-    NEXT_2,
-    COUSIN_1,
-    COUSIN_2,
-) = range(15)
+OFFSET, STRIDE, HEIGHT, WIDTH, LEVEL, ORIENT = range(6)
+PARENT, SIBLING_1, SIBLING_2, CHILD, LOW, NEXT_1, NEXT_2, COUSIN_1, COUSIN_2 = range(6, 15)
 """OFFSET: flat index of cell (0, 0). LEVEL: 1 is the finest. LOW: start of the level's low-pass image in the array of
 low-pass images. The others are rows of the table, -1 for none: SIBLING_1, SIBLING_2, bands of the same level coded
 earlier; NEXT_1, NEXT_2, bands of the same level coded later; COUSIN_1, COUSIN_2, siblings of the parent."""

@@ -29,10 +29,9 @@ from sonarpost.codec.interface import (
     Mask,
     SnippetPixels,
     StreamHeader,
-    check_image,
     check_received,
+    encoder_input,
     model_tag,
-    to_uint8,
 )
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles, join_tiles, tile_grid
 from sonarpost.errors import ConfigError, StreamError
@@ -125,15 +124,13 @@ class VqCodec:
         Raises:
             StreamError: Size or dtype is not supported, or the stream exceeds the budget or 65,535 body bytes.
         """
-        check_image(image)
-        height_px, width_px = int(image.shape[0]), int(image.shape[1])
-        length = self._body_length(height_px, width_px)
-        header = StreamHeader(self.codec_id, codebook_tag(self.tiles), height_px, width_px)
+        grey, header = encoder_input(self, image)
+        length = self._body_length(header.height_px, header.width_px)
         limit = MAX_BODY_BYTES if budget_bytes is None else min(budget_bytes - header.size, MAX_BODY_BYTES)
         if length > limit:
-            needed = f"at least {length + header.size} B for {height_px} x {width_px} px"
+            needed = f"at least {length + header.size} B for {header.height_px} x {header.width_px} px"
             raise StreamError("codec vq", "budget_bytes", limit + header.size, needed)
-        indices, _ = self.tiles.nearest(cut_tiles(to_uint8(image), self.tiles.tile_px))
+        indices, _ = self.tiles.nearest(cut_tiles(grey, self.tiles.tile_px))
         return header.pack() + pack_indices(indices + 1, self.packing)
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:

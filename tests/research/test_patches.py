@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonarpost.codec.vq.patches import PatchPlan, ToneMapping, cut_around, cut_line, reduce_line, shuffled, stretch
+from research.common.patches import PatchPlan, ToneMapping, cut_around, cut_line, reduce_line, shuffled, stretch
 
 
 def line(pings: int = 300, samples: int = 260, seed: int = 0) -> np.ndarray:
