@@ -17,7 +17,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 COMPILE_S: Final = {"emb": 20, "vq": 2}
-"""Time to compile all functions of a codec, measured on a 2.5 GHz core."""
+"""Approximate time to compile all functions of a codec."""
 
 log = logging.getLogger(__name__)
 

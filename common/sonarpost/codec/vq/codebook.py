@@ -173,7 +173,7 @@ def find_codebook(tag: int, search_path: Sequence[str | Path] = ()) -> Codebook:
     """Return the codebook with the tag of a stream header.
 
     The order of the search is: `search_path`, the shipped codebooks, the files and folders of the environment variable
-    SONARPOST_CODEBOOKS. A folder stands for its `.tiles` files.
+    SONARPOST_CODEBOOKS. Of a folder, the `.tiles` files are searched.
 
     Args:
         tag: The 16 bits of the codebook's identity in the stream header.
