@@ -1,4 +1,4 @@
-"""Contract of every `FrameReceiver`: the same events for the same things, whatever the wire format."""
+"""Contract of every `FrameReceiver`: the same events in every wire format."""
 
 from __future__ import annotations
 

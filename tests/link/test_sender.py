@@ -1,4 +1,4 @@
-"""Contract of every `ImageSender`: the same behaviour for a service, whatever the wire format."""
+"""Contract of every `ImageSender`: the same behaviour in every wire format."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ class FrameReceiver(Protocol):
     """A receiver of one or several wire formats, for any number of sources."""
 
     def accept(self, source: int, frame: bytes, now: float) -> list[Event]:
-        """Process a frame, after whatever `poll(now)` does; return the events that follow.
+        """Process a frame after `poll(now)`; return the events of both.
 
         Never raises because of `frame`: it reports one it cannot use as `FrameRejected`.
 

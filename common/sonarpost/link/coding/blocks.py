@@ -28,7 +28,9 @@ from sonarpost.link.frames.v1.frame import BLOCKS, Symbol, SymbolKind
 from sonarpost.link.frames.v1.payload_objects import (
     CHECK_BYTES,
     MAX_STREAM_BYTES,
+    MESSAGE_OVERHEAD_BYTES,
     ImageNumber,
+    MessageObject,
     PieceEnd,
     PieceList,
     Preview,
@@ -46,6 +48,7 @@ TakeNumber = Callable[[], int]
 _AHEAD: Final = 32
 """Symbols to compute at a time: a matrix product of several costs little more than one."""
 _PREVIEW_URGENCY: Final = 2.0
+_MESSAGE_URGENCY: Final = 8.0
 _MAX_GROUP: Final = 60
 _PREVIEW_SHARE: Final = 0.6
 """Greatest share of a group's frames for previews."""
@@ -394,6 +397,21 @@ def _unlayered_block(
         urgency=1.0,
         spans=tuple(image.span(a, b) for image, a, b in zip(run, starts, stops, strict=True)),
         planned=planned,
+        last_activity_s=now,
+    )
+
+
+def message_block(message_number: int, message: bytes, symbol_bytes: int, number: int, now: float) -> SendBlock:
+    """Return a block without layers for a message that is longer than a frame."""
+    source = -(-(len(message) + MESSAGE_OVERHEAD_BYTES) // symbol_bytes)
+    return SendBlock(
+        kind=SymbolKind.OBJECT,
+        number=number,
+        symbol_bytes=symbol_bytes,
+        objects=(MessageObject(message_number, message).pack(source * symbol_bytes),),
+        layering=None,
+        contacts=(),
+        urgency=_MESSAGE_URGENCY,
         last_activity_s=now,
     )
 

@@ -106,7 +106,7 @@ class TransmitQueue(ImageSender):
     @property
     def measured_loss(self) -> float | None:
         """Share of frames lost according to feedback."""
-        return self.sender.measured_loss
+        return self.sender.state.tracker.loss
 
     @property
     def planned_loss(self) -> float:

@@ -322,9 +322,8 @@ def test_reported_images_are_deleted_before_open_ones() -> None:
     receiver.accept(1, half("top"), 0)
     receiver.accept(2, half("top"), 1)
     assert len(images(receiver.accept(2, half("bottom"), 2))) == 1
-    assert (
-        receiver.accept(3, half("top"), 3) == []
-    )  # deletes the image of source 2, although it was seen after that of source 1
+    assert receiver.accept(3, half("top"), 3) == []
+    # This deleted the image of source 2, although it was seen after that of source 1.
     (event,) = images(receiver.accept(1, half("bottom"), 4))
     assert (event.source, event.version, event.complete) == (1, 1, True)
 

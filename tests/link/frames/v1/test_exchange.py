@@ -126,7 +126,7 @@ def test_feedback_completes_all_images_at_other_frame_lengths_and_with_bursts(fr
     world.add(40, 300)
     world.run()
     assert all(world.latest[n].complete and world.latest[n].stream == world.sent[n] for n in range(1, 41))
-    assert world.sender.measured_loss == pytest.approx(0.5, abs=0.25)
+    assert world.sender.state.tracker.loss == pytest.approx(0.5, abs=0.25)
 
 
 def test_messages_arrive_once() -> None:
@@ -426,4 +426,4 @@ def test_block_continues_until_all_receivers_have_it() -> None:
                 sender.on_feedback(feedback, now, receiver=address)
     assert len(latest) == 60
     assert all(e.complete and e.stream == stream(number_of_image(e.image_id), 300) for e in latest.values())
-    assert sender.measured_loss == pytest.approx(0.4, abs=0.2)
+    assert sender.state.tracker.loss == pytest.approx(0.4, abs=0.2)

@@ -16,6 +16,7 @@ from sonarpost.link.coding.blocks import (
     SendBlock,
     group_limit,
     make_group,
+    message_block,
     numbers_needed,
     unlayered_blocks,
 )
@@ -46,11 +47,9 @@ from sonarpost.link.frames.v1.frame import (
 from sonarpost.link.frames.v1.payload_objects import (
     ENTRY_HEAD_BYTES,
     MAX_NUMBER,
-    MESSAGE_OVERHEAD_BYTES,
     WINDOW,
     Feedback,
     ImageNumber,
-    MessageObject,
     RefineRequest,
 )
 from sonarpost.link.queue.messages import MessageSender
@@ -59,7 +58,6 @@ from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_
 _MIN_PREFIX_BYTES: Final = 16
 _MAX_SYMBOL_FACTOR: Final = 4
 """Limit of the symbols sent of a block without feedback while other images wait, in its source symbols."""
-_MESSAGE_URGENCY: Final = 8.0
 _NO_FEEDBACK_CAUTION: Final = -2.5
 """Argument `caution` of `symbols_to_send` for a block without feedback: 2.5 standard deviations above the average."""
 _ANY_PRIORITY: Final = -(2**31)
@@ -131,11 +129,6 @@ class V1Sender:
     def is_idle(self) -> bool:
         """Whether there is nothing to send, and nothing that feedback can request."""
         return not (self.waiting or self.blocks or self.state.messages.waiting)
-
-    @property
-    def measured_loss(self) -> float | None:
-        """Share of frames lost according to the feedback of the worst receiver; None before the second feedback."""
-        return self.state.tracker.loss
 
     def add_image(
         self,
@@ -327,20 +320,12 @@ class V1Sender:
     def _begin_long_messages(self, now: float) -> None:
         room = segments_room(self.config.frame_bytes, self._protection) - 2
         while self._free_numbers() >= 1 and (message := self.state.messages.take_long(room)) is not None:
-            size = self.symbol_bytes
-            source = -(-(len(message.data) + MESSAGE_OVERHEAD_BYTES) // size)
-            block = SendBlock(
-                kind=SymbolKind.OBJECT,
-                number=self._take_number(),
-                symbol_bytes=size,
-                objects=(MessageObject(message.number, message.data).pack(source * size),),
-                layering=None,
-                contacts=(),
-                urgency=_MESSAGE_URGENCY,
-                planned=min(255, symbols_to_send(source, self.config.worst, _NO_FEEDBACK_CAUTION)),
-                last_activity_s=now,
-            )
+            block = message_block(message.number, message.data, self.symbol_bytes, self._take_number(), now)
+            block.planned = self._planned_without_feedback(block)
             self.blocks.append(block)
+
+    def _planned_without_feedback(self, block: SendBlock) -> int:
+        return min(255, symbols_to_send(block.source_symbols, self.config.worst, _NO_FEEDBACK_CAUTION))
 
     def _segments_frame(self, now: float, min_priority: int) -> bytes | None:
         """Return a frame of messages of at least a priority, filled up; None if there are none."""
@@ -484,7 +469,7 @@ class V1Sender:
         made = list(unlayered_blocks([image], self.config, self.symbol_bytes, self._take_number, now))
         for block in made:
             if not self.config.feedback:
-                block.planned = min(255, symbols_to_send(block.source_symbols, self.config.worst, _NO_FEEDBACK_CAUTION))
+                block.planned = self._planned_without_feedback(block)
         self.blocks += made
         return bool(made)
 
