@@ -27,6 +27,7 @@ from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import SenderState, V1Sender, WaitingImages
 from sonarpost.link.receiver import FrameRejected, ImageUpdate
+from sonarpost.link.state import SavedParts
 
 SIZES = (32, 64, 256, 100)
 
@@ -366,6 +367,32 @@ def test_memory_is_bounded() -> None:
     assert all(len(group(parts, f"image/{source}")) <= 5 for source in receiver.sources)
     assert all(len(group(parts, f"block/{source}")) <= 16 for source in receiver.sources)
     assert receiver.counts.evicted_sources == 4
+
+
+def test_state_to_save_for_a_frame_does_not_grow_with_the_contacts() -> None:
+    channel = LossChannel(0.2)
+    sender = V1Sender(SenderConfig(frame_bytes=60, channels=(channel,), kept_images=725))
+    receiver, generator = V1Receiver(ReceiverConfig(max_contacts=725)), np.random.default_rng(1)
+    for number in range(1, 726):
+        sender.add_image(number, contact(number), stream(number, 300), 0.0)
+    written: list[int] = []
+    saved, now = SavedParts({}), 0.0
+    while (frame := sender.next_frame(now)) is not None:
+        now += 1.0
+        if generator.random() < channel.loss:
+            continue
+        sampled = now % 50 < 5  # of 50 frames, compare five with the state before
+        if sampled:
+            saved.commit(receiver.parts())
+        receiver.accept(VEHICLE, frame, now)
+        if sampled:
+            changes = saved.changes(receiver.parts())
+            written.append(sum(len(name) + len(data or b"") for name, data in changes.items()))
+    assert len(group(receiver.parts(), f"image/{VEHICLE}")) == 725
+    assert len(written) > 200
+    assert max(written) <= 8000
+    quarter = len(written) // 4
+    assert np.mean(written[-quarter:]) < 1.2 * np.mean(written[:quarter])
 
 
 def test_old_blocks_and_contacts_are_deleted() -> None:

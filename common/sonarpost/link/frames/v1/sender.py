@@ -126,6 +126,10 @@ class V1Sender:
         return self.config.frame_bytes - HEADER_BYTES - overhead
 
     @property
+    def _segments_room(self) -> int:
+        return segments_room(self.config.frame_bytes, self._protection)
+
+    @property
     def is_idle(self) -> bool:
         """Whether there is nothing to send, and nothing that feedback can request."""
         return not (self.waiting or self.blocks or self.state.messages.waiting)
@@ -228,7 +232,7 @@ class V1Sender:
         Blocks with symbols that are too long for it are given up; their images wait again.
         """
         self.config = replace(self.config, frame_bytes=frame_bytes)
-        room = segments_room(frame_bytes, self._protection)
+        room = self._segments_room
         lost = [b for b in self.blocks if b.symbol_bytes != self.symbol_bytes and b.symbol_bytes + 5 > room]
         self.blocks = [b for b in self.blocks if b not in lost]
         self.retired = [b for b in self.retired if b.symbol_bytes == self.symbol_bytes or b.symbol_bytes + 5 <= room]
@@ -257,7 +261,7 @@ class V1Sender:
     def _images_frame(self, now: float) -> bytes | None:
         if self.config.announce and not any(b.is_fresh_preview and b.left > 0 for b in self.blocks):
             # Contacts whose group waits precede the detail of others.
-            announced = self._announcements(segments_room(self.config.frame_bytes, self._protection))
+            announced = self._announcements(self._segments_room)
             if announced:
                 return pack_segments(announced, self.config.frame_bytes, self._protection)
         return self._symbol_frame(now)
@@ -318,7 +322,7 @@ class V1Sender:
         return number
 
     def _begin_long_messages(self, now: float) -> None:
-        room = segments_room(self.config.frame_bytes, self._protection) - 2
+        room = self._segments_room - 2
         while self._free_numbers() >= 1 and (message := self.state.messages.take_long(room)) is not None:
             block = message_block(message.number, message.data, self.symbol_bytes, self._take_number(), now)
             block.planned = self._planned_without_feedback(block)
@@ -329,7 +333,7 @@ class V1Sender:
 
     def _segments_frame(self, now: float, min_priority: int) -> bytes | None:
         """Return a frame of messages of at least a priority, filled up; None if there are none."""
-        room = segments_room(self.config.frame_bytes, self._protection)
+        room = self._segments_room
         messages, frame = self.state.messages, self.state.frames_sent
         if not messages.has_ready(min_priority, frame):
             return None
@@ -376,7 +380,7 @@ class V1Sender:
         if len(symbol.data) == self.symbol_bytes:
             return pack_symbol(symbol, self._protection)
         first = Segment(SegmentKind.SYMBOL, symbol.head() + symbol.data)
-        room = segments_room(self.config.frame_bytes, self._protection) - first.size
+        room = self._segments_room - first.size
         return pack_segments([first, *self._fillers(room)], self.config.frame_bytes, self._protection)
 
     def _next_symbol(self, max_bytes: int) -> Symbol | None:
@@ -409,7 +413,7 @@ class V1Sender:
     def _extend_unconfirmed_block(self) -> None:
         """With feedback, while the next group waits for block numbers, send more of the least redundant block.
 
-        Plans stay below the expected need, so these symbols are rarely useless; silence always is.
+        Plans stay below the expected need, so most of these symbols are useful.
         """
         if not self.waiting or any(b.left > 0 for b in self.blocks) or not self.config.feedback:
             return
