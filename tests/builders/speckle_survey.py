@@ -1,4 +1,4 @@
-"""A seabed of pure speckle with boxes of light and shadow on it: all of it known, none of it the simulator's."""
+"""Survey of a seabed of speckle with rectangular highlights and shadows; independent of the simulator."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PINGS, SAMPLES, RANGE_M, ALTITUDE_M, SPEED_MPS, RATE_HZ = 200, 512, 20.0, 3.0, 1
 
 @dataclass(frozen=True)
 class Box:
-    """An object: highlight from (ping, sample), so many pings and samples, then a shadow away from the vehicle."""
+    """An object: a highlight centred on (`ping`, `sample`), and its shadow on the side away from the vehicle."""
 
     side: Side = Side.PORT
     ping: int = 100
@@ -45,7 +45,9 @@ def _image(rng: np.random.Generator, boxes: list[Box]) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def make_survey() -> Callable[..., Survey]:
-    def make(
+    """Return a function that creates a survey of objects, each given by fields of `Box`."""
+
+    def create(
         *objects: dict,
         seed: int = 1,
         navigation: bool = True,
@@ -56,9 +58,9 @@ def make_survey() -> Callable[..., Survey]:
     ) -> Survey:
         boxes = [Box(**fields) for fields in objects]
         rng = np.random.default_rng(seed)
-        top = np.iinfo(dtype).max
+        full_scale = np.iinfo(dtype).max
         images = {
-            side: np.clip(_image(rng, [b for b in boxes if b.side is side]) * scale, 0, top).astype(dtype)
+            side: np.clip(_image(rng, [b for b in boxes if b.side is side]) * scale, 0, full_scale).astype(dtype)
             for side in sides
         }
         pings = tuple(
@@ -77,4 +79,4 @@ def make_survey() -> Callable[..., Survey]:
         )
         return Survey(Path("made.xtf"), "made", "made", pings)
 
-    return make
+    return create

@@ -1,6 +1,6 @@
-"""What a survey reader may do with any bytes: refuse them with a SurveyFileError, or give pings that can be.
+"""Check of the survey readers with arbitrary bytes: they raise SurveyFileError or return plausible pings.
 
-Used by the coverage-guided fuzzer (`run_atheris_survey.py`) and by the bounded tests of the default suite.
+The coverage-guided fuzzer (`run_atheris_survey.py`) and the tests of the default suite use it.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ FILES = (
     ("waterfall", "line.csv"),
     ("waterfall", "line.port.png"),
 )
-"""Which format and which of its files an input's first byte stands for."""
-MOST_PINGS = 2000
+"""Format and file that the first byte of an input selects."""
+MAX_PINGS = 2000
 OPTIONS = SurveyOptions(projected_crs="EPSG:32619", humminbird_depth_as_altitude=True)
 
 
@@ -53,7 +53,7 @@ def tiny_survey() -> Survey:
 
 
 class Readers:
-    """Whole recordings of every format in a folder, of which one file at a time is replaced."""
+    """Valid recordings of every format in a folder; `check` replaces one file at a time."""
 
     def __init__(self, root: Path) -> None:
         self._opened: dict[str, Path] = {}
@@ -61,25 +61,25 @@ class Readers:
             (root / kind).mkdir()
             self._opened[kind] = make(tiny_survey(), root / kind)
         self._files = [root / kind / name for kind, name in FILES]
-        self._whole = [path.read_bytes() for path in self._files]
+        self._valid = [path.read_bytes() for path in self._files]
 
     def seeds(self) -> list[bytes]:
-        """Return an input of each file as it should be."""
-        return [bytes([number]) + whole for number, whole in enumerate(self._whole)]
+        """Return a valid input for each file."""
+        return [bytes([number]) + content for number, content in enumerate(self._valid)]
 
     def check(self, data: bytes) -> str:
-        """Read an input; return "refused" or "read".
+        """Read an input; return "rejected" or "read".
 
         Raises:
-            AssertionError: A ping holds what cannot be.
-            Exception: Anything but a SurveyFileError that reading raised.
+            AssertionError: A value of a ping is impossible.
+            Exception: The reader raised an exception other than SurveyFileError.
         """
         number = (data[0] if data else 0) % len(FILES)
         self._files[number].write_bytes(data[1:])
         try:
             return self._read(self._opened[FILES[number][0]])
         finally:
-            self._files[number].write_bytes(self._whole[number])
+            self._files[number].write_bytes(self._valid[number])
 
     def _read(self, path: Path) -> str:
         try:
@@ -88,14 +88,14 @@ class Readers:
                 for ping in source.pings():
                     check_ping(ping)
                     count += 1
-                assert count == source.info.ping_count <= MOST_PINGS
+                assert count == source.info.ping_count <= MAX_PINGS
         except SurveyFileError:
-            return "refused"
+            return "rejected"
         return "read"
 
 
 def check_ping(ping: Ping) -> None:
-    """Raise AssertionError where a ping holds what no vehicle can have."""
+    """Raise AssertionError if a value of the ping is impossible."""
     assert math.isfinite(ping.time_utc_s)
     assert (ping.lat_deg is None) == (ping.lon_deg is None)
     assert ping.lat_deg is None or ping.lon_deg is None or (abs(ping.lat_deg) <= 90 and abs(ping.lon_deg) <= 180)

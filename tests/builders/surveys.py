@@ -1,4 +1,4 @@
-"""The small survey as files of every format, for tests that hold for all of them."""
+"""Survey files of every format with the content of a `Survey`."""
 
 from __future__ import annotations
 
@@ -24,13 +24,22 @@ def make_xtf(survey: Survey, folder: Path) -> Path:
 
 
 def mercator(lat_deg: float, lon_deg: float) -> tuple[int, int]:
-    """The inverse of the reader's conversion, in whole metres as the recorder stores them."""
+    """Return Mercator coordinates in whole metres, as Humminbird recorders store them."""
     geocentric = math.atan(math.tan(math.radians(lat_deg)) / 1.0067642927)
     north_m = RADIUS_M * math.asinh(math.tan(geocentric))
     return round(math.radians(lon_deg) * RADIUS_M), round(north_m)
 
 
 def son_ping(number: int, time_ms: int, samples: bytes, extra: bytes = b"", **values: int) -> bytes:
+    """Return a ping of a SON file.
+
+    Args:
+        number: Number of the ping.
+        time_ms: Time since the start of the recording.
+        samples: Samples of 8 bits.
+        extra: Additional header fields.
+        values: Fields `east`, `north`, `heading`, `speed` and `depth` in the units of the format.
+    """
     fields = struct.pack(">BIBI", 0x80, number, 0x81, time_ms)
     fields += struct.pack(">BiBi", 0x82, values.get("east", 0), 0x83, values.get("north", 0))
     fields += struct.pack(">BHH", 0x84, 1, values.get("heading", 0)) + struct.pack(

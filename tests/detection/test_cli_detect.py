@@ -1,3 +1,5 @@
+"""`sonarpost detect`."""
+
 from __future__ import annotations
 
 import argparse
@@ -30,15 +32,15 @@ def file(make_survey, tmp_path_factory):
     return path
 
 
-def test_the_table_names_each_contact(file, capsys):
+def test_table_lists_each_contact(file, capsys):
     assert run(file) == 0
-    head, columns, line = capsys.readouterr().out.splitlines()
-    assert head == f"{file}: 200 pings, 1 contacts"
+    title, columns, line = capsys.readouterr().out.splitlines()
+    assert title == f"{file}: 200 pings, 1 contacts"
     assert len(columns.split()) == len(line.split()) - 1  # the position is two numbers
     assert line.split()[2:4] == ["mine-like", "starboard"]
 
 
-def test_json_is_one_object_with_every_files_contacts(file, capsys):
+def test_json_is_one_object_with_contacts_of_every_file(file, capsys):
     assert run(file, file, "--json", "--vehicle", "uuv-7") == 0
     lines = capsys.readouterr().out.splitlines()
     files = json.loads(lines[-1])["files"]
@@ -63,40 +65,40 @@ def test_snippets_are_written_at_both_scales(file, tmp_path):
     (tmp_path / "out").mkdir()
     assert run(file, "--snippets", tmp_path / "out") == 0
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["line7-001-ground.png", "line7-001.png"]
-    with Image.open(tmp_path / "out" / "line7-001-ground.png") as picture:
-        assert picture.size == (100, 100)
+    with Image.open(tmp_path / "out" / "line7-001-ground.png") as image:
+        assert image.size == (100, 100)
 
 
-def test_a_survey_in_two_files_is_one_line_to_the_command(make_survey, tmp_path, capsys):
-    whole = make_survey({"ping": 99, "sample": 300}, {"ping": 40, "sample": 350})
+def test_consecutive_files_are_one_line(make_survey, tmp_path, capsys):
+    survey = make_survey({"ping": 99, "sample": 300}, {"ping": 40, "sample": 350})
     paths = [tmp_path / "a.xtf", tmp_path / "b.xtf"]
-    for path, pings in zip(paths, (whole.pings[:100], whole.pings[100:]), strict=True):
-        write_xtf(replace(whole, pings=pings), path)
+    for path, pings in zip(paths, (survey.pings[:100], survey.pings[100:]), strict=True):
+        write_xtf(replace(survey, pings=pings), path)
     assert run(*paths, "--json") == 0
     files = json.loads(capsys.readouterr().out)["files"]
     found = [(number, c["ping"], c["sample"]) for number, f in enumerate(files) for c in f["contacts"]]
     assert len(found) == 2
-    on_the_seam = [100 * number + ping for number, ping, sample in found if abs(sample - 300) < 10]
-    assert on_the_seam == [pytest.approx(99, abs=3)]
+    at_boundary = [100 * number + ping for number, ping, sample in found if abs(sample - 300) < 10]
+    assert at_boundary == [pytest.approx(99, abs=3)]
     assert run(*paths, "--plot", tmp_path / "out.png") == 0
 
 
-def test_the_plot_frames_the_contact_on_its_side(file, tmp_path):
+def test_plot_marks_contact_on_its_side(file, tmp_path):
     assert run(file, "--plot", tmp_path / "out.png") == 0
-    with Image.open(tmp_path / "out.png") as picture:
-        pixels = np.asarray(picture).astype(int)
+    with Image.open(tmp_path / "out.png") as image:
+        pixels = np.asarray(image).astype(int)
     assert pixels.shape == (200, 1024, 3)
     rows, columns = np.nonzero((pixels[..., 0] == 255) & (pixels[..., 1] == 80) & (pixels[..., 2] == 60))
     assert columns.min() > 512 + 230
     assert abs(rows.min() - 110) < 5
 
 
-def test_several_files_get_a_plot_each(file, tmp_path):
+def test_several_files_give_one_plot_each(file, tmp_path):
     assert run(file, file, "--plot", tmp_path / "out.png") == 0
     assert [p.name for p in tmp_path.iterdir()] == ["out-line7.png"]
 
 
-def test_the_options_limit_the_list(file, capsys):
+def test_options_limit_number_of_contacts(file, capsys):
     assert run(file, "--threshold", "2") == 0
     assert capsys.readouterr().out.splitlines() == [f"{file}: 200 pings, 0 contacts"]
     assert run(file, "--threshold", "0.001", "--max-contacts", "3", "--json") == 0
@@ -105,12 +107,12 @@ def test_the_options_limit_the_list(file, capsys):
 
 
 @pytest.mark.parametrize("options", [("--threshold", "3"), ("--threshold", "nan"), ("--max-contacts", "0")])
-def test_an_option_out_of_range_is_named(file, options):
+def test_error_names_option_out_of_range(file, options):
     with pytest.raises(ConfigError, match=r"threshold|max_contacts"):
         run(file, *options)
 
 
-def test_a_bad_file_and_a_folder_that_is_not_there_are_errors_that_main_tells(file, tmp_path):
+def test_invalid_file_and_missing_folder_raise(file, tmp_path):
     (tmp_path / "bad.xtf").write_bytes(b"not a survey")
     with pytest.raises(SurveyFileError):
         run(tmp_path / "bad.xtf")
@@ -118,6 +120,6 @@ def test_a_bad_file_and_a_folder_that_is_not_there_are_errors_that_main_tells(fi
         run(file, "--plot", tmp_path / "absent" / "out.png")
 
 
-def test_one_side_alone_and_no_side_can_be_drawn(make_survey):
+def test_waterfall_with_one_side_or_none(make_survey):
     assert annotated_waterfall(make_survey(sides=(Side.STARBOARD,)), ()).size == (512, 200)
     assert annotated_waterfall(make_survey(sides=()), ()).size == (1, 1)

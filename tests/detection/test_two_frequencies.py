@@ -1,4 +1,4 @@
-"""Files of sonars of two frequencies give what the first frequency alone gives: places, sizes, pictures."""
+"""Detection in dual-frequency surveys gives the results of the first frequency alone."""
 
 from __future__ import annotations
 
@@ -40,24 +40,24 @@ def simulated():
 
 
 @SECOND
-def test_an_object_has_the_place_and_size_it_has_in_the_first_frequency_alone(samples, range_m, simulated, tmp_path):
+def test_detections_equal_those_of_first_frequency(samples, range_m, simulated, tmp_path):
     alone, both = read_both(simulated.survey, tmp_path, samples, range_m)
     found = detect(both)
     assert len(found) == len(simulated.truth) == 4
-    for thing in simulated.truth:
-        # A highlight is the near face, so that it lies a little nearer than the object's middle.
-        slant_m = (thing.sample_index + 0.5) * RANGE_M / SAMPLES
-        (one,) = [d for d in found if d.side is thing.side and abs(d.slant_range_m - slant_m) < 0.4]
-        assert one.ping_index == pytest.approx(thing.ping, abs=10)
-        assert one.ground_range_m == pytest.approx(thing.ground_range_m, abs=0.7)
-        assert one.length_m == pytest.approx(thing.length_m, abs=0.5)
-        assert one.width_m == pytest.approx(thing.width_m, abs=0.6)
-        assert one.height_m == pytest.approx(thing.height_m, abs=0.15)
+    for target in simulated.truth:
+        # The highlight is the near face, which is nearer than the middle of the object.
+        slant_m = (target.sample_index + 0.5) * RANGE_M / SAMPLES
+        (one,) = [d for d in found if d.side is target.side and abs(d.slant_range_m - slant_m) < 0.4]
+        assert one.ping_index == pytest.approx(target.ping, abs=10)
+        assert one.ground_range_m == pytest.approx(target.ground_range_m, abs=0.7)
+        assert one.length_m == pytest.approx(target.length_m, abs=0.5)
+        assert one.width_m == pytest.approx(target.width_m, abs=0.6)
+        assert one.height_m == pytest.approx(target.height_m, abs=0.15)
     assert found == detect(alone)
 
 
 @SECOND
-def test_an_object_without_altitude_and_navigation_too(samples, range_m, make_survey, tmp_path):
+def test_detections_without_altitude_and_navigation(samples, range_m, make_survey, tmp_path):
     survey = make_survey({}, navigation=False, altitude=False)
     alone, both = read_both(survey, tmp_path, samples, range_m)
     (found,) = detect(both)
@@ -68,7 +68,7 @@ def test_an_object_without_altitude_and_navigation_too(samples, range_m, make_su
 
 
 @SECOND
-def test_cells_are_those_of_the_first_frequency(samples, range_m, make_survey, tmp_path):
+def test_cells_are_those_of_first_frequency(samples, range_m, make_survey, tmp_path):
     alone, both = (
         normalise_side(survey, Side.PORT, DetectorSettings())
         for survey in read_both(make_survey({}), tmp_path, samples, range_m)
@@ -79,9 +79,9 @@ def test_cells_are_those_of_the_first_frequency(samples, range_m, make_survey, t
 
 @SECOND
 @pytest.mark.parametrize("sample", [250, 505])
-def test_its_pictures_too(sample, samples, range_m, make_survey, tmp_path):
+def test_snippets_are_those_of_first_frequency(sample, samples, range_m, make_survey, tmp_path):
     alone, both = read_both(make_survey({}), tmp_path, samples, range_m)
-    # At the recording's outer edge the window is shifted.
+    # At the outer edge of the recording the window is shifted.
     found = replace(detect(alone)[0], sample=sample)
     for one, other in zip(
         (cut_snippet(alone, found, 80, 140), cut_snippet(alone, found, 80, 1000)),
@@ -97,16 +97,16 @@ def test_its_pictures_too(sample, samples, range_m, make_survey, tmp_path):
     )
 
 
-def test_a_second_frequency_of_long_range_does_not_forbid_small_pixels(make_survey, tmp_path):
+def test_long_range_of_second_frequency_allows_small_pixels(make_survey, tmp_path):
     alone, both = read_both(make_survey({}), tmp_path, 512, 8000.0)
     (found,) = detect(alone)
     pixel_m = 8000.0 / MAX_COLUMNS / 2
-    picture = ground_projected_image(alone, found, 8, 14, pixel_m)
-    assert picture is not None
-    np.testing.assert_array_equal(ground_projected_image(both, found, 8, 14, pixel_m), picture)
+    image = ground_projected_image(alone, found, 8, 14, pixel_m)
+    assert image is not None
+    np.testing.assert_array_equal(ground_projected_image(both, found, 8, 14, pixel_m), image)
 
 
-def test_a_sample_that_only_the_second_frequency_has_is_not_of_the_survey(make_survey):
+def test_sample_beyond_first_frequency_is_rejected(make_survey):
     survey = make_survey({})
     found = replace(detect(survey)[0], sample=600)
     with pytest.raises(ValueError, match="512 samples"):
@@ -114,14 +114,14 @@ def test_a_sample_that_only_the_second_frequency_has_is_not_of_the_survey(make_s
 
 
 @SECOND
-def test_contacts_are_drawn_where_they_are(samples, range_m, make_survey, tmp_path):
+def test_annotated_waterfall_shows_first_frequency(samples, range_m, make_survey, tmp_path):
     alone, both = read_both(make_survey({}), tmp_path, samples, range_m)
-    pictures = [np.asarray(annotated_waterfall(survey, detect(survey))) for survey in (alone, both)]
-    np.testing.assert_array_equal(*pictures)
+    images = [np.asarray(annotated_waterfall(survey, detect(survey))) for survey in (alone, both)]
+    np.testing.assert_array_equal(*images)
 
 
 @SECOND
-def test_a_line_of_several_files_too(samples, range_m, make_survey, tmp_path):
+def test_line_of_several_files(samples, range_m, make_survey, tmp_path):
     found = []
     for survey in read_both(make_survey({}), tmp_path, samples, range_m):
         detector = StreamDetector()
@@ -131,17 +131,17 @@ def test_a_line_of_several_files_too(samples, range_m, make_survey, tmp_path):
     assert found[0] == found[1] != []
 
 
-def test_files_whose_frequencies_change_places_are_not_one_line(make_survey):
+def test_exchanged_frequencies_are_no_continuation(make_survey):
     survey = with_second_frequency(make_survey({}), 512, 10.0)
     first, second = replace(survey, pings=survey.pings[:98]), replace(survey, pings=survey.pings[98:])
     assert is_continuation(first, second)
-    # Both sides' second channels come first: the picture would go on at another scale.
-    turned = tuple(replace(p, channels=(*p.channels[2:], *p.channels[:2])) for p in second.pings)
-    assert not is_continuation(first, replace(second, pings=turned))
+    # The second channels of both sides come first: the image would continue at another scale.
+    exchanged = tuple(replace(p, channels=(*p.channels[2:], *p.channels[:2])) for p in second.pings)
+    assert not is_continuation(first, replace(second, pings=exchanged))
 
 
 @SECOND
-def test_a_coded_picture_is_put_back_into_the_first_frequency_alone(samples, range_m, make_survey, tmp_path):
+def test_codec_effect_uses_first_frequency(samples, range_m, make_survey, tmp_path):
     alone, both = read_both(make_survey({}), tmp_path, samples, range_m)
     (found,) = detect(alone)
     cut = cut_snippet(alone, found, 80, 140)

@@ -1,4 +1,4 @@
-"""A small survey to write, read and damage."""
+"""Fixture: a small survey."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 @pytest.fixture
 def small_survey() -> Callable[..., Survey]:
-    """Makes a survey of a few pings with different samples on both sides."""
+    """Return a function that creates a survey of a few pings with different samples on both sides."""
 
-    def make(dtype: type = np.uint8, pings: int = 5, samples: int = 40) -> Survey:
+    def create(dtype: type = np.uint8, pings: int = 5, samples: int = 40) -> Survey:
         rng = np.random.default_rng(3)
-        top = np.iinfo(dtype).max
-        rows = []
+        full_scale = np.iinfo(dtype).max
+        ping_list = []
         for row in range(pings):
             channels = tuple(
-                ChannelPing(side, rng.integers(0, top, samples, dtype=dtype, endpoint=True), 25.0, 600_000.0)
+                ChannelPing(side, rng.integers(0, full_scale, samples, dtype=dtype, endpoint=True), 25.0, 600_000.0)
                 for side in Side
             )
-            rows.append(
+            ping_list.append(
                 Ping(
                     number=row + 10,
                     time_utc_s=1_378_847_588.13 + row * 0.37,
@@ -39,6 +39,6 @@ def small_survey() -> Callable[..., Survey]:
                     roll_deg=3.75,
                 )
             )
-        return Survey(Path("made.xtf"), "HDS", "made", tuple(rows))
+        return Survey(Path("made.xtf"), "HDS", "made", tuple(ping_list))
 
-    return make
+    return create

@@ -1,3 +1,5 @@
+"""Bottom tracking: altitude from the first return."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -20,8 +22,8 @@ def survey_of(rows: np.ndarray, range_m: float = 30.0) -> Survey:
     return Survey(Path("x"), "x", "x", pings)
 
 
-def drawn(altitude_m: np.ndarray, samples: int = 600, range_m: float = 30.0) -> np.ndarray:
-    """Return pings with a ring-down, dark water and a bright, speckled bottom from `altitude_m` on."""
+def synthetic_echo(altitude_m: np.ndarray, samples: int = 600, range_m: float = 30.0) -> np.ndarray:
+    """Return samples of a ring-down, a dark water column, and a bright seabed with speckle from `altitude_m` on."""
     rng = np.random.default_rng(1)
     centres = (np.arange(samples) + 0.5) * range_m / samples
     level = np.where(centres >= altitude_m[:, None], 90.0, 2.0)
@@ -29,36 +31,36 @@ def drawn(altitude_m: np.ndarray, samples: int = 600, range_m: float = 30.0) -> 
     return np.clip(level * rng.rayleigh(0.8, level.shape), 0, 255).astype(np.uint8)
 
 
-def test_a_sloping_bottom_is_followed():
+def test_tracker_follows_sloping_bottom():
     altitude = np.linspace(4.0, 9.0, 200)
-    assert np.abs(track_bottom(survey_of(drawn(altitude))) - altitude).max() < 0.25
+    assert np.abs(track_bottom(survey_of(synthetic_echo(altitude))) - altitude).max() < 0.25
 
 
-def test_fish_and_gaps_do_not_mislead():
+def test_tracker_ignores_fish_and_gaps():
     altitude = np.full(200, 7.0)
-    rows = drawn(altitude)
+    rows = synthetic_echo(altitude)
     rows[50:56, 60:66] = 255  # a school of fish at 3 m
     rows[100:110] = 0  # lost pings
     assert np.abs(track_bottom(survey_of(rows)) - altitude).max() < 0.25
 
 
-def test_where_nothing_stands_out_there_is_no_altitude():
+def test_no_altitude_without_first_return():
     assert np.isnan(track_bottom(survey_of(np.full((60, 400), 80, np.uint8)))).all()
     assert np.isnan(track_bottom(survey_of(np.zeros((60, 400), np.uint8)))).all()
-    assert track_bottom(dataclasses.replace(survey_of(drawn(np.full(3, 5.0))), pings=())).shape == (0,)
+    assert track_bottom(dataclasses.replace(survey_of(synthetic_echo(np.full(3, 5.0))), pings=())).shape == (0,)
 
 
-def test_a_long_gap_stays_open():
-    rows = drawn(np.full(200, 7.0))
+def test_long_gap_is_not_interpolated():
+    rows = synthetic_echo(np.full(200, 7.0))
     rows[60:140] = 0
     tracked = track_bottom(survey_of(rows))
     assert np.isnan(tracked[80:120]).all()
     assert np.isfinite(tracked[:55]).all()
 
 
-def test_sides_of_another_range_and_sampling():
-    near = drawn(np.full(80, 6.0), samples=300, range_m=20.0)
-    far = drawn(np.full(80, 6.0), samples=900, range_m=60.0)
+def test_sides_with_different_range_and_sampling():
+    near = synthetic_echo(np.full(80, 6.0), samples=300, range_m=20.0)
+    far = synthetic_echo(np.full(80, 6.0), samples=900, range_m=60.0)
     pings = tuple(
         Ping(i, i * 0.1, (ChannelPing(Side.PORT, near[i], 20.0), ChannelPing(Side.STARBOARD, far[i], 60.0)))
         for i in range(80)
@@ -67,20 +69,20 @@ def test_sides_of_another_range_and_sampling():
 
 
 @pytest.mark.parametrize("window", [0, 4, -1])
-def test_the_window_is_odd(window):
+def test_even_window_is_rejected(window):
     with pytest.raises(ValueError, match="odd"):
-        track_bottom(survey_of(drawn(np.full(5, 5.0))), window_pings=window)
+        track_bottom(survey_of(synthetic_echo(np.full(5, 5.0))), window_pings=window)
 
 
 @pytest.mark.parametrize("kind", list(SeabedKind))
-def test_a_simulated_vehicle_is_tracked_to_its_true_altitude(kind):
+def test_tracked_altitude_matches_simulation(kind):
     survey = simulate_survey(SurveySpec(seed=2, seabed=kind, pings=200, samples=512, targets=1, clutter=1)).survey
     truth = np.array([p.altitude_m for p in survey])
     assert np.median(np.abs(track_bottom(survey) - truth)) < 0.2
 
 
-def test_the_files_own_altitude_goes_first():
-    survey = survey_of(drawn(np.full(60, 7.0)))
+def test_recorded_altitude_has_precedence():
+    survey = survey_of(synthetic_echo(np.full(60, 7.0)))
     pings = list(survey.pings)
     pings[5] = dataclasses.replace(pings[5], altitude_m=6.5)
     altitude = altitudes_m(dataclasses.replace(survey, pings=tuple(pings)))
@@ -89,8 +91,8 @@ def test_the_files_own_altitude_goes_first():
 
 
 @pytest.mark.realdata
-def test_real_first_returns(data_dir):
-    """Against the first returns read off the pictures by eye."""
+def test_first_returns_of_recordings(data_dir):
+    """The expected values were read from the images."""
     river = track_bottom(read_xtf(data_dir / "surveys" / "000_1236.xtf"))
     assert np.isfinite(river).all()
     assert river[[100, 480, 1000, 1363]] == pytest.approx([6.7, 6.7, 4.1, 1.4], abs=0.5)

@@ -1,3 +1,5 @@
+"""Positions, distances, and the error ellipse of positions of samples."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -6,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyxtf
 from hypothesis import given
 from hypothesis import strategies as st
+from pyproj import Geod
 
 from sonarpost.sonar.geometry import (
     WGS84_EQUATORIAL_RADIUS_M,
@@ -23,13 +27,14 @@ from sonarpost.sonar.geometry import (
     sample_slant_range_m,
     slant_to_ground_range_m,
 )
-from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.options import ErrorBudget, Mounting, SurveyOptions
+from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 
 def geodesic(origin: Position, bearing_deg: float, distance_m: float) -> Position:
-    """Vincenty's direct formula (Survey Review 1975): exact to a tenth of a millimetre, and another way altogether."""
+    """Return the position by Vincenty's direct formula (Survey Review 1975), accurate to 0.1 mm."""
     f, a = WGS84_FLATTENING, WGS84_EQUATORIAL_RADIUS_M
     b = a * (1 - f)
     azimuth = math.radians(bearing_deg)
@@ -66,32 +71,32 @@ ORIGINS = st.builds(Position, st.floats(-80, 80), st.floats(-180, 179.99))
 
 
 @given(origin=ORIGINS, bearing=st.floats(0, 360), distance=st.floats(0, 500))
-def test_offsets_agree_with_the_geodesic_to_a_millimetre(origin, bearing, distance):
+def test_offsets_match_geodesic_within_1_mm(origin, bearing, distance):
     got, want = offset_position(origin, bearing, distance), geodesic(origin, bearing, distance)
-    metres = 111_000.0
-    assert abs(got.lat_deg - want.lat_deg) * metres < 1e-3
+    metres_per_deg = 111_000.0
+    assert abs(got.lat_deg - want.lat_deg) * metres_per_deg < 1e-3
     lon_error = (got.lon_deg - want.lon_deg + 180) % 360 - 180
-    assert abs(lon_error) * metres * math.cos(math.radians(origin.lat_deg)) < 1e-3
+    assert abs(lon_error) * metres_per_deg * math.cos(math.radians(origin.lat_deg)) < 1e-3
     assert -180 <= got.lon_deg < 180
 
 
 @given(origin=ORIGINS, bearing=st.floats(0, 360), distance=st.floats(0, 500))
-def test_offset_between_undoes_offset_position(origin, bearing, distance):
+def test_offset_between_inverts_offset_position(origin, bearing, distance):
     north, east = offset_between_m(origin, offset_position(origin, bearing, distance))
     assert north == pytest.approx(distance * math.cos(math.radians(bearing)), abs=1e-3)
     assert east == pytest.approx(distance * math.sin(math.radians(bearing)), abs=1e-3)
 
 
-def test_ground_range_is_the_flat_bottom_triangle():
+def test_ground_range_assumes_flat_seabed():
     assert slant_to_ground_range_m(5.0, 3.0) == pytest.approx(4.0)
     np.testing.assert_allclose(slant_to_ground_range_m([3.0, 5.0, 13.0], [3.0, 3.0, 12.0]), [0.0, 4.0, 5.0])
     assert np.isnan(slant_to_ground_range_m(2.9, 3.0))
 
 
 @given(ground=st.floats(0, 500), altitude=st.floats(0.1, 100))
-def test_slant_and_ground_are_inverse(ground, altitude):
+def test_slant_and_ground_range_conversions_are_inverse(ground, altitude):
     back = slant_to_ground_range_m(ground_to_slant_range_m(ground, altitude), altitude)
-    # At nadir a slant range says little about the ground range.
+    # Near nadir the ground range is very sensitive to the slant range.
     assert np.nan_to_num(back) == pytest.approx(ground, abs=1e-5)
 
 
@@ -116,16 +121,16 @@ def ping_at(heading_deg: float | None, **changes: object) -> Ping:
         (225, Side.STARBOARD, math.sqrt(0.5), -math.sqrt(0.5)),
     ],
 )
-def test_a_sample_lies_abeam_on_its_side(heading, side, north, east):
+def test_sample_lies_abeam_on_its_side(heading, side, north, east):
     ping = ping_at(heading)
     index = 60
     slant_m = sample_slant_range_m(ping.channel(side), index)
     assert slant_m == pytest.approx(30.25)
     ground_m = math.sqrt(30.25**2 - 12.25**2)
-    place = sample_position(ping, side, index)
-    got = offset_between_m(Position(60.0, 10.0), place)
+    position = sample_position(ping, side, index)
+    got = offset_between_m(Position(60.0, 10.0), position)
     assert got == pytest.approx((north * ground_m, east * ground_m), abs=1e-3)
-    assert place == ground_position(ping, side, ground_m)
+    assert position == ground_position(ping, side, ground_m)
 
 
 def test_tracked_altitude_is_used_for_a_ping_without_altitude():
@@ -148,18 +153,18 @@ def straight_line(step_m: float, count: int, digits: int = 12, **changes: object
     origin = Position(48.0, -68.0)
     pings = []
     for row in range(count):
-        place = offset_position(origin, 30.0, row * step_m)
-        ping = Ping(row, row * 0.1, (), round(place.lat_deg, digits), round(place.lon_deg, digits), **changes)
+        position = offset_position(origin, 30.0, row * step_m)
+        ping = Ping(row, row * 0.1, (), round(position.lat_deg, digits), round(position.lon_deg, digits), **changes)
         pings.append(ping)
     return Survey(Path("x"), "x", "x", tuple(pings))
 
 
-def test_distance_along_a_straight_line():
+def test_along_track_distance_of_straight_line():
     np.testing.assert_allclose(along_track_m(straight_line(0.12, 300)), 0.12 * np.arange(300), atol=1e-3)
     assert ping_spacing_m(straight_line(0.12, 300)) == pytest.approx(0.12, rel=1e-4)
 
 
-def test_coarse_fixes_do_not_lengthen_the_track():
+def test_coarse_fixes_do_not_lengthen_track():
     coarse = straight_line(0.12, 600, digits=5)  # steps of 1.1 m north and 0.75 m east
     raw = [
         offset_between_m(Position(coarse.pings[0].lat_deg, coarse.pings[0].lon_deg), Position(p.lat_deg, p.lon_deg))
@@ -169,7 +174,7 @@ def test_coarse_fixes_do_not_lengthen_the_track():
     assert ping_spacing_m(coarse) == pytest.approx(0.12, rel=0.03)
 
 
-def test_pings_without_a_fix_are_bridged():
+def test_distance_is_interpolated_over_missing_fixes():
     survey = straight_line(0.12, 300)
     lost = {*range(5), 100, 101, 102, *range(290, 300)}
     pings = tuple(
@@ -179,7 +184,7 @@ def test_pings_without_a_fix_are_bridged():
     np.testing.assert_allclose(distance, 0.12 * np.arange(300), atol=2e-3)
 
 
-def test_speed_and_time_where_there_are_no_fixes():
+def test_distance_from_speed_and_time_without_fixes():
     survey = straight_line(1.0, 50, speed_mps=1.5)
     pings = [dataclasses.replace(p, lat_deg=None, lon_deg=None) for p in survey]
     pings[7] = dataclasses.replace(pings[7], speed_mps=None)
@@ -188,18 +193,146 @@ def test_speed_and_time_where_there_are_no_fixes():
     )
 
 
-def test_nothing_is_guessed():
+def test_distance_is_unknown_without_navigation():
     survey = straight_line(1.0, 5)
-    bare = dataclasses.replace(survey, pings=tuple(dataclasses.replace(p, lat_deg=None, lon_deg=None) for p in survey))
-    assert along_track_m(bare) is None
-    assert ping_spacing_m(bare) is None
+    without_fixes = dataclasses.replace(
+        survey, pings=tuple(dataclasses.replace(p, lat_deg=None, lon_deg=None) for p in survey)
+    )
+    assert along_track_m(without_fixes) is None
+    assert ping_spacing_m(without_fixes) is None
     assert ping_spacing_m(straight_line(0.0, 5)) is None
     assert along_track_m(dataclasses.replace(survey, pings=())) is None
 
 
 @pytest.mark.realdata
-def test_the_real_vehicle_went_as_fast_as_it_says(data_dir):
+def test_track_speed_of_recording_matches_recorded_speed(data_dir):
     survey = read_xtf(data_dir / "surveys" / "scotsman-iver2.xtf")
     speeds = [p.speed_mps for p in survey if p.speed_mps is not None]
-    lasted_s = survey.pings[-1].time_utc_s - survey.pings[0].time_utc_s
-    assert along_track_m(survey)[-1] / lasted_s == pytest.approx(np.mean(speeds), rel=0.05)
+    duration_s = survey.pings[-1].time_utc_s - survey.pings[0].time_utc_s
+    assert along_track_m(survey)[-1] / duration_s == pytest.approx(np.mean(speeds), rel=0.05)
+
+
+NO_ERRORS = dict.fromkeys(ErrorBudget.model_fields, 0.0)
+FINE = 6000
+"""Number of samples with which the sample spacing is negligible."""
+
+
+def accurate_ping(**changes) -> Ping:
+    channels = tuple(ChannelPing(side, np.zeros(FINE, np.uint8), 60.0) for side in Side)
+    complete = Ping(1, 0.0, channels, 60.0, 10.0, heading_deg=30.0, altitude_m=12.0, speed_mps=1.5)
+    return dataclasses.replace(complete, **changes)
+
+
+def only_errors(**errors) -> SurveyOptions:
+    return SurveyOptions(errors=ErrorBudget(**{**NO_ERRORS, **errors}))
+
+
+def test_each_error_contribution():
+    index = 3600  # 36 m of slant range
+    slant = 36.005
+    ground = math.sqrt(slant**2 - 144)
+    cases = {
+        "position_m": (5.0, 5.0, 5.0),
+        "heading_deg": (2.0, 0.0, ground * math.radians(2)),
+        "altitude_m": (0.3, 0.3 * 12 / ground, 0.0),
+        "sound_speed": (0.01, 0.01 * slant**2 / ground, 0.0),
+        "bottom_slope_deg": (3.0, ground * math.tan(math.radians(3)) * 12 / ground, 0.0),
+        "time_s": (0.4, 0.0, 0.6),
+    }
+    for name, (value, across_m, along_m) in cases.items():
+        got = georeference(accurate_ping(), Side.PORT, index, only_errors(**{name: value}))
+        assert got.across_sigma_m == pytest.approx(across_m, abs=0.004), name
+        assert got.along_sigma_m == pytest.approx(along_m, abs=1e-9), name
+    assert georeference(accurate_ping(), Side.PORT, index, SurveyOptions()).drms_m > 7
+
+
+def test_error_ellipse_matches_monte_carlo():
+    """Monte Carlo: positions are computed from inputs that are drawn from the error budget."""
+    rng = np.random.default_rng(4)
+    options = only_errors(position_m=1.0, heading_deg=2.0, altitude_m=0.3, sound_speed=0.01)
+    got = georeference(accurate_ping(), Side.STARBOARD, 3600, options)
+    north, east = [], []
+    for _ in range(4000):
+        sampled = accurate_ping(heading_deg=30 + rng.normal(0, 2), altitude_m=12 + rng.normal(0, 0.3))
+        factor = 1 + rng.normal(0, 0.01)
+        channels = tuple(dataclasses.replace(c, slant_range_m=60 * factor) for c in sampled.channels)
+        place = georeference(dataclasses.replace(sampled, channels=channels), Side.STARBOARD, 3600, options)
+        n, e = offset_between_m(got.position, place.position)
+        north.append(n + rng.normal(0, 1))
+        east.append(e + rng.normal(0, 1))
+    bearing = math.radians(got.bearing_deg)
+    across = np.array(north) * math.cos(bearing) + np.array(east) * math.sin(bearing)
+    along = np.array(east) * math.cos(bearing) - np.array(north) * math.sin(bearing)
+    assert across.std() == pytest.approx(got.across_sigma_m, rel=0.06)
+    assert along.std() == pytest.approx(got.along_sigma_m, rel=0.06)
+
+
+def test_error_near_nadir_is_large_and_finite():
+    near = georeference(accurate_ping(), Side.PORT, 1200.4, only_errors(altitude_m=0.2))
+    far = georeference(accurate_ping(), Side.PORT, 5000, only_errors(altitude_m=0.2))
+    assert far.across_sigma_m < 0.06
+    assert 1.5 < near.across_sigma_m < 3
+
+
+def test_tracked_altitude_and_layback_increase_error():
+    index = 3600
+    without_altitude = accurate_ping(altitude_m=None)
+    assert georeference(without_altitude, Side.PORT, index, SurveyOptions()) is None
+    options = only_errors(altitude_m=0.1, tracked_altitude_m=1.0, layback_m=7.0)
+    tracked = georeference(without_altitude, Side.PORT, index, options, tracked_altitude_m=12.0)
+    own = georeference(accurate_ping(), Side.PORT, index, options)
+    assert tracked.position == own.position
+    assert tracked.across_sigma_m == pytest.approx(10 * own.across_sigma_m, rel=0.01)
+    towed = options.model_copy(update={"mounting": Mounting(layback_m=50)})
+    assert georeference(accurate_ping(), Side.PORT, index, towed).along_sigma_m == pytest.approx(7)
+
+
+@pytest.mark.parametrize("index", [-1, FINE, 500, float("nan")])
+def test_no_position_outside_swath_or_in_water_column(index):
+    assert georeference(accurate_ping(), Side.PORT, index, SurveyOptions()) is None
+
+
+@pytest.mark.parametrize("lat", [89.5, -90.0])
+def test_no_position_at_poles(lat):
+    assert georeference(accurate_ping(lat_deg=lat), Side.PORT, 3600, SurveyOptions()) is None
+
+
+@pytest.mark.realdata
+def test_positions_of_recording_match_pyxtf_and_geographiclib(data_dir):
+    """The reference is independent: pyxtf reads the file, pyproj computes the geodesic."""
+    path = data_dir / "surveys" / "scotsman-iver2.xtf"
+    _, packets = pyxtf.xtf_read(str(path))
+    geod = Geod(ellps="WGS84")
+    survey = read_survey(path)
+    compared, worst_m = 0, 0.0
+    for got, head in list(zip(survey, packets[pyxtf.XTFHeaderType.sonar], strict=True))[1::9]:
+        assert (got.lat_deg, got.lon_deg) == (head.SensorYcoordinate, head.SensorXcoordinate)
+        for side, number, sign in ((Side.PORT, 0, -90), (Side.STARBOARD, 1, 90)):
+            channel = head.ping_chan_headers[number]
+            for index in (400, 700, 1023):
+                slant_m = (index + 0.5) * channel.SlantRange / channel.NumSamples
+                if slant_m <= head.SensorPrimaryAltitude:
+                    continue
+                ground_m = math.sqrt(slant_m**2 - head.SensorPrimaryAltitude**2)
+                lon, lat, _ = geod.fwd(
+                    head.SensorXcoordinate, head.SensorYcoordinate, head.SensorHeading + sign, ground_m
+                )
+                place = georeference(got, side, index, SurveyOptions()).position
+                _, _, off_m = geod.inv(lon, lat, place.lon_deg, place.lat_deg)
+                worst_m, compared = max(worst_m, off_m), compared + 1
+    assert compared > 250
+    assert worst_m < 0.001
+
+
+@pytest.mark.realdata
+def test_labelled_point_of_wreck_lies_to_starboard(data_dir):
+    channel, sample, row = map(int, (data_dir / "surveys" / "scotsman-iver2.xtf.hits").read_text().split())
+    survey = read_survey(data_dir / "surveys" / "scotsman-iver2.xtf")
+    side = (Side.PORT, Side.STARBOARD)[channel]
+    target = survey.pings[row]
+    found = georeference(target, side, sample, SurveyOptions())
+    north, east = offset_between_m(Position(target.lat_deg, target.lon_deg), found.position)
+    right = offset_position(Position(target.lat_deg, target.lon_deg), target.heading_deg + 90, 10)
+    towards = offset_between_m(Position(target.lat_deg, target.lon_deg), right)
+    assert (north * towards[0] + east * towards[1] > 0) is (side is Side.STARBOARD)
+    assert math.hypot(north, east) == pytest.approx(found.ground_range_m, abs=0.001)

@@ -1,4 +1,4 @@
-"""The water column out, the bottom over equal steps, beam and range evened."""
+"""Ground-range images, beam and range normalisation."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ def survey_of(rows: np.ndarray, range_m: float = 50.0, scale: float = 1.0) -> Su
     return Survey(Path("x"), "x", "x", pings)
 
 
-def test_a_line_on_the_bottom_is_straight_whatever_the_altitude():
+def test_line_on_seabed_is_straight_with_changing_altitude():
     altitude_m = np.linspace(5, 15, 60)
     centres_m = (np.arange(1000) + 0.5) * 0.05
     ground_m = np.sqrt(np.maximum(centres_m**2 - altitude_m[:, None] ** 2, 0))
     rows = np.where(np.abs(ground_m - 20) < 0.15, 200, 10).astype(np.uint8)
     image = ground_range_image(survey_of(rows), Side.PORT, altitude_m, 0.1)
     assert set(np.nanargmax(image, axis=1)) <= {198, 199, 200, 201}
-    # Nothing is known beyond the reach, which ends sooner the higher the sonar is.
+    # The ground range ends where the slant range ends.
     ends = np.isfinite(image).sum(axis=1)
     np.testing.assert_allclose(ends * 0.1, np.sqrt(50**2 - altitude_m**2), atol=0.11)
 
 
-def test_the_mean_echo_stays():
+def test_resampling_keeps_mean_echo():
     rows = np.random.default_rng(0).integers(0, 255, (4, 900), dtype=np.uint8)
     image = ground_range_image(survey_of(rows, scale=0.5), Side.PORT, np.zeros(4), 0.5)
     assert image.mean() == pytest.approx(rows.mean() / 2, rel=1e-3)
 
 
-def test_unknown_altitude_and_absent_side_are_nan():
+def test_unknown_altitude_gives_nan_and_absent_side_no_columns():
     rows = np.full((3, 100), 7, np.uint8)
     image = ground_range_image(survey_of(rows), Side.PORT, np.array([5.0, np.nan, 5.0]), 0.5)
     assert np.isnan(image[1]).all()
@@ -42,50 +42,50 @@ def test_unknown_altitude_and_absent_side_are_nan():
     assert ground_range_image(survey_of(rows), Side.STARBOARD, np.full(3, 5.0), 0.5).shape == (3, 0)
 
 
-def test_a_step_has_the_mean_of_the_samples_it_spans_with_their_parts():
+def test_interval_mean_weights_partial_samples():
     samples = np.array([10, 20, 40, 80], np.uint8)
-    places = np.array([0.0, 0.5, 2.0, 2.25, 2.75, 4.0])
-    np.testing.assert_allclose(interval_means(samples, places), [10, (5 + 20) / 1.5, 40, 40, (10 + 80) / 1.25])
+    edges = np.array([0.0, 0.5, 2.0, 2.25, 2.75, 4.0])
+    np.testing.assert_allclose(interval_means(samples, edges), [10, (5 + 20) / 1.5, 40, 40, (10 + 80) / 1.25])
 
 
-def test_a_step_beyond_the_last_sample_or_too_narrow_has_no_mean():
+def test_interval_beyond_samples_or_too_narrow_is_nan():
     samples = np.array([10, 20], np.uint16)
     means = interval_means(samples, np.array([0.0, 0.0, 0.25, 1.0, 2.0, 2.5]), min_width=0.25)
     np.testing.assert_array_equal(means, [np.nan, np.nan, 10, 20, np.nan])
 
 
 @pytest.mark.parametrize("spacing", [0.0, -1.0, 1e-9, float("nan")])
-def test_absurd_steps_are_refused(spacing):
+def test_invalid_spacing_is_rejected(spacing):
     with pytest.raises(ValueError, match="spacing"):
         ground_range_image(survey_of(np.ones((2, 9), np.uint8)), Side.PORT, np.ones(2), spacing)
 
 
-def test_another_number_of_altitudes_is_refused():
+def test_wrong_number_of_altitudes_is_rejected():
     with pytest.raises(ValueError, match="one for each"):
         ground_range_image(survey_of(np.ones((2, 9), np.uint8)), Side.PORT, np.ones(3), 1.0)
 
 
-def test_beam_pattern_is_evened_while_the_altitude_changes():
+def test_beam_normalisation_handles_changing_altitude():
     rng = np.random.default_rng(1)
     altitude_m = np.linspace(5, 15, 400)
     angle = np.arctan2((np.arange(300) + 0.5) * 0.1, altitude_m[:, None])
     echo = (1 + np.cos(3 * angle) ** 2) * 50 * rng.rayleigh(0.8, angle.shape)
-    even = beam_normalised(echo.astype(np.float32), altitude_m, 0.1)
+    normalised = beam_normalised(echo.astype(np.float32), altitude_m, 0.1)
     for low in (0.2, 0.5, 0.8, 1.1):
-        patch = even[(angle > low) & (angle < low + 0.1)]
+        patch = normalised[(angle > low) & (angle < low + 0.1)]
         assert patch.mean() == pytest.approx(1, abs=0.05)
-    # By columns alone it does not come out: the same column is seen at many angles.
+    # Normalising by columns is not sufficient, because the angle of a column changes with altitude.
     by_column = range_normalised(echo.astype(np.float32), window_pings=799)
     assert np.abs(by_column[:60, :60].mean(axis=0) - 1).max() > 0.15
 
 
-def test_range_normalising_keeps_gaps_and_objects():
+def test_range_normalisation_keeps_gaps_and_objects():
     image = np.tile(np.linspace(200, 20, 50, dtype=np.float32), (300, 1))
     image[100:104, 20] *= 3
     image[:, 40] = np.nan
     image[7] = np.nan
-    even = range_normalised(image, window_pings=201)
-    assert np.isnan(even[:, 40]).all()
-    assert np.isnan(even[7]).all()
-    assert np.nanmedian(even) == pytest.approx(1, abs=1e-3)
-    assert even[101, 20] > 2.5
+    normalised = range_normalised(image, window_pings=201)
+    assert np.isnan(normalised[:, 40]).all()
+    assert np.isnan(normalised[7]).all()
+    assert np.nanmedian(normalised) == pytest.approx(1, abs=1e-3)
+    assert normalised[101, 20] > 2.5

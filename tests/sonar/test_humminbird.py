@@ -1,4 +1,4 @@
-"""Humminbird recordings: headers of other models, one side, damage, the real one."""
+"""Humminbird recordings: headers of other models, one side, damage, a recording."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def recording(small_survey, tmp_path):
     return path, path.with_suffix("") / "B002.SON", path.with_suffix("") / "B003.SON"
 
 
-def test_longer_headers_of_other_models_are_walked_by_their_tags(recording):
+def test_longer_headers_are_parsed_by_tags(recording):
     path, port, starboard = recording
     extra = b"".join(struct.pack(">BI", tag, 7) for tag in range(0xA1, 0xB2)) + b"\x60\x01"
     for side in (port, starboard):
@@ -32,7 +32,7 @@ def test_longer_headers_of_other_models_are_walked_by_their_tags(recording):
     assert [ping.channel(Side.PORT).samples.tolist() for ping in survey] == [[1, 2, 3], [4]]
 
 
-def test_pings_of_one_side_only_stay_single(recording):
+def test_ping_with_one_side_only(recording):
     path, port, starboard = recording
     port.write_bytes(son_ping(1, 0, b"a") + son_ping(3, 40, b"b") + son_ping(5, 80, b"c"))
     starboard.write_bytes(son_ping(2, 0, b"d") + son_ping(6, 80, b"e"))
@@ -50,13 +50,13 @@ def test_pings_of_one_side_only_stay_single(recording):
         read_survey(path)
 
 
-def test_depth_and_spacing_are_options(recording):
+def test_depth_and_sample_spacing_options(recording):
     path, *_ = recording
     plain = read_survey(path)
     assert plain.pings[0].altitude_m is None
     assert any("slant range is not recorded: assuming 0.0191 m" in w for w in plain.warnings)
-    told = SurveyOptions(humminbird_sample_spacing_m=0.05, humminbird_depth_as_altitude=True)
-    survey = read_survey(path, told)
+    options = SurveyOptions(humminbird_sample_spacing_m=0.05, humminbird_depth_as_altitude=True)
+    survey = read_survey(path, options)
     assert survey.pings[0].altitude_m == pytest.approx(6.2)
     assert survey.pings[0].channels[0].slant_range_m == pytest.approx(2.0)
     assert survey.warnings == ()
@@ -74,7 +74,7 @@ def test_depth_and_spacing_are_options(recording):
         (lambda raw: raw[:4] + b"\x41\x00" * 500 + raw[4:], "header"),
     ],
 )
-def test_a_bad_header_is_named(recording, damage, field):
+def test_error_names_invalid_header_field(recording, damage, field):
     path, port, _ = recording
     port.write_bytes(damage(port.read_bytes()))
     with pytest.raises(SurveyFileError, match=rf"B002.SON: ping 0.*{field}"):
@@ -82,14 +82,14 @@ def test_a_bad_header_is_named(recording, damage, field):
 
 
 @pytest.mark.parametrize("dat", [b"", bytes(64), b"\xc1" + bytes(63), b"\xc1" * 70_000])
-def test_a_bad_dat_file(recording, dat):
+def test_invalid_dat_file_is_rejected(recording, dat):
     path, *_ = recording
     path.write_bytes(dat)
     with pytest.raises(SurveyFileError, match=r"line\.DAT"):
         read_survey(path)
 
 
-def test_a_position_without_a_fix_is_none(recording):
+def test_missing_fix_is_none(recording):
     path, port, starboard = recording
     for side in (port, starboard):
         side.write_bytes(
@@ -104,18 +104,18 @@ def test_a_position_without_a_fix_is_none(recording):
 
 
 @pytest.mark.realdata
-def test_the_real_recording(data_dir):
+def test_humminbird_recording(data_dir):
     folder = data_dir / "surveys"
     survey = read_survey(folder / "humminbird" / "test.DAT")
     for side, name in ((Side.PORT, "B002_port"), (Side.STARBOARD, "B003_stbd")):
-        picture = np.asarray(Image.open(folder / "derived" / f"pyhum_{name}.png"))
-        np.testing.assert_array_equal(np.nan_to_num(survey.waterfall(side)), picture)
+        image = np.asarray(Image.open(folder / "derived" / f"pyhum_{name}.png"))
+        np.testing.assert_array_equal(np.nan_to_num(survey.waterfall(side)), image)
     assert len(survey.warnings) == 2
-    # Positions, speeds and headings are recorded apart from each other, and agree.
+    # Speed and position are independent in the recording and agree.
     times = np.array([ping.time_utc_s for ping in survey])
-    sailed_m = np.trapezoid([ping.speed_mps for ping in survey], times)
-    assert along_track_m(survey)[-1] == pytest.approx(sailed_m, rel=0.05)
-    # The first return, where it was read off the picture; the echo sounder agrees with it but in the last third.
+    distance_m = np.trapezoid([ping.speed_mps for ping in survey], times)
+    assert along_track_m(survey)[-1] == pytest.approx(distance_m, rel=0.05)
+    # Expected values were read from the image. The echo sounder agrees with them except in the last third.
     altitude_m = altitudes_m(survey)
     samples = altitude_m / survey.pings[0].channels[0].sample_spacing_m
     assert samples[[0, 800, 1800, 2200, 2800, 3400]] == pytest.approx([96, 230, 257, 160, 57, 97], abs=12)

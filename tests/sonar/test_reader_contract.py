@@ -1,4 +1,4 @@
-"""What every survey reader must do, whatever its format."""
+"""The contract of survey readers, for every file format."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ STORED = {
     "humminbird": lambda path: path.with_suffix("") / "B003.SON",
     "waterfall": lambda path: path.with_name("line.csv"),
 }
-"""The file of each format that holds the pings' navigation."""
+"""The file with the navigation of the pings, by format."""
 
 pytestmark = pytest.mark.parametrize("kind", sorted(MAKERS))
 
 
-def test_samples_and_navigation_come_back(kind, small_survey, tmp_path):
+def test_samples_and_navigation_are_read(kind, small_survey, tmp_path):
     written = small_survey()
     read = read_survey(MAKERS[kind](written, tmp_path))
     assert len(read.pings) == len(written.pings)
@@ -41,25 +41,25 @@ def test_samples_and_navigation_come_back(kind, small_survey, tmp_path):
             np.testing.assert_array_equal(got.channel(side).samples, want.channel(side).samples)
             assert got.channel(side).slant_range_m > 0
         off_m = offset_between_m(Position(want.lat_deg, want.lon_deg), Position(got.lat_deg, got.lon_deg))
-        assert np.hypot(*off_m) < 0.8  # whole metres of a Mercator map at worst
+        assert np.hypot(*off_m) < 0.8  # Humminbird stores Mercator coordinates in whole metres
         assert got.heading_deg == pytest.approx(want.heading_deg, abs=0.05)
         assert got.speed_mps == pytest.approx(want.speed_mps, abs=0.05)
 
 
-def test_the_description_matches_and_a_walk_can_be_repeated(kind, small_survey, tmp_path):
+def test_info_matches_pings_and_iteration_can_be_repeated(kind, small_survey, tmp_path):
     with open_survey(MAKERS[kind](small_survey(), tmp_path)) as source:
         first, second = list(source.pings()), list(source.pings())
         assert source.info.ping_count == len(first) == 5
         assert source.info.sides == tuple(Side)
-        together = list(zip(source.pings(), source.pings(), strict=True))  # two walks at a time
+        together = list(zip(source.pings(), source.pings(), strict=True))  # two iterators at a time
     assert [p.number for p in first] == [p.number for p in second] == [p.number for p, _ in together]
     assert all(a.number == b.number for a, b in together)
 
 
-def test_a_jump_and_time_that_goes_back_are_told(kind, small_survey, tmp_path):
+def test_position_jump_and_decreasing_time_are_reported(kind, small_survey, tmp_path):
     pings = list(small_survey(pings=12).pings)
     pings[4] = dataclasses.replace(pings[4], lat_deg=49.9)
-    if kind != "humminbird":  # its time is an unsigned number that both channels are paired by
+    if kind != "humminbird":  # its channels are paired by an unsigned time
         pings[8] = dataclasses.replace(pings[8], time_utc_s=pings[8].time_utc_s - 30)
     read = read_survey(MAKERS[kind](dataclasses.replace(small_survey(), pings=tuple(pings)), tmp_path))
     assert [p.lat_deg is None for p in read] == [row == 4 for row in range(12)]
@@ -69,7 +69,7 @@ def test_a_jump_and_time_that_goes_back_are_told(kind, small_survey, tmp_path):
     )
 
 
-def test_a_new_place_is_believed_in_the_end(kind, small_survey, tmp_path):
+def test_repeated_positions_after_jump_are_accepted(kind, small_survey, tmp_path):
     pings = [
         dataclasses.replace(p, lat_deg=p.lat_deg + (row >= 5)) for row, p in enumerate(small_survey(pings=15).pings)
     ]
@@ -77,7 +77,7 @@ def test_a_new_place_is_believed_in_the_end(kind, small_survey, tmp_path):
     assert [p.lat_deg is None for p in read] == [5 <= row < 9 for row in range(15)]
 
 
-def test_the_mounting_moves_every_position(kind, small_survey, tmp_path):
+def test_mounting_shifts_every_position(kind, small_survey, tmp_path):
     path = MAKERS[kind](small_survey(), tmp_path)
     options = SurveyOptions(mounting=Mounting(forward_m=2, starboard_m=3, layback_m=42, heading_offset_deg=10))
     for plain, moved in zip(read_survey(path), read_survey(path, options), strict=True):
@@ -87,12 +87,12 @@ def test_the_mounting_moves_every_position(kind, small_survey, tmp_path):
         assert np.hypot(*offset_between_m(want, Position(moved.lat_deg, moved.lon_deg))) < 0.001
 
 
-def test_every_truncation_is_one_error_or_whole_pings(kind, small_survey, tmp_path):
+def test_every_truncation_raises_error_or_gives_complete_pings(kind, small_survey, tmp_path):
     path = MAKERS[kind](small_survey(), tmp_path)
     stored = STORED[kind](path)
-    whole = stored.read_bytes()
-    for length in range(0, len(whole), max(len(whole) // 150, 1)):
-        stored.write_bytes(whole[:length])
+    complete = stored.read_bytes()
+    for length in range(0, len(complete), max(len(complete) // 150, 1)):
+        stored.write_bytes(complete[:length])
         try:
             survey = read_survey(path)
         except SurveyFileError:
@@ -102,13 +102,13 @@ def test_every_truncation_is_one_error_or_whole_pings(kind, small_survey, tmp_pa
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_damage_reads_or_raises_one_error(kind, small_survey, tmp_path, data):
+def test_damaged_file_is_read_or_raises_survey_file_error(kind, small_survey, tmp_path, data):
     folder = tmp_path / "damaged"
     if not folder.exists():
         folder.mkdir()
         MAKERS[kind](small_survey(), folder)
-        (tmp_path / "whole").write_bytes(STORED[kind](_path(kind, folder)).read_bytes())
-    raw = bytearray((tmp_path / "whole").read_bytes())
+        (tmp_path / "complete").write_bytes(STORED[kind](_path(kind, folder)).read_bytes())
+    raw = bytearray((tmp_path / "complete").read_bytes())
     for _ in range(data.draw(st.integers(1, 5))):
         raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
     path = _path(kind, folder)
@@ -134,7 +134,7 @@ def check(survey: Survey) -> None:
         assert all(c.slant_range_m > 0 and c.samples.size for c in ping.channels)
 
 
-def test_a_file_that_is_written_to_while_it_is_read_is_an_error(kind, small_survey, tmp_path):
+def test_file_modified_while_read_is_an_error(kind, small_survey, tmp_path):
     path = MAKERS[kind](small_survey(pings=30), tmp_path)
     with open_survey(path) as source:
         pings = source.pings()
@@ -146,7 +146,7 @@ def test_a_file_that_is_written_to_while_it_is_read_is_an_error(kind, small_surv
             list(pings)
 
 
-def test_a_file_that_is_replaced_while_it_is_read_stays_the_old_one(kind, small_survey, tmp_path):
+def test_replaced_file_is_read_to_its_end(kind, small_survey, tmp_path):
     path = MAKERS[kind](small_survey(), tmp_path)
     with open_survey(path) as source:
         before = [p.time_utc_s for p in source.pings()]
@@ -155,11 +155,11 @@ def test_a_file_that_is_replaced_while_it_is_read_stays_the_old_one(kind, small_
         assert [p.time_utc_s for p in source.pings()] == before
 
 
-def test_what_is_no_file(kind, small_survey, tmp_path):
+def test_missing_or_irregular_file_is_rejected(kind, small_survey, tmp_path):
     path = MAKERS[kind](small_survey(), tmp_path)
     stored = STORED[kind](path)
     stored.unlink()
-    if kind != "humminbird":  # a recording of one side is one
+    if kind != "humminbird":  # one side alone is a valid recording
         with pytest.raises(SurveyFileError, match="No such file"):
             open_survey(path)
     os.mkfifo(stored)
@@ -167,10 +167,10 @@ def test_what_is_no_file(kind, small_survey, tmp_path):
         open_survey(path)
 
 
-def test_memory_does_not_grow_with_the_file(kind, small_survey, tmp_path):
-    """The walk of a file ten times as long takes no more memory; pictures of a waterfall are held, and left out."""
+def test_memory_is_independent_of_file_length(kind, small_survey, tmp_path):
+    """Reading a file of ten times the length needs no more memory; waterfall images are excluded."""
     if kind == "waterfall":
-        pytest.skip("its pictures are decoded whole, up to image_files.MAX_PIXELS")
+        pytest.skip("images are decoded completely, up to image_files.MAX_PIXELS")
     peaks = []
     for number, pings in enumerate((300, 3000)):
         folder = tmp_path / str(number)

@@ -1,4 +1,4 @@
-"""A side's picture is its first channel's: what the others have does not show in it."""
+"""Dual-frequency surveys: images use the first channel of each side."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def survey():
 
 
 @SECOND
-def test_a_waterfall_is_as_wide_as_the_first_channel(samples, range_m, survey, tmp_path):
+def test_waterfall_has_width_of_first_channel(samples, range_m, survey, tmp_path):
     alone, both = read_both(survey, tmp_path, samples, range_m)
     for side in Side:
         assert both.waterfall(side).shape == (120, 256)
@@ -33,7 +33,7 @@ def test_a_waterfall_is_as_wide_as_the_first_channel(samples, range_m, survey, t
 
 
 @SECOND
-def test_ground_range_ends_with_the_first_channel(samples, range_m, survey, tmp_path):
+def test_ground_range_ends_with_first_channel(samples, range_m, survey, tmp_path):
     altitude_m = np.full(120, 5.0)
     alone, both = (
         ground_range_image(s, Side.PORT, altitude_m, 0.25) for s in read_both(survey, tmp_path, samples, range_m)
@@ -43,23 +43,23 @@ def test_ground_range_ends_with_the_first_channel(samples, range_m, survey, tmp_
 
 
 @SECOND
-def test_the_bottom_is_looked_for_as_finely_as_in_the_first_channel_alone(samples, range_m, survey, tmp_path):
+def test_bottom_tracking_uses_first_channel(samples, range_m, survey, tmp_path):
     alone, both = read_both(survey, tmp_path, samples, range_m)
     np.testing.assert_array_equal(track_bottom(both), track_bottom(alone))
 
 
 @SECOND
 @pytest.mark.parametrize("flags", [[], ["--ground"], ["--ground", "--even"]])
-def test_plots_are_the_same(flags, samples, range_m, survey, tmp_path):
-    pictures = []
+def test_plots_use_first_channel(flags, samples, range_m, survey, tmp_path):
+    images = []
     for path in files_of(survey, tmp_path, samples, range_m):
         assert main(["survey", "plot", *flags, "--out", str(path.parent), str(path)]) == 0
-        pictures.append((path.parent / "line-waterfall.png").read_bytes())
-    assert pictures[0] == pictures[1]
+        images.append((path.parent / "line-waterfall.png").read_bytes())
+    assert images[0] == images[1]
 
 
 @SECOND
-def test_the_exported_range_is_that_of_the_picture(samples, range_m, survey, tmp_path, capsys):
+def test_exported_range_is_that_of_first_channel(samples, range_m, survey, tmp_path, capsys):
     tables = []
     for path in files_of(survey, tmp_path, samples, range_m):
         assert main(["survey", "export", str(path)]) == 0
@@ -69,24 +69,24 @@ def test_the_exported_range_is_that_of_the_picture(samples, range_m, survey, tmp
 
 
 @SECOND
-def test_info_lists_what_the_file_holds_and_says_what_is_looked_at(samples, range_m, survey, tmp_path, capsys):
+def test_info_lists_all_channels_and_names_the_one_in_use(samples, range_m, survey, tmp_path, capsys):
     alone, both = files_of(survey, tmp_path, samples, range_m)
     note = (
         "several channels a side in 120 of 120 pings: images and contacts are of the first, 400 kHz, slant range 30 m"
     )
     assert main(["survey", "info", "--json", str(both)]) == 0
-    facts = json.loads(capsys.readouterr().out)
-    assert facts["samples"] == sorted({256, samples})
-    assert facts["frequency_hz"] == [400e3, 900e3]
-    assert facts["slant_range_m"] == [min(30.0, range_m), max(30.0, range_m)]
-    assert facts["warnings"][-1] == note
+    info = json.loads(capsys.readouterr().out)
+    assert info["samples"] == sorted({256, samples})
+    assert info["frequency_hz"] == [400e3, 900e3]
+    assert info["slant_range_m"] == [min(30.0, range_m), max(30.0, range_m)]
+    assert info["warnings"][-1] == note
     assert main(["survey", "info", str(both)]) == 0
     assert f"  note: {note}\n" in capsys.readouterr().out
     assert main(["survey", "info", str(alone)]) == 0
     assert "several channels" not in capsys.readouterr().out
 
 
-def test_a_survey_without_a_side_has_no_range_there(survey):
+def test_absent_side_has_zero_range(survey):
     port = replace(survey, pings=tuple(replace(p, channels=p.channels[:1]) for p in survey.pings))
     assert (port.sample_count(Side.STARBOARD), port.max_slant_range_m(Side.STARBOARD)) == (0, 0.0)
     assert port.waterfall(Side.STARBOARD).shape == (120, 0)

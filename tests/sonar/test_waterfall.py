@@ -1,4 +1,4 @@
-"""Surveys as pictures and a table."""
+"""Surveys as waterfall images with a navigation table."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from sonarpost.sonar.readers import open_survey, read_survey
 from sonarpost.sonar.survey import Side
 
 
-def replaced(path, old: str, new: str):
+def replace_text(path, old: str, new: str):
     path.write_text(path.read_text().replace(old, new))
 
 
-def test_tiff_of_16_bits(small_survey, tmp_path):
+def test_16_bit_tiff(small_survey, tmp_path):
     survey = small_survey(np.uint16)
     read = read_survey(make_waterfall(survey, tmp_path, tiff=True))
     np.testing.assert_array_equal(read.waterfall(Side.PORT), survey.waterfall(Side.PORT))
@@ -37,9 +37,9 @@ def test_tiff_of_16_bits(small_survey, tmp_path):
         ('positions = "degrees"\n', 'positions = "degrees"\n[columns]\nlat_deg = "y"\n', "no 'y'"),
     ],
 )
-def test_a_bad_description_is_named(small_survey, tmp_path, old, new, field):
+def test_error_names_invalid_description_field(small_survey, tmp_path, old, new, field):
     path = make_waterfall(small_survey(), tmp_path)
-    replaced(path, old, new)
+    replace_text(path, old, new)
     with pytest.raises(SurveyFileError, match=field):
         open_survey(path)
 
@@ -60,14 +60,14 @@ def test_a_bad_description_is_named(small_survey, tmp_path, old, new, field):
         ("354.5", "9" * 70_000, "line|field"),
     ],
 )
-def test_a_bad_table_is_named(small_survey, tmp_path, old, new, field):
+def test_error_names_invalid_table_field(small_survey, tmp_path, old, new, field):
     path = make_waterfall(small_survey(), tmp_path)
-    replaced(tmp_path / "line.csv", old, new)
+    replace_text(tmp_path / "line.csv", old, new)
     with pytest.raises(SurveyFileError, match=field):
         open_survey(path)
 
 
-def test_a_table_of_another_length_than_the_pictures(small_survey, tmp_path):
+def test_table_length_must_match_images(small_survey, tmp_path):
     path = make_waterfall(small_survey(), tmp_path)
     lines = (tmp_path / "line.csv").read_text().splitlines(keepends=True)
     for changed in (lines[:-1], [*lines, lines[-1]]):
@@ -76,7 +76,7 @@ def test_a_table_of_another_length_than_the_pictures(small_survey, tmp_path):
             read_survey(path)
 
 
-def test_nan_navigation_is_unknown_and_a_wild_value_is_told(small_survey, tmp_path):
+def test_nan_navigation_is_unknown_and_out_of_range_is_reported(small_survey, tmp_path):
     path = make_waterfall(small_survey(), tmp_path)
     table = tmp_path / "line.csv"
     lines = table.read_text().splitlines()
@@ -95,7 +95,7 @@ def test_nan_navigation_is_unknown_and_a_wild_value_is_told(small_survey, tmp_pa
 
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", ["scotsman-iver2", "000_1236"])
-def test_derived_pictures_read_as_the_recordings_they_are_of(data_dir, tmp_path, name):
+def test_derived_images_match_recordings(data_dir, tmp_path, name):
     derived = data_dir / "surveys" / "derived"
     path = tmp_path / "line.waterfall.toml"
     path.write_text(
@@ -105,8 +105,8 @@ def test_derived_pictures_read_as_the_recordings_they_are_of(data_dir, tmp_path,
         '[columns]\nlat_deg = "y_or_lat"\nlon_deg = "x_or_lon"\ntime_utc = "utc"\nslant_range_m = "slant_range"\n'
         'heading_deg = "heading"\naltitude_m = "alt"\nspeed_mps = "speed"\n'
     )
-    pictures, recording = read_survey(path), read_survey(data_dir / "surveys" / f"{name}.xtf")
-    for got, want in zip(pictures, recording, strict=True):
+    images, recording = read_survey(path), read_survey(data_dir / "surveys" / f"{name}.xtf")
+    for got, want in zip(images, recording, strict=True):
         for side in Side:
             np.testing.assert_array_equal(got.channel(side).samples, want.channel(side).samples)
         assert (got.lat_deg, got.lon_deg) == (want.lat_deg, want.lon_deg)

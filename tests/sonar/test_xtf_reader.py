@@ -1,3 +1,5 @@
+"""XTF files: damage, missing values, variants of different recorders."""
+
 from __future__ import annotations
 
 import csv
@@ -11,28 +13,35 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from pyproj import Transformer
+from pyxtf import XTFPingHeader
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.readers import SUPPORTED_SUFFIXES, read_survey, register_reader, supported_suffixes
+from sonarpost.sonar.geometry import Position, offset_between_m
+from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers.xtf import MAX_FILE_BYTES, read_xtf
-from sonarpost.sonar.survey import Side
+from sonarpost.sonar.survey import ChannelPing, Side
 from sonarpost.sonar.xtf_writer import write_xtf
 
 HEADER = 1024
-PACKET = 512  # the small survey's: 256 + 2 * (64 + 40), padded
+PACKET = 512
+"""Length of a packet of `small_survey`: 256 + 2 * (64 + 40), padded to 64."""
 CHAN_INFO = 256
+CHANNEL = HEADER + 256
+CHANNEL_BYTES = 64 + 40
+WEIGHT, TIME_DELAY = 58, 12
 
 
 @pytest.fixture
 def raw(small_survey, tmp_path) -> bytearray:
-    write_xtf(small_survey(), tmp_path / "whole.xtf")
-    return bytearray((tmp_path / "whole.xtf").read_bytes())
+    write_xtf(small_survey(), tmp_path / "complete.xtf")
+    return bytearray((tmp_path / "complete.xtf").read_bytes())
 
 
-def read_bytes(tmp_path: Path, content: bytes):
+def read(tmp_path: Path, content: bytes, **options):
     path = tmp_path / "bad.xtf"
     path.write_bytes(content)
-    return read_xtf(path)
+    return read_xtf(path, SurveyOptions(**options))
 
 
 def put(raw: bytearray, offset: int, fmt: str, *values: float) -> bytearray:
@@ -40,32 +49,32 @@ def put(raw: bytearray, offset: int, fmt: str, *values: float) -> bytearray:
     return raw
 
 
-def test_the_packet_size_assumed_here(raw):
+def test_packet_size_of_small_survey(raw):
     assert len(raw) == HEADER + 5 * PACKET
 
 
 @pytest.mark.parametrize("length", [0, 1, 500, 1023])
-def test_shorter_than_the_header(tmp_path, raw, length):
+def test_file_shorter_than_header_is_rejected(tmp_path, raw, length):
     with pytest.raises(SurveyFileError, match="file size"):
-        read_bytes(tmp_path, raw[:length])
+        read(tmp_path, raw[:length])
 
 
-def test_every_truncation_is_an_error_but_at_a_packet_border(tmp_path, raw):
+def test_truncation_inside_packet_is_an_error(tmp_path, raw):
     for length in range(HEADER, len(raw), 29):
         if (length - HEADER) % PACKET:
             with pytest.raises(SurveyFileError, match="truncated"):
-                read_bytes(tmp_path, raw[:length])
-    assert len(read_bytes(tmp_path, raw[: HEADER + 2 * PACKET]).pings) == 2
+                read(tmp_path, raw[:length])
+    assert len(read(tmp_path, raw[: HEADER + 2 * PACKET]).pings) == 2
 
 
-def test_a_file_of_no_pings(tmp_path, raw):
+def test_file_without_pings_is_rejected(tmp_path, raw):
     with pytest.raises(SurveyFileError, match="pings"):
-        read_bytes(tmp_path, raw[:HEADER])
+        read(tmp_path, raw[:HEADER])
 
 
-def test_not_an_xtf_file(tmp_path):
+def test_other_file_format_is_rejected(tmp_path):
     with pytest.raises(SurveyFileError, match=r"FileFormat: got '0x89', expected '?0x7b"):
-        read_bytes(tmp_path, b"\x89PNG" + bytes(2000))
+        read(tmp_path, b"\x89PNG" + bytes(2000))
 
 
 @pytest.mark.parametrize(
@@ -90,21 +99,21 @@ def test_not_an_xtf_file(tmp_path):
         (CHAN_INFO + 2, "H", 2, "CorrectionFlags"),
     ],
 )
-def test_a_bad_field_is_named(tmp_path, raw, offset, fmt, value, field):
+def test_error_names_invalid_field(tmp_path, raw, offset, fmt, value, field):
     with pytest.raises(SurveyFileError, match=field) as caught:
-        read_bytes(tmp_path, put(raw, offset, fmt, value))
+        read(tmp_path, put(raw, offset, fmt, value))
     assert caught.value.where.endswith("bad.xtf")
     assert caught.value.expected
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_damage_reads_or_raises_one_error(tmp_path, raw, data):
+def test_damaged_file_is_read_or_raises_survey_file_error(tmp_path, raw, data):
     damaged = bytearray(raw)
     for _ in range(data.draw(st.integers(1, 6))):
         damaged[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
     try:
-        survey = read_bytes(tmp_path, bytes(damaged))
+        survey = read(tmp_path, bytes(damaged))
     except SurveyFileError:
         return
     for ping in survey:
@@ -115,16 +124,16 @@ def test_damage_reads_or_raises_one_error(tmp_path, raw, data):
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(tail=st.binary(max_size=3000))
-def test_noise_after_a_good_header_reads_or_raises_one_error(tmp_path, raw, tail):
+def test_noise_after_valid_header_raises_survey_file_error(tmp_path, raw, tail):
     with pytest.raises(SurveyFileError):
-        read_bytes(tmp_path, raw[:HEADER] + tail)
+        read(tmp_path, raw[:HEADER] + tail)
 
 
 def test_other_packets_are_skipped_and_counted(tmp_path, raw):
     attitude = struct.pack("<HBBHHHI", 0xFACE, 3, 0, 0, 0, 0, 64) + bytes(50)
     unknown = struct.pack("<HBBHHHI", 0xFACE, 199, 0, 0, 0, 0, 14)
     body = raw[:HEADER] + attitude + raw[HEADER : HEADER + PACKET] + unknown + attitude + raw[HEADER + PACKET :]
-    survey = read_bytes(tmp_path, body)
+    survey = read(tmp_path, body)
     assert len(survey.pings) == 5
     assert survey.warnings == (
         "skipped packet of type 199: not a sonar ping (1 times)",
@@ -132,71 +141,69 @@ def test_other_packets_are_skipped_and_counted(tmp_path, raw):
     )
 
 
-def test_projected_metres_give_no_positions(tmp_path, raw):
-    survey = read_bytes(tmp_path, put(raw, 164, "H", 0))
+def test_projected_coordinates_without_crs_give_no_positions(tmp_path, raw):
+    survey = read(tmp_path, put(raw, 164, "H", 0))
     assert all(p.lat_deg is None and p.lon_deg is None and p.heading_deg == 354.5 for p in survey)
     assert len(survey.warnings) == 1
     assert "NavUnits is 0 (projected metres)" in survey.warnings[0]
-    survey = read_bytes(tmp_path, put(raw, 164, "H", 7))
+    survey = read(tmp_path, put(raw, 164, "H", 7))
     assert all(p.lat_deg is None for p in survey)
     assert survey.warnings == ("no positions: NavUnits is 7, expected 3 (degrees) or 0 (projected metres)",)
 
 
 @pytest.mark.parametrize("lat", [float("nan"), float("inf"), 90.5, -1e300])
-def test_a_position_that_is_not_on_earth(tmp_path, raw, lat):
-    survey = read_bytes(tmp_path, put(raw, HEADER + PACKET + 160, "d", lat))
+def test_invalid_position_is_unknown(tmp_path, raw, lat):
+    survey = read(tmp_path, put(raw, HEADER + PACKET + 160, "d", lat))
     assert [p.lat_deg is None for p in survey] == [False, True, False, False, False]
     assert survey.pings[1].lon_deg is None
     assert survey.warnings == ("no position fix in 1 of 5 pings, the first in row 1",)
 
 
-def test_altitude_zero_is_unknown_and_a_wild_one_is_dropped(tmp_path, raw):
+def test_zero_altitude_is_unknown_and_negative_is_reported(tmp_path, raw):
     put(raw, HEADER + 196, "f", 0.0)
-    survey = read_bytes(tmp_path, put(raw, HEADER + PACKET + 196, "f", -4.0))
+    survey = read(tmp_path, put(raw, HEADER + PACKET + 196, "f", -4.0))
     assert [p.altitude_m for p in survey] == [None, None, 6.25, 6.25, 6.25]
     assert survey.warnings == ("altitude_m out of range in 1 of 5 pings, the first in row 1",)
 
 
-def test_hundred_hundredths_are_the_next_second(tmp_path, raw):
-    before = read_bytes(tmp_path, raw).pings[0].time_utc_s
-    assert read_bytes(tmp_path, put(raw, HEADER + 21, "B", 100)).pings[0].time_utc_s == pytest.approx(
-        before - 0.13 + 1.0
-    )
+def test_100_hundredths_are_the_next_second(tmp_path, raw):
+    before = read(tmp_path, raw).pings[0].time_utc_s
+    assert read(tmp_path, put(raw, HEADER + 21, "B", 100)).pings[0].time_utc_s == pytest.approx(before - 0.13 + 1.0)
 
 
-def test_another_kind_of_channel_is_skipped(tmp_path, raw):
-    survey = read_bytes(tmp_path, put(raw, CHAN_INFO, "B", 0))
+def test_sub_bottom_channel_is_skipped(tmp_path, raw):
+    survey = read(tmp_path, put(raw, CHAN_INFO, "B", 0))
     assert survey.sides() == (Side.STARBOARD,)
     assert survey.warnings == ("skipped channel: sub-bottom, not side-scan (5 times)",)
 
 
-def test_samples_before_the_count_field_existed(tmp_path, raw):
+def test_sample_count_from_file_header(tmp_path, raw):
     for row in range(5):
         put(raw, HEADER + row * PACKET + 256 + 42, "I", 0)
-    survey = read_bytes(tmp_path, put(raw, CHAN_INFO + 8, "I", 40))
+    survey = read(tmp_path, put(raw, CHAN_INFO + 8, "I", 40))
     assert survey.pings[0].channels[0].samples.shape == (40,)
 
 
-def test_more_than_six_channels_have_a_longer_header(tmp_path, raw):
+def test_more_than_six_channels_extend_file_header(tmp_path, raw):
     put(raw, 166, "H", 7)
-    survey = read_bytes(tmp_path, raw[:HEADER] + bytes(1024) + raw[HEADER:])
+    survey = read(tmp_path, raw[:HEADER] + bytes(1024) + raw[HEADER:])
     assert len(survey.pings) == 5
 
 
 def test_frequency_in_hertz_or_kilohertz(tmp_path, raw):
     for row in range(5):
         put(raw, HEADER + row * PACKET + 256 + 26, "H", 0)
-    assert read_bytes(tmp_path, raw).pings[0].channels[0].frequency_hz == 600_000
+    assert read(tmp_path, raw).pings[0].channels[0].frequency_hz == 600_000
     put(raw, CHAN_INFO + 32, "f", 455_000.0)
-    assert read_bytes(tmp_path, raw).pings[0].channels[0].frequency_hz == 455_000
+    assert read(tmp_path, raw).pings[0].channels[0].frequency_hz == 455_000
 
 
-def test_an_index_file_beside_the_survey_is_left_alone(tmp_path, raw):
-    (tmp_path / "bad.pyxtf_idx").write_bytes(b"cos\nabort\n(tR.")  # a pickle that would end the process
-    assert len(read_bytes(tmp_path, raw).pings) == 5
+def test_index_file_of_pyxtf_is_not_loaded(tmp_path, raw):
+    (tmp_path / "bad.pyxtf_idx").write_bytes(b"cos\nabort\n(tR.")  # a pickle that would abort the process
+    assert len(read(tmp_path, raw).pings) == 5
 
 
-def test_port_stored_nearest_first_is_remarked_on(small_survey, tmp_path):
+def test_port_stored_nearest_first_is_reported(small_survey, tmp_path):
     survey = small_survey(pings=80, samples=128)
     for ping in survey:
         for channel in ping.channels:
@@ -207,7 +214,7 @@ def test_port_stored_nearest_first_is_remarked_on(small_survey, tmp_path):
     assert "port looks stored nearest" in read_xtf(tmp_path / "a.xtf").warnings[0]
 
 
-def test_what_is_no_file(tmp_path):
+def test_missing_or_irregular_file_is_rejected(tmp_path):
     with pytest.raises(SurveyFileError, match="No such file"):
         read_xtf(tmp_path / "absent.xtf")
     with pytest.raises(SurveyFileError, match=r"directory|regular"):
@@ -217,38 +224,177 @@ def test_what_is_no_file(tmp_path):
         read_xtf(tmp_path / "pipe.xtf")
 
 
-def test_a_giant_is_refused_by_its_size(tmp_path):
+def test_file_above_size_limit_is_rejected(tmp_path):
     with (tmp_path / "giant.xtf").open("wb") as file:
         file.truncate(MAX_FILE_BYTES + 1)
     with pytest.raises(SurveyFileError, match="file size"):
         read_xtf(tmp_path / "giant.xtf")
 
 
-def test_the_registry(small_survey, tmp_path):
-    write_xtf(small_survey(), tmp_path / "A.XTF")
-    assert len(read_survey(tmp_path / "A.XTF").pings) == 5
-    assert ".xtf" in SUPPORTED_SUFFIXES
-    with pytest.raises(SurveyFileError, match=r"suffix: got '.jsf', expected .*\.xtf"):
-        read_survey(tmp_path / "a.jsf")
-    with pytest.raises(ValueError, match="already"):
-        register_reader([".XTF"], lambda path: small_survey())
-    with pytest.raises(ValueError, match="not a file suffix"):
-        register_reader(["xtf"], lambda path: small_survey())
-    assert "xtf" not in supported_suffixes()
+def in_every_ping(raw: bytearray, offset: int, fmt: str, *values: float) -> bytearray:
+    for row in range(5):
+        struct.pack_into("<" + fmt, raw, HEADER + row * PACKET + offset, *values)
+    return raw
+
+
+def attitude(time: tuple[int, ...], pitch: float, roll: float, heading: float) -> bytes:
+    year, month, day, hour, minute, second, millisecond = time
+    body = struct.pack("<HBBHHHI", 0xFACE, 3, 0, 0, 0, 0, 64) + bytes(16)
+    body += struct.pack("<ffffIf", pitch, roll, 0, 0, 0, heading)
+    return body + struct.pack("<HBBBBBHB", year, month, day, hour, minute, second, millisecond, 0)
+
+
+def test_weight_scales_echo_and_not_samples(raw, tmp_path):
+    struct.pack_into("<h", raw, CHANNEL + WEIGHT, 3)
+    struct.pack_into("<h", raw, CHANNEL + CHANNEL_BYTES + WEIGHT, -2)
+    plain, weighted = read(tmp_path, in_every_ping(bytearray(raw), 256 + WEIGHT, "h", 0)), read(tmp_path, raw)
+    port, starboard = weighted.pings[0].channels
+    assert (port.scale, starboard.scale) == (1 / 8, 4.0)
+    np.testing.assert_array_equal(port.samples, plain.pings[0].channels[0].samples)
+    np.testing.assert_array_equal(port.echo(), port.samples / np.float32(8))
+    np.testing.assert_array_equal(weighted.waterfall(Side.STARBOARD)[0], starboard.samples * np.float32(4))
+    struct.pack_into("<h", raw, CHANNEL + WEIGHT, 999)
+    assert "sample weight beyond ±31 is not applied (1 times)" in read(tmp_path, raw).warnings
+
+
+@pytest.mark.parametrize("range_includes_delay", [True, False])
+def test_time_delay_keeps_every_echo_at_its_range(raw, tmp_path, range_includes_delay):
+    """25 m in 40 samples; recording starts at 12.5 m, or at 25 m."""
+    in_every_ping(raw, 32, "f", 750.0)
+    duration_s = 25 / 750 / (2 if range_includes_delay else 1)
+    for offset in (256, 256 + CHANNEL_BYTES):
+        in_every_ping(raw, offset + TIME_DELAY, "ff", duration_s, duration_s)
+    survey = read(tmp_path, raw)
+    channel = survey.pings[0].channels[1]
+    assert channel.samples.shape == (80,)
+    assert not channel.samples[:40].any()
+    assert channel.slant_range_m == pytest.approx(25 if range_includes_delay else 50)
+    assert any("zeros replace" in w for w in survey.warnings)
+
+
+def test_inconsistent_time_delay_skips_channel(raw, tmp_path):
+    in_every_ping(raw, 256 + TIME_DELAY, "ff", 0.5, 0.001)
+    survey = read(tmp_path, raw)
+    assert survey.sides() == (Side.STARBOARD,)
+    assert any("TimeDelay, SlantRange and TimeDuration disagree" in w for w in survey.warnings)
+
+
+def test_attitude_packets_fill_missing_attitude(raw, tmp_path):
+    in_every_ping(raw, 204, "fff", 0, 0, 0)  # pitch, roll, heading
+    first = attitude((2013, 9, 10, 21, 13, 8, 100), 1.5, -2.5, 123.0)
+    later = attitude((2013, 9, 10, 21, 13, 8, 800), 2.5, -3.5, 124.0)
+    body = raw[:HEADER] + first + raw[HEADER : HEADER + 2 * PACKET] + later + raw[HEADER + 2 * PACKET :]
+    survey = read(tmp_path, body)
+    # Pings start at 8.13 s, every 0.37 s. The last one is within 1 s of the second packet.
+    assert [p.heading_deg for p in survey] == [123, 123, 124, 124, 124]
+    assert [p.pitch_deg for p in survey] == [1.5, 1.5, 2.5, 2.5, 2.5]
+    assert survey.pings[0].roll_deg == -2.5
+    assert survey.warnings == ("heading_deg, pitch_deg, roll_deg from attitude packets (2 of them)",)
+    old = attitude((2013, 9, 10, 21, 13, 7, 0), 1.5, -2.5, 123.0)
+    assert read(tmp_path, raw[:HEADER] + old + raw[HEADER:]).pings[0].heading_deg is None
+
+
+def test_zero_heading_in_attitude_packets_is_unknown(raw, tmp_path):
+    in_every_ping(raw, 204, "fff", 0, 0, 0)
+    packet = attitude((2013, 9, 10, 21, 13, 8, 100), 1.5, -2.5, 0.0)
+    survey = read(tmp_path, raw[:HEADER] + packet + raw[HEADER:])
+    assert survey.pings[0].heading_deg is None
+    assert survey.pings[0].pitch_deg == 1.5
+
+
+def test_attitude_of_ping_has_precedence(raw, tmp_path):
+    packet = attitude((2013, 9, 10, 21, 13, 8, 100), 40.0, 40.0, 40.0)
+    survey = read(tmp_path, raw[:HEADER] + packet + raw[HEADER:])
+    assert (survey.pings[0].heading_deg, survey.pings[0].pitch_deg) == (354.5, -2.5)
+
+
+def test_projected_coordinates_require_crs(raw, tmp_path):
+    to_utm = Transformer.from_crs(4326, 32619, always_xy=True)
+    easting, northing = to_utm.transform(-68.827935, 48.44545)
+    struct.pack_into("<H", raw, 164, 0)
+    in_every_ping(raw, 160, "dd", northing, easting)
+    assert all(p.lat_deg is None for p in read(tmp_path, raw))
+    survey = read(tmp_path, raw, projected_crs="EPSG:32619")
+    for ping in survey:
+        off_m = offset_between_m(Position(48.44545, -68.827935), Position(ping.lat_deg, ping.lon_deg))
+        assert np.hypot(*off_m) < 0.001
+    assert survey.warnings == ()
+    for wrong in ("EPSG:4326", "EPSG:999999", "nonsense", "EPSG:2225"):  # degrees, unknown, invalid, US feet
+        with pytest.raises(SurveyFileError, match="projected_crs"):
+            read(tmp_path, raw, projected_crs=wrong)
+
+
+def test_nav_units_decide_not_coordinate_values(raw, tmp_path):
+    """A local grid with small coordinates: only NavUnits determines the unit."""
+    struct.pack_into("<H", raw, 164, 0)
+    in_every_ping(raw, 160, "dd", 48.4, -68.8)
+    assert all(p.lat_deg is None for p in read(tmp_path, raw))
+    metres = read(tmp_path, raw, projected_crs="+proj=utm +zone=19 +datum=WGS84 +units=m")
+    assert all(abs(p.lat_deg) < 1 for p in metres)
+
+
+def test_degrees_ignore_projected_crs(raw, tmp_path):
+    assert read(tmp_path, raw, projected_crs="EPSG:32619").pings[0].lat_deg == 48.44545
+
+
+def test_coordinates_outside_projection_give_no_position(raw, tmp_path):
+    struct.pack_into("<H", raw, 164, 0)
+    in_every_ping(raw, 160, "dd", 1e30, 1e30)
+    survey = read(tmp_path, raw, projected_crs="EPSG:32619")
+    assert survey.warnings == ("no position fix in 5 of 5 pings, the first in row 0",)
+
+
+def test_position_source_ship(raw, tmp_path):
+    in_every_ping(raw, XTFPingHeader.ShipYcoordinate.offset, "dd", 10.0, 20.0)
+    assert read(tmp_path, raw).pings[0].lat_deg == 48.44545
+    ship = read(tmp_path, raw, position_source="ship").pings[0]
+    assert (ship.lat_deg, ship.lon_deg) == (10.0, 20.0)
+
+
+def test_port_order_nearest_first(raw, tmp_path):
+    one = read(tmp_path, raw).pings[0].channels[0].samples
+    other = read(tmp_path, raw, port_order="nearest_first").pings[0].channels[0].samples
+    np.testing.assert_array_equal(one, other[::-1])
+
+
+def test_32_bit_samples_keep_all_bits(small_survey, tmp_path):
+    survey = small_survey(np.uint32)
+    survey.pings[0].channels[0].samples[:3] = (2**32 - 1, 2**31 + 1, 2**24 + 1)
+    write_xtf(survey, tmp_path / "a.xtf")
+    channel: ChannelPing = read_xtf(tmp_path / "a.xtf").pings[0].channels[0]
+    assert channel.samples[:3].tolist() == [2**32 - 1, 2**31 + 1, 2**24 + 1]
+
+
+def test_bathymetry_and_unknown_packets_are_skipped(raw, tmp_path):
+    packets = b"".join(
+        struct.pack("<HBBHHHI", 0xFACE, kind, 0, 0, 0, 0, 14 + 300) + bytes(range(256)) + bytes(44)
+        for kind in (1, 2, 8, 65, 107, 199, 255)
+    )
+    survey = read(tmp_path, raw[:HEADER] + packets + raw[HEADER:] + packets)
+    assert len(survey.pings) == 5
+    assert len(survey.warnings) == 7
+    assert all("(2 times)" in warning for warning in survey.warnings)
+
+
+@pytest.mark.parametrize("slant_range_m", [1e30, 10_001, float("nan"), float("inf"), -5])
+def test_implausible_slant_range_skips_channel(raw, tmp_path, slant_range_m):
+    survey = read(tmp_path, in_every_ping(raw, 256 + 4, "f", slant_range_m))
+    assert survey.sides() == (Side.STARBOARD,)
+    assert survey.warnings == ("skipped port channel: no samples or no slant range (5 times)",)
 
 
 @pytest.mark.realdata
 @pytest.mark.parametrize(("name", "sonar"), [("scotsman-iver2", "HDS"), ("000_1236", "WizMap")])
-def test_real_recordings_agree_with_their_derived_pictures(data_dir, name, sonar):
+def test_recordings_match_derived_images(data_dir, name, sonar):
     folder = data_dir / "surveys"
     survey = read_xtf(folder / f"{name}.xtf")
     assert survey.sonar_id == sonar
-    # The pictures hold the file's own order: port from far to near.
+    # The images have the order of the file: port from far to near.
     for side, suffix, step in ((Side.PORT, "port", -1), (Side.STARBOARD, "stbd", 1)):
-        picture = np.asarray(Image.open(folder / "derived" / f"{name}.xtf.{suffix}.png"))
+        image = np.asarray(Image.open(folder / "derived" / f"{name}.xtf.{suffix}.png"))
         rows = np.stack([ping.channel(side).samples for ping in survey])
-        assert rows.dtype == picture.dtype
-        np.testing.assert_array_equal(rows[:, ::step], picture)
+        assert rows.dtype == image.dtype
+        np.testing.assert_array_equal(rows[:, ::step], image)
     with (folder / "derived" / f"{name}.xtf.nav.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == len(survey.pings)
@@ -264,7 +410,7 @@ def test_real_recordings_agree_with_their_derived_pictures(data_dir, name, sonar
 
 
 @pytest.mark.realdata
-def test_the_real_ping_without_a_fix(data_dir):
+def test_recorded_ping_without_fix(data_dir):
     survey = read_xtf(data_dir / "surveys" / "scotsman-iver2.xtf")
     assert [row for row, ping in enumerate(survey) if ping.lat_deg is None] == [0]
     assert survey.warnings == ("no position fix in 1 of 461 pings, the first in row 0",)
@@ -273,10 +419,10 @@ def test_the_real_ping_without_a_fix(data_dir):
 
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", ["scotsman-iver2", "000_1236"])
-def test_the_near_end_of_a_real_channel_is_the_water_column(data_dir, name):
-    """Index 0 is nearest the vehicle: on both sides the dark water comes before the bright bottom."""
+def test_samples_of_recordings_start_in_water_column(data_dir, name):
+    """Index 0 is nearest to the vehicle: on both sides the dark water column is before the bright seabed."""
     survey = read_xtf(data_dir / "surveys" / f"{name}.xtf")
     for side in Side:
-        picture = survey.waterfall(side)
-        water = picture[:200, 30:60].mean()
-        assert water * 5 < picture[:200, picture.shape[1] // 2 : picture.shape[1] // 2 + 50].mean()
+        image = survey.waterfall(side)
+        water = image[:200, 30:60].mean()
+        assert water * 5 < image[:200, image.shape[1] // 2 : image.shape[1] // 2 + 50].mean()

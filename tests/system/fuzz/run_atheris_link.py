@@ -4,9 +4,9 @@
     python tests/system/fuzz/run_atheris_link.py receiver -max_total_time=480
     python tests/system/fuzz/run_atheris_link.py driver -max_total_time=480
 
-`receiver` is the v1 receiver, `driver` the modem's driver with the NMEA parser (`link_oracle` says what is checked).
-Options with one dash are libFuzzer's. It begins with genuine traffic; what it found of interest is kept in
-`build/fuzz/link-…`, an input that fails is written to the current folder, and `run_atheris_link.py receiver crash-…`
+`receiver` is the v1 receiver, `driver` is the modem driver with the NMEA parser. `link_oracle` describes the checks.
+Options with one dash are those of libFuzzer. The seeds are genuine traffic. Interesting inputs are stored in
+`build/fuzz/link-…`. An input that fails is written to the current folder; `run_atheris_link.py receiver crash-…`
 repeats it.
 """
 
@@ -34,7 +34,7 @@ def main() -> None:
     """Run until libFuzzer ends the process."""
     name, *arguments = sys.argv[1:] or [""]
     if name not in CHECKS:
-        sys.exit(f"run_atheris_link: {name!r} is none of {', '.join(CHECKS)}")
+        sys.exit(f"run_atheris_link: {name!r} is not one of {', '.join(CHECKS)}")
     corpus = WORK / f"link-{name}"
     corpus.mkdir(parents=True, exist_ok=True)
     if not any(Path(argument).is_file() for argument in arguments):

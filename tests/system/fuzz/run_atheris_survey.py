@@ -3,9 +3,9 @@
     python -m pip install 'sonarpost[fuzz]'       # x86-64 and Python 3.11 to 3.13: Atheris has no other wheels
     python tests/system/fuzz/run_atheris_survey.py -max_total_time=180
 
-Options with one dash are libFuzzer's. An input's first byte says which file it is (`survey_oracle.FILES`), the rest is
-the file. It begins with whole recordings; what it found of interest is kept in `build/fuzz/survey`, an input that
-fails is written to the current folder, and `run_atheris_survey.py crash-…` repeats it.
+Options with one dash are those of libFuzzer. The first byte of an input selects the file (`survey_oracle.FILES`), and
+the rest is its content. The seeds are valid recordings. Interesting inputs are stored in `build/fuzz/survey`. An input
+that fails is written to the current folder; `run_atheris_survey.py crash-…` repeats it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ def main() -> None:
     """Run until libFuzzer ends the process."""
     arguments = sys.argv[1:]
     WORK.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(prefix="survey-", dir=WORK.parent))  # libFuzzer ends the process: it stays
+    folder = Path(
+        tempfile.mkdtemp(prefix="survey-", dir=WORK.parent)
+    )  # not deleted, because libFuzzer ends the process
     readers = Readers(folder)
     if not any(Path(argument).is_file() for argument in arguments):
         for number, seed in enumerate(readers.seeds()):

@@ -1,3 +1,5 @@
+"""Snippets in samples, at half the scale, and in ground range."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -8,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.detection.detector import detect
-from sonarpost.detection.snippets import cut_expanded, cut_snippet, to_grey
+from sonarpost.detection.snippets import cut_expanded, cut_ground_snippet, cut_snippet, to_grey
 from sonarpost.sonar.survey import ChannelPing, Side
 
 
@@ -27,7 +29,7 @@ def raw_window(survey, side, snippet):
     ]
 
 
-def test_the_default_picture_is_centred_on_highlight_and_shadow(found):
+def test_default_snippet_is_centred_on_highlight_and_shadow(found):
     survey, detection = found
     snippet = cut_snippet(survey, detection)
     assert snippet.image.shape == snippet.image16.shape == (100, 100)
@@ -35,7 +37,7 @@ def test_the_default_picture_is_centred_on_highlight_and_shadow(found):
     assert snippet.target_column == 50 - detection.shadow_samples // 2
     assert (snippet.pixel_along_m, snippet.pixel_across_m) == (detection.pixel_along_m, 20 / 512)
     assert np.array_equal(snippet.image16, raw_window(survey, Side.STARBOARD, snippet))
-    # Bright at the target, dark to its right: the nadir is to the left.
+    # Bright at the target, dark to its right, because the nadir is to the left.
     row, column = snippet.target_row, snippet.target_column
     shadow_column = column + 6 + detection.shadow_samples // 2
     assert snippet.image[row - 2 : row + 3, column - 3 : column + 4].mean() > 180
@@ -43,7 +45,7 @@ def test_the_default_picture_is_centred_on_highlight_and_shadow(found):
 
 
 @given(ping=st.integers(0, 199), sample=st.integers(0, 511), height=st.integers(1, 230), width=st.integers(1, 600))
-def test_the_window_is_shifted_at_borders_never_shrunk(found, ping, sample, height, width):
+def test_window_is_shifted_at_borders(found, ping, sample, height, width):
     survey, detection = found
     snippet = cut_snippet(survey, replace(detection, ping_index=ping, sample=sample), height, width)
     assert snippet.image.shape == (min(height, 200), min(width, 512))
@@ -54,22 +56,22 @@ def test_the_window_is_shifted_at_borders_never_shrunk(found, ping, sample, heig
     assert 0 <= snippet.target_column < snippet.image.shape[1]
 
 
-def test_samples_a_ping_does_not_have_are_black_and_do_not_shift_the_greys(found):
+def test_missing_samples_are_black_and_do_not_change_contrast(found):
     survey, detection = found
     pings = list(survey.pings)
     cut = pings[90].channel(Side.STARBOARD)
     pings[90] = replace(pings[90], channels=())
     pings[91] = replace(pings[91], channels=(ChannelPing(Side.STARBOARD, cut.samples[:250], cut.slant_range_m),))
-    whole = cut_snippet(survey, detection)
-    holed = cut_snippet(replace(survey, pings=tuple(pings)), detection)
-    row = 90 - holed.first_ping_index
-    assert not holed.image[row].any()
-    assert not holed.image[row + 1, 250 - holed.first_sample :].any()
+    complete = cut_snippet(survey, detection)
+    with_gaps = cut_snippet(replace(survey, pings=tuple(pings)), detection)
+    row = 90 - with_gaps.first_ping_index
+    assert not with_gaps.image[row].any()
+    assert not with_gaps.image[row + 1, 250 - with_gaps.first_sample :].any()
     untouched = np.r_[0:row, row + 2 : 100]
-    assert np.abs(holed.image[untouched].astype(int) - whole.image[untouched]).max() <= 4
+    assert np.abs(with_gaps.image[untouched].astype(int) - complete.image[untouched]).max() <= 4
 
 
-def test_values_beyond_16_bits_are_divided_by_a_power_of_two(found, make_survey):
+def test_values_beyond_16_bits_are_divided_by_power_of_two(found, make_survey):
     _, detection = found
     survey = make_survey({"side": Side.STARBOARD}, dtype=np.uint32, scale=10_000.0)
     snippet = cut_snippet(survey, detection)
@@ -80,7 +82,7 @@ def test_values_beyond_16_bits_are_divided_by_a_power_of_two(found, make_survey)
     assert snippet.image16[0, 0] == pixel // snippet.divisor16
 
 
-def test_greys_follow_the_documented_formula():
+def test_grey_levels_follow_documented_formula():
     raw = np.arange(10_000, dtype=np.uint32).reshape(100, 100) ** 2
     grey = to_grey(raw, np.ones(raw.shape, dtype=np.bool_))
     low, high = np.percentile(np.arange(10_000), (0.5, 99.5))
@@ -89,7 +91,7 @@ def test_greys_follow_the_documented_formula():
     assert (grey[0, 0], grey[-1, -1]) == (0, 255)
 
 
-def test_a_glint_does_not_turn_the_rest_black():
+def test_single_bright_pixel_does_not_change_contrast():
     rng = np.random.default_rng(0)
     raw = rng.integers(100, 200, (100, 100), dtype=np.uint32)
     plain = to_grey(raw, np.ones(raw.shape, dtype=np.bool_))
@@ -97,14 +99,14 @@ def test_a_glint_does_not_turn_the_rest_black():
     assert abs(float(to_grey(raw, np.ones(raw.shape, dtype=np.bool_)).mean()) - float(plain.mean())) < 2
 
 
-def test_a_window_of_one_value_is_mid_grey_and_an_unknown_one_black():
+def test_flat_window_is_mid_grey_and_unknown_is_black():
     flat = np.full((4, 5), 77, dtype=np.uint32)
     assert (to_grey(flat, np.ones(flat.shape, dtype=np.bool_)) == 128).all()
     assert not to_grey(flat, np.zeros(flat.shape, dtype=np.bool_)).any()
 
 
 @pytest.mark.parametrize("change", [{"ping_index": 200}, {"ping_index": -1}, {"sample": 512}])
-def test_a_detection_of_another_survey_is_refused(found, change):
+def test_detection_outside_survey_is_rejected(found, change):
     survey, detection = found
     for cut in (cut_snippet, cut_expanded):
         with pytest.raises(ValueError, match="expected inside 200 pings of 512 samples"):
@@ -112,48 +114,80 @@ def test_a_detection_of_another_survey_is_refused(found, change):
 
 
 @pytest.mark.parametrize("size", [(0, 10), (10, 0)])
-def test_a_picture_without_pixels_is_refused(found, size):
+def test_empty_window_is_rejected(found, size):
     with pytest.raises(ValueError, match="expected 1 or more"):
         cut_snippet(*found, *size)
 
 
-def fours(image):
-    """Means of blocks of two rows and two columns."""
+def block_means(image):
+    """Return the means of blocks of 2 x 2 pixels."""
     return sum(image[row::2, column::2].astype(float) for row in (0, 1) for column in (0, 1)) / 4
 
 
-def test_the_wide_picture_is_twice_the_ground_around_the_same_middle(found):
+def test_expanded_snippet_covers_twice_the_extent(found):
     survey, detection = found
     narrow = cut_snippet(survey, detection, 40, 60)
-    wide = cut_expanded(survey, detection, 40, 60)
+    expanded = cut_expanded(survey, detection, 40, 60)
     top, left = narrow.first_ping_index - 20, narrow.first_sample - 30
-    values = fours(survey.waterfall(Side.STARBOARD)[top : top + 80, left : left + 120])
+    values = block_means(survey.waterfall(Side.STARBOARD)[top : top + 80, left : left + 120])
     root = np.sqrt(values)
     low, high = np.percentile(root, (0.5, 99.5))
-    assert wide.shape == narrow.image.shape
-    np.testing.assert_array_equal(wide, np.clip(np.rint(255 * (root - low) / (high - low)), 0, 255))
+    assert expanded.shape == narrow.image.shape
+    np.testing.assert_array_equal(expanded, np.clip(np.rint(255 * (root - low) / (high - low)), 0, 255))
 
 
 @given(ping=st.integers(0, 199), sample=st.integers(0, 511), height=st.integers(1, 210), width=st.integers(1, 600))
-def test_the_wide_picture_keeps_within_the_recording(found, ping, sample, height, width):
+def test_expanded_snippet_stays_within_recording(found, ping, sample, height, width):
     survey, detection = found
-    wide = cut_expanded(survey, replace(detection, ping_index=ping, sample=sample), height, width)
+    expanded = cut_expanded(survey, replace(detection, ping_index=ping, sample=sample), height, width)
     if height >= 200 or width >= 512:
-        assert wide is None, "there is no more ground than the snippet shows"
+        assert expanded is None, "the recording does not extend beyond the snippet"
     else:
-        assert wide.shape == (min(height, 100), min(width, 256))
+        assert expanded.shape == (min(height, 100), min(width, 256))
 
 
-def test_samples_a_ping_does_not_have_do_not_darken_the_wide_picture(found):
+def test_missing_samples_do_not_darken_expanded_snippet(found):
     survey, detection = found
     pings = list(survey.pings)
-    whole = cut_expanded(survey, detection, 40, 60)
+    complete = cut_expanded(survey, detection, 40, 60)
     top = cut_snippet(survey, detection, 40, 60).first_ping_index - 20
     for row in (top + 10, top + 11, top + 20):
         pings[row] = replace(pings[row], channels=())
-    holed = cut_expanded(replace(survey, pings=tuple(pings)), detection, 40, 60)
-    assert not holed[5].any(), "both of its pings are absent"
-    # One of two pings is there: its mean stands, unhalved.
-    assert abs(float(holed[10].mean()) - float(whole[10].mean())) < 15
+    with_gaps = cut_expanded(replace(survey, pings=tuple(pings)), detection, 40, 60)
+    assert not with_gaps[5].any(), "both pings of the row are absent"
+    # One of the two pings is present: the row has its mean.
+    assert abs(float(with_gaps[10].mean()) - float(complete[10].mean())) < 15
     untouched = [row for row in range(40) if row not in (5, 10)]
-    assert np.abs(holed[untouched].astype(int) - whole[untouched]).max() <= 6
+    assert np.abs(with_gaps[untouched].astype(int) - complete[untouched]).max() <= 6
+
+
+def test_ground_snippet_is_centred_at_its_scale(make_survey):
+    survey = make_survey({"pings": 10, "samples": 25, "shadow_samples": 40})
+    (found,) = detect(survey)
+    cut = cut_ground_snippet(survey, found, size_m=8.0, pixel_m=0.1)
+    assert cut.image.shape == cut.known.shape == (80, 80)
+    assert cut.pixel_m == 0.1
+    assert cut.known.all()
+    assert cut.image[38:42, 37:43].mean() > 180
+    assert cut.image[38:42, 50:56].mean() < 60
+    # The object is 1.0 m long along-track: about ten rows of 0.1 m.
+    bright = cut.image[:, 37:43].mean(axis=1) > 150
+    assert np.count_nonzero(bright) == pytest.approx(10, abs=3)
+
+
+def test_ground_snippet_beyond_recording_is_unknown(make_survey):
+    survey = make_survey({"ping": 8})
+    (found,) = detect(survey)
+    cut = cut_ground_snippet(survey, found, size_m=10.0, pixel_m=0.2)
+    assert not cut.known[:15].any()
+    assert (cut.image[~cut.known] == 0).all()
+    assert cut.known[30:].all()
+
+
+def test_no_ground_snippet_without_navigation(make_survey):
+    survey = make_survey({}, navigation=False)
+    (found,) = detect(survey)
+    assert cut_ground_snippet(survey, found) is None
+    for size_m, pixel_m in ((0.0, 0.1), (10.0, 0.0), (1.0, 2.0), (1000.0, 0.01)):
+        with pytest.raises(ValueError, match="size_m, pixel_m"):
+            cut_ground_snippet(survey, found, size_m, pixel_m)

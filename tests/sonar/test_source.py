@@ -1,4 +1,4 @@
-"""A stream of pings in strips: every ping once as a new one, strips that overlap, memory that is bounded."""
+"""Surveys read in blocks and strips, with bounded memory."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.source import strips
+from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.source import InMemorySource, blocks, load_survey, strips
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 
 
@@ -18,7 +19,7 @@ def pings(count, samples=4):
 
 @pytest.mark.parametrize("count", [1, 9, 10, 11, 14, 15, 16, 17, 30, 100, 101, 107])
 @pytest.mark.parametrize("overlap", [0, 1, 4, 9])
-def test_strips_cover_the_stream_and_overlap(count, overlap):
+def test_strips_cover_stream_and_overlap(count, overlap):
     found = list(strips(pings(count), 10, overlap))
     assert [s.is_last for s in found] == [False] * (len(found) - 1) + [True]
     for strip in found:
@@ -28,15 +29,15 @@ def test_strips_cover_the_stream_and_overlap(count, overlap):
         assert other.first_row == one.first_row + len(one.pings) - overlap
         assert len(one.pings) == 10
     assert found[-1].first_row + len(found[-1].pings) == count
-    # A short rest goes with the strip before it, so that no strip is mostly overlap.
+    # A short rest is part of the strip before it, so that no strip consists mostly of overlap.
     assert len(found) == 1 or len(found[-1].pings) > overlap
 
 
-def test_an_empty_stream_has_no_strips():
+def test_empty_stream_has_no_strips():
     assert list(strips([], 10, 2)) == []
 
 
-def test_long_pings_make_short_strips():
+def test_byte_limit_shortens_strips():
     found = list(strips(pings(100, samples=1000), 50, 4, max_bytes=20_000))
     assert max(len(s.pings) for s in found) <= 21
     assert found[-1].first_row + len(found[-1].pings) == 100
@@ -44,18 +45,18 @@ def test_long_pings_make_short_strips():
         assert other.first_row == one.first_row + len(one.pings) - 4
 
 
-def test_pings_too_long_for_any_strip_are_an_error_that_says_where():
+def test_error_names_row_where_pings_are_too_long():
     with pytest.raises(SurveyFileError, match=r"survey, row 4: samples: got 'over 4000 bytes in 5 pings'"):
         list(strips(pings(100, samples=1000), 50, 20, max_bytes=2000))
 
 
 @pytest.mark.parametrize(("length", "overlap"), [(0, 0), (10, 10), (10, -1)])
-def test_lengths_that_cannot_be_are_refused(length, overlap):
+def test_invalid_strip_lengths_are_rejected(length, overlap):
     with pytest.raises(ValueError, match="expected more than the overlap"):
         list(strips(pings(3), length, overlap))
 
 
-def test_it_reads_no_farther_than_it_must():
+def test_strips_read_stream_lazily():
     read = []
 
     def stream():
@@ -66,3 +67,31 @@ def test_it_reads_no_farther_than_it_must():
     first = next(strips(stream(), 10, 2))
     assert len(first.pings) == 10
     assert len(read) <= 16
+
+
+@pytest.mark.parametrize(("length", "overlap"), [(1, 0), (3, 0), (3, 2), (5, 5), (12, 0), (12, 3), (100, 9), (2, 7)])
+def test_blocks_contain_every_ping_once_with_overlap(small_survey, length, overlap):
+    source = InMemorySource(small_survey(pings=12), SurveyOptions())
+    new = []
+    for lead, survey in blocks(source, length, overlap):
+        numbers = [ping.number for ping in survey]
+        assert numbers == list(range(numbers[0], numbers[-1] + 1))
+        new_numbers = numbers[lead : lead + length]
+        assert lead == min(overlap, new_numbers[0] - 10)
+        assert numbers[-1] == min(new_numbers[-1] + overlap, 21)
+        new += new_numbers
+    assert new == list(range(10, 22))
+
+
+def test_invalid_block_lengths_are_rejected(small_survey):
+    source = InMemorySource(small_survey(), SurveyOptions())
+    for length, overlap in ((0, 0), (1, -1)):
+        with pytest.raises(ValueError, match="block"):
+            list(blocks(source, length, overlap))
+
+
+def test_load_survey_limits_number_of_samples(small_survey):
+    source = InMemorySource(small_survey(), SurveyOptions())
+    assert len(load_survey(source, 400).pings) == 5
+    with pytest.raises(SurveyFileError, match="samples"):
+        load_survey(source, 399)

@@ -1,3 +1,5 @@
+"""The detector with surveys of speckle, simulated surveys and recordings."""
+
 from __future__ import annotations
 
 import itertools
@@ -21,12 +23,12 @@ from sonarpost.sonar.survey import Ping, Side, Survey
 
 
 def box(**fields):
-    """An object of `make_survey`, by the fields that differ from the default."""
+    """Return an object for `make_survey`: the fields that differ from the default."""
     return fields
 
 
 @pytest.mark.parametrize("side", list(Side))
-def test_an_object_is_found_where_it_lies_with_its_size(make_survey, side):
+def test_object_is_detected_with_position_and_size(make_survey, side):
     survey = make_survey(box(side=side))
     (found,) = detect(survey)
     assert found.side is side
@@ -46,27 +48,27 @@ def test_an_object_is_found_where_it_lies_with_its_size(make_survey, side):
 
 
 @pytest.mark.parametrize(("side", "sign"), [(Side.PORT, -1), (Side.STARBOARD, 1)])
-def test_port_is_left_of_the_heading_and_starboard_right(make_survey, side, sign):
+def test_port_is_left_of_heading_and_starboard_right(make_survey, side, sign):
     (found,) = detect(make_survey(box(side=side)))
     north_m, east_m = offset_between_m(found.vehicle, found.position)
     assert east_m == pytest.approx(sign * found.ground_range_m, abs=0.01)
     assert north_m == pytest.approx(0.0, abs=0.01)
 
 
-def test_what_the_survey_does_not_tell_is_none(make_survey):
+def test_unknown_navigation_is_none(make_survey):
     (found,) = detect(make_survey(box(), navigation=False))
     assert (found.vehicle, found.position, found.heading_deg, found.speed_mps) == (None, None, None, None)
     assert (found.length_m, found.pixel_along_m) == (None, None)
     assert found.height_m is not None  # from range alone
 
 
-def test_without_an_altitude_the_first_return_gives_it(make_survey):
+def test_altitude_from_first_return(make_survey):
     (found,) = detect(make_survey(box(), altitude=False))
     assert found.altitude_m == pytest.approx(3.0, abs=0.25)
     assert found.position is not None
 
 
-def test_both_sides_are_searched_and_the_most_confident_comes_first(make_survey):
+def test_detections_of_both_sides_are_sorted_by_confidence(make_survey):
     boxes = (box(ping=50, sample=400, highlight=3.0), box(side=Side.STARBOARD, ping=150), box(ping=140))
     found = detect(make_survey(*boxes))
     assert {(d.side, round(d.ping_index, -1)) for d in found} == {
@@ -80,21 +82,21 @@ def test_both_sides_are_searched_and_the_most_confident_comes_first(make_survey)
     assert detect(make_survey(*boxes), strict) == found[:1]
 
 
-def test_an_empty_seabed_gives_nothing(make_survey):
+def test_empty_seabed_gives_few_detections(make_survey):
     assert sum(len(detect(make_survey(seed=seed))) for seed in range(4)) <= 2
 
 
-def test_the_unit_of_the_samples_does_not_matter(make_survey):
-    places = [
+def test_detections_are_independent_of_sample_scale(make_survey):
+    positions = [
         [(d.side, d.ping_index, d.sample) for d in detect(make_survey(box(), dtype=dtype, scale=scale))]
         for dtype, scale in ((np.uint16, 1.0), (np.uint32, 50_000.0), (np.uint16, 4.0))
     ]
-    assert places[0] == places[1] == places[2] != []
+    assert positions[0] == positions[1] == positions[2] != []
     eight_bits = detect(make_survey(box(), dtype=np.uint8, scale=1 / 80))
     assert [(d.side, d.ping_index // 8) for d in eight_bits] == [(Side.PORT, 100 // 8)]
 
 
-def test_the_sides_are_mirror_images(make_survey):
+def test_sides_are_symmetric(make_survey):
     survey = make_survey(box())
     swap = {Side.PORT: Side.STARBOARD, Side.STARBOARD: Side.PORT}
     swapped = tuple(replace(p, channels=tuple(replace(c, side=swap[c.side]) for c in p.channels)) for p in survey.pings)
@@ -104,18 +106,18 @@ def test_the_sides_are_mirror_images(make_survey):
 
 
 @pytest.mark.parametrize("pings", [0, 1, 2, 7])
-def test_short_and_empty_surveys_give_nothing(make_survey, pings):
+def test_short_and_empty_surveys_give_no_detections(make_survey, pings):
     survey = make_survey()
     assert detect(replace(survey, pings=survey.pings[:pings])) == ()
     assert detect(Survey(Path("x"), "x", "x", tuple(Ping(i, float(i), ()) for i in range(pings)))) == ()
 
 
 @pytest.mark.parametrize("seabed", [SeabedKind.SAND, SeabedKind.MUD, SeabedKind.GRAVEL])
-def test_simulated_mines_are_found_with_few_false_alarms(seabed):
+def test_simulated_mines_are_detected_with_few_false_alarms(seabed):
     simulated = simulate_survey(SurveySpec(seed=7, seabed=seabed, targets=8, clutter=2))
-    began = time.process_time()
+    start_s = time.process_time()
     found = detect(simulated.survey)
-    spent_s = time.process_time() - began
+    duration_s = time.process_time() - start_s
 
     def near(detection, truth):
         along_m = abs(detection.ping_index - truth.ping) * 0.1
@@ -129,21 +131,21 @@ def test_simulated_mines_are_found_with_few_false_alarms(seabed):
     false_alarms = [d for d in found if not any(near(d, t) for t in simulated.truth)]
     assert len(false_alarms) <= 3
     for truth, detection in pairs:
-        place = Position(truth.lat_deg, truth.lon_deg)
-        assert np.hypot(*offset_between_m(place, detection.position)) < 2.0
+        true_position = Position(truth.lat_deg, truth.lon_deg)
+        assert np.hypot(*offset_between_m(true_position, detection.position)) < 2.0
     errors = [abs(d.height_m - t.height_m) / t.height_m for t, d in pairs]
     assert np.median(errors) < 0.25
-    assert spent_s < 6.0  # two seconds on a quiet core; room for a busy machine
+    assert duration_s < 6.0  # about 2 s on an idle core
 
 
 @pytest.mark.realdata
-def test_the_scotsman_gives_the_wreck_and_the_small_objects_to_port(data_dir):
+def test_scotsman_gives_wreck_and_small_objects_to_port(data_dir):
     survey = read_survey(data_dir / "surveys" / "scotsman-iver2.xtf")
     found = detect(survey)
     assert len(found) <= 20
-    # The wreck, read off the picture: pings 165 to 365, samples 150 to 600.
+    # The wreck covers pings 165 to 365 and samples 150 to 600 in the image.
     assert [d for d in found if d.side is Side.STARBOARD and 165 <= d.ping_index <= 365 and 150 <= d.sample <= 600]
-    # Small objects with a shadow to port, likewise.
+    # Small objects with a shadow to port.
     for ping, sample in ((241, 895), (276, 611), (313, 945), (356, 283)):
         assert [
             d
@@ -160,41 +162,41 @@ def test_the_scotsman_gives_the_wreck_and_the_small_objects_to_port(data_dir):
 
 
 @pytest.mark.realdata
-def test_the_scotsmans_label_is_a_contact_by_position_and_positions_are_those_of_the_geodesic(data_dir):
+def test_scotsman_label_matches_a_contact_and_positions_match_geodesic(data_dir):
     survey = read_survey(data_dir / "surveys" / "scotsman-iver2.xtf")
     channel, column, row = map(int, (data_dir / "surveys" / "scotsman-iver2.xtf.hits").read_text().split())
-    assert (channel, column, row) == (1, 138, 281)  # XTF's channel 1: starboard
+    assert (channel, column, row) == (1, 138, 281)  # XTF channel 1 is starboard
     ping = survey.pings[row]
     spacing_m = ping.channel(Side.STARBOARD).sample_spacing_m
-    # As a slant range the label would lie in the water: the bottom begins later.
+    # As a slant range the label would be in the water column.
     assert (column + 0.5) * spacing_m < track_bottom(survey)[row]
-    # As a ground range it is the wreck's near rim.
+    # As a ground range it is the near edge of the wreck.
     geod = Geod(ellps="WGS84")
 
-    def placed(at, side, ground_m):
+    def lon_lat(at, side, ground_m):
         turn = 90.0 if side is Side.STARBOARD else -90.0
         lon, lat, _ = geod.fwd(at.lon_deg, at.lat_deg, at.heading_deg + turn, ground_m)
         return lon, lat
 
-    label = placed(ping, Side.STARBOARD, (column + 0.5) * spacing_m)
+    label = lon_lat(ping, Side.STARBOARD, (column + 0.5) * spacing_m)
     found = detect(survey)
-    apart_m = [
+    distances = [
         (geod.inv(*label, d.position.lon_deg, d.position.lat_deg)[2], d) for d in found if d.side is Side.STARBOARD
     ]
-    distance_m, nearest = min(apart_m, key=lambda pair: pair[0])
+    distance_m, nearest = min(distances, key=lambda pair: pair[0])
     assert distance_m < nearest.position_sigma_m
     for d in found:
         at = survey.pings[d.ping_index]
         slant_m = (d.sample + 0.5) * at.channel(d.side).sample_spacing_m
-        lon, lat = placed(at, d.side, np.sqrt(slant_m**2 - at.altitude_m**2))
+        lon, lat = lon_lat(at, d.side, np.sqrt(slant_m**2 - at.altitude_m**2))
         assert geod.inv(lon, lat, d.position.lon_deg, d.position.lat_deg)[2] < 0.01
 
 
 @pytest.mark.realdata
-def test_an_eight_bit_survey_without_altitude_or_speed_works(data_dir):
+def test_8_bit_survey_without_altitude_or_speed(data_dir):
     survey = read_survey(data_dir / "surveys" / "000_1236.xtf")
     found = detect(survey)
-    assert 10 <= len(found) <= 60  # a river bed strewn with debris
+    assert 10 <= len(found) <= 60  # a river bed with debris
     assert all(d.height_m is not None and d.position is not None and d.length_m is not None for d in found)
-    # A branched object with its shadow on open sand, the plainest on this line's port side.
+    # A branched object with shadow on sand, the clearest on the port side.
     assert any(d.side is Side.PORT and abs(d.ping_index - 330) < 8 and abs(d.sample - 327) < 15 for d in found)

@@ -1,3 +1,5 @@
+"""XTF files that this package writes, read back and by pyxtf."""
+
 from __future__ import annotations
 
 import ctypes
@@ -35,7 +37,7 @@ def assert_same(read: Survey, written: Survey) -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
-def test_what_is_written_is_read_back(small_survey, tmp_path, dtype):
+def test_written_survey_is_read_back(small_survey, tmp_path, dtype):
     survey = small_survey(dtype)
     write_xtf(survey, tmp_path / "line7.xtf")
     read = read_xtf(tmp_path / "line7.xtf")
@@ -45,7 +47,7 @@ def test_what_is_written_is_read_back(small_survey, tmp_path, dtype):
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
-def test_pyxtf_reads_what_is_written(small_survey, tmp_path, dtype):
+def test_pyxtf_reads_written_survey(small_survey, tmp_path, dtype):
     survey = small_survey(dtype)
     write_xtf(survey, tmp_path / "a.xtf")
     header, packets = pyxtf.xtf_read(str(tmp_path / "a.xtf"))
@@ -61,7 +63,7 @@ def test_pyxtf_reads_what_is_written(small_survey, tmp_path, dtype):
         assert got.NumBytesThisRecord % 64 == 0
 
 
-def test_same_survey_gives_same_bytes_and_no_leftovers(small_survey, tmp_path):
+def test_same_survey_gives_same_bytes_and_no_temporary_files(small_survey, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         write_xtf(small_survey(), tmp_path / name / "x.xtf")
@@ -69,7 +71,7 @@ def test_same_survey_gives_same_bytes_and_no_leftovers(small_survey, tmp_path):
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["x.xtf"]
 
 
-def test_golden_bytes_of_a_ping(tmp_path):
+def test_golden_bytes_of_ping(tmp_path):
     port = ChannelPing(Side.PORT, np.array([1, 2, 3], np.uint16), 30.0, 600_000.0)
     ping = Ping(7, 1_378_847_588.13, (port,), lat_deg=48.5, lon_deg=-68.5, heading_deg=0.0)
     write_xtf(Survey(Path("x"), "HDS", "x", (ping,)), tmp_path / "x.xtf")
@@ -85,17 +87,17 @@ def test_golden_bytes_of_a_ping(tmp_path):
     assert packet[320:326] == bytes.fromhex("0300 0200 0100")  # farthest first
 
 
-def test_missing_navigation_comes_back_as_none(small_survey, tmp_path):
+def test_missing_navigation_is_read_as_none(small_survey, tmp_path):
     survey = small_survey()
-    bare = tuple(Ping(p.number, p.time_utc_s, p.channels) for p in survey.pings)
-    write_xtf(dataclasses.replace(survey, pings=bare), tmp_path / "a.xtf")
+    without_navigation = tuple(Ping(p.number, p.time_utc_s, p.channels) for p in survey.pings)
+    write_xtf(dataclasses.replace(survey, pings=without_navigation), tmp_path / "a.xtf")
     read = read_xtf(tmp_path / "a.xtf")
     for ping in read:
         assert {ping.lat_deg, ping.lon_deg, ping.heading_deg, ping.altitude_m, ping.speed_mps} == {None}
     assert read.warnings == ("no position fix in 5 of 5 pings, the first in row 0",)
 
 
-def test_one_ping_without_navigation_among_others(small_survey, tmp_path):
+def test_one_ping_without_navigation(small_survey, tmp_path):
     survey = small_survey()
     first = Ping(1, survey.pings[0].time_utc_s, survey.pings[0].channels)
     write_xtf(dataclasses.replace(survey, pings=(first, *survey.pings[1:])), tmp_path / "a.xtf")
@@ -104,14 +106,14 @@ def test_one_ping_without_navigation_among_others(small_survey, tmp_path):
     assert (read.pings[0].lat_deg, read.pings[0].heading_deg, read.pings[0].pitch_deg) == (None, None, None)
 
 
-def test_due_north_is_not_mistaken_for_no_heading(small_survey, tmp_path):
+def test_heading_zero_differs_from_unknown_heading(small_survey, tmp_path):
     survey = small_survey()
     north = tuple(dataclasses.replace(p, heading_deg=0.0) for p in survey.pings)
     write_xtf(dataclasses.replace(survey, pings=north), tmp_path / "a.xtf")
     assert [p.heading_deg for p in read_xtf(tmp_path / "a.xtf")] == [0.0] * 5
 
 
-def test_two_frequencies_and_a_ping_without_one_side(small_survey, tmp_path):
+def test_dual_frequency_and_ping_without_one_side(small_survey, tmp_path):
     survey = small_survey()
     low = ChannelPing(Side.PORT, np.arange(17, dtype=np.uint16), 80.0, 262_500.0)
     pings = list(survey.pings)
@@ -131,7 +133,7 @@ def test_two_frequencies_and_a_ping_without_one_side(small_survey, tmp_path):
     time=st.floats(0, 4e9),
     samples=st.lists(st.integers(0, 65535), min_size=1, max_size=70),
 )
-def test_any_ping_survives(tmp_path_factory, lat, lon, heading, altitude, time, samples):
+def test_any_ping_is_read_back(tmp_path_factory, lat, lon, heading, altitude, time, samples):
     channel = ChannelPing(Side.PORT, np.array(samples, np.uint16), 30.0, None)
     ping = Ping(1, time, (channel,), lat, lon, heading, altitude, depth_m=3.0, speed_mps=1.0, pitch_deg=1, roll_deg=1)
     path = tmp_path_factory.mktemp("any") / "x.xtf"
@@ -148,7 +150,7 @@ def test_any_ping_survives(tmp_path_factory, lat, lon, heading, altitude, time, 
         ({"pings": ()}, "channels"),
     ],
 )
-def test_a_survey_that_does_not_fit_the_format(small_survey, tmp_path, change, field):
+def test_survey_outside_format_is_rejected(small_survey, tmp_path, change, field):
     with pytest.raises(SurveyFileError, match=field):
         write_xtf(dataclasses.replace(small_survey(), **change), tmp_path / "a.xtf")
     assert not list(tmp_path.iterdir())
@@ -166,26 +168,26 @@ def test_a_survey_that_does_not_fit_the_format(small_survey, tmp_path, change, f
         ({"channels": (ChannelPing(Side.PORT, np.zeros(3, np.uint16), 9.0),)}, "sample type"),
     ],
 )
-def test_a_ping_that_does_not_fit_the_format(small_survey, tmp_path, change, field):
+def test_ping_outside_format_is_rejected(small_survey, tmp_path, change, field):
     survey = small_survey()
     pings = (*survey.pings[:2], dataclasses.replace(survey.pings[2], **change))
     with pytest.raises(SurveyFileError, match=f"row 2, {field}"):
         write_xtf(dataclasses.replace(survey, pings=pings), tmp_path / "a.xtf")
 
 
-def test_float_samples_are_refused(small_survey, tmp_path):
+def test_float_samples_are_rejected(small_survey, tmp_path):
     channel = ChannelPing(Side.PORT, np.zeros(3, np.float32), 9.0)
     ping = dataclasses.replace(small_survey().pings[0], channels=(channel,))
     with pytest.raises(SurveyFileError, match="uint8, uint16 or uint32"):
         write_xtf(Survey(Path("x"), "A", "x", (ping,)), tmp_path / "a.xtf")
 
 
-def test_nowhere_to_write(small_survey, tmp_path):
+def test_missing_folder_is_an_error(small_survey, tmp_path):
     with pytest.raises(FileNotFoundError, match="No such file"):
         write_xtf(small_survey(), tmp_path / "absent" / "a.xtf")
 
 
-def test_reading_is_silent(small_survey, tmp_path, capfd):
+def test_reading_prints_and_warns_nothing(small_survey, tmp_path, capfd):
     write_xtf(small_survey(), tmp_path / "a.xtf")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -194,6 +196,6 @@ def test_reading_is_silent(small_survey, tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_structures_have_the_sizes_of_the_format():
+def test_pyxtf_structures_have_format_sizes():
     sizes = [ctypes.sizeof(c) for c in (pyxtf.XTFFileHeader, pyxtf.XTFPingHeader, pyxtf.XTFPingChanHeader)]
     assert sizes == [1024, 256, 64]

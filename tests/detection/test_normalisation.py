@@ -1,3 +1,5 @@
+"""Normalisation of a side: cells, water column, seabed level."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -13,7 +15,7 @@ from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 SETTINGS = DetectorSettings()
 
 
-def test_the_seabed_comes_out_flat_whatever_the_range(make_survey):
+def test_normalised_seabed_is_flat_over_range(make_survey):
     grid = normalise_side(make_survey(), Side.PORT, SETTINGS)
     by_range = np.nanmedian(grid.level[:, 100:], axis=0)
     assert np.abs(by_range).max() < 0.35
@@ -21,7 +23,7 @@ def test_the_seabed_comes_out_flat_whatever_the_range(make_survey):
     assert grid.level.dtype == np.float32
 
 
-def test_the_water_column_is_masked_and_the_seabed_is_not(make_survey):
+def test_water_column_is_masked(make_survey):
     grid = normalise_side(make_survey(), Side.STARBOARD, SETTINGS)
     first = 3.0 / grid.cell_across_m
     assert np.abs(grid.first_return_cell - first).max() <= 2
@@ -29,12 +31,12 @@ def test_the_water_column_is_masked_and_the_seabed_is_not(make_survey):
     assert np.isfinite(grid.level[:, int(first * 1.02) + 12 :]).all()
 
 
-def test_the_bottom_is_found_without_an_altitude(make_survey):
+def test_first_return_without_altitude(make_survey):
     grid = normalise_side(make_survey(altitude=False), Side.PORT, SETTINGS)
     assert np.abs(grid.first_return_cell * grid.cell_across_m - 3.0).max() < 0.2
 
 
-def test_lengths_of_cells_and_rows(make_survey):
+def test_cell_and_row_lengths(make_survey):
     grid = normalise_side(make_survey(), Side.PORT, SETTINGS)
     assert grid.samples_per_cell == 2
     assert grid.cell_across_m == pytest.approx(2 * 20.0 / 512)
@@ -45,7 +47,7 @@ def test_lengths_of_cells_and_rows(make_survey):
     assert unknown.row_along_m == SETTINGS.assumed_row_along_m
 
 
-def test_pings_without_the_channel_or_cut_short_are_unknown(make_survey):
+def test_missing_channel_and_short_ping_are_unknown(make_survey):
     survey = make_survey()
     pings = list(survey.pings)
     pings[50] = replace(pings[50], channels=())
@@ -58,7 +60,7 @@ def test_pings_without_the_channel_or_cut_short_are_unknown(make_survey):
     assert np.isfinite(grid.level[[49, 51, 59, 61], 100:]).all()
 
 
-def test_a_single_spike_does_not_survive(make_survey):
+def test_single_spike_is_removed(make_survey):
     survey = make_survey()
     samples = survey.pings[80].channel(Side.PORT).samples
     samples[301] = 65535
@@ -77,7 +79,7 @@ def test_a_single_spike_does_not_survive(make_survey):
         (ChannelPing(Side.PORT, np.full(200, 9, np.uint8), 0.0),),
     ],
 )
-def test_a_side_that_holds_nothing_to_work_with_is_none(channels):
+def test_unusable_side_is_none(channels):
     survey = Survey(Path("x"), "x", "x", tuple(Ping(i, float(i), channels, altitude_m=2.0) for i in range(20)))
     assert normalise_side(survey, Side.PORT, SETTINGS) is None
 
@@ -96,6 +98,6 @@ def test_a_side_that_holds_nothing_to_work_with_is_none(channels):
         {"highlight_sizes_m": ((1.0, 0.0),)},
     ],
 )
-def test_settings_no_detector_can_work_with_are_refused(wrong):
+def test_invalid_settings_are_rejected(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         DetectorSettings(**wrong)
