@@ -1,4 +1,4 @@
-"""Fixtures of these tests; `builders.speckle_survey` makes them."""
+"""Fixtures of these tests, from `builders.speckle_survey`."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ def test_vq_row_is_the_best_codebook_within_the_budget(folder: Path, tmp_path: P
     assert none.misses == len(images)
     assert np.array_equal(small.stream_bytes, coarse.stream_bytes)
     assert np.array_equal(large.psnr, np.maximum(coarse.psnr, fine.psnr))
-    assert (large.stream_bytes <= fine.stream_bytes).all()  # of the packings the tightest
+    assert (large.stream_bytes <= fine.stream_bytes).all()  # the most compact packing
     assert sum(none.reasons.values()) == len(images)
 
 
@@ -157,7 +157,7 @@ def test_bd_rate_compares_emb_with_every_other_codec(
     found = json.loads(capsys.readouterr().out)
     assert set(found["bd_rate"]) == {"emb"}
     assert set(found["bd_rate"]["emb"]) == {"spiht", "vq"}
-    assert found["bd_rate"]["emb"]["spiht"] > 0  # block means are no match for a wavelet
+    assert found["bd_rate"]["emb"]["spiht"] > 0  # block means are less efficient than a wavelet
     details = json.loads(file.read_text())
     assert details["bd_rate"]["emb"]["spiht"]["percent"] == pytest.approx(found["bd_rate"]["emb"]["spiht"], abs=0.01)
     gains = [row["emb_gain"]["psnr"]["mean"] for row in details["results"] if row["codec"] == "spiht"]
@@ -350,7 +350,7 @@ def test_plot_and_sheet_are_written(folder: Path, tmp_path: Path) -> None:
         assert len(set(picture.convert("L").tobytes())) > 50
     with Image.open(sheet) as picture:
         drawn = np.asarray(picture.convert("L"))
-    # The first row's first picture is the original, enlarged twice.
+    # The first image of the first row is the original, enlarged by two.
     first = snippet(0).repeat(2, 0).repeat(2, 1)
     assert np.array_equal(drawn[56 : 56 + first.shape[0], 20 : 20 + first.shape[1]], first)
 

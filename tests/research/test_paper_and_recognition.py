@@ -1,4 +1,4 @@
-"""`python -m research.paper` and `python -m research.recognition`, in small."""
+"""`python -m research.paper` and `python -m research.recognition` with small data sets."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def run(command: ModuleType, *arguments: object) -> int:
 
 
 def scene(seed: int, *, target: bool, side_px: int = 80) -> np.ndarray:
-    """Speckle, with a highlight and a shadow for a target."""
+    """Return speckle, optionally with a target: a highlight and its shadow."""
     rng = np.random.default_rng(seed)
     image = 45 * rng.rayleigh(1.0, (side_px, side_px))
     if target:
@@ -68,8 +68,8 @@ def test_classifier_separates_targets_from_clutter_but_not_in_noise(classifier: 
     areas = []
     for sigma in (0, 60, 600):
         rng = np.random.default_rng(sigma)
-        seen = [np.clip(p.pixels + rng.normal(0, sigma, p.pixels.shape), 0, 255).astype(np.uint8) for p in test]
-        areas.append(auc(classifier.scores(seen, groups), is_target)[0])
+        noisy = [np.clip(p.pixels + rng.normal(0, sigma, p.pixels.shape), 0, 255).astype(np.uint8) for p in test]
+        areas.append(auc(classifier.scores(noisy, groups), is_target)[0])
     assert areas[0] > 0.97
     assert areas[0] >= areas[1] >= areas[2]
     assert areas[2] < 0.8
@@ -118,7 +118,7 @@ def test_features_are_invariant_to_brightness_and_require_a_minimum_size() -> No
 
 @pytest.fixture
 def data_set(tmp_path: Path) -> Path:
-    """A data set in the layout of SDVD: dated targets as PNG, numbered clutter as JPEG."""
+    """Return a data set in the layout of SDVD: dated targets as PNG, numbered clutter as JPEG."""
     rows = []
     for split, count in (("train", 2 * FOLDS), ("test", 6)):
         images = tmp_path / split / "images"
@@ -174,21 +174,21 @@ def test_grain_is_added_with_the_given_strength() -> None:
     from sonarpost.codec.baselines.spiht import SpihtCodec
     from sonarpost.codec.emb.codec import EmbCodec
 
-    plain, twin = EmbCodec(), codec_with_grain(EmbCodec())
-    assert isinstance(twin, EmbCodec)
-    assert twin.send_texture
+    plain, textured = EmbCodec(), codec_with_grain(EmbCodec())
+    assert isinstance(textured, EmbCodec)
+    assert textured.send_texture
     assert codec_with_grain(SpihtCodec()) is None
     image = np.clip(45 * np.random.default_rng(0).rayleigh(1.0, (48, 48)), 0, 255).astype(np.uint8)
-    stream = twin.encode(image, 64)
-    picture = twin.decode(stream).image
-    views = [with_grain(twin, stream, picture, strength) for strength in (0.0, 0.5, 1.0)]
-    assert all(view is not None for view in views)
-    assert np.array_equal(views[0], picture)
-    assert np.array_equal(views[1], twin.decode_with_speckle(stream))
-    spreads = [float(np.std(view)) for view in views]
+    stream = textured.encode(image, 64)
+    decoded = textured.decode(stream).image
+    outputs = [with_grain(textured, stream, decoded, strength) for strength in (0.0, 0.5, 1.0)]
+    assert all(output is not None for output in outputs)
+    assert np.array_equal(outputs[0], decoded)
+    assert np.array_equal(outputs[1], textured.decode_with_speckle(stream))
+    spreads = [float(np.std(output)) for output in outputs]
     assert spreads[0] < spreads[1] < spreads[2]
-    assert with_grain(plain, plain.encode(image, 64), picture) is None
-    assert with_grain(SpihtCodec(), stream, picture) is None
+    assert with_grain(plain, plain.encode(image, 64), decoded) is None
+    assert with_grain(SpihtCodec(), stream, decoded) is None
 
 
 def test_poor_classifier_gives_status_1(
@@ -252,18 +252,18 @@ def test_more_dimensions_increase_size_and_quality() -> None:
 
 def test_rotated_search_finds_the_nearest_tile_and_adds_it_once() -> None:
     training = [scene(i, target=True, side_px=60) for i in range(6)]
-    every = np.concatenate([cut_tiles(p, 20) for p in training])
-    database = RotatedTiles(every, 40)
-    for picture in training:
-        database.add_tiles_of(picture)
+    tiles = np.concatenate([cut_tiles(p, 20) for p in training])
+    database = RotatedTiles(tiles, 40)
+    for image in training:
+        database.add_tiles_of(image)
     before = len(database)
-    rotated = database.rotate(every)
+    rotated = database.rotate(tiles)
     index, squared = database.nearest(rotated)
-    brute = np.square(rotated[:, None] - rotated[None]).sum(2)
-    assert (squared >= brute.min(axis=1) - 1e-6).all()
+    expected = np.square(rotated[:, None] - rotated[None]).sum(2)
+    assert (squared >= expected.min(axis=1) - 1e-6).all()
     assert len(np.unique(index)) == before
-    for picture in training:
-        database.add_tiles_of(picture)
+    for image in training:
+        database.add_tiles_of(image)
     assert len(database) == before
     assert psnr_db(training[0], database.encode_and_decode(training[0])) > 25
 
@@ -281,8 +281,8 @@ def test_page_contains_the_figures_of_the_run(
     for part in ("## Table II", "## Fig. 2", "## Fig. 3", "| 100 |", "codec jpeg2000 is not in", "line.xtf"):
         assert part in page
     for name in ("fig2.png", "fig3.png"):
-        with Image.open(tmp_path / "reproduction" / name) as picture:
-            assert picture.width > 400
+        with Image.open(tmp_path / "reproduction" / name) as image:
+            assert image.width > 400
     with pytest.raises(ConfigError, match="--training"):
         run(paper, "--out", tmp_path, "--training", "1")
     with pytest.raises(SurveyFileError):

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from research import channel_table
 from research.common.images import simulated_images
 from research.sea_trial import __main__ as sea_trial
 from research.sea_trial.__main__ import SIZES_PX, Cell, claims, measure, table
@@ -134,3 +135,9 @@ def test_command_prints_and_plots(
 def test_invalid_option_is_an_error(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert sea_trial.main([*wrong]) == 2
     assert wrong[0] in capsys.readouterr().err
+
+
+def test_delivery_table_has_every_rate_and_range() -> None:
+    lines = channel_table.table(ChannelParameters(), packets=2).splitlines()
+    assert len(lines) == 2 + len(channel_table.RANGES_M)
+    assert lines[2].split("|")[1:4] == [" 2 ", " 54.0 ", " 100 / 100 "]

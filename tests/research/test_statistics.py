@@ -100,8 +100,8 @@ def test_curves_use_the_images_coded_by_both_codecs() -> None:
     base = np.linspace(18, 24, pictures)
     easy = np.arange(pictures) < 19
     one = [point(int(b), [b] * pictures, list(base + curve(np.array(b)))) for b in RATES]
-    # The other is the same codec at twice the bytes; it misses the best picture at one budget, and nearly all at
-    # another, which therefore does not count.
+    # The other is the same codec at twice the bytes; it misses the best image at one budget. It misses nearly
+    # all at another, which is therefore excluded.
     two = [point(int(b), [2 * b] * pictures, list(base + curve(np.array(b)))) for b in RATES]
     for array in (two[2].stream_bytes, two[2].psnr):
         array[~easy] = np.nan
@@ -185,7 +185,7 @@ def test_ms_ssim_of_equal_and_of_damaged_images() -> None:
 
 
 def test_ms_ssim_of_constant_images_is_the_luminance_term() -> None:
-    # Without any contrast all contrast-structure terms are 1; what is left is the coarsest scale's luminance.
+    # Without any contrast all contrast-structure terms are 1; only the luminance of the coarsest scale remains.
     a, b = np.full((32, 32), 100, np.uint8), np.full((32, 32), 140, np.uint8)
     c1 = (0.01 * 255) ** 2
     luminance = (2 * 100 * 140 + c1) / (100**2 + 140**2 + c1)
