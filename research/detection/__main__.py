@@ -146,7 +146,7 @@ def _shape_pd(files: Sequence[EvaluatedFile], kind: str) -> float:
     plain = [f for f in files if f.seabed in PLAIN]
     objects = sum(t.kind == kind for f in plain for t in f.truth)
     hits = sum(
-        c.is_first and c.thing is not None and c.thing.kind == kind and c.confidence >= OPERATING_CONFIDENCE
+        c.is_first and c.target is not None and c.target.kind == kind and c.confidence >= OPERATING_CONFIDENCE
         for f in plain
         for c in f.contacts
     )

@@ -77,8 +77,8 @@ def contact_snippets(files: Sequence[EvaluatedFile], limit: int) -> list[Contact
         (file.survey, detection)
         for file in files
         for detection, contact in zip(file.detections, file.contacts, strict=True)
-        if contact.thing is not None
-        and contact.thing.is_mine_like
+        if contact.target is not None
+        and contact.target.is_mine_like
         and contact.is_first
         and detection.confidence >= _MIN_CONFIDENCE
     ]

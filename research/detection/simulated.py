@@ -38,12 +38,12 @@ class Scale:
 def object_at(truth: Sequence[TruthObject], side: Side, row: int, sample: float, scale: Scale) -> int | None:
     """Return the index of the nearest object at a ping and sample; None if there is none."""
     nearest, nearest_m = None, float("inf")
-    for index, thing in enumerate(truth):
-        if thing.side is not side:
+    for index, target in enumerate(truth):
+        if target.side is not side:
             continue
-        limit_m = NEAR_M + (0.0 if thing.is_mine_like else thing.length_m / 2)
-        along_m = abs(row - thing.ping) * scale.row_m
-        across_m = abs(sample - thing.sample_index) * scale.sample_m
+        limit_m = NEAR_M + (0.0 if target.is_mine_like else target.length_m / 2)
+        along_m = abs(row - target.ping) * scale.row_m
+        across_m = abs(sample - target.sample_index) * scale.sample_m
         if along_m < limit_m and across_m < limit_m and max(along_m, across_m) < nearest_m:
             nearest, nearest_m = index, max(along_m, across_m)
     return nearest
@@ -55,12 +55,12 @@ class EvaluatedContact:
 
     Attributes:
         confidence: Confidence of the contact.
-        thing: The object; None for a false alarm.
+        target: The object; None for a false alarm.
         is_first: Whether it is the most confident contact of its object (True for a false alarm).
     """
 
     confidence: float
-    thing: TruthObject | None
+    target: TruthObject | None
     is_first: bool
 
 
@@ -97,8 +97,8 @@ def evaluate_file(seabed: SeabedKind, seed: int) -> EvaluatedFile:
     for d in detections:
         scale = Scale(d.pixel_along_m or _ALL_CONTACTS.assumed_row_along_m, d.pixel_across_m)
         index = object_at(simulated.truth, d.side, d.ping_index, d.sample, scale)
-        thing = None if index is None else simulated.truth[index]
-        contacts.append(EvaluatedContact(d.confidence, thing, index not in assigned))
+        target = None if index is None else simulated.truth[index]
+        contacts.append(EvaluatedContact(d.confidence, target, index not in assigned))
         if index is not None:
             assigned.add(index)
     return EvaluatedFile(seabed, survey, detections, tuple(contacts), simulated.truth, seconds)
@@ -127,11 +127,11 @@ def operating_point(files: Sequence[EvaluatedFile], confidence: float) -> Operat
     mines = sum(t.is_mine_like for f in files for t in f.truth)
     hits = alarms = others = 0
     for contact in (c for f in files for c in f.contacts if c.confidence >= confidence):
-        if contact.thing is None:
+        if contact.target is None:
             alarms += 1
         elif contact.is_first:
-            hits += contact.thing.is_mine_like
-            others += not contact.thing.is_mine_like
+            hits += contact.target.is_mine_like
+            others += not contact.target.is_mine_like
     return OperatingPoint(hits / mines if mines else 0.0, alarms / len(files), others / len(files))
 
 
@@ -145,10 +145,10 @@ def roc(files: Sequence[EvaluatedFile], kind: str | None = None) -> tuple[Floats
     objects = sum(t.is_mine_like and (kind is None or t.kind == kind) for f in files for t in f.truth)
     contacts = sorted((c for f in files for c in f.contacts), key=lambda c: -c.confidence)
     hit = [
-        c.is_first and c.thing is not None and c.thing.is_mine_like and (kind is None or c.thing.kind == kind)
+        c.is_first and c.target is not None and c.target.is_mine_like and (kind is None or c.target.kind == kind)
         for c in contacts
     ]
-    alarms = np.cumsum([0.0, *(float(c.thing is None) for c in contacts)]) / max(len(files), 1)
+    alarms = np.cumsum([0.0, *(float(c.target is None) for c in contacts)]) / max(len(files), 1)
     return alarms, np.cumsum([0.0, *map(float, hit)]) / max(objects, 1)
 
 
@@ -175,7 +175,7 @@ class ReliabilityBin:
 
 def reliability(files: Sequence[EvaluatedFile], bins: int = 10) -> tuple[ReliabilityBin, ...]:
     """Return claimed and true share of objects by confidence, without empty bins."""
-    pairs = [(c.confidence / 2, c.thing is not None) for f in files for c in f.contacts if c.is_first]
+    pairs = [(c.confidence / 2, c.target is not None) for f in files for c in f.contacts if c.is_first]
     found = []
     for number in range(bins):
         inside = [p for p in pairs if number <= min(p[0] * bins, bins - 1e-9) < number + 1]

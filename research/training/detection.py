@@ -126,12 +126,12 @@ def kept_rows(sides: list[SideCandidates], model: FusionModel) -> tuple[Floats, 
         fused = fused_confidences(side.candidates, side.grid, SETTINGS, model)
         for _, place in suppress_duplicates(list(zip(fused, side.candidates, strict=True)), side.grid, SETTINGS):
             index = row_of[id(place)]
-            thing = side.objects[index]
-            if thing is not None and id(thing) in assigned:
+            target = side.objects[index]
+            if target is not None and id(target) in assigned:
                 continue
-            assigned.add(id(thing))
+            assigned.add(id(target))
             rows.append([*log_scores(place.scores), -levels[index]])
-            kinds.append(0 if thing is None else 2 if thing.is_mine_like else 1)
+            kinds.append(0 if target is None else 2 if target.is_mine_like else 1)
     return np.array(rows), np.array(kinds)
 
 

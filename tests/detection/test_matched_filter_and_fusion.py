@@ -109,7 +109,7 @@ def test_image_without_values_stays_nan():
 
 def test_response_to_object_with_shadow_exceeds_seabed(make_survey):
     with_object, grid, response = best_near(make_survey(box()))
-    assert with_object > 5 * SETTINGS.least_matched
+    assert with_object > 5 * SETTINGS.min_matched_response
     strongest = peaks(response, grid, SETTINGS, 1.0)[0]
     assert abs(strongest.row - 100) <= 4
     assert abs(strongest.cell * 2 - 250) <= 10

@@ -31,7 +31,7 @@ from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Side, Survey
 
 
-def thing(kind=ObjectKind.SPHERE, ping=100, sample=300, side=Side.PORT):
+def target(kind=ObjectKind.SPHERE, ping=100, sample=300, side=Side.PORT):
     mine = kind not in (ObjectKind.BOULDER, ObjectKind.DEBRIS, ObjectKind.RIDGE)
     return TruthObject(kind, mine, side, ping, sample, 0.0, 0.0, 10.0, 2.0, 1.0, 0.5, 0.0)
 
@@ -42,7 +42,7 @@ def judged(*contacts, truth):
 
 def test_contact_is_assigned_to_the_nearest_object_of_its_side():
     scale = Scale(0.1, 0.03)
-    truth = (thing(), thing(ping=110), thing(side=Side.STARBOARD), thing(ObjectKind.DEBRIS, ping=400))
+    truth = (target(), target(ping=110), target(side=Side.STARBOARD), target(ObjectKind.DEBRIS, ping=400))
     assert object_at(truth, Side.PORT, 101, 300.0, scale) == 0
     assert object_at(truth, Side.PORT, 109, 300.0, scale) == 1
     assert object_at(truth, Side.STARBOARD, 109, 320.0, scale) == 2
@@ -52,7 +52,7 @@ def test_contact_is_assigned_to_the_nearest_object_of_its_side():
 
 
 def test_each_object_counts_once_and_contacts_without_object_are_false_alarms():
-    mine, other_mine, stone = thing(), thing(ping=500), thing(ObjectKind.BOULDER, ping=800)
+    mine, other_mine, stone = target(), target(ping=500), target(ObjectKind.BOULDER, ping=800)
     one = judged(
         EvaluatedContact(1.8, mine, True),
         EvaluatedContact(1.7, mine, False),
@@ -141,7 +141,7 @@ def test_image_without_the_object_has_no_confidence(make_survey):
 
 def test_plots_are_written_for_available_data(tmp_path):
     pytest.importorskip("matplotlib")
-    one = judged(EvaluatedContact(1.8, thing(), True), EvaluatedContact(0.4, None, True), truth=(thing(),))
+    one = judged(EvaluatedContact(1.8, target(), True), EvaluatedContact(0.4, None, True), truth=(target(),))
     tiles = [TileScore("test", f"{i}_a.png", i < 2, 1.0 - i / 10) for i in range(4)]
     plot_all(tmp_path / "out", [one], tiles, [])
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["reliability.png", "roc.png", "tiles.png"]

@@ -105,7 +105,7 @@ class Candidate:
 def find_candidates(grid: LevelGrid, settings: DetectorSettings) -> list[Candidate]:
     """Return the candidates of one side of a survey, or of an image, in order of the matched-filter response."""
     limit = math.ceil(_MAX_PER_1000_PINGS * max(1.0, len(grid.level) / 1000))
-    found = peaks(matched_response(grid, settings), grid, settings, settings.least_matched)[:limit]
+    found = peaks(matched_response(grid, settings), grid, settings, settings.min_matched_response)[:limit]
     measurements = [m for m in (measure(grid, peak, settings) for peak in found) if m is not None]
     texture = TextureMap(grid)
     return [

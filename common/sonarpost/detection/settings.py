@@ -24,7 +24,7 @@ class DetectorSettings:
         noise_window_m: Along-track and across-track extent of the neighbourhood that defines the local noise.
         guard_m: Guard distance between a highlight and the ring of seabed of the CFAR test.
         ring_m: Width of that ring.
-        least_matched: Minimum matched-filter response, in local noise units, of a candidate.
+        min_matched_response: Minimum matched-filter response, in local noise units, of a candidate.
         clutter_radius_m: Distance, along and across, within which other candidates define the local clutter.
         clutter_area_m2: Area of seabed for each accepted candidate: the local clutter level is the evidence that one
             candidate in this area reaches.
@@ -49,7 +49,7 @@ class DetectorSettings:
     noise_window_m: tuple[float, float] = (24.0, 12.0)
     guard_m: float = 0.6
     ring_m: float = 1.5
-    least_matched: float = 1.6
+    min_matched_response: float = 1.6
     clutter_radius_m: float = 30.0
     clutter_area_m2: float = 90.0
     separation_along_m: float = 3.0

@@ -12,7 +12,7 @@ track, at ground range g, altitude h and slant range r = sqrt(g^2 + h^2):
 * altitude, e: c = e h/g; near the nadir, where h/g has no bound, limited to the possible range of g
 * slope of the bottom, b radians: the bottom at g is g tan(b) higher or lower, which is an altitude error
 * time of the position relative to the ping, t: a = speed t
-* layback, l, if there is one: a
+* layback of a towed body, l: a
 """
 
 from __future__ import annotations

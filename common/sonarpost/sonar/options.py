@@ -58,7 +58,7 @@ class ErrorBudget(_Section):
         sound_speed: Sound speed assumed by the recorder, as a fraction.
         bottom_slope_deg: Slope of the bottom across the track, which is assumed flat.
         time_s: Time of the ping relative to the time of the position.
-        layback_m: Layback, if there is one.
+        layback_m: Layback of a towed body.
     """
 
     position_m: _Sigma = 5.0

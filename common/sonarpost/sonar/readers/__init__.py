@@ -2,7 +2,7 @@
 
 A reader is a function from a path and options to an open `SurveySource`. For a bad file it raises `SurveyFileError`
 only. Other packages add formats by entry points of the group `sonarpost.survey_readers`: the name is the suffix
-without its dot, the object is the reader (example: docs/explanation/surveys.md).
+without its dot, the object is the reader (example: docs/how-to/survey-reader.md).
 """
 
 from __future__ import annotations

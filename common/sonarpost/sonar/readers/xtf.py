@@ -123,7 +123,7 @@ class XtfSource(StreamedSource):
         return [*warnings, *self._cleaner.warnings(self._pings), *self._port_order.warnings()]
 
     def _from_attitude(self) -> tuple[str, ...]:
-        """Return the fields taken from attitude packets: those that are zero in every ping, but not there."""
+        """Return the fields taken from attitude packets: zero in every ping, and set in a packet."""
         return tuple(name for name in sorted(self._attitude_fields) if not self._cleaner.is_recorded(name))
 
     def _read_pings(self, *, first_pass: bool) -> Iterator[Ping]:

@@ -1,8 +1,8 @@
 """Parsing and validation of the records of an XTF file.
 
-The structures are pyxtf's. pyxtf's own file reader is not used because it trusts the file: it does not terminate on a
-record of length zero, returns short sample arrays for a truncated packet, selects a channel's sample size by its
-position in the ping in place of its number, and unpickles any `.pyxtf_idx` file beside the survey.
+The structures are those of pyxtf. Its file reader is not used, because it does not validate the file. It does not
+terminate on a record of length zero, and returns short sample arrays for a truncated packet. It selects the sample size
+of a channel by position in the ping and not by channel number. It unpickles any `.pyxtf_idx` file beside the survey.
 
 Field meanings are those of the XTF file format, revision 35 and later:
 
