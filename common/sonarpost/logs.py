@@ -10,8 +10,7 @@ import json
 import logging
 import re
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -32,40 +31,38 @@ def kv(**fields: object) -> dict[str, object]:
 _NEEDS_QUOTES = re.compile(r"[ \"'=]").search
 
 
-class _Context:
-    """Fields of a log context; those of a record are read from its payload when the first line is logged."""
+class log_context:  # noqa: N801  # a context manager, named like a function
+    """Context manager that adds fields to every line that this thread logs inside the block.
 
-    def __init__(self, outer: _Context | None, fields: Mapping[str, object], payload: bytes) -> None:
-        self._outer = outer
-        self._own = fields
+    Args:
+        payload: A record as msgpack; its vehicle, image and contact are added when the first line is logged.
+        **fields: Further fields; None is omitted.
+    """
+
+    __slots__ = ("_fields", "_outer", "_own", "_payload", "_token")
+
+    def __init__(self, payload: bytes = b"", /, **fields: object) -> None:
         self._payload = payload
-        self._all: Mapping[str, object] | None = None
+        self._own = fields
+        self._fields: Mapping[str, object] | None = None
+
+    def __enter__(self) -> None:
+        self._outer = _context.get()
+        self._token = _context.set(self)
+
+    def __exit__(self, *_: object) -> None:
+        _context.reset(self._token)
 
     def fields(self) -> Mapping[str, object]:
         """Return the fields of this context and of those around it."""
-        if self._all is None:
+        if self._fields is None:
             outer = {} if self._outer is None else self._outer.fields()
-            self._all = {**outer, **context_of_payload(self._payload), **self._own}
-        return self._all
+            own = {name: value for name, value in self._own.items() if value is not None}
+            self._fields = {**outer, **context_of_payload(self._payload), **own}
+        return self._fields
 
 
-_context: ContextVar[_Context | None] = ContextVar("log_context", default=None)
-
-
-@contextmanager
-def log_context(payload: bytes = b"", /, **fields: object) -> Iterator[None]:
-    """Add fields to every line that this thread logs inside the block.
-
-    Args:
-        payload: A record as msgpack, whose vehicle, image and contact are added.
-        **fields: Further fields; None is omitted.
-    """
-    known = {name: value for name, value in fields.items() if value is not None}
-    token = _context.set(_Context(_context.get(), known, payload))
-    try:
-        yield
-    finally:
-        _context.reset(token)
+_context: ContextVar[log_context | None] = ContextVar("log_context", default=None)
 
 
 def context_of_payload(payload: bytes) -> dict[str, str]:

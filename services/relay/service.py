@@ -103,6 +103,7 @@ class RelayService(Service[RelayConfig]):
         super().__init__(platform, config)
         upstreams = [Upstream(site, platform.tls) for site in config.sites()]
         self._upstreams = {upstream.queue: upstream for upstream in upstreams}
+        self._inboxes = {upstream.queue: keys.shore_inbox(platform.id, upstream.options.site) for upstream in upstreams}
         sites = [self._monitored(upstream) for upstream in upstreams]
         self._site_monitor = SiteMonitor(platform.id, sites, platform.tls)
         self._image_reserve = DiskReserve(self.store, config.disk_reserve_bytes, "senders keep their images")
@@ -175,8 +176,7 @@ class RelayService(Service[RelayConfig]):
         else:
             priority = PREVIEW_PRIORITY if record.version == 1 else DETAIL_PRIORITY
             topic = topic_of(record) if self.config.supersede else None
-        for queue, upstream in self._upstreams.items():
-            inbox = keys.shore_inbox(vessel, upstream.options.site)
+        for queue, inbox in self._inboxes.items():
             effects.send_payload(inbox, queue, payload, Relayed, priority=priority, topic=topic)
         effects.count(f"{record.TYPE}s_relayed")
         log.info("Record queued for the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
