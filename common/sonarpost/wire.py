@@ -7,15 +7,17 @@ out of range is an error with the key and the name of the field.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TypeVar
 
 import msgpack
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Record
 
 R = TypeVar("R", bound=Record)
+M = TypeVar("M", bound=BaseModel)
 
 MAX_PAYLOAD_BYTES = 40 * 1024 * 1024
 ENCODING_PREFIX = "application/msgpack;schema=sonarpost."
@@ -71,11 +73,20 @@ def decode(record_type: type[R], payload: bytes, where: str) -> R:
         # In Python 1.0 and true equal 1; other languages distinguish them.
         if type(fields.get(name)) is not type(expected) or fields[name] != expected:
             raise PayloadError(where, name, fields.get(name), repr(expected))
+    return validated(record_type, fields, where)
+
+
+def validated(model: type[M], fields: Mapping[str, object], where: str) -> M:
+    """Validate the fields of a map.
+
+    Raises:
+        PayloadError: A field is missing or invalid.
+    """
     try:
-        return record_type.model_validate(fields)
+        return model.model_validate(fields)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        field = ".".join(str(part) for part in first["loc"]) or record_type.TYPE
+        field = ".".join(str(part) for part in first["loc"]) or str(getattr(model, "TYPE", ""))
         value = "nothing" if first["type"] == "missing" else first["input"]
         raise PayloadError(where, field, value, expected_text(first["type"], first["msg"])) from error
 

@@ -5,19 +5,28 @@ from __future__ import annotations
 import msgpack
 import pytest
 
+from sonarpost import wire
 from sonarpost.bus.connectivity import PresenceReply
 from sonarpost.errors import PayloadError
 
 
-def test_presence_reply_round_trip():
-    assert PresenceReply.unpack(PresenceReply("shore-1", "c2").pack(), "key") == PresenceReply("shore-1", "c2")
+def parsed(payload: bytes) -> PresenceReply:
+    return wire.validated(PresenceReply, wire.unpack_map(payload, "key"), "key")
+
+
+def test_presence_reply_round_trip() -> None:
+    reply = PresenceReply(v=1, platform="shore-1", service="c2")
+    assert parsed(reply.pack()) == reply
+    assert msgpack.unpackb(reply.pack()) == {"v": 1, "platform": "shore-1", "service": "c2"}
 
 
 @pytest.mark.parametrize(
     "fields",
     [
         {},
+        {"platform": "a", "service": "b"},
         {"v": 2, "platform": "a", "service": "b"},
+        {"v": True, "platform": "a", "service": "b"},
         {"v": 1, "platform": 3, "service": "b"},
         {"v": 1, "platform": "a", "service": "b" * 41},
         {"v": 1, "platform": "", "service": "b"},
@@ -25,6 +34,6 @@ def test_presence_reply_round_trip():
 )
 def test_invalid_presence_reply_is_rejected(fields):
     with pytest.raises(PayloadError):
-        PresenceReply.unpack(msgpack.packb(fields), "key")
+        parsed(msgpack.packb(fields))
     with pytest.raises(PayloadError):
-        PresenceReply.unpack(b"junk", "key")
+        parsed(b"junk")

@@ -10,6 +10,7 @@ import msgpack
 import pytest
 import zenoh
 from builders.common import eventually
+from builders.records import decision_record
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -41,18 +42,7 @@ def item(seq: int, payload: bytes) -> OutboxItem:
 
 
 def decision(number: int) -> bytes:
-    return wire.encode(
-        Decision(
-            decision_id=f"d{number}",
-            vessel_id="vessel-1",
-            vehicle_id="uuv-1",
-            image_id="0001",
-            image_version=1,
-            verdict="unsure",
-            operator="op",
-            decided_utc_s=1.0,
-        )
-    )
+    return wire.encode(decision_record(f"d{number}"))
 
 
 # Bytes
@@ -82,14 +72,14 @@ SHA = bytes(32)
         ({"records": [[n, 0, SHA] for n in range(1, MAX_BATCH_RECORDS + 2)]}, b"", "records"),
         ({"records": [[4, 1, SHA], [4, 1, SHA]]}, b"ab", "records"),
         ({"records": [[4, 1, SHA], 5]}, b"ab", "records.1"),
-        ({"records": [[4, 1, SHA], [5, 1]]}, b"ab", "records.1"),
-        ({"records": [[0, 2, SHA]]}, b"ab", "records.0"),
-        ({"records": [[True, 2, SHA]]}, b"ab", "records.0"),
-        ({"records": [[1 << 63, 2, SHA]]}, b"ab", "records.0"),
-        ({"records": [[4, -1, SHA]]}, b"ab", "records.0"),
-        ({"records": [[4, CHUNK_BYTES + 1, SHA]]}, b"ab", "records.0"),
-        ({"records": [[4, 2, b"short"]]}, b"ab", "records.0"),
-        ({"records": [[4, 2, "text"]]}, b"ab", "records.0"),
+        ({"records": [[4, 1, SHA], [5, 1]]}, b"ab", "records.1.2"),
+        ({"records": [[0, 2, SHA]]}, b"ab", "records.0.0"),
+        ({"records": [[True, 2, SHA]]}, b"ab", "records.0.0"),
+        ({"records": [[1 << 63, 2, SHA]]}, b"ab", "records.0.0"),
+        ({"records": [[4, -1, SHA]]}, b"ab", "records.0.1"),
+        ({"records": [[4, CHUNK_BYTES + 1, SHA]]}, b"ab", "records.0.1"),
+        ({"records": [[4, 2, b"short"]]}, b"ab", "records.0.2"),
+        ({"records": [[4, 2, "text"]]}, b"ab", "records.0.2"),
         ({}, b"a", "payload"),
         ({}, b"abc", "payload"),
         ({}, bytes(CHUNK_BYTES + 1), "payload"),
@@ -114,9 +104,9 @@ def test_arbitrary_bytes_parse_or_raise_payload_error(attached: bytes, data: byt
     [
         ([["stored", ""]], "replies"),
         (None, "replies"),
-        ([["stored", ""], ["more", ""]], "replies.1"),
-        ([["stored", ""], ["stored"]], "replies.1"),
-        ([["stored", 1], ["stored", ""]], "replies.0"),
+        ([["stored", ""], ["more", ""]], "replies.1.0"),
+        ([["stored", ""], ["stored"]], "replies.1.1"),
+        ([["stored", 1], ["stored", ""]], "replies.0.1"),
         (["stored", ["stored", ""]], "replies.0"),
     ],
 )

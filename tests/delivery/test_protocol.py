@@ -11,6 +11,7 @@ import msgpack
 import pytest
 import zenoh
 from builders.common import eventually
+from builders.records import decision_record
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
@@ -26,17 +27,7 @@ KEY = keys.contact_decision("vessel-1")
 
 
 def decision(number: int, remark: str = "") -> Decision:
-    return Decision(
-        decision_id=f"d{number}",
-        vessel_id="vessel-1",
-        vehicle_id="uuv-1",
-        image_id="0001",
-        image_version=1,
-        verdict="unsure",
-        remark=remark,
-        operator="op",
-        decided_utc_s=1.0,
-    )
+    return decision_record(f"d{number}", remark=remark)
 
 
 class Producer(Service[ServiceConfig]):

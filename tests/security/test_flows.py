@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 from builders.common import eventually, free_port
+from builders.records import decision_record
 
 from sonarpost import keys, wire
 from sonarpost.bus.connectivity import ConnectivityState, diagnose_no_reply, probe_endpoint, query_presence
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.messages import Advice, Command, Decision, Record
+from sonarpost.messages import Advice, Command, Record
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.security.router_config import RouterOptions
 from sonarpost.services.c2.config import C2Config
@@ -69,19 +70,6 @@ def start_service(world, tmp_path):
         service.stop()
 
 
-def decision(number: int) -> Decision:
-    return Decision(
-        decision_id=f"d-{number}",
-        vessel_id="vessel-1",
-        vehicle_id="uuv-1",
-        image_id="AAAA",
-        image_version=1,
-        verdict="unsure",
-        operator="op",
-        decided_utc_s=1.0,
-    )
-
-
 def test_records_advice_and_commands_pass_the_routers(world, start_service, tmp_path):
     got: list[str] = []
     c2 = start_service(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
@@ -98,7 +86,7 @@ def test_records_advice_and_commands_pass_the_routers(world, start_service, tmp_
     expert = start_service(Producer, "shore-1", world.shore_local)
     c2.session.declare_subscriber("sonarpost/v1/**", lambda sample: got.append(str(sample.key_expr)))
 
-    operator.send(keys.contact_decision("vessel-1"), "relay", decision(1))
+    operator.send(keys.contact_decision("vessel-1"), "relay", decision_record("d-1"))
     eventually(lambda: c2.health().counters.get("decisions_stored") == 1, what="the decision at the shore")
 
     advice = Advice(
@@ -137,7 +125,7 @@ def test_relay_with_its_own_session_reaches_the_shore(world, start_service, tmp_
         tls=world.tls("vessel-1"),
     )
     operator = start_service(Producer, "vessel-1", world.vessel_local)
-    operator.send(keys.contact_decision("vessel-1"), "relay", decision(2))
+    operator.send(keys.contact_decision("vessel-1"), "relay", decision_record("d-2"))
     eventually(lambda: c2.health().counters.get("decisions_stored") == 1, what="the decision at the shore")
     eventually(lambda: relay.health().gauges.get("reached_shore") == 1.0, what="the connectivity check")
 

@@ -10,7 +10,7 @@ import sqlite3
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -219,7 +219,7 @@ class ShoreIndex:
         """
         where = "" if removed else "WHERE removed_utc_s IS NULL"
         rows = self._rows(ImageRow, f"{where} ORDER BY first_frame_utc_s, vessel_id, name")
-        return [_with_bool(row) for row in rows]
+        return [replace(row, complete=bool(row.complete)) for row in rows]  # SQLite has no booleans
 
     def decisions(self) -> list[DecisionRow]:
         """Return all decisions, oldest first."""
@@ -257,9 +257,3 @@ class ShoreIndex:
             return self._db.execute(sql, values)
         except sqlite3.Error as error:
             raise OSError(f"{self.path}: {error}") from error
-
-
-def _with_bool(row: ImageRow) -> ImageRow:
-    """Return the row with a boolean, which SQLite does not have."""
-    values = {f.name: getattr(row, f.name) for f in fields(row)}
-    return ImageRow(**{**values, "complete": bool(row.complete)})

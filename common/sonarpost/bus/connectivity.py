@@ -16,9 +16,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Annotated
 
 import msgpack
 import zenoh
+from pydantic import BaseModel, ConfigDict, Field
 
 from sonarpost import keys, wire
 from sonarpost.config import TlsConfig
@@ -33,7 +35,6 @@ TLS_REFUSAL_S = 0.7
 # A presence query costs some hundred bytes of the radio link.
 PROBE_INTERVAL_REACHED_S = 120.0
 PROBE_INTERVAL_NOT_REACHED_S = (2.0, 5.0, 15.0, 30.0)
-PRESENCE_VERSION = 1
 _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?P<host>\[[^]]+\]|[^:\[\]]+):(?P<port>[0-9]{1,5})(?P<options>[?#;].*)?")
 
 
@@ -68,35 +69,19 @@ class ConnectivityResult:
 # Presence
 
 
-@dataclass(frozen=True, slots=True)
-class PresenceReply:
+class PresenceReply(BaseModel):
     """Reply to a presence query: a running process of a platform."""
 
-    platform: str
-    service: str
+    model_config = ConfigDict(frozen=True, strict=True)
+
+    v: Annotated[int, Field(ge=1, le=1)]
+    platform: Annotated[str, Field(min_length=1, max_length=40)]
+    service: Annotated[str, Field(min_length=1, max_length=40)]
 
     def pack(self) -> bytes:
         """Return the reply as msgpack."""
-        packed: bytes = msgpack.packb({"v": PRESENCE_VERSION, "platform": self.platform, "service": self.service})
+        packed: bytes = msgpack.packb(self.model_dump())
         return packed
-
-    @classmethod
-    def unpack(cls, payload: bytes, where: str) -> PresenceReply:
-        """Parse a reply.
-
-        Raises:
-            PayloadError: It is not a presence reply; names the field.
-        """
-        fields = wire.unpack_map(payload, where)
-        if fields.get("v") != PRESENCE_VERSION:
-            raise PayloadError(where, "v", fields.get("v"), str(PRESENCE_VERSION))
-        names = []
-        for field in ("platform", "service"):
-            value = fields.get(field)
-            if not isinstance(value, str) or not 1 <= len(value) <= 40:
-                raise PayloadError(where, field, value, "1 to 40 characters")
-            names.append(value)
-        return cls(*names)
 
 
 def declare_presence(
@@ -107,7 +92,7 @@ def declare_presence(
     A vessel queries a key below its own prefix, which access control treats as it treats the vessel's records. A reply
     therefore shows that routers, certificates and access control let the records pass.
     """
-    payload = PresenceReply(platform, service).pack()
+    payload = PresenceReply(v=1, platform=platform, service=service).pack()
 
     def on_query(query: zenoh.Query) -> None:
         # The key is `.../inbox/{vessel}/hello/{service or *}`.
@@ -135,7 +120,8 @@ def query_presence(
         if reply.ok is None:
             continue
         try:
-            presence = PresenceReply.unpack(reply.ok.payload.to_bytes(), str(reply.ok.key_expr))
+            where = str(reply.ok.key_expr)
+            presence = wire.validated(PresenceReply, wire.unpack_map(reply.ok.payload.to_bytes(), where), where)
         except PayloadError as error:
             return ConnectivityResult(ConnectivityState.NO_REPLY, str(error))
         platforms[presence.service] = presence.platform

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Annotated, Literal
 
 import msgpack
+from pydantic import BaseModel, ConfigDict, Field
 
 from sonarpost import wire
 from sonarpost.delivery.records import OutboxItem, ReceivedChunk, consumer_of
@@ -27,11 +28,50 @@ MAX_BATCH_RECORDS = 128
 BATCH_RECORD_OVERHEAD_BYTES = 48
 """Size of the entries of one more record in attachment and reply."""
 
-DONE_UP_TO = "settled"
-"""Field of the attachment: the producer no longer holds this sequence number and all below it."""
-
 AckStatus = Literal["stored", "more", "refused", "later"]
-_STATUSES: Final[tuple[AckStatus, ...]] = ("stored", "more", "refused", "later")
+_Natural = Annotated[int, Field(ge=0, lt=1 << 63)]
+_Seq = Annotated[int, Field(ge=1, lt=1 << 63)]
+_Origin = Annotated[bytes, Field(min_length=16, max_length=16)]
+_Digest = Annotated[bytes, Field(min_length=32, max_length=32)]
+_BatchRecord = tuple[_Seq, Annotated[int, Field(ge=0, le=CHUNK_BYTES)], _Digest]
+
+
+class _Fields(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+
+class _Attachment(_Fields):
+    """Attachment of a query with one chunk."""
+
+    v: Annotated[int, Field(ge=1, le=1)]
+    origin: _Origin
+    seq: _Seq
+    size: Annotated[int, Field(ge=0, le=MAX_RECORD_BYTES)]
+    sha256: _Digest
+    offset: _Natural
+    settled: _Natural = 0
+
+
+class _BatchAttachment(_Fields):
+    """Attachment of a query with several records: (seq, size, sha256) of each."""
+
+    v: Annotated[int, Field(ge=2, le=2)]
+    origin: _Origin
+    records: Annotated[tuple[_BatchRecord, ...], Field(min_length=1, max_length=MAX_BATCH_RECORDS)]
+    settled: _Natural = 0
+
+
+class _Reply(_Fields):
+    v: Annotated[int, Field(ge=1, le=1)]
+    status: AckStatus
+    next: _Natural
+    reason: str = ""
+    takes: _Natural = 0
+
+
+class _BatchReply(_Fields):
+    v: Annotated[int, Field(ge=2, le=2)]
+    replies: tuple[tuple[Literal["stored", "refused", "later"], str], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,13 +103,8 @@ class AckReply:
         Raises:
             PayloadError: It is not a reply of this protocol.
         """
-        fields = wire.unpack_map(payload, where)
-        _require_version(fields, where)
-        status, reason = fields.get("status"), fields.get("reason", "")
-        if not isinstance(reason, str):
-            raise PayloadError(where, "reason", reason, "text")
-        max_batch = _integer(fields, "takes", where) if "takes" in fields else 0
-        return cls(_status(status, where), _integer(fields, "next", where), reason, max_batch)
+        reply = wire.validated(_Reply, wire.unpack_map(payload, where), where)
+        return cls(reply.status, reply.next, reply.reason, reply.takes)
 
 
 def attachment(origin: bytes, item: OutboxItem, offset: int = 0, done_up_to: int = 0) -> bytes:
@@ -92,7 +127,7 @@ def attachment(origin: bytes, item: OutboxItem, offset: int = 0, done_up_to: int
         "sha256": item.sha256,
         "offset": offset,
     }
-    return _pack(fields | ({DONE_UP_TO: done_up_to} if done_up_to else {}))
+    return _pack(fields | ({"settled": done_up_to} if done_up_to else {}))
 
 
 def batch_attachment(origin: bytes, items: Sequence[OutboxItem], done_up_to: int = 0) -> bytes:
@@ -109,7 +144,7 @@ def batch_attachment(origin: bytes, items: Sequence[OutboxItem], done_up_to: int
         "consumer": consumer_of(items[0].queue),
         "records": [(item.seq, len(item.payload), item.sha256) for item in items],
     }
-    return _pack(fields | ({DONE_UP_TO: done_up_to} if done_up_to else {}))
+    return _pack(fields | ({"settled": done_up_to} if done_up_to else {}))
 
 
 def parse_query(attached: bytes, data: bytes, where: str) -> tuple[ReceivedChunk, ...] | ReceivedChunk:
@@ -120,61 +155,32 @@ def parse_query(attached: bytes, data: bytes, where: str) -> tuple[ReceivedChunk
     """
     fields = wire.unpack_map(attached, where)
     if _is_batch(fields):
-        return _parse_batch(fields, data, where)
-    _require_version(fields, where)
-    chunk = ReceivedChunk(
-        origin=_binary(fields, "origin", 16, where),
-        seq=_integer(fields, "seq", where),
-        size=_integer(fields, "size", where),
-        sha256=_binary(fields, "sha256", 32, where),
-        offset=_integer(fields, "offset", where),
-        data=data,
-        done_up_to=_integer(fields, DONE_UP_TO, where) if DONE_UP_TO in fields else 0,
-    )
-    if chunk.size > MAX_RECORD_BYTES:
-        raise PayloadError(where, "size", chunk.size, f"at most {MAX_RECORD_BYTES} bytes")
-    if chunk.seq < 1:
-        raise PayloadError(where, "seq", chunk.seq, "at least 1")
-    if chunk.done_up_to >= chunk.seq:
-        raise PayloadError(where, DONE_UP_TO, chunk.done_up_to, "a number below seq")
+        return _parse_batch(wire.validated(_BatchAttachment, fields, where), data, where)
+    chunk = wire.validated(_Attachment, fields, where)
+    if chunk.settled >= chunk.seq:
+        raise PayloadError(where, "settled", chunk.settled, "a number below seq")
     if len(data) > CHUNK_BYTES or chunk.offset + len(data) > chunk.size:
         expected = f"a chunk of at most {CHUNK_BYTES} bytes inside size"
         raise PayloadError(where, "payload", f"{len(data)} bytes", expected)
-    return chunk
+    return ReceivedChunk(chunk.origin, chunk.seq, chunk.size, chunk.sha256, chunk.offset, data, chunk.settled)
 
 
-def _parse_batch(fields: Mapping[str, object], data: bytes, where: str) -> tuple[ReceivedChunk, ...]:
-    origin = _binary(fields, "origin", 16, where)
-    done_up_to = _integer(fields, DONE_UP_TO, where) if DONE_UP_TO in fields else 0
-    records = fields.get("records")
-    if not isinstance(records, tuple) or not 0 < len(records) <= MAX_BATCH_RECORDS:
-        raise PayloadError(where, "records", records, f"an array of 1 to {MAX_BATCH_RECORDS} records")
+def _parse_batch(batch: _BatchAttachment, data: bytes, where: str) -> tuple[ReceivedChunk, ...]:
     if len(data) > CHUNK_BYTES:
         raise PayloadError(where, "payload", f"{len(data)} bytes", f"at most {CHUNK_BYTES} bytes")
     chunks = []
     start = 0
-    for number, record in enumerate(records):
-        seq, size, sha256 = _batch_record(record, f"records.{number}", where)
-        chunks.append(ReceivedChunk(origin, seq, size, sha256, 0, data[start : start + size], done_up_to))
+    for seq, size, sha256 in batch.records:
+        chunks.append(ReceivedChunk(batch.origin, seq, size, sha256, 0, data[start : start + size], batch.settled))
         start += size
     if start != len(data):
         raise PayloadError(where, "payload", f"{len(data)} bytes", f"{start} bytes, the sum of the records' sizes")
     numbers = {chunk.seq for chunk in chunks}
     if len(numbers) < len(chunks):
         raise PayloadError(where, "records", sorted(chunk.seq for chunk in chunks), "each seq once")
-    if done_up_to >= min(numbers):
-        raise PayloadError(where, DONE_UP_TO, done_up_to, "a number below every seq")
+    if batch.settled >= min(numbers):
+        raise PayloadError(where, "settled", batch.settled, "a number below every seq")
     return tuple(chunks)
-
-
-def _batch_record(record: object, field: str, where: str) -> tuple[int, int, bytes]:
-    if isinstance(record, tuple) and len(record) == 3:
-        seq, size, sha256 = record
-        # `type(...) is int` excludes bool, which is a subclass of int.
-        valid = type(seq) is int and type(size) is int and 0 < seq < 1 << 63 and 0 <= size <= CHUNK_BYTES
-        if valid and isinstance(sha256, bytes) and len(sha256) == 32:
-            return seq, size, sha256
-    raise PayloadError(where, field, record, f"[seq from 1, size to {CHUNK_BYTES}, sha256 of 32 bytes]")
 
 
 def pack_replies(replies: Sequence[AckReply]) -> bytes:
@@ -194,23 +200,13 @@ def unpack_replies(payload: bytes, count: int, where: str) -> tuple[AckReply, ..
     fields = wire.unpack_map(payload, where)
     if not _is_batch(fields):
         return AckReply.unpack(payload, where)
-    replies = fields.get("replies")
-    if not isinstance(replies, tuple) or len(replies) != count:
+    replies = wire.validated(_BatchReply, fields, where).replies
+    if len(replies) != count:
         raise PayloadError(where, "replies", replies, f"an array of {count}")
-    return tuple(_batch_reply(reply, f"replies.{number}", where) for number, reply in enumerate(replies))
+    return tuple(_STORED if status == "stored" else AckReply(status, reason=reason) for status, reason in replies)
 
 
 _STORED = AckReply("stored")
-
-
-def _batch_reply(reply: object, field: str, where: str) -> AckReply:
-    if isinstance(reply, tuple) and len(reply) == 2:
-        status, reason = reply
-        if status == "stored" and reason == "":
-            return _STORED
-        if status in ("stored", "refused", "later") and isinstance(reason, str):
-            return AckReply(_status(status, where), reason=reason)
-    raise PayloadError(where, field, reply, "[stored, refused or later, reason]")
 
 
 def _pack(fields: Mapping[str, object]) -> bytes:
@@ -220,29 +216,3 @@ def _pack(fields: Mapping[str, object]) -> bytes:
 
 def _is_batch(fields: Mapping[str, object]) -> bool:
     return type(fields.get("v")) is int and fields["v"] == BATCH_VERSION
-
-
-def _require_version(fields: Mapping[str, object], where: str) -> None:
-    if _integer(fields, "v", where) != SINGLE_VERSION:
-        raise PayloadError(where, "v", fields["v"], str(SINGLE_VERSION))
-
-
-def _status(status: object, where: str) -> AckStatus:
-    for known in _STATUSES:
-        if status == known:
-            return known
-    raise PayloadError(where, "status", status, "stored, more, refused or later")
-
-
-def _integer(fields: Mapping[str, object], name: str, where: str) -> int:
-    value = fields.get(name)
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 63:
-        raise PayloadError(where, name, value, "a whole number from 0")
-    return value
-
-
-def _binary(fields: Mapping[str, object], name: str, length: int, where: str) -> bytes:
-    value = fields.get(name)
-    if not isinstance(value, bytes) or len(value) != length:
-        raise PayloadError(where, name, value, f"{length} bytes")
-    return value

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 from builders.common import eventually
-from builders.records import reconstructed_image
+from builders.records import decision_record, reconstructed_image
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.archive.shore_files import find_image, select_for_removal
 from sonarpost.archive.shore_index import FILE_NAME, ImageRow, ShoreIndex
 from sonarpost.errors import StoredFileError
-from sonarpost.messages import Decision, Pixels
+from sonarpost.messages import Pixels
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 
@@ -29,19 +29,6 @@ def image(image_id="AAAA", version=1, vessel="vessel-1", first_frame_utc_s=1_700
         version=version,
         first_frame_utc_s=first_frame_utc_s,
         last_frame_utc_s=first_frame_utc_s + 1,
-    )
-
-
-def decision(decision_id="d1"):
-    return Decision(
-        decision_id=decision_id,
-        vessel_id="vessel-1",
-        vehicle_id="uuv-1",
-        image_id="AAAA",
-        image_version=1,
-        verdict="mine_like",
-        operator="op",
-        decided_utc_s=1.0,
     )
 
 
@@ -127,7 +114,7 @@ def test_retention_deletes_files_and_keeps_decisions(archive, tmp_path):
     kept.flush()
     kept.store_image(image("BBBB"), 5.0)
     kept.flush()
-    kept.store_decision(decision())
+    kept.store_decision(decision_record())
     kept.flush()
     removed = kept.apply_retention(1e9)
     assert [r.image_id for r in removed] == ["AAAA", "BBBB"]
@@ -180,7 +167,7 @@ def test_index_is_completed_from_the_files(archive, tmp_path):
     first.flush()
     first.store_image(image("AAAA", 2), 5.0)
     first.flush()
-    first.store_decision(decision())
+    first.store_decision(decision_record())
     first.flush()
     before = [replace(r, relayed_utc_s=None, accepted_utc_s=0.0) for r in first.index().images()]
     first.close()

@@ -7,12 +7,13 @@ import pytest
 import zenoh
 from builders.common import eventually, free_port
 from builders.faulty_link import FaultyLink
+from builders.records import decision_record
 
 from sonarpost import keys
 from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.bus.session import router_config
 from sonarpost.errors import StoredFileError
-from sonarpost.messages import Advice, Command, Decision, TaskingState
+from sonarpost.messages import Advice, Command, TaskingState
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.services.relay.config import RelayConfig
@@ -229,16 +230,7 @@ def test_envelope_of_another_vessel_is_refused_to_its_sender(begin, runner, refu
     from sonarpost.messages import Relayed
 
     service, sender = begin(), runner.peer("vessel-1", "relay")
-    inner = Decision(
-        decision_id="d",
-        vessel_id="vessel-2",
-        vehicle_id="uuv-1",
-        image_id="AAAA",
-        image_version=1,
-        verdict="unsure",
-        operator="op",
-        decided_utc_s=1.0,
-    )
+    inner = decision_record("d", vessel_id="vessel-2")
     forged = Relayed(
         vessel_id="vessel-2", key=keys.contact_decision("vessel-2"), payload=wire.encode(inner), relayed_utc_s=1.0
     )

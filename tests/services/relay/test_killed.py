@@ -11,9 +11,10 @@ import time
 import msgpack
 import pytest
 from builders.common import REPOSITORY, eventually
+from builders.records import decision_record
 
 from sonarpost import keys
-from sonarpost.messages import Decision, Relayed
+from sonarpost.messages import Relayed
 
 RECORDS = 400
 KILLS = 3
@@ -57,19 +58,7 @@ def test_every_site_receives_every_record_once_if_the_relay_is_killed(runner, re
     console.send(
         keys.contact_decision("vessel-1"),
         "relay",
-        *(
-            Decision(
-                decision_id=name,
-                vessel_id="vessel-1",
-                vehicle_id="uuv-1",
-                image_id="AAAA",
-                image_version=1,
-                verdict="unsure",
-                operator="op",
-                decided_utc_s=1.0,
-            )
-            for name in wanted
-        ),
+        *(decision_record(name) for name in wanted),
     )
     rng = random.Random(7)
     for kill in range(1, KILLS + 1):
