@@ -21,7 +21,6 @@ def test_record_stays_in_the_inbox_until_handled(tmp_path: Path) -> None:
     store = Store(tmp_path / "s.db")
     first, second = store.inbox_items(9)
     assert (first.payload, second.payload) == (b"1", b"2")
-    assert store.inbox_items(9, after_id=first.id) == (second,)
     with store.transaction() as tx:
         tx.remove_handled(first)
     assert store.inbox_items(9) == (second,)

@@ -46,7 +46,6 @@ class OutboxItem:
         payload: The record's bytes.
         sha256: SHA-256 digest of the payload, 32 bytes.
         position: Order among records of equal priority; a newer edition inherits it from the one it replaces.
-        created_utc_s: When the record was queued.
     """
 
     queue: str
@@ -57,7 +56,6 @@ class OutboxItem:
     payload: bytes
     sha256: bytes
     position: int = field(default=0, compare=False)
-    created_utc_s: float = field(default=0.0, compare=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,7 +73,7 @@ _INDEXES = """
 CREATE INDEX IF NOT EXISTS outbox_place ON outbox (consumer, priority, place, seq);
 CREATE INDEX IF NOT EXISTS outbox_topic ON outbox (consumer, topic, edition) WHERE topic <> '';
 """
-_ITEM = "consumer, seq, key, encoding, priority, payload, sha256, place, created_utc_s"
+_ITEM = "consumer, seq, key, encoding, priority, payload, sha256, place"
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,11 +235,9 @@ class Store:
         sql = f"SELECT {_ITEM} FROM outbox WHERE consumer = ? AND seq BETWEEN ? AND ?"  # noqa: S608 constants
         found = {}
         for first, last in runs(numbers):
-            for c, s, k, e, p, d, h, at, t in self._read(sql, (queue, first, last)):
+            for q, s, k, e, p, d, h, position in self._read(sql, (queue, first, last)):
                 seq = _int(s)
-                found[seq] = OutboxItem(
-                    str(c), seq, str(k), str(e), _int(p), _bytes(d), _bytes(h), _int(at), float(str(t))
-                )
+                found[seq] = OutboxItem(str(q), seq, str(k), str(e), _int(p), _bytes(d), _bytes(h), _int(position))
         return tuple(found[number] for number in numbers if number in found)
 
     def mark_in_flight(self, queue: str, numbers: Sequence[int]) -> Set[int]:
@@ -302,21 +300,20 @@ class Store:
         """Return the free space inside the file in bytes; the file itself never shrinks."""
         return self._read_int("PRAGMA freelist_count") * self._read_int("PRAGMA page_size")
 
-    def inbox_items(self, limit: int = 1, after_id: int = 0, max_bytes: int | None = None) -> tuple[InboxItem, ...]:
+    def inbox_items(self, limit: int = 1, max_bytes: int | None = None) -> tuple[InboxItem, ...]:
         """Return accepted records that are not handled yet, oldest first.
 
         Args:
             limit: Maximum number of records.
-            after_id: Only records with a higher identifier.
             max_bytes: Maximum sum of the payload sizes, at least one record; None for no limit.
         """
         if max_bytes is not None:
-            limit = self._count_within(limit, after_id, max_bytes)
-        found = self._read("SELECT id, key, payload FROM inbox WHERE id > ? ORDER BY id LIMIT ?", (after_id, limit))
+            limit = self._count_within(limit, max_bytes)
+        found = self._read("SELECT id, key, payload FROM inbox ORDER BY id LIMIT ?", (limit,))
         return tuple(InboxItem(_int(i), str(k), _bytes(p)) for i, k, p in found)
 
-    def _count_within(self, limit: int, after_id: int, max_bytes: int) -> int:
-        sizes = self._read("SELECT LENGTH(payload) FROM inbox WHERE id > ? ORDER BY id LIMIT ?", (after_id, limit))
+    def _count_within(self, limit: int, max_bytes: int) -> int:
+        sizes = self._read("SELECT LENGTH(payload) FROM inbox ORDER BY id LIMIT ?", (limit,))
         total = 0
         for count, (size,) in enumerate(sizes):
             total += _int(size)

@@ -16,6 +16,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar, Generic, TypeVar
 
@@ -88,7 +89,7 @@ class Service(ABC, Generic[C]):
         self._disk_reserve = DiskReserve(self.store, HANDLING_RESERVE_BYTES, "senders keep their records")
         self._counters: Counter[str] = Counter()
         self._counter_lock = threading.Lock()
-        self._types: dict[str, type[Record]] = {}
+        self._record_type = lru_cache(TYPES_KEPT)(self._find_record_type)
         self._degraded = ""
         self._session: zenoh.Session | None = None
         self._inbox: Inbox | None = None
@@ -248,15 +249,7 @@ class Service(ABC, Generic[C]):
 
     # Records
 
-    def _record_type(self, key: str) -> type[Record]:
-        known = self._types.get(key)
-        if known is None:
-            known = self._types[key] = self._find_type(key)
-            if len(self._types) > TYPES_KEPT:
-                self._types.pop(next(iter(self._types)))
-        return known
-
-    def _find_type(self, key: str) -> type[Record]:
+    def _find_record_type(self, key: str) -> type[Record]:
         for expression, record_type in self.consumed_keys().items():
             if zenoh.KeyExpr(expression).intersects(key):
                 return record_type
