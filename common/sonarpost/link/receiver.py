@@ -24,7 +24,7 @@ WireFormat = Literal["v1", "paper"]
 
 @dataclass(frozen=True, slots=True)
 class ImageUpdate:
-    """All that is known of an image, after more of it arrived or the wait for more ended.
+    """The received content of an image, after more of it arrived or the wait for more ended.
 
     Attributes:
         source: Modem address of the vehicle.

@@ -291,12 +291,12 @@ def _layered(
     first, later = guess.overhead_bytes(), 1 + len(images) + CHECK_BYTES
     arrive = arrivals(frames, config.planned_channels, config.depth)
     plan = plan_layers(distortion, symbol_bytes, arrive, first, later)
-    whole = plan_unlayered(distortion, symbol_bytes, arrive, first)
-    if plan is None or (whole is not None and whole[1] >= plan.expected_db):
-        if whole is not None:
-            room = whole[0] * symbol_bytes
+    unlayered = plan_unlayered(distortion, symbol_bytes, arrive, first)
+    if plan is None or (unlayered is not None and unlayered[1] >= plan.expected_db):
+        if unlayered is not None:
+            room = unlayered[0] * symbol_bytes
             stops = _fitted_stops(images, starts, distortion.stops(room - first), room, None)
-            yield _unlayered_block(images, stops, whole[0], symbol_bytes, take_number(), frames, now, final=True)
+            yield _unlayered_block(images, stops, unlayered[0], symbol_bytes, take_number(), frames, now, final=True)
         return
     if plan.expected_db <= 0:
         return

@@ -267,7 +267,7 @@ def symbols_to_send(missing_symbols: int, channel: LossChannel, caution: float) 
     Fewer than the average need: feedback requests the rest, while symbols beyond the need are useless.
 
     Args:
-        missing_symbols: Symbols that the receiver lacks.
+        missing_symbols: Symbols that are missing at the receiver.
         channel: The channel.
         caution: Standard deviations below the average.
     """

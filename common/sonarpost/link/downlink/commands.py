@@ -16,7 +16,7 @@ from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_
 
 MAX_PENDING: Final = 500
 """Maximum number of open commands."""
-_REMEMBERED: Final = 1000
+_MAX_CLOSED: Final = 1000
 _MAX_RETRY_FACTOR: Final = 8
 _WHERE: Final = "commands"
 
@@ -117,7 +117,7 @@ class CommandTracker:
         added = replace(command, state=state, due_s=float(now), order=order)
         self._commands[command.token] = added
         closed = [token for token, each in self._commands.items() if not each.state.is_open]
-        for token in closed[: max(0, len(closed) - _REMEMBERED)]:
+        for token in closed[: max(0, len(closed) - _MAX_CLOSED)]:
             del self._commands[token]
         return added
 

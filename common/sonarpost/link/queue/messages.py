@@ -13,7 +13,7 @@ LOWEST_PRIORITY: Final = 7
 FILLER_PRIORITY: Final = 6
 """From this priority on a message only fills the rest of frames, until it has aged."""
 MAX_MESSAGE_BYTES: Final = 4096
-_IDS_REMEMBERED: Final = 1024
+_MAX_KNOWN_IDS: Final = 1024
 _MAX_SEGMENT_DATA_BYTES: Final = 254
 
 
@@ -89,7 +89,7 @@ class MessageQueue:
         if name in self.known:
             return False
         self.known[name] = self.next_key
-        while len(self.known) > _IDS_REMEMBERED:
+        while len(self.known) > _MAX_KNOWN_IDS:
             del self.known[next(iter(self.known))]
         active = {m.source for m in self.waiting.values()}
         if source not in active:

@@ -5,7 +5,7 @@ Rules for the packets of an image, earlier ones first:
 1. One half per packet, as in the paper: if each half fits one packet, the first packet carries the top half and the
    second the bottom half.
 2. A half that does not fit is divided over several packets. The halves then share a packet if, and only if, that saves
-   one: a packet costs its whole airtime, however little it carries.
+   one: a packet costs the same airtime however few bytes it carries.
 3. The contact record fills every free frame, which costs no airtime. It goes first in each group of packets that has a
    free frame, because position and confidence matter before the image; further copies go last.
 4. If no packet of the image has a free frame (always so at one frame per packet), the contact record goes first, in a

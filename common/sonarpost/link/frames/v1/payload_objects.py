@@ -359,7 +359,7 @@ def _with_check(body: bytes, length: int) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """Feedback of a receiver: the symbols that it lacks.
+    """Feedback of a receiver: the symbols that are missing.
 
     Attributes:
         newest: Number of the newest block received, 0..31.

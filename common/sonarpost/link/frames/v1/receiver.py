@@ -37,7 +37,7 @@ from sonarpost.link.frames.v1.payload_objects import (
 from sonarpost.link.receiver import Event, FeedbackReceived, FrameRejected, ImageUpdate, MessageReceived
 from sonarpost.link.state import SEPARATE, Bounds, Byte, Count, Errors, PartReader, Parts, pack_part
 
-_MESSAGES_REMEMBERED: Final = 64
+_MAX_RECENT_MESSAGES: Final = 64
 _MAX_WITHOUT_RECORD: Final = 128
 """Images without a contact record that a receiver keeps of each sender."""
 
@@ -262,7 +262,7 @@ class PeerState:
         digest = zlib.crc32(message.data)
         repeated = any((number, check) == (message.number, digest) for number, check, _ in self.recent_messages)
         others = [m for m in self.recent_messages if m[:2] != (message.number, digest)]
-        self.recent_messages = [*others, (message.number, digest, now)][-_MESSAGES_REMEMBERED:]
+        self.recent_messages = [*others, (message.number, digest, now)][-_MAX_RECENT_MESSAGES:]
         return [] if repeated else [MessageReceived(self.address, message.number, message.data, now)]
 
     @property

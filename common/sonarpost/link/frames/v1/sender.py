@@ -98,7 +98,7 @@ class V1Sender:
         blocks: Blocks that are being sent, the oldest first.
         retired: Blocks that were sent without feedback, and that feedback can still mention.
         kept: Images by number, the oldest first, including those that wait.
-        may_repair: Whether some images may lack a part that no block holds.
+        may_repair: Whether a part of an image may be missing at receivers, and in no block.
         state: The rest of the state.
 
     Args:
