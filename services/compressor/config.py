@@ -24,7 +24,7 @@ class CompressorConfig(ServiceConfig):
         cache_s: Maximum age of an image in the cache.
     """
 
-    codec: str = "vq"
+    codec: str = "emb"
     model: str = "standard"
     codebook: str = "nominal-10"
     packing: IndexPacking = IndexPacking.BITS14

@@ -1,4 +1,4 @@
-"""A chain of real processes, small enough for tests: pictures instead of surveys, a fast clock in the water."""
+"""A chain of real processes for tests: snippets instead of surveys, a fast channel."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ import numpy.typing as npt
 import pytest
 
 from sonarpost.cli.demo.chain import Chain
+from sonarpost.cli.demo.outcome import Outcome, evaluate
 from sonarpost.cli.demo.settings import ChainSettings, free_ports
 from sonarpost.cli.demo.watch import Watcher
 from sonarpost.sonar.image_files import write_png
 
-PICTURES = 6
+IMAGES = 6
 TIME_SCALE = 40.0
 
 
-def picture(number: int) -> npt.NDArray[np.uint8]:
-    """A seabed of its own with a highlight and a shadow, 80 x 140 px."""
+def snippet(number: int) -> npt.NDArray[np.uint8]:
+    """Return a snippet of seabed with a highlight and a shadow, shape (80, 140)."""
     rng = np.random.default_rng(number)
     image = rng.gamma(4.0, 25.0, (80, 140))
     image[30:44, 50:60] += 120
@@ -31,7 +32,7 @@ def picture(number: int) -> npt.NDArray[np.uint8]:
 
 
 class RunningChain:
-    """A started chain and what is seen of it."""
+    """A started chain and its observer."""
 
     def __init__(self, chain: Chain, watcher: Watcher) -> None:
         self.chain = chain
@@ -39,16 +40,20 @@ class RunningChain:
         self.settings = chain.settings
         self.deposited = 0
 
-    def deposit(self, count: int = PICTURES) -> None:
-        """Put pictures where the vehicle polls."""
+    def deposit(self, count: int = IMAGES) -> None:
+        """Put snippets into the folder that the vehicle polls."""
         for _ in range(count):
-            hidden = self.settings.incoming / f".picture-{self.deposited:03}.png"
-            write_png(hidden, picture(self.deposited))
+            hidden = self.settings.incoming / f".snippet-{self.deposited:03}.png"
+            write_png(hidden, snippet(self.deposited))
             hidden.rename(hidden.with_name(hidden.name[1:]))
             self.deposited += 1
 
+    def outcome(self) -> Outcome:
+        """Return the outcome so far."""
+        return evaluate(self.settings, self.watcher.snippets, self.watcher.contact_of_image, 0.0)
+
     def until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-        """Wait for `condition()`; fail with what the chain is busy with when it does not come true."""
+        """Wait for `condition()`; after `timeout_s` fail with what keeps the chain busy."""
         deadline = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > deadline:
@@ -56,11 +61,11 @@ class RunningChain:
             time.sleep(0.05)
 
     def busy(self) -> str:
-        """Return what the chain has left to do."""
+        """Return what keeps the chain busy, an empty text if nothing does."""
         return self.watcher.busy(0, time.time() - 3.0)
 
     def until_idle(self, timeout_s: float = 60.0) -> None:
-        """Wait until nothing is left to do, for longer than a packet needs."""
+        """Wait until the chain has been idle for longer than a packet."""
         quiet_since: list[float] = []
 
         def quiet() -> bool:
@@ -78,7 +83,7 @@ ChainMaker = Callable[..., "contextmanager[RunningChain]"]
 
 @pytest.fixture
 def start_chain(tmp_path: Path) -> Iterator[Callable[..., RunningChain]]:
-    """Starts a chain; it is stopped when the test ends."""
+    """Starts a chain of the paper's format; it is stopped at the end of the test."""
     with ExitStack() as stack:
 
         def start(**changes: object) -> RunningChain:
@@ -86,6 +91,7 @@ def start_chain(tmp_path: Path) -> Iterator[Callable[..., RunningChain]]:
             settings = ChainSettings(
                 folder=tmp_path / "run",
                 mode="snippets",
+                link="paper",
                 time_scale=TIME_SCALE,
                 router_ports=(ports[0], ports[1], ports[2]),
             )

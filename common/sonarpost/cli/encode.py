@@ -30,7 +30,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add both commands."""
     encode = subparsers.add_parser("encode", help="encode an image or a folder of images")
     encode.add_argument("input", type=Path, metavar="IMAGE_OR_DIR", help="TIFF or PNG, grey, 8 or 16 bits")
-    encode.add_argument("--codec", default="vq", help="name of a codec; `--codec help` lists them (default: vq)")
+    encode.add_argument(
+        "--codec", default="emb", help="name of a codec; `--codec help` lists them (default: %(default)s)"
+    )
     encode.add_argument("--model", help="model of emb: standard (default) or structure")
     encode.add_argument(
         "--codebook",

@@ -1,4 +1,4 @@
-"""The demo as a user runs it: its last line, its files, its exit status, and that nothing of it is left running."""
+"""The demo as a user runs it: its last line, its files, its exit status, and the end of all its processes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def run_demo(out: Path, *options: str, status: int = 0) -> dict[str, object]:
 
 
 def processes_of(folder: Path) -> list[int]:
-    """Return processes whose command line names a file of this run."""
+    """Return the processes whose command line contains `folder`."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():
@@ -56,57 +56,57 @@ def processes_of(folder: Path) -> list[int]:
     return found
 
 
-def test_the_demo_carries_a_simulated_survey_ashore(tmp_path: Path) -> None:
+def test_demo_delivers_a_simulated_survey(tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = run_demo(out, "--time-scale", "60")
     assert result["contacts"] == result["images_vessel"] == result["images_shore"] == result["images_complete"]
     assert isinstance(result["contacts"], int)
-    assert result["contacts"] >= 6  # as many mine-like objects as the simulator has put there
+    assert result["contacts"] >= 6  # the simulated survey has six mine-like objects
     assert result["frames_lost"] == 0
     assert result["sha256_match"] is True
     with Image.open(out / "demo.png") as sheet:
         assert sheet.width > 500
         assert sheet.height > 500
-    sidecars = [json.loads(p.read_text()) for p in (out / "shore" / "pictures" / "vessel-1").glob("*.json")]
+    sidecars = [json.loads(p.read_text()) for p in (out / "shore" / "images" / "vessel-1").glob("*.json")]
     assert all(s["contact"]["lat_deg"] and s["contact"]["lon_deg"] for s in sidecars)
     assert processes_of(out) == []
-    again = run_demo(out, "--time-scale", "60", "--rate", "4", "--loss", "0.3", "--seed", "5")
+    again = run_demo(out, "--paper", "--time-scale", "60", "--rate", "4", "--loss", "0.3", "--seed", "5")
     assert isinstance(again["frames_lost"], int)
     assert again["frames_lost"] > 0
     assert again["images_shore"] == again["images_vessel"]
 
 
 @pytest.mark.realdata
-def test_a_real_survey_arrives_with_its_contacts_and_positions(tmp_path: Path, data_dir: Path) -> None:
+def test_real_survey_arrives_with_its_contacts_and_positions(tmp_path: Path, data_dir: Path) -> None:
     out = tmp_path / "out"
     result = run_demo(out, "--survey", str(data_dir / "surveys" / "scotsman-iver2.xtf"), "--time-scale", "60")
     assert isinstance(result["contacts"], int)
     assert result["contacts"] >= 4
     assert result["images_complete"] == result["contacts"]
     assert result["sha256_match"] is True
-    for path in (out / "shore" / "pictures" / "vessel-1").glob("*.json"):
+    for path in (out / "shore" / "images" / "vessel-1").glob("*.json"):
         contact = json.loads(path.read_text())["contact"]
-        # The recording's own track lies within these bounds.
+        # The bounds of the recorded track.
         assert contact["lat_deg"] == pytest.approx(48.4457, abs=0.001)
         assert contact["lon_deg"] == pytest.approx(-68.8283, abs=0.002)
 
 
-def test_a_folder_of_pictures_is_sent_as_the_papers_talker_did(tmp_path: Path) -> None:
-    from builders.chain import picture
+def test_folder_of_snippets_is_sent(tmp_path: Path) -> None:
+    from builders.chain import snippet
 
     from sonarpost.sonar.image_files import write_png, write_tiff
 
-    folder = tmp_path / "pictures"
+    folder = tmp_path / "snippets"
     folder.mkdir()
-    write_png(folder / "a.png", picture(1))
-    write_tiff(folder / "b.tiff", picture(2).astype("uint16") * 200)
-    (folder / "notes.txt").write_text("not a picture")
+    write_png(folder / "a.png", snippet(1))
+    write_tiff(folder / "b.tiff", snippet(2).astype("uint16") * 200)
+    (folder / "notes.txt").write_text("not an image")
     result = run_demo(tmp_path / "out", "--images", str(folder), "--time-scale", "60")
     assert result["contacts"] == result["images_complete"] == 2
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_nothing_is_left_running_when_the_demo_is_ended(tmp_path: Path, number: signal.Signals) -> None:
+def test_no_process_is_left_when_the_demo_is_ended(tmp_path: Path, number: signal.Signals) -> None:
     out = tmp_path / "out"
     process = subprocess.Popen(demo(out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     eventually(lambda: len(processes_of(out / "config")) == 8, 30, "all services started")
@@ -126,14 +126,14 @@ def test_nothing_is_left_running_when_the_demo_is_ended(tmp_path: Path, number: 
         (("--loss", "1.5"), "expected 0 to 1"),
     ],
 )
-def test_wrong_options_are_refused_in_one_line(tmp_path: Path, options: tuple[str, ...], message: str) -> None:
+def test_invalid_options_are_refused_in_one_line(tmp_path: Path, options: tuple[str, ...], message: str) -> None:
     done = subprocess.run(demo(tmp_path / "out", *options), capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == 2
     assert message in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_a_folder_that_is_not_the_demos_is_left_alone(tmp_path: Path) -> None:
+def test_folder_with_other_files_is_not_touched(tmp_path: Path) -> None:
     (tmp_path / "precious.txt").write_text("mine")
     done = subprocess.run(demo(tmp_path), capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == 2
@@ -141,7 +141,7 @@ def test_a_folder_that_is_not_the_demos_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "precious.txt").read_text() == "mine"
 
 
-def test_a_survey_that_cannot_be_read_is_named_with_its_reason(tmp_path: Path) -> None:
+def test_unreadable_survey_is_named_with_the_reason(tmp_path: Path) -> None:
     survey = tmp_path / "empty.xtf"
     survey.touch()
     options = ("--survey", str(survey), "--json")

@@ -12,7 +12,7 @@ from builders.chain import RunningChain
 
 pytestmark = pytest.mark.chain
 
-# What the log of each service says of one contact; the first two know it by `contact_id`, the others by `image_id`.
+# Log line of each service for one contact; the first two have `contact_id`, the others `image_id`.
 STEPS = {
     "atd_stub": "Contact detected",
     "compressor": "Image encoded",
@@ -40,7 +40,7 @@ def read_text(text: str) -> list[Line]:
 
 
 def steps_with(lines: list[Line], **wanted: str) -> set[str]:
-    """Services whose line of the table above has these fields."""
+    """Return the services that logged their line of `STEPS` with these fields."""
     return {
         line["service"]
         for line in lines
@@ -58,7 +58,7 @@ def test_one_contact_is_followed_from_detection_to_the_shore(
     monkeypatch.setenv("SONARPOST_PLATFORM__LOG_FORMAT", log_format)
     run = start_chain()
     run.deposit(2)
-    run.until(lambda: len(run.watcher.shore) == 2, 60, "both pictures ashore")
+    run.until(lambda: len(run.watcher.shore) == 2, 60, "both images at the shore site")
     folder: Path = run.settings.folder / "logs"
     lines = [line for service in STEPS for line in read((folder / f"{service}.log").read_text())]
     identifiers: set[str] = set()
@@ -67,7 +67,7 @@ def test_one_contact_is_followed_from_detection_to_the_shore(
         (join,) = (n for n in lines if n["message"] == STEPS["compressor"] and n["contact_id"] == contact_id)
         vehicle, image_id = join["vehicle"], join["image_id"]
         assert steps_with(lines, image_id=image_id) == set(STEPS) - {"atd_stub"}
-        # The modem knows addresses, not names.
+        # op_modem logs addresses, not names.
         assert steps_with(lines, vehicle=vehicle, image_id=image_id) == set(STEPS) - {"atd_stub", "op_modem"}
         identifiers.add(image_id)
     assert len(identifiers) == 2

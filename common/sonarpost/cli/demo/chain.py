@@ -18,11 +18,11 @@ ROUTERS = ("router-uuv", "router-vessel", "router-shore")
 
 
 class ChainError(SonarpostError):
-    """A process of the chain has ended that should not."""
+    """A process of the chain has ended unexpectedly."""
 
 
 class Chain:
-    """The three routers and all services, each a process; use as a context manager, nothing is left behind."""
+    """The three routers and all services, each a process; a context manager that stops all of them at its end."""
 
     def __init__(self, settings: ChainSettings) -> None:
         self.settings = settings
@@ -58,7 +58,7 @@ class Chain:
         """Start a router or a service; its output goes to logs/NAME.log."""
         log = (self.settings.folder / "logs" / f"{name}.log").open("ab")
         self._logs.append(log)
-        # Should this process die without cleaning up, its children end by themselves.
+        # If this process is killed, the child processes end too.
         environment = {**os.environ, EXIT_WITH_PARENT: str(os.getpid())}
         self._processes[name] = subprocess.Popen(  # noqa: S603 our own interpreter and modules
             [sys.executable, "-m", *self._module(name)],
@@ -66,17 +66,17 @@ class Chain:
             stdout=log,
             stderr=log,
             env=environment,
-            # Ctrl-C is ours to handle: the services are stopped in order.
+            # Ctrl-C reaches this process only, which stops the services in order.
             process_group=0,
         )
 
     def kill(self, name: str) -> None:
-        """End a process at once, as a power cut would (SIGKILL)."""
+        """End a process at once (SIGKILL), as a power cut would."""
         self._processes[name].kill()
         self._processes[name].wait()
 
     def terminate(self, name: str) -> float:
-        """Ask a process to stop (SIGTERM); return how many seconds it took."""
+        """Stop a process (SIGTERM); return the seconds it took."""
         started = time.monotonic()
         self._processes[name].send_signal(signal.SIGTERM)
         self._processes[name].wait(timeout=STOP_S)
@@ -87,19 +87,23 @@ class Chain:
         return self._processes[name].poll()
 
     def check(self) -> None:
-        """Raise ChainError when a process has ended by itself."""
+        """Check that all processes run.
+
+        Raises:
+            ChainError: One has ended.
+        """
         for name, process in self._processes.items():
             if process.poll() is not None:
                 raise ChainError(f"{name} ended with status {process.returncode}; its log: {self.log_tail(name)}")
 
     def log_tail(self, name: str, lines: int = 5) -> str:
-        """Return the last lines a process has written."""
+        """Return the last lines of the log of a process."""
         path = self.settings.folder / "logs" / f"{name}.log"
         text = path.read_text(encoding="utf-8", errors="replace")
         return "\n".join(text.splitlines()[-lines:])
 
     def stop(self) -> None:
-        """Stop everything: services first, then routers; whoever does not obey is killed."""
+        """Stop all processes: services first, then routers; one that does not stop within 5 s is killed."""
         for group in (tuple(n for n in self._processes if n not in ROUTERS), ROUTERS):
             running = [self._processes[n] for n in group if n in self._processes and self._processes[n].poll() is None]
             for process in running:

@@ -11,9 +11,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from sonarpost.cli.demo.account import settle
 from sonarpost.cli.demo.chain import Chain
-from sonarpost.cli.demo.page import Page
+from sonarpost.cli.demo.operator_page import OperatorPage
+from sonarpost.cli.demo.outcome import evaluate
 from sonarpost.cli.demo.report import show
 from sonarpost.cli.demo.settings import ChainSettings, free_ports
 from sonarpost.cli.demo.watch import Watcher
@@ -26,8 +26,12 @@ from sonarpost.sonar.xtf_writer import write_xtf
 
 MARKER = ".sonarpost-demo"
 QUIET_S = 1.5
+"""Real time without a change after which an idle chain has finished."""
 STALLED_S = 60.0
-PICTURE_SUFFIXES = (".tif", ".tiff", ".png")
+"""Real time without a change after which the demo ends although the chain is busy."""
+MAX_FEEDBACK_INTERVALS = 12
+"""Feedback intervals without a change, on top of `STALLED_S`, while the vessel still repeats feedback."""
+IMAGE_SUFFIXES = (".tif", ".tiff", ".png")
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -36,28 +40,31 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "demo",
         help="run the whole chain on this host, from a survey file to the shore",
         description="Run every service as a process, with emulated acoustic modems on pseudo-terminals, three Zenoh "
-        "routers, and a survey (simulated unless one is given). Ends with a table and a contact sheet.",
+        "routers, and a simulated or given survey. Ends with a table and a contact sheet. The exit status is 1 if an "
+        "image that the channel can deliver is missing or incomplete at the shore site.",
     )
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--survey", type=Path, metavar="FILE_OR_DIR", help="survey file, or a folder of them")
-    source.add_argument("--images", type=Path, metavar="DIR", help="send the TIFF and PNG pictures of a folder instead")
+    source.add_argument("--images", type=Path, metavar="DIR", help="send the TIFF and PNG snippets of a folder instead")
     parser.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="(default %(default)s)")
-    parser.add_argument(
+    link = parser.add_mutually_exclusive_group()
+    link.add_argument(
         "--link",
         choices=("v1", "paper"),
-        default="paper",
+        default="v1",
         help="wire format: v1 with the codec emb, or the paper's with its tile codec (default %(default)s)",
     )
+    link.add_argument("--paper", action="store_const", const="paper", dest="link", help="short for --link paper")
     parser.add_argument("--rate", type=int, default=1, choices=sorted(RATES), help="Micro-Modem rate (default 1)")
     parser.add_argument("--loss", type=_probability, default=0.0, metavar="P", help="probability of losing a frame")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulated survey and the water")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the survey and channel simulators")
     parser.add_argument(
         "--time-scale", type=_positive, default=20.0, metavar="X", help="simulated seconds a second (default 20)"
     )
     parser.add_argument(
-        "--console", action="store_true", help="serve the operator's page, and leave it open afterwards until Ctrl-C"
+        "--console", action="store_true", help="serve the operator's page and keep it open at the end until Ctrl-C"
     )
-    parser.add_argument("--json", action="store_true", help="end with one JSON object on the last line")
+    parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     parser.set_defaults(run=run)
 
 
@@ -76,9 +83,9 @@ def _positive(text: str) -> float:
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Run the demo; return 0 when everything the water let through is ashore, unchanged."""
+    """Run the demo; return 0 if everything that the channel can deliver is at the shore site, unchanged."""
     console = Console(stderr=True)
-    # The routers start at the same time as those who look for them; that they are not there at once is no news.
+    # Routers and services start together: failed first attempts to connect are expected.
     logging.getLogger("sonarpost.bus.session").setLevel(logging.ERROR)
     started = time.monotonic()
     inputs = _inputs(parsed)
@@ -95,7 +102,7 @@ def run(parsed: argparse.Namespace) -> int:
         router_ports=(ports[0], ports[1], ports[2]),
         console_port=ports[3] if parsed.console else None,
     )
-    page = Page(settings) if parsed.console else None
+    page = OperatorPage(settings) if parsed.console else None
     with Chain(settings) as chain, Watcher(settings) as watcher:
         with console.status("starting three routers and eight services"):
             watcher.wait_until_started(chain.check)
@@ -104,25 +111,25 @@ def run(parsed: argparse.Namespace) -> int:
         files = _deposit(inputs, settings, parsed.seed, console)
         _follow(chain, watcher, files, console)
         if page is not None:
-            page.leave_open(chain, console)
-    result = settle(settings, len(watcher.snippets), time.monotonic() - started)
-    show(watcher, settings, result, console)
+            page.keep_open(chain, console)
+    outcome = evaluate(settings, watcher.snippets, watcher.contact_of_image, time.monotonic() - started)
+    show(watcher, settings, outcome, console)
     if parsed.json:
-        print(result.as_json(), flush=True)
-    refused = _refused(settings, console)
-    return 0 if not result.missing_ashore and result.sha256_match and refused < files else 1
+        print(outcome.as_json(), flush=True)
+    refused = _print_refused(settings, console)
+    return 0 if outcome.succeeded and refused < files else 1
 
 
 def _inputs(parsed: argparse.Namespace) -> tuple[Path, ...] | None:
     """Return the files to process, None for a simulated survey.
 
     Raises:
-        SurveyFileError: There are none.
+        SurveyFileError: There is no such file or folder, or no suitable file in it.
     """
     given: Path | None = parsed.survey or parsed.images
     if given is None:
         return None
-    suffixes = PICTURE_SUFFIXES if parsed.images else SUPPORTED_SUFFIXES
+    suffixes = IMAGE_SUFFIXES if parsed.images else SUPPORTED_SUFFIXES
     if given.is_file() and not parsed.images:
         return (given,)
     if not given.is_dir():
@@ -134,10 +141,10 @@ def _inputs(parsed: argparse.Namespace) -> tuple[Path, ...] | None:
 
 
 def _fresh_folder(folder: Path) -> Path:
-    """Empty a folder of an earlier demo; never one that holds anything else.
+    """Return the folder, new or emptied.
 
     Raises:
-        ConfigError: The folder holds something that no demo has made.
+        ConfigError: The folder is not empty and not of an earlier demo.
     """
     folder = folder.absolute()
     if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not (folder / MARKER).is_file())):
@@ -149,8 +156,8 @@ def _fresh_folder(folder: Path) -> Path:
     return folder
 
 
-def _refused(settings: ChainSettings, console: Console) -> int:
-    """Say which input files were put aside and why; return how many."""
+def _print_refused(settings: ChainSettings, console: Console) -> int:
+    """Print which input files were refused, with the reason; return their number."""
     reasons = sorted((settings.incoming / "quarantine").glob("*.reason.txt"))
     for path in reasons:
         console.print(f"[red]refused:[/red] {path.read_text(encoding='utf-8').strip()}", soft_wrap=True)
@@ -158,7 +165,7 @@ def _refused(settings: ChainSettings, console: Console) -> int:
 
 
 def _deposit(inputs: tuple[Path, ...] | None, settings: ChainSettings, seed: int, console: Console) -> int:
-    """Put the input where the vehicle polls, as its own recorder would; return how many files."""
+    """Put the input files into the folder that the vehicle polls; return their number."""
     if inputs is None:
         with console.status("simulating a survey of 1000 pings"):
             simulated = simulate_survey(SurveySpec(seed=seed, seabed=SeabedKind.SAND, targets=6, clutter=6))
@@ -178,18 +185,20 @@ def _deposit(inputs: tuple[Path, ...] | None, settings: ChainSettings, seed: int
 
 
 def _follow(chain: Chain, watcher: Watcher, files: int, console: Console) -> None:
-    """Show progress until the chain has nothing left to do, or nothing has changed for a minute."""
-    airtime_s = RATES[chain.settings.rate].airtime_s
+    """Show progress until the chain has finished, or nothing has changed for too long."""
+    settings = chain.settings
+    airtime_s = RATES[settings.rate].airtime_s
+    stalled_s = STALLED_S + 10 * settings.packet_s + MAX_FEEDBACK_INTERVALS * settings.feedback_interval_s
     columns = (
-        TextColumn("{task.description:<22}"),
+        TextColumn("{task.description:<24}"),
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[unit]}"),
     )
     with Progress(*columns, TimeElapsedColumn(), console=console) as progress:
-        air = progress.add_task("acoustic air time", total=None, unit="s")
-        shore = progress.add_task("pictures ashore", total=None, unit="")
-        changes, changed_at, quiet_since = -1, time.monotonic(), None
+        air = progress.add_task("acoustic airtime", total=None, unit="s")
+        shore = progress.add_task("images at the shore site", total=None, unit="")
+        changes, changed_at, idle_since = -1, time.monotonic(), None
         while True:
             chain.check()
             now = time.monotonic()
@@ -198,14 +207,14 @@ def _follow(chain: Chain, watcher: Watcher, files: int, console: Console) -> Non
             progress.update(shore, total=len(watcher.encoded) or None, completed=len(watcher.shore))
             busy = watcher.busy(files, time.time() - 5.0)
             if watcher.changes != changes:
-                changes, changed_at, quiet_since = watcher.changes, now, None
+                changes, changed_at, idle_since = watcher.changes, now, None
             if busy:
-                quiet_since = None
-                if now - changed_at > STALLED_S + 10 * airtime_s / chain.settings.time_scale:
-                    console.print(f"[red]nothing has moved for a minute; still busy: {busy}")
+                idle_since = None
+                if now - changed_at > stalled_s:
+                    console.print(f"[red]no change for {stalled_s:.0f} s; still busy: {busy}")
                     return
-            elif quiet_since is None:
-                quiet_since = now
-            elif now - quiet_since > QUIET_S + watcher.settled_s:
+            elif idle_since is None:
+                idle_since = now
+            elif now - idle_since > QUIET_S + settings.packet_s:
                 return
             time.sleep(0.1)

@@ -9,67 +9,86 @@ from typing import Literal
 from rich.console import Console
 from rich.table import Table
 
-from sonarpost.cli.demo.account import Result
+from sonarpost.cli.demo.outcome import Outcome
 from sonarpost.cli.demo.settings import ChainSettings
-from sonarpost.cli.demo.sheet import SheetRow, write_sheet
+from sonarpost.cli.demo.sheet import SheetCell, SheetContact, write_sheet
 from sonarpost.cli.demo.watch import Watcher
-from sonarpost.codec.interface import DecodedImage
-from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq.codebook import open_codebook
+from sonarpost.codec import decode_image, get_codec
+from sonarpost.codec.interface import Image, to_uint8
+from sonarpost.codec.quality import psnr_db
 from sonarpost.messages import EncodedImage, ReconstructedImage
 
 _COLUMNS: tuple[tuple[str, Literal["left", "right"]], ...] = (
     ("image", "left"),
     ("ping", "right"),
     ("conf.", "right"),
-    ("position ashore", "left"),
+    ("position at the shore", "left"),
     ("bytes", "right"),
     ("vessel", "left"),
     ("shore", "left"),
 )
+_PAPER_CODEBOOKS = ("nominal-10", "nominal-20")
 
 
-def show(watcher: Watcher, settings: ChainSettings, result: Result, console: Console) -> None:
-    """Write the sheet into the demo's folder, print table and summary."""
+def show(watcher: Watcher, settings: ChainSettings, outcome: Outcome, console: Console) -> None:
+    """Write the sheet into the demo's folder; print the table and the summary."""
     sheet = settings.folder / "demo.png"
-    write_sheet(sheet, _title(settings, result), _rows(watcher, settings))
+    third = "as sent, before losses" if settings.link == "paper" else "the paper's codec, same number of bytes"
+    stages = ("original", "received at the shore site", third)
+    title = f"sonarpost: {outcome.images_complete} of {outcome.contacts} images complete at the shore site"
+    write_sheet(sheet, title, _subtitle(settings, outcome), stages, _sheet_contacts(watcher, settings))
     _print_table(watcher, settings, console)
-    _print_summary(result, sheet, console)
+    _print_summary(outcome, sheet, console)
 
 
-def _as_sent(image: EncodedImage, settings: ChainSettings) -> DecodedImage:
-    """Decode the stream as it left the vehicle, nothing lost."""
-    resources = CodecResources(open_codebook(settings.codebook).tiles)
-    return default_registry().create_for_stream(image.stream, resources).decode(image.stream)
-
-
-def _rows(watcher: Watcher, settings: ChainSettings) -> list[SheetRow]:
-    rows = []
-    for image_id, image in watcher.encoded.items():
-        size = f"{image.height_px} x {image.width_px} px in {len(image.stream)} B"
-        snippet = watcher.snippets.get(image.contact.contact_id)
-        vessel, shore = watcher.vessel.get(image_id), watcher.shore.get(image_id)
-        got = [
-            (None, None)
-            if received is None or not received.codec
-            else (received.picture.to_array(), received.missing())
-            for received in (vessel, shore)
-        ]
-        rows.append(
-            SheetRow(
-                title=f"{image_id}  {image.contact.contact_id}",
-                detail=f"{_position(watcher, image_id, image)}   confidence {_confidence(image)}   "
-                f"{size}   {_completeness(watcher.shore.get(image_id))}",
-                pictures=(
-                    snippet.picture.to_array() if snippet else None,
-                    _as_sent(image, settings).image,
-                    got[0][0],
-                    got[1][0],
+def _sheet_contacts(watcher: Watcher, settings: ChainSettings) -> list[SheetContact]:
+    """Return the images, the highest confidence first."""
+    by_confidence = sorted(watcher.encoded.items(), key=lambda one: -(one[1].contact.atd_confidence or 0.0))
+    contacts = []
+    for image_id, encoded in by_confidence:
+        snippet, received = watcher.snippets.get(encoded.contact.contact_id), watcher.shore.get(image_id)
+        original = None if snippet is None else to_uint8(snippet.picture.to_array())
+        size = f"{encoded.height_px} x {encoded.width_px} px"
+        raw = f"{size}, {encoded.height_px * encoded.width_px} B"
+        place = f"{_position(watcher, image_id, encoded)}   confidence {_confidence(encoded)}"
+        contacts.append(
+            SheetContact(
+                title=f"{image_id}  {encoded.contact.contact_id}",
+                detail=f"{place}   {_state(received)}",
+                cells=(
+                    SheetCell(raw, original),
+                    _received_cell(received, original),
+                    _as_sent_cell(encoded) if settings.link == "paper" else _paper_cell(original, len(encoded.stream)),
                 ),
-                missing=(None, None, got[0][1], got[1][1]),
             )
         )
-    return rows
+    return contacts
+
+
+def _received_cell(received: ReconstructedImage | None, original: Image | None) -> SheetCell:
+    if received is None or not received.codec:
+        return SheetCell()
+    image = received.picture.to_array()
+    label = f"{received.codec}, {received.bytes_received} B{_psnr(original, to_uint8(image))}"
+    return SheetCell(label, image, received.missing())
+
+
+def _as_sent_cell(encoded: EncodedImage) -> SheetCell:
+    return SheetCell(f"{len(encoded.stream)} B", decode_image(encoded.stream).image)
+
+
+def _paper_cell(original: Image | None, budget_bytes: int) -> SheetCell:
+    """Return what the paper's codec makes of at most as many bytes: 10-pixel tiles, else 20-pixel tiles."""
+    if original is None:
+        return SheetCell()
+    streams = [get_codec("vq", codebook=name).encode(original) for name in _PAPER_CODEBOOKS]
+    stream = next((one for one in streams if len(one) <= budget_bytes), streams[-1])
+    image = decode_image(stream).image
+    return SheetCell(f"vq, {len(stream)} B{_psnr(original, image)}", image)
+
+
+def _psnr(original: Image | None, image: Image) -> str:
+    return "" if original is None or original.shape != image.shape else f", PSNR {psnr_db(original, image):.1f} dB"
 
 
 def _confidence(image: EncodedImage) -> str:
@@ -77,7 +96,7 @@ def _confidence(image: EncodedImage) -> str:
 
 
 def _position(watcher: Watcher, image_id: str, image: EncodedImage) -> str:
-    """Return the position as the shore knows it."""
+    """Return the position that the shore site received."""
     if image.contact.lat_deg is None:
         return "no fix"
     received = watcher.shore.get(image_id)
@@ -87,60 +106,56 @@ def _position(watcher: Watcher, image_id: str, image: EncodedImage) -> str:
     return f"{contact.lat_deg:.6f} {contact.lon_deg:.6f}"
 
 
-def _completeness(received: ReconstructedImage | None) -> str:
+def _state(received: ReconstructedImage | None) -> str:
     if received is None:
         return "not received"
     if received.complete:
         return "complete"
     if received.codec and not received.missing_fraction:
-        return f"coarse: {received.bytes_received} B so far"
-    halves = f" ({' and '.join(received.missing_halves)} half)" if received.missing_halves else ""
-    return f"{100 * received.missing_fraction:.0f} % missing{halves}"
+        return f"{received.bytes_received} of {received.bytes_total} B"
+    return f"{100 * received.missing_fraction:.0f} % missing"
 
 
-def _title(settings: ChainSettings, result: Result) -> str:
-    return (
-        f"sonarpost: {result.images_shore} of {result.contacts} pictures ashore, rate {settings.rate}, "
-        f"frame loss {settings.loss:g}, {result.acoustic_s:.0f} s in the water"
-    )
+def _subtitle(settings: ChainSettings, outcome: Outcome) -> str:
+    method = "the paper's codec and link" if settings.link == "paper" else "codec emb, link v1"
+    losses = f"{outcome.frames_lost} of {outcome.frames_sent} frames lost"
+    return f"{method}, modem rate {settings.rate}, {losses}, {outcome.acoustic_s:.0f} s of acoustic airtime"
 
 
 def _print_table(watcher: Watcher, settings: ChainSettings, console: Console) -> None:
-    table = Table(title=f"pictures sent at rate {settings.rate}")
+    table = Table(title=f"images sent at rate {settings.rate}")
     for heading, justify in _COLUMNS:
         table.add_column(heading, justify=justify, no_wrap=True)
     for image_id, image in watcher.encoded.items():
         contact = image.contact
         vessel, shore = watcher.vessel.get(image_id), watcher.shore.get(image_id)
         same = vessel is not None and shore is not None and vessel.picture_sha256 == shore.picture_sha256
+        state = _state(vessel)
         table.add_row(
             image_id,
             "-" if contact.ping_number is None else f"{contact.ping_number} {(contact.channel or '-')[:4]}",
             _confidence(image),
             _position(watcher, image_id, image),
             str(len(image.stream)),
-            "-" if vessel is None else _on_the_vessel(vessel),
-            "same" if same else "-" if shore is None else "other",
+            state if state == "complete" else f"[red]{state}",
+            "same" if same else "[red]not received" if shore is None else "[red]older version",
         )
     console.print(table)
 
 
-def _on_the_vessel(received: ReconstructedImage) -> str:
-    if received.complete:
-        return "complete"
-    if received.codec and not received.missing_fraction:
-        return f"{received.bytes_received} B"
-    return f"{100 * received.missing_fraction:.0f} % lost"
-
-
-def _print_summary(result: Result, sheet: Path, console: Console) -> None:
+def _print_summary(outcome: Outcome, sheet: Path, console: Console) -> None:
     console.print(
-        f"{result.contacts} contacts, {result.frames_sent} frames sent, {result.frames_lost} lost, "
-        f"{result.images_vessel} pictures on the vessel, {result.images_shore} ashore "
-        f"({result.images_complete} complete), "
-        f"{'identical' if result.sha256_match else '[red]not identical[/red]'}; "
-        f"{result.acoustic_s:.0f} s in the water, {result.elapsed_s:.0f} s here"
+        f"{outcome.contacts} contacts; {outcome.frames_sent} frames sent, {outcome.frames_lost} lost; "
+        f"{outcome.images_vessel} images at the vessel, {outcome.images_shore} at the shore site "
+        f"({outcome.images_complete} complete), "
+        f"{'identical' if outcome.sha256_match else '[red]not identical[/red]'}; "
+        f"{outcome.acoustic_s:.0f} s of airtime, {outcome.elapsed_s:.0f} s real time"
     )
-    if result.missing_ashore:
-        console.print(f"[red]let through by the water but not ashore: {', '.join(result.missing_ashore)}")
+    for text, names in (
+        ("contacts without an encoded image", outcome.not_sent),
+        ("images missing at the shore site", outcome.missing),
+        ("images incomplete at the shore site", outcome.incomplete),
+    ):
+        if names:
+            console.print(f"[red]FAILED: {len(names)} {text}: {', '.join(names)}")
     print(f"contact sheet: {sheet}", file=sys.stderr)

@@ -1,14 +1,12 @@
-"""The configuration files of a chain on one host, written from a few choices."""
+"""Settings of a chain on one host, and the configuration files written from them."""
 
 from __future__ import annotations
 
-import math
 import socket
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sonarpost.link.frames.v1.frame import HEADER_BYTES
 from sonarpost.modem.micromodem import RATES
 
 UUV, VESSEL, SHORE, WATER = "uuv-1", "vessel-1", "shore-1", "water"
@@ -24,33 +22,34 @@ PLATFORM_OF = {
     "c2": SHORE,
 }
 HEALTH_INTERVAL_S = 0.25
-_PAPER_BYTES, _PAPER_HEADER_BYTES, _RECORD_BYTES, _MOST_STREAM_BYTES = 196, 13, 40, 2048
+STREAM_BYTES = 200
+"""Stream length with v1: what the paper's codec makes of 80 x 140 px, so that both can be compared."""
 
 
 @dataclass(frozen=True)
 class ChainSettings:
-    """What a chain on one host is to do.
+    """Settings of a chain of processes on one host.
 
     Attributes:
-        folder: Everything the chain writes lies here.
-        mode: As of atd_stub.
-        link: Wire format through the water: "v1" with the codec emb, or the paper's with its tile codec.
+        folder: Folder of everything that the chain writes.
+        mode: As in [atd_stub].
+        link: Wire format: "v1" with the codec emb, or the paper's with its tile codec.
         rate: Micro-Modem rate.
         loss: Probability that a frame is lost.
-        seed: Of the water.
-        time_scale: Simulated seconds in the water a real second.
-        codebook: Of the vehicle.
-        vessel_codebooks: Of the vessel; normally the same.
-        router_ports: TCP ports of the uuv, vessel and shore routers.
-        shore_port_for_vessel: Where the vessel's router looks for the shore's; another than the shore's own where a
-            test puts a link in between that can be cut.
-        console_port: Of the operator's page on the vessel; None without one.
-        extra: More lines for a service's table, by service.
+        seed: Seed of the channel simulator.
+        time_scale: Simulated seconds in the channel for each real second.
+        codebook: Codebook of the vehicle, for the paper's codec.
+        vessel_codebooks: Codebooks of the vessel.
+        router_ports: TCP ports of the routers of the vehicle, the vessel and the shore site.
+        shore_port_for_vessel: Port at which the vessel's router connects to the shore site, if not the shore router's
+            own: a test puts a connection there that it can cut.
+        console_port: Port of the operator's page on the vessel; None for no page.
+        extra: Additional lines for the table of a service, by service.
     """
 
     folder: Path
     mode: Literal["survey", "snippets"] = "survey"
-    link: Literal["v1", "paper"] = "paper"
+    link: Literal["v1", "paper"] = "v1"
     rate: int = 1
     loss: float = 0.0
     seed: int = 1
@@ -64,55 +63,43 @@ class ChainSettings:
 
     @property
     def incoming(self) -> Path:
-        """Folder that atd_stub polls."""
+        """Input folder of atd_stub."""
         return self.folder / "uuv" / "incoming"
 
     @property
-    def vessel_pictures(self) -> Path:
-        """Where the decompressor writes."""
-        return self.folder / "vessel" / "pictures"
+    def vessel_images(self) -> Path:
+        """Output folder of the decompressor."""
+        return self.folder / "vessel" / "images"
 
     @property
-    def shore_pictures(self) -> Path:
-        """Where c2 writes what this vessel relays."""
-        return self.folder / "shore" / "pictures" / VESSEL
+    def shore_images(self) -> Path:
+        """Folder in which c2 stores the images of this vessel."""
+        return self.folder / "shore" / "images" / VESSEL
 
     @property
     def channel_log(self) -> Path:
-        """What the water did with every packet."""
+        """Log of the simulated channel: the fate of every packet."""
         return self.folder / "water" / "channel.jsonl"
 
     @property
-    def pairing_timeout_s(self) -> float:
-        """Real seconds after which an image waits no longer: a few packets, and what a loaded host may add."""
-        return 4 * RATES[self.rate].airtime_s / self.time_scale + 3.0
+    def packet_s(self) -> float:
+        """Real duration of a packet."""
+        return RATES[self.rate].airtime_s / self.time_scale
 
     @property
-    def stream_bytes(self) -> int:
-        """Bytes of a picture's stream with v1: what fits the packets that the paper's codec and format take.
-
-        Those are the packets of a picture of 80 x 140 px in 196 bytes, half by half; 40 bytes are the record's.
-        """
-        rate = RATES[self.rate]
-        frames_a_half = math.ceil(_PAPER_BYTES / 2 / (rate.frame_bytes - _PAPER_HEADER_BYTES))
-        packets = 2 * math.ceil(frames_a_half / rate.frames)
-        return min(packets * rate.frames * (rate.frame_bytes - HEADER_BYTES) - _RECORD_BYTES, _MOST_STREAM_BYTES)
+    def pairing_timeout_s(self) -> float:
+        """Real time the paper's receiver waits for the rest of an image: four packets and 3 s for a loaded host."""
+        return 4 * self.packet_s + 3.0
 
     @property
     def feedback_interval_s(self) -> float:
-        """Real seconds from one report of the vessel to the next, with v1."""
+        """Real time between two feedback messages of the vessel, with v1."""
         return 30.0 / self.time_scale + 0.5
 
     @property
     def reply_timeout_s(self) -> float:
-        """Real seconds that drivers wait for their modem, with v1: one that is receiving answers when it is done."""
+        """Real time the drivers wait for a reply, with v1: a modem that receives replies at the end of the packet."""
         return 5.0 / self.time_scale + 1.0
-
-    @property
-    def settled_s(self) -> float:
-        """Real seconds without any change after which pictures that lack something will not get it any more."""
-        airtime_s = RATES[self.rate].airtime_s / self.time_scale
-        return 3 * self.feedback_interval_s + 4 * airtime_s if self.link == "v1" else airtime_s
 
     @property
     def ports_folder(self) -> Path:
@@ -120,17 +107,16 @@ class ChainSettings:
         return self.folder / "water" / "ports"
 
     def modem_port(self, address: int) -> Path:
-        """Path of the pseudo-terminal of an emulated modem: the emulator numbers them in the order of its table."""
+        """Path of the pseudo-terminal of an emulated modem; the emulator numbers them in the order of its table."""
         return self.ports_folder / f"modem-{(UUV_ADDRESS, VESSEL_ADDRESS).index(address) + 1}"
 
     def config_file(self, service: str) -> Path:
-        """Return the file a service reads."""
-        # Only the vessel's page is not always there.
+        """Return the configuration file of a service; the optional console belongs to the vessel."""
         return self.folder / "config" / f"{PLATFORM_OF.get(service, VESSEL)}.toml"
 
 
 def free_ports(count: int) -> tuple[int, ...]:
-    """Return TCP ports that are free now, all different."""
+    """Return different TCP ports that are free now."""
     probes = [socket.socket() for _ in range(count)]
     try:
         for probe in probes:
@@ -142,7 +128,7 @@ def free_ports(count: int) -> tuple[int, ...]:
 
 
 def write_config(settings: ChainSettings) -> None:
-    """Write one TOML file a platform."""
+    """Write one TOML file for each platform."""
     folder = settings.folder / "config"
     folder.mkdir(parents=True, exist_ok=True)
     uuv_port, vessel_port, shore_port = settings.router_ports
@@ -176,12 +162,12 @@ def _service_table(settings: ChainSettings, service: str) -> str:
         + _vehicle_link(settings),
         "op_modem": modem.format(name="op_modem", port=settings.modem_port(VESSEL_ADDRESS), address=VESSEL_ADDRESS)
         + _vessel_link(settings),
-        "decompressor": f'[decompressor]\nout_dir = "{settings.vessel_pictures}"\n'
+        "decompressor": f'[decompressor]\nout_dir = "{settings.vessel_images}"\n'
         f"pairing_timeout_s = {settings.pairing_timeout_s:.3f}\ncodebooks = [{codebooks}]\n"
         f'vehicles = {{ {UUV_ADDRESS} = "{UUV}" }}\n'
         + ("" if page is None else 'image_consumers = ["relay", "console"]\n'),
         "relay": "[relay]\n" + ("" if page is None else 'advice_consumers = ["console"]\n'),
-        "c2": f'[c2]\nout_dir = "{settings.shore_pictures.parent}"\n',
+        "c2": f'[c2]\nout_dir = "{settings.shore_images.parent}"\n',
         "acoustic_channel": f'[acoustic_channel]\npty_dir = "{settings.ports_folder}"\nlog = "{settings.channel_log}"\n'
         f"seed = {settings.seed}\nframe_loss = {settings.loss}\ntime_scale = {settings.time_scale}\n"
         f"modem = [{{ address = {UUV_ADDRESS} }}, {{ address = {VESSEL_ADDRESS}, east_m = 100.0 }}]\n",
@@ -191,7 +177,7 @@ def _service_table(settings: ChainSettings, service: str) -> str:
 
 
 def _console_table(settings: ChainSettings) -> str:
-    # The paper's link carries nothing down.
+    # The paper's link has no downlink.
     down = '"op_modem"' if settings.link == "v1" else ""
     return (
         f'[console]\nport = {settings.console_port}\nvehicles = {{ {UUV_ADDRESS} = "{UUV}" }}\n'
@@ -200,16 +186,16 @@ def _console_table(settings: ChainSettings) -> str:
 
 
 def _codec(settings: ChainSettings) -> str:
-    return f'codec = "emb"\nbudget_bytes = {settings.stream_bytes}\n' if settings.link == "v1" else ""
+    return 'codec = "vq"\n' if settings.link == "paper" else f'codec = "emb"\nbudget_bytes = {STREAM_BYTES}\n'
 
 
 def _vehicle_link(settings: ChainSettings) -> str:
     if settings.link == "paper":
         return 'link = "paper"\n'
-    # Services keep real time: what takes seconds in the water takes so much less here, and the host its own time.
+    # Services run in real time: durations in the channel are divided by the time scale; the host's own delays are not.
     scale = settings.time_scale
     return (
-        f'link = "v1"\nexpected_loss = {min(settings.loss, 0.9)}\nstream_bytes = {settings.stream_bytes}\n'
+        f'link = "v1"\nexpected_loss = {min(settings.loss, 0.9)}\nstream_bytes = {STREAM_BYTES}\n'
         f"tx_burst_s = {60 / scale:.3f}\nrx_window_s = {10 / scale + 0.5:.3f}\nqueue_interval_s = 0.2\n"
         f"group_delay_s = {20 / scale:.3f}\nretry_s = 0.2\nreply_timeout_s = {settings.reply_timeout_s:.3f}\n"
     )

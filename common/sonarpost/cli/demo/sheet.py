@@ -1,4 +1,4 @@
-"""The contact sheet: every picture as it was, as it was sent, as the vessel has it, as the shore has it."""
+"""The contact sheet: for each contact, its image at several stages side by side."""
 
 from __future__ import annotations
 
@@ -12,69 +12,92 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sonarpost.codec.interface import to_uint8
 
-COLUMNS = ("original", "as sent", "received on the vessel", "received ashore")
 BACKGROUND, INK, FAINT, MISSING = (16, 20, 26), (232, 236, 240), (140, 150, 160), (200, 70, 60)
 SCALE = 2
-MARGIN, GAP, CAPTION, HEADER = 24, 16, 54, 84
-MAX_ROWS = 12
-
-Picture = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+MARGIN, GAP, GROUP_GAP, LABEL, CAPTION, HEADER = 24, 12, 40, 24, 56, 104
+MAX_CONTACTS, CONTACTS_A_LINE = 12, 2
 
 
 @dataclass(frozen=True)
-class SheetRow:
-    """One contact on the sheet; a picture that does not exist is None."""
+class SheetCell:
+    """One image of a contact.
+
+    Attributes:
+        label: Text below the image.
+        image: Shape (height, width); None where there is none.
+        missing: Pixels without data, same shape; they are hatched.
+    """
+
+    label: str = ""
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | None = None
+    missing: npt.NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True)
+class SheetContact:
+    """One contact: a cell for each stage, and two lines of text below them."""
 
     title: str
     detail: str
-    pictures: tuple[Picture | None, Picture | None, Picture | None, Picture | None]
-    missing: tuple[npt.NDArray[np.bool_] | None, ...]
+    cells: tuple[SheetCell, ...]
 
 
-def write_sheet(path: Path, title: str, rows: Sequence[SheetRow]) -> None:
-    """Draw the sheet, most interesting rows first as given, at most 12 of them."""
-    shown = rows[:MAX_ROWS]
-    width_px = max((p.shape[1] for row in shown for p in row.pictures if p is not None), default=140) * SCALE
-    heights = [max((p.shape[0] for p in row.pictures if p is not None), default=80) * SCALE for row in shown]
-    total_width = 2 * MARGIN + len(COLUMNS) * width_px + (len(COLUMNS) - 1) * GAP
-    total_height = HEADER + sum(h + CAPTION for h in heights) + MARGIN + (24 if len(rows) > MAX_ROWS else 0)
-    sheet = Image.new("RGB", (max(total_width, 720), total_height), BACKGROUND)
+def write_sheet(path: Path, title: str, subtitle: str, stages: Sequence[str], contacts: Sequence[SheetContact]) -> None:
+    """Write the sheet as PNG: the first 12 contacts, two side by side.
+
+    Args:
+        path: Where to write.
+        title: First line.
+        subtitle: Second line.
+        stages: Heading of each cell of a contact.
+        contacts: Contacts, the most interesting first.
+    """
+    shown = contacts[:MAX_CONTACTS]
+    images = [[cell.image for cell in contact.cells if cell.image is not None] for contact in shown]
+    width_px = max((image.shape[1] for group in images for image in group), default=140) * SCALE
+    heights_px = [max((image.shape[0] for image in group), default=80) * SCALE for group in images]
+    group_px = len(stages) * (width_px + GAP) - GAP + GROUP_GAP
+    groups = min(CONTACTS_A_LINE, max(1, len(shown)))
+    lines_px = [max(heights_px[i : i + groups]) for i in range(0, len(shown), groups)]
+    more = f"and {len(contacts) - len(shown)} more in the folders beside this sheet" if contacts[MAX_CONTACTS:] else ""
+    total_height = HEADER + sum(px + LABEL + CAPTION for px in lines_px) + MARGIN
+    sheet = Image.new("RGB", (2 * MARGIN + groups * group_px - GROUP_GAP, total_height), BACKGROUND)
     draw = ImageDraw.Draw(sheet)
     draw.text((MARGIN, 14), title, fill=INK, font=ImageFont.load_default(20))
-    for column, name in enumerate(COLUMNS):
-        draw.text((MARGIN + column * (width_px + GAP), 50), name, fill=FAINT, font=ImageFont.load_default(15))
-    top = HEADER
-    for row, height_px in zip(shown, heights, strict=True):
-        for column in range(len(COLUMNS)):
-            left = MARGIN + column * (width_px + GAP)
-            _paste(sheet, (left, top), row.pictures[column], row.missing[column], (width_px, height_px))
-        draw.text((MARGIN, top + height_px + 6), row.title, fill=INK, font=ImageFont.load_default(14))
-        draw.text((MARGIN, top + height_px + 25), row.detail, fill=FAINT, font=ImageFont.load_default(13))
-        top += height_px + CAPTION
-    if len(rows) > MAX_ROWS:
-        more = f"and {len(rows) - MAX_ROWS} more, in the folders beside this sheet"
-        draw.text((MARGIN, top), more, fill=FAINT, font=ImageFont.load_default(14))
+    draw.text((MARGIN, 44), f"{subtitle}   {more}", fill=FAINT, font=ImageFont.load_default(15))
+    for number, contact in enumerate(shown):
+        line, group = divmod(number, groups)
+        left = MARGIN + group * group_px
+        top = HEADER + sum(px + LABEL + CAPTION for px in lines_px[:line])
+        _draw_contact(sheet, (left, top), contact, (width_px, lines_px[line]))
+        for stage, name in enumerate(stages if line == 0 else ()):
+            draw.text((left + stage * (width_px + GAP), 76), name, fill=INK, font=ImageFont.load_default(15))
     sheet.save(path)
 
 
-def _paste(
-    sheet: Image.Image,
-    corner: tuple[int, int],
-    picture: Picture | None,
-    missing: npt.NDArray[np.bool_] | None,
-    box: tuple[int, int],
-) -> None:
-    if picture is None:
+def _draw_contact(sheet: Image.Image, corner: tuple[int, int], contact: SheetContact, size_px: tuple[int, int]) -> None:
+    draw = ImageDraw.Draw(sheet)
+    left, below = corner[0], corner[1] + size_px[1]
+    for stage, cell in enumerate(contact.cells):
+        x = left + stage * (size_px[0] + GAP)
+        _paste(sheet, (x, corner[1]), cell, size_px)
+        draw.text((x, below + 4), cell.label, fill=INK, font=ImageFont.load_default(13))
+    draw.text((left, below + LABEL), contact.title, fill=INK, font=ImageFont.load_default(14))
+    draw.text((left, below + LABEL + 18), contact.detail, fill=FAINT, font=ImageFont.load_default(13))
+
+
+def _paste(sheet: Image.Image, corner: tuple[int, int], cell: SheetCell, size_px: tuple[int, int]) -> None:
+    if cell.image is None:
         draw = ImageDraw.Draw(sheet)
-        draw.rectangle((corner[0], corner[1], corner[0] + box[0] - 1, corner[1] + box[1] - 1), outline=MISSING)
+        far_corner = (corner[0] + size_px[0] - 1, corner[1] + size_px[1] - 1)
+        draw.rectangle((*corner, *far_corner), outline=MISSING)
         draw.text((corner[0] + 12, corner[1] + 12), "nothing received", fill=MISSING, font=ImageFont.load_default(14))
         return
-    colour = np.repeat(to_uint8(picture)[:, :, None], 3, axis=2)
-    if missing is not None and missing.any():
-        # Thin diagonal lines say "no data" where plain black could pass for a shadow.
-        rows, columns = np.indices(missing.shape)
-        colour[missing & ((rows + columns) % 8 == 0)] = MISSING
-    tile = Image.fromarray(colour).resize(
-        (picture.shape[1] * SCALE, picture.shape[0] * SCALE), Image.Resampling.NEAREST
-    )
+    colour = np.repeat(to_uint8(cell.image)[:, :, None], 3, axis=2)
+    if cell.missing is not None and cell.missing.any():
+        # Hatched: plain black could pass for a shadow.
+        rows, columns = np.indices(cell.missing.shape)
+        colour[cell.missing & ((rows + columns) % 8 == 0)] = MISSING
+    height_px, width_px = cell.image.shape
+    tile = Image.fromarray(colour).resize((width_px * SCALE, height_px * SCALE), Image.Resampling.NEAREST)
     sheet.paste(tile, corner)

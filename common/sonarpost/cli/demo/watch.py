@@ -1,4 +1,4 @@
-"""Watches a running chain over Zenoh, as any subscriber could, and tells when nothing is left to do."""
+"""Observation of a running chain over Zenoh, as any subscriber can do it, and detection of its end."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 R = TypeVar("R", bound=Record)
 
 CONNECT_S = 20.0
-# Gauges that are zero when a service has nothing left to do.
+# Gauges that are zero when a service has no work left.
 IDLE_GAUGES: Mapping[str, tuple[str, ...]] = {
     "atd_stub": ("files_waiting", "contacts_waiting", "outbox"),
     "compressor": ("inbox", "outbox"),
@@ -41,15 +41,18 @@ IDLE_GAUGES: Mapping[str, tuple[str, ...]] = {
 
 
 class Watcher:
-    """Collects what the chain publishes.
+    """Collects the records that the chain publishes.
 
     Attributes:
         snippets: By contact identifier.
         encoded: By the identifier that an image has on the vessel.
-        vessel: Latest version of every picture on the vessel, by image identifier.
-        shore: The same, as shown to shore subscribers.
-        accepted: Images of which op_modem has accepted a frame.
-        health: Latest health by service.
+        vessel: Latest version of each image on the vessel, by image identifier.
+        shore: The same, as published at the shore site.
+        accepted: Images of which op_modem received a frame.
+        health: Latest health report by service.
+        queue: Latest state of the vehicle's transmit queue.
+        packets_sent: Packets that the vehicle sent.
+        changes: Number of changes so far.
     """
 
     def __init__(self, settings: ChainSettings) -> None:
@@ -74,7 +77,7 @@ class Watcher:
         self._subscribe(uuv, keys.image_encoded(UUV), EncodedImage, self._on_encoded)
         self._subscribe(uuv, keys.acoustic_tx(UUV), AcousticFrame, self._on_sent)
         self._subscribe(uuv, keys.acoustic_queue(UUV), QueueState, self._on_queue)
-        self._subscribe(vessel, keys.acoustic_rx(VESSEL), AcousticFrame, self._on_heard)
+        self._subscribe(vessel, keys.acoustic_rx(VESSEL), AcousticFrame, self._on_received)
         self._subscribe(vessel, keys.image_reconstructed(VESSEL), ReconstructedImage, self._on_vessel)
         self._subscribe(shore, keys.shore_image(VESSEL), ReconstructedImage, self._on_shore)
         for session, platform in ((uuv, UUV), (uuv, WATER), (vessel, VESSEL), (shore, SHORE)):
@@ -131,7 +134,7 @@ class Watcher:
             self.packets_sent += 1
             self.changes += 1
 
-    def _on_heard(self, frame: AcousticFrame) -> None:
+    def _on_received(self, frame: AcousticFrame) -> None:
         if self.settings.link == "v1":
             for event in self._v1.accept(frame.source, frame.data, frame.time_utc_s):
                 if isinstance(event, ImageUpdate):
@@ -159,7 +162,7 @@ class Watcher:
 
     @property
     def packets_planned(self) -> int:
-        """Packets that the images encoded so far take: with the paper's format by its rule, with v1 by the queue."""
+        """Packets that the images encoded so far need: computed for the paper's format, from the queue for v1."""
         rate = RATES[self.settings.rate]
         with self._lock:
             images, queue = tuple(self.encoded.values()), self.queue
@@ -169,12 +172,24 @@ class Watcher:
         contact = ContactSummary()
         return sum(len(plan_packets(i.image_id, i.stream, contact, rate.frames, rate.frame_bytes)) for i in images)
 
+    @property
+    def contact_of_image(self) -> dict[str, str]:
+        """Contact identifier of each encoded image, by image identifier."""
+        with self._lock:
+            return {image_id: image.contact.contact_id for image_id, image in self.encoded.items()}
+
+    @property
+    def all_complete(self) -> bool:
+        """Whether every encoded image is complete at the shore site."""
+        with self._lock:
+            return all(i in self.shore and self.shore[i].complete for i in self.encoded)
+
     def busy(self, files_expected: int, since_utc_s: float) -> str:
-        """Return what still keeps the chain busy, an empty text when nothing does.
+        """Return what still keeps the chain busy, an empty text if nothing does.
 
         Args:
-            files_expected: Input files that atd_stub is to have dealt with.
-            since_utc_s: Health older than this says nothing.
+            files_expected: Number of input files that atd_stub has to process.
+            since_utc_s: Older health reports are not considered.
         """
         with self._lock:
             health = dict(self.health)
@@ -182,39 +197,38 @@ class Watcher:
         for service, gauges in IDLE_GAUGES.items():
             report = health.get(service)
             if report is None or report.time_utc_s < since_utc_s:
-                return f"waiting for {service}"
+                return f"no recent health report of {service}"
             for gauge in gauges:
                 if report.gauges.get(gauge, 1.0) != 0.0:
                     return f"{service}: {gauge} {report.gauges.get(gauge, 1.0):g}"
         counters = health["atd_stub"].counters
-        dealt_with = counters.get("files_processed", 0) + counters.get("files_quarantined", 0)
-        if dealt_with < files_expected:
-            return f"atd_stub: {dealt_with} of {files_expected} files"
+        processed = counters.get("files_processed", 0) + counters.get("files_quarantined", 0)
+        if processed < files_expected:
+            return f"atd_stub: {processed} of {files_expected} files"
         if encoded < contacts:
             return f"compressor: {encoded} of {contacts} contacts"
-        return self._queue_busy(queue, since_utc_s) if self.settings.link == "v1" else ""
+        if self.settings.link == "paper" or self.all_complete:
+            return ""
+        feedback_open = health["op_modem"].gauges.get("feedback_open", 1.0)
+        return self._queue_busy(queue, feedback_open, since_utc_s)
 
     @staticmethod
-    def _queue_busy(queue: QueueState | None, since_utc_s: float) -> str:
+    def _queue_busy(queue: QueueState | None, feedback_open: float, since_utc_s: float) -> str:
         if queue is None or queue.time_utc_s < since_utc_s:
-            return "waiting for the vehicle's queue"
+            return "no recent state of the vehicle's queue"
         if queue.images_waiting or queue.messages_waiting:
-            return f"uuv_modem: {queue.images_waiting} pictures, {queue.messages_waiting} messages"
-        return ""
-
-    @property
-    def settled_s(self) -> float:
-        """Real seconds without any change after which nothing more is to be expected."""
-        with self._lock:
-            whole = all(i in self.shore and self.shore[i].complete for i in self.encoded)
-        airtime_s = RATES[self.settings.rate].airtime_s / self.settings.time_scale
-        return airtime_s if whole else self.settings.settled_s
+            return f"uuv_modem: {queue.images_waiting} images, {queue.messages_waiting} messages"
+        # The vessel repeats its feedback until the vehicle has sent what is missing.
+        return f"op_modem: feedback_open {feedback_open:g}" if feedback_open else ""
 
     def wait_until_started(self, check: Callable[[], None]) -> None:
-        """Wait for the first health of every service.
+        """Wait for the first health report of every service.
 
         Args:
-            check: Called now and then; raises when waiting is in vain.
+            check: Called repeatedly; raises when a process has ended.
+
+        Raises:
+            PortError: A service has not reported within 40 s.
         """
         deadline = time.monotonic() + 2 * CONNECT_S
         while True:
@@ -224,5 +238,5 @@ class Watcher:
                 return
             check()
             if time.monotonic() > deadline:
-                raise PortError(f"no sign of life from {', '.join(missing)} within {2 * CONNECT_S:.0f} s")
+                raise PortError(f"no health report of {', '.join(missing)} within {2 * CONNECT_S:.0f} s")
             time.sleep(0.05)

@@ -1,4 +1,4 @@
-"""The operator's page of a demo: who may log in, where it is, open until somebody ends it."""
+"""The operator's page of a demo: its address, its user, and waiting until it is closed."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from sonarpost.cli.demo.settings import VESSEL, ChainSettings
 USER = "op"
 
 
-class Page:
-    """The console of a demo's vessel, with one operator.
+class OperatorPage:
+    """The console of the demo's vessel, with one operator.
 
     Args:
-        settings: Of the chain; `console_port` is the page's.
+        settings: Settings of the chain, with `console_port`.
     """
 
     def __init__(self, settings: ChainSettings) -> None:
         self._password = secrets.token_urlsafe(9)
         self.address = f"http://127.0.0.1:{settings.console_port}/"
-        # Commands know services by name only.
+        # A command imports a service by name only: the import rules separate them.
         users_file = importlib.import_module("sonarpost.services.console.store.users")
         users = users_file.Users(settings.folder / "state" / VESSEL / users_file.FILE_NAME)
         try:
@@ -33,14 +33,14 @@ class Page:
             users.close()
 
     def show(self, console: Console) -> None:
-        """Say where it is and who may log in."""
-        console.print(f"the operator's page: {self.address}  user {USER}  password {self._password}", highlight=False)
+        """Print the address, the user and the password."""
+        console.print(f"operator's page: {self.address}  user {USER}  password {self._password}", highlight=False)
 
-    def leave_open(self, chain: Chain, console: Console) -> None:
-        """Wait until somebody presses Ctrl-C, or a process of the chain ends.
+    def keep_open(self, chain: Chain, console: Console) -> None:
+        """Wait for Ctrl-C.
 
         Raises:
-            ChainError: One did.
+            ChainError: A process of the chain has ended.
         """
         self.show(console)
         console.print("open until Ctrl-C; the contact sheet follows")

@@ -1,0 +1,101 @@
+"""The outcome of a demo: which images count as missing, incomplete or not sent."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonarpost.cli.demo.outcome import Outcome, evaluate
+from sonarpost.cli.demo.settings import UUV_ADDRESS, ChainSettings
+from sonarpost.codec import encode
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.sender import plan_packets
+
+ENCODED = {"0001": "contact-1", "0002": "contact-2"}
+
+
+def store_image(folder: Path, image_id: str, *, complete: bool = True, pixels: bytes = b"pixels") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{image_id}.json").write_text(json.dumps({"image_id": image_id, "complete": complete}))
+    (folder / f"{image_id}.tiff").write_bytes(pixels)
+
+
+def store_at_both(settings: ChainSettings, image_id: str, *, complete: bool = True) -> None:
+    for folder in (settings.vessel_images, settings.shore_images):
+        store_image(folder, image_id, complete=complete)
+
+
+def outcome_of(settings: ChainSettings, contacts: tuple[str, ...] = ("contact-1", "contact-2")) -> Outcome:
+    return evaluate(settings, contacts, ENCODED, elapsed_s=1.0)
+
+
+def test_succeeds_when_every_image_is_complete(tmp_path: Path) -> None:
+    settings = ChainSettings(tmp_path, loss=0.3)
+    for image_id in ENCODED:
+        store_at_both(settings, image_id)
+    outcome = outcome_of(settings)
+    assert outcome.succeeded
+    assert (outcome.contacts, outcome.images_shore, outcome.images_complete) == (2, 2, 2)
+    assert "missing" not in json.loads(outcome.as_json())
+
+
+@pytest.mark.parametrize("link", ["v1", "paper"])
+def test_image_that_is_absent_is_missing_with_v1_only(tmp_path: Path, link: str) -> None:
+    settings = ChainSettings(tmp_path, link=link, loss=0.3)  # type: ignore[arg-type]
+    store_at_both(settings, "0001")
+    outcome = outcome_of(settings)
+    # The paper's link does not repeat: no frame of this image was delivered.
+    assert outcome.missing == (("0002",) if link == "v1" else ())
+    assert outcome.succeeded == (link == "paper")
+
+
+@pytest.mark.parametrize(("link", "loss", "incomplete"), [("v1", 0.3, True), ("v1", 1.0, False), ("paper", 0.3, False)])
+def test_incomplete_image_is_a_failure_where_the_link_repeats(
+    tmp_path: Path, link: str, loss: float, incomplete: bool
+) -> None:
+    settings = ChainSettings(tmp_path, link=link, loss=loss)  # type: ignore[arg-type]
+    store_at_both(settings, "0001")
+    store_at_both(settings, "0002", complete=False)
+    outcome = outcome_of(settings)
+    assert outcome.incomplete == (("0002",) if incomplete else ())
+    assert outcome.succeeded != incomplete
+
+
+def test_image_of_which_a_frame_was_delivered_is_missing(tmp_path: Path) -> None:
+    settings = ChainSettings(tmp_path, link="paper")
+    stream = encode(np.full((80, 140), 90, np.uint8), "vq")
+    frame = plan_packets("0001", stream, ContactSummary(height_px=80, width_px=140), 3, 64)[0][0]
+    entry = {
+        "event": "packet",
+        "source": UUV_ADDRESS,
+        "packet": 1,
+        "kind": "data",
+        "airtime_s": 6.1,
+        "heard": True,
+        "frames": [{"fate": "intact", "hex": frame.hex()}],
+    }
+    settings.channel_log.parent.mkdir(parents=True)
+    settings.channel_log.write_text(json.dumps(entry) + "\n")
+    outcome = outcome_of(settings)
+    assert outcome.missing == ("0001",)
+    assert not outcome.succeeded
+
+
+def test_contact_without_an_encoded_image_is_reported(tmp_path: Path) -> None:
+    settings = ChainSettings(tmp_path)
+    for image_id in ENCODED:
+        store_at_both(settings, image_id)
+    outcome = outcome_of(settings, ("contact-1", "contact-2", "contact-3"))
+    assert outcome.not_sent == ("contact-3",)
+    assert not outcome.succeeded
+
+
+def test_different_pixels_at_the_shore_site_are_a_failure(tmp_path: Path) -> None:
+    settings = ChainSettings(tmp_path)
+    for image_id in ENCODED:
+        store_image(settings.vessel_images, image_id)
+        store_image(settings.shore_images, image_id, pixels=b"other")
+    assert not outcome_of(settings).sha256_match
