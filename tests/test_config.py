@@ -17,7 +17,6 @@ from pydantic import Field, model_validator
 from sonarpost import config
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.errors import ConfigError
-from sonarpost.toml_lines import key_lines
 
 
 class Kind(StrEnum):
@@ -370,13 +369,15 @@ class Writer:
         elif isinstance(value, list):
             self.text += "["
             for number, inner in enumerate(value):
-                self.filler("", "\n", " # ] x = 1\n", "\n\n ")
+                if len(path) == 2:
+                    self.filler("", "\n", " # ] x = 1\n", "\n\n ")
                 self.note((*path, str(number)))
                 self.value((*path, str(number)), inner)
                 self.text += ","
             self.text += "]"
         elif isinstance(value, str):
-            self.text += self.draw(st.sampled_from([quoted(value), f'"""\n{quoted(value)[1:-1]}\\\n  """']))
+            long = f'"""\n{quoted(value)[1:-1]}\\\n  """'
+            self.text += self.draw(st.sampled_from([quoted(value), long])) if len(path) == 2 else quoted(value)
         else:
             self.text += str(value).lower()
 
@@ -396,13 +397,13 @@ def test_line_of_every_key_of_an_arbitrary_document(data: st.DataObject) -> None
             writer.value((name, key), value)
             writer.filler("\n", " # c\n", "\n\n")
     assert tomllib.loads(writer.text).keys() == tables.keys()
-    assert key_lines(writer.text) == writer.lines
+    assert config.key_lines(writer.text) == writer.lines
 
 
 @pytest.mark.parametrize("name", ["uuv", "vessel", "shore"])
 def test_line_of_every_key_of_the_example_files(name: str) -> None:
     text = (REPOSITORY / "config" / f"{name}.toml").read_text(encoding="utf-8")
-    lines = key_lines(text)
+    lines = config.key_lines(text)
     for table, keys in tomllib.loads(text).items():
         for key in keys:
             line = text.splitlines()[lines[table, key] - 1]

@@ -8,7 +8,8 @@ TOML value, or used as a string if it is not one.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -18,7 +19,6 @@ from pydantic_core import to_json
 from sonarpost.errors import ConfigError
 from sonarpost.logs import LogFormat
 from sonarpost.messages import PlatformId
-from sonarpost.toml_lines import key_lines
 from sonarpost.wire import expected_text
 
 ENVIRONMENT_PREFIX = "SONARPOST_"
@@ -146,10 +146,10 @@ def load(path: Path, service: str, model: type[C], environment: Mapping[str, str
         raise ConfigError(str(path), "", str(error), "a readable TOML file") from error
     try:
         tables: dict[str, object] = tomllib.loads(text)
-        source = _Source(path, text)
     except (ValueError, RecursionError) as error:
         # tomllib raises other errors than its own for very long numbers and deep nesting.
         raise ConfigError(str(path), "", str(error), "valid TOML") from error
+    source = _Source(path, text)
     for name, table in tables.items():
         if name not in ("platform", *SERVICES):
             raise source.error((name,), "an unknown table", "platform, " + ", ".join(SERVICES))
@@ -165,18 +165,49 @@ class _Source:
 
     def __init__(self, path: Path, text: str) -> None:
         self._path = path
-        self._lines = key_lines(text)
+        self._text = text
 
     def error(self, names: Sequence[str], value: object, expected: str) -> ConfigError:
-        where = f"{self._path}:{line}" if (line := self._line(names)) else str(self._path)
+        lines = key_lines(self._text)
+        # The line of the key or, if the key is absent, of the nearest table around it.
+        known = (lines.get(tuple(names[:length])) for length in range(len(names), 0, -1))
+        line = next((number for number in known if number is not None), None)
+        where = str(self._path) if line is None else f"{self._path}:{line}"
         return ConfigError(where, ".".join(names), value, expected)
 
-    def _line(self, names: Sequence[str]) -> int | None:
-        """Return the line of a key or, if the key is absent, of the nearest table around it."""
-        for length in range(len(names), 0, -1):
-            if (line := self._lines.get(tuple(names[:length]))) is not None:
-                return line
-        return None
+
+def key_lines(text: str) -> dict[tuple[str, ...], int]:
+    """Return the first line of each table and key, from 1; `tomllib` does not report lines.
+
+    The document is parsed up to the end of each line: keys that are new there belong to the statement that ends there.
+
+    Args:
+        text: A TOML document that `tomllib` accepts.
+
+    Returns:
+        Lines by path. The elements of an array are named by their index: ("modems", "0", "address"). What is nested in
+        one element over several lines has the first line of the element.
+    """
+    lines: dict[tuple[str, ...], int] = {}
+    rows = text.replace("\r\n", "\n").split("\n")
+    first = 1
+    for number in range(1, len(rows) + 1):
+        # The bracket completes an array that continues on the next line.
+        for end in ("", "\n]"):
+            with suppress(ValueError, RecursionError):
+                for path in _paths(tomllib.loads("\n".join(rows[:number]) + end)):
+                    lines.setdefault(path, first)
+                first = number + 1
+                break
+    return lines
+
+
+def _paths(value: object, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Yield the paths of all keys and elements in a document."""
+    members = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for name, member in members:
+        yield (*path, str(name))
+        yield from _paths(member, (*path, str(name)))
 
 
 def _overrides(environment: Mapping[str, str]) -> dict[str, dict[str, object]]:
