@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 PRIVATE_FILE = 0o600
 PUBLIC_FILE = 0o644
@@ -15,11 +17,21 @@ PRIVATE_FOLDER = 0o700
 
 
 def write_atomically(path: Path, data: bytes, mode: int = PUBLIC_FILE) -> None:
-    """Write a temporary file, flush it to the disk and rename it to `path`.
+    """Write a file with `atomic_file`.
+
+    Raises:
+        OSError: It cannot be written (full disk, no permission); `path` is unchanged.
+    """
+    with atomic_file(path, mode) as file:
+        file.write(data)
+
+
+@contextmanager
+def atomic_file(path: Path, mode: int = PUBLIC_FILE) -> Iterator[BinaryIO]:
+    """Yield a temporary file; at the end of the block, flush it to the disk and rename it to `path`.
 
     Args:
-        path: The file to create or replace; its folder must exist.
-        data: Content of the file.
+        path: The file to create or replace; its folder must exist. It is unchanged if the block raises.
         mode: Its permissions, independent of the umask.
 
     Raises:
@@ -29,7 +41,7 @@ def write_atomically(path: Path, data: bytes, mode: int = PUBLIC_FILE) -> None:
     temporary = Path(name)
     try:
         with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
+            yield file
             file.flush()
             # mkstemp creates files that only their owner can read.
             os.fchmod(file.fileno(), mode)

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 import json
-import os
 import sys
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
 from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
-from sonarpost.files import sync_folder
+from sonarpost.files import atomic_file
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import SurveySource
 from sonarpost.sonar.survey import Ping
@@ -52,27 +50,11 @@ def run(parsed: argparse.Namespace) -> int:
         if parsed.out is None:
             write(source, sys.stdout)
         else:
-            with _atomic_text_file(parsed.out) as out:
+            with atomic_file(parsed.out) as file:
+                out = io.TextIOWrapper(file, encoding="utf-8", newline="")
                 write(source, out)
+                out.detach()  # flushes the text; `atomic_file` closes the file
     return 0
-
-
-@contextmanager
-def _atomic_text_file(path: Path) -> Iterator[TextIO]:
-    """Yield a temporary file that replaces `path` after a complete write."""
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    temporary = Path(name)
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8", newline="") as file:
-            yield file
-            file.flush()
-            os.fchmod(file.fileno(), 0o644)
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
 
 
 def write_csv(source: SurveySource, out: TextIO) -> None:
