@@ -178,15 +178,11 @@ class ShoreIndex:
     def _writing(self) -> Iterator[sqlite3.Connection]:
         with self._lock:
             try:
-                self._db.execute("BEGIN IMMEDIATE")
-                yield self._db
-                self._db.execute("COMMIT")
-            except BaseException as error:
-                if self._db.in_transaction:
-                    self._db.execute("ROLLBACK")
-                if isinstance(error, sqlite3.Error):
-                    raise OSError(f"{self.path}: {error}") from error
-                raise
+                with self._db:
+                    self._db.execute("BEGIN IMMEDIATE")
+                    yield self._db
+            except sqlite3.Error as error:
+                raise OSError(f"{self.path}: {error}") from error
 
     def put(self, rows: Iterable[ImageRow | DecisionRow | TaskingRow]) -> None:
         """Add rows, or replace those with the same keys.

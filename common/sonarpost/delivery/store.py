@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
-import logging
 import shutil
 import sqlite3
 import threading
@@ -23,9 +22,6 @@ from typing import IO
 from sonarpost.delivery.records import SITE_SEPARATOR, InboxItem, OutboxItem
 from sonarpost.delivery.transaction import Transaction, runs
 from sonarpost.errors import DeliveryError, RetryLaterError
-from sonarpost.logs import kv
-
-log = logging.getLogger(__name__)
 
 CACHE_KB = 8000
 """Page cache: records in flight are deleted without reading them from the disk."""
@@ -163,15 +159,12 @@ class Store:
         with self._lock:
             tx = Transaction(self._db, self._in_flight)
             try:
-                self._db.execute("BEGIN IMMEDIATE")
-                yield tx
-                tx.flush()
-                self._db.execute("COMMIT")
-            except BaseException as error:
-                self._roll_back()
-                if isinstance(error, sqlite3.Error):
-                    raise DeliveryError(f"{self.path}: {error}") from error
-                raise
+                with self._db:
+                    self._db.execute("BEGIN IMMEDIATE")
+                    yield tx
+                    tx.flush()
+            except sqlite3.Error as error:
+                raise DeliveryError(f"{self.path}: {error}") from error
         if tx.wrote_outbox:
             for event in tuple(self._outbox_listeners):
                 event.set()
@@ -185,13 +178,6 @@ class Store:
     def remove_outbox_listener(self, event: threading.Event) -> None:
         """Stop setting `event`."""
         self._outbox_listeners.remove(event)
-
-    def _roll_back(self) -> None:
-        try:
-            if self._db.in_transaction:
-                self._db.execute("ROLLBACK")
-        except sqlite3.ProgrammingError:
-            log.debug("Store closed during a transaction; nothing to roll back", extra=kv(path=self.path))
 
     def _query(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[object, ...]]:
         """Query the writing connection, after the transaction in progress."""
