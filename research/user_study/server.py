@@ -16,7 +16,7 @@ from pydantic import Field
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, RedirectResponse, Response
-from starlette.routing import Route
+from starlette.routing import Mount, Route
 from starlette.types import ASGIApp
 
 from research.user_study.trials import NONE_OF_THEM, Answer, Decoded, Trial, results, trials_for
@@ -31,7 +31,7 @@ from sonarpost.services.console.web.access import (
     RequestBody,
     SecurityMiddleware,
 )
-from sonarpost.services.console.web.server import STATIC, routing_error, static_file, static_routes
+from sonarpost.services.console.web.server import STATIC, StaticFolder, page, routing_error
 from sonarpost.sonar.image_files import read_image
 
 OWN_STATIC: Final = Path(__file__).parent / "static"
@@ -213,15 +213,15 @@ class StudyApp:
 
         routes = [
             Route("/", lambda _: RedirectResponse("/panel", 303)),
-            Route("/panel", lambda _: static_file(OWN_STATIC, "panel.html")),
-            Route("/panel/{path:path}", lambda request: static_file(OWN_STATIC, str(request.path_params["path"]))),
+            Route("/panel", lambda _: page(OWN_STATIC / "panel.html")),
+            Mount("/panel", StaticFolder(directory=OWN_STATIC)),
             Route("/api/panel", endpoint(self._info)),
             Route("/api/panel/start", endpoint(self._start), methods=["POST"]),
             Route("/api/panel/next", endpoint(self._next)),
             Route("/api/panel/answers", endpoint(self._answer), methods=["POST"]),
             Route("/api/panel/results", endpoint(self._results)),
             Route("/api/panel/pictures/{token}.png", endpoint(self._image)),
-            *static_routes(static),
+            Mount("/static", StaticFolder(directory=static)),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: routing_error})
         self.asgi: ASGIApp = SecurityMiddleware(app, (host,), tls=False)

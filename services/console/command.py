@@ -9,8 +9,7 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -18,11 +17,10 @@ from sonarpost.config import load
 from sonarpost.errors import ConfigError
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.state import ConsoleState
-from sonarpost.services.console.store.database import ROLES, Database
+from sonarpost.services.console.store.database import DATABASE_NAME, ROLES, Database
 from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
-DATABASE_NAME = "console-review.db"
 TRAINING_USERS = (("watch", "observer"), ("op", "operator"), ("expert", "expert"))
 
 
@@ -65,7 +63,8 @@ def run(parsed: argparse.Namespace) -> int:
         PortError: The address cannot be bound.
     """
     if hasattr(parsed, "run_action"):
-        with _open_users(parsed) as users:
+        folder: Path = parsed.state_dir or load(parsed.config, "console", ConsoleConfig, {})[0].state_dir
+        with closing(Users(folder / FILE_NAME)) as users:
             parsed.run_action(parsed, users)
         return 0
     if parsed.training is None:
@@ -73,16 +72,6 @@ def run(parsed: argparse.Namespace) -> int:
     if not 1 <= parsed.training <= 100_000:
         raise ConfigError("console", "--training", parsed.training, "1 to 100000")
     return _run_training(parsed)
-
-
-@contextmanager
-def _open_users(parsed: argparse.Namespace) -> Iterator[Users]:
-    folder: Path = parsed.state_dir or load(parsed.config, "console", ConsoleConfig, {})[0].state_dir
-    users = Users(folder / FILE_NAME)
-    try:
-        yield users
-    finally:
-        users.close()
 
 
 def _read_password(parsed: argparse.Namespace) -> str:
@@ -120,35 +109,30 @@ def _run_training(parsed: argparse.Namespace) -> int:
     # Imported here because it loads the codecs and their compiler.
     from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator  # noqa: PLC0415
 
-    with tempfile.TemporaryDirectory(prefix="sonarpost-training-") as scratch:
+    config = ConsoleConfig(port=parsed.port, vessel_lat_deg=56.4495, vessel_lon_deg=-5.6012)
+    with ExitStack() as stack:
+        scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="sonarpost-training-"))
         folder: Path = parsed.state or Path(scratch)
-        config = ConsoleConfig(port=parsed.port, vessel_lat_deg=56.4495, vessel_lon_deg=-5.6012)
-        database, users = Database(folder / DATABASE_NAME), Users(folder / FILE_NAME)
-        try:
-            password = parsed.password or secrets.token_urlsafe(9)
-            for name, role in TRAINING_USERS:
-                users.add(name, role, password)
-            state = ConsoleState(config, database)
-            app = ConsoleApp(state, users, VESSEL, training=True)
-            server = WebServer(app.asgi, config.host, config.port)
-            simulator = TrainingSimulator(state, parsed.training, parsed.seed, parsed.interval)
-            print(f"{server.address}  users {', '.join(name for name, _ in TRAINING_USERS)}  password {password}")
-            print("All contacts are simulated. Ctrl-C ends the training.", flush=True)
-            stop = threading.Event()
-            if threading.current_thread() is threading.main_thread():
-                for number in (signal.SIGINT, signal.SIGTERM):
-                    signal.signal(number, lambda *_: stop.set())
-            server.start()
-            try:
-                simulator.load_backlog(parsed.training * 2 // 3)
-                simulator.start()
-                while server.running and not stop.wait(0.5):
-                    pass
-            finally:
-                simulator.stop()
-                app.stop()
-                server.stop()
-        finally:
-            users.close()
-            database.close()
+        database = stack.enter_context(closing(Database(folder / DATABASE_NAME)))
+        users = stack.enter_context(closing(Users(folder / FILE_NAME)))
+        password = parsed.password or secrets.token_urlsafe(9)
+        for name, role in TRAINING_USERS:
+            users.add(name, role, password)
+        state = ConsoleState(config, database)
+        app = ConsoleApp(state, users, VESSEL, training=True)
+        server = WebServer(app.asgi, config.host, config.port)
+        simulator = TrainingSimulator(state, parsed.training, parsed.seed, parsed.interval)
+        print(f"{server.address}  users {', '.join(name for name, _ in TRAINING_USERS)}  password {password}")
+        print("All contacts are simulated. Ctrl-C ends the training.", flush=True)
+        stop = threading.Event()
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, lambda *_: stop.set())
+        server.start()
+        for part in (server, app, simulator):
+            stack.callback(part.stop)
+        simulator.load_backlog(parsed.training * 2 // 3)
+        simulator.start()
+        while server.running and not stop.wait(0.5):
+            pass
     return 0

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 import zenoh
@@ -23,7 +23,6 @@ from sonarpost.logs import kv
 from sonarpost.messages import (
     AcousticFrame,
     Advice,
-    Command,
     Decision,
     DownlinkState,
     Health,
@@ -38,15 +37,13 @@ from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.events import RateLimiter
 from sonarpost.services.console.fleet import frame_event
 from sonarpost.services.console.state import ConsoleState, UnsentRecord
-from sonarpost.services.console.store.database import Database
-from sonarpost.services.console.store.requests import Table
+from sonarpost.services.console.store.database import DATABASE_NAME, ID_COLUMN, RECORD_TYPES, Database, Table
 from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 from sonarpost.sonar.image_files import read_image
 
 log = logging.getLogger(__name__)
 
-DATABASE_NAME = "console-review.db"
 COMMAND_PRIORITY = 1
 ADVICE_PRIORITY = 2
 DECISION_PRIORITY = 2
@@ -172,13 +169,12 @@ class ConsoleService(Service[ConsoleConfig]):
         self._wake.set()
 
     def _apply_acknowledgements(self) -> None:
-        tables: Mapping[str, Table] = {"decision": "decision", "request": "request", "advice": "advice"}
         for name in self.store.state_names(_ACKNOWLEDGED):
             value = self.store.get_state(name)
             table, consumer, record_id = name.removeprefix(_ACKNOWLEDGED).split("/", 2)
             if value is not None:
                 # A refusal always has a reason.
-                self.state.apply_acknowledgement(tables[table], record_id, consumer, value.decode() or None)
+                self.state.apply_acknowledgement(cast("Table", table), record_id, consumer, value.decode() or None)
             with self.store.transaction() as tx:
                 tx.delete_state(name)
 
@@ -315,11 +311,12 @@ class ConsoleService(Service[ConsoleConfig]):
 
 def _table_and_id(item: OutboxItem) -> tuple[Table, str]:
     """Return the table and identifier of a record in the outbox."""
-    if item.encoding == wire.encoding_of(Decision):
-        return "decision", wire.decode(Decision, item.payload, item.key).decision_id
-    if item.encoding == wire.encoding_of(Command):
-        return "request", wire.decode(Command, item.payload, item.key).command_id
-    return "advice", wire.decode(Advice, item.payload, item.key).advice_id
+    table, record_type = next(
+        (table, record_type)
+        for table, record_type in RECORD_TYPES.items()
+        if item.encoding == wire.encoding_of(record_type)
+    )
+    return table, str(getattr(wire.decode(record_type, item.payload, item.key), ID_COLUMN[table]))
 
 
 def stored_records(out_dir: Path) -> Iterator[ReconstructedImage | Decision]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 from sonarpost import wire
@@ -17,18 +17,26 @@ from sonarpost.services.console.events import EventHub
 from sonarpost.services.console.fleet import FleetMonitor, fleet_json
 from sonarpost.services.console.store import contacts, decisions, requests
 from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter
-from sonarpost.services.console.store.database import Actor, Database, DisplayedImage, add_audit_entry, insert_row
+from sonarpost.services.console.store.database import (
+    ID_COLUMN,
+    RECORD_TYPES,
+    Actor,
+    Database,
+    DisplayedImage,
+    Table,
+    add_audit_entry,
+    find_record,
+    insert_row,
+)
 from sonarpost.services.console.store.decisions import DecisionInput, DeliveryStates
-from sonarpost.services.console.store.requests import ID_COLUMN, Table
 from sonarpost.services.console.store.serialisers import (
+    RECORD_JSON,
     Json,
-    advice_json,
     audit_json,
     contact_json,
     contact_record_json,
-    decision_json,
     decode_image,
-    request_json,
+    list_records,
     version_json,
 )
 
@@ -102,7 +110,7 @@ class ConsoleState:
     def store_decision(self, record: Decision) -> bool:
         """Store a decision of another program or console; return whether it is new."""
         with self.database.transaction() as db:
-            known = decisions.find_decision(db, record.decision_id) is not None
+            known = find_record(db, "decision", record.decision_id) is not None
             at_shore = self.config.role == "shore"
             contact_id = decisions.store_received_decision(db, record, self.clock(), at_shore=at_shore)
         if contact_id is not None:
@@ -146,7 +154,7 @@ class ConsoleState:
         with self.database.transaction() as db:
             if table == "decision":
                 if decisions.apply_acknowledgement(db, record_id, consumer, reason, now):
-                    row = decisions.find_decision(db, record_id)
+                    row = find_record(db, "decision", record_id)
                     contact_id = row and str(row["contact_id"])
             elif table == "request":
                 state = "asked" if reason is None else "refused"
@@ -176,8 +184,9 @@ class ConsoleState:
     def _publish(self, table: Table, record_id: str) -> Json:
         """Publish a decision, request or comment; return it."""
         with self.database.read() as db:
-            row = db.execute(f"SELECT * FROM {table} WHERE {ID_COLUMN[table]} = ?", (record_id,)).fetchone()  # noqa: S608
-        body = {"decision": decision_json, "request": request_json, "advice": advice_json}[table](row)
+            row = find_record(db, table, record_id)
+        assert row is not None
+        body = RECORD_JSON[table](row)
         if row["contact_id"]:
             self.events.publish(table, {"id": row["contact_id"], table: body})
         return body
@@ -222,9 +231,9 @@ class ConsoleState:
                 "contact": contact,
                 "record": contact_record_json(decode_image(versions[-1])),
                 "versions": [version_json(row) for row in versions],
-                "decisions": decisions.list_decisions(db, contact_id),
-                "advice": requests.list_advice(db, contact_id),
-                "requests": requests.list_requests(db, contact_id),
+                "decisions": list_records(db, "decision", contact_id),
+                "advice": list_records(db, "advice", contact_id),
+                "requests": list_records(db, "request", contact_id),
                 "measurements": [{**json.loads(row["body"]), "id": row["id"]} for row in measurements],
                 "group": looks,
                 "audit": [audit_json(row) for row in audit],
@@ -380,14 +389,9 @@ class ConsoleState:
 
     def unsent_records(self) -> list[UnsentRecord]:
         """Return the stored records that are not yet in the outbox, oldest first."""
-        types: Mapping[Table, type[Decision] | type[Command] | type[Advice]] = {
-            "decision": Decision,
-            "request": Command,
-            "advice": Advice,
-        }
         found: list[UnsentRecord] = []
         with self.database.read() as db:
-            for table, record_type in types.items():
+            for table, record_type in RECORD_TYPES.items():
                 rows = db.execute(
                     f"SELECT {ID_COLUMN[table]} AS id, vessel_id, payload FROM {table} WHERE sent = 0 ORDER BY seq"  # noqa: S608
                 )

@@ -16,14 +16,24 @@ from pathlib import Path
 from typing import Final, Literal
 
 from sonarpost.errors import DeliveryError
+from sonarpost.messages import Advice, Command, Decision
 
 Role = Literal["observer", "operator", "expert"]
 Side = Literal["vessel", "shore"]
 Permission = Literal["decide", "measure", "request", "advise"]
+Table = Literal["decision", "request", "advice"]
+"""Tables of the records that this console sends; their columns `payload` and `sent` hold what the outbox receives."""
 
 ROLES: Final[tuple[Role, ...]] = ("observer", "operator", "expert")
 PERMISSIONS: Final[tuple[Permission, ...]] = ("decide", "measure", "request", "advise")
+ID_COLUMN: Final[dict[Table, str]] = {"decision": "decision_id", "request": "command_id", "advice": "advice_id"}
+RECORD_TYPES: Final[dict[Table, type[Decision] | type[Command] | type[Advice]]] = {
+    "decision": Decision,
+    "request": Command,
+    "advice": Advice,
+}
 
+DATABASE_NAME: Final = "console-review.db"
 SCHEMA_VERSION = 1
 
 _SCHEMA = """
@@ -150,17 +160,9 @@ class SqliteFile:
         Raises:
             DeliveryError: The transaction failed, for example because of a full disk, and was rolled back.
         """
-        with self._lock:
-            try:
-                self._db.execute("BEGIN IMMEDIATE")
-                yield self._db
-                self._db.execute("COMMIT")
-            except BaseException as error:
-                if self._db.in_transaction:
-                    self._db.execute("ROLLBACK")
-                if isinstance(error, sqlite3.Error):
-                    raise DeliveryError(f"{self.path}: {error}") from error
-                raise
+        with self.read() as db, db:
+            db.execute("BEGIN IMMEDIATE")
+            yield db
 
     def close(self) -> None:
         """Close the file."""
@@ -180,6 +182,13 @@ def insert_row(db: sqlite3.Connection, table: str, values: Mapping[str, object])
     columns, marks = ", ".join(values), ", ".join("?" * len(values))
     inserted = db.execute(f"INSERT INTO {table} ({columns}) VALUES ({marks})", tuple(values.values()))  # noqa: S608
     return inserted.lastrowid or 0
+
+
+def find_record(db: sqlite3.Connection, table: Table, record_id: str) -> sqlite3.Row | None:
+    """Return the row of a record; None if there is none."""
+    sql = f"SELECT * FROM {table} WHERE {ID_COLUMN[table]} = ?"  # noqa: S608  constants only
+    row: sqlite3.Row | None = db.execute(sql, (record_id,)).fetchone()
+    return row
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,13 @@ from sonarpost import wire
 from sonarpost.errors import BadInputError, SonarpostError
 from sonarpost.messages import Decision, DownlinkState, Verdict
 from sonarpost.services.console.store.contacts import find_contact, find_contact_of_image, find_version
-from sonarpost.services.console.store.database import Actor, DisplayedImage, add_audit_entry, insert_row
+from sonarpost.services.console.store.database import (
+    Actor,
+    DisplayedImage,
+    add_audit_entry,
+    find_record,
+    insert_row,
+)
 from sonarpost.services.console.store.requests import is_later_state
 from sonarpost.services.console.store.serialisers import Json, contact_json, decision_json, decode_image
 
@@ -104,7 +110,7 @@ def undo_decision(
     row = _check_revision(db, contact_id, revision)
     if row["effective"] != decision_id:
         raise BadInputError("undo", "decision_id", decision_id, f"the valid decision, {row['effective']}")
-    undone = find_decision(db, decision_id)
+    undone = find_record(db, "decision", decision_id)
     assert undone is not None
     db.execute("UPDATE decision SET undone = 1 WHERE decision_id = ?", (decision_id,))
     previous = _valid_decision(db, contact_id)
@@ -127,7 +133,7 @@ def store_received_decision(
     Returns:
         The contact identifier; None if the decision is already stored or its image is not.
     """
-    if find_decision(db, record.decision_id) is not None:
+    if find_record(db, "decision", record.decision_id) is not None:
         return None
     contact_id = find_contact_of_image(db, record.vessel_id, record.vehicle_id, record.image_id, record.decided_utc_s)
     delivery = DeliveryStates("delivered", "none") if at_shore else DeliveryStates("relay", "waiting")
@@ -156,21 +162,9 @@ def attach_waiting_records(db: sqlite3.Connection, contact_id: str, now_utc_s: f
         _update_contact(db, contact_id, now_utc_s)
 
 
-def find_decision(db: sqlite3.Connection, decision_id: str) -> sqlite3.Row | None:
-    """Return the row of a decision; None if there is none."""
-    row: sqlite3.Row | None = db.execute("SELECT * FROM decision WHERE decision_id = ?", (decision_id,)).fetchone()
-    return row
-
-
-def list_decisions(db: sqlite3.Connection, contact_id: str) -> list[Json]:
-    """Return the decisions about a contact, newest first."""
-    rows = db.execute("SELECT * FROM decision WHERE contact_id = ? ORDER BY seq DESC", (contact_id,))
-    return [decision_json(row) for row in rows]
-
-
 def apply_downlink_state(db: sqlite3.Connection, state: DownlinkState) -> bool:
     """Update the delivery of a decision to the vehicle; return whether it has changed."""
-    row = find_decision(db, state.record_id)
+    row = find_record(db, "decision", state.record_id)
     if row is None or not is_later_state(row["vehicle"], row["times_sent"], state.state, state.times_sent):
         return False
     db.execute(
@@ -193,7 +187,7 @@ def apply_acknowledgement(
         reason: Reason of the refusal; None if the consumer has stored the decision.
         now_utc_s: Time of the acknowledgement.
     """
-    row = find_decision(db, decision_id)
+    row = find_record(db, "decision", decision_id)
     column, stored = ("shore", "relay") if consumer == "relay" else ("vehicle", "asked")
     if row is None or row[column] != "waiting":
         return False
@@ -221,7 +215,7 @@ def _check_revision(db: sqlite3.Connection, contact_id: str, revision: int) -> s
     row = find_contact(db, contact_id)
     assert row is not None  # The caller has checked that the contact exists.
     if row["revision"] != revision:
-        last = None if row["last_decision"] is None else find_decision(db, row["last_decision"])
+        last = None if row["last_decision"] is None else find_record(db, "decision", row["last_decision"])
         raise ConflictError(contact_json(row), None if last is None else decision_json(last))
     return row
 

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import sqlite3
 import uuid
-from typing import Final, Literal
+from typing import Final
 
 from sonarpost import wire
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Advice, Command, CommandKind, DownlinkState, TaskingState
 from sonarpost.services.console.store.contacts import find_contact, find_contact_of_image
-from sonarpost.services.console.store.database import Actor, DisplayedImage, add_audit_entry, insert_row
-from sonarpost.services.console.store.serialisers import Json, advice_json, request_json
+from sonarpost.services.console.store.database import (
+    Actor,
+    DisplayedImage,
+    Table,
+    add_audit_entry,
+    find_record,
+    insert_row,
+)
+from sonarpost.services.console.store.serialisers import Json
 
 REQUEST_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider")
 """Kinds in the order of the page. `wider` is displayed as "expand"."""
@@ -27,9 +34,6 @@ _STATE_ORDER: Final = {
     "refused": 3,
     "expired": 3,
 }
-
-Table = Literal["decision", "request", "advice"]
-ID_COLUMN: Final[dict[Table, str]] = {"decision": "decision_id", "request": "command_id", "advice": "advice_id"}
 
 
 def unavailable_reason(row: sqlite3.Row, kind: str) -> str:
@@ -98,12 +102,6 @@ def add_request(
     return record.command_id
 
 
-def list_requests(db: sqlite3.Connection, contact_id: str) -> list[Json]:
-    """Return the requests about a contact, newest first."""
-    rows = db.execute("SELECT * FROM request WHERE contact_id = ? ORDER BY seq DESC", (contact_id,))
-    return [request_json(row) for row in rows]
-
-
 def is_later_state(known: str, known_times_sent: int, state: str, times_sent: int | None) -> bool:
     """Return whether a delivery state is later than the known one.
 
@@ -118,7 +116,7 @@ def update_request_state(
     db: sqlite3.Connection, command_id: str, state: str, reason: str, times_sent: int | None, utc_s: float
 ) -> str | None:
     """Update the delivery state of a request; return the contact identifier, None if nothing has changed."""
-    row = db.execute("SELECT * FROM request WHERE command_id = ?", (command_id,)).fetchone()
+    row = find_record(db, "request", command_id)
     if row is None or not is_later_state(row["state"], row["times_sent"], state, times_sent):
         return None
     db.execute(
@@ -138,7 +136,7 @@ def apply_tasking_state(db: sqlite3.Connection, state: TaskingState) -> tuple[Ta
     if state.kind == "command":
         contact_id = update_request_state(db, state.record_id, state.state, state.reason, None, state.changed_utc_s)
         return None if contact_id is None else ("request", contact_id)
-    row = db.execute("SELECT * FROM advice WHERE advice_id = ?", (state.record_id,)).fetchone()
+    row = find_record(db, "advice", state.record_id)
     if row is None or row["state"] in (None, "delivered", "refused") or row["state"] == state.state:
         return None
     db.execute(
@@ -153,7 +151,7 @@ def refuse_advice(db: sqlite3.Connection, advice_id: str, reason: str) -> str | 
         "UPDATE advice SET state = 'refused', reason = ? WHERE advice_id = ? AND state = 'waiting'",
         (reason, advice_id),
     )
-    row = db.execute("SELECT contact_id FROM advice WHERE advice_id = ?", (advice_id,)).fetchone()
+    row = find_record(db, "advice", advice_id)
     return None if row is None else str(row["contact_id"])
 
 
@@ -171,17 +169,11 @@ def store_received_advice(db: sqlite3.Connection, record: Advice) -> str | None:
     Returns:
         The contact identifier; None if the comment is already stored or its image is not.
     """
-    if db.execute("SELECT 1 FROM advice WHERE advice_id = ?", (record.advice_id,)).fetchone():
+    if find_record(db, "advice", record.advice_id) is not None:
         return None
     contact_id = find_contact_of_image(db, record.vessel_id, record.vehicle_id, record.image_id, record.advised_utc_s)
     _insert_advice(db, contact_id or "", record, None)
     return contact_id
-
-
-def list_advice(db: sqlite3.Connection, contact_id: str) -> list[Json]:
-    """Return the comments on a contact, newest first."""
-    rows = db.execute("SELECT * FROM advice WHERE contact_id = ? ORDER BY seq DESC", (contact_id,))
-    return [advice_json(row) for row in rows]
 
 
 def _insert_advice(db: sqlite3.Connection, contact_id: str, record: Advice, state: str | None) -> None:

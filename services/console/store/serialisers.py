@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Final
 
@@ -11,6 +12,7 @@ from sonarpost import wire
 from sonarpost.messages import ReconstructedImage
 from sonarpost.review.costs import airtime_of_frames
 from sonarpost.review.rendering import LAYERS
+from sonarpost.services.console.store.database import Table
 
 Json = dict[str, object]
 
@@ -81,6 +83,19 @@ def advice_json(row: sqlite3.Row) -> Json:
     """Return a comment."""
     delivery = None if row["state"] is None else {"state": row["state"], "reason": row["reason"]}
     return {**_select(row, _ADVICE_COLUMNS), "delivery": delivery}
+
+
+RECORD_JSON: Final[Mapping[Table, Callable[[sqlite3.Row], Json]]] = {
+    "decision": decision_json,
+    "request": request_json,
+    "advice": advice_json,
+}
+
+
+def list_records(db: sqlite3.Connection, table: Table, contact_id: str) -> list[Json]:
+    """Return the decisions, requests or comments about a contact, newest first."""
+    rows = db.execute(f"SELECT * FROM {table} WHERE contact_id = ? ORDER BY seq DESC", (contact_id,))  # noqa: S608
+    return [RECORD_JSON[table](row) for row in rows]
 
 
 def audit_json(row: sqlite3.Row) -> Json:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import socket
 import ssl
 import threading
@@ -15,8 +16,9 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
-from starlette.routing import Route
-from starlette.types import ASGIApp
+from starlette.routing import Mount, Route
+from starlette.staticfiles import PathLike, StaticFiles
+from starlette.types import ASGIApp, Scope
 
 from sonarpost.config import TlsConfig
 from sonarpost.errors import ConfigError, PortError
@@ -46,16 +48,6 @@ STATIC: Final = Path(__file__).parents[1] / "static"
 CONTACT_STALE_S: Final = 600.0
 STOP_S: Final = 1.0
 MAX_CONNECTIONS: Final = 200
-_MEDIA_TYPES: Final = {
-    ".html": "text/html; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".mjs": "text/javascript; charset=utf-8",
-    ".svg": "image/svg+xml",
-    ".png": "image/png",
-    ".woff2": "font/woff2",
-    ".json": "application/json",
-}
 
 
 class ConsoleApp:
@@ -79,8 +71,8 @@ class ConsoleApp:
             *self._stream.routes(access),
             Route("/", _page_endpoint(access, "index.html")),
             Route("/password", _page_endpoint(access, "password.html")),
-            Route("/login", lambda _: static_file(STATIC, "login.html")),
-            *static_routes(STATIC),
+            Route("/login", lambda _: page(STATIC / "login.html")),
+            Mount("/static", StaticFolder(directory=STATIC)),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: routing_error})
         self.asgi: ASGIApp = SecurityMiddleware(app, (config.host, *config.names), tls=config.tls)
@@ -116,23 +108,26 @@ def _page_endpoint(access: AccessControl, name: str) -> Endpoint:
     """Return the endpoint of a page, which redirects to the log-in page without a session."""
 
     def serve(call: Call) -> Response:
-        return RedirectResponse("/login", 303) if call.session is None else static_file(STATIC, name)
+        return RedirectResponse("/login", 303) if call.session is None else page(STATIC / name)
 
     return access.endpoint(serve, needs_session=False)
 
 
-def static_routes(folder: Path) -> list[Route]:
-    """Return the route of a folder of static files."""
-    return [Route("/static/{path:path}", lambda request: static_file(folder, str(request.path_params["path"])))]
+class StaticFolder(StaticFiles):
+    """Static files that browsers revalidate at each use."""
+
+    def file_response(
+        self, full_path: PathLike, stat_result: os.stat_result, scope: Scope, status_code: int = 200
+    ) -> Response:
+        """Return the response of a file."""
+        response = super().file_response(full_path, stat_result, scope, status_code)
+        response.headers["Cache-Control"] = "no-cache"
+        return response
 
 
-def static_file(folder: Path, name: str) -> Response:
-    """Return a static file, or 404. Only paths from a listing of the folder are served."""
-    files = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
-    path = files.get(name)
-    if path is None or path.suffix not in _MEDIA_TYPES:
-        return error_response(ApiError(404, "not_found", "no such file"))
-    return FileResponse(path, media_type=_MEDIA_TYPES[path.suffix], headers={"Cache-Control": "no-cache"})
+def page(path: Path) -> Response:
+    """Return the response of a page."""
+    return FileResponse(path, headers={"Cache-Control": "no-cache"})
 
 
 async def routing_error(_request: Request, error: Exception) -> Response:
