@@ -51,6 +51,8 @@ NAMED_OTHERWISE = {
     "bytes_left": "B",
 }
 _FLOW = re.compile(r"Record: (?P<record>\w+)\. From: (?P<source>.*?)\. To: (?P<to>.*?)\. Delivery: (?P<delivery>.*?)\.")
+# A bar outside code; Python-Markdown shows a backslash inside code.
+_CELL_BAR = re.compile(r"\|(?=(?:[^`]*`[^`]*`)*[^`]*$)")
 _PARAMETERS = ("platform", "vehicle", "vessel", "site", "kind", "service")
 
 
@@ -117,8 +119,11 @@ def key_table(service: str = "") -> str:
     """Return the table of keys, of all or of those that one service sends or receives."""
     rows = [row for row in key_rows() if row.record]
     if not service:
-        header = ("key and meaning", "record", "from", "to", "delivery")
-        return table(header, [(f"`{r.key}`<br>{r.summary}", _record(r), r.source, r.to, r.delivery) for r in rows])
+        header = ("key and meaning", "record", "from, to", "delivery")
+        return table(
+            header,
+            [(f"`{r.key}`<br>{r.summary}", _record(r), f"from {r.source}<br>to {r.to}", r.delivery) for r in rows],
+        )
     cells = []
     for row in rows:
         for direction, names in (("in", row.to), ("out", row.source)):
@@ -244,7 +249,7 @@ def unit(name: str) -> str:
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+    return "\n".join("| " + " | ".join(_CELL_BAR.sub(r"\\|", cell) for cell in line) + " |" for line in lines)
 
 
 def _record(row: KeyRow) -> str:
@@ -280,7 +285,7 @@ def _range(schema: Mapping[str, Any]) -> str:
     if "const" in schema or "enum" in schema:
         return ", ".join(f"`{_toml(value)}`" for value in schema.get("enum", [schema.get("const")]))
     if "pattern" in schema:
-        return f"`{schema['pattern']}`"
+        return _pattern(schema["pattern"])
     if "maxLength" in schema:
         what = "bytes" if schema.get("format") == "binary" else "characters"
         return f"{schema.get('minLength', 0)} to {schema['maxLength']} {what}"
@@ -289,6 +294,14 @@ def _range(schema: Mapping[str, Any]) -> str:
     if low and high:
         return f"{low} to {high}"
     return f"from {low}" if low else f"to {high}" if high else ""
+
+
+def _pattern(pattern: str) -> str:
+    """Return a pattern without its anchors, or the list of values if it is `^(one|two)$`."""
+    inner = pattern.removeprefix("^").removesuffix("$")
+    if re.fullmatch(r"\(\w+(\|\w+)+\)", inner):
+        return ", ".join(f"`{_toml(value)}`" for value in inner[1:-1].split("|"))
+    return f"`{inner}`"
 
 
 def _number(value: float | None) -> str:
@@ -403,7 +416,11 @@ def _command_section(command: Command) -> str:
             rows.append(
                 (f"`{argument_name(action)}`", meaning, "" if "default" in meaning else _argument_default(action))
             )
-    return f"{text}\n\n{table(('argument', 'meaning', 'default'), rows)}" if rows else text
+    if not rows:
+        return text
+    if not any(default for *_, default in rows):
+        return f"{text}\n\n{table(('argument', 'meaning'), [row[:2] for row in rows])}"
+    return f"{text}\n\n{table(('argument', 'meaning', 'default'), rows)}"
 
 
 def argument_name(action: argparse.Action) -> str:
