@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
 
@@ -13,6 +14,10 @@ ORIGIN = b"o" * 16
 def send(store: Store, *payloads: bytes, consumer: str = "c", priority: int = 4) -> list[int]:
     with store.transaction() as tx:
         return [tx.send("k", consumer, p, encoding="e", priority=priority) for p in payloads]
+
+
+def queued_items(store: Store, queue: str, limit: int) -> tuple[OutboxItem, ...]:
+    return store.queued_items(queue, store.queued_numbers(queue, limit))
 
 
 def fail_within(store: Store, write: Callable[[Transaction], object]) -> None:

@@ -15,6 +15,7 @@ import pytest
 import zenoh
 from builders.common import eventually, free_port, publish_once
 from builders.records import decision_record, reconstructed_image
+from builders.store_steps import queued_items
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import router_config
@@ -212,7 +213,7 @@ def test_comment_is_stored_by_c2_when_the_command_ends(capsys, c2, router, tmp_p
     assert main([*arguments, "--router", router]) == 0
     assert "comment a-1 for vessel-1 accepted" in capsys.readouterr().out
     eventually(lambda: c2.gauges()["waiting_for_vessels"] == 1)
-    [item] = c2.store.queued("relay@vessel-1", 9)
+    [item] = queued_items(c2.store, "relay@vessel-1", 9)
     advice = wire.decode(Advice, item.payload, item.key)
     assert item.key == keys.advice("vessel-1")
     assert (advice.image_id, advice.image_version, advice.verdict, advice.author) == ("AAAA", 2, "mine_like", "ann")
@@ -227,7 +228,7 @@ def test_command_is_sent_before_a_comment(capsys, c2, router):
     assert main(["c2", "comment", "uuv-1/AAAA", "--vessel", "vessel-1", "--router", router]) == 0
     assert main(["c2", "command", "uuv-1/AAAA", "--vessel", "vessel-1", "--kind", "refine", "--router", router]) == 0
     eventually(lambda: c2.gauges()["waiting_for_vessels"] == 2)
-    assert [item.key for item in c2.store.queued("relay@vessel-1", 9)] == [
+    assert [item.key for item in queued_items(c2.store, "relay@vessel-1", 9)] == [
         keys.command("vessel-1", "refine"),
         keys.advice("vessel-1"),
     ]
@@ -347,4 +348,4 @@ def test_expand_and_its_former_name_send_the_same_record(kind, capsys, c2, route
     arguments = ["c2", "command", "uuv-1/AAAA", "--vessel", "vessel-1", "--kind", kind, "--router", router]
     assert main(arguments) == 0
     eventually(lambda: c2.gauges()["waiting_for_vessels"] == 1)
-    assert [item.key for item in c2.store.queued("relay@vessel-1", 9)] == [keys.command("vessel-1", "wider")]
+    assert [item.key for item in queued_items(c2.store, "relay@vessel-1", 9)] == [keys.command("vessel-1", "wider")]

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from builders.store_steps import send
+from builders.store_steps import queued_items, send
 
 from sonarpost.delivery.store import Store
 from sonarpost.errors import DeliveryError
@@ -70,7 +70,7 @@ def test_read_from_a_closed_store_raises(tmp_path: Path) -> None:
     store = Store(tmp_path / "s.db")
     store.close()
     with pytest.raises(DeliveryError, match="closed"):
-        store.queued("c", 1)
+        queued_items(store, "c", 1)
 
 
 def test_deleted_records_are_not_overwritten_on_disk(store: Store) -> None:

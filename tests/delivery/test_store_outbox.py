@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from builders.store_steps import fail_within, send
+from builders.store_steps import fail_within, queued_items, send
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,8 +17,10 @@ from sonarpost.delivery.store import Store
 
 def test_queued_record_is_unchanged(store: Store) -> None:
     assert send(store, b"payload") == [1]
-    assert store.queued("c", 9) == (OutboxItem("c", 1, "k", "e", 4, b"payload", hashlib.sha256(b"payload").digest()),)
-    assert store.queued("other", 9) == ()
+    assert queued_items(store, "c", 9) == (
+        OutboxItem("c", 1, "k", "e", 4, b"payload", hashlib.sha256(b"payload").digest()),
+    )
+    assert queued_items(store, "other", 9) == ()
 
 
 def test_numbers_are_consecutive_in_a_queue_and_never_reused(tmp_path: Path) -> None:
@@ -40,7 +42,7 @@ def test_failed_transaction_uses_no_number(store: Store) -> None:
     with pytest.raises(ZeroDivisionError):
         fail_within(store, lambda tx: tx.send("k", "c", b"lost", encoding="e"))
     assert send(store, b"1") == [1]
-    assert [item.payload for item in store.queued("c", 9)] == [b"1"]
+    assert [item.payload for item in queued_items(store, "c", 9)] == [b"1"]
 
 
 @given(st.lists(st.integers(1, 7), max_size=12))
@@ -49,10 +51,10 @@ def test_queue_order_is_priority_then_age(tmp_path_factory: pytest.TempPathFacto
     store = Store(tmp_path_factory.mktemp("order") / "s.db")
     for priority in priorities:
         send(store, b"x", priority=priority)
-    order = [(item.priority, item.seq) for item in store.queued("c", 99)]
+    order = [(item.priority, item.seq) for item in queued_items(store, "c", 99)]
     assert order == sorted(order)
     assert len(order) == len(priorities)
-    assert store.queued("c", 3) == store.queued("c", 99)[:3]
+    assert queued_items(store, "c", 3) == queued_items(store, "c", 99)[:3]
     store.close()
 
 
@@ -67,7 +69,7 @@ def test_two_stores_have_different_origins(tmp_path: Path) -> None:
 def test_refused_record_is_quarantined_with_its_reason(store: Store) -> None:
     send(store, b"bad")
     with store.transaction() as tx:
-        tx.quarantine_refused(store.queued("c", 1)[0], "no such record")
+        tx.quarantine_refused(queued_items(store, "c", 1)[0], "no such record")
     assert (store.outbox_depth(), store.refused_count()) == (0, 1)
     assert store._query("SELECT direction, key, payload, reason FROM refused") == [
         ("out", "k", b"bad", "no such record")

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from builders.store_steps import ORIGIN, fail_within, send
+from builders.store_steps import ORIGIN, fail_within, queued_items, send
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -26,7 +26,7 @@ def test_state_is_remembered_replaced_and_forgotten(tmp_path: Path) -> None:
     with store.transaction() as tx:
         tx.put_state("a", b"1")
         tx.put_state("b", b"")
-        assert tx.get_state("a") == b"1"
+        assert store.get_state("a") == b"1"
     with store.transaction() as tx:
         tx.put_state("a", b"2")
         tx.delete_state("absent")
@@ -35,7 +35,7 @@ def test_state_is_remembered_replaced_and_forgotten(tmp_path: Path) -> None:
     assert (store.get_state("a"), store.get_state("b"), store.get_state("absent")) == (b"2", b"", None)
     with store.transaction() as tx:
         tx.delete_state("a")
-        assert tx.get_state("a") is None
+        assert store.get_state("a") is None
     assert store.get_state("a") is None
     store.close()
 
@@ -65,7 +65,7 @@ def check_complete(path: Path, reported: int) -> None:
     done = int(store.get_state("n") or b"0")
     assert done in (reported, reported + 1)  # the last one can be committed and not yet reported
     inbox = [item.payload for item in store.inbox_items(10**6)]
-    queued = store.queued("c", 10**6)
+    queued = queued_items(store, "c", 10**6)
     # Handled records are queued and no longer in the inbox, in order, without duplicates or gaps.
     assert [*(item.payload for item in queued), *inbox] == [
         b"%d/%d" % (n, p) for n in range(1, done + 1) for p in range(5)
@@ -106,7 +106,7 @@ def test_full_disk_rolls_back_the_transaction_only(store: Store) -> None:
         write()
     assert store.get_state("small") is None
     assert store.inbox_depth() == 0
-    assert [item.payload for item in store.queued("c", 9)] == [b"before"]
+    assert [item.payload for item in queued_items(store, "c", 9)] == [b"before"]
     store._query("PRAGMA max_page_count=1000000")
     write()
     assert (store.get_state("small"), store.inbox_depth()) == (b"1", 1)
@@ -116,7 +116,7 @@ def test_threads_write_one_at_a_time(store: Store) -> None:
     def count() -> None:
         for _ in range(25):
             with store.transaction() as tx:
-                tx.put_state("n", str(int(tx.get_state("n") or b"0") + 1).encode())
+                tx.put_state("n", str(int(store.get_state("n") or b"0") + 1).encode())
                 tx.send("k", "c", b"x", encoding="e")
 
     threads = [threading.Thread(target=count) for _ in range(4)]
@@ -125,20 +125,20 @@ def test_threads_write_one_at_a_time(store: Store) -> None:
     for thread in threads:
         thread.join()
     assert store.get_state("n") == b"100"
-    assert [item.seq for item in store.queued("c", 999)] == list(range(1, 101))
+    assert [item.seq for item in queued_items(store, "c", 999)] == list(range(1, 101))
 
 
 def test_transaction_reads_its_own_writes(store: Store) -> None:
     def write(tx: Transaction) -> None:
         tx.put_state("a", b"1")
         tx.accept("k", b"x", ORIGIN, 3)
-        assert tx.get_state("a") == b"1"
+        assert store.get_state("a") == b"1"
         assert tx.was_received(ORIGIN, 3)
 
     with pytest.raises(ZeroDivisionError):
         fail_within(store, write)
     with store.transaction() as tx:
-        assert tx.get_state("a") is None
+        assert store.get_state("a") is None
         assert not tx.was_received(ORIGIN, 3)
 
 
@@ -156,14 +156,14 @@ def test_many_records_in_one_transaction_keep_order_and_numbers(store: Store) ->
         for payload in payloads:
             tx.accept("k", payload)
     assert numbers == list(range(1, len(payloads) + 1))
-    assert [item.payload for item in store.queued("c", 1000)] == payloads
+    assert [item.payload for item in queued_items(store, "c", 1000)] == payloads
     assert [item.payload for item in store.inbox_items(1000)] == payloads
     with store.transaction() as tx:
         assert tx.send("k", "c", b"x", encoding="") == len(payloads) + 1
         tx.remove_acknowledged("c", [*range(1, 50), 60, len(payloads) + 1])
         for done in store.inbox_items(40):
             tx.remove_handled(done)
-    assert [item.seq for item in store.queued("c", 1000)] == [*range(50, 60), *range(61, len(payloads) + 1)]
+    assert [item.seq for item in queued_items(store, "c", 1000)] == [*range(50, 60), *range(61, len(payloads) + 1)]
     assert [item.payload for item in store.inbox_items(1000)] == payloads[40:]
 
 

@@ -7,6 +7,7 @@ import sqlite3
 from pathlib import Path
 
 import pytest
+from builders.store_steps import queued_items
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,7 +24,7 @@ def send(store: Store, topic: str, edition: int, *, priority: int = 6, queue: st
 
 
 def queued(store: Store, queue: str = "c2") -> list[str]:
-    return [item.payload.decode().rstrip(".") for item in store.queued(queue, 99)]
+    return [item.payload.decode().rstrip(".") for item in queued_items(store, queue, 99)]
 
 
 def test_newer_edition_inherits_position_and_priority(store: Store) -> None:
@@ -32,7 +33,7 @@ def test_newer_edition_inherits_position_and_priority(store: Store) -> None:
     send(store, "c", 1, priority=6)
     assert send(store, "a", 2, priority=6) == 4
     assert queued(store) == ["a2", "b1", "c1"]
-    assert [item.priority for item in store.queued("c2", 9)] == [5, 5, 6]
+    assert [item.priority for item in queued_items(store, "c2", 9)] == [5, 5, 6]
 
 
 def test_edition_in_flight_and_newest_edition_are_kept(store: Store) -> None:
@@ -71,7 +72,7 @@ def test_newest_edition_is_sent_for_any_order_of_arrival(
         send(store, topic, edition)
         newest[topic] = max(newest.get(topic, 0), edition)
         if take_one:
-            for item in store.queued("c2", 1):
+            for item in queued_items(store, "c2", 1):
                 assert store.mark_in_flight("c2", (item.seq,))
                 name = item.payload.decode().rstrip(".")
                 sent.setdefault(name[0], set()).add(int(name[1:]))
@@ -154,7 +155,7 @@ def test_record_queued_during_the_read_is_not_reported_as_done(store: Store, sta
     store._reader.set_trace_callback(queue_during_read)
     done_up_to = store.done_up_to("c2")
     store._reader.set_trace_callback(None)
-    assert all(done_up_to < item.seq for item in store.queued("c2", 9))
+    assert all(done_up_to < item.seq for item in queued_items(store, "c2", 9))
 
 
 def test_done_up_to_must_be_below_the_sequence_number() -> None:

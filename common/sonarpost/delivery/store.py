@@ -16,8 +16,9 @@ import uuid
 from collections.abc import Iterator, Sequence, Set
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from sonarpost.delivery.records import SITE_SEPARATOR, InboxItem, OutboxItem
 from sonarpost.delivery.transaction import Transaction, runs
@@ -179,17 +180,17 @@ class Store:
         """Stop setting `event`."""
         self._outbox_listeners.remove(event)
 
-    def _query(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[object, ...]]:
+    def _query(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
         """Query the writing connection, after the transaction in progress."""
         return self._fetch(self._db, self._lock, sql, args)
 
-    def _read(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[object, ...]]:
+    def _read(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
         """Query committed data without waiting for a transaction in progress."""
         return self._fetch(self._reader, self._reader_lock, sql, args)
 
     def _fetch(
         self, db: sqlite3.Connection, lock: AbstractContextManager[object], sql: str, args: tuple[object, ...]
-    ) -> list[tuple[object, ...]]:
+    ) -> list[tuple[Any, ...]]:
         with lock:
             try:
                 return db.execute(sql, args).fetchall()
@@ -197,7 +198,7 @@ class Store:
                 raise DeliveryError(f"{self.path}: {error}") from error
 
     def _read_int(self, sql: str, args: tuple[object, ...] = ()) -> int:
-        return _int(self._read(sql, args)[0][0])
+        return int(self._read(sql, args)[0][0])
 
     # Outbox
 
@@ -205,32 +206,25 @@ class Store:
         """Return the names of the queues that hold records."""
         return tuple(str(row[0]) for row in self._read("SELECT DISTINCT consumer FROM outbox"))
 
-    def queued(self, queue: str, limit: int) -> tuple[OutboxItem, ...]:
-        """Return the first `limit` records of a queue: most urgent first, then oldest first."""
-        return self.queued_items(queue, self.queued_numbers(queue, limit))
-
     def queued_numbers(self, queue: str, limit: int) -> tuple[int, ...]:
         """Return the first `limit` sequence numbers of a queue: most urgent first, then oldest first."""
         found = self._read(
             "SELECT seq FROM outbox WHERE consumer = ? ORDER BY priority, place, seq LIMIT ?", (queue, limit)
         )
-        return tuple(_int(row[0]) for row in found)
+        return tuple(int(row[0]) for row in found)
 
     def queued_items(self, queue: str, numbers: Sequence[int]) -> tuple[OutboxItem, ...]:
         """Return those of the numbered records that are still queued, in the order of `numbers`."""
         sql = f"SELECT {_ITEM} FROM outbox WHERE consumer = ? AND seq BETWEEN ? AND ?"  # noqa: S608 constants
-        found = {}
-        for first, last in runs(numbers):
-            for q, s, k, e, p, d, h, position in self._read(sql, (queue, first, last)):
-                seq = _int(s)
-                found[seq] = OutboxItem(str(q), seq, str(k), str(e), _int(p), _bytes(d), _bytes(h), _int(position))
+        items = [OutboxItem(*row) for run in runs(numbers) for row in self._read(sql, (queue, *run))]
+        found = {item.seq: item for item in items}
         return tuple(found[number] for number in numbers if number in found)
 
     def mark_in_flight(self, queue: str, numbers: Sequence[int]) -> Set[int]:
         """Protect records from replacement by newer editions; return the numbers that are still queued."""
         sql = "SELECT seq FROM outbox WHERE consumer = ? AND seq BETWEEN ? AND ?"
         with self._lock:
-            queued = {_int(row[0]) for run in runs(numbers) for row in self._query(sql, (queue, *run))}
+            queued = {int(row[0]) for run in runs(numbers) for row in self._query(sql, (queue, *run))}
             self._in_flight.update((queue, seq) for seq in queued)
         return queued
 
@@ -266,7 +260,7 @@ class Store:
             " WHERE consumer = ? AND priority <= ?",
             (queue, max_priority),
         )[0]
-        return QueueDepth(_int(records), _int(size), None if oldest is None else float(str(oldest)))
+        return QueueDepth(int(records), int(size), oldest)
 
     def outbox_depth(self) -> int:
         """Return the number of records in all queues."""
@@ -294,23 +288,16 @@ class Store:
             max_bytes: Maximum sum of the payload sizes, at least one record; None for no limit.
         """
         if max_bytes is not None:
-            limit = self._count_within(limit, max_bytes)
+            sizes = self._read("SELECT LENGTH(payload) FROM inbox ORDER BY id LIMIT ?", (limit,))
+            totals = accumulate(size for (size,) in sizes)
+            limit = max(1, sum(total <= max_bytes for total in totals))
         found = self._read("SELECT id, key, payload FROM inbox ORDER BY id LIMIT ?", (limit,))
-        return tuple(InboxItem(_int(i), str(k), _bytes(p)) for i, k, p in found)
-
-    def _count_within(self, limit: int, max_bytes: int) -> int:
-        sizes = self._read("SELECT LENGTH(payload) FROM inbox ORDER BY id LIMIT ?", (limit,))
-        total = 0
-        for count, (size,) in enumerate(sizes):
-            total += _int(size)
-            if total > max_bytes:
-                return max(count, 1)
-        return limit
+        return tuple(InboxItem(*row) for row in found)
 
     def get_state(self, name: str) -> bytes | None:
         """Return the value under `name`, or None."""
         found = self._query("SELECT value FROM state WHERE name = ?", (name,))
-        return _bytes(found[0][0]) if found else None
+        return bytes(found[0][0]) if found else None
 
     def state_names(self, prefix: str) -> tuple[str, ...]:
         """Return the names of all values that start with `prefix`."""
@@ -386,13 +373,3 @@ def _lock_exclusively(path: Path) -> IO[bytes]:
         file.close()
         raise DeliveryError(f"{path}: in use by another process of this service") from error
     return file
-
-
-def _int(value: object) -> int:
-    assert isinstance(value, int)
-    return value
-
-
-def _bytes(value: object) -> bytes:
-    assert isinstance(value, bytes)
-    return value

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from functools import cache
 
 from sonarpost import wire
@@ -30,14 +31,13 @@ class UnitOfWork:
 
     Attributes:
         payload: Bytes of the handled record as received; empty if no record caused this unit of work.
+        counts: Increments of the health counters.
     """
 
     def __init__(self, payload: bytes = b"") -> None:
         self.payload = payload
-        self._sends: list[tuple[str, str, bytes, str, int, Topic | None]] = []
-        self._state: dict[str, bytes | None] = {}
-        self._quarantined: list[tuple[str, bytes, str]] = []
-        self._counts: dict[str, int] = {}
+        self.counts: Counter[str] = Counter()
+        self._writes: list[Callable[[Transaction], object]] = []
 
     def send(self, key: str, queue: str, record: Record, *, priority: int = 4, topic: Topic | None = None) -> None:
         """Queue a record; see `Transaction.send`."""
@@ -54,40 +54,29 @@ class UnitOfWork:
         topic: Topic | None = None,
     ) -> None:
         """Queue an encoded record; fields that this version does not know are preserved."""
-        self._sends.append((key, queue, payload, wire.encoding_of(record_type), priority, topic))
+        encoding = wire.encoding_of(record_type)
+        self._writes.append(lambda tx: tx.send(key, queue, payload, encoding=encoding, priority=priority, topic=topic))
 
     def put_state(self, name: str, value: bytes) -> None:
         """Store `value` under `name`."""
-        self._state[name] = value
+        self._writes.append(lambda tx: tx.put_state(name, value))
 
     def delete_state(self, name: str) -> None:
         """Delete the value under `name`."""
-        self._state[name] = None
+        self._writes.append(lambda tx: tx.delete_state(name))
 
     def quarantine(self, key: str, payload: bytes, reason: str) -> None:
         """Store data that cannot be used, with the reason, in the store's `refused` table."""
-        self._quarantined.append((key, payload, reason))
+        self._writes.append(lambda tx: tx.quarantine("in", key, payload, reason))
 
     def count(self, name: str, by: int = 1) -> None:
         """Increase a health counter when the unit of work is committed."""
-        self._counts[name] = self._counts.get(name, 0) + by
+        self.counts[name] += by
 
     def write(self, tx: Transaction) -> None:
         """Write everything into an open transaction."""
-        for key, queue, payload, encoding, priority, topic in self._sends:
-            tx.send(key, queue, payload, encoding=encoding, priority=priority, topic=topic)
-        for name, value in self._state.items():
-            if value is None:
-                tx.delete_state(name)
-            else:
-                tx.put_state(name, value)
-        for key, payload, reason in self._quarantined:
-            tx.quarantine("in", key, payload, reason)
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        """Increments of the health counters."""
-        return self._counts
+        for write in self._writes:
+            write(tx)
 
 
 class Transaction:
@@ -360,11 +349,6 @@ class Transaction:
     def delete_state(self, name: str) -> None:
         """Delete the value under `name`."""
         self._db.execute("DELETE FROM state WHERE name = ?", (name,))
-
-    def get_state(self, name: str) -> bytes | None:
-        """Return the value under `name`, or None."""
-        row = self._db.execute("SELECT value FROM state WHERE name = ?", (name,)).fetchone()
-        return bytes(row[0]) if row else None
 
 
 @cache
