@@ -1,21 +1,20 @@
 """Statistics of the modem: `CACST` of a reception and `CAXST` of a transmission.
 
 The layouts are those of version 6 and later. Missing fields are None, additional fields are kept as text. `CACST` of
-older firmware has the same order, without the version and with a time of day only; it is read too.
+older firmware has the same order, without the version and with a time of day only; it is read too. The attributes up to
+the version or `more` have the order of the fields in the sentence.
 """
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from collections.abc import Callable, Sequence
+from dataclasses import Field, dataclass, fields
+from typing import Any
 
 from sonarpost.modem.micromodem.nmea import FieldReader, Sentence
 
 FIRST_VERSIONED = 6
 """First version of `CACST` that includes its version."""
-
-_TIMESTAMP = re.compile(r"(\d{8})(\d{6})(?:\.(\d{1,9}))?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,51 +77,14 @@ class LinkStatistics:
         """Read `CACST`."""
         first = FieldReader(sentence, ("CACST",), 2).integer(0, "version", 0, 99)
         versioned = first >= FIRST_VERSIONED
-        fields = sentence.fields[1:] if versioned else sentence.fields
-        read = FieldReader(Sentence(sentence.kind, fields))
-        return cls(
-            mode=read.integer(0, "mode", 0, 255),
-            arrival_time=read.text(1),
-            clock=read.text(2),
-            mfd_peak=read.optional_integer(3, "mfd_peak"),
-            mfd_power_db=read.optional_integer(4, "mfd_pow"),
-            mfd_ratio=read.optional_integer(5, "mfd_ratio"),
-            spl_db=read.optional_integer(6, "spl"),
-            agn=read.optional_integer(7, "agn"),
-            shift_ainp=read.optional_integer(8, "shift_ainp"),
-            shift_ain=read.optional_integer(9, "shift_ain"),
-            shift_mfd=read.optional_integer(10, "shift_mfd"),
-            shift_p2b=read.optional_integer(11, "shift_p2b"),
-            rate=read.optional_integer(12, "rate"),
-            src=read.optional_integer(13, "src"),
-            dest=read.optional_integer(14, "dest"),
-            psk_error=read.optional_integer(15, "psk_err"),
-            packet_type=read.optional_integer(16, "pkt_type"),
-            nframes=read.optional_integer(17, "nframes"),
-            nbad=read.optional_integer(18, "nbad"),
-            snr_rss_db=read.optional_real(19, "snr_rss"),
-            snr_in_db=read.optional_real(20, "snr_in"),
-            snr_out_db=read.optional_real(21, "snr_out"),
-            snr_symbol_db=read.optional_real(22, "snr_sym"),
-            mse_db=read.optional_real(23, "mse"),
-            dqf=read.optional_integer(24, "dqf"),
-            doppler=read.optional_real(25, "doppler"),
-            noise_db=read.optional_real(26, "noise"),
-            carrier_hz=read.optional_real(27, "carrier"),
-            bandwidth_hz=read.optional_real(28, "bandwidth"),
-            version=first if versioned else None,
-            more=fields[29:],
-        )
+        texts = sentence.fields[1:] if versioned else sentence.fields
+        values = _read(FieldReader(Sentence(sentence.kind, texts)), fields(cls)[:-2])
+        return cls(**values, version=first if versioned else None, more=texts[len(values) :])
 
     @property
     def good(self) -> bool:
         """Whether the packet was received without an error."""
         return self.mode == 0
-
-    @property
-    def arrival_utc(self) -> datetime | None:
-        """Time of arrival on the modem's clock; None without a date, or when the clock was never set."""
-        return _utc(self.arrival_time)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,39 +119,16 @@ class TransmitStatistics:
     @classmethod
     def parse(cls, sentence: Sentence) -> TransmitStatistics:
         """Read `CAXST`."""
-        read = FieldReader(sentence, ("CAXST",), 3)
-        return cls(
-            version=read.integer(0, "version", 0, 99),
-            date=read.text(1),
-            time=read.text(2),
-            clock=read.text(3),
-            mode=read.optional_integer(4, "mode"),
-            probe_length=read.optional_integer(5, "probe_len"),
-            bandwidth_hz=read.optional_real(6, "bw"),
-            carrier_hz=read.optional_real(7, "carrier"),
-            rate=read.optional_integer(8, "rate"),
-            src=read.optional_integer(9, "src"),
-            dest=read.optional_integer(10, "dest"),
-            ack=read.optional_integer(11, "ack"),
-            frames_expected=read.optional_integer(12, "nexp"),
-            frames_sent=read.optional_integer(13, "nsent"),
-            packet_type=read.optional_integer(14, "pkt_type"),
-            nbytes=read.optional_integer(15, "nbytes"),
-            more=sentence.fields[16:],
-        )
-
-    @property
-    def started_utc(self) -> datetime | None:
-        """Start of the transmission on the modem's clock; None when the clock was never set."""
-        return _utc(self.date + self.time)
+        values = _read(FieldReader(sentence, ("CAXST",), 3), fields(cls)[:-1])
+        return cls(**values, more=sentence.fields[len(values) :])
 
 
-def _utc(timestamp: str) -> datetime | None:
-    match = _TIMESTAMP.fullmatch(timestamp)
-    if match is None:
-        return None
-    try:
-        whole = datetime.strptime(match[1] + match[2], "%Y%m%d%H%M%S").replace(tzinfo=UTC)
-    except ValueError:
-        return None  # a clock that was never set reports day 0 or hour 99; the other statistics are valid
-    return whole + timedelta(seconds=float(f"0.{match[3] or 0}"))
+def _read(read: FieldReader, attributes: Sequence[Field[Any]]) -> dict[str, Any]:
+    """Return the values of attributes, which have the order of the fields of the sentence, each read by its type."""
+    readers: dict[object, Callable[[int, str], object]] = {
+        "int": lambda index, name: read.integer(index, name, 0, 255),
+        "str": read.text,
+        "int | None": read.optional_integer,
+        "float | None": read.optional_real,
+    }
+    return {each.name: readers[each.type](index, each.name) for index, each in enumerate(attributes)}
