@@ -28,7 +28,7 @@ from research.link.schemes import (
     run_v1,
 )
 from sonarpost.errors import ConfigError
-from sonarpost.link.coding.channel_capacity import LossChannel, erasure_bound_frames
+from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.frames.v1.frame import MAX_FRAME_BYTES, MIN_FRAME_BYTES
 
 _Row = dict[str, object]
@@ -164,7 +164,8 @@ def measure_setting(
 def _row(scheme: str, result: SchemeResult, setting: Setting) -> _Row:
     delivered = result.delivered
     payload = sum(d.payload_bytes for d in delivered)
-    bound_frames = erasure_bound_frames(payload, setting.frame_bytes, setting.channel.loss)
+    # The capacity of an erasure channel is 1 - loss (Elias, "Coding for two noisy channels", 1955).
+    bound_frames = payload / (setting.frame_bytes * (1.0 - setting.channel.loss))
     return {
         "scheme": scheme,
         "loss": setting.channel.loss,

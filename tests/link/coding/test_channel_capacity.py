@@ -10,7 +10,7 @@ import pytest
 from sonarpost.errors import ConfigError
 from sonarpost.link.coding.channel_capacity import (
     LossChannel,
-    erasure_bound_frames,
+    RateSelector,
     frames_for,
     received_distribution,
     unseen_share,
@@ -61,11 +61,28 @@ def test_unseen_share_of_a_systematic_block() -> None:
     assert frames_for(1, LossChannel(0.3), 1e-9, 5) == 5
 
 
-def test_erasure_bound() -> None:
-    assert erasure_bound_frames(640, 64, 0.5) == 20
-
-
 @pytest.mark.parametrize(("loss", "burst"), [(-0.1, 1), (1.0, 1), (float("nan"), 1), (0.3, 0.5)])
 def test_channel_out_of_range_is_rejected(loss: float, burst: float) -> None:
     with pytest.raises(ConfigError, match="acoustic channel"):
         LossChannel(loss, burst)
+
+
+@pytest.mark.parametrize(
+    ("losses", "best"),
+    [({0: 0.0, 1: 0.0, 5: 0.0}, 5), ({0: 0.0, 1: 0.1, 5: 0.98}, 1), ({0: 0.1, 1: 0.95, 5: 1.0}, 0), ({0: 0.0}, 5)],
+)
+def test_rate_with_the_most_payload_per_second_is_selected(losses: dict[int, float], best: int) -> None:
+    selector = RateSelector((0, 1, 5), 0, losses={number: (loss, 50.0) for number, loss in losses.items()})
+    assert selector.select(100.0) == best
+
+
+def test_a_rate_without_a_measured_loss_stays() -> None:
+    selector = RateSelector((0, 1, 5), 1, losses={0: (0.0, 50.0), 1: (0.9, -9000.0)})
+    assert selector.select(100.0) == 1
+    assert selector.losses == {0: (0.0, 50.0)}, "old measurements are deleted"
+
+
+@pytest.mark.parametrize(("allowed", "first"), [((1, 9), 1), ((1,), 0), ((), 1)])
+def test_unknown_rate_is_rejected(allowed: tuple[int, ...], first: int) -> None:
+    with pytest.raises(ConfigError, match="rate selection"):
+        RateSelector(allowed, first)

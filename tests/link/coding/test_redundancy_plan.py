@@ -8,8 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from sonarpost.errors import ConfigError, StreamError
-from sonarpost.link.coding.channel_capacity import LossChannel, best_rate
+from sonarpost.errors import StreamError
+from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.coding.redundancy_plan import (
     GroupDistortion,
     arrivals,
@@ -20,7 +20,6 @@ from sonarpost.link.coding.redundancy_plan import (
     quality_curve,
     symbols_to_send,
 )
-from sonarpost.modem.micromodem import RATES
 
 
 def curve(scale: float, length: int = 400) -> np.ndarray:
@@ -141,12 +140,3 @@ def test_symbols_to_send() -> None:
     assert symbols_to_send(50, LossChannel(0.0), 2.0) == 50
     assert symbols_to_send(50, LossChannel(0.5), 0.0) == 100
     assert 50 <= symbols_to_send(50, LossChannel(0.5), 2.0) < 100 < symbols_to_send(50, LossChannel(0.5), -2.0)
-
-
-def test_best_rate() -> None:
-    assert best_rate({0: 0.0, 1: 0.0, 5: 0.0}, RATES).number == 5
-    assert best_rate({0: 0.0, 1: 0.1, 5: 0.98}, RATES).number == 1
-    assert best_rate({0: 0.1, 1: 0.95, 5: 1.0}, RATES).number == 0
-    for measured in ({}, {9: 0.1}, {1: 1.5}):
-        with pytest.raises(ConfigError, match="rate selection"):
-            best_rate(measured, RATES)

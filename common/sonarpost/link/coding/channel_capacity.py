@@ -1,4 +1,4 @@
-"""Model of the acoustic channel: how many frames arrive, what no scheme can exceed, and which rate carries most.
+"""Model of the acoustic channel: how many frames arrive, and which rate carries most.
 
 Frame losses follow a two-state Markov chain (Gilbert, "Capacity of a burst-noise channel", Bell System Technical
 Journal 39, 1960): the probability of a loss depends on whether the frame before was lost. `burst` is the mean number of
@@ -7,7 +7,7 @@ frames lost in a row; at 1 / (1 - loss) or below, losses are independent.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sonarpost.errors import ConfigError
 from sonarpost.link.frames.v1.frame import HEADER_BYTES
-from sonarpost.modem.micromodem import RATES, Rate
+from sonarpost.modem.micromodem import RATES
 
 Values = npt.NDArray[np.float64]
 
@@ -49,14 +49,9 @@ class LossChannel:
     def spread(self, depth: int) -> LossChannel:
         """Return the channel of frames that are sent `depth` frames apart."""
         memory = self.memory**depth
-        return (
-            LossChannel(self.loss, max(1.0, 1.0 / ((1.0 - self.loss) * (1.0 - memory)))) if memory > 0 else self.plain
-        )
-
-    @property
-    def plain(self) -> LossChannel:
-        """The channel with the same loss and independent losses."""
-        return LossChannel(self.loss)
+        if memory == 0.0:
+            return LossChannel(self.loss)
+        return LossChannel(self.loss, max(1.0, 1.0 / ((1.0 - self.loss) * (1.0 - memory))))
 
 
 def received_distribution(frames: int, channel: LossChannel) -> Values:
@@ -72,15 +67,6 @@ def received_distribution(frames: int, channel: LossChannel) -> Values:
         arriving = lost * (1 - stay_lost) + good * (1 - become_lost)
         lost, good = next_lost, np.concatenate([[0.0], arriving[:-1]])
     return (lost + good)[: frames + 1]
-
-
-def erasure_bound_frames(payload_bytes: float, frame_bytes: int, loss: float) -> float:
-    """Return the least average number of frames that any scheme must send for a payload.
-
-    The capacity of an erasure channel (Elias, "Coding for two noisy channels", 1955) is 1 - loss. Headers, checksums
-    and feedback are not included.
-    """
-    return payload_bytes / (frame_bytes * (1.0 - loss))
 
 
 def unseen_share(source_frames: int, sent_frames: int, channel: LossChannel) -> float:
@@ -107,29 +93,6 @@ def frames_for(source_frames: int, channel: LossChannel, unseen: float, limit: i
     return low
 
 
-def best_rate(measured_loss: Mapping[int, float], rates: Mapping[int, Rate]) -> Rate:
-    """Return the rate with the most payload per second, with an ideal erasure code.
-
-    Args:
-        measured_loss: Share of frames lost by rate number, of the allowed rates.
-        rates: Content and airtime of a packet of each rate.
-
-    Raises:
-        ConfigError: No rate, an unknown one, or a loss outside 0..1.
-    """
-    if not measured_loss:
-        raise ConfigError("rate selection", "measured_loss", {}, "at least one rate")
-    for number, loss in measured_loss.items():
-        if number not in rates or not 0.0 <= loss <= 1.0:
-            raise ConfigError("rate selection", f"rate {number}", loss, f"one of {sorted(rates)}, loss 0..1")
-
-    def goodput_bps(number: int) -> float:
-        rate = rates[number]
-        return 8 * rate.frames * (rate.frame_bytes - HEADER_BYTES) * (1 - measured_loss[number]) / rate.airtime_s
-
-    return rates[max(measured_loss, key=goodput_bps)]
-
-
 @dataclass(eq=False)
 class RateSelector:
     """Selects the rate with the most payload per second, and tests the others from time to time.
@@ -142,7 +105,6 @@ class RateSelector:
         current: The rate in use.
         memory_s: How long a measurement is valid.
         losses: Loss and time of the measurement, by rate.
-        rates: The rates by number.
 
     Raises:
         ConfigError: An unknown rate, or the current one is not allowed.
@@ -152,12 +114,10 @@ class RateSelector:
     current: int
     memory_s: float = 1800.0
     losses: dict[int, tuple[float, float]] = field(default_factory=dict)
-    rates: Mapping[int, Rate] = field(default_factory=lambda: RATES)
 
     def __post_init__(self) -> None:
-        unknown = [number for number in (*self.allowed, self.current) if number not in self.rates]
-        if unknown or self.current not in self.allowed:
-            expected = f"some of {sorted(self.rates)}, with the first"
+        if not set(self.allowed) <= set(RATES) or self.current not in self.allowed:
+            expected = f"some of {sorted(RATES)}, with the first"
             raise ConfigError("rate selection", "rates", tuple(self.allowed), expected)
 
     def record_loss(self, loss: float, now: float) -> None:
@@ -165,17 +125,16 @@ class RateSelector:
         self.losses[self.current] = (min(max(loss, 0.0), 1.0), float(now))
 
     def select(self, now: float) -> int:
-        """Make the best rate the current one and return it."""
-        by_speed = sorted(self.allowed, key=lambda number: self.rates[number].throughput_bps)
-        known: dict[int, float] = {}
+        """Make the best rate, with an ideal erasure code, the current one and return it."""
+        self.losses = {n: (loss, at) for n, (loss, at) in self.losses.items() if 0 <= now - at <= self.memory_s}
+        if self.current not in self.losses:
+            return self.current  # a rate on trial stays until its loss is measured
+        goodput_bps: dict[int, float] = {}
         assumed = 0.0
-        for number in by_speed:
-            loss, measured_s = self.losses.get(number, (assumed, -1.0))
-            if number in self.losses and not 0 <= now - measured_s <= self.memory_s:
-                del self.losses[number]
-                loss = assumed
-            known[number] = loss
-            assumed = max(assumed, loss) if number in self.losses else assumed
-        if self.current in self.losses:  # a rate on trial stays until its loss is measured
-            self.current = best_rate(known, self.rates).number
+        for rate in sorted((RATES[number] for number in self.allowed), key=lambda rate: rate.throughput_bps):
+            loss = self.losses[rate.number][0] if rate.number in self.losses else assumed
+            assumed = max(assumed, loss)
+            payload_bytes = rate.frames * (rate.frame_bytes - HEADER_BYTES)
+            goodput_bps[rate.number] = 8 * payload_bytes * (1 - loss) / rate.airtime_s
+        self.current = max(goodput_bps, key=lambda number: goodput_bps[number])
         return self.current
