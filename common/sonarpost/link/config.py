@@ -16,6 +16,8 @@ _QUEUE: Final = "acoustic queue"
 _GROUP_FRAMES: Final = 144
 _MAX_GROUP: Final = 60
 _FEEDBACK_GROUP: Final = 24
+_LOSS_ERROR: Final = 0.15
+"""Relative error of a measured loss. Planning for it costs less than 0.01 dB if the measurement is right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +27,6 @@ class SenderConfig:
     Attributes:
         frame_bytes: Length of a frame, 32..256.
         channels: Measured channel to each receiver; all receivers are equally important.
-        uncertainty: Relative error of a measured loss: detail is planned for losses that much smaller and greater too.
-            0.15 costs less than 0.01 dB if the measurement is right.
         feedback: Whether receivers send feedback. Without it each block is sent once, with layers.
         frames_per_image: Average number of frames for an image, previews included; only without feedback.
         stream_bytes: Bytes of a stream that are planned at first; only with feedback.
@@ -34,9 +34,6 @@ class SenderConfig:
         depth: Groups that are sent at a time; their frames are interleaved against bursts.
         group_delay_s: How long an image waits for others of its group.
         max_defer_s: With feedback, how long without one until a few more symbols are sent.
-        receiver_memory_s: How long after its last feedback a receiver counts.
-        block_symbols: With feedback, maximum number of source symbols of a block.
-        caution: See `redundancy_plan.symbols_to_send`.
         kept_images: Images to keep after they were sent, to refine them on request.
         announce: Whether contacts whose group waits are sent once before the detail of others.
 
@@ -46,7 +43,6 @@ class SenderConfig:
 
     frame_bytes: int = 64
     channels: tuple[LossChannel, ...] = (LossChannel(0.3),)
-    uncertainty: float = 0.15
     feedback: bool = False
     frames_per_image: float = 6.0
     stream_bytes: int = 512
@@ -54,31 +50,24 @@ class SenderConfig:
     depth: int = 2
     group_delay_s: float = 0.0
     max_defer_s: float = 600.0
-    receiver_memory_s: float = 3600.0
-    block_symbols: int = 96
-    caution: float = 1.5
     kept_images: int = 256
     announce: bool = False
 
     def __post_init__(self) -> None:
         _check(_LINK, "frame_bytes", self.frame_bytes, MIN_FRAME_BYTES, MAX_FRAME_BYTES)
         _check(_LINK, "channels", len(self.channels), 1, 64)
-        _check(_LINK, "uncertainty", self.uncertainty, 0, 0.9)
         _check(_LINK, "frames_per_image", self.frames_per_image, 1, 255)
         _check(_LINK, "stream_bytes", self.stream_bytes, 16, 65535)
         _check(_LINK, "group_images", self.group_images, 0, 120)
         _check(_LINK, "depth", self.depth, 1, WINDOW // 4)
         _check(_LINK, "group_delay_s", self.group_delay_s, 0, 86400)
         _check(_LINK, "max_defer_s", self.max_defer_s, 0.001, 86400)
-        _check(_LINK, "receiver_memory_s", self.receiver_memory_s, 0.001, 1e9)
-        _check(_LINK, "block_symbols", self.block_symbols, 1, 200)
-        _check(_LINK, "caution", self.caution, 0, 10)
         _check(_LINK, "kept_images", self.kept_images, 1, 65535)
 
     @property
     def planned_channels(self) -> tuple[LossChannel, ...]:
         """The channels that detail is planned for."""
-        factors = (1 - self.uncertainty, 1.0, 1 + self.uncertainty) if self.uncertainty else (1.0,)
+        factors = (1 - _LOSS_ERROR, 1.0, 1 + _LOSS_ERROR)
         return tuple(LossChannel(min(c.loss * f, 0.99), c.burst) for c in self.channels for f in factors)
 
     @property
@@ -110,7 +99,6 @@ class ReceiverConfig:
         contact_memory_s: Time after its last frame at which a contact is deleted.
         feedback_interval_frames: Feedback is due after this many frames ...
         feedback_interval_s: ... or this long after the last one, while something is missing.
-        presence_s: While frames arrive, feedback is due this long after the last one even if nothing is missing.
 
     Raises:
         ConfigError: A value out of range.
@@ -122,12 +110,11 @@ class ReceiverConfig:
     contact_memory_s: float = 6 * 3600.0
     feedback_interval_frames: int = 48
     feedback_interval_s: float = 60.0
-    presence_s: float = 600.0
 
     def __post_init__(self) -> None:
         _check(_LINK, "max_sources", self.max_sources, 1, 128)
         _check(_LINK, "max_contacts", self.max_contacts, 1, 65535)
-        for name in ("block_memory_s", "contact_memory_s", "feedback_interval_s", "presence_s"):
+        for name in ("block_memory_s", "contact_memory_s", "feedback_interval_s"):
             _check(_LINK, name, getattr(self, name), 0.001, 1e9)
         _check(_LINK, "feedback_interval_frames", self.feedback_interval_frames, 1, 65535)
 
@@ -146,7 +133,6 @@ class QueueConfig:
         max_defer_s: How long without feedback until a few more symbols are sent, in case all were lost.
         image_airtime_share: Share of frames for images, however many messages wait.
         aging_s: Waiting time that makes a message one level more urgent.
-        message_missed: Acceptable probability that a message is lost; the number of copies follows from it.
         max_messages: Maximum number of waiting messages.
         frames_per_image: See `SenderConfig`.
         stream_bytes: See `SenderConfig`.
@@ -166,7 +152,6 @@ class QueueConfig:
     max_defer_s: float = 120.0
     image_airtime_share: float = 0.25
     aging_s: float = 600.0
-    message_missed: float = 0.01
     max_messages: int = 2000
     frames_per_image: float = 6.0
     stream_bytes: int = 512
@@ -179,7 +164,6 @@ class QueueConfig:
         _check(_QUEUE, "feedback_memory_s", self.feedback_memory_s, 0.001, 86400.0)
         _check(_QUEUE, "image_airtime_share", self.image_airtime_share, 0.0, 1.0)
         _check(_QUEUE, "aging_s", self.aging_s, 0.001, 86400.0)
-        _check(_QUEUE, "message_missed", self.message_missed, 1e-6, 0.5)
         _check(_QUEUE, "max_messages", self.max_messages, 1, 100_000)
         if self.feedback not in ("auto", "never"):
             raise ConfigError(_QUEUE, "feedback", self.feedback, "auto, never")

@@ -61,6 +61,14 @@ def test_unseen_share_of_a_systematic_block() -> None:
     assert frames_for(1, LossChannel(0.3), 1e-9, 5) == 5
 
 
+def test_higher_loss_takes_more_frames() -> None:
+    found = [frames_for(24, LossChannel(loss), 0.004, 255) for loss in (0.0, 0.1, 0.3, 0.5)]
+    assert found[0] == 24
+    assert found == sorted(found)
+    assert frames_for(24, LossChannel(0.3, 8.0), 0.004, 255) > found[2]
+    assert frames_for(24, LossChannel(0.9), 0.004, 30) == 30
+
+
 @pytest.mark.parametrize(("loss", "burst"), [(-0.1, 1), (1.0, 1), (float("nan"), 1), (0.3, 0.5)])
 def test_channel_out_of_range_is_rejected(loss: float, burst: float) -> None:
     with pytest.raises(ConfigError, match="acoustic channel"):

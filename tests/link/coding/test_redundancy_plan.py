@@ -16,7 +16,6 @@ from sonarpost.link.coding.redundancy_plan import (
     copies,
     plan_layers,
     plan_unlayered,
-    preview_frames,
     quality_curve,
     symbols_to_send,
 )
@@ -120,14 +119,6 @@ def test_planning_takes_less_than_50_ms_per_image() -> None:
     started = time.process_time()
     assert plan_layers(GroupDistortion.of(curves, [30] * 24), 59, arrive, 80, 29) is not None
     assert (time.process_time() - started) / 24 < 0.05
-
-
-def test_previews_get_more_frames_at_higher_loss() -> None:
-    found = [preview_frames(24, LossChannel(loss)) for loss in (0.0, 0.1, 0.3, 0.5)]
-    assert found[0] == 24
-    assert found == sorted(found)
-    assert preview_frames(24, LossChannel(0.3, 8.0)) > found[2]
-    assert preview_frames(24, LossChannel(0.9), limit=30) == 30
 
 
 def test_number_of_copies() -> None:

@@ -12,14 +12,13 @@ import numpy as np
 from sonarpost.errors import FrameError
 from sonarpost.link.coding import erasure_code
 from sonarpost.link.coding.byte_ranges import Ranges
-from sonarpost.link.coding.channel_capacity import Values
+from sonarpost.link.coding.channel_capacity import Values, frames_for
 from sonarpost.link.coding.erasure_code import Layering, layered_symbols
 from sonarpost.link.coding.redundancy_plan import (
     GroupDistortion,
     arrivals,
     plan_layers,
     plan_unlayered,
-    preview_frames,
     symbols_to_send,
 )
 from sonarpost.link.config import SenderConfig
@@ -43,13 +42,16 @@ from sonarpost.link.state import PROGRESS, SEPARATE, Bounds, Byte, Count
 
 StreamSpan = tuple[ImageNumber, Byte, StreamPosition, StreamPosition]
 """Number and link of an image, and a part of its stream, [start, stop)."""
-TakeNumber = Callable[[], int]
 
 _AHEAD: Final = 32
 """Symbols to compute at a time: a matrix product of several costs little more than one."""
 _PREVIEW_URGENCY: Final = 2.0
 _MESSAGE_URGENCY: Final = 8.0
 _MAX_GROUP: Final = 60
+_MAX_SOURCE_SYMBOLS: Final = 96
+"""Source symbols of a block with feedback."""
+_PREVIEWS_UNSEEN: Final = 0.004
+"""Share of previews that may stay unknown at the planned loss."""
 _PREVIEW_SHARE: Final = 0.6
 """Greatest share of a group's frames for previews."""
 
@@ -213,7 +215,7 @@ def group_limit(config: SenderConfig, symbol_bytes: int) -> int:
     limit = config.group_size
     if config.feedback and not config.group_images:
         # Long frames hold more: at the fast rates a small group would fill the window with small blocks.
-        limit = max(limit, min(_MAX_GROUP, config.block_symbols * symbol_bytes // config.stream_bytes))
+        limit = max(limit, min(_MAX_GROUP, _MAX_SOURCE_SYMBOLS * symbol_bytes // config.stream_bytes))
     while limit > 1 and (
         _planned_previews(config, shape.source_symbols(limit), limit) >= erasure_code.MAX_SYMBOLS
         or (not config.feedback and limit * config.frames_per_image > erasure_code.MAX_SYMBOLS)
@@ -227,193 +229,143 @@ def numbers_needed(images: Sequence[OutgoingImage], config: SenderConfig, symbol
     if not config.feedback:
         return 2
     total = sum(image.goal_bytes(config.stream_bytes) + 8 for image in images)
-    return 3 + total // (config.block_symbols * symbol_bytes)
+    return 3 + total // (_MAX_SOURCE_SYMBOLS * symbol_bytes)
 
 
 def _planned_previews(config: SenderConfig, source: int, images: int) -> int:
     if config.feedback:
-        return symbols_to_send(source, config.worst, config.caution)
-    limit = round(_PREVIEW_SHARE * config.frames_per_image * images)
-    return max(preview_frames(source, channel.spread(config.depth + 1), limit=limit) for channel in config.channels)
+        return symbols_to_send(source, config.worst)
+    limit = min(round(_PREVIEW_SHARE * config.frames_per_image * images), erasure_code.MAX_SYMBOLS)
+    spread = [channel.spread(config.depth + 1) for channel in config.channels]
+    return max(frames_for(source, channel, _PREVIEWS_UNSEEN, limit) for channel in spread)
 
 
-def make_group(
-    images: Sequence[OutgoingImage], config: SenderConfig, symbol_bytes: int, take_number: TakeNumber, now: float
-) -> list[SendBlock]:
-    """Return the blocks of a group, previews first."""
-    shape = entry_shape(symbol_bytes)
-    planned = min(_planned_previews(config, shape.source_symbols(len(images)), len(images)), erasure_code.MAX_SYMBOLS)
-    for image in images:
-        image.sent = min(shape.prefix_bytes, len(image.stream))
-    previews = SendBlock(
-        kind=SymbolKind.PREVIEW,
-        number=take_number(),
-        symbol_bytes=symbol_bytes,
-        objects=(_preview_object(images, symbol_bytes),),
-        layering=None,
-        contacts=tuple(image.number for image in images),
-        urgency=_PREVIEW_URGENCY,
-        spans=tuple(image.span(0, image.sent) for image in images),
-        planned=planned,
-        last_activity_s=now,
-    )
-    for image in images:
-        if image.sent == shape.prefix_bytes == image.goal_bytes(config.stream_bytes):
-            image.sent -= 1  # a full entry cannot say that the stream ends; a piece of one byte does
-    if config.feedback:
-        return [previews, *unlayered_blocks(images, config, symbol_bytes, take_number, now)]
-    frames = min(round(config.frames_per_image * len(images)) - planned, erasure_code.MAX_SYMBOLS)
-    return [previews, *_layered(images, config, symbol_bytes, frames, take_number, now)]
+@dataclass(frozen=True)
+class BlockBuilder:
+    """Makes blocks of images and messages, and records in the images how much of them the blocks hold.
 
+    Attributes:
+        config: Configuration of the sender.
+        symbol_bytes: Length of a symbol.
+        take_number: Returns the number of the next block.
+        now: Seconds.
+    """
 
-def _preview_object(images: Sequence[OutgoingImage], symbol_bytes: int) -> bytes:
-    """Return the source symbols of a preview block as one object."""
-    shape = entry_shape(symbol_bytes)
-    entries = [image.preview(shape.prefix_bytes).pack(shape.entry_bytes) for image in images]
-    groups = [b"".join(entries[i : i + shape.entries]) for i in range(0, len(entries), shape.entries)]
-    return b"".join(group.ljust(symbol_bytes * shape.symbols, b"\0") for group in groups)
+    config: SenderConfig
+    symbol_bytes: int
+    take_number: Callable[[], int]
+    now: float
 
+    def group(self, images: Sequence[OutgoingImage]) -> list[SendBlock]:
+        """Return the blocks of a group, previews first."""
+        shape = entry_shape(self.symbol_bytes)
+        source = shape.source_symbols(len(images))
+        planned = min(_planned_previews(self.config, source, len(images)), erasure_code.MAX_SYMBOLS)
+        stops = [min(shape.prefix_bytes, len(image.stream)) for image in images]
+        entries = [image.preview(shape.prefix_bytes).pack(shape.entry_bytes) for image in images]
+        groups = [b"".join(entries[i : i + shape.entries]) for i in range(0, len(entries), shape.entries)]
+        data = b"".join(group.ljust(self.symbol_bytes * shape.symbols, b"\0") for group in groups)
+        previews = self._block(SymbolKind.PREVIEW, [data], images, [0] * len(images), stops, planned, _PREVIEW_URGENCY)
+        for image in images:
+            if image.sent == shape.prefix_bytes == image.goal_bytes(self.config.stream_bytes):
+                image.sent -= 1  # a full entry cannot say that the stream ends; a piece of one byte does
+        if self.config.feedback:
+            return [previews, *self.unlayered(images)]
+        frames = min(round(self.config.frames_per_image * len(images)) - planned, erasure_code.MAX_SYMBOLS)
+        detail = self._layered(images, frames)
+        return [previews] if detail is None else [previews, detail]
 
-def _layered(
-    images: Sequence[OutgoingImage],
-    config: SenderConfig,
-    symbol_bytes: int,
-    frames: int,
-    take_number: TakeNumber,
-    now: float,
-) -> Iterator[SendBlock]:
-    starts = [image.sent for image in images]
-    distortion = GroupDistortion.of([image.curve for image in images], starts)
-    if frames < 1 or distortion.total_bytes == 0:
-        return
-    # Lengths of 128 bytes and more take two bytes; most pieces are shorter or longer together.
-    guess = _pieces(images, starts, [min(s + 128, len(i.stream)) for i, s in zip(images, starts, strict=True)])
-    first, later = guess.overhead_bytes(), 1 + len(images) + CHECK_BYTES
-    arrive = arrivals(frames, config.planned_channels, config.depth)
-    plan = plan_layers(distortion, symbol_bytes, arrive, first, later)
-    unlayered = plan_unlayered(distortion, symbol_bytes, arrive, first)
-    if plan is None or (unlayered is not None and unlayered[1] >= plan.expected_db):
-        if unlayered is not None:
-            room = unlayered[0] * symbol_bytes
+    def unlayered(self, images: Sequence[OutgoingImage]) -> Iterator[SendBlock]:
+        """Yield blocks without layers that continue each image from `sent` to its goal."""
+        goals = {image.number: image.goal_bytes(self.config.stream_bytes) for image in images}
+        rest = [image for image in images if image.sent < goals[image.number]]
+        room = _MAX_SOURCE_SYMBOLS * self.symbol_bytes
+        while rest:
+            run = _run_that_fits(rest, goals, room)
+            starts = [image.sent for image in run]
+            stops = [goals[image.number] for image in run]
+            if len(run) == 1:
+                # Shortened to what a block holds, not extended: bytes beyond the goal only fill the last symbol.
+                limits = _fitted_stops(run, starts, stops, room, None)
+                stops = [min(a, b) for a, b in zip(limits, stops, strict=True)]
+            size = _pieces(run, starts, stops).overhead_bytes() + sum(stops) - sum(starts)
+            source = -(-size // self.symbol_bytes)
+            stops = _fitted_stops(run, starts, stops, source * self.symbol_bytes, None)
+            final = all(stop >= goals[image.number] for image, stop in zip(run, stops, strict=True))
+            yield self._unlayered(run, stops, source, symbols_to_send(source, self.config.worst), final=final)
+            rest = [image for image in rest if image.sent < goals[image.number]]
+
+    def message(self, number: int, data: bytes) -> SendBlock:
+        """Return a block without layers for a message that is longer than a frame."""
+        source = -(-(len(data) + MESSAGE_OVERHEAD_BYTES) // self.symbol_bytes)
+        packed = MessageObject(number, data).pack(source * self.symbol_bytes)
+        return self._block(SymbolKind.OBJECT, [packed], [], [], [], 0, _MESSAGE_URGENCY)
+
+    def _layered(self, images: Sequence[OutgoingImage], frames: int) -> SendBlock | None:
+        """Return a block with the layers of the greatest expected gain, or without layers if that is better."""
+        starts = [image.sent for image in images]
+        distortion = GroupDistortion.of([image.curve for image in images], starts)
+        if frames < 1 or distortion.total_bytes == 0:
+            return None
+        # Lengths of 128 bytes and more take two bytes; most pieces are shorter or longer together.
+        guess = _pieces(images, starts, [min(s + 128, len(i.stream)) for i, s in zip(images, starts, strict=True)])
+        first, later = guess.overhead_bytes(), 1 + len(images) + CHECK_BYTES
+        arrive = arrivals(frames, self.config.planned_channels, self.config.depth)
+        plan = plan_layers(distortion, self.symbol_bytes, arrive, first, later)
+        unlayered = plan_unlayered(distortion, self.symbol_bytes, arrive, first)
+        if unlayered is not None and (plan is None or unlayered[1] >= plan.expected_db):
+            source = unlayered[0]
+            room = source * self.symbol_bytes
             stops = _fitted_stops(images, starts, distortion.stops(room - first), room, None)
-            yield _unlayered_block(images, stops, unlayered[0], symbol_bytes, take_number(), frames, now, final=True)
-        return
-    if plan.expected_db <= 0:
-        return
-    layers = _layers(images, starts, distortion, plan.layering, symbol_bytes, first, later)
-    stops = [piece.stop for piece in layers[-1].pieces]
-    objects: list[bytes] = []
-    below: Sequence[PieceEnd] | None = None
-    for layer, length in zip(layers, plan.layering.lengths(symbol_bytes), strict=True):
-        objects.append(layer.pack(length, below))
-        below = layer.ends
-    yield SendBlock(
-        kind=SymbolKind.LAYERED,
-        number=take_number(),
-        symbol_bytes=symbol_bytes,
-        objects=tuple(objects),
-        layering=plan.layering,
-        contacts=tuple(image.number for image in images),
-        urgency=1.0,
-        spans=tuple(image.span(a, b) for image, a, b in zip(images, starts, stops, strict=True)),
-        planned=frames,
-        last_activity_s=now,
-    )
-    for image, stop in zip(images, stops, strict=True):
-        image.sent = stop
+            return self._unlayered(images, stops, source, frames, final=True)
+        if plan is None or plan.expected_db <= 0:
+            return None
+        lengths = plan.layering.lengths(self.symbol_bytes)
+        objects: list[bytes] = []
+        begins, total = starts, 0
+        below: Sequence[PieceEnd] | None = None
+        for number, length in enumerate(lengths):
+            total += length - (later if objects else first)
+            stops = _fitted_stops(images, begins, distortion.stops(total), length, below)
+            layer = _pieces(images, begins, stops, final=number == len(lengths) - 1)
+            objects.append(layer.pack(length, below))
+            begins, below = stops, layer.ends
+        return self._block(SymbolKind.LAYERED, objects, images, starts, begins, frames, layering=plan.layering)
 
+    def _unlayered(
+        self, images: Sequence[OutgoingImage], stops: Sequence[int], source: int, planned: int, *, final: bool
+    ) -> SendBlock:
+        """Return a block of `source` source symbols without layers that continues images to their stops."""
+        starts = [image.sent for image in images]
+        data = _pieces(images, starts, stops, final=final).pack(source * self.symbol_bytes)
+        return self._block(SymbolKind.OBJECT, [data], images, starts, stops, planned)
 
-def _layers(
-    images: Sequence[OutgoingImage],
-    starts: Sequence[int],
-    distortion: GroupDistortion,
-    layering: Layering,
-    symbol_bytes: int,
-    first: int,
-    later: int,
-) -> list[PieceList]:
-    """Return the pieces of each layer, the lowest first."""
-    layers: list[PieceList] = []
-    begins, total = list(starts), 0
-    lengths = layering.lengths(symbol_bytes)
-    for number, length in enumerate(lengths):
-        total += length - (later if layers else first)
-        below = layers[-1].ends if layers else None
-        stops = _fitted_stops(images, begins, distortion.stops(total), length, below)
-        layers.append(_pieces(images, begins, stops, final=number == len(lengths) - 1))
-        begins = stops
-    return layers
-
-
-def unlayered_blocks(
-    images: Sequence[OutgoingImage],
-    config: SenderConfig,
-    symbol_bytes: int,
-    take_number: TakeNumber,
-    now: float,
-) -> Iterator[SendBlock]:
-    """Yield blocks without layers that continue each image from `sent` to its goal."""
-    goals = {image.number: image.goal_bytes(config.stream_bytes) for image in images}
-    rest = [image for image in images if image.sent < goals[image.number]]
-    while rest:
-        run, room = _run_that_fits(rest, goals, config.block_symbols * symbol_bytes)
-        starts = [image.sent for image in run]
-        stops = [goals[image.number] for image in run]
-        if len(run) == 1:
-            # Shortened to what a block holds, not extended: bytes beyond the goal only fill the last symbol.
-            limits = _fitted_stops(run, starts, stops, min(room, config.block_symbols * symbol_bytes), None)
-            stops = [min(a, b) for a, b in zip(limits, stops, strict=True)]
-        size = _pieces(run, starts, stops).overhead_bytes() + sum(stops) - sum(starts)
-        source = -(-size // symbol_bytes)
-        stops = _fitted_stops(run, starts, stops, source * symbol_bytes, None)
-        final = all(stop >= goals[image.number] for image, stop in zip(run, stops, strict=True))
-        planned = symbols_to_send(source, config.worst, config.caution)
-        yield _unlayered_block(run, stops, source, symbol_bytes, take_number(), planned, now, final=final)
-        rest = [image for image in rest if image.sent < goals[image.number]]
-
-
-def _unlayered_block(
-    run: Sequence[OutgoingImage],
-    stops: Sequence[int],
-    source: int,
-    symbol_bytes: int,
-    number: int,
-    planned: int,
-    now: float,
-    *,
-    final: bool,
-) -> SendBlock:
-    """Return a block without layers that continues images to their stops, and update `sent` of the images."""
-    starts = [image.sent for image in run]
-    for image, stop in zip(run, stops, strict=True):
-        image.sent = stop
-    return SendBlock(
-        kind=SymbolKind.OBJECT,
-        number=number,
-        symbol_bytes=symbol_bytes,
-        objects=(_pieces(run, starts, stops, final=final).pack(source * symbol_bytes),),
-        layering=None,
-        contacts=tuple(image.number for image in run),
-        urgency=1.0,
-        spans=tuple(image.span(a, b) for image, a, b in zip(run, starts, stops, strict=True)),
-        planned=planned,
-        last_activity_s=now,
-    )
-
-
-def message_block(message_number: int, message: bytes, symbol_bytes: int, number: int, now: float) -> SendBlock:
-    """Return a block without layers for a message that is longer than a frame."""
-    source = -(-(len(message) + MESSAGE_OVERHEAD_BYTES) // symbol_bytes)
-    return SendBlock(
-        kind=SymbolKind.OBJECT,
-        number=number,
-        symbol_bytes=symbol_bytes,
-        objects=(MessageObject(message_number, message).pack(source * symbol_bytes),),
-        layering=None,
-        contacts=(),
-        urgency=_MESSAGE_URGENCY,
-        last_activity_s=now,
-    )
+    def _block(
+        self,
+        kind: SymbolKind,
+        objects: Sequence[bytes],
+        images: Sequence[OutgoingImage],
+        starts: Sequence[int],
+        stops: Sequence[int],
+        planned: int,
+        urgency: float = 1.0,
+        layering: Layering | None = None,
+    ) -> SendBlock:
+        spans = tuple(image.span(a, b) for image, a, b in zip(images, starts, stops, strict=True))
+        for image, stop in zip(images, stops, strict=True):
+            image.sent = stop
+        return SendBlock(
+            kind=kind,
+            number=self.take_number(),
+            symbol_bytes=self.symbol_bytes,
+            objects=tuple(objects),
+            layering=layering,
+            contacts=tuple(image.number for image in images),
+            urgency=urgency,
+            spans=spans,
+            planned=planned,
+            last_activity_s=self.now,
+        )
 
 
 def _pieces(
@@ -422,9 +374,7 @@ def _pieces(
     return PieceList(tuple(image.piece(a, b) for image, a, b in zip(images, starts, stops, strict=True)), final)
 
 
-def _run_that_fits(
-    rest: Sequence[OutgoingImage], goals: Mapping[int, int], room: int
-) -> tuple[list[OutgoingImage], int]:
+def _run_that_fits(rest: Sequence[OutgoingImage], goals: Mapping[int, int], room: int) -> list[OutgoingImage]:
     """Return images from the front whose rest fits one block (at least one), so that blocks become equally large."""
     sizes = [goals[image.number] - image.sent + 5 for image in rest]
     blocks = -(-(sum(sizes) + 16) // room)
@@ -435,7 +385,7 @@ def _run_that_fits(
             break
         run.append(image)
         used += size
-    return run, room
+    return run
 
 
 def _fitted_stops(

@@ -20,6 +20,8 @@ from sonarpost.link.frames.v1.payload_objects import NEVER_RECEIVED, WINDOW, Fee
 from sonarpost.link.state import Bounds, Count
 
 _MIN_FRAMES_TO_MEASURE: Final = 16
+_RECEIVER_MEMORY_S: Final = 3600.0
+"""How long after its last feedback a receiver counts."""
 
 
 @dataclass(eq=False)
@@ -73,7 +75,7 @@ class FeedbackTracker:
     ) -> tuple[list[SendBlock], list[SendBlock]]:
         """Plan the blocks according to a feedback; return the blocks to continue, and those that all receivers have."""
         self.receivers[receiver] = now
-        self.receivers = {r: at for r, at in self.receivers.items() if at + config.receiver_memory_s >= now}
+        self.receivers = {r: at for r, at in self.receivers.items() if at + _RECEIVER_MEMORY_S >= now}
         self.meters = {r: meter for r, meter in self.meters.items() if r in self.receivers}
         done = [block for block in blocks if self._is_done(block, feedback, config, now, receiver)]
         return [block for block in blocks if block not in done], done
@@ -91,7 +93,7 @@ class FeedbackTracker:
         if max(block.missing.get(known, block.source_symbols) for known in self.receivers) == 0:
             return True
         if need > 0:
-            more = symbols_to_send(block.missing[receiver], config.worst, config.caution)
+            more = symbols_to_send(block.missing[receiver], config.worst)
             block.planned = max(block.sent + more, block.planned if len(self.receivers) > 1 else 0)
         return False
 

@@ -17,14 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.errors import StreamError
-from sonarpost.link.coding.channel_capacity import LossChannel, Values, frames_for, received_distribution
+from sonarpost.link.coding.channel_capacity import LossChannel, Values, received_distribution
 from sonarpost.link.coding.erasure_code import DESCRIPTOR_SYMBOLS, MAX_LAYERS, MAX_STEP, SHARES, Layering
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
 
 Counts = npt.NDArray[np.int64]
 
-PREVIEWS_UNSEEN: Final = 0.004
-"""Share of previews that may stay unknown at the planned loss."""
 _PEAK_SQUARED: Final = 255.0**2
 _MIN_ERROR: Final = 0.065  # 60 dB
 _NO_IMAGE: Final = 3.0 * 55.0**2  # mean square error, against mid-grey, of an image that cannot be decoded at all
@@ -246,14 +244,6 @@ def arrivals(frames: int, channels: Sequence[LossChannel], depth: int) -> Values
     return mean
 
 
-def preview_frames(source_symbols: int, channel: LossChannel, unseen: float = PREVIEWS_UNSEEN, limit: int = 255) -> int:
-    """Return how many frames of a preview block to send so that at most `unseen` of its contacts stay unknown.
-
-    At most `limit`, but every source symbol once.
-    """
-    return frames_for(source_symbols, channel, unseen, limit=min(255, limit))
-
-
 def copies(channel: LossChannel, missed: float = 0.01, limit: int = 8) -> int:
     """Return how many copies of a frame to send so that all are lost with a probability of at most `missed`."""
     if channel.loss <= missed:
@@ -261,7 +251,7 @@ def copies(channel: LossChannel, missed: float = 0.01, limit: int = 8) -> int:
     return min(limit, math.ceil(math.log(missed) / math.log(channel.loss)))
 
 
-def symbols_to_send(missing_symbols: int, channel: LossChannel, caution: float) -> int:
+def symbols_to_send(missing_symbols: int, channel: LossChannel, caution: float = 1.5) -> int:
     """Return how many symbols to send before the next feedback.
 
     Fewer than the average need: feedback requests the rest, while symbols beyond the need are useless.

@@ -28,6 +28,8 @@ _SEGMENTS: Final = 2
 _MIN_LOSS_CHANGE: Final = 0.02
 _FRAMES_WITHOUT_FEEDBACK: Final = 64
 """After so many frames and a long time without feedback, no receiver is assumed to send any."""
+_MISSED: Final = 0.01
+"""Acceptable probability that all copies of a message are lost."""
 _URGENT: Final = 2
 """Messages up to this priority may be lost with a tenth of the usual probability."""
 _FRAMES_LOADED: Final = 8
@@ -280,7 +282,7 @@ class TransmitQueue(ImageSender):
         """Pass the next messages to the sender; the others wait here, where more urgent ones can overtake them."""
         room = _FRAMES_LOADED * self.sender.symbol_bytes
         loaded = sum(len(m.data) for m in self.sender.state.messages.waiting)
-        worst, missed = self.sender.config.worst, self.config.message_missed
+        worst = self.sender.config.worst
         while loaded < room and (message := self.messages.next(now, self.config.aging_s)) is not None:
             level = message.level(now, self.config.aging_s)
             self.messages.remove(message)
@@ -289,7 +291,7 @@ class TransmitQueue(ImageSender):
                 now,
                 priority=-level if level >= FILLER_PRIORITY else FILLER_PRIORITY - level,
                 lifetime_s=message.expires_s - now,
-                times=copies(worst, missed / 10 if message.priority <= _URGENT else missed),
+                times=copies(worst, _MISSED / 10 if message.priority <= _URGENT else _MISSED),
                 rises_s=message.added_s + (message.priority - FILLER_PRIORITY + 1) * self.config.aging_s,
             )
             loaded += len(message.data)

@@ -347,7 +347,7 @@ def test_invalid_images_messages_and_configurations_are_rejected() -> None:
     for data in (b"", bytes(4097)):
         with pytest.raises(FrameError, match="message"):
             sender.add_message(data, 0.0)
-    for wrong in ({"frame_bytes": 31}, {"channels": ()}, {"depth": 9}, {"caution": float("nan")}):
+    for wrong in ({"frame_bytes": 31}, {"channels": ()}, {"depth": 9}, {"max_defer_s": float("nan")}):
         with pytest.raises(ConfigError):
             SenderConfig(**wrong)  # type: ignore[arg-type]
     with pytest.raises(ConfigError):

@@ -40,6 +40,8 @@ from sonarpost.link.state import SEPARATE, Bounds, Byte, Count, Errors, PartRead
 _MAX_RECENT_MESSAGES: Final = 64
 _MAX_WITHOUT_RECORD: Final = 128
 """Images without a contact record that a receiver keeps of each sender."""
+_PRESENCE_S: Final = 600.0
+"""While frames arrive, feedback is due this long after the last one even if nothing is missing."""
 
 
 @dataclass(eq=False)
@@ -300,7 +302,7 @@ class PeerState:
         frames = self.frames - self.feedback_frames
         return (
             useful and (since_feedback_s >= config.feedback_interval_s or frames >= config.feedback_interval_frames)
-        ) or (frames > 0 and since_feedback_s >= config.presence_s)
+        ) or (frames > 0 and since_feedback_s >= _PRESENCE_S)
 
     def parts(self) -> dict[str, bytes]:
         """Return the state to save: the sender, its images, its blocks, and their symbols."""

@@ -12,13 +12,11 @@ from typing import Annotated, Final
 
 from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.coding.blocks import (
+    BlockBuilder,
     OutgoingImage,
     SendBlock,
     group_limit,
-    make_group,
-    message_block,
     numbers_needed,
-    unlayered_blocks,
 )
 from sonarpost.link.coding.channel_capacity import LossChannel, Values
 from sonarpost.link.coding.delivery_ledger import (
@@ -128,6 +126,9 @@ class V1Sender:
     @property
     def _segments_room(self) -> int:
         return segments_room(self.config.frame_bytes, self._protection)
+
+    def _builder(self, now: float) -> BlockBuilder:
+        return BlockBuilder(self.config, self.symbol_bytes, self._take_number, now)
 
     @property
     def is_idle(self) -> bool:
@@ -277,7 +278,7 @@ class V1Sender:
             self.waiting = self.waiting[limit:]
             for image in group:
                 image.announced = False
-            self.blocks += make_group(group, self.config, symbol_bytes, self._take_number, now)
+            self.blocks += self._builder(now).group(group)
 
     def _may_begin(self, group: Sequence[OutgoingImage]) -> bool:
         previews = sum(1 for b in self.blocks if b.kind == SymbolKind.PREVIEW and b.left > 0)
@@ -302,8 +303,8 @@ class V1Sender:
             return
         for image, start in found:
             image.goal, image.sent = image.goal_bytes(self.config.stream_bytes), start
-        make = make_group if found[0][1] == 0 else unlayered_blocks
-        self.blocks += make(group, self.config, self.symbol_bytes, self._take_number, now)
+        builder = self._builder(now)
+        self.blocks += builder.group(group) if found[0][1] == 0 else builder.unlayered(group)
 
     def _free_numbers(self) -> int:
         if not self.blocks:
@@ -324,7 +325,7 @@ class V1Sender:
     def _begin_long_messages(self, now: float) -> None:
         room = self._segments_room - 2
         while self._free_numbers() >= 1 and (message := self.state.messages.take_long(room)) is not None:
-            block = message_block(message.number, message.data, self.symbol_bytes, self._take_number(), now)
+            block = self._builder(now).message(message.number, message.data)
             block.planned = self._planned_without_feedback(block)
             self.blocks.append(block)
 
@@ -470,7 +471,7 @@ class V1Sender:
         image.goal = max(image.goal, image.sent, min(request.stream_bytes, len(image.stream)))
         if any(waiting.number == image.number for waiting in self.waiting):
             return True
-        made = list(unlayered_blocks([image], self.config, self.symbol_bytes, self._take_number, now))
+        made = list(self._builder(now).unlayered([image]))
         for block in made:
             if not self.config.feedback:
                 block.planned = self._planned_without_feedback(block)
