@@ -39,7 +39,7 @@ SIMULATED_WEIGHT: Final = 0.25
 """Weight of all simulated images relative to all real ones: their targets and sonar differ."""
 _CONTRAST_FLOOR: Final = 10.0
 DEFAULT_GRAIN_STRENGTH: Final = 0.5
-"""Share of the strength that restores the power of the texture; the default of `decode_with_speckle` of emb."""
+"""Share of the strength that restores the power of the texture."""
 
 
 def features(images: Sequence[Image]) -> Features:

@@ -23,12 +23,11 @@ from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.side_info import RegionOfInterest
 from sonarpost.codec.jit import compilation_log
 image = np.random.default_rng(0).integers(0, 256, (75, 48), dtype=np.uint8)
-valid = image > 3
 for model in ("standard", "structure"):
     codec = EmbCodec(model, send_texture=True)
-    stream = codec.encode_with_estimate(image, 90, region=RegionOfInterest(2, 2, 7, 7), valid=valid).stream
-    codec.extend(stream, image, 150, valid=valid)
-    codec.decode_with_speckle(stream)
+    stream = codec.encode_with_estimate(image, 90, region=RegionOfInterest(2, 2, 7, 7)).stream
+    codec.extend(stream, image, 150)
+    codec.speckle_layer(stream)
     codec.decode(stream[:20])
     c.decode(c.encode(image.astype(np.uint16) * 257, model=model))
 c.decode(c.encode(image, "vq"))

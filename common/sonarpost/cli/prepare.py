@@ -7,6 +7,7 @@ import logging
 import sys
 import time
 
+from sonarpost.codec.jit import compilation_log
 from sonarpost.codec.machine_code import prepare_machine_code
 
 
@@ -24,14 +25,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(_: argparse.Namespace) -> int:
     """Compile what the cache on disk does not hold; return 0."""
     started_s = time.monotonic()
-    prepared = prepare_machine_code(lambda step: print(f"Preparing machine code: {step}", flush=True))
-    if not prepared.compiled:
+    prepare_machine_code(lambda step: print(f"Preparing machine code: {step}", flush=True))
+    if not compilation_log.compiled:
         print("Machine code is ready: the cache holds all functions")
         return 0
-    folders = ", ".join(str(folder) for folder in prepared.cache_folders)
-    print(
-        f"Machine code is ready: compiled={prepared.compiled} after_s={time.monotonic() - started_s:.1f} in {folders}"
-    )
+    folders = ", ".join(sorted(str(folder) for folder in compilation_log.cache_folders))
+    after_s = time.monotonic() - started_s
+    print(f"Machine code is ready: compiled={compilation_log.compiled} after_s={after_s:.1f} in {folders}")
     return 0
 
 

@@ -3,41 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from sonarpost.codec.interface import Codec, ExtensibleCodec, Image
-from sonarpost.codec.jit import compilation_log
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.tile_search import IncrementalTileSet
 from sonarpost.codec.vq.tiles import cut_tiles
 
 
-@dataclass(frozen=True)
-class Preparation:
-    """Result of `prepare_machine_code`.
-
-    Attributes:
-        compiled: Number of functions compiled; 0 if the cache held all of them.
-        cache_folders: Folders with the machine code of the compiled functions.
-    """
-
-    compiled: int
-    cache_folders: tuple[Path, ...]
-
-
-def prepare_machine_code(progress: Callable[[str], None] | None = None) -> Preparation:
-    """Compile all functions of emb and vq that are not in the cache on disk.
+def prepare_machine_code(progress: Callable[[str], None] | None = None) -> None:
+    """Compile all functions of emb and vq that are not in the cache on disk; `jit.compilation_log` counts them.
 
     numba stores the cache beside the modules or, if set, in the folder of the environment variable NUMBA_CACHE_DIR.
 
     Args:
         progress: Called with the name of each step before it starts.
     """
-    already_compiled = compilation_log.compiled
     registry, tiles = default_registry(), load_default(10).tiles
     for name, resources in (
         ("emb, model standard", CodecResources(model="standard")),
@@ -50,8 +33,6 @@ def prepare_machine_code(progress: Callable[[str], None] | None = None) -> Prepa
     tile_set = IncrementalTileSet(tiles.tile_px, 100)
     tile_set.append(tiles.tiles[:100])
     tile_set.nearest(cut_tiles(_sample_snippet(), tiles.tile_px))
-    compiled = compilation_log.compiled - already_compiled
-    return Preparation(compiled, tuple(sorted(compilation_log.cache_folders)))
 
 
 def _run_all_paths(codec: Codec) -> None:

@@ -140,7 +140,7 @@ def test_quotient_without_division_is_exact(threshold: int, size: int) -> None:
 @given(st.integers(1, 2**40))
 def test_logarithm_is_linear_between_powers_of_two(value: int) -> None:
     power = value.bit_length() - 1
-    assert kernel._log2_eighths(value) == 8 * power + ((value << 3) >> power) - 8
+    assert kernel.log2_eighths(value) == 8 * power + ((value << 3) >> power) - 8
 
 
 def test_adaptation_increases_the_probability_of_a_repeated_bit() -> None:

@@ -26,7 +26,15 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image as Pillow
 
-from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decoder_input, encoder_input
+from sonarpost.codec.interface import (
+    DecodedImage,
+    Image,
+    Mask,
+    SnippetPixels,
+    decoder_input,
+    encoder_input,
+    squared_error,
+)
 from sonarpost.errors import ConfigError, StreamError
 
 DEFAULT_LEVELS = 4
@@ -152,7 +160,7 @@ def _best_candidate(image: Image, limit_bits: int) -> QuantisedImage | None:
     best, best_error = None, 0
     for candidate in _candidates(image, limit_bits):
         reconstructed = _enlarge(candidate.levels[candidate.symbols].astype(np.uint8), image.shape)
-        error = int(((reconstructed.astype(np.int64) - image) ** 2).sum())
+        error = squared_error(reconstructed, image)
         if best is None or error < best_error:
             best, best_error = candidate, error
         if error == 0:

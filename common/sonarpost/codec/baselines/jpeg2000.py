@@ -25,7 +25,15 @@ from typing import ClassVar
 import numpy as np
 from PIL import Image as Pillow
 
-from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decoder_input, encoder_input
+from sonarpost.codec.interface import (
+    DecodedImage,
+    Image,
+    Mask,
+    SnippetPixels,
+    decode_whole_body,
+    encoder_input,
+    squared_error,
+)
 from sonarpost.errors import ConfigError, StreamError
 
 RAW_CODEC_ID = 0x02
@@ -138,17 +146,8 @@ class Jpeg2000Codec:
         return header.pack() + self._body(best, grey.shape)
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
-        """Reconstruct the image (see `Codec.decode`).
-
-        If the bytes before the first gap do not decode, all pixels are missing.
-        """
-        header, body, notes = decoder_input(self, stream, received)
-        try:
-            return DecodedImage.without_gaps(self._decode_body(body, (header.height_px, header.width_px)), notes)
-        except StreamError as error:
-            if received is None or received.all():
-                raise
-            return DecodedImage.all_missing(header, [*notes, f"nothing can be decoded: {error}"])
+        """Reconstruct the image (see `decode_whole_body`)."""
+        return decode_whole_body(self, stream, received, self._decode_body)
 
     def _decode_body(self, body: bytes, shape: tuple[int, int]) -> Image:
         if not self.packets_only:
@@ -167,7 +166,6 @@ class Jpeg2000Codec:
 
     def _candidates(self, grey: Image, header_bytes: int, budget_bytes: int | None) -> Iterator[_Candidate]:
         """Yield the best candidate within the budget for each number of decompositions and each brightness offset."""
-        height_px, width_px = grey.shape
         shifts = {0}
         if self.packets_only:
             centre = (128 - int(grey.sum(dtype=np.int64)) // grey.size) // _SHIFT_STEP
@@ -183,8 +181,10 @@ class Jpeg2000Codec:
                 else:
                     packets = _search(shifted, decompositions, budget_bytes - overhead)
                 if packets is not None:
-                    reconstructed = _shifted(_decode(codestream(height_px, width_px, decompositions, packets)), -shift)
-                    error = int(((reconstructed.astype(np.int64) - grey) ** 2).sum())
+                    reconstructed = _shifted(
+                        _decode(codestream(grey.shape[0], grey.shape[1], decompositions, packets)), -shift
+                    )
+                    error = squared_error(reconstructed, grey)
                     yield _Candidate(decompositions, shift, packets, error)
 
 

@@ -23,13 +23,22 @@ import importlib.util
 import io
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
 from PIL import Image as Pillow
 from PIL import features
 
-from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decoder_input, encoder_input
+from sonarpost.codec.interface import (
+    DecodedImage,
+    Image,
+    Mask,
+    SnippetPixels,
+    decode_whole_body,
+    encoder_input,
+    squared_error,
+)
 from sonarpost.errors import ConfigError, StreamError
 
 DEFAULT_QUALITY = 30
@@ -111,18 +120,8 @@ class StillImageCodec:
         return header.pack() + body
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:
-        """Reconstruct the image (see `Codec.decode`).
-
-        If the bytes before the first gap do not decode, all pixels are missing.
-        """
-        header, body, notes = decoder_input(self, stream, received)
-        try:
-            image = _decode(self.format, body, (header.height_px, header.width_px))
-            return DecodedImage.without_gaps(image, notes)
-        except StreamError as error:
-            if received is None or received.all():
-                raise
-            return DecodedImage.all_missing(header, [*notes, f"nothing can be decoded: {error}"])
+        """Reconstruct the image (see `decode_whole_body`)."""
+        return decode_whole_body(self, stream, received, partial(_decode, self.format))
 
 
 def _search_quality(image_format: StillImageFormat, grey: Image, limit_bytes: int) -> bytes | None:
@@ -140,7 +139,7 @@ def _search_quality(image_format: StillImageFormat, grey: Image, limit_bytes: in
             high = quality - 1
             continue
         low = quality + 1
-        error = int(((_decode(image_format, body, grey.shape).astype(np.int64) - grey) ** 2).sum())
+        error = squared_error(_decode(image_format, body, grey.shape), grey)
         if best is None or error < best_error:
             best, best_error = body, error
     return best

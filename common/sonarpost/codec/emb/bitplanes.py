@@ -146,7 +146,8 @@ def reconstructed_coefficients(state: CoefficientState, model: Model, region: Re
 def image_features(state: CoefficientState, mean: int) -> tuple[int, int, int]:
     """Return the image features of the enhancer: threshold, mean level, share of significant coefficients."""
     share = 8192 * int(np.count_nonzero(state.lower)) // (state.layout.height_px * state.layout.width_px)
-    return _log2_eighths(state.threshold) - 96, _log2_eighths(max(mean, 4)) - 48, _log2_eighths(share + 16) - 56
+    threshold, level, amount = (kernel.log2_eighths(value) for value in (state.threshold, max(mean, 4), share + 16))
+    return threshold - 96, level - 48, amount - 56
 
 
 def _last_layer(model: Model) -> I64:
@@ -160,12 +161,7 @@ def _density(state: CoefficientState, band: list[int]) -> int:
     start = band[OFFSET] - 2 * band[STRIDE] - 2
     stop = start + (band[HEIGHT] + 4) * band[STRIDE]
     significant = int(np.count_nonzero(state.lower[start:stop]))
-    return _log2_eighths((2048 * significant + 512) // (cells + 1) + 1) - 40
-
-
-def _log2_eighths(value: int) -> int:
-    power = value.bit_length() - 1
-    return 8 * power + ((value << 3) >> power) - 8
+    return kernel.log2_eighths((2048 * significant + 512) // (cells + 1) + 1) - 40
 
 
 def _set_band_features(features: I32, band: list[int], threshold: int, mean: int, density: int) -> None:
@@ -173,7 +169,7 @@ def _set_band_features(features: I32, band: list[int], threshold: int, mean: int
     if band[ORIENT] != LL:
         values[min(band[LEVEL], 4) - 1] = 32
         values[3 + band[ORIENT]] = 32
-    values[7] = min(_log2_eighths(threshold) - 104, 36)
-    values[8] = _log2_eighths(max(mean, 4)) - 48
+    values[7] = min(kernel.log2_eighths(threshold) - 104, 36)
+    values[8] = kernel.log2_eighths(max(mean, 4)) - 48
     values[9] = density
     features[kernel.BAND_FEATURES :] = values

@@ -17,7 +17,7 @@ from sonarpost.codec.emb import CODEC_IDS, DEFAULT_MODEL, NAME, transform
 from sonarpost.codec.emb.bitplanes import constrained_targets
 from sonarpost.codec.emb.coder import CoefficientState
 from sonarpost.codec.emb.decode import DecodedCoefficients, decoded_image, image_before_enhancer, read_body
-from sonarpost.codec.emb.encode import MAX_BODY_BYTES, TrialEncoder, error_by_length, fill_invalid
+from sonarpost.codec.emb.encode import MAX_BODY_BYTES, TrialEncoder, error_by_length
 from sonarpost.codec.emb.model import Model, shipped_models
 from sonarpost.codec.emb.rate_distortion_opt import TargetCoefficients, target_coefficients
 from sonarpost.codec.emb.side_info import MEAN_STEP, RegionOfInterest, SideInfo, region_weights
@@ -100,12 +100,7 @@ class EmbCodec:
         return self.encode_with_estimate(image, budget_bytes).stream
 
     def encode_with_estimate(
-        self,
-        image: SnippetPixels,
-        budget_bytes: int | None = None,
-        *,
-        region: RegionOfInterest | None = None,
-        valid: Mask | None = None,
+        self, image: SnippetPixels, budget_bytes: int | None = None, *, region: RegionOfInterest | None = None
     ) -> Encoded:
         """Encode and estimate the error of each prefix, from which the link computes its redundancy.
 
@@ -113,14 +108,11 @@ class EmbCodec:
             image: As for `encode`.
             budget_bytes: As for `encode`.
             region: Region of interest, which gets more of the bits. Costs 2 bytes.
-            valid: Same shape as the image, False for pixels without survey data; these are not sent.
 
         Raises:
-            StreamError: As for `encode`, or `valid` has another shape.
+            StreamError: As for `encode`.
         """
         grey, header = encoder_input(self, image)
-        if valid is not None:
-            grey = fill_invalid(grey, valid)
         budget = max(64, grey.size // 25) if budget_bytes is None else budget_bytes
         limit = min(budget - header.size, MAX_BODY_BYTES)
         if limit < MIN_BODY_BYTES:
@@ -133,21 +125,9 @@ class EmbCodec:
         estimate = error_by_length(best.curve, len(best.body), header.size, grey.size)
         return Encoded(header.pack() + best.body, estimate)
 
-    def extend(self, stream: bytes, image: SnippetPixels, budget_bytes: int, *, valid: Mask | None = None) -> bytes:
-        """Return a longer stream of the same snippet (see `ExtensibleCodec.extend`).
-
-        Args:
-            stream: A stream of this snippet.
-            image: The snippet, as passed to `encode`.
-            budget_bytes: Length of the longer stream.
-            valid: As passed to `encode_with_estimate`.
-
-        Raises:
-            StreamError: As for `encode` and `decode`, or the sizes of snippet and stream differ.
-        """
+    def extend(self, stream: bytes, image: SnippetPixels, budget_bytes: int) -> bytes:
+        """Return a longer stream of the same snippet (see `ExtensibleCodec.extend`)."""
         grey, _ = encoder_input(self, image)
-        if valid is not None:
-            grey = fill_invalid(grey, valid)
         model, header = _model_of(stream, self.network)
         if grey.shape != (header.height_px, header.width_px):
             raise StreamError("image", "shape", grey.shape, f"the stream's {(header.height_px, header.width_px)}")
@@ -174,7 +154,9 @@ class EmbCodec:
         return DecodedImage.without_gaps(decoded_image(state, side, model), notes)
 
     def speckle_layer(self, stream: bytes) -> npt.NDArray[np.int16]:
-        """Return the synthetic speckle that the decoded image lacks; see `speckle_synthesis.synthesise_speckle`.
+        """Return the synthetic speckle that the decoded image lacks, as grey levels to add, shape of the image, int16.
+
+        For viewing, add half of it and clip. Do not measure on the result.
 
         Raises:
             StreamError: As for `decode`, or the stream carries no texture levels.
@@ -183,15 +165,6 @@ class EmbCodec:
         if side.texture is None:
             raise StreamError("stream", "texture", None, "a stream encoded with send_texture")
         return synthesise_speckle(decoded_image(state, side, model), state.layout, side.texture)
-
-    def decode_with_speckle(self, stream: bytes) -> Image:
-        """Return the image with synthetic speckle at half strength, for viewing. Do not measure on it.
-
-        Raises:
-            StreamError: As for `speckle_layer`.
-        """
-        layer = self.speckle_layer(stream).astype(np.int32)
-        return np.clip(self.decode(stream).image + (layer >> 1), 0, 255).astype(np.uint8)
 
     def decode_before_enhancer(self, stream: bytes) -> DecodedCoefficients:
         """Return the image before the enhancer, the input for its training.

@@ -17,7 +17,7 @@ from sonarpost.codec.emb.bitplanes import code_planes, image_features, reconstru
 from sonarpost.codec.emb.coder import Coder, CoefficientState
 from sonarpost.codec.emb.kernel import I32, I64
 from sonarpost.codec.emb.model import DILATIONS, Model
-from sonarpost.codec.emb.side_info import SideInfo, read_side_info
+from sonarpost.codec.emb.side_info import SideInfo, code_side_info
 from sonarpost.codec.emb.transform import UNIT, Layout
 from sonarpost.codec.interface import Image
 from sonarpost.codec.jit import jit
@@ -50,7 +50,7 @@ def read_body(body: bytes, layout: Layout, model: Model) -> tuple[CoefficientSta
         model: The model that encoded it.
     """
     coder, state = Coder.reader(body), CoefficientState(layout)
-    side = read_side_info(coder, model)
+    side = code_side_info(coder, model, SideInfo(0, 0))
     if side.start_step >= 0:
         code_planes(coder, state, model, np.zeros(layout.cells, np.int32), side)
     return state, side

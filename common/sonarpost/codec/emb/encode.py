@@ -21,10 +21,8 @@ from sonarpost.codec.emb.decode import grey_of
 from sonarpost.codec.emb.kernel import I64
 from sonarpost.codec.emb.model import Model
 from sonarpost.codec.emb.rate_distortion_opt import TargetCoefficients
-from sonarpost.codec.emb.side_info import RegionOfInterest, SideInfo, write_side_info
-from sonarpost.codec.interface import MAX_SIDE_PX, Image, Mask
-from sonarpost.codec.jit import jit
-from sonarpost.errors import StreamError
+from sonarpost.codec.emb.side_info import RegionOfInterest, SideInfo, code_side_info
+from sonarpost.codec.interface import MAX_SIDE_PX
 
 MAX_BODY_BYTES: Final = 0xFFFF
 MAX_PIXELS: Final = MAX_SIDE_PX * MAX_SIDE_PX
@@ -40,10 +38,10 @@ SEARCHES: Final[tuple[tuple[int, int, tuple[int, ...], int], ...]] = (
 (`next_step`). The trials take about 100 ms for 140 x 80 px."""
 PERCEPTUAL_SEARCHES: Final = (*SEARCHES[:-2], SEARCHES[-1])
 """The same for perceptual models, whose long streams have more planes."""
-_FILL_ROUNDS: Final = 24
 # (0.01 * 255)^2 and (0.03 * 255)^2, times 2^16.
 _SSIM_C1: Final = 426148
 _SSIM_C2: Final = 3835331
+_TAPS: Final = (1, 8, 28, 56, 70, 56, 28, 8, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +80,7 @@ class TrialEncoder:
         """Write a body with the start step of `side`."""
         coder, state = Coder.writer(self.limit, self.prefix), CoefficientState(targets.layout)
         coder.curve[0] = int((targets.originals.astype(np.int64) ** 2).sum())
-        write_side_info(coder, self.model, side)
+        code_side_info(coder, self.model, side)
         coder.record_error()
         code_planes(coder, state, self.model, targets.targets, side, self.price, originals=targets.originals)
         if side.region is not None:
@@ -148,45 +146,6 @@ def _mean_of_neighbours(errors: dict[int, int], step: int, count: int) -> int:
     return sum(values) // len(values)
 
 
-def fill_invalid(image: Image, valid: Mask) -> Image:
-    """Return the image with smooth values in place of invalid pixels, which then cost almost no bits.
-
-    Each invalid pixel gets the mean of the smallest block (of sides 2, 4, 8, ...) with a valid pixel, and is smoothed
-    with its neighbours. The stream does not contain the mask; the decoder shows the fill.
-
-    Args:
-        image: Shape (height_px, width_px), uint8.
-        valid: Same shape.
-
-    Raises:
-        StreamError: The shapes differ.
-    """
-    if valid.shape != image.shape:
-        raise StreamError("image", "valid.shape", valid.shape, f"the image's {image.shape}")
-    if valid.all():
-        return image
-    if not valid.any():
-        return np.full_like(image, 128)
-    filled = _block_means(np.where(valid, image, 0).astype(np.int64), valid.astype(np.int64))
-    invalid = ~valid
-    for _ in range(_FILL_ROUNDS):
-        padded = np.pad(filled, 1, mode="edge")
-        neighbours = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]
-        filled[invalid] = ((neighbours + 2) >> 2)[invalid]
-    return filled.astype(np.uint8)
-
-
-def _block_means(total: I64, count: I64) -> I64:
-    """Return the mean of each cell, or of the block around it if its count is 0."""
-    if total.size == 1:
-        return total // np.maximum(count, 1)
-    height, width = total.shape
-    pad = ((0, height % 2), (0, width % 2))
-    halves = [np.pad(a, pad).reshape((height + 1) // 2, 2, (width + 1) // 2, 2).sum((1, 3)) for a in (total, count)]
-    coarse = _block_means(halves[0], halves[1]).repeat(2, 0).repeat(2, 1)[:height, :width]
-    return np.where(count > 0, total // np.maximum(count, 1), coarse)
-
-
 def error_by_length(curve: I64, body_bytes: int, header_bytes: int, pixels: int) -> npt.NDArray[np.float64]:
     """Return the mean squared error by stream length, from the squared error by number of bytes.
 
@@ -217,58 +176,34 @@ def structural_similarity(original: I64, decoded: I64) -> int:
         decoded: Same shape.
     """
     a, b = _block_sums(original), _block_sums(decoded)
-    half = int(_mean_similarity(a, b, 4, 0))
-    a, b = _block_sums(a), _block_sums(b)
-    return max(half, 1) * max(int(_mean_similarity(a, b, 16, 1)), 1)
+    half = _mean_similarity(a, b, 4)
+    quarter = _mean_similarity(_block_sums(a), _block_sums(b), 16, with_luminance=True)
+    return max(half, 1) * max(quarter, 1)
 
 
-@jit
 def _block_sums(plane: I64) -> I64:
     height, width = plane.shape[0] // 2, plane.shape[1] // 2
-    out = np.zeros((height, width), np.int64)
-    for y in range(height):
-        for x in range(width):
-            out[y, x] = (
-                plane[2 * y, 2 * x] + plane[2 * y, 2 * x + 1] + plane[2 * y + 1, 2 * x] + plane[2 * y + 1, 2 * x + 1]
-            )
-    return out
+    return np.asarray(plane[: 2 * height, : 2 * width].reshape(height, 2, width, 2).sum((1, 3)), np.int64)
 
 
-@jit
 def _blurred(plane: I64) -> I64:
     """Apply a binomial window of 9 x 9 taps, standard deviation 1.4, gain 65536; edges repeat."""
-    taps = (1, 8, 28, 56, 70, 56, 28, 8, 1)
-    height, width = plane.shape
-    across, out = np.zeros_like(plane), np.zeros_like(plane)
-    for y in range(height):
-        for x in range(width):
-            for k in range(9):
-                across[y, x] += taps[k] * plane[y, min(max(x + k - 4, 0), width - 1)]
-    for y in range(height):
-        for k in range(9):
-            line = min(max(y + k - 4, 0), height - 1)
-            for x in range(width):
-                out[y, x] += taps[k] * across[line, x]
-    return out
+    for _ in range(2):  # along the columns, then along the rows
+        length = plane.shape[0]
+        padded = np.pad(plane, ((4, 4), (0, 0)), mode="edge")
+        plane = sum((tap * padded[k : k + length] for k, tap in enumerate(_TAPS)), np.zeros_like(plane)).T
+    return plane
 
 
-@jit
-def _mean_similarity(a: I64, b: I64, unit: int, with_luminance: int) -> int:
+def _mean_similarity(a: I64, b: I64, unit: int, *, with_luminance: bool = False) -> int:
     """Return the mean structural similarity, times 2^14, of images in 1/`unit` grey."""
-    mean_a, mean_b = _blurred(a), _blurred(b)
-    square, product = _blurred(a * a + b * b), _blurred(a * b)
+    p, q = _blurred(a), _blurred(b)
     # In units of a squared mean (weights of 2^16, see below) and of 2^32 times a variance.
-    c1 = (np.int64(_SSIM_C1) * unit * unit) >> 2
-    c2 = (np.int64(_SSIM_C2) * unit * unit) << 16
-    total = np.int64(0)
-    for y in range(a.shape[0]):
-        for x in range(a.shape[1]):
-            p, q = mean_a[y, x], mean_b[y, x]
-            variances = (square[y, x] << 16) - p * p - q * q
-            covariance = 2 * ((product[y, x] << 16) - p * q)
-            similarity = (covariance + c2) // (((variances + c2) >> 14) + 1)
-            if with_luminance == 1:
-                p, q = p >> 9, q >> 9
-                similarity = similarity * ((2 * p * q + c1) // (((p * p + q * q + c1) >> 14) + 1)) >> 14
-            total += similarity
-    return int(total // (a.shape[0] * a.shape[1]))
+    c1, c2 = (_SSIM_C1 * unit * unit) >> 2, (_SSIM_C2 * unit * unit) << 16
+    variances = (_blurred(a * a + b * b) << 16) - p * p - q * q
+    covariance = 2 * ((_blurred(a * b) << 16) - p * q)
+    similarity = (covariance + c2) // (((variances + c2) >> 14) + 1)
+    if with_luminance:
+        p, q = p >> 9, q >> 9
+        similarity = similarity * ((2 * p * q + c1) // (((p * p + q * q + c1) >> 14) + 1)) >> 14
+    return int(similarity.sum() // similarity.size)

@@ -226,8 +226,8 @@ def _clip(value: int, limit: int) -> int:
 
 
 @jit
-def _log2_eighths(value: int) -> int:
-    """Return 8 log2(value) for value >= 1, linear between powers of two."""
+def log2_eighths(value: int) -> int:
+    """Return 8 log2(value) for value >= 1, linear between powers of two, as an integer."""
     power, rest = 0, value
     for step in (32, 16, 8, 4, 2, 1):
         if rest >> step:
@@ -367,7 +367,7 @@ def _context(  # noqa: C901, PLR0912, PLR0915  44 features, one after the other
     here = bands[row, LOW] + (y + 1) * low_stride + x + 1
     level = bands[row, LEVEL]
     grey = max(lows[here] >> level, 256)  # 1/64 grey, at least 4 grey
-    f[27] = min(_log2_eighths(grey), 120) - 80
+    f[27] = min(log2_eighths(grey), 120) - 80
     across = abs(lows[here + 1] - lows[here - 1])
     along = abs(lows[here + low_stride] - lows[here - low_stride])
     f[28], f[29] = _quotient(across * 4, threshold, inverse), _quotient(along * 4, threshold, inverse)
@@ -376,7 +376,7 @@ def _context(  # noqa: C901, PLR0912, PLR0915  44 features, one after the other
     )
     f[30] = _quotient(curvature * 2, threshold, inverse)
     neighbours = lows[here + 1] + lows[here - 1] + lows[here + low_stride] + lows[here - low_stride]
-    f[31] = min(_log2_eighths(max(neighbours >> (level + 2), 256)), 120) - 80
+    f[31] = min(log2_eighths(max(neighbours >> (level + 2), 256)), 120) - 80
 
 
 @jit

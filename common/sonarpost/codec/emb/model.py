@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -58,14 +58,8 @@ def _network_arrays(features: int, sign_features: int, sign_hidden: int) -> Arra
     )
 
 
-@dataclass(frozen=True)
-class ModelFormat:
-    """Format of a model file.
-
-    Attributes:
-        magic: First bytes of the file.
-        arrays: Name, shape and type of each array, in order.
-    """
+class ModelFormat(NamedTuple):
+    """Format of a model file: its first bytes; name, shape and type of each array, in order."""
 
     magic: bytes
     arrays: Arrays

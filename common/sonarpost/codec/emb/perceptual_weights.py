@@ -29,16 +29,12 @@ VARIANCE_OFFSET: Final = 150
 _WINDOWS: Final = ((1, 1), (1, 2), (2, 2))
 
 
+@lru_cache(maxsize=8)
 def initial_scales(weights: PerceptualWeights, layout: Layout) -> I32:
     """Return the scales of all coefficients by their level only, flat, int32. Do not modify the result."""
-    return _scales_by_level(tuple(weights.levels.tolist()), layout)
-
-
-@lru_cache(maxsize=8)
-def _scales_by_level(levels: tuple[int, ...], layout: Layout) -> I32:
     out = np.full(layout.cells, UNIT_SCALE, np.int32)
     for band in layout.bands.tolist():
-        out[cells_of(band)] = levels[0 if band[ORIENT] == LL else band[LEVEL]]
+        out[cells_of(band)] = weights.levels[0 if band[ORIENT] == LL else band[LEVEL]]
     return out
 
 

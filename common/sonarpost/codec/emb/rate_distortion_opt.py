@@ -19,20 +19,7 @@ from sonarpost.codec.emb.kernel import I32
 from sonarpost.codec.emb.model import PerceptualWeights
 from sonarpost.codec.emb.perceptual_weights import expected_scales, initial_scales
 from sonarpost.codec.emb.side_info import UNIT_WEIGHT
-from sonarpost.codec.emb.transform import (
-    HEIGHT,
-    HH,
-    HL,
-    LEVEL,
-    LH,
-    LL,
-    ORIENT,
-    WIDTH,
-    Layout,
-    Plane,
-    cells_of,
-)
-from sonarpost.codec.jit import jit
+from sonarpost.codec.emb.transform import HEIGHT, HH, HL, LEVEL, LH, LL, ORIENT, WIDTH, Layout, Plane, cells_of
 
 _BITS_A_COEFFICIENT: Final = 5
 """Approximate cost of a coefficient that is sent, with sign, refinement and its share of zeros."""
@@ -128,58 +115,9 @@ def _threshold(coefficients: Plane, body_bytes: int) -> int:
 def _optimal_step(plane: Plane, coefficients: Plane, layout: Layout) -> Plane:
     """Return the change of each coefficient that alone minimises the error of the image; flat, int64."""
     decoded, _ = transform.inverse(transform.from_flat(coefficients.astype(np.int32), layout), layout)
-    residual = plane - decoded
-    _correlate(residual, layout.sides)
-    height, width = (int(n) for n in layout.sides[layout.levels])
-    low = (transform.cosine_matrix(height) @ residual[:height, :width] + _HALF) >> transform.FRACTION_BITS
-    residual[:height, :width] = (low @ transform.cosine_matrix(width).T + _HALF) >> transform.FRACTION_BITS
     gradient = np.zeros(layout.cells, np.int64)
-    gradient[layout.position] = residual
+    gradient[layout.position] = transform.correlate(plane - decoded, layout)
     return (gradient * _step_sizes(layout) + (1 << (_STEP_BITS - 1))) >> _STEP_BITS
-
-
-@jit
-def _lift_transposed(line: Plane, n: int, first: int, constant: int) -> None:
-    """Transpose of `transform._lift`: every second value adds its share to its two neighbours."""
-    for i in range(first, n, 2):
-        share = (line[i] * constant + _HALF) >> transform.FRACTION_BITS
-        line[i - 1 if i > 0 else i + 1] += share
-        line[i + 1 if i + 1 < n else i - 1] += share
-
-
-@jit
-def _correlate_line(line: Plane, n: int, scratch: Plane) -> None:
-    """Transpose of `transform.synthesise_line`."""
-    if n == 1:
-        return
-    _lift_transposed(line, n, 1, -transform.ALPHA)
-    _lift_transposed(line, n, 0, -transform.BETA)
-    _lift_transposed(line, n, 1, -transform.GAMMA)
-    _lift_transposed(line, n, 0, -transform.DELTA)
-    low = (n + 1) // 2
-    for i in range(n):
-        if i % 2 == 0:
-            scratch[i // 2] = (line[i] * transform.GAIN_INVERSE + _HALF) >> transform.FRACTION_BITS
-        else:
-            scratch[low + i // 2] = (line[i] * transform.GAIN + _HALF) >> transform.FRACTION_BITS
-    line[:n] = scratch[:n]
-
-
-@jit
-def _correlate(plane: Plane, sides: I32) -> None:
-    """Replace the plane by its scalar product with each synthesis wavelet."""
-    line = np.zeros(max(plane.shape), np.int64)
-    scratch = np.zeros(max(plane.shape), np.int64)
-    for level in range(sides.shape[0] - 1):
-        height, width = sides[level, 0], sides[level, 1]
-        for x in range(width):
-            line[:height] = plane[:height, x]
-            _correlate_line(line, height, scratch)
-            plane[:height, x] = line[:height]
-        for y in range(height):
-            line[:width] = plane[y, :width]
-            _correlate_line(line, width, scratch)
-            plane[y, :width] = line[:width]
 
 
 @lru_cache(maxsize=8)
@@ -193,9 +131,8 @@ def _step_sizes(layout: Layout) -> Plane:
     for band in layout.bands.tolist():
         if not band[HEIGHT] or not band[WIDTH]:
             continue
-        level, orient = band[LEVEL], band[ORIENT]
-        down = columns[level - 1][int(orient in (LH, HH))] if orient != LL else columns[layout.levels][0]
-        across = rows[level - 1][int(orient in (HL, HH))] if orient != LL else rows[layout.levels][0]
+        level, orient = (band[LEVEL] - 1, band[ORIENT]) if band[ORIENT] != LL else (layout.levels, LL)
+        down, across = columns[level][int(orient in (LH, HH))], rows[level][int(orient in (HL, HH))]
         norms = (down[:, None] * across) >> _SQUARE_BITS
         at = cells_of(band)
         out[at] = (gains[at] << (_SQUARE_BITS + _STEP_BITS - 10)) // norms

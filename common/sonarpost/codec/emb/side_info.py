@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Final
 
 import numpy as np
@@ -112,39 +112,37 @@ class SideInfo:
         return self.mean_index * MEAN_STEP
 
 
+_WHOLE_IMAGE: Final = RegionOfInterest(0, 0, 15, 15)
+
+
 class _EndOfStreamError(Exception):
     """The bytes do not determine the next bit."""
 
 
-def write_side_info(coder: Coder, model: Model, side: SideInfo) -> None:
-    """Write side information. If the budget ends within it, the coder stops."""
-    _code(coder, model, side)
+def code_side_info(coder: Coder, model: Model, side: SideInfo) -> SideInfo:
+    """Write side information, or read what the stream determines of it.
 
+    If the budget ends within it, the coder stops.
 
-def read_side_info(coder: Coder, model: Model) -> SideInfo:
-    """Read the side information that the stream determines."""
-    return _code(coder, model, None)
-
-
-def _code(coder: Coder, model: Model, side: SideInfo | None) -> SideInfo:
+    Args:
+        coder: The range coder.
+        model: The networks.
+        side: Values to write; ignored when the coder reads.
+    """
     mean_index = -1
     try:
-        mean_index = _code_mean(coder, model, side.mean_index if side else 0)
-        step = side.start_step if side else 0
-        start_step = 2 * _code_number(coder, 2, step >> 1) + _code_bit(coder, step & 1, _ODD_STEP)
+        mean_index = _code_mean(coder, model, side.mean_index)
+        start_step = 2 * _code_number(coder, 2, side.start_step >> 1) + _code_bit(coder, side.start_step & 1, _ODD_STEP)
         extra = 0
-        while extra < MAX_EXTRA_PLANES and _code_bit(coder, int(side is not None and extra < side.extra_planes), _RARE):
+        while extra < MAX_EXTRA_PLANES and _code_bit(coder, int(extra < side.extra_planes), _RARE):
             extra += 1
         region = None
-        if _code_bit(coder, int(side is not None and side.region is not None), _RARE):
-            given = side.region if side else None
-            corners = (given.top, given.left, given.bottom, given.right) if given else (0,) * 4
-            top, left, bottom, right = (_code_number(coder, 4, n) for n in corners)
+        if _code_bit(coder, int(side.region is not None), _RARE):
+            top, left, bottom, right = (_code_number(coder, 4, n) for n in astuple(side.region or _WHOLE_IMAGE))
             region = RegionOfInterest(min(top, bottom), min(left, right), max(top, bottom), max(left, right))
         texture = None
-        if _code_bit(coder, int(side is not None and side.texture is not None), _RARE):
-            levels = side.texture if side and side.texture else (0,) * TEXTURE_BANDS
-            texture = tuple(_code_number(coder, 4, n) for n in levels)
+        if _code_bit(coder, int(side.texture is not None), _RARE):
+            texture = tuple(_code_number(coder, 4, n) for n in side.texture or (0,) * TEXTURE_BANDS)
         return SideInfo(mean_index, start_step, region, texture, extra)
     except _EndOfStreamError:
         return SideInfo(mean_index, -1)

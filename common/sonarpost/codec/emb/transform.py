@@ -128,17 +128,8 @@ def layout_of(height_px: int, width_px: int) -> Layout:
             (offset, stride, rows, columns, level, orient, parent, first, second, child, low, *following, *cousins)
         )
         position[top : top + rows, left : left + columns] = cells_of(list(table[-1]))
-    return Layout(
-        height_px,
-        width_px,
-        levels,
-        np.array(table, np.int32),
-        cells,
-        position,
-        np.array(sides, np.int32),
-        low_offsets,
-        low_cells,
-    )
+    bands, sides_array = np.array(table, np.int32), np.array(sides, np.int32)
+    return Layout(height_px, width_px, levels, bands, cells, position, sides_array, low_offsets, low_cells)
 
 
 @jit
@@ -151,19 +142,35 @@ def _lift(line: Plane, n: int, first: int, constant: int) -> None:
 
 
 @jit
-def _analyse(line: Plane, n: int, scratch: Plane) -> None:
+def _lift_transposed(line: Plane, n: int, first: int, constant: int) -> None:
+    """Transpose of `_lift`: every second value adds its share to its two neighbours."""
+    for i in range(first, n, 2):
+        share = (line[i] * constant + _ROUND) >> FRACTION_BITS
+        line[i - 1 if i > 0 else i + 1] += share
+        line[i + 1 if i + 1 < n else i - 1] += share
+
+
+@jit
+def _decompose_line(line: Plane, n: int, scratch: Plane, transposed: int) -> None:
+    """Apply one level of the wavelet; `transposed`: the transpose of `synthesise_line` instead."""
     if n == 1:
         return
-    _lift(line, n, 1, ALPHA)
-    _lift(line, n, 0, BETA)
-    _lift(line, n, 1, GAMMA)
-    _lift(line, n, 0, DELTA)
+    if transposed:
+        _lift_transposed(line, n, 1, -ALPHA)
+        _lift_transposed(line, n, 0, -BETA)
+        _lift_transposed(line, n, 1, -GAMMA)
+        _lift_transposed(line, n, 0, -DELTA)
+        even_gain, odd_gain = GAIN_INVERSE, GAIN
+    else:
+        _lift(line, n, 1, ALPHA)
+        _lift(line, n, 0, BETA)
+        _lift(line, n, 1, GAMMA)
+        _lift(line, n, 0, DELTA)
+        even_gain, odd_gain = GAIN, GAIN_INVERSE
     low = (n + 1) // 2
     for i in range(n):
-        if i % 2 == 0:
-            scratch[i // 2] = (line[i] * GAIN + _ROUND) >> FRACTION_BITS
-        else:
-            scratch[low + i // 2] = (line[i] * GAIN_INVERSE + _ROUND) >> FRACTION_BITS
+        place, gain = (i // 2, even_gain) if i % 2 == 0 else (low + i // 2, odd_gain)
+        scratch[place] = (line[i] * gain + _ROUND) >> FRACTION_BITS
     line[:n] = scratch[:n]
 
 
@@ -186,18 +193,19 @@ def synthesise_line(line: Plane, n: int, scratch: Plane) -> None:
 
 
 @jit
-def _forward(plane: Plane, sides: I32) -> None:
+def _decompose(plane: Plane, sides: I32, transposed: int) -> None:
+    """Apply `_decompose_line` to the rows and then the columns of each level."""
     line = np.zeros(max(plane.shape), np.int64)
     scratch = np.zeros(max(plane.shape), np.int64)
     for level in range(sides.shape[0] - 1):
         height, width = sides[level, 0], sides[level, 1]
         for y in range(height):
             line[:width] = plane[y, :width]
-            _analyse(line, width, scratch)
+            _decompose_line(line, width, scratch, transposed)
             plane[y, :width] = line[:width]
         for x in range(width):
             line[:height] = plane[:height, x]
-            _analyse(line, height, scratch)
+            _decompose_line(line, height, scratch, transposed)
             plane[:height, x] = line[:height]
 
 
@@ -272,8 +280,23 @@ def forward(image: Plane, layout: Layout) -> Plane:
         image: Shape (height_px, width_px), int64, in 1/64 grey, minus its mean level.
         layout: Layout of the image.
     """
-    plane = np.ascontiguousarray(image, np.int64).copy()
-    _forward(plane, layout.sides)
+    plane = np.array(image, np.int64, order="C")
+    _decompose(plane, layout.sides, 0)
+    return _with_cosines(plane, layout)
+
+
+def correlate(image: Plane, layout: Layout) -> Plane:
+    """Return the scalar product of an image with each synthesis wavelet, in the usual square layout.
+
+    This is the transpose of `inverse`: each level takes the columns first.
+    """
+    turned = np.array(image.T, np.int64, order="C")
+    _decompose(turned, np.ascontiguousarray(layout.sides[:, ::-1]), 1)
+    return _with_cosines(turned.T, layout)
+
+
+def _with_cosines(plane: Plane, layout: Layout) -> Plane:
+    """Apply the cosine transform to the lowest band, in place."""
     height, width = (int(n) for n in layout.sides[layout.levels])
     low = _matrix_step(cosine_matrix(height), plane[:height, :width])
     plane[:height, :width] = _matrix_step(cosine_matrix(width), low.T).T

@@ -3,9 +3,8 @@
 1. Each image is cut into tiles four times: from its corner and shifted by half a tile, plain and mirrored (port and
    starboard shadows point in opposite directions). This doubles the gain.
 2. Every training tile is encoded with the base codebook, and the uses of each base tile are counted. The least used
-base
-   tiles are removed (among equals the last); free places up to `max_tiles` are filled first. At least `keep` base tiles
-   stay, the most used ones. They keep their numbers and pixels.
+   base tiles are removed (among equals the last); free places up to `max_tiles` are filled first. At least `keep` base
+   tiles stay, the most used ones. They keep their numbers and pixels.
 3. New tiles are selected from the training tiles in eight steps. Each step sums the squared distances of all training
    tiles to their nearest tile in order, and selects the tiles at which the sum passes equal steps. Tiles with a large
    error are therefore more likely, without random numbers (k-means++ seeding, Arthur and Vassilvitskii, SODA 2007, with

@@ -101,12 +101,9 @@ class VqCodec:
 
     def __post_init__(self) -> None:
         if len(self.tiles) > self.packing.max_index:
-            raise ConfigError(
-                "codec vq",
-                "packing",
-                f"{self.packing.value} for {len(self.tiles)} tiles",
-                f"at most {self.packing.max_index} tiles, or a wider packing",
-            )
+            packing = f"{self.packing.value} for {len(self.tiles)} tiles"
+            expected = f"at most {self.packing.max_index} tiles, or a wider packing"
+            raise ConfigError("codec vq", "packing", packing, expected)
 
     @property
     def codec_id(self) -> int:

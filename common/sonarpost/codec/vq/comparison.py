@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import subspace_angles
 
 from sonarpost.codec.vq.tile_search import IncrementalTileSet
 from sonarpost.codec.vq.tiles import TileDatabase
@@ -82,19 +83,8 @@ def compare(first: TileDatabase, second: TileDatabase) -> CodebookDifference:
 
 
 def principal_angles_deg(first: npt.NDArray[np.int16], second: npt.NDArray[np.int16]) -> npt.NDArray[np.float64]:
-    """Return the principal angles between the row spaces of two bases, shape (rows of the smaller,), in degrees.
-
-    Small angles come from their sines, because an arc cosine is inaccurate there (Knyazev and Argentati, SIAM J.
-    Scientific Computing 23(6), 2002).
-    """
-    if first.shape[0] < second.shape[0]:
-        first, second = second, first
-    larger = np.linalg.qr(first.T.astype(np.float64))[0]
-    smaller = np.linalg.qr(second.T.astype(np.float64))[0]
-    cosines = np.linalg.svd(larger.T @ smaller, compute_uv=False)
-    sines = np.linalg.svd(smaller - larger @ (larger.T @ smaller), compute_uv=False)[::-1]
-    angles = np.where(cosines * cosines >= 0.5, np.arcsin(np.clip(sines, 0, 1)), np.arccos(np.clip(cosines, 0, 1)))
-    return np.asarray(np.degrees(angles), dtype=np.float64)
+    """Return the principal angles between the row spaces of two bases, shape (rows of the smaller,), in degrees."""
+    return np.asarray(np.degrees(subspace_angles(first.T.astype(np.float64), second.T.astype(np.float64))), np.float64)
 
 
 def _unmatched(
