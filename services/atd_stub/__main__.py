@@ -6,11 +6,5 @@ from sonarpost.runtime.process import main
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.service import AtdStubService
 
-
-def run() -> int:
-    """Run the service until it is stopped; return the exit status."""
-    return main(AtdStubService, AtdStubConfig)
-
-
 if __name__ == "__main__":
-    sys.exit(run())
+    sys.exit(main(AtdStubService, AtdStubConfig))

@@ -6,11 +6,5 @@ from sonarpost.runtime.process import main
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 
-
-def run() -> int:
-    """Run the service until it is stopped; return the exit status."""
-    return main(C2Service, C2Config)
-
-
 if __name__ == "__main__":
-    sys.exit(run())
+    sys.exit(main(C2Service, C2Config))

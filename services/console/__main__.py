@@ -6,11 +6,5 @@ from sonarpost.runtime.process import main
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
 
-
-def run() -> int:
-    """Run the service until it is stopped; return the exit status."""
-    return main(ConsoleService, ConsoleConfig)
-
-
 if __name__ == "__main__":
-    sys.exit(run())
+    sys.exit(main(ConsoleService, ConsoleConfig))

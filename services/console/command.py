@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 import getpass
 import secrets
-import signal
 import sys
 import tempfile
-import threading
 from contextlib import ExitStack, closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +18,7 @@ from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.database import DATABASE_NAME, ROLES, Database
 from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
+from sonarpost.stop_signals import stop_on_signals
 
 TRAINING_USERS = (("watch", "observer"), ("op", "operator"), ("expert", "expert"))
 
@@ -124,10 +123,7 @@ def _run_training(parsed: argparse.Namespace) -> int:
         simulator = TrainingSimulator(state, parsed.training, parsed.seed, parsed.interval)
         print(f"{server.address}  users {', '.join(name for name, _ in TRAINING_USERS)}  password {password}")
         print("All contacts are simulated. Ctrl-C ends the training.", flush=True)
-        stop = threading.Event()
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, lambda *_: stop.set())
+        stop = stack.enter_context(stop_on_signals())
         server.start()
         for part in (server, app, simulator):
             stack.callback(part.stop)

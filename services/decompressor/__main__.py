@@ -6,11 +6,5 @@ from sonarpost.runtime.process import main
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.service import DecompressorService
 
-
-def run() -> int:
-    """Run the service until it is stopped; return the exit status."""
-    return main(DecompressorService, DecompressorConfig)
-
-
 if __name__ == "__main__":
-    sys.exit(run())
+    sys.exit(main(DecompressorService, DecompressorConfig))

@@ -6,11 +6,5 @@ from sonarpost.runtime.process import main
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService
 
-
-def run() -> int:
-    """Run the service until it is stopped; return the exit status."""
-    return main(OpModemService, OpModemConfig)
-
-
 if __name__ == "__main__":
-    sys.exit(run())
+    sys.exit(main(OpModemService, OpModemConfig))

@@ -6,11 +6,5 @@ from sonarpost.runtime.process import main
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
-
-def run() -> int:
-    """Run the service until it is stopped; return the exit status."""
-    return main(RelayService, RelayConfig)
-
-
 if __name__ == "__main__":
-    sys.exit(run())
+    sys.exit(main(RelayService, RelayConfig))

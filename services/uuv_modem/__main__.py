@@ -6,11 +6,5 @@ from sonarpost.runtime.process import main
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService
 
-
-def run() -> int:
-    """Run the service until it is stopped; return the exit status."""
-    return main(UuvModemService, UuvModemConfig)
-
-
 if __name__ == "__main__":
-    sys.exit(run())
+    sys.exit(main(UuvModemService, UuvModemConfig))

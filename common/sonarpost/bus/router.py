@@ -13,13 +13,11 @@ import argparse
 import json
 import logging
 import os
-import signal
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 
 import zenoh
 
@@ -31,6 +29,7 @@ from sonarpost.errors import BadInputError, ConfigError, DeliveryError, Sonarpos
 from sonarpost.messages import Health, ServiceState
 from sonarpost.parent_process import exit_with_parent
 from sonarpost.security.tls_files import TlsMonitor
+from sonarpost.stop_signals import stop_on_signals
 
 log = logging.getLogger(__name__)
 
@@ -171,18 +170,11 @@ def run(config: zenoh.Config) -> int:
     Returns:
         Exit status; 2 if the router cannot listen or the configuration is invalid.
     """
-    stop = threading.Event()
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, on_signal)
     _log_zenoh_to_stderr()
     listen, connect = _endpoints_text(config, "listen/endpoints"), _endpoints_text(config, "connect/endpoints")
     try:
         monitor = RouterMonitor(config)
-        with zenoh.open(config) as session:
+        with stop_on_signals() as stop, zenoh.open(config) as session:
             monitor.start(session)
             log.info("Router started", extra=logs.kv(listen=listen, connect=connect))
             stop.wait()

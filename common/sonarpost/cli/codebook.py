@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from sonarpost.cli.parsers import Subparsers, add_command
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.interface import Image, to_uint8
 from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split
@@ -28,23 +29,16 @@ IMAGE_SUFFIXES = (".tiff", ".tif", ".png")
 _ROUND = re.compile(r"(?P<fom>\d{1,6}(\.\d{1,6})?):(?P<rms>\d{1,6}(\.\d{1,6})?)(:(?P<images>\d{1,9}))?", re.ASCII)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command and its actions."""
-    parser = subparsers.add_parser("codebook", help="build, compare and adapt tile codebooks")
-
-    def show_help(_: argparse.Namespace) -> int:
-        parser.print_help()
-        return 0
-
-    parser.set_defaults(run=show_help)
-    actions = parser.add_subparsers(metavar="ACTION")
+    actions = add_command(subparsers, "codebook", "build, compare and adapt tile codebooks")
     _add_build(actions)
     _add_info(actions)
     _add_diff(actions)
     _add_adapt(actions)
 
 
-def _add_build(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_build(actions: Subparsers) -> None:
     parser = actions.add_parser("build", help="build a codebook from images (the paper's Table IV)")
     _add_images_and_output(parser)
     parser.add_argument("--tile", type=int, default=10, metavar="PX", help="side of a tile (default: 10)")
@@ -66,13 +60,13 @@ def _add_build(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.set_defaults(run=run_build)
 
 
-def _add_info(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_info(actions: Subparsers) -> None:
     parser = actions.add_parser("info", help="show the content of a codebook")
     parser.add_argument("codebook", metavar="NAME_OR_FILE", help="nominal-10, nominal-20 or a file")
     parser.set_defaults(run=run_info)
 
 
-def _add_diff(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_diff(actions: Subparsers) -> None:
     parser = actions.add_parser(
         "diff", help="show the differences of two codebooks", description="Exit status 0: same identity; 1: different."
     )
@@ -81,7 +75,7 @@ def _add_diff(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.set_defaults(run=run_diff)
 
 
-def _add_adapt(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_adapt(actions: Subparsers) -> None:
     parser = actions.add_parser(
         "adapt",
         help="adapt a codebook to a type of seabed",

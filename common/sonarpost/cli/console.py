@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 
+from sonarpost.cli.parsers import Subparsers
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+
+def add_parser(subparsers: Subparsers) -> None:
     """Add the subcommand."""
     # The import contract does not allow a static import of a service here.
     command = importlib.import_module("sonarpost.services.console.command")

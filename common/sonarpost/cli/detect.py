@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
+from sonarpost.cli.parsers import Subparsers
 from sonarpost.detection.detector import MINE_LIKE, Detection
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.snippets import cut_ground_snippet, cut_snippet, to_grey
@@ -33,7 +34,7 @@ _HEADER = (
 )
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the subcommand."""
     parser = subparsers.add_parser(
         "detect",

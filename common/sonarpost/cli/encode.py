@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sonarpost.cli.parsers import Subparsers
 from sonarpost.cli.prepare import log_preparation_to_stderr
 from sonarpost.codec import Codec, StreamHeader, codec_names, decode_image, get_codec
 from sonarpost.codec.api import CodecOptions
@@ -26,7 +27,7 @@ MAX_STREAM_FILE_BYTES = 1 << 18  # header and the longest body, twice for hexade
 EXIT_SOME_FAILED = 1
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add both commands."""
     encode = subparsers.add_parser("encode", help="encode an image or a folder of images")
     encode.add_argument("input", type=Path, metavar="IMAGE_OR_DIR", help="TIFF or PNG, grey, 8 or 16 bits")

@@ -8,17 +8,19 @@ import logging
 from prometheus_client import start_http_server
 
 from sonarpost import logs
-from sonarpost.cli.shared import add_router_options, router_of, stop_on_signals
+from sonarpost.cli.parsers import Subparsers
+from sonarpost.cli.shared import add_router_options, router_of
 from sonarpost.errors import PortError
 from sonarpost.monitoring.fleet import FleetTracker, FleetWatcher
 from sonarpost.monitoring.metrics import FleetCollector, registry_of
+from sonarpost.stop_signals import stop_on_signals
 
 log = logging.getLogger(__name__)
 
 DEFAULT_PORT = 9464
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the subcommand."""
     parser = subparsers.add_parser(
         "metrics",

@@ -5,26 +5,26 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import sys
 import threading
 from pathlib import Path
-from types import FrameType
 
 from pydantic import ValidationError
 
+from sonarpost.cli.parsers import Subparsers
 from sonarpost.errors import ConfigError
 from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.channel.config import EmulatorConfig
 from sonarpost.simulation.channel.emulator import ChannelEmulator
 from sonarpost.simulation.channel.parameters import PRESETS, build_parameters, config_error, read_parameters
+from sonarpost.stop_signals import stop_on_signals
 
 WATCH_S = 0.2
 EXIT_FAILED = 1
 MAX_MODEMS = 64
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the subcommand."""
     parser = subparsers.add_parser(
         "modem-emulator",
@@ -74,20 +74,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(parsed: argparse.Namespace) -> int:
     """Run the emulator until SIGINT or SIGTERM; return 0, or 1 when it failed."""
-    stopping = threading.Event()
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        stopping.set()
-
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        return _serve(parsed, stopping)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with stop_on_signals() as stop:
+        return _serve(parsed, stop)
 
 
-def _serve(parsed: argparse.Namespace, stopping: threading.Event) -> int:
+def _serve(parsed: argparse.Namespace, stop: threading.Event) -> int:
     emulator = ChannelEmulator(_config(parsed), echo=sys.stdout if parsed.json else None)
     emulator.open()
     try:
@@ -98,7 +89,7 @@ def _serve(parsed: argparse.Namespace, stopping: threading.Event) -> int:
         if not parsed.json:
             for device in devices:
                 _print(f"modem {device.modem}: address {device.address}, {device.device}")
-        while not stopping.wait(WATCH_S):
+        while not stop.wait(WATCH_S):
             if emulator.failure is not None:
                 print(f"sonarpost: the emulator failed: {emulator.failure}", file=sys.stderr)
                 return EXIT_FAILED

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
+from sonarpost.cli.parsers import Subparsers, add_command, aligned
 from sonarpost.files import PUBLIC_FILE, write_atomically, write_new
 from sonarpost.keys import SHORE
 from sonarpost.security.fleet import (
@@ -34,16 +35,9 @@ EXIT_ENDING = 1
 UPDATE_ROUTERS = "write the routers' configurations again (`sonarpost pki router-config`) and restart them"
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command and its actions."""
-    parser = subparsers.add_parser("pki", help="certificates of the fleet and access control of its routers")
-
-    def show_help(_: argparse.Namespace) -> int:
-        parser.print_help()
-        return 0
-
-    parser.set_defaults(run=show_help)
-    actions = parser.add_subparsers(metavar="ACTION")
+    actions = add_command(subparsers, "pki", "certificates of the fleet and access control of its routers")
 
     init = _add_action(actions, "init", run_init, "create the fleet's authority in a new folder")
     init.add_argument("--fleet", default="sonarpost", metavar="NAME", help="name of the fleet")
@@ -73,7 +67,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _add_action(
-    actions: argparse._SubParsersAction[argparse.ArgumentParser],
+    actions: Subparsers,
     name: str,
     run: Callable[[argparse.Namespace], int],
     text: str,
@@ -265,9 +259,8 @@ def _print_table(rows: Sequence[tuple[CertificateEntry, str]]) -> None:
     lines = [("name", "role", "state", "valid to", "serial", "hosts")] + [
         (e.common_name, e.role, state, f"{e.not_after:%Y-%m-%d}", e.serial[:16], " ".join(e.hosts)) for e, state in rows
     ]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    for line in lines:
-        print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
+    for line in aligned(lines):
+        print(line)
 
 
 def _show(bundle: Bundle) -> None:

@@ -7,11 +7,12 @@ import logging
 import sys
 import time
 
+from sonarpost.cli.parsers import Subparsers
 from sonarpost.codec.jit import compilation_log
 from sonarpost.codec.machine_code import prepare_machine_code
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         "prepare",

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import importlib
+import runpy
 import sys
 from pathlib import Path
 
 from sonarpost import logs
 from sonarpost.bus import router
+from sonarpost.cli.parsers import Subparsers
 from sonarpost.config import SERVICES
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the subcommands."""
     run = subparsers.add_parser("run", help="run one service of the chain", description="Run one service.")
     run.add_argument("service", choices=SERVICES, help="name of the service, a table of the file")
@@ -25,10 +26,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run_service(parsed: argparse.Namespace) -> int:
     """Run the service's own module, as `python -m sonarpost.services.NAME` does."""
-    sys.argv = [f"sonarpost.services.{parsed.service}", "--config", str(parsed.config)]
-    module = importlib.import_module(f"sonarpost.services.{parsed.service}.__main__")
-    status: int = module.run()
-    return status
+    sys.argv[1:] = ["--config", str(parsed.config)]
+    runpy.run_module(f"sonarpost.services.{parsed.service}", run_name="__main__", alter_sys=True)
+    return 0
 
 
 def run_router(parsed: argparse.Namespace) -> int:

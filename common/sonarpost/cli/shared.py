@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from types import FrameType
 
 from sonarpost.config import PlatformConfig, TlsConfig, load
 from sonarpost.errors import ConfigError
@@ -58,22 +53,6 @@ def router_of(parsed: argparse.Namespace) -> tuple[tuple[str, ...], TlsConfig | 
             raise ConfigError("command line", "tls", " ".join(str(f) for f in files if f), expected)
         tls = TlsConfig(ca=files[0], certificate=files[1], key=files[2])
     return endpoints, tls
-
-
-@contextmanager
-def stop_on_signals() -> Iterator[threading.Event]:
-    """Return an event that SIGINT and SIGTERM set, so that a command can clean up before it ends."""
-    stop = threading.Event()
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def add_site_option(parser: argparse.ArgumentParser) -> None:

@@ -7,6 +7,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+from sonarpost.cli.parsers import Subparsers
 from sonarpost.files import write_atomically
 from sonarpost.simulation.seabed.survey import SimulatedSurvey, SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
@@ -15,7 +16,7 @@ from sonarpost.sonar.xtf_writer import write_xtf
 TRUTH_SCHEMA = 1
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the `simulate` command."""
     default = SurveySpec()
     parser = subparsers.add_parser(

@@ -19,9 +19,11 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sonarpost.cli.shared import add_router_options, printable, router_of, stop_on_signals
+from sonarpost.cli.parsers import Subparsers, aligned
+from sonarpost.cli.shared import add_router_options, printable, router_of
 from sonarpost.errors import ConfigError
 from sonarpost.monitoring.fleet import FleetState, FleetWatcher, ServiceStatus
+from sonarpost.stop_signals import stop_on_signals
 
 EXIT_NOT_OK = 1
 UNKNOWN = "-"
@@ -34,7 +36,7 @@ Severity = Literal["ok", "error", "stale", "gone"]
 _STYLES: dict[Severity, str] = {"ok": "", "error": "bold red", "stale": "yellow", "gone": "dim"}
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the subcommand."""
     parser = subparsers.add_parser(
         "status",
@@ -258,11 +260,8 @@ def table(state: FleetState, rows: Sequence[Row], router: str) -> RenderableType
 
 def plain_text(state: FleetState, rows: Sequence[Row], router: str) -> str:
     """Return the table as plain text, with columns aligned by spaces."""
-    lines = [HEADINGS, *(tuple(printable(cell) for cell in row.cells) for row in rows)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(HEADINGS))]
-    out = [_headline(state, router)]
-    out += ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
-    return "\n".join([*out, *_details(rows)])
+    lines = aligned([HEADINGS, *([printable(cell) for cell in row.cells] for row in rows)])
+    return "\n".join([_headline(state, router), *lines, *_details(rows)])
 
 
 def as_json(state: FleetState, rows: Sequence[Row], time_utc: str) -> str:

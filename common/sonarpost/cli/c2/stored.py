@@ -8,6 +8,7 @@ import re
 import sys
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +20,7 @@ from rich.text import Text
 
 from sonarpost.archive.shore_files import find_image, image_paths
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, TaskingRow
+from sonarpost.cli.parsers import Subparsers
 from sonarpost.cli.shared import printable, time_text
 from sonarpost.errors import BadInputError, ConfigError, StoredFileError
 from sonarpost.export.contacts import ExportContact, load_contacts, match_start_time
@@ -67,7 +69,7 @@ class ListedImage:
     decision: DecisionRow | None
 
 
-def add_actions(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_actions(actions: Subparsers) -> None:
     """Add the actions `ls`, `get` and `export`."""
     ls = actions.add_parser("ls", help="list images with their decisions, or commands and comments")
     _add_filters(ls)
@@ -138,14 +140,11 @@ def run_ls(parsed: argparse.Namespace) -> int:
         ConfigError: `--since` is invalid.
     """
     record_filter = RecordFilter.of(parsed)
-    index = ShoreIndex(parsed.out_dir, writable=False)
-    try:
+    with closing(ShoreIndex(parsed.out_dir, writable=False)) as index:
         if parsed.tasking:
             _print_tasking(index.tasking(), record_filter, as_json=parsed.json)
             return 0
         images = join_decisions(index.images(), index.decisions())
-    finally:
-        index.close()
     rows = select_images(images, record_filter, undecided=parsed.undecided, all_versions=parsed.all_versions)
     if parsed.json:
         for row in rows:
@@ -265,11 +264,8 @@ def run_get(parsed: argparse.Namespace) -> int:
         StoredFileError: No image or several images match, or a file cannot be read.
         OSError: A copy cannot be written.
     """
-    index = ShoreIndex(parsed.out_dir, writable=False)
-    try:
+    with closing(ShoreIndex(parsed.out_dir, writable=False)) as index:
         row = find_image(index.images(), parsed.picture, parsed.vessel, parsed.version)
-    finally:
-        index.close()
     copies = []
     for path in image_paths(parsed.out_dir, row):
         try:
@@ -326,11 +322,8 @@ def _mark_exported(out_dir: Path, contacts: Sequence[ExportContact]) -> None:
     """Mark images as exported in the index; retention deletes exported images first."""
     exported = {(c.image.vessel_id, c.image.vehicle_id, c.image.image_id, c.image.first_frame_utc_s) for c in contacts}
     try:
-        index = ShoreIndex(out_dir)
-        try:
+        with closing(ShoreIndex(out_dir)) as index:
             rows = [row for row in index.images() if _image_key(row) in exported]
             index.mark("exported_utc_s", rows, time.time())
-        finally:
-            index.close()
     except (OSError, BadInputError) as error:
         print(f"not marked as exported: {error}", file=sys.stderr)

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from sonarpost import keys
 from sonarpost.bus.session import open_with_retry
+from sonarpost.cli.parsers import Subparsers
 from sonarpost.cli.shared import add_router_options, add_site_option, router_of
 from sonarpost.delivery.client import deliver
 from sonarpost.errors import ConfigError, PortError
@@ -26,7 +27,7 @@ KINDS = {"refine": "refine", "resend": "resend", "expand": "wider", "revisit": "
 RENAMED_ACTIONS = {"task": "command", "advise": "comment"}
 
 
-def add_actions(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_actions(actions: Subparsers) -> None:
     """Add the actions `command` and `comment`."""
     command = actions.add_parser("command", help="request more detail, a lost image part, more seabed or a revisit")
     _add_common_options(command)

@@ -14,6 +14,7 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
+from sonarpost.cli.parsers import Subparsers
 from sonarpost.cli.shared import add_router_options, add_site_option, printable, router_of, time_text
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Decision, ReconstructedImage, Record, TaskingState
@@ -22,7 +23,7 @@ POLL_S = 0.2
 DISCONNECTED_AFTER_S = 1.0
 
 
-def add_actions(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_actions(actions: Subparsers) -> None:
     """Add the action `watch`."""
     parser = actions.add_parser("watch", help="print a line for each accepted record, live; Ctrl-C ends it")
     add_site_option(parser)

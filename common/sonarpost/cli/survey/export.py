@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
+from sonarpost.cli.parsers import Subparsers
 from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
 from sonarpost.files import atomic_file
 from sonarpost.sonar.readers import open_survey
@@ -27,7 +28,7 @@ _FIELDS = (
 )
 
 
-def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_action(actions: Subparsers) -> None:
     """Add the action."""
     parser = actions.add_parser("export", help="write the track of a recording as CSV or GeoJSON")
     parser.add_argument("file", type=Path, metavar="FILE", help="survey file")

@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from sonarpost.cli.parsers import Subparsers
 from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.readers import open_survey
@@ -20,7 +21,7 @@ _STEP_M = 5.0
 """Step of the track length: fixes are often coarse and repeated over many pings."""
 
 
-def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_action(actions: Subparsers) -> None:
     """Add the action."""
     parser = actions.add_parser("info", help="list contents and irregularities of recordings")
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="survey file")

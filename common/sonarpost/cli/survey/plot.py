@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
+from sonarpost.cli.parsers import Subparsers
 from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
@@ -37,7 +38,7 @@ _INK, _PAPER, _BOTTOM_COLOUR = (20, 20, 20), (245, 245, 245), (255, 190, 0)
 _LINE, _START, _END = (20, 70, 160), (0, 140, 60), (200, 30, 30)
 
 
-def add_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_action(actions: Subparsers) -> None:
     """Add the action."""
     parser = actions.add_parser(
         "plot",
