@@ -57,7 +57,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("packing", ["14bit", "2byte", "3byte", "ascii5"])
 def test_folder_is_encoded_and_decoded(run: Run, folder: Path, text: bool, packing: str) -> None:
-    assert run("encode", folder, "--packing", packing, *(["--text"] if text else [])) == 0
+    assert run("encode", folder, "--codec", "vq", "--packing", packing, *(["--text"] if text else [])) == 0
     suffix = ".txt" if text else ".vq"
     streams = sorted(folder.glob(f"*{suffix}"))
     assert [stream.stem for stream in streams] == ["a", "b", "c"]
@@ -75,7 +75,7 @@ def test_folder_is_encoded_and_decoded(run: Run, folder: Path, text: bool, packi
 
 def test_one_file_with_another_codebook_and_output_folder(run: Run, folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / "deeper"
-    assert run("encode", folder / "b.png", "--codebook", "nominal-20", "--out", out) == 0
+    assert run("encode", folder / "b.png", "--codec", "vq", "--codebook", "nominal-20", "--out", out) == 0
     assert [path.name for path in out.iterdir()] == ["b.vq"]
     # The decoder finds the shipped codebook by the tag in the stream.
     assert run("decode", out / "b.vq", "--out", tmp_path / "pictures") == 0
@@ -90,7 +90,7 @@ def test_invalid_files_of_a_folder_are_reported_and_the_others_processed(
     (folder / "0bad.png").write_bytes(b"\x89PNG\r\n\x1a\n but no more")
     write_png(folder / "small.png", np.zeros((8, 8), np.uint8))
     write_png(folder / "a.png", snippet(5))  # the stem of a.tiff: one stream would overwrite the other
-    assert run("encode", folder) == 1
+    assert run("encode", folder, "--codec", "vq") == 1
     output = capsys.readouterr()
     assert "3 of 6 files done" in output.out
     for name in ("0bad.png", "small.png", "a.tiff"):
@@ -108,7 +108,7 @@ def test_invalid_files_of_a_folder_are_reported_and_the_others_processed(
 def test_missing_pixels_are_written_as_a_mask_and_reported(
     run: Run, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run("encode", folder / "a.tiff")
+    run("encode", folder / "a.tiff", "--codec", "vq")
     stream = folder / "a.vq"
     stream.write_bytes(stream.read_bytes()[:-20])
     capsys.readouterr()
@@ -129,8 +129,8 @@ def test_invalid_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Pa
         ("encode", empty),
         ("encode", folder / "notes.md"),
         ("encode", folder / "a.tiff", "--codec", "zip"),
-        ("encode", folder / "a.tiff", "--codebook", tmp_path / "absent.tiles"),
-        ("encode", folder / "a.tiff", "--budget", 30),
+        ("encode", folder / "a.tiff", "--codec", "vq", "--codebook", tmp_path / "absent.tiles"),
+        ("encode", folder / "a.tiff", "--codec", "vq", "--budget", 30),
         ("encode", folder / "a.tiff", "--out", tmp_path / "file" / "x"),
         ("decode", tmp_path / "absent.vq"),
         ("decode", tmp_path / "big.vq"),
@@ -166,7 +166,7 @@ def test_codebook_is_built_from_a_folder_and_used(run: Run, folder: Path, tmp_pa
     assert built.notes["images"] == "3"
     assert built.tiles.tile_px == 8
     assert not out.with_name("mine.tiles.journal").exists()
-    assert run("encode", folder / "a.tiff", "--codebook", out) == 0
+    assert run("encode", folder / "a.tiff", "--codec", "vq", "--codebook", out) == 0
     with pytest.raises(CodebookError, match="SONARPOST_CODEBOOKS"):
         run("decode", folder / "a.vq")
     assert run("decode", folder / "a.vq", "--codebook", out) == 0
