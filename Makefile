@@ -1,4 +1,4 @@
-# sonarpost: `make demo` runs the whole chain, `make test` the whole test suite. Both set up what they need.
+# sonarpost: `make demo` runs the whole chain, `make test` the whole test suite. Both install what they need.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,11 +10,12 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 setup: $(STAMP)
 
-# The locked versions of what sonarpost needs at run time, then sonarpost itself, editable. `make demo` needs no more.
+# The locked run-time dependencies, sonarpost itself, editable, and the machine code of its codecs. Enough for `make demo`.
 $(RUN_TIME): requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) install -r requirements.lock
 	$(PIP) install --no-deps --no-build-isolation -e .
+	$(BIN)/sonarpost prepare
 	touch $@
 
 # The tools for tests, checks and documentation.
@@ -25,11 +26,11 @@ $(STAMP): $(RUN_TIME) requirements-dev.lock
 demo: $(RUN_TIME)
 	$(BIN)/sonarpost demo $(ARGS)
 
-# Two at a time, a file's tests together and those of real processes one after the other (tests/conftest.py).
+# Two workers; the tests of a file run in one worker, those with real processes one after the other (tests/conftest.py).
 test: setup
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
-# Tests that take minutes each: long outages, processes killed at random for five minutes.
+# Tests of several minutes each: long outages, processes killed at random for five minutes.
 test-long: setup
 	$(BIN)/python -m pytest -m long -o faulthandler_timeout=1800 $(ARGS)
 
@@ -40,15 +41,15 @@ check: setup docs
 	$(BIN)/lint-imports
 	$(BIN)/python tests/check_wheel.py
 
-# The images that docker-compose.yml names; where no registry is reached they are made from Debian and PyPI alone.
+# The images of docker-compose.yml; without an image registry they are built from Debian and PyPI.
 images:
 	packaging/images.sh
 
-# The whole chain in containers, built, started, disturbed and taken away again. Needs a container engine.
+# The whole chain in containers: build, start, inject faults, remove. Needs a container engine.
 test-compose: setup
 	PYTHON=$(BIN)/python packaging/test-compose.sh $(ARGS)
 
-# The pictures of the console's page in docs/explanation/console; needs Chromium.
+# The screenshots in docs/explanation/console; needs Chromium.
 screenshots: setup
 	$(BIN)/python packaging/screenshots.py
 
@@ -65,8 +66,8 @@ fmt: setup
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-# Resolve the dependencies of pyproject.toml again and write down the exact versions: those of the run time with the
-# build tools of an editable installation, then those that tests, checks and documentation need besides.
+# Resolve the dependencies of pyproject.toml and write the exact versions: requirements.lock for the run time and the
+# build tools of an editable installation, requirements-dev.lock for tests, checks and documentation.
 lock:
 	rm -rf build/lock && $(PYTHON) -m venv build/lock
 	build/lock/bin/python -m pip install --quiet --disable-pip-version-check . build editables hatchling

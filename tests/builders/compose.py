@@ -219,7 +219,7 @@ def project() -> Iterator[Project]:
             "SIM_SURVEYS": "1",
             "SIM_TIME_SCALE": "60.0",
             "HEALTH_INTERVAL_S": "1.0",
-            "SEAM_WAIT_S": "0.0",
+            "JOIN_TIMEOUT_S": "0.0",
             "HEALTH_CHECK_INTERVAL": "3s",
             "SHORE_PUBLISH": "127.0.0.1:",  # a free port of this host
         },

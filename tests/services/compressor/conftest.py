@@ -18,6 +18,7 @@ OUT = keys.image_encoded("uuv-1")
 @pytest.fixture
 def start_service(runner, platform):
     def start(**options):
+        options = {"codec": "vq", **options}  # fast, and of fixed length
         return runner.start(CompressorService(platform("uuv-1"), CompressorConfig(**options)))
 
     return start

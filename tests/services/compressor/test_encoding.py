@@ -40,6 +40,13 @@ def test_a_snippet_is_encoded_with_its_contact(start_service, atd, modem, snippe
     check_monitoring(service)
 
 
+def test_the_default_codec_is_emb(runner, platform, atd, modem, snippet):
+    runner.start(CompressorService(platform("uuv-1"), CompressorConfig()))
+    atd.send(IN, "compressor", snippet("c1"))
+    eventually(lambda: len(modem.received) == 1, 30)
+    assert modem.received[0].codec == "emb"
+
+
 def test_16_bit_images_are_mapped_over_their_own_range(start_service, atd, modem, snippet, vq):
     start_service()
     deep = snippet("deep", dtype=np.uint16)
