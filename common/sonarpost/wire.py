@@ -85,10 +85,15 @@ def validated(model: type[M], fields: Mapping[str, object], where: str) -> M:
     try:
         return model.model_validate(fields)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = ".".join(str(part) for part in first["loc"]) or str(getattr(model, "TYPE", ""))
-        value = "nothing" if first["type"] == "missing" else first["input"]
-        raise PayloadError(where, field, value, expected_text(first["type"], first["msg"])) from error
+        field, value, expected = first_error(error)
+        raise PayloadError(where, field or str(getattr(model, "TYPE", "")), value, expected) from error
+
+
+def first_error(error: ValidationError) -> tuple[str, object, str]:
+    """Return field, value and expected value of the first error of pydantic, as arguments of a `BadInputError`."""
+    first = error.errors(include_url=False)[0]
+    value = "nothing" if first["type"] == "missing" else first["input"]
+    return ".".join(str(part) for part in first["loc"]), value, expected_text(first["type"], first["msg"])
 
 
 def expected_text(kind: str, message: str) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from research.common.images import read_grey, read_sdvd_index, survey_line
 from research.common.statistics import Interval, auc, bootstrap_weights, interval
-from sonarpost.detection.image_detector import ScaledImage, detect_in_image
+from research.detection.image_detector import ScaledImage, detect_in_image
 from sonarpost.errors import SurveyFileError
 
 PIXEL_M: Final = 0.05

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.sonar.readers.xtf import read_xtf
+from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -39,6 +39,6 @@ def files_of(survey: Survey, folder: Path, samples: int, range_m: float) -> tupl
 
 def read_both(survey: Survey, folder: Path, samples: int, range_m: float) -> tuple[Survey, Survey]:
     """Return the survey read from the file of its first frequency alone, and from the file of both."""
-    alone, both = (read_xtf(path) for path in files_of(survey, folder, samples, range_m))
+    alone, both = (read_survey(path) for path in files_of(survey, folder, samples, range_m))
     assert {len(p.channels) for p in both.pings} == {2 * len(p.channels) for p in alone.pings}
     return alone, both

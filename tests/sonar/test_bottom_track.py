@@ -11,7 +11,7 @@ import pytest
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.bottom_track import altitudes_m, track_bottom
-from sonarpost.sonar.readers.xtf import read_xtf
+from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 
@@ -93,8 +93,8 @@ def test_recorded_altitude_has_precedence():
 @pytest.mark.realdata
 def test_first_returns_of_recordings(data_dir):
     """The expected values were read from the images."""
-    river = track_bottom(read_xtf(data_dir / "surveys" / "000_1236.xtf"))
+    river = track_bottom(read_survey(data_dir / "surveys" / "000_1236.xtf"))
     assert np.isfinite(river).all()
     assert river[[100, 480, 1000, 1363]] == pytest.approx([6.7, 6.7, 4.1, 1.4], abs=0.5)
-    dive = track_bottom(read_xtf(data_dir / "surveys" / "scotsman-iver2.xtf"))
+    dive = track_bottom(read_survey(data_dir / "surveys" / "scotsman-iver2.xtf"))
     assert dive[[10, 120, 260, 450]] == pytest.approx([13.9, 9.4, 4.3, 3.0], abs=0.6)

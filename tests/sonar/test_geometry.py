@@ -29,7 +29,6 @@ from sonarpost.sonar.geometry import (
 )
 from sonarpost.sonar.options import ErrorBudget, Mounting, SurveyOptions
 from sonarpost.sonar.readers import read_survey
-from sonarpost.sonar.readers.xtf import read_xtf
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 
@@ -206,7 +205,7 @@ def test_distance_is_unknown_without_navigation():
 
 @pytest.mark.realdata
 def test_track_speed_of_recording_matches_recorded_speed(data_dir):
-    survey = read_xtf(data_dir / "surveys" / "scotsman-iver2.xtf")
+    survey = read_survey(data_dir / "surveys" / "scotsman-iver2.xtf")
     speeds = [p.speed_mps for p in survey if p.speed_mps is not None]
     duration_s = survey.pings[-1].time_utc_s - survey.pings[0].time_utc_s
     assert along_track_m(survey)[-1] / duration_s == pytest.approx(np.mean(speeds), rel=0.05)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.sonar.ground_range import beam_normalised, ground_range_image, interval_means, range_normalised
+from sonarpost.sonar.ground_range import beam_normalised, ground_range_image, interval_means
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 
@@ -74,18 +74,3 @@ def test_beam_normalisation_handles_changing_altitude():
     for low in (0.2, 0.5, 0.8, 1.1):
         patch = normalised[(angle > low) & (angle < low + 0.1)]
         assert patch.mean() == pytest.approx(1, abs=0.05)
-    # Normalising by columns is not sufficient, because the angle of a column changes with altitude.
-    by_column = range_normalised(echo.astype(np.float32), window_pings=799)
-    assert np.abs(by_column[:60, :60].mean(axis=0) - 1).max() > 0.15
-
-
-def test_range_normalisation_keeps_gaps_and_objects():
-    image = np.tile(np.linspace(200, 20, 50, dtype=np.float32), (300, 1))
-    image[100:104, 20] *= 3
-    image[:, 40] = np.nan
-    image[7] = np.nan
-    normalised = range_normalised(image, window_pings=201)
-    assert np.isnan(normalised[:, 40]).all()
-    assert np.isnan(normalised[7]).all()
-    assert np.nanmedian(normalised) == pytest.approx(1, abs=1e-3)
-    assert normalised[101, 20] > 2.5

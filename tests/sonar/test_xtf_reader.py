@@ -19,7 +19,7 @@ from pyxtf import XTFPingHeader
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.readers.xtf import MAX_FILE_BYTES, read_xtf
+from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Side
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -41,7 +41,7 @@ def raw(small_survey, tmp_path) -> bytearray:
 def read(tmp_path: Path, content: bytes, **options):
     path = tmp_path / "bad.xtf"
     path.write_bytes(content)
-    return read_xtf(path, SurveyOptions(**options))
+    return read_survey(path, SurveyOptions(**options))
 
 
 def put(raw: bytearray, offset: int, fmt: str, *values: float) -> bytearray:
@@ -211,24 +211,17 @@ def test_port_stored_nearest_first_is_reported(small_survey, tmp_path):
             if channel.side is Side.PORT:
                 channel.samples[:] = channel.samples[::-1].copy()
     write_xtf(survey, tmp_path / "a.xtf")
-    assert "port looks stored nearest" in read_xtf(tmp_path / "a.xtf").warnings[0]
+    assert "port looks stored nearest" in read_survey(tmp_path / "a.xtf").warnings[0]
 
 
 def test_missing_or_irregular_file_is_rejected(tmp_path):
     with pytest.raises(SurveyFileError, match="No such file"):
-        read_xtf(tmp_path / "absent.xtf")
+        read_survey(tmp_path / "absent.xtf")
     with pytest.raises(SurveyFileError, match=r"directory|regular"):
-        read_xtf(tmp_path)
+        read_survey(tmp_path)
     os.mkfifo(tmp_path / "pipe.xtf")
     with pytest.raises(SurveyFileError, match="regular"):
-        read_xtf(tmp_path / "pipe.xtf")
-
-
-def test_file_above_size_limit_is_rejected(tmp_path):
-    with (tmp_path / "giant.xtf").open("wb") as file:
-        file.truncate(MAX_FILE_BYTES + 1)
-    with pytest.raises(SurveyFileError, match="file size"):
-        read_xtf(tmp_path / "giant.xtf")
+        read_survey(tmp_path / "pipe.xtf")
 
 
 def in_every_ping(raw: bytearray, offset: int, fmt: str, *values: float) -> bytearray:
@@ -361,7 +354,7 @@ def test_32_bit_samples_keep_all_bits(small_survey, tmp_path):
     survey = small_survey(np.uint32)
     survey.pings[0].channels[0].samples[:3] = (2**32 - 1, 2**31 + 1, 2**24 + 1)
     write_xtf(survey, tmp_path / "a.xtf")
-    channel: ChannelPing = read_xtf(tmp_path / "a.xtf").pings[0].channels[0]
+    channel: ChannelPing = read_survey(tmp_path / "a.xtf").pings[0].channels[0]
     assert channel.samples[:3].tolist() == [2**32 - 1, 2**31 + 1, 2**24 + 1]
 
 
@@ -387,7 +380,7 @@ def test_implausible_slant_range_skips_channel(raw, tmp_path, slant_range_m):
 @pytest.mark.parametrize(("name", "sonar"), [("scotsman-iver2", "HDS"), ("000_1236", "WizMap")])
 def test_recordings_match_derived_images(data_dir, name, sonar):
     folder = data_dir / "surveys"
-    survey = read_xtf(folder / f"{name}.xtf")
+    survey = read_survey(folder / f"{name}.xtf")
     assert survey.sonar_id == sonar
     # The images have the order of the file: port from far to near.
     for side, suffix, step in ((Side.PORT, "port", -1), (Side.STARBOARD, "stbd", 1)):
@@ -411,17 +404,17 @@ def test_recordings_match_derived_images(data_dir, name, sonar):
 
 @pytest.mark.realdata
 def test_recorded_ping_without_fix(data_dir):
-    survey = read_xtf(data_dir / "surveys" / "scotsman-iver2.xtf")
+    survey = read_survey(data_dir / "surveys" / "scotsman-iver2.xtf")
     assert [row for row, ping in enumerate(survey) if ping.lat_deg is None] == [0]
     assert survey.warnings == ("no position fix in 1 of 461 pings, the first in row 0",)
-    assert read_xtf(data_dir / "surveys" / "000_1236.xtf").pings[0].altitude_m is None
+    assert read_survey(data_dir / "surveys" / "000_1236.xtf").pings[0].altitude_m is None
 
 
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", ["scotsman-iver2", "000_1236"])
 def test_samples_of_recordings_start_in_water_column(data_dir, name):
     """Index 0 is nearest to the vehicle: on both sides the dark water column is before the bright seabed."""
-    survey = read_xtf(data_dir / "surveys" / f"{name}.xtf")
+    survey = read_survey(data_dir / "surveys" / f"{name}.xtf")
     for side in Side:
         image = survey.waterfall(side)
         water = image[:200, 30:60].mean()

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.readers.xtf import read_xtf
+from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -40,7 +40,7 @@ def assert_same(read: Survey, written: Survey) -> None:
 def test_written_survey_is_read_back(small_survey, tmp_path, dtype):
     survey = small_survey(dtype)
     write_xtf(survey, tmp_path / "line7.xtf")
-    read = read_xtf(tmp_path / "line7.xtf")
+    read = read_survey(tmp_path / "line7.xtf")
     assert_same(read, survey)
     assert (read.sonar_id, read.line_name, read.warnings) == ("HDS", "line7", ())
     assert read.path == tmp_path / "line7.xtf"
@@ -91,7 +91,7 @@ def test_missing_navigation_is_read_as_none(small_survey, tmp_path):
     survey = small_survey()
     without_navigation = tuple(Ping(p.number, p.time_utc_s, p.channels) for p in survey.pings)
     write_xtf(dataclasses.replace(survey, pings=without_navigation), tmp_path / "a.xtf")
-    read = read_xtf(tmp_path / "a.xtf")
+    read = read_survey(tmp_path / "a.xtf")
     for ping in read:
         assert {ping.lat_deg, ping.lon_deg, ping.heading_deg, ping.altitude_m, ping.speed_mps} == {None}
     assert read.warnings == ("no position fix in 5 of 5 pings, the first in row 0",)
@@ -101,7 +101,7 @@ def test_one_ping_without_navigation(small_survey, tmp_path):
     survey = small_survey()
     first = Ping(1, survey.pings[0].time_utc_s, survey.pings[0].channels)
     write_xtf(dataclasses.replace(survey, pings=(first, *survey.pings[1:])), tmp_path / "a.xtf")
-    read = read_xtf(tmp_path / "a.xtf")
+    read = read_survey(tmp_path / "a.xtf")
     assert_same(dataclasses.replace(read, pings=read.pings[1:]), dataclasses.replace(survey, pings=survey.pings[1:]))
     assert (read.pings[0].lat_deg, read.pings[0].heading_deg, read.pings[0].pitch_deg) == (None, None, None)
 
@@ -110,7 +110,7 @@ def test_heading_zero_differs_from_unknown_heading(small_survey, tmp_path):
     survey = small_survey()
     north = tuple(dataclasses.replace(p, heading_deg=0.0) for p in survey.pings)
     write_xtf(dataclasses.replace(survey, pings=north), tmp_path / "a.xtf")
-    assert [p.heading_deg for p in read_xtf(tmp_path / "a.xtf")] == [0.0] * 5
+    assert [p.heading_deg for p in read_survey(tmp_path / "a.xtf")] == [0.0] * 5
 
 
 def test_dual_frequency_and_ping_without_one_side(small_survey, tmp_path):
@@ -121,7 +121,7 @@ def test_dual_frequency_and_ping_without_one_side(small_survey, tmp_path):
     pings[2] = dataclasses.replace(pings[2], channels=pings[2].channels[1:])
     survey = dataclasses.replace(survey, pings=tuple(pings))
     write_xtf(survey, tmp_path / "a.xtf")
-    assert_same(read_xtf(tmp_path / "a.xtf"), survey)
+    assert_same(read_survey(tmp_path / "a.xtf"), survey)
 
 
 @settings(max_examples=60, deadline=None)
@@ -139,7 +139,7 @@ def test_any_ping_is_read_back(tmp_path_factory, lat, lon, heading, altitude, ti
     path = tmp_path_factory.mktemp("any") / "x.xtf"
     survey = Survey(path, "A", "x", (ping,))
     write_xtf(survey, path)
-    assert_same(read_xtf(path), survey)
+    assert_same(read_survey(path), survey)
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_reading_prints_and_warns_nothing(small_survey, tmp_path, capfd):
     write_xtf(small_survey(), tmp_path / "a.xtf")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        read_xtf(tmp_path / "a.xtf")
+        read_survey(tmp_path / "a.xtf")
     assert caught == []
     assert capfd.readouterr() == ("", "")
 

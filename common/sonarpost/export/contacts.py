@@ -32,7 +32,7 @@ from sonarpost.messages import (
     Time,
     Verdict,
 )
-from sonarpost.wire import expected_text
+from sonarpost.wire import first_error
 
 MAX_FILE_BYTES: Final = 1 << 20
 """Larger JSON files are rejected. A side-car with 64 notes of 2000 characters is far smaller."""
@@ -263,10 +263,7 @@ def _read(model: type[R], path: Path, problems: list[BadInputError]) -> R | None
     except OSError as error:
         problems.append(StoredFileError(str(path), "", error.strerror or str(error), f"a readable {model.TYPE}"))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        value = "nothing" if first["type"] == "missing" else first["input"]
-        field = ".".join(str(part) for part in first["loc"])
-        problems.append(StoredFileError(str(path), field, value, expected_text(first["type"], first["msg"])))
+        problems.append(StoredFileError(str(path), *first_error(error)))
     return None
 
 

@@ -27,6 +27,7 @@ from sonarpost.errors import BadInputError
 from sonarpost.files import PRIVATE_FILE, PUBLIC_FILE, write_atomically, write_new_folder
 from sonarpost.security import certificates
 from sonarpost.security.certificates import SignedCertificate
+from sonarpost.wire import first_error
 
 CA_CERTIFICATE = "ca.pem"
 CA_KEY = "ca.key"
@@ -108,9 +109,7 @@ class FleetIndex(BaseModel):
         except OSError as error:
             raise PkiError(str(path), "", str(error), "a readable file") from error
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            field = ".".join(str(part) for part in first["loc"])
-            raise PkiError(str(path), field, first.get("input"), first["msg"]) from error
+            raise PkiError(str(path), *first_error(error)) from error
         for entry in index.certificates:
             if certificates.platform_of(entry.common_name)[0] != entry.platform:
                 raise PkiError(str(path), "common_name", entry.common_name, f"a name of {entry.platform}")

@@ -152,7 +152,7 @@ def ping_spacing_m(survey: Survey) -> float | None:
 
 def _track_m(survey: Survey, fixed: list[int]) -> FloatArray:
     """Return (north, east) of every ping, shape (pings, 2), interpolated and extrapolated over missing fixes."""
-    positions = [_position(survey.pings[row]) for row in fixed]
+    positions = [Position(survey.pings[row].lat_deg, survey.pings[row].lon_deg) for row in fixed]  # type: ignore[arg-type]
     known = np.array([offset_between_m(positions[0], position) for position in positions], dtype=np.float64)
     rows = np.arange(len(survey.pings))
     track = np.stack([np.interp(rows, fixed, known[:, axis]) for axis in (0, 1)], axis=1)
@@ -161,12 +161,6 @@ def _track_m(survey: Survey, fixed: list[int]) -> FloatArray:
     track[: fixed[0]] = known[0] + (rows[: fixed[0]] - fixed[0])[:, None] * step
     track[fixed[-1] + 1 :] = known[-1] + (rows[fixed[-1] + 1 :] - fixed[-1])[:, None] * step
     return track
-
-
-def _position(ping: Ping) -> Position:
-    assert ping.lat_deg is not None
-    assert ping.lon_deg is not None
-    return Position(ping.lat_deg, ping.lon_deg)
 
 
 def _window_pings(times: FloatArray) -> int:

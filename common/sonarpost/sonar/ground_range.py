@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import uniform_filter1d
 
 from sonarpost.sonar.geometry import ground_to_slant_range_m
 from sonarpost.sonar.survey import FloatImage, Samples, Side, Survey
@@ -75,24 +74,6 @@ def interval_means(samples: Samples | FloatImage, edges: FloatArray, *, min_widt
     means = np.full(len(widths), np.nan)
     means[inside] = totals[inside] / widths[inside]
     return means
-
-
-def range_normalised(image: FloatImage, *, window_pings: int = 501) -> FloatImage:
-    """Divide each column by its moving mean along-track, which removes the decrease of the echo with range.
-
-    Args:
-        image: Shape (pings, columns) over ground or slant range; NaN where unknown.
-        window_pings: Window of the mean, much longer than any object.
-
-    Returns:
-        Same shape, float32, about 1 on average; NaN stays NaN.
-    """
-    known = np.isfinite(image)
-    values = np.where(known, image, 0).astype(np.float64)
-    count = uniform_filter1d(known.astype(np.float64), window_pings, axis=0, mode="constant")
-    mean = uniform_filter1d(values, window_pings, axis=0, mode="constant") / np.maximum(count, 1e-9)
-    result: FloatImage = np.where(known & (mean > 0), image / np.where(mean > 0, mean, 1), np.nan).astype(np.float32)
-    return result
 
 
 def beam_normalised(image: FloatImage, altitude_m: FloatArray, spacing_m: float) -> FloatImage:

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sonarpost.errors import ConfigError
+from sonarpost.wire import first_error
 
 _MAX_BYTES = 1 << 16
 _Offset = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]
@@ -112,6 +113,4 @@ def load_options(path: Path) -> SurveyOptions:
     try:
         return SurveyOptions.model_validate(table)
     except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(str(path), field, first["input"], first["msg"]) from error
+        raise ConfigError(str(path), *first_error(error)) from error

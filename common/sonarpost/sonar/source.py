@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
@@ -114,22 +114,22 @@ class StreamedSource(SurveySource):
             yield apply_mounting(jumps.filter(ping), self.options.mounting)
 
 
-class InMemorySource(SurveySource):
-    """A survey in memory as a source, for formats that are read as a whole."""
+class InMemorySource(StreamedSource):
+    """A survey in memory as a source, for formats that are read as a whole.
+
+    Raises:
+        SurveyFileError: The survey has no ping with a port or starboard channel.
+    """
 
     def __init__(self, survey: Survey, options: SurveyOptions) -> None:
-        self.options = options
-        checks = NavigationChecks(options.mounting)
-        for row, ping in enumerate(survey.pings):
-            checks.observe(row, ping)
-        jumps = PositionJumpFilter()
-        pings = tuple(apply_mounting(jumps.filter(ping), options.mounting) for ping in survey.pings)
-        self._survey = replace(survey, pings=pings)
-        warnings = (*survey.warnings, *checks.warnings(len(pings)))
-        self.info = SurveyInfo(survey.path, survey.sonar_id, survey.line_name, len(pings), survey.sides(), warnings)
+        super().__init__(survey.path, options)
+        self._survey = survey
+        self._validate(survey.sonar_id, survey.line_name)
 
-    def pings(self) -> Iterator[Ping]:
-        """Yield the pings."""
+    def _format_warnings(self) -> list[str]:
+        return list(self._survey.warnings)
+
+    def _read_pings(self, *, first_pass: bool) -> Iterator[Ping]:
         return iter(self._survey.pings)
 
 
@@ -147,7 +147,7 @@ def load_survey(source: SurveySource, max_bytes: int = MAX_HELD_BYTES) -> Survey
     held = 0
     pings = []
     for ping in source.pings():
-        held += sum(channel.samples.nbytes for channel in ping.channels)
+        held += _size_bytes(ping)
         if held > max_bytes:
             raise SurveyFileError(str(info.path), "samples", f"more than {max_bytes} bytes", "a recording in blocks")
         pings.append(ping)

@@ -35,7 +35,7 @@ def write_xtf(survey: Survey, path: Path) -> None:
 
     Samples keep their size (8, 16 or 32 bits). Time is rounded to 10 ms, the resolution of the format; altitude,
     depth, heading, attitude and speed to 32-bit floats. XTF has no code for an unknown value: None is written as zero,
-    which `read_xtf` reads as None for a position, an altitude, or a field that is zero in every ping. For the same
+    which the reader takes as None for a position, an altitude, or a field that is zero in every ping. For the same
     reason a heading of exactly 0 degrees is written as 360. The same survey gives the same bytes.
 
     Args:

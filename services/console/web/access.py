@@ -21,7 +21,7 @@ from sonarpost.services.console.store.database import Actor, Permission, Side
 from sonarpost.services.console.store.decisions import ConflictError
 from sonarpost.services.console.store.serialisers import Json
 from sonarpost.services.console.store.users import Session, Users, is_equal_secret
-from sonarpost.wire import expected_text
+from sonarpost.wire import first_error
 
 log = logging.getLogger(__name__)
 
@@ -86,9 +86,8 @@ class Call:
         try:
             return model.model_validate_json(self.body)
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            field = ".".join(str(part) for part in first["loc"]) or None
-            raise ApiError(400, "bad_request", expected_text(first["type"], first["msg"]), field) from error
+            field, _, expected = first_error(error)
+            raise ApiError(400, "bad_request", expected, field or None) from error
 
 
 Handler = Callable[[Call], Response]

@@ -17,7 +17,7 @@ from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import BoundaryDetection, Origin, pack, stored_ping_count, unpack
 from sonarpost.services.atd_stub.service import AtdStubService
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey
-from sonarpost.sonar.readers.xtf import read_xtf
+from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -244,6 +244,6 @@ def test_the_builders_write_the_pings_of_each_part(tmp_path):
     """The builders of this file work: the written pings are read back."""
     survey = survey_of(60, Box(30))
     (path,) = split(tmp_path, survey, (10, 50))
-    read = read_xtf(path)
+    read = read_survey(path)
     assert [p.number for p in read.pings] == list(range(10, 50))
     np.testing.assert_array_equal(read.pings[0].channel(Side.PORT).samples, survey.pings[10].channel(Side.PORT).samples)

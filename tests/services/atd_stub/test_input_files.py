@@ -18,7 +18,7 @@ from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.input_folder import InputFile, StableFiles, list_input_files
 from sonarpost.services.atd_stub.service import AtdStubService
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff
-from sonarpost.sonar.readers.xtf import read_xtf
+from sonarpost.sonar.readers import read_survey
 
 KEY = keys.contact_detected("uuv-1")
 THRESHOLD = 0.3
@@ -68,7 +68,7 @@ def check_next_image(texture, put_file, compressor):
 
 
 def best_of(path):
-    return detect(read_xtf(path), DetectorSettings(confidence_threshold=THRESHOLD, max_contacts=3))
+    return detect(read_survey(path), DetectorSettings(confidence_threshold=THRESHOLD, max_contacts=3))
 
 
 def counter(service, name):

@@ -12,7 +12,7 @@ from sonarpost.detection.stream import is_continuation
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import pack, unpack
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey
-from sonarpost.sonar.readers.xtf import read_xtf
+from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Side
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -38,7 +38,7 @@ def test_contacts_and_snippets_equal_those_of_the_first_frequency_alone(ground, 
 def test_dual_frequency_files_are_joined(samples, range_m, tmp_path):
     survey = with_second_frequency(survey_of(300, Box(150)), samples, range_m)
     paths = split(tmp_path, survey, (0, 149), (149, 300))
-    read = [read_xtf(path) for path in paths]
+    read = [read_survey(path) for path in paths]
     assert [len(ping.channels) for ping in (read[0].pings[-1], read[1].pings[0])] == [4, 4]
     assert is_continuation(*read), "the command line joins them too"
     assert len(near(detect_in_files(paths, join_timeout_s=30.0), 150)) == 1
@@ -53,6 +53,6 @@ def test_a_second_frequency_with_another_range_is_no_continuation(tmp_path):
     before, after = (with_second_frequency(survey, 320, range_m) for range_m in (12.5, 10.0))
     first, second = split(tmp_path, before, (0, 100), (100, 200))
     write_xtf(replace(after, pings=after.pings[100:]), second)
-    assert not is_continuation(read_xtf(first), read_xtf(second))
+    assert not is_continuation(read_survey(first), read_survey(second))
     file_end = detect_in_survey(first, "0" * 64, "uuv-1", AtdStubConfig(), {}, 100.0).file_end
     assert not detect_in_survey(second, "1" * 64, "uuv-1", AtdStubConfig(), {file_end.sonar_id: file_end}, 100.0).joined

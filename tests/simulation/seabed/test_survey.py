@@ -16,7 +16,7 @@ from sonarpost.simulation.seabed.targets import MINE_LIKE_KINDS
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.geometry import Position, georeference, offset_between_m, ping_spacing_m
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.readers.xtf import read_xtf
+from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Side
 
 SMALL = SurveySpec(seed=5, pings=180, samples=512, seabed=SeabedKind.SAND, targets=2, clutter=2)
@@ -151,7 +151,7 @@ def test_command_writes_survey_and_truth(tmp_path, capsys):
     words += ["--targets", "2", "--clutter", "2"]
     assert run(*words, "--truth", str(truth)) == 0
     assert "180 pings, 2 mine-like objects, 2 others" in capsys.readouterr().out
-    read, made = read_xtf(out), simulate_survey(SMALL)
+    read, made = read_survey(out), simulate_survey(SMALL)
     assert read.warnings == ()
     assert read.sonar_id == made.survey.sonar_id
     for side in Side:

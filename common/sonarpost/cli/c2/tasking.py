@@ -19,7 +19,7 @@ from sonarpost.cli.shared import add_router_options, add_site_option, router_of
 from sonarpost.delivery.client import deliver
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import Advice, Command, Record, Verdict
-from sonarpost.wire import expected_text
+from sonarpost.wire import first_error
 
 CONSUMER = "c2"
 KINDS = {"refine": "refine", "resend": "resend", "expand": "wider", "revisit": "revisit", "wider": "wider"}
@@ -147,9 +147,7 @@ def _send(parsed: argparse.Namespace, key: str, record_type: type[Record], field
     try:
         record = record_type.model_validate(fields)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        name = ".".join(str(part) for part in first["loc"])
-        raise ConfigError("c2", name, first["input"], expected_text(first["type"], first["msg"])) from error
+        raise ConfigError("c2", *first_error(error)) from error
     endpoints, tls = router_of(parsed)
     timed_out = threading.Event()
     timer = threading.Timer(parsed.timeout, timed_out.set)

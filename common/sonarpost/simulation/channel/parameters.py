@@ -19,7 +19,7 @@ from pydantic import Field, ValidationError
 from sonarpost.config import ServiceConfig
 from sonarpost.errors import ConfigError
 from sonarpost.simulation.channel.acoustics import SPHERICAL_DB_PER_DECADE, absorption_db_per_km, noise_db_per_hz
-from sonarpost.wire import expected_text
+from sonarpost.wire import first_error
 
 Value = float | int | bool | str
 Probability = Annotated[float, Field(ge=0, le=1)]
@@ -156,12 +156,10 @@ def build_parameters(values: Mapping[str, Value], where: str) -> ChannelParamete
 
 def config_error(where: str, error: ValidationError) -> ConfigError:
     """Return the error that names the first wrong parameter."""
-    first = error.errors(include_url=False)[0]
-    expected = expected_text(first["type"], first["msg"])
-    if first["type"] == "extra_forbidden":
+    field, value, expected = first_error(error)
+    if error.errors()[0]["type"] == "extra_forbidden":
         expected = f"one of {', '.join(['preset', *ChannelParameters.model_fields])}"
-    if not first["loc"]:  # keys that do not fit together: the text has the form of a ConfigError
-        name, _, rest = expected.partition(": got ")
+    if not field:  # keys that do not fit together: the text has the form of a ConfigError
+        field, _, rest = expected.partition(": got ")
         value, _, expected = rest.partition(", expected ")
-        return ConfigError(where, name, value, expected)
-    return ConfigError(where, ".".join(str(part) for part in first["loc"]), first["input"], expected)
+    return ConfigError(where, field, value, expected)

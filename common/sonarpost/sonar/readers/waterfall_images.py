@@ -42,6 +42,7 @@ from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers.open_file import CheckedFile
 from sonarpost.sonar.source import StreamedSource
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Ping, Side
+from sonarpost.wire import first_error
 
 _MAX_TOML_BYTES: Final = 1 << 16
 _COORDINATES: Final = {"degrees": ("lat_deg", "lon_deg"), "metres": ("northing_m", "easting_m")}
@@ -238,8 +239,6 @@ def _read_description(path: Path) -> WaterfallDescription:
                 tomllib.loads(file.read_at(0, file.size_bytes, "file").decode("utf-8"))
             )
         except ValidationError as error:
-            first = error.errors()[0]
-            field = ".".join(str(part) for part in first["loc"])
-            raise file.error(field, first["input"], first["msg"]) from error
+            raise file.error(*first_error(error)) from error
         except (ValueError, RecursionError) as error:  # not UTF-8, or not TOML
             raise file.error("", str(error), "TOML") from error

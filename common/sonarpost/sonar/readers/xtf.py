@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from pyxtf import XTFPacketStart, XTFPingHeader
+from pyxtf import XTFPacketStart
 
 from sonarpost.sonar.geometry import Position
 from sonarpost.sonar.navigation import (
@@ -31,16 +31,14 @@ from sonarpost.sonar.readers.xtf_records import (
     parse_attitude,
     read_header,
 )
-from sonarpost.sonar.source import StreamedSource, load_survey
-from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
+from sonarpost.sonar.source import StreamedSource
+from sonarpost.sonar.survey import ChannelPing, Ping, Side
 
 PACKET_MAGIC: Final = 0xFACE
 SONAR_PACKET: Final = 0
 ATTITUDE_PACKET: Final = 3
 NAV_UNITS_METRES: Final = 0
 NAV_UNITS_DEGREES: Final = 3
-MAX_FILE_BYTES: Final = 1 << 30
-"""Limit of `read_xtf`, which loads a survey into memory; larger files are read through `XtfSource`."""
 MAX_PACKET_BYTES: Final = 1 << 24
 
 _START_BYTES: Final = ctypes.sizeof(XTFPacketStart)
@@ -51,34 +49,12 @@ _PROFILE_COLUMNS: Final = 32
 _PROFILE_PINGS: Final = 64
 
 
-def read_xtf(path: Path, options: SurveyOptions | None = None) -> Survey:
-    """Read an XTF recording into memory.
-
-    The file must be complete: a file that ends inside a packet is an error, since a finished recording has no such
-    end. What the file does not record (a field that is zero in every ping) is None. HSeconds of 100 (rounding of a
-    recorder) is read as the next second.
-
-    Args:
-        path: The file.
-        options: None for the defaults.
-
-    Returns:
-        The survey, with one warning for each kind of irregularity.
-
-    Raises:
-        SurveyFileError: Not an XTF file, truncated, inconsistent, too long, without sonar pings, or unreadable.
-    """
-    with CheckedFile(path) as file:
-        if file.size_bytes > MAX_FILE_BYTES:
-            raise file.error("file size", file.size_bytes, f"at most {MAX_FILE_BYTES} bytes, or reading in blocks")
-    with XtfSource(path, options or SurveyOptions()) as source:
-        return load_survey(source)
-
-
 class XtfSource(StreamedSource):
     """An open XTF recording.
 
-    Pitch, roll and heading that no ping contains are taken from attitude packets up to one second before the ping.
+    The file must be complete: a file that ends inside a packet is rejected. A field that is zero in every ping is
+    unknown. HSeconds of 100 (rounding of a recorder) is read as the next second. Pitch, roll and heading that no ping
+    contains are taken from attitude packets up to one second before the ping.
 
     Raises:
         SurveyFileError: Not an XTF file, truncated, inconsistent, without sonar pings, or unreadable.
@@ -161,26 +137,27 @@ class XtfSource(StreamedSource):
     def _ping(self, raw: bytes, place: str, attitude: Attitude | None, row: int | None) -> Ping:
         """Return a ping; `row` is its row in the first pass, else None."""
         header, time_utc_s = self._parser.header(raw, place)
-        channels = tuple(self._parser.channels(raw, header, place))
-        record = NavigationRecord.of_ping(header, of_ship=self.options.position_source == "ship")
-        if row is not None:
-            self._cleaner.observe(row, record)
-            self._port_order.observe(channels)
-        navigation = self._cleaner.clean(record)
-        values = {name: getattr(navigation, name) for name in _ATTITUDE_FIELDS}
-        if attitude is not None and 0 <= time_utc_s - attitude.time_utc_s <= _ATTITUDE_VALID_S:
-            values.update({name: getattr(attitude, name) for name in self._from_attitude()})
-        return Ping(
+        of_ship = self.options.position_source == "ship"
+        stored = Ping(
             number=int(header.PingNumber),
             time_utc_s=time_utc_s,
-            channels=channels,
-            lat_deg=navigation.lat_deg,
-            lon_deg=navigation.lon_deg,
-            altitude_m=navigation.altitude_m,
-            depth_m=navigation.depth_m,
-            speed_mps=navigation.speed_mps,
-            **values,
+            channels=tuple(self._parser.channels(raw, header, place)),
+            lat_deg=float(header.ShipYcoordinate if of_ship else header.SensorYcoordinate),
+            lon_deg=float(header.ShipXcoordinate if of_ship else header.SensorXcoordinate),
+            heading_deg=float(header.SensorHeading),
+            altitude_m=float(header.SensorPrimaryAltitude),
+            depth_m=float(header.SensorDepth),
+            speed_mps=float(header.SensorSpeed) * KNOT_MPS,
+            pitch_deg=float(header.SensorPitch),
+            roll_deg=float(header.SensorRoll),
         )
+        if row is not None:
+            self._cleaner.observe(row, stored)
+            self._port_order.observe(stored.channels)
+        ping = self._cleaner.clean(stored)
+        if attitude is not None and 0 <= time_utc_s - attitude.time_utc_s <= _ATTITUDE_VALID_S:
+            ping = replace(ping, **{name: getattr(attitude, name) for name in self._from_attitude()})
+        return ping
 
 
 class _PortOrderCheck:
@@ -222,48 +199,11 @@ class _PortOrderCheck:
         return profile
 
 
-@dataclass(frozen=True, slots=True)
-class NavigationRecord:
-    """Navigation of one ping in SI units and degrees; None if unknown.
-
-    As stored in the file (`of_ping`), `lat_deg` and `lon_deg` contain the Y and X coordinate in the unit of the file.
-    """
-
-    lat_deg: float | None
-    lon_deg: float | None
-    heading_deg: float | None
-    altitude_m: float | None
-    depth_m: float | None
-    speed_mps: float | None
-    pitch_deg: float | None
-    roll_deg: float | None
-
-    @classmethod
-    def of_ping(cls, header: XTFPingHeader, *, of_ship: bool = False) -> NavigationRecord:
-        """Return the sensor fields of a ping header, without checks.
-
-        Args:
-            header: The header; its speed is in knots.
-            of_ship: Use the position of the ship, which differs for a towed or independent sonar.
-        """
-        return cls(
-            lat_deg=float(header.ShipYcoordinate if of_ship else header.SensorYcoordinate),
-            lon_deg=float(header.ShipXcoordinate if of_ship else header.SensorXcoordinate),
-            heading_deg=float(header.SensorHeading),
-            altitude_m=float(header.SensorPrimaryAltitude),
-            depth_m=float(header.SensorDepth),
-            speed_mps=float(header.SensorSpeed) * KNOT_MPS,
-            pitch_deg=float(header.SensorPitch),
-            roll_deg=float(header.SensorRoll),
-        )
-
-    def is_empty(self) -> bool:
-        """Return whether every field is zero: the recorder had no navigation yet."""
-        return not any(getattr(self, each.name) for each in fields(self))
-
-
 class NavigationCleaner:
     """Replaces unknown and implausible navigation values by None.
+
+    The pings are given as stored in the file: `lat_deg` and `lon_deg` hold the Y and X coordinate in the unit of the
+    file, and unknown values are zero.
 
     These are None: a position that is 0/0, not finite or out of range; a position in metres without a projection; an
     altitude of 0; a field that is zero in every ping; all fields of a ping whose navigation is all zero; a value
@@ -281,12 +221,12 @@ class NavigationCleaner:
         self._without_fix = PingCounter()
         self._implausible: dict[str, PingCounter] = {}
 
-    def observe(self, row: int, record: NavigationRecord) -> None:
-        """Count irregularities of a record in the first pass through the file."""
-        if self._position(record) is None:
+    def observe(self, row: int, stored: Ping) -> None:
+        """Count irregularities of a ping in the first pass through the file."""
+        if self._position(stored) is None:
             self._without_fix.add(row)
         for name in NAVIGATION_LIMITS:
-            value = getattr(record, name)
+            value = getattr(stored, name)
             if value:
                 self._recorded.add(name)
                 if not is_plausible(name, value):
@@ -296,19 +236,19 @@ class NavigationCleaner:
         """Return whether the field is not zero in any ping observed so far."""
         return name in self._recorded
 
-    def clean(self, record: NavigationRecord) -> NavigationRecord:
-        """Return the record with None for unknown and implausible values."""
-        values: dict[str, float | None] = {name: getattr(record, name) for name in NAVIGATION_LIMITS}
-        empty = record.is_empty()
+    def clean(self, stored: Ping) -> Ping:
+        """Return the ping with its position in degrees, and None for unknown and implausible values."""
+        values: dict[str, Any] = {name: getattr(stored, name) for name in NAVIGATION_LIMITS}
+        empty = not any((stored.lat_deg, stored.lon_deg, *values.values()))  # the recorder had no navigation yet
         for name, value in values.items():
             unknown = empty or name not in self._recorded or (name == "altitude_m" and value == 0)
             if unknown or value is None or not is_plausible(name, value):
                 values[name] = None
         if values["heading_deg"] == 360.0:
             values["heading_deg"] = 0.0
-        position = self._position(record)
+        position = self._position(stored)
         lat_deg, lon_deg = (None, None) if position is None else (position.lat_deg, position.lon_deg)
-        return replace(record, lat_deg=lat_deg, lon_deg=lon_deg, **values)
+        return replace(stored, lat_deg=lat_deg, lon_deg=lon_deg, **values)
 
     def warnings(self, total: int) -> list[str]:
         """Return one line for each kind of irregularity in `total` pings."""
@@ -326,9 +266,9 @@ class NavigationCleaner:
         implausible = sorted(self._implausible.items())
         return warnings + [f"{name} out of range in {counter.summary(total)}" for name, counter in implausible]
 
-    def _position(self, record: NavigationRecord) -> Position | None:
-        if record.lat_deg is None or record.lon_deg is None:
+    def _position(self, stored: Ping) -> Position | None:
+        if stored.lat_deg is None or stored.lon_deg is None:
             return None
         if self._nav_units == NAV_UNITS_METRES and self._projection is not None:
-            return self._projection.position(record.lon_deg, record.lat_deg)
-        return position_in_degrees(record.lat_deg, record.lon_deg) if self._nav_units == NAV_UNITS_DEGREES else None
+            return self._projection.position(stored.lon_deg, stored.lat_deg)
+        return position_in_degrees(stored.lat_deg, stored.lon_deg) if self._nav_units == NAV_UNITS_DEGREES else None

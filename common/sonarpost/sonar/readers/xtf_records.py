@@ -47,18 +47,6 @@ _DELAY_AGREEMENT: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class ChannelInfo:
-    """Description of a channel in the file header."""
-
-    kind: int
-    bytes_per_sample: int
-    sample_format: int
-    legacy_samples: int
-    frequency_khz: float
-    corrections: int
-
-
-@dataclass(frozen=True, slots=True)
 class Attitude:
     """An attitude packet: time and angles of a motion sensor."""
 
@@ -68,7 +56,7 @@ class Attitude:
     heading_deg: float
 
 
-def read_header(reader: SequentialReader, file: CheckedFile) -> tuple[XTFFileHeader, list[ChannelInfo]]:
+def read_header(reader: SequentialReader, file: CheckedFile) -> tuple[XTFFileHeader, list[XTFChanInfo]]:
     """Read the file header with its channels.
 
     Raises:
@@ -85,19 +73,8 @@ def read_header(reader: SequentialReader, file: CheckedFile) -> tuple[XTFFileHea
     # The header contains six channels; every further eight channels add 1024 bytes.
     extra = math.ceil(max(count - 6, 0) / 8)
     raw += reader.read(1024 * extra, "file header")
-    return header, [_channel(raw, index) for index in range(6 + 8 * extra)]
-
-
-def _channel(raw: bytes, index: int) -> ChannelInfo:
-    info = XTFChanInfo.from_buffer_copy(raw, _CHAN_INFO_OFFSET + index * _CHAN_INFO_BYTES)
-    return ChannelInfo(
-        kind=info.TypeOfChannel,
-        bytes_per_sample=info.BytesPerSample,
-        sample_format=info.SampleFormat,
-        legacy_samples=info.Reserved,
-        frequency_khz=info.Frequency,
-        corrections=info.CorrectionFlags,
-    )
+    offsets = range(_CHAN_INFO_OFFSET, _CHAN_INFO_OFFSET + (6 + 8 * extra) * _CHAN_INFO_BYTES, _CHAN_INFO_BYTES)
+    return header, [XTFChanInfo.from_buffer_copy(raw, offset) for offset in offsets]
 
 
 def parse_attitude(raw: bytes) -> Attitude | None:
@@ -118,7 +95,7 @@ def parse_attitude(raw: bytes) -> Attitude | None:
 class PingParser:
     """Parses the sonar packets of one file; `notes` counts skipped and corrected data."""
 
-    def __init__(self, file: CheckedFile, channels: list[ChannelInfo], *, port_farthest_first: bool) -> None:
+    def __init__(self, file: CheckedFile, channels: list[XTFChanInfo], *, port_farthest_first: bool) -> None:
         self._file = file
         self._channels = channels
         self._reverse = {Side.PORT: port_farthest_first, Side.STARBOARD: False}
@@ -165,7 +142,7 @@ class PingParser:
                 raise self._file.error(f"{where}, ChannelNumber", number, f"0 to {len(self._channels) - 1}")
             info = self._channels[number]
             bytes_per_sample = self._sample_bytes(info, number)
-            samples = int(channel_head.NumSamples) or info.legacy_samples
+            samples = int(channel_head.NumSamples) or int(info.Reserved)  # older files: in the header
             end = offset + samples * bytes_per_sample
             if end > len(raw):
                 limit = (len(raw) - offset) // bytes_per_sample
@@ -175,31 +152,33 @@ class PingParser:
             if channel is not None:
                 yield channel
 
-    def _sample_bytes(self, info: ChannelInfo, number: int) -> int:
-        size = info.bytes_per_sample
+    def _sample_bytes(self, info: XTFChanInfo, number: int) -> int:
+        size = int(info.BytesPerSample)
         if size not in _SAMPLE_BYTES:
             raise self._file.error(f"channel {number}, BytesPerSample", size, "1, 2 or 4")
         # Only side-scan channels must contain integers; other channels are skipped.
-        if info.kind in _SIDES and info.sample_format and _FORMAT_BYTES.get(info.sample_format) != size:
+        if info.TypeOfChannel in _SIDES and info.SampleFormat and _FORMAT_BYTES.get(info.SampleFormat) != size:
             expected = f"0, or the unsigned integer of {size} bytes"
-            raise self._file.error(f"channel {number}, SampleFormat", info.sample_format, expected)
-        if info.kind in _SIDES and info.corrections == _GROUND_RANGE:
-            raise self._file.error(f"channel {number}, CorrectionFlags", info.corrections, "slant-range samples (1)")
+            raise self._file.error(f"channel {number}, SampleFormat", info.SampleFormat, expected)
+        if info.TypeOfChannel in _SIDES and info.CorrectionFlags == _GROUND_RANGE:
+            raise self._file.error(
+                f"channel {number}, CorrectionFlags", info.CorrectionFlags, "slant-range samples (1)"
+            )
         return size
 
     def _channel_ping(
-        self, head: XTFPingChanHeader, info: ChannelInfo, raw: bytes, sound_velocity_mps: float
+        self, head: XTFPingChanHeader, info: XTFChanInfo, raw: bytes, sound_velocity_mps: float
     ) -> ChannelPing | None:
-        side = _SIDES.get(info.kind)
+        side = _SIDES.get(info.TypeOfChannel)
         if side is None:
-            name = _CHANNEL_NAMES.get(info.kind, f"type {info.kind}")
+            name = _CHANNEL_NAMES.get(info.TypeOfChannel, f"type {info.TypeOfChannel}")
             self.notes[f"skipped channel: {name}, not side-scan"] += 1
             return None
         slant_range_m = float(head.SlantRange)
         if not raw or not 0 < slant_range_m <= MAX_SLANT_RANGE_M:  # includes NaN
             self.notes[f"skipped {side.value} channel: no samples or no slant range"] += 1
             return None
-        samples = _samples(raw, info.bytes_per_sample, reverse=self._reverse[side])
+        samples = _samples(raw, info.BytesPerSample, reverse=self._reverse[side])
         if head.TimeDelay:
             delayed = _with_delay(samples, slant_range_m, head, sound_velocity_mps)
             if delayed is None:
@@ -211,7 +190,7 @@ class PingParser:
             side=side,
             samples=samples,
             slant_range_m=slant_range_m,
-            frequency_hz=_frequency_hz(float(head.Frequency) or info.frequency_khz),
+            frequency_hz=_frequency_hz(float(head.Frequency) or info.Frequency),
             scale=self._scale(int(head.Weight)),
         )
 
@@ -225,12 +204,8 @@ class PingParser:
 
 def _samples(raw: bytes, bytes_per_sample: int, *, reverse: bool) -> Samples:
     """Return little-endian unsigned integers in native byte order, reversed if requested."""
-    step = -1 if reverse else 1
-    if bytes_per_sample == 1:
-        return np.frombuffer(raw, dtype=np.uint8)[::step].copy()
-    if bytes_per_sample == 2:
-        return np.frombuffer(raw, dtype="<u2")[::step].astype(np.uint16)
-    return np.frombuffer(raw, dtype="<u4")[::step].astype(np.uint32)
+    samples = np.frombuffer(raw, dtype=f"<u{bytes_per_sample}")[:: -1 if reverse else 1]
+    return samples.astype(f"u{bytes_per_sample}")  # a copy in any case
 
 
 def _with_delay(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonarpost.detection.image_detector import ScaledImage, detect_in_image, normalise_image
+from research.detection.image_detector import ScaledImage, detect_in_image, normalise_image
 from sonarpost.sonar.survey import Side
 
 
