@@ -104,11 +104,12 @@ def run(parsed: argparse.Namespace) -> int:
     )
     page = OperatorPage(settings) if parsed.console else None
     with Chain(settings) as chain, Watcher(settings) as watcher:
+        # During the start of the services: the vehicle processes files when it is ready.
+        files = _deposit(inputs, settings, parsed.seed, console)
         with console.status("starting three routers and eight services"):
             watcher.wait_until_started(chain.check)
         if page is not None:
             page.show(console)
-        files = _deposit(inputs, settings, parsed.seed, console)
         _follow(chain, watcher, files, console)
         if page is not None:
             page.keep_open(chain, console)
