@@ -35,8 +35,7 @@ class EventHub:
         self._lock = threading.Lock()
         self._events: deque[Event] = deque(maxlen=buffered)
         self._last = 0
-        self._subscribers: dict[int, Callable[[], None]] = {}
-        self._next_subscriber = 0
+        self._subscribers: set[Callable[[], None]] = set()
 
     def publish(self, name: str, data: Json) -> None:
         """Add an event and notify the subscribers."""
@@ -46,22 +45,20 @@ class EventHub:
             self._events.append(Event(self._last, name, text))
         self.notify_all()
 
-    def subscribe(self, notify: Callable[[], None]) -> int:
-        """Call `notify` at every event, from any thread; it must not block. Return a number for `unsubscribe`."""
+    def subscribe(self, notify: Callable[[], None]) -> None:
+        """Call `notify` at every event, from any thread; it must not block."""
         with self._lock:
-            self._next_subscriber += 1
-            self._subscribers[self._next_subscriber] = notify
-            return self._next_subscriber
+            self._subscribers.add(notify)
 
-    def unsubscribe(self, subscriber: int) -> None:
-        """Remove a subscriber."""
+    def unsubscribe(self, notify: Callable[[], None]) -> None:
+        """Stop to call `notify`."""
         with self._lock:
-            self._subscribers.pop(subscriber, None)
+            self._subscribers.discard(notify)
 
     def notify_all(self) -> None:
         """Notify the subscribers, also without an event, for example when the server stops."""
         with self._lock:
-            subscribers = tuple(self._subscribers.values())
+            subscribers = tuple(self._subscribers)
         for notify in subscribers:
             notify()
 

@@ -61,7 +61,8 @@ class UnsentRecord:
 class ConsoleState:
     """The console's state. Every change is stored in the database, and published as an event.
 
-    Every method that changes the state raises DeliveryError if the database refuses the change.
+    Every method that changes the state raises DeliveryError if the database refuses the change. Every method with a
+    contact identifier, and with a version, raises NotFoundError if there is none.
 
     Attributes:
         clock: UTC seconds.
@@ -210,11 +211,7 @@ class ConsoleState:
             return contacts.list_contacts(db, query)
 
     def contact_detail(self, contact_id: str) -> Json:
-        """Return all data of a contact.
-
-        Raises:
-            NotFoundError: There is no such contact.
-        """
+        """Return all data of a contact."""
         contact = self._contact_json(contact_id)
         with self.database.read() as db:
             versions = db.execute(
@@ -247,11 +244,7 @@ class ConsoleState:
         return contact_json(row)
 
     def image(self, contact_id: str, version: int) -> ReconstructedImage:
-        """Return the record of an image version.
-
-        Raises:
-            NotFoundError: There is no such version.
-        """
+        """Return the record of an image version."""
         row = None
         if version < 2**31:  # larger numbers exceed the integers of SQLite
             with self.database.read() as db:
@@ -261,11 +254,7 @@ class ConsoleState:
         return decode_image(row)
 
     def request_costs(self, contact_id: str) -> list[Json]:
-        """Return the cost of each kind of request for a contact.
-
-        Raises:
-            NotFoundError: There is no such contact.
-        """
+        """Return the cost of each kind of request for a contact."""
         vehicle_id = str(self._contact_json(contact_id)["vehicle_id"])
         rate = self.fleet.uplink_rate(vehicle_id, self.config.assumed_rate)
         with self.database.read() as db:
@@ -314,7 +303,6 @@ class ConsoleState:
         """Store a decision to send; return it with its contact.
 
         Raises:
-            NotFoundError: There is no such contact.
             ConflictError: Another decision was stored after the contact was displayed.
             BadInputError: The displayed image is not a version of this contact.
         """
@@ -328,7 +316,7 @@ class ConsoleState:
         """Store a decision that undoes another one; return it with its contact.
 
         Raises:
-            NotFoundError, ConflictError: See `decide`.
+            ConflictError: See `decide`.
             BadInputError: `decision_id` is not the valid decision.
         """
         self._contact_json(contact_id)
@@ -347,7 +335,6 @@ class ConsoleState:
         """Store a request to send; return it.
 
         Raises:
-            NotFoundError: There is no such contact.
             BadInputError: The request is not possible, or one of this kind is in progress.
         """
         self._contact_json(contact_id)
@@ -356,11 +343,7 @@ class ConsoleState:
         return self._publish_action("request", contact_id, command_id)
 
     def add_advice(self, contact_id: str, record: Advice, actor: Actor) -> Json:
-        """Store a comment to send; return it.
-
-        Raises:
-            NotFoundError: There is no such contact or version.
-        """
+        """Store a comment to send; return it."""
         self.image(contact_id, record.image_version)
         with self.database.transaction() as db:
             requests.add_advice(db, contact_id, record, actor)
@@ -370,7 +353,6 @@ class ConsoleState:
         """Measure a line on an image, and optionally store the measurement.
 
         Raises:
-            NotFoundError: There is no such contact or version.
             NotMeasurableError: This part of the image cannot be measured.
         """
         image = self.image(contact_id, line.version)

@@ -274,9 +274,9 @@ def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path: Path) -> Non
         runners[2].set_poll_handler(lambda polled: [b"polled"])
         eventually(lambda: all(runner.ready for runner in runners.values()))
         requests = [
-            runners[1].ping(2),
-            runners[1].send_mini(2, 0x123),
-            runners[1].send_flexible(2, 1, b"flexible"),
+            runners[1].request(lambda driver, now: driver.ping(2, now)),
+            runners[1].request(lambda driver, now: driver.send_mini(2, 0x123, now)),
+            runners[1].request(lambda driver, now: driver.send_flexible(2, 1, b"flexible", now)),
             runners[1].request_packet(2, 1),
         ]
         eventually(lambda: len([e for e in events[1] if isinstance(e, RequestDone)]) == len(requests), 20.0)
@@ -286,7 +286,7 @@ def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path: Path) -> Non
         assert [e.bits for e in events[2] if isinstance(e, MiniPacketReceived)] == [0x123]
         assert [e.packet.data for e in events[2] if isinstance(e, FlexibleDataReceived)] == [b"flexible"]
         with pytest.raises(FrameError):
-            runners[1].send_mini(2, 0x2000)
+            runners[1].request(lambda driver, now: driver.send_mini(2, 0x2000, now))
     finally:
         for runner in runners.values():
             runner.stop()

@@ -101,11 +101,7 @@ def _add_images_and_output(parser: argparse.ArgumentParser) -> None:
 
 
 def run_build(args: argparse.Namespace) -> int:
-    """Build a codebook; return 0, or 1 if an image was skipped.
-
-    Raises:
-        SonarpostError: No image can be read, an argument is invalid, or the codebook cannot be written.
-    """
+    """Build a codebook; return 0, or 1 if an image was skipped."""
     rounds = parse_rounds(args.rounds, args.tile)
     if args.refine < 0:
         raise ConfigError("--refine", "", args.refine, "zero or more passes")
@@ -154,21 +150,13 @@ def parse_rounds(text: str, tile_px: int) -> tuple[Round, ...]:
 
 
 def run_info(args: argparse.Namespace) -> int:
-    """Print the content of a codebook; return 0.
-
-    Raises:
-        CodebookError: The codebook cannot be read.
-    """
+    """Print the content of a codebook; return 0."""
     _print_codebook(open_codebook(args.codebook))
     return 0
 
 
 def run_diff(args: argparse.Namespace) -> int:
-    """Print the differences; return 0 if the identities are equal, else 1, like `diff`.
-
-    Raises:
-        CodebookError: A codebook cannot be read, or the tile sizes differ.
-    """
+    """Print the differences; return 0 if the identities are equal, else 1, like `diff`."""
     first, second = open_codebook(args.first).tiles, open_codebook(args.second).tiles
     difference = compare(first, second)
     _print_table(
@@ -200,11 +188,7 @@ def _variance_text(tiles: UnmatchedTiles, own: str, other: str) -> str:
 
 
 def run_adapt(args: argparse.Namespace) -> int:
-    """Adapt a codebook and measure the gain; return 0, or 1 if an image was skipped.
-
-    Raises:
-        SonarpostError: Fewer than two images can be read, an argument is invalid, or the codebook cannot be written.
-    """
+    """Adapt a codebook and measure the gain; return 0, or 1 if an image was skipped."""
     console = Console(stderr=True)
     base = open_codebook(args.base).tiles
     images, skipped = _training_images(args.images, console)

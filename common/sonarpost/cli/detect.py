@@ -71,13 +71,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Detect in every file and print the contacts.
-
-    Raises:
-        SurveyFileError: A file cannot be read.
-        OSError: An image cannot be written.
-        ConfigError: The value of an option is out of range.
-    """
+    """Detect in every file and print the contacts."""
     try:
         settings = DetectorSettings(confidence_threshold=parsed.threshold, max_contacts=parsed.max_contacts)
     except ValueError as error:

@@ -68,11 +68,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run_encode(args: argparse.Namespace) -> int:
-    """Encode; return 0, or 1 if any file of the folder could not be encoded.
-
-    Raises:
-        SonarpostError: The codec or the codebook is not available, or a single input file is invalid.
-    """
+    """Encode; return 0, or 1 if any file of the folder could not be encoded."""
     registry = default_registry()
     if args.codec == "help":
         for name in registry.names():
@@ -92,11 +88,7 @@ def run_encode(args: argparse.Namespace) -> int:
 
 
 def run_decode(args: argparse.Namespace) -> int:
-    """Decode; return 0, or 1 if any file of the folder could not be decoded.
-
-    Raises:
-        SonarpostError: The codebook cannot be read, or a single input file is invalid.
-    """
+    """Decode; return 0, or 1 if any file of the folder could not be decoded."""
     log_preparation_to_stderr()
     suffixes = (*(f".{name}" for name in (*codec_names(), *RETIRED_NAMES)), TEXT_SUFFIX)
     # Opened before the loop: an unreadable codebook is one error, not one for each file.

@@ -49,12 +49,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Serve until SIGTERM or SIGINT.
-
-    Raises:
-        ConfigError: A router option is invalid.
-        PortError: The address cannot be bound.
-    """
+    """Serve until SIGTERM or SIGINT."""
     endpoints, tls = router_of(parsed)
     logs.configure_logging("metrics", log_format=parsed.log_format)
     with stop_on_signals() as stop:

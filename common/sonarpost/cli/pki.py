@@ -135,11 +135,7 @@ def _add_router_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run_init(args: argparse.Namespace) -> int:
-    """Create the authority; return 0.
-
-    Raises:
-        PkiError: The folder exists, or the passphrase is invalid.
-    """
+    """Create the authority; return 0."""
     secret = None
     if args.passphrase_file is not None:
         secret = _passphrase_from(args.passphrase_file)
@@ -156,33 +152,21 @@ def run_init(args: argparse.Namespace) -> int:
 
 
 def run_issue(args: argparse.Namespace) -> int:
-    """Issue a certificate; return 0.
-
-    Raises:
-        BadInputError: The platform has one already, or an argument is invalid.
-    """
+    """Issue a certificate; return 0."""
     _show(_fleet(args).issue(args.platform, args.role, args.hosts or (), args.days, args.out))
     print(f"To admit it, {UPDATE_ROUTERS}.")
     return 0
 
 
 def run_renew(args: argparse.Namespace) -> int:
-    """Renew a certificate; return 0.
-
-    Raises:
-        BadInputError: The platform has none, or an argument is invalid.
-    """
+    """Renew a certificate; return 0."""
     _show(_fleet(args).renew(args.platform, args.hosts, args.days, args.out))
     print("Routers need no new configuration. The old certificate remains valid until its end.")
     return 0
 
 
 def run_revoke(args: argparse.Namespace) -> int:
-    """Revoke a platform's name; return 0.
-
-    Raises:
-        PkiError: The platform has no certificate that is not revoked.
-    """
+    """Revoke a platform's name; return 0."""
     entry = _fleet(args).revoke(args.platform, args.reason)
     print(f"revoked    {entry.common_name}")
     print(f"Not in force yet: {UPDATE_ROUTERS}.")
@@ -190,11 +174,7 @@ def run_revoke(args: argparse.Namespace) -> int:
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """Print all certificates; return 1 if one that is in use ends within `--warn-days`, else 0.
-
-    Raises:
-        PkiError: There is no authority, or its index is damaged.
-    """
+    """Print all certificates; return 1 if one that is in use ends within `--warn-days`, else 0."""
     fleet = _fleet(args)
     index = fleet.index()
     now_utc_s = time.time()
@@ -217,11 +197,7 @@ def run_list(args: argparse.Namespace) -> int:
 
 
 def run_router_config(args: argparse.Namespace) -> int:
-    """Write a router's configuration with TLS and the present access control; return 0.
-
-    Raises:
-        BadInputError: The platform has no certificate or no router, or an endpoint is invalid.
-    """
+    """Write a router's configuration with TLS and the present access control; return 0."""
     options = RouterOptions(
         platform=args.platform,
         listen=args.listen,

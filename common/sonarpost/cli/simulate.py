@@ -25,35 +25,27 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Write a simulated side-scan survey as XTF. The same options give the same file.",
     )
     parser.add_argument("out", type=Path, metavar="OUT.xtf", help="the file to create or replace")
-    parser.add_argument("--seed", type=int, default=default.seed, help="seed of every random draw (%(default)s)")
-    parser.add_argument(
-        "--seabed",
-        choices=[kind.value for kind in SeabedKind],
-        default=default.seabed.value,
-        help="type of seabed (%(default)s)",
-    )
-    parser.add_argument("--pings", type=int, default=default.pings, help="number of pings (%(default)s)")
-    parser.add_argument("--samples", type=int, default=default.samples, help="samples per side (%(default)s)")
-    parser.add_argument(
-        "--range-m", type=float, default=default.range_m, help="slant range per side in metres (%(default)s)"
-    )
-    parser.add_argument("--altitude-m", type=float, default=default.altitude_m, help="altitude in metres (%(default)s)")
+    for name, text in (
+        ("seed", "seed of every random draw"),
+        ("pings", "number of pings"),
+        ("samples", "samples per side"),
+        ("range_m", "slant range per side in metres"),
+        ("altitude_m", "altitude in metres"),
+        ("targets", "number of mine-like objects"),
+        ("clutter", "number of other objects"),
+    ):
+        value = getattr(default, name)
+        option = f"--{name.replace('_', '-')}"
+        parser.add_argument(option, type=type(value), default=value, help=f"{text} (%(default)s)")
+    kinds = [kind.value for kind in SeabedKind]
+    parser.add_argument("--seabed", choices=kinds, default=default.seabed.value, help="type of seabed (%(default)s)")
     parser.add_argument("--bits", type=int, choices=(8, 16), default=default.bits, help="bits per sample (%(default)s)")
-    parser.add_argument(
-        "--targets", type=int, default=default.targets, help="number of mine-like objects (%(default)s)"
-    )
-    parser.add_argument("--clutter", type=int, default=default.clutter, help="number of other objects (%(default)s)")
     parser.add_argument("--truth", type=Path, metavar="FILE.json", help="write the ground truth as JSON")
     parser.set_defaults(run=run_simulate)
 
 
 def run_simulate(args: argparse.Namespace) -> int:
-    """Simulate and write a survey; print its summary.
-
-    Raises:
-        ConfigError: An option out of range.
-        OSError: A file cannot be written.
-    """
+    """Simulate and write a survey; print its summary."""
     spec = SurveySpec(
         seed=args.seed,
         seabed=SeabedKind(args.seabed),

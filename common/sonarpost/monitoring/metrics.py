@@ -14,6 +14,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from sonarpost.messages import Health
 from sonarpost.monitoring.fleet import FleetState, ServiceStatus
 
 LABELS: Final = ("platform", "service")
@@ -46,61 +47,51 @@ class FleetCollector(Collector):
     def collect(self) -> Iterable[Metric]:
         """Return all metrics."""
         state = self._state()
+        connected = float(state.connected)
         yield GaugeMetricFamily(
-            "sonarpost_exporter_router_connected",
-            "1 while the exporter reaches its router",
-            value=float(state.connected),
+            "sonarpost_exporter_router_connected", "1 while the exporter reaches its router", value=connected
         )
         yield CounterMetricFamily("sonarpost_exporter_records_rejected", "Invalid health records", value=state.rejected)
-        yield self._up(state.services)
-        age = GaugeMetricFamily(
-            "sonarpost_health_age_seconds", "Time since the arrival of the last health record", labels=LABELS
-        )
-        for status in state.services:
-            if status.age_s is not None:
-                age.add_metric((status.platform, status.service), status.age_s)
-        yield age
-        fresh = [s for s in state.services if s.health is not None and (s.age_s or 0.0) <= self._stale_after_s]
-        yield from self._record_metrics(fresh)
-
-    def _up(self, services: Iterable[ServiceStatus]) -> Metric:
-        up = GaugeMetricFamily("sonarpost_up", "1 while the service's liveliness token exists", labels=LABELS)
-        for status in services:
-            # Unknown without a router: no series rather than a wrong one.
-            if status.alive is not None:
-                up.add_metric((status.platform, status.service), float(status.alive))
-        return up
-
-    def _record_metrics(self, services: Sequence[ServiceStatus]) -> Iterable[Metric]:
-        state = GaugeMetricFamily(
-            "sonarpost_state", "1 for the present state of the service", labels=(*LABELS, "state")
-        )
-        started = GaugeMetricFamily("sonarpost_started_time_seconds", "Start of the process, Unix time", labels=LABELS)
-        sent = GaugeMetricFamily(
-            "sonarpost_health_time_seconds", "Time in the last health record, by the platform's clock", labels=LABELS
-        )
-        for status in services:
-            health, labels = status.health, (status.platform, status.service)
-            assert health is not None
-            for name in STATES:
-                state.add_metric((*labels, name), float(health.state == name))
-            started.add_metric(labels, health.started_utc_s)
-            sent.add_metric(labels, health.time_utc_s)
-        yield from (state, started, sent)
-        yield from _values(services)
+        # Unknown without a router: no series rather than a wrong one.
+        alive = ((_labels(s), float(s.alive)) for s in state.services if s.alive is not None)
+        yield _gauge("up", "1 while the service's liveliness token exists", alive)
+        ages = ((_labels(s), s.age_s) for s in state.services if s.age_s is not None)
+        yield _gauge("health_age_seconds", "Time since the arrival of the last health record", ages)
+        fresh = {_labels(s): s.health for s in state.services if s.health and (s.age_s or 0.0) <= self._stale_after_s}
+        states = [((*of, name), float(health.state == name)) for of, health in fresh.items() for name in STATES]
+        yield _gauge("state", "1 for the present state of the service", states, (*LABELS, "state"))
+        started = ((of, health.started_utc_s) for of, health in fresh.items())
+        yield _gauge("started_time_seconds", "Start of the process, Unix time", started)
+        sent = ((of, health.time_utc_s) for of, health in fresh.items())
+        yield _gauge("health_time_seconds", "Time in the last health record, by the platform's clock", sent)
+        yield from _values(fresh)
 
 
-def _values(services: Iterable[ServiceStatus]) -> Iterable[Metric]:
+def _labels(status: ServiceStatus) -> tuple[str, str]:
+    return status.platform, status.service
+
+
+def _gauge(
+    name: str, text: str, values: Iterable[tuple[Sequence[str], float]] = (), labels: Sequence[str] = LABELS
+) -> GaugeMetricFamily:
+    gauge = GaugeMetricFamily(f"sonarpost_{name}", text, labels=labels)
+    for of, value in values:
+        gauge.add_metric(of, value)
+    return gauge
+
+
+def _values(services: Mapping[tuple[str, str], Health]) -> Iterable[Metric]:
     """Return one metric for each counter and gauge; the counter if a name is both."""
     counters: dict[str, CounterMetricFamily] = {}
     gauges: dict[str, GaugeMetricFamily] = {}
-    for status in services:
-        assert status.health is not None
-        labels = (status.platform, status.service)
-        for name, count in _usable(status.health.counters):
-            counters.setdefault(name, _counter(name)).add_metric(labels, count)
-        for name, value in _usable(status.health.gauges):
-            gauges.setdefault(name, _gauge(name)).add_metric(labels, value)
+    for labels, health in services.items():
+        for name, count in _usable(health.counters):
+            if name not in counters:
+                text = "Events since the service started"
+                counters[name] = CounterMetricFamily(f"sonarpost_{name}", text, labels=LABELS)
+            counters[name].add_metric(labels, count)
+        for name, value in _usable(health.gauges):
+            gauges.setdefault(name, _gauge(name, "Value in the last health record")).add_metric(labels, value)
     yield from counters.values()
     yield from (gauge for name, gauge in gauges.items() if name not in counters)
 
@@ -109,14 +100,6 @@ def _usable(values: Mapping[str, float]) -> Iterable[tuple[str, float]]:
     """Return the values with valid metric names."""
     usable = ((n, v) for n, v in values.items() if _NAME.fullmatch(n) and not _RESERVED.search(n) and n not in _OWN)
     return sorted(usable)[:MAX_VALUES]
-
-
-def _counter(name: str) -> CounterMetricFamily:
-    return CounterMetricFamily(f"sonarpost_{name}", "Events since the service started", labels=LABELS)
-
-
-def _gauge(name: str) -> GaugeMetricFamily:
-    return GaugeMetricFamily(f"sonarpost_{name}", "Value in the last health record", labels=LABELS)
 
 
 def registry_of(collector: FleetCollector) -> CollectorRegistry:

@@ -100,31 +100,7 @@ class ModemRunner:
         Raises:
             FrameError: An address, a rate or frames that the modem cannot send.
         """
-        return self._call(lambda now: self._driver.send_packet(destination, rate, frames, ack=ack, now=now))
-
-    def ping(self, destination: int) -> int:
-        """Queue a ping, from any thread; see `MicroModem.ping`.
-
-        Raises:
-            FrameError: An address outside 0..127.
-        """
-        return self._call(lambda now: self._driver.ping(destination, now))
-
-    def send_mini(self, destination: int, bits: int) -> int:
-        """Queue a user mini-packet, from any thread; see `MicroModem.send_mini`.
-
-        Raises:
-            FrameError: An address outside 0..127, or more than 13 bits.
-        """
-        return self._call(lambda now: self._driver.send_mini(destination, bits, now))
-
-    def send_flexible(self, destination: int, rate: int, data: bytes) -> int:
-        """Queue flexible data, from any thread; see `MicroModem.send_flexible`.
-
-        Raises:
-            FrameError: Data, an address or a rate that the modem cannot send.
-        """
-        return self._call(lambda now: self._driver.send_flexible(destination, rate, data, now))
+        return self.request(lambda driver, now: driver.send_packet(destination, rate, frames, ack=ack, now=now))
 
     def request_packet(self, source: int, rate: int, frames: int | None = None, *, ack: bool = False) -> int:
         """Queue a poll of another modem, from any thread; see `MicroModem.request_packet`.
@@ -132,7 +108,7 @@ class ModemRunner:
         Raises:
             FrameError: An address, a rate or a number of frames that the modem cannot request.
         """
-        return self._call(lambda now: self._driver.request_packet(source, rate, frames, ack=ack, now=now))
+        return self.request(lambda driver, now: driver.request_packet(source, rate, frames, ack=ack, now=now))
 
     def set_poll_handler(self, uplink: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
         """Set the function that returns frames when another modem polls; see `MicroModem.set_poll_handler`.
@@ -149,9 +125,14 @@ class ModemRunner:
         self._inputs.put(None)
         return sent
 
-    def _call(self, request: Callable[[float], int]) -> int:
+    def request(self, request: Callable[[MicroModem, float], int]) -> int:
+        """Call any other request of the driver, from any thread: `runner.request(lambda d, now: d.ping(2, now))`.
+
+        Args:
+            request: Receives the driver and the monotonic time, and returns the number of the request.
+        """
         with self._lock:
-            number = request(self._clock())
+            number = request(self._driver, self._clock())
         self._inputs.put(None)
         return number
 

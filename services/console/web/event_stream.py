@@ -59,7 +59,7 @@ class EventStream:
         def notify() -> None:
             loop.call_soon_threadsafe(notified.set)
 
-        subscriber = hub.subscribe(notify)
+        hub.subscribe(notify)
         self._open[session_key] += 1
         try:
             number = hub.parse_event_id(last_id) if last_id else hub.last
@@ -87,7 +87,7 @@ class EventStream:
                 with suppress(TimeoutError):
                     await asyncio.wait_for(notified.wait(), KEEP_ALIVE_S)
         finally:
-            hub.unsubscribe(subscriber)
+            hub.unsubscribe(notify)
             self._open[session_key] -= 1
             if self._open[session_key] <= 0:
                 del self._open[session_key]

@@ -111,10 +111,14 @@ def test_unhandled_exception_is_logged_and_answered(console, monkeypatch, caplog
 def test_event_buffer():
     hub = EventHub(buffered=3)
     notified = []
-    subscriber = hub.subscribe(lambda: notified.append(1))
+
+    def notify() -> None:
+        notified.append(1)
+
+    hub.subscribe(notify)
     for number in range(5):
         hub.publish("contact", {"n": number})
-    hub.unsubscribe(subscriber)
+    hub.unsubscribe(notify)
     hub.publish("contact", {"n": 5})
     assert len(notified) == 5
     assert [json.loads(e.data)["n"] for e in hub.events_after(4) or ()] == [4, 5]

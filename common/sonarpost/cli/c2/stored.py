@@ -133,12 +133,7 @@ def since_of(text: str | None, now_utc_s: float | None = None) -> float:
 
 
 def run_ls(parsed: argparse.Namespace) -> int:
-    """Print the table of images, or of commands and comments; return 0.
-
-    Raises:
-        StoredFileError: The folder has no index.
-        ConfigError: `--since` is invalid.
-    """
+    """Print the table of images, or of commands and comments; return 0."""
     record_filter = RecordFilter.of(parsed)
     with closing(ShoreIndex(parsed.out_dir, writable=False)) as index:
         if parsed.tasking:
@@ -258,12 +253,7 @@ def _print_table(headings: Sequence[str], rows: Sequence[Sequence[str]], noun: s
 
 
 def run_get(parsed: argparse.Namespace) -> int:
-    """Copy the files of an image and print their paths; return 0.
-
-    Raises:
-        StoredFileError: No image or several images match, or a file cannot be read.
-        OSError: A copy cannot be written.
-    """
+    """Copy the files of an image and print their paths; return 0."""
     with closing(ShoreIndex(parsed.out_dir, writable=False)) as index:
         row = find_image(index.images(), parsed.picture, parsed.vessel, parsed.version)
     copies = []
@@ -283,13 +273,7 @@ def run_get(parsed: argparse.Namespace) -> int:
 
 
 def run_export(parsed: argparse.Namespace) -> int:
-    """Export contacts; return 0, or 1 if a stored file was rejected.
-
-    Raises:
-        ConfigError: No output is requested, or an option is invalid.
-        StoredFileError: The folder cannot be read.
-        OSError, PortError: A file cannot be written, or events cannot be sent.
-    """
+    """Export contacts; return 0, or 1 if a stored file was rejected."""
     if not any(getattr(parsed, name) for name in (*FORMATS, "cot")):
         options = ", ".join(f"--{name}" for name in (*FORMATS, "cot"))
         raise ConfigError("c2 export", "", "no output", f"at least one of {options}")

@@ -76,13 +76,7 @@ def refuse_renamed(parsed: argparse.Namespace) -> int:
 
 
 def run_comment(parsed: argparse.Namespace) -> int:
-    """Send a comment to c2; return 0 after c2 has stored it.
-
-    Raises:
-        ConfigError: An option is invalid.
-        PayloadError: c2 rejects the record.
-        DeliveryError, PortError: c2 or its router cannot be reached in time.
-    """
+    """Send a comment to c2; return 0 after c2 has stored it."""
     vehicle, image = _vehicle_and_image(parsed)
     fields = {
         "advice_id": parsed.id or f"a-{uuid.uuid4().hex}",
@@ -103,11 +97,7 @@ def run_comment(parsed: argparse.Namespace) -> int:
 
 
 def run_command(parsed: argparse.Namespace) -> int:
-    """Send a command to c2; return 0 after c2 has stored it.
-
-    Raises:
-        ConfigError, PayloadError, DeliveryError, PortError: See `run_comment`.
-    """
+    """Send a command to c2; return 0 after c2 has stored it."""
     vehicle, image = _vehicle_and_image(parsed)
     fields = {
         "command_id": parsed.id or f"c-{uuid.uuid4().hex}",

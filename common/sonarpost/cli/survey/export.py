@@ -39,13 +39,7 @@ def add_action(actions: Subparsers) -> None:
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Write the track; return 0.
-
-    Raises:
-        SurveyFileError: The file cannot be read; no output file is written.
-        ConfigError: The options file is invalid.
-        OSError: The track cannot be written.
-    """
+    """Write the track; return 0."""
     write = write_csv if parsed.format == "csv" else write_geojson
     with open_survey(parsed.file, options_of(parsed)) as source:
         if parsed.out is None:

@@ -31,12 +31,7 @@ def add_action(actions: Subparsers) -> None:
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Describe every file; return 0.
-
-    Raises:
-        SurveyFileError: A file cannot be read.
-        ConfigError: The options file is invalid.
-    """
+    """Describe every file; return 0."""
     options = options_of(parsed)
     for path in parsed.files:
         with open_survey(path, options) as source:

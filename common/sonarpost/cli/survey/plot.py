@@ -61,13 +61,7 @@ def add_action(actions: Subparsers) -> None:
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Draw every file; print the names of the images; return 0.
-
-    Raises:
-        SurveyFileError: A file cannot be read.
-        ConfigError: The options file or the number of rows is invalid.
-        OSError: An image cannot be written.
-    """
+    """Draw every file; print the names of the images; return 0."""
     if not 1 <= parsed.rows <= _MAX_ROWS_OPTION:
         raise ConfigError("survey plot", "--rows", parsed.rows, f"1 to {_MAX_ROWS_OPTION}")
     if parsed.even and not parsed.ground:
