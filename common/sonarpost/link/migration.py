@@ -6,7 +6,7 @@ and maps with its immutable content. Each function returns the parts that `resto
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import wraps
 from typing import Any, Final, TypeVar
 
@@ -23,10 +23,45 @@ from sonarpost.link.frames.v1.sender import SenderState, WaitingImages
 from sonarpost.link.queue.messages import MessageIdentifier, MessageQueue, QueuedMessage
 from sonarpost.link.queue.transmit_queue import QueueState
 from sonarpost.link.sender import OutgoingPacket
-from sonarpost.link.state import Errors, Parts, below, from_plain, pack_part, prefixed, to_plain, unpack_plain
+from sonarpost.link.state import Errors, Parts, from_plain, pack_part, prefixed, to_plain, unpack_plain
 
 _WHERE: Final = "state of version 0.1"
 _FORMAT: Final = 1
+_UNNAMED: Final = ("0000", "?")
+"""Image and contact identifier of an image without a name."""
+_RENAMED: Final[dict[type, dict[str, str]]] = {
+    AssembledImage: {"first_at": "first_frame_s", "last_at": "last_frame_s", "told": "reported"},
+    AuthenticationCounts: {"sealed": "protected"},
+    BlockDecoder: {"last_at": "last_symbol_s"},
+    OutgoingImage: {"added_at": "added_s"},
+    PeerState: {
+        "heard_at": "last_frame_s",
+        "newest": "newest_block",
+        "span": "block_span",
+        "messages": "recent_messages",
+        "reported_at": "feedback_s",
+        "reported_frames": "feedback_frames",
+        "needless": "redundant_symbols",
+    },
+    PendingCommand: {"asked_at": "added_s", "expires_at": "expires_s", "due_at": "due_s"},
+    PendingImage: {
+        "first_at": "first_frame_s",
+        "last_at": "last_frame_s",
+        "news_at": "wait_from_s",
+        "heard_at": "last_seen_s",
+        "given": "reported",
+    },
+    QueuedMessage: {"id": "message_id", "added_at": "added_s", "expires_at": "expires_s"},
+    QueueState: {
+        "interval_s": "packet_interval_s",
+        "credit": "image_credit",
+        "last_report_at": "last_feedback_s",
+        "frames_at_report": "frames_at_feedback",
+    },
+    SendBlock: {"asked_at": "last_activity_s"},
+    V1ReceiverCounts: {"refused": "rejected", "reports": "feedback", "forgotten_sources": "evicted_sources"},
+}
+"""Fields of version 0.1 that have other names now."""
 _T = TypeVar("_T")
 _A = TypeVar("_A")
 _Map = dict[str, Any]
@@ -53,10 +88,10 @@ def _state(state: _Map) -> _Map:
     return state
 
 
-def _read(kind: type[_T], entry: _Map, names: Mapping[str, str] | None = None, **values: object) -> _T:
+def _read(kind: type[_T], entry: _Map, **values: object) -> _T:
     """Return a dataclass from a map with the field names of version 0.1; `values` replace fields."""
-    plain = {(names or {}).get(name, name): value for name, value in entry.items()}
-    return from_plain(kind, {**plain, **values}, _WHERE)
+    names = _RENAMED.get(kind, {})
+    return from_plain(kind, {**{names.get(name, name): value for name, value in entry.items()}, **values}, _WHERE)
 
 
 @_converts
@@ -70,25 +105,17 @@ def v1_receiver_parts(data: bytes) -> dict[str, bytes]:
 
 
 def _v1_receiver_parts(state: _Map) -> dict[str, bytes]:
-    names = {"refused": "rejected", "reports": "feedback", "forgotten_sources": "evicted_sources"}
-    parts = {"counts": pack_part(_read(V1ReceiverCounts, _state(state)["counts"], names))}
-    names = {
-        "heard_at": "last_frame_s",
-        "newest": "newest_block",
-        "span": "block_span",
-        "messages": "recent_messages",
-        "reported_at": "feedback_s",
-        "reported_frames": "feedback_frames",
-        "needless": "redundant_symbols",
-    }
+    parts = {"counts": pack_part(_read(V1ReceiverCounts, _state(state)["counts"]))}
     for order, source in enumerate(state["sources"]):
-        peer = _read(PeerState, source, names, order=order)
+        peer = _read(PeerState, source, order=order)
         peer.blocks = {block.number: block for block in map(_block, source["blocks"])}
         peer.rival_blocks = {block.number: block for block in map(_block, source["rivals"])}
-        for image_order, entry in enumerate(source["contacts"], start=1):
-            image = _assembled_image(peer.address, entry, image_order)
+        for peer.image_order, entry in enumerate(source["contacts"], start=1):
+            contact, stream = entry["contact"] or None, _packed_stream(entry["pieces"], 0)
+            image = _read(
+                AssembledImage, entry, source=peer.address, contact=contact, stream=stream, order=peer.image_order
+            )
             peer.images[image.number] = image
-            peer.image_order = image_order
         parts |= peer.parts()
     return parts
 
@@ -96,28 +123,10 @@ def _v1_receiver_parts(state: _Map) -> dict[str, bytes]:
 def _block(entry: _Map) -> BlockDecoder:
     layers = entry["layers"]
     ends = [[number, link, start + len(data)] for number, link, start, data in layers[-1]["pieces"]] if layers else []
-    block = _read(
-        BlockDecoder,
-        entry,
-        {"last_at": "last_symbol_s"},
-        layering=entry["layering"] or None,
-        layers=len(layers),
-        layer_ends=ends,
-    )
+    layering = entry["layering"] or None
+    block = _read(BlockDecoder, entry, layering=layering, layers=len(layers), layer_ends=ends)
     block.restore_chunk(_read(SymbolChunk, {"symbols": entry["symbols"]}))
     return block
-
-
-def _assembled_image(source: int, entry: _Map, order: int) -> AssembledImage:
-    return _read(
-        AssembledImage,
-        entry,
-        {"first_at": "first_frame_s", "last_at": "last_frame_s", "told": "reported"},
-        source=source,
-        contact=entry["contact"] or None,
-        stream=_packed_stream(entry["pieces"], 0),
-        order=order,
-    )
 
 
 def _packed_stream(pieces: list[tuple[int, bytes]], length: int) -> object:
@@ -132,19 +141,12 @@ def paper_receiver_parts(data: bytes) -> dict[str, bytes]:
     """Convert the state of the `paper` receiver."""
     state = _state(unpack_plain(dict, data, _WHERE))
     parts = {"counts": pack_part(_read(PaperReceiverCounts, state["counts"]))}
-    names = {
-        "first_at": "first_frame_s",
-        "last_at": "last_frame_s",
-        "news_at": "wait_from_s",
-        "heard_at": "last_seen_s",
-        "given": "reported",
-    }
     for order, entry in enumerate(state["images"]):
         candidates = [
             {"header": c["header"], "body": _packed_stream(c["pieces"], c["body_length"]), "frames": c["frames"]}
             for c in entry["candidates"]
         ]
-        image = _read(PendingImage, entry, names, candidates=candidates, order=order)
+        image = _read(PendingImage, entry, candidates=candidates, order=order)
         parts[f"image/{image.source}/{image.image_id}"] = pack_part(image)
     return parts
 
@@ -153,8 +155,8 @@ def paper_receiver_parts(data: bytes) -> dict[str, bytes]:
 def authentication_parts(data: bytes) -> dict[str, bytes]:
     """Convert the state of the authentication."""
     state = _state(unpack_plain(dict, data, _WHERE))
-    counts = _read(AuthenticationCounts, state["counts"], {"sealed": "protected"})
-    parts = {"authentication": pack_part(_read(AuthenticationState, state, counts=to_plain(counts)))}
+    counts = to_plain(_read(AuthenticationCounts, state["counts"]))
+    parts = {"authentication": pack_part(_read(AuthenticationState, state, counts=counts))}
     for source, newest, seen in state["windows"]:
         window = SavedWindow(source, ReplayWindow(newest, int.from_bytes(seen, "big")))
         parts[f"window/{source}"] = pack_part(window)
@@ -167,9 +169,8 @@ def endpoint_parts(data: bytes) -> dict[str, bytes]:
     state = _state(unpack_plain(dict, data, _WHERE))
     parts = {"endpoint": pack_part(_read(EndpointState, state))}
     parts |= prefixed("v1/", _v1_receiver_parts(state["receiver"]))
-    names = {"asked_at": "added_s", "expires_at": "expires_s", "due_at": "due_s"}
     for order, entry in enumerate(_state(state["orders"])["orders"], start=1):
-        command = _read(PendingCommand, entry, names, order=order)
+        command = _read(PendingCommand, entry, order=order)
         parts[f"commands/command/{command.token}"] = pack_part(command)
     return parts
 
@@ -183,100 +184,85 @@ def queue_parts(parts: Parts) -> tuple[dict[str, bytes], Errors]:
     """
     errors: dict[str, FrameError] = {}
     maps: dict[str, _Map] = {}
+    converted: dict[str, bytes] = {}
     for name, data in parts.items():
         try:
             maps[name] = unpack_plain(dict, data, _WHERE)
         except FrameError as error:
             errors[name] = error
-    converted: dict[str, bytes] = {}
-    for name, convert in (("core", _core_parts), ("packet", _packet_parts)):
-        if name in maps:
+    converters: dict[str, Callable[[_Map], dict[str, bytes]]] = {
+        "picture": _image_parts,
+        "message": _message_parts,
+        "packet": _packet_parts,
+        "core": lambda core: _core_parts((core, maps)),
+    }
+    for name in sorted(maps, key=lambda name: name == "core"):  # the core last: it replaces images without progress
+        convert = converters.get(name.partition("/")[0])
+        if convert is not None:
             try:
-                converted |= convert(maps)
+                converted |= convert(maps[name])
             except FrameError as error:
                 errors[name] = error
-    for name, convert_entry in (("picture", _image_parts), ("message", _message_parts)):
-        for rest, entry in below(f"{name}/", maps).items():
-            try:
-                converted = {**convert_entry(entry), **converted}
-            except FrameError as error:
-                errors[f"{name}/{rest}"] = error
     return converted, errors
 
 
 @_converts
 def _image_parts(entry: _Map) -> dict[str, bytes]:
-    image_id, contact_id = entry.get("name") or ("0000", "?")
-    image = _read(OutgoingImage, entry, {"added_at": "added_s"}, image_id=image_id, contact_id=contact_id)
+    image_id, contact_id = entry.get("name") or _UNNAMED
+    image = _read(OutgoingImage, entry, image_id=image_id, contact_id=contact_id)
     return {f"image/{image.number}": pack_part(image)}
 
 
 @_converts
 def _message_parts(entry: _Map) -> dict[str, bytes]:
-    names = {"id": "message_id", "added_at": "added_s", "expires_at": "expires_s"}
-    message = _read(QueuedMessage, entry, names)
+    message = _read(QueuedMessage, entry)
     return {f"message/{message.key}": pack_part(message)}
 
 
 @_converts
-def _packet_parts(maps: Mapping[str, _Map]) -> dict[str, bytes]:
-    entry = maps["packet"]
+def _packet_parts(entry: _Map) -> dict[str, bytes]:
     return {"packet": pack_part(_read(OutgoingPacket, entry))} if entry.get("frames") else {}
 
 
 @_converts
-def _core_parts(maps: Mapping[str, _Map]) -> dict[str, bytes]:
-    core = _state(maps["core"])
+def _core_parts(content: tuple[_Map, dict[str, _Map]]) -> dict[str, bytes]:
+    """Convert the part `core`, and the images and blocks (in the other parts) whose progress it has."""
+    core, maps = _state(content[0]), content[1]
     sender = _state(core["sender"])
-    queue = _read(
-        QueueState,
-        core,
-        {
-            "interval_s": "packet_interval_s",
-            "credit": "image_credit",
-            "last_report_at": "last_feedback_s",
-            "frames_at_report": "frames_at_feedback",
-        },
-        losses={rate: [loss, measured_s] for rate, loss, measured_s in core["losses"]},
-        planned_loss=core.get("planned_loss", 0.2),
-    )
-    state = _read(
-        SenderState,
-        sender,
-        messages=[[_message_copies(*entry) for entry in sender["messages"]], sender["next_message"]],
-        tracker=[dict(sender["receivers"]), {receiver: measured for receiver, *measured in sender["meters"]}],
-    )
+    losses = {rate: [loss, measured_s] for rate, loss, measured_s in core["losses"]}
+    tracker = [dict(sender["receivers"]), {receiver: measured for receiver, *measured in sender["meters"]}]
+    waiting_copies = [_copies(entry) for entry in sender["messages"]]
     messages = _read(MessageQueue, core)
-    parts = {"queue": pack_part(queue), "sender": pack_part(state), "messages": pack_part(messages)}
-    parts["waiting"] = pack_part(_read(WaitingImages, {"numbers": sender["waiting"]}))
+    parts = {
+        "queue": pack_part(_read(QueueState, core, losses=losses, planned_loss=core.get("planned_loss", 0.2))),
+        "sender": pack_part(
+            _read(SenderState, sender, messages=[waiting_copies, sender["next_message"]], tracker=tracker)
+        ),
+        "messages": pack_part(messages),
+        "waiting": pack_part(_read(WaitingImages, {"numbers": sender["waiting"]})),
+    }
     names = {number: (image_id, contact_id) for number, image_id, contact_id in core["names"]}
     for order, (number, sent, *rest) in enumerate(core["sent"], start=1):
-        goal, settled = rest or (0, [])
-        image_id, contact_id = names.get(number, ("0000", "?"))
+        goal, delivered = rest or (0, [])
+        image_id, contact_id = names.get(number, _UNNAMED)
         image = _read(
             OutgoingImage,
             maps[f"picture/{number}"],
-            {"added_at": "added_s"},
             image_id=image_id,
             contact_id=contact_id,
             order=order,
             sent=sent,
             goal=goal,
-            delivered=settled,
+            delivered=delivered,
             announced=number in sender["announced"],
         )
         parts[f"image/{number}"] = pack_part(image)
         parts[f"image-progress/{number}"] = pack_part(image, "progress")
     for retired, entries in ((False, core["blocks"]), (True, core.get("past", []))):
         for entry in entries:
-            block = _read(
-                SendBlock,
-                {**maps[f"block/{entry['number']}"], **entry},
-                {"asked_at": "last_activity_s"},
-                layering=maps[f"block/{entry['number']}"]["layering"] or None,
-                missing=dict(entry["needs"]),
-                retired=retired,
-            )
+            fixed = maps[f"block/{entry['number']}"]
+            layering, missing = fixed["layering"] or None, dict(entry["needs"])
+            block = _read(SendBlock, {**fixed, **entry}, layering=layering, missing=missing, retired=retired)
             parts[f"block/{block.number}"] = pack_part(block)
             parts[f"block-progress/{block.number}"] = pack_part(block, "progress")
     for order, name in enumerate(core["known"], start=messages.next_key - len(core["known"])):
@@ -284,23 +270,8 @@ def _core_parts(maps: Mapping[str, _Map]) -> dict[str, bytes]:
     return parts
 
 
-def _message_copies(
-    number: int,
-    data: bytes,
-    priority: int,
-    expires_s: float,
-    copies: int,
-    after_frame: int,
-    rises_s: float,
-    extra: int = 2,
-) -> _Map:
-    return {
-        "number": number,
-        "data": data,
-        "priority": priority,
-        "expires_s": expires_s,
-        "copies": copies,
-        "after_frame": after_frame,
-        "rises_s": None if rises_s == float("inf") else rises_s,
-        "extra": extra,
-    }
+def _copies(entry: list[Any]) -> list[Any]:
+    """Return the fields of a `MessageCopies`; an infinite time of the rise became None."""
+    number, data, priority, expires_s, copies, after_frame, rises_s, *extra = entry
+    rises_s = None if rises_s == float("inf") else rises_s
+    return [number, data, priority, expires_s, copies, after_frame, rises_s, *extra]

@@ -8,7 +8,7 @@ docs/specifications/acoustic-v1.md has the specification and the security analys
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Final
 
 from cryptography.exceptions import InvalidTag
@@ -28,7 +28,7 @@ _NONCE_BYTES: Final = 13
 _LOOK_BACK: Final = 64
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class AuthenticationCounts:
     """Counters since the first start; they continue over restarts.
 
@@ -121,6 +121,9 @@ class FrameAuthenticator:
 
     Memory: a window of two numbers for each of at most 128 transmitters, created after the first genuine frame.
 
+    Attributes:
+        counts: The counters.
+
     Args:
         key: The common key.
         address: Modem address of this station, 0..127. Stations that send in the same direction need different ones.
@@ -155,17 +158,12 @@ class FrameAuthenticator:
         self._windows: dict[int, ReplayWindow] = {}
         self._ahead: dict[int, int] = {}
         self._next = self._limit = first_counter
-        self._counts = AuthenticationCounts()
+        self.counts = AuthenticationCounts()
 
     @property
     def overhead_bytes(self) -> int:
         """Bytes that protection adds to a frame."""
         return self.settings.overhead_bytes
-
-    @property
-    def counts(self) -> AuthenticationCounts:
-        """The counters."""
-        return self._counts
 
     @property
     def frames_left(self) -> int:
@@ -204,7 +202,7 @@ class FrameAuthenticator:
         encrypted = self._own.encrypt(_nonce(counter), data, head)
         cut = len(encrypted) - self.settings.tag_bytes
         low = (counter % self.settings.counter_step).to_bytes(self.settings.counter_bytes, "big")
-        self._count(protected=1)
+        self.counts.protected += 1
         return head + encrypted[:cut] + low + encrypted[cut:]
 
     def verify(self, source: int, protected: bytes, where: str = "acoustic frame") -> bytes:
@@ -220,7 +218,7 @@ class FrameAuthenticator:
                 ahead that another frame must confirm it.
         """
         if not (0 <= source <= MAX_ADDRESS and len(protected) > self.overhead_bytes):
-            self._count(forged=1)
+            self.counts.forged += 1
             expected = f"more than {self.overhead_bytes} bytes from an address of 0..{MAX_ADDRESS}"
             raise FrameError(where, "tag", f"{len(protected)} bytes from {source}", expected)
         cut = len(protected) - self.overhead_bytes
@@ -232,9 +230,9 @@ class FrameAuthenticator:
             plain = self._decrypt(source, counter, head, data + tag)
             if plain is not None:
                 self._check_counter(source, window, counter, where)
-                self._count(genuine=1)
+                self.counts.genuine += 1
                 return head + plain
-        self._count(forged=1)
+        self.counts.forged += 1
         raise FrameError(where, "tag", tag, f"a tag of modem {source} with key {self._key.fingerprint}")
 
     def _candidates(self, source: int, window: ReplayWindow, low: int) -> Iterator[int]:
@@ -270,7 +268,7 @@ class FrameAuthenticator:
     def _check_counter(self, source: int, window: ReplayWindow, counter: int, where: str) -> None:
         """Accept a counter with a correct tag, or raise FrameError."""
         if not window.is_new(counter):
-            self._count(replayed=1)
+            self.counts.replayed += 1
             expected = f"one not accepted before, above {max(-1, window.newest - WINDOW)}"
             raise FrameError(where, "counter", counter, expected)
         if counter > window.newest + self.settings.counter_step - WINDOW:
@@ -278,7 +276,7 @@ class FrameAuthenticator:
             before = self._ahead.get(source)
             if before is None or not 0 < counter - before <= self.settings.counter_step - WINDOW:
                 self._ahead[source] = counter
-                self._count(unconfirmed=1)
+                self.counts.unconfirmed += 1
                 raise FrameError(where, "counter", counter, f"near {window.newest}, or a second frame like this one")
         window.accept(counter)
         self._windows[source] = window
@@ -294,7 +292,7 @@ class FrameAuthenticator:
 
         Save it in the transaction of what followed from the verified frames.
         """
-        state = AuthenticationState(self._key.fingerprint, self._limit, self._counts)
+        state = AuthenticationState(self._key.fingerprint, self._limit, self.counts)
         windows = {f"window/{source}": pack_part(SavedWindow(source, w)) for source, w in self._windows.items()}
         return {"authentication": pack_part(state), **windows}
 
@@ -317,15 +315,10 @@ class FrameAuthenticator:
                 raise FrameError(_WHERE, "newest", saved.window.newest, f"0..{lifetime - 1}")
 
         self._next = self._limit = min(max(self._limit, state.limit), lifetime)
-        self._counts = state.counts
+        self.counts = state.counts
         self._windows = {s.source: s.window for s in reader.read_group("window", SavedWindow, apply=check)}
         self._ahead.clear()
         return reader.errors
-
-    def _count(self, **increments: int) -> None:
-        self._counts = replace(
-            self._counts, **{name: getattr(self._counts, name) + n for name, n in increments.items()}
-        )
 
 
 def _nonce(counter: int) -> bytes:

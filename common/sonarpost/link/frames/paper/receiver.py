@@ -6,7 +6,7 @@ docs/specifications/acoustic-paper.md gives the rules and their reasons.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
@@ -177,7 +177,7 @@ class PendingImage:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class PaperReceiverCounts:
     """Counters since the first start; they continue over restarts.
 
@@ -219,6 +219,9 @@ class PaperReceiver:
     Memory: at most `max_images` images, each with at most three bodies of 64 KiB. The image that was least recently
     seen is deleted first, images that are not open before the others.
 
+    Attributes:
+        counts: The counters.
+
     Args:
         timeout_s: Wait for more of an open image.
         max_images: Images to store, reported or not.
@@ -239,22 +242,17 @@ class PaperReceiver:
         self._max_images = max_images
         self._memory_s = memory_s
         self._images: dict[tuple[int, str], PendingImage] = {}  # the least recently seen first
-        self._counts = PaperReceiverCounts()
-
-    @property
-    def counts(self) -> PaperReceiverCounts:
-        """The counters."""
-        return self._counts
+        self.counts = PaperReceiverCounts()
 
     def accept(self, source: int, frame: bytes, now: float) -> list[Event]:
         """Process a frame; see `FrameReceiver.accept`."""
         now = float(now)
         events = self.poll(now)
-        self._count(frames=1)
+        self.counts.frames += 1
         try:
             parsed = parse_frame(frame, f"acoustic frame from modem {source}")
         except FrameError as reason:
-            self._count(rejected=1)
+            self.counts.rejected += 1
             return [*events, FrameRejected(source, reason, now)]
         return events + self._add(source, parsed, now)
 
@@ -281,7 +279,7 @@ class PaperReceiver:
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`: counters and images."""
         images = {f"image/{image.source}/{image.image_id}": pack_part(image) for image in self._images.values()}
-        return {"counts": pack_part(self._counts), **images}
+        return {"counts": pack_part(self.counts), **images}
 
     def restore(self, parts: Parts) -> Errors:
         """Replace the state by saved parts; the settings stay.
@@ -290,7 +288,7 @@ class PaperReceiver:
             Why parts were skipped.
         """
         reader = PartReader(parts, "paper receiver state")
-        self._counts = reader.read("counts", PaperReceiverCounts) or PaperReceiverCounts()
+        self.counts = reader.read("counts", PaperReceiverCounts) or PaperReceiverCounts()
         images = [
             image for group in reader.groups("image") for image in reader.read_group(group, PendingImage, apply=_check)
         ]
@@ -307,12 +305,13 @@ class PaperReceiver:
             events += self._make_room()
             image = PendingImage(source, frame.image_id, now, now, now, now)
         self._images[key] = image
-        image.order = self._counts.frames
+        image.order = self.counts.frames
         earlier_conflicts = image.conflicts
         outcome = image.add_half(frame, now) if isinstance(frame, HalfFrame) else image.add_contact(frame.contact, now)
-        self._count(conflicts=image.conflicts - earlier_conflicts, duplicates=int(outcome is FrameOutcome.DUPLICATE))
+        self.counts.conflicts += image.conflicts - earlier_conflicts
+        self.counts.duplicates += outcome is FrameOutcome.DUPLICATE
         if outcome is FrameOutcome.REJECTED:
-            self._count(rejected=1)
+            self.counts.rejected += 1
             reason = FrameError(
                 f"acoustic frame from modem {source}",
                 "stream header",
@@ -333,25 +332,18 @@ class PaperReceiver:
             if image.open:
                 events += self._report([image])
             del self._images[key]
-            self._count(evicted=1)
+            self.counts.evicted += 1
         return events
 
     def _report(self, images: Iterable[PendingImage]) -> list[Event]:
         events: list[Event] = []
         for image in list(images):
             update = image.next_update()
-            self._count(
-                images=bool(update.stream),
-                complete_images=bool(update.stream) and update.complete,
-                contacts_only=not update.stream,
-            )
+            self.counts.images += bool(update.stream)
+            self.counts.complete_images += bool(update.stream) and update.complete
+            self.counts.contacts_only += not update.stream
             events.append(update)
         return events
-
-    def _count(self, **increments: int) -> None:
-        self._counts = replace(
-            self._counts, **{name: getattr(self._counts, name) + n for name, n in increments.items()}
-        )
 
 
 def _check(image: PendingImage) -> None:

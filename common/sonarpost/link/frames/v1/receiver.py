@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Final
 
 from sonarpost.errors import BadInputError, FrameError
@@ -317,7 +317,7 @@ class PeerState:
         return parts
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class V1ReceiverCounts:
     """Counters since the first start; they continue over restarts.
 
@@ -346,6 +346,9 @@ class V1Receiver:
     Memory: at most `max_sources` senders, each with at most 32 blocks of 255 symbols and `max_contacts` images of
     64 KiB.
 
+    Attributes:
+        counts: The counters.
+
     Args:
         config: Bounds and times.
         protection: Verifies frames.
@@ -355,12 +358,7 @@ class V1Receiver:
         self.config = config or ReceiverConfig()
         self._protection = protection
         self._sources: dict[int, PeerState] = {}  # the one whose last frame is oldest first
-        self._counts = V1ReceiverCounts()
-
-    @property
-    def counts(self) -> V1ReceiverCounts:
-        """The counters."""
-        return self._counts
+        self.counts = V1ReceiverCounts()
 
     @property
     def sources(self) -> tuple[int, ...]:
@@ -370,12 +368,12 @@ class V1Receiver:
     def accept(self, source: int, frame: bytes, now: float) -> list[Event]:
         """Process a frame; see `FrameReceiver.accept`."""
         now = float(now)
-        self._count(frames=1)
+        self.counts.frames += 1
         where = f"acoustic frame from modem {source}"
         try:
             content = parse_frame(frame, source, self._protection, where)
         except FrameError as reason:
-            self._count(rejected=1)
+            self.counts.rejected += 1
             return [FrameRejected(source, reason, now)]
         peer = self._peer(source, now)
         events: list[Event] = []
@@ -383,9 +381,13 @@ class V1Receiver:
             try:
                 events += self._process(peer, item, now, where)
             except BadInputError as error:
-                self._count(rejected=1)
+                self.counts.rejected += 1
                 events.append(FrameRejected(source, _as_frame_error(error, where), now))
-        self._count_events(events)
+        for event in events:
+            self.counts.updates += isinstance(event, ImageUpdate)
+            self.counts.complete += isinstance(event, ImageUpdate) and event.complete
+            self.counts.messages += isinstance(event, MessageReceived)
+            self.counts.feedback += isinstance(event, FeedbackReceived)
         return events
 
     def poll(self, now: float) -> list[Event]:
@@ -418,12 +420,12 @@ class V1Receiver:
         if peer is None:
             while len(self._sources) >= self.config.max_sources:
                 del self._sources[next(iter(self._sources))]
-                self._count(evicted_sources=1)
+                self.counts.evicted_sources += 1
             peer = PeerState(source, now, feedback_s=now)
         self._sources[source] = peer
         peer.last_frame_s = now
         peer.frames += 1
-        peer.order = self._counts.frames
+        peer.order = self.counts.frames
         peer.feedback_s = min(peer.feedback_s, now)
         peer.delete_old(now, self.config)
         return peer
@@ -449,7 +451,7 @@ class V1Receiver:
 
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`: counters, senders, their images and blocks."""
-        parts = {"counts": pack_part(self._counts)}
+        parts = {"counts": pack_part(self.counts)}
         for peer in self._sources.values():
             parts |= peer.parts()
         return parts
@@ -461,7 +463,7 @@ class V1Receiver:
             Why parts were skipped.
         """
         reader = PartReader(parts, "v1 receiver state")
-        self._counts = reader.read("counts", V1ReceiverCounts) or V1ReceiverCounts()
+        self.counts = reader.read("counts", V1ReceiverCounts) or V1ReceiverCounts()
         peers = {peer.address: peer for peer in reader.read_group("peer", PeerState)}
         images = [image for group in reader.groups("image") for image in reader.read_group(group, AssembledImage)]
         for image in sorted(images, key=lambda image: image.order):
@@ -471,20 +473,6 @@ class V1Receiver:
             peer.rival_blocks = _restored_blocks(reader, "rival", address)
         self._sources = {p.address: p for p in sorted(peers.values(), key=lambda p: p.order)}
         return reader.errors
-
-    def _count_events(self, events: list[Event]) -> None:
-        updates = [e for e in events if isinstance(e, ImageUpdate)]
-        self._count(
-            updates=len(updates),
-            complete=sum(e.complete for e in updates),
-            messages=sum(isinstance(e, MessageReceived) for e in events),
-            feedback=sum(isinstance(e, FeedbackReceived) for e in events),
-        )
-
-    def _count(self, **increments: int) -> None:
-        self._counts = replace(
-            self._counts, **{name: getattr(self._counts, name) + n for name, n in increments.items()}
-        )
 
 
 def _restored_blocks(reader: PartReader, table: str, address: int) -> dict[int, BlockDecoder]:
