@@ -10,9 +10,9 @@ from builders.common import REPOSITORY
 
 from sonarpost.codec.interface import StreamHeader, tag_length
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame
+from sonarpost.link.frames.paper.frame import HALF_PREFIX_SIZE, ContactFrame, HalfFrame
 from sonarpost.link.frames.paper.frame import parse_frame as parse_paper_frame
-from sonarpost.link.frames.paper.sender import body_capacity_bytes, plan_packets
+from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.link.frames.v1.frame import (
     Segment,
     SegmentKind,
@@ -64,8 +64,9 @@ def test_paper_rate_table_equals_capacities_and_packet_plans() -> None:
         for rate in map(int, rates.split(",")):
             seen.append(rate)
             assert RATES[rate] == (int(frames), int(size))
-            assert body_capacity_bytes(*RATES[rate], with_contact=True, header_bytes=4) == int(with_contact)
-            assert body_capacity_bytes(*RATES[rate], with_contact=False, header_bytes=4) == int(without)
+            body_bytes = int(size) - HALF_PREFIX_SIZE - 4
+            assert int(without) == 2 * int(frames) * body_bytes
+            assert int(with_contact) == 2 * max(1, int(frames) - 1) * body_bytes
             stream = StreamHeader(0x10, 0xBEEF, 140, 80).pack() + bytes(88)
             plan = plan_packets("00A7", stream, ContactSummary(), *RATES[rate])
             assert [re.sub(r"[^TBC]", "", "".join(chr(f[0]) for f in packet)) for packet in plan] == re.findall(

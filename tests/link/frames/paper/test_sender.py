@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, half_bounds, parse_frame
+from sonarpost.link.frames.paper.frame import HALF_PREFIX_SIZE, ContactFrame, HalfFrame, half_bounds, parse_frame
 from sonarpost.link.frames.paper.receiver import PaperReceiver
-from sonarpost.link.frames.paper.sender import Packet, body_capacity_bytes, plan_packets
+from sonarpost.link.frames.paper.sender import Packet, plan_packets
 from sonarpost.link.receiver import ImageUpdate
 
 GOLDEN = json.loads((GOLDEN_FOLDER / "link" / "paper_packets.json").read_text())["plans"]
@@ -136,32 +136,15 @@ def test_capacity_is_the_longest_body_with_one_packet_per_half(
 ) -> None:
     frames_per_packet, frame_bytes = RATES[rate]
     contact = CONTACT if with_contact else None
-    capacity = body_capacity_bytes(frames_per_packet, frame_bytes, with_contact=with_contact, header_bytes=header_bytes)
     own_packet = 1 if with_contact and frames_per_packet == 1 else 0
+    frames = frames_per_packet - 1 if with_contact and not own_packet else frames_per_packet
+    capacity = 2 * frames * (frame_bytes - HALF_PREFIX_SIZE - header_bytes)
     plan = plan_packets("0K3P", make_stream(capacity, header_bytes), contact, frames_per_packet, frame_bytes)
     assert len(plan) == 2 + own_packet
     if with_contact and not own_packet:
         assert all(any(frame[:1] == b"C" for frame in packet) for packet in plan)
     beyond = plan_packets("0K3P", make_stream(capacity + 1, header_bytes), contact, frames_per_packet, frame_bytes)
     assert len(beyond) > len(plan) or sum(frame[:1] == b"C" for frame in beyond[0]) == 0
-
-
-def test_capacity_never_exceeds_the_body_length_field() -> None:
-    assert body_capacity_bytes(8, 2**16, with_contact=False) == 65535
-
-
-@pytest.mark.parametrize("with_contact", [True, False])
-@pytest.mark.parametrize("rate", sorted(RATES))
-def test_default_capacity_fits_every_header(rate: int, with_contact: bool) -> None:
-    capacities = [body_capacity_bytes(*RATES[rate], with_contact=with_contact, header_bytes=n) for n in HEADERS]
-    assert body_capacity_bytes(*RATES[rate], with_contact=with_contact) == min(capacities)
-
-
-@pytest.mark.parametrize("header_bytes", [-1, 0, 1, 8])
-def test_capacity_rejects_an_impossible_header_length(header_bytes: int) -> None:
-    with pytest.raises(FrameError) as caught:
-        body_capacity_bytes(3, 64, with_contact=False, header_bytes=header_bytes)
-    assert caught.value.field == "header_bytes"
 
 
 @given(st.integers(0, 700), st.sampled_from(sorted(RATES)), st.sampled_from(sorted(HEADERS)))

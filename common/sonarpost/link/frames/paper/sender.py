@@ -219,30 +219,6 @@ def plan_packets(
     )
 
 
-def body_capacity_bytes(
-    frames_per_packet: int, frame_bytes: int, *, with_contact: bool, header_bytes: int = StreamHeader.MAX_SIZE
-) -> int:
-    """Return the longest stream body of which each half fits one packet.
-
-    With a contact record, one frame of each packet is reserved for it, unless a packet has only one frame: then the
-    record has a packet of its own and uses nothing of the body's frames.
-
-    Args:
-        frames_per_packet: Frames in a packet.
-        frame_bytes: Length of a frame.
-        with_contact: Whether a contact record is sent.
-        header_bytes: `StreamHeader.size`; by default the longest, so that every codec and image size fits.
-
-    Raises:
-        FrameError: As `plan_packets`, or no stream header has this length.
-    """
-    if not 2 <= header_bytes <= StreamHeader.MAX_SIZE:
-        raise FrameError("packet plan", "header_bytes", header_bytes, f"2..{StreamHeader.MAX_SIZE}")
-    _check_sizes(frames_per_packet, frame_bytes, with_contact=with_contact)
-    frames = frames_per_packet - 1 if with_contact and frames_per_packet > 1 else frames_per_packet
-    return min(2 * frames * (frame_bytes - HALF_PREFIX_SIZE - header_bytes), _MAX_BODY_BYTES)
-
-
 def _check_sizes(frames_per_packet: int, frame_bytes: int, *, with_contact: bool) -> None:
     if frames_per_packet < 1:
         raise FrameError("packet plan", "frames_per_packet", frames_per_packet, "at least 1")
