@@ -16,6 +16,7 @@ import types
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
+from functools import cache
 from typing import Annotated, Final, NamedTuple, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import msgpack
@@ -56,8 +57,8 @@ def pack_part(value: object, part: str = "") -> bytes:
         value: The dataclass.
         part: "progress" for the fields with the metadata `PROGRESS`; otherwise the fields without metadata.
     """
-    fields = [to_plain(getattr(value, name)) for name in _schema(type(value)).names[part]]
-    packed: bytes = msgpack.packb([FORMAT_VERSION, *fields])
+    kind: type = type(value)
+    packed: bytes = msgpack.packb([FORMAT_VERSION, *(to_plain(getattr(value, name)) for name in _names(kind, part))])
     return packed
 
 
@@ -120,10 +121,13 @@ class PartReader:
     def __init__(self, parts: Parts, where: str) -> None:
         self.errors: dict[str, FrameError] = {}
         self._where = where
-        self._groups: dict[str, dict[str, bytes]] = {}
-        for name, data in parts.items():
-            group, _, rest = name.rpartition("/")
-            self._groups.setdefault(group, {})[rest] = data
+        self._parts = parts
+        self._groups: dict[str, list[str]] = {}
+        for name in sorted(parts):
+            self._groups.setdefault(name.rpartition("/")[0], []).append(name)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._parts
 
     def groups(self, first: str) -> list[str]:
         """Return the names of the groups below `first`: for example image/3 of image/3/7."""
@@ -146,45 +150,37 @@ class PartReader:
             apply: Receives each part; raises BadInputError to reject it.
         """
         found: list[_T] = []
-        for rest in sorted(self._groups.get(group, {})):
-            name = f"{group}/{rest}"
-            part = None
-            if progress and f"{progress}/{rest}" in self:
-                part = self._read(f"{progress}/{rest}", kind, apply, main=name)
+        for name in self._groups.get(group, []):
+            second = progress + name.removeprefix(group)
+            part = self._read(name, kind, apply, second) if progress and second in self else None
             part = part or self._read(name, kind, apply)
             found += [] if part is None else [part]
         return found
 
-    def __contains__(self, name: str) -> bool:
-        group, _, rest = name.rpartition("/")
-        return rest in self._groups.get(group, {})
-
-    def _plain(self, name: str, kind: type, part: str) -> dict[str, object]:
-        """Return the fields in a part by name."""
-        group, _, rest = name.rpartition("/")
-        version, *values = unpack_plain(list, self._groups[group][rest], self._where) or [None]
-        if type(version) is not int or version != FORMAT_VERSION:
-            raise FrameError(self._where, "format version", version, str(FORMAT_VERSION))
-        return _by_name(_schema(kind).names[part], values, self._where)
-
     def _read(
-        self, name: str, kind: type[_T], apply: Callable[[_T], object] | None = None, main: str = ""
+        self, name: str, kind: type[_T], apply: Callable[[_T], object] | None = None, progress: str = ""
     ) -> _T | None:
-        """Return a part (with `main`, both together), None if it cannot be read."""
+        """Return a part, together with its `progress` part if it is named; None if one of them cannot be read."""
+        invalid = name
         try:
-            plain = self._plain(name, kind, "progress" if main else "")
-            if main:
-                try:
-                    plain |= self._plain(main, kind, "")
-                except FrameError:
-                    return None  # the caller reads `main` alone next, and rejects it
+            plain = self._plain(name, kind, "")
+            if progress:
+                invalid = progress
+                plain |= self._plain(progress, kind, "progress")
             part = from_plain(kind, plain, self._where)
             if apply is not None:
                 apply(part)
         except BadInputError as error:
-            self.errors[name] = FrameError(f"{self._where}: {name}", error.field, error.value, error.expected)
+            self.errors[invalid] = FrameError(f"{self._where}: {invalid}", error.field, error.value, error.expected)
             return None
         return part
+
+    def _plain(self, name: str, kind: type, part: str) -> dict[str, object]:
+        """Return the fields in a part by name."""
+        version, *values = unpack_plain(list, self._parts[name], self._where) or [None]
+        if type(version) is not int or version != FORMAT_VERSION:
+            raise FrameError(self._where, "format version", version, str(FORMAT_VERSION))
+        return _Reader(self._where).by_name(_names(kind, part), values)
 
 
 def to_plain(value: object) -> object:  # noqa: PLR0911 one return a kind
@@ -201,7 +197,8 @@ def to_plain(value: object) -> object:  # noqa: PLR0911 one return a kind
         return value.astype("<f8").tobytes()
     if hasattr(value, "unpack"):
         return value.pack()  # type: ignore[attr-defined]
-    return [to_plain(getattr(value, name)) for name in _schema(type(value)).names[""]]
+    kind: type = type(value)
+    return [to_plain(getattr(value, name)) for name in _names(kind)]
 
 
 def from_plain(kind: type[_T], plain: object, where: str, field: str = "") -> _T:
@@ -213,41 +210,31 @@ def from_plain(kind: type[_T], plain: object, where: str, field: str = "") -> _T
     return cast("_T", _Reader(where).read(kind, plain, field))
 
 
-class _Field(NamedTuple):
+class _Attribute(NamedTuple):
     kind: object
     required: bool
     part: str
 
 
-class _Schema(NamedTuple):
-    fields: Mapping[str, _Field]
-    names: Mapping[str, tuple[str, ...]]
-    """Names of the fields, by part."""
+@cache
+def _attributes(kind: type) -> dict[str, _Attribute]:
+    """Return the fields of a dataclass that are saved, by name."""
+    if not is_dataclass(kind):
+        raise TypeError(f"{kind.__name__} cannot be saved")
+    hints = get_type_hints(kind, include_extras=True)
+    return {
+        f.name: _Attribute(
+            hints[f.name], f.default is MISSING and f.default_factory is MISSING, f.metadata.get("part", "")
+        )
+        for f in fields(kind)
+        if f.metadata != SEPARATE
+    }
 
 
-_SCHEMAS: Final[dict[type, _Schema]] = {}
-
-
-def _schema(kind: type) -> _Schema:
-    if kind not in _SCHEMAS:
-        if not is_dataclass(kind):
-            raise TypeError(f"{kind.__name__} cannot be saved")
-        hints = get_type_hints(kind, include_extras=True)
-        found = {
-            f.name: _Field(
-                hints[f.name], f.default is MISSING and f.default_factory is MISSING, f.metadata.get("part", "")
-            )
-            for f in fields(kind)
-        }
-        names = {part: tuple(n for n, f in found.items() if f.part == part) for part in ("", "progress")}
-        _SCHEMAS[kind] = _Schema({n: f for n, f in found.items() if f.part != "separate"}, names)
-    return _SCHEMAS[kind]
-
-
-def _by_name(names: tuple[str, ...], values: list[object], where: str, path: str = "") -> dict[str, object]:
-    if len(values) > len(names):
-        raise FrameError(where, path, f"{len(values)} fields", f"at most {len(names)}")
-    return dict(zip(names, values, strict=False))
+@cache
+def _names(kind: type, part: str = "") -> tuple[str, ...]:
+    """Return the names of the fields in a part."""
+    return tuple(name for name, attribute in _attributes(kind).items() if attribute.part == part)
 
 
 class _Reader(NamedTuple):
@@ -256,7 +243,9 @@ class _Reader(NamedTuple):
     def read(self, kind: object, plain: object, field: str) -> object:
         origin, args = get_origin(kind), get_args(kind)
         if origin is Annotated:
-            return self._bounded(self.read(args[0], plain, field), args[1], field)
+            value, bounds = cast("float", self.read(args[0], plain, field)), args[1]
+            self.check(bounds.low <= value <= bounds.high, field, value, f"{bounds.low}..{bounds.high}")
+            return value
         if origin in (Union, types.UnionType):
             (some,) = (arg for arg in args if arg is not types.NoneType)
             return None if plain is None else self.read(some, plain, field)
@@ -265,26 +254,26 @@ class _Reader(NamedTuple):
         if origin is dict:
             if not isinstance(plain, dict):
                 raise FrameError(self.where, field, plain, "a map")
-            return {
-                self.read(args[0], key, field): self.read(args[1], item, f"{field}[{key!r}]")
-                for key, item in plain.items()
-            }
+            pairs = ((self.read(args[0], k, field), self.read(args[1], v, f"{field}[{k!r}]")) for k, v in plain.items())
+            return dict(pairs)
         if origin is np.ndarray:
             return self._array(plain, field)
         assert isinstance(kind, type), f"{kind} cannot be saved"
         return self._scalar(kind, plain, field)
 
-    def _bounded(self, value: object, bounds: object, field: str) -> object:
-        if isinstance(bounds, Bounds) and not (isinstance(value, int | float) and bounds.low <= value <= bounds.high):
-            raise FrameError(self.where, field, value, f"{bounds.low}..{bounds.high}")
-        return value
+    def check(self, fits: object, field: str, value: object, expected: str) -> None:
+        if not fits:
+            raise FrameError(self.where, field, value, expected)
+
+    def by_name(self, names: tuple[str, ...], values: list[object], field: str = "") -> dict[str, object]:
+        self.check(len(values) <= len(names), field, f"{len(values)} fields", f"at most {len(names)}")
+        return dict(zip(names, values, strict=False))
 
     def _sequence(self, origin: type, args: tuple[object, ...], plain: object, field: str) -> object:
         if not isinstance(plain, list | tuple):
             raise FrameError(self.where, field, plain, "a list")
         kinds: tuple[object, ...] = (args[0],) * len(plain) if origin is not tuple or args[-1] is ... else args
-        if len(kinds) != len(plain):
-            raise FrameError(self.where, field, plain, f"a list of {len(kinds)}")
+        self.check(len(kinds) == len(plain), field, plain, f"a list of {len(kinds)}")
         items = [self.read(k, item, f"{field}[{n}]") for n, (k, item) in enumerate(zip(kinds, plain, strict=True))]
         return origin(items)
 
@@ -292,19 +281,22 @@ class _Reader(NamedTuple):
         if not isinstance(plain, bytes) or len(plain) % 8:
             raise FrameError(self.where, field, plain, "bytes of float64 values")
         values = np.frombuffer(plain, "<f8").astype(np.float64)
-        if not np.isfinite(values).all():
-            raise FrameError(self.where, field, "not finite", "finite values")
+        self.check(np.isfinite(values).all(), field, "not finite", "finite values")
         return values
 
     def _scalar(self, kind: type, plain: object, field: str) -> object:
         if kind in (bool, int, str, bytes):
-            if type(plain) is not kind:
-                raise FrameError(self.where, field, plain, kind.__name__)
+            self.check(type(plain) is kind, field, plain, kind.__name__)
             return plain
         if kind is float:
             if type(plain) not in (int, float) or not math.isfinite(cast("float", plain)):
                 raise FrameError(self.where, field, plain, "a finite number")
             return float(cast("float", plain))
+        if issubclass(kind, Enum):
+            known = {member.value: member for member in kind}
+            fits = type(plain) in {type(value) for value in known} and plain in known
+            self.check(fits, field, plain, ", ".join(map(str, known)))
+            return known[plain]
         try:
             return self._object(kind, plain, field)
         except BadInputError as error:
@@ -314,27 +306,20 @@ class _Reader(NamedTuple):
             raise FrameError(self.where, path, error.value, error.expected) from error
 
     def _object(self, kind: type, plain: object, field: str) -> object:
-        if issubclass(kind, Enum):
-            known = [member.value for member in kind]
-            if not any(type(plain) is type(value) and plain == value for value in known):
-                raise FrameError(self.where, field, plain, ", ".join(map(str, known)))
-            return kind(plain)
         if hasattr(kind, "unpack"):
-            if type(plain) is not bytes:
-                raise FrameError(self.where, field, plain, "bytes")
+            self.check(type(plain) is bytes, field, plain, "bytes")
             value = kind.unpack(plain)
-            if value.pack() != plain:
-                raise FrameError(self.where, field, plain, f"{len(value.pack())} bytes")
+            self.check(value.pack() == plain, field, plain, f"{len(value.pack())} bytes")
             return value
         if isinstance(plain, list):
-            plain = _by_name(_schema(kind).names[""], plain, self.where, field)
+            plain = self.by_name(_names(kind), plain, field)
         if not isinstance(plain, dict):
             raise FrameError(self.where, field, plain, "a list of fields")
         values: dict[str, object] = {}
-        for name, (field_kind, required, _) in _schema(kind).fields.items():
+        for name, attribute in _attributes(kind).items():
             path = f"{field}.{name}" if field else name
             if name in plain:
-                values[name] = self.read(field_kind, plain[name], path)
-            elif required:
-                raise FrameError(self.where, path, "nothing", "a value")
+                values[name] = self.read(attribute.kind, plain[name], path)
+            else:
+                self.check(not attribute.required, path, "nothing", "a value")
         return kind(**values)
