@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 from sonarpost.errors import ConfigError
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.frames.v1.frame import MAX_FRAME_BYTES, MIN_FRAME_BYTES
 from sonarpost.link.frames.v1.payload_objects import WINDOW
+from sonarpost.link.state import Bounds, check_bounds
 
 _LINK: Final = "acoustic link v1"
 _QUEUE: Final = "acoustic queue"
@@ -41,28 +41,22 @@ class SenderConfig:
         ConfigError: A value out of range.
     """
 
-    frame_bytes: int = 64
+    frame_bytes: Annotated[int, Bounds(MIN_FRAME_BYTES, MAX_FRAME_BYTES)] = 64
     channels: tuple[LossChannel, ...] = (LossChannel(0.3),)
     feedback: bool = False
-    frames_per_image: float = 6.0
-    stream_bytes: int = 512
-    group_images: int = 0
-    depth: int = 2
-    group_delay_s: float = 0.0
-    max_defer_s: float = 600.0
-    kept_images: int = 256
+    frames_per_image: Annotated[float, Bounds(1, 255)] = 6.0
+    stream_bytes: Annotated[int, Bounds(16, 65535)] = 512
+    group_images: Annotated[int, Bounds(0, 120)] = 0
+    depth: Annotated[int, Bounds(1, WINDOW // 4)] = 2
+    group_delay_s: Annotated[float, Bounds(0, 86400)] = 0.0
+    max_defer_s: Annotated[float, Bounds(0.001, 86400)] = 600.0
+    kept_images: Annotated[int, Bounds(1, 65535)] = 256
     announce: bool = False
 
     def __post_init__(self) -> None:
-        _check(_LINK, "frame_bytes", self.frame_bytes, MIN_FRAME_BYTES, MAX_FRAME_BYTES)
-        _check(_LINK, "channels", len(self.channels), 1, 64)
-        _check(_LINK, "frames_per_image", self.frames_per_image, 1, 255)
-        _check(_LINK, "stream_bytes", self.stream_bytes, 16, 65535)
-        _check(_LINK, "group_images", self.group_images, 0, 120)
-        _check(_LINK, "depth", self.depth, 1, WINDOW // 4)
-        _check(_LINK, "group_delay_s", self.group_delay_s, 0, 86400)
-        _check(_LINK, "max_defer_s", self.max_defer_s, 0.001, 86400)
-        _check(_LINK, "kept_images", self.kept_images, 1, 65535)
+        check_bounds(self, _LINK, ConfigError)
+        if not 1 <= len(self.channels) <= 64:
+            raise ConfigError(_LINK, "channels", len(self.channels), "1..64")
 
     @property
     def planned_channels(self) -> tuple[LossChannel, ...]:
@@ -104,19 +98,15 @@ class ReceiverConfig:
         ConfigError: A value out of range.
     """
 
-    max_sources: int = 16
-    max_contacts: int = 512
-    block_memory_s: float = 3600.0
-    contact_memory_s: float = 6 * 3600.0
-    feedback_interval_frames: int = 48
-    feedback_interval_s: float = 60.0
+    max_sources: Annotated[int, Bounds(1, 128)] = 16
+    max_contacts: Annotated[int, Bounds(1, 65535)] = 512
+    block_memory_s: Annotated[float, Bounds(0.001, 1e9)] = 3600.0
+    contact_memory_s: Annotated[float, Bounds(0.001, 1e9)] = 6 * 3600.0
+    feedback_interval_frames: Annotated[int, Bounds(1, 65535)] = 48
+    feedback_interval_s: Annotated[float, Bounds(0.001, 1e9)] = 60.0
 
     def __post_init__(self) -> None:
-        _check(_LINK, "max_sources", self.max_sources, 1, 128)
-        _check(_LINK, "max_contacts", self.max_contacts, 1, 65535)
-        for name in ("block_memory_s", "contact_memory_s", "feedback_interval_s"):
-            _check(_LINK, name, getattr(self, name), 0.001, 1e9)
-        _check(_LINK, "feedback_interval_frames", self.feedback_interval_frames, 1, 65535)
+        check_bounds(self, _LINK, ConfigError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,30 +135,20 @@ class QueueConfig:
 
     rates: tuple[int, ...] = (1,)
     first_rate: int = 1
-    expected_loss: float = 0.2
-    burst_frames: float = 1.0
+    expected_loss: Annotated[float, Bounds(0.0, 0.95)] = 0.2
+    burst_frames: Annotated[float, Bounds(1.0, 1000.0)] = 1.0
     feedback: str = "auto"
-    feedback_memory_s: float = 900.0
+    feedback_memory_s: Annotated[float, Bounds(0.001, 86400.0)] = 900.0
     max_defer_s: float = 120.0
-    image_airtime_share: float = 0.25
-    aging_s: float = 600.0
-    max_messages: int = 2000
+    image_airtime_share: Annotated[float, Bounds(0.0, 1.0)] = 0.25
+    aging_s: Annotated[float, Bounds(0.001, 86400.0)] = 600.0
+    max_messages: Annotated[int, Bounds(1, 100_000)] = 2000
     frames_per_image: float = 6.0
     stream_bytes: int = 512
     group_delay_s: float = 0.0
     kept_images: int = 256
 
     def __post_init__(self) -> None:
-        _check(_QUEUE, "expected_loss", self.expected_loss, 0.0, 0.95)
-        _check(_QUEUE, "burst_frames", self.burst_frames, 1.0, 1000.0)
-        _check(_QUEUE, "feedback_memory_s", self.feedback_memory_s, 0.001, 86400.0)
-        _check(_QUEUE, "image_airtime_share", self.image_airtime_share, 0.0, 1.0)
-        _check(_QUEUE, "aging_s", self.aging_s, 0.001, 86400.0)
-        _check(_QUEUE, "max_messages", self.max_messages, 1, 100_000)
+        check_bounds(self, _QUEUE, ConfigError)
         if self.feedback not in ("auto", "never"):
             raise ConfigError(_QUEUE, "feedback", self.feedback, "auto, never")
-
-
-def _check(where: str, name: str, value: float, low: float, high: float) -> None:
-    if not (math.isfinite(value) and low <= value <= high):
-        raise ConfigError(where, name, value, f"{low}..{high}")

@@ -50,6 +50,25 @@ Count = Annotated[int, Bounds(0, 2**62)]
 Byte = Annotated[int, Bounds(0, 255)]
 
 
+def check_bounds(value: object, where: str, error: type[BadInputError]) -> None:
+    """Raise `error` for the first field of a dataclass that is not within its `Bounds`; None is accepted."""
+    kind: type = type(value)
+    for name, bounds in _bounds_of(kind):
+        number = getattr(value, name)
+        if number is not None and not bounds.low <= number <= bounds.high:
+            raise error(where, name, number, f"{bounds.low}..{bounds.high}")
+
+
+@cache
+def _bounds_of(kind: type) -> list[tuple[str, Bounds]]:
+    found: list[tuple[str, Bounds]] = []
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        optional = get_origin(hint) in (Union, types.UnionType)
+        for each in get_args(hint) if optional else (hint,):
+            found += [(name, bounds) for bounds in getattr(each, "__metadata__", ()) if isinstance(bounds, Bounds)]
+    return found
+
+
 def pack_part(value: object, part: str = "") -> bytes:
     """Return a dataclass as the bytes of a part.
 

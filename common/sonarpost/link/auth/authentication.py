@@ -297,12 +297,10 @@ class FrameAuthenticator:
         return {"authentication": pack_part(state), **windows}
 
     def restore(self, parts: Parts) -> Errors:
-        """Replace the state by saved parts; reserved counters count as used. A state of another key has no effect.
+        """Replace the state by saved parts; return why parts were skipped.
 
-        A limit that was saved later than this state must be passed as `first_counter`: the higher one applies.
-
-        Returns:
-            Why parts were skipped.
+        Reserved counters count as used. A limit that was saved later than this state must be passed as
+        `first_counter`: the higher one applies. A state of another key has no effect.
         """
         reader = PartReader(parts, "authentication state")
         state = reader.read("authentication", AuthenticationState)

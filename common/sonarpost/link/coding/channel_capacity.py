@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
 from sonarpost.errors import ConfigError
 from sonarpost.link.frames.v1.frame import HEADER_BYTES
+from sonarpost.link.state import Bounds, check_bounds
 from sonarpost.modem.micromodem import RATES
 
 Values = npt.NDArray[np.float64]
@@ -32,14 +34,11 @@ class LossChannel:
         ConfigError: A value out of range.
     """
 
-    loss: float
-    burst: float = 1.0
+    loss: Annotated[float, Bounds(0, 0.99)]
+    burst: Annotated[float, Bounds(1, 1e6)] = 1.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.loss <= 0.99:
-            raise ConfigError("acoustic channel", "loss", self.loss, "0..0.99")
-        if not 1.0 <= self.burst <= 1e6:
-            raise ConfigError("acoustic channel", "burst", self.burst, "1..1000000 frames")
+        check_bounds(self, "acoustic channel", ConfigError)
 
     @property
     def memory(self) -> float:

@@ -10,16 +10,16 @@ every copy. So a lost command or confirmation does not change the outcome.
 from __future__ import annotations
 
 import hashlib
-import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 from sonarpost.errors import FrameError
 from sonarpost.link.frames.paper.frame import format_image_id, is_image_id
-from sonarpost.link.frames.v1.payload_objects import MAX_NUMBER
+from sonarpost.link.frames.v1.payload_objects import MAX_NUMBER, ImageNumber, StreamPosition
+from sonarpost.link.state import Bounds, check_bounds
 from sonarpost.messages import Verdict
 
 SMALLEST_ROOM_BYTES: Final = 27
@@ -29,6 +29,7 @@ ALL_BYTES: Final = 0
 
 _WHERE: Final = "acoustic message"
 _MAX_U32: Final = 2**32 - 1
+
 _DEGREE_STEPS: Final = 10_000_000
 _CONFIDENCE_STEPS: Final = 254
 _NO_CONFIDENCE: Final = 255
@@ -91,34 +92,25 @@ class CommandMessage:
         FrameError: A value out of range (also in the derived classes).
     """
 
-    token: int
-    issued_utc_s: int
+    token: Annotated[int, Bounds(0, _MAX_U32)]
+    issued_utc_s: Annotated[int, Bounds(0, _MAX_U32)]
 
     def __post_init__(self) -> None:
-        _check("token", self.token, 0, _MAX_U32)
-        _check("issued_utc_s", self.issued_utc_s, 0, _MAX_U32)
+        check_bounds(self, _WHERE, FrameError)
 
 
 @dataclass(frozen=True, slots=True)
 class ImageCommandMessage(CommandMessage):
     """Base of the commands for an image. `number`: of its contact, 1..65535."""
 
-    number: int
-
-    def __post_init__(self) -> None:
-        CommandMessage.__post_init__(self)
-        _check("number", self.number, 1, MAX_NUMBER)
+    number: ImageNumber
 
 
 @dataclass(frozen=True, slots=True)
 class RefineMessage(ImageCommandMessage):
     """Send more detail. `stream_bytes`: length of the stream to send, 1..65535; `ALL_BYTES` for all."""
 
-    stream_bytes: int = ALL_BYTES
-
-    def __post_init__(self) -> None:
-        ImageCommandMessage.__post_init__(self)
-        _check("stream_bytes", self.stream_bytes, 0, 65535)
+    stream_bytes: StreamPosition = ALL_BYTES
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,13 +132,8 @@ class RevisitMessage(CommandMessage):
         lon_deg: WGS 84, -180..180; the same.
     """
 
-    lat_deg: float
-    lon_deg: float
-
-    def __post_init__(self) -> None:
-        CommandMessage.__post_init__(self)
-        _check("lat_deg", self.lat_deg, -90, 90)
-        _check("lon_deg", self.lon_deg, -180, 180)
+    lat_deg: Annotated[float, Bounds(-90, 90)]
+    lon_deg: Annotated[float, Bounds(-180, 180)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,16 +147,13 @@ class DecisionMessage(ImageCommandMessage):
         mlo_class: Class of mine-like object, empty if not classified. Cut between characters if it does not fit.
     """
 
-    version: int
+    version: Annotated[int, Bounds(1, 2**63)]
     verdict: Verdict
-    confidence: float | None = None
+    confidence: Annotated[float, Bounds(0, 1)] | None = None
     mlo_class: str = ""
 
     def __post_init__(self) -> None:
         ImageCommandMessage.__post_init__(self)
-        _check("version", self.version, 1, 2**63)
-        if self.confidence is not None:
-            _check("confidence", self.confidence, 0, 1)
         if self.verdict not in _VERDICTS:
             raise FrameError(_WHERE, "verdict", self.verdict, ", ".join(_VERDICTS))
 
@@ -361,6 +345,6 @@ def image_of_number(number: int) -> str:
     return format_image_id(number)
 
 
-def _check(name: str, value: float, low: float, high: float) -> None:
-    if not (math.isfinite(value) and low <= value <= high):
+def _check(name: str, value: int, low: int, high: int) -> None:
+    if not low <= value <= high:
         raise FrameError(_WHERE, name, value, f"{low}..{high}")

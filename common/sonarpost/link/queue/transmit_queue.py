@@ -369,12 +369,9 @@ class TransmitQueue(ImageSender):
         return parts if self.in_flight is None else {**parts, "packet": pack_part(self.in_flight)}
 
     def restore(self, parts: Parts) -> Errors:
-        """Replace the state of a new queue by saved parts; the configuration stays.
+        """Replace the state of a new queue by saved parts; the configuration stays. Return why parts were skipped.
 
         If the rate in use is not configured any more, the queue continues with the first rate.
-
-        Returns:
-            Why parts were skipped.
         """
         reader = PartReader(parts, "queue state")
         state = reader.read("queue", QueueState)

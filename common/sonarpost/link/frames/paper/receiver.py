@@ -33,7 +33,7 @@ class FrameOutcome(Enum):
     REJECTED = "rejected"
 
 
-@dataclass(slots=True)
+@dataclass(eq=False, slots=True)
 class ImageCandidate:
     """The body according to the frames that agree on one stream header and body length.
 
@@ -116,8 +116,7 @@ class PendingImage:
         best = self.best
         if best is None:
             return -1, 0, self.contact is not None
-        index = next(i for i, candidate in enumerate(self.candidates) if candidate is best)
-        return index, best.body.received_bytes, self.contact is not None
+        return self.candidates.index(best), best.body.received_bytes, self.contact is not None
 
     def add_half(self, frame: HalfFrame, now: float) -> FrameOutcome:
         """Add a half frame."""
@@ -129,14 +128,11 @@ class PendingImage:
         if candidate is None:
             if len(self.candidates) >= MAX_CANDIDATES:
                 return FrameOutcome.REJECTED
-            candidate = ImageCandidate(frame.header, PartialBytes(bytearray(frame.body_length)))
-            candidate.body.write(frame.offset, frame.payload)
+            candidate = ImageCandidate(frame.header, PartialBytes(bytearray(frame.body_length)), frames=0)
             self.candidates.append(candidate)
-            self.last_frame_s = self.wait_from_s = now
-            return FrameOutcome.ADDED
         added, conflict = candidate.body.write(frame.offset, frame.payload)
         self.conflicts += conflict
-        if not added:
+        if not added and candidate.frames:
             return FrameOutcome.DUPLICATE
         candidate.frames += 1
         self.last_frame_s = self.wait_from_s = now
@@ -282,11 +278,7 @@ class PaperReceiver:
         return {"counts": pack_part(self.counts), **images}
 
     def restore(self, parts: Parts) -> Errors:
-        """Replace the state by saved parts; the settings stay.
-
-        Returns:
-            Why parts were skipped.
-        """
+        """Replace the state by saved parts; the settings stay. Return why parts were skipped."""
         reader = PartReader(parts, "paper receiver state")
         self.counts = reader.read("counts", PaperReceiverCounts) or PaperReceiverCounts()
         images = [

@@ -161,10 +161,9 @@ class PaperSender(ImageSender):
         return {**parts, "progress": pack_part(progress)}
 
     def restore(self, parts: Parts) -> Errors:
-        """Replace the state by saved parts. An image that was planned for another rate is sent from its beginning.
+        """Replace the state by saved parts; return why parts were skipped.
 
-        Returns:
-            Why parts were skipped.
+        An image that was planned for another rate is sent from its beginning.
         """
         reader = PartReader(parts, "paper sender state")
         images = reader.read_group("image", WaitingImage, apply=self._plan)

@@ -457,11 +457,7 @@ class V1Receiver:
         return parts
 
     def restore(self, parts: Parts) -> Errors:
-        """Replace the state by saved parts; the configuration stays.
-
-        Returns:
-            Why parts were skipped.
-        """
+        """Replace the state by saved parts; the configuration stays. Return why parts were skipped."""
         reader = PartReader(parts, "v1 receiver state")
         self.counts = reader.read("counts", V1ReceiverCounts) or V1ReceiverCounts()
         peers = {peer.address: peer for peer in reader.read_group("peer", PeerState)}

@@ -491,13 +491,10 @@ class V1Sender:
         return parts
 
     def restore(self, parts: Parts) -> Errors:
-        """Replace the state by saved parts; the configuration stays.
+        """Replace the state by saved parts; the configuration stays. Return why parts were skipped.
 
         If a part other than an image cannot be read, the progress is unknown: the sender then starts again with all
         images that are not delivered.
-
-        Returns:
-            Why parts were skipped.
         """
         reader = PartReader(parts, "sender state")
         images = reader.read_group("image", OutgoingImage, progress="image-progress")
