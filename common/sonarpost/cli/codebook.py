@@ -46,8 +46,8 @@ def _add_build(actions: Subparsers) -> None:
         "--rounds",
         default=DEFAULT_ROUNDS,
         metavar="FOM:RMS[:IMAGES],...",
-        help="images below this figure of merit add tiles farther than this many grey levels RMS; maximum number of "
-        f"images (default: {DEFAULT_ROUNDS}, the paper's 39 and 320 of 400-pixel tiles)",
+        help="for each round: figure of merit below which an image adds tiles, grey levels RMS from which a tile is "
+        f"new, maximum number of images (default: {DEFAULT_ROUNDS}, the paper's 39 and 320 of 400-pixel tiles)",
     )
     parser.add_argument(
         "--dims", type=int, default=MAX_DIMS, metavar="N", help=f"dimensions of the basis (default: {MAX_DIMS})"
@@ -68,7 +68,7 @@ def _add_info(actions: Subparsers) -> None:
 
 def _add_diff(actions: Subparsers) -> None:
     parser = actions.add_parser(
-        "diff", help="show the differences of two codebooks", description="Exit status 0: same identity; 1: different."
+        "diff", help="compare two codebooks", description="Compare two codebooks. Exit status 1: they differ."
     )
     parser.add_argument("first", metavar="A", help="nominal-10, nominal-20 or a file")
     parser.add_argument("second", metavar="B", help="the other codebook")

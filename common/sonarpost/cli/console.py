@@ -1,4 +1,4 @@
-"""`sonarpost console`: manages the users of the console, and serves a training console."""
+"""Manage the users of the console, and serve a training console."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def parser(command: str = "") -> argparse.ArgumentParser:
     """Return the parser of one command, or of all of them where the name is not one."""
     whole = argparse.ArgumentParser(
         prog="sonarpost",
-        description="Side-scan-sonar snippets from an underwater vehicle, by acoustic modem, to ship and shore.",
+        description="Send images of sonar contacts from an underwater vehicle to a vessel and a shore site.",
     )
     whole.add_argument("--version", action="version", version=f"sonarpost {__version__}")
     subparsers = whole.add_subparsers(metavar="COMMAND", required=False)

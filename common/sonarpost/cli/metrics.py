@@ -44,7 +44,7 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="S",
         help="time after which all metrics of a stopped service are removed (default: %(default)s)",
     )
-    parser.add_argument("--log-format", choices=("text", "json"), default="text", help="form of log lines")
+    parser.add_argument("--log-format", choices=("text", "json"), default="text", help="format of log lines")
     parser.set_defaults(run=run)
 
 

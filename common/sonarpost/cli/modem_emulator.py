@@ -33,42 +33,45 @@ def add_parser(subparsers: Subparsers) -> None:
         'output is a JSON object, {"modems":[{"address":1,"device":"…"},…]}. Open the devices with any serial program '
         "or, for TCP, with a socket:// URL.",
     )
-    parser.add_argument("--modems", type=int, default=2, metavar="N", help="number of modems, addresses from 1 (2)")
+    parser.add_argument("--modems", type=int, default=2, metavar="N", help="number of modems (default: 2)")
     ports = parser.add_mutually_exclusive_group()
     ports.add_argument(
-        "--pty", type=Path, nargs="?", const=Path("modems"), metavar="DIR", help="links modem-1, … in DIR (./modems)"
+        "--pty",
+        type=Path,
+        nargs="?",
+        const=Path("modems"),
+        metavar="DIR",
+        help="links modem-1, … in DIR (default: modems)",
     )
     ports.add_argument(
-        "--tcp", type=int, nargs="*", metavar="PORT", help="TCP port of each modem, 0 for a free one; none: all free"
+        "--tcp", type=int, nargs="*", metavar="PORT", help="a TCP port for each modem; default: free ports"
     )
-    parser.add_argument("--mm", type=int, choices=(1, 2), default=2, help="Micro-Modem 1 or 2 (2)")
+    parser.add_argument("--mm", type=int, choices=(1, 2), default=2, help="Micro-Modem generation (default: 2)")
     parser.add_argument(
-        "--transponder",
-        action="append",
-        default=[],
-        metavar="LETTER=EAST,NORTH,DEPTH",
-        help="a ranging transponder A to D, metres from modem 1",
+        "--spacing", type=float, default=100.0, metavar="M", help="metres between modems (default: 100)"
     )
-    parser.add_argument("--spacing", type=float, default=100.0, metavar="M", help="metres between the modems (100)")
-    parser.add_argument("--preset", choices=list(PRESETS), help="set of channel parameters (still)")
-    parser.add_argument("--channel", type=Path, metavar="FILE", help="TOML file of channel parameters, over the preset")
+    parser.add_argument("--preset", choices=list(PRESETS), help="set of channel parameters (default: still)")
+    parser.add_argument("--channel", type=Path, metavar="FILE", help="TOML file with parameters; overrides the preset")
     parser.add_argument("--water", dest="renamed_water", help=argparse.SUPPRESS)
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="any channel parameter, over the file"
-    )
-    parser.add_argument("--loss", type=float, metavar="P", help="probability that a frame is lost (0)")
-    parser.add_argument("--packet-loss", type=float, metavar="P", help="probability that a packet is lost (0)")
-    parser.add_argument("--tail-damage", type=float, metavar="P", help="probability of a damaged tail (0)")
-    parser.add_argument("--range-loss", action="store_true", help="lose frames by signal-to-noise ratio too")
-    parser.add_argument("--snr-at-1m", type=float, metavar="DB", help="signal-to-noise ratio at 1 m (60)")
-    parser.add_argument("--seed", type=int, metavar="N", help="seed of every random draw (0)")
-    parser.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="simulated seconds per second (1)")
-    parser.add_argument(
-        "--airtime", action="append", default=[], metavar="RATE=S", help="air time of a rate, instead of the nominal"
-    )
-    parser.add_argument("--baud", type=float, metavar="B", help="simulate the speed of the serial lines, as 19200")
+    for name, metavar, text in (
+        ("loss", "P", "probability that a frame is lost (default: 0)"),
+        ("packet-loss", "P", "probability that a packet is lost (default: 0)"),
+        ("tail-damage", "P", "probability that the tail of a packet is damaged (default: 0)"),
+        ("snr-at-1m", "DB", "signal-to-noise ratio at 1 m (default: 60)"),
+        ("baud", "B", "speed of the serial lines, for example 19200 (default: 0, no delay)"),
+    ):
+        parser.add_argument(f"--{name}", type=float, metavar=metavar, help=text)
+    for name, metavar, text in (
+        ("set", "NAME=VALUE", "a channel parameter; overrides the file"),
+        ("transponder", "LETTER=EAST,NORTH,DEPTH", "a ranging transponder, A to D; metres from modem 1"),
+        ("airtime", "RATE=S", "air time of a rate in seconds, instead of the nominal one"),
+    ):
+        parser.add_argument(f"--{name}", action="append", default=[], metavar=metavar, help=text)
+    parser.add_argument("--range-loss", action="store_true", help="lose frames also by signal-to-noise ratio")
+    parser.add_argument("--seed", type=int, metavar="N", help="seed of every random draw (default: 0)")
+    parser.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="simulated seconds per second")
     parser.add_argument("--log", type=Path, metavar="FILE", help="append the outcome of every packet, as JSON lines")
-    parser.add_argument("--json", action="store_true", help="print those JSON lines too, instead of text")
+    parser.add_argument("--json", action="store_true", help="print the outcome of every packet, as JSON lines")
     parser.set_defaults(run=run)
 
 

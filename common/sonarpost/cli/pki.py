@@ -41,7 +41,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
     init = _add_action(actions, "init", run_init, "create the fleet's authority in a new folder")
     init.add_argument("--fleet", default="sonarpost", metavar="NAME", help="name of the fleet")
-    init.add_argument("--days", type=int, default=AUTHORITY_DAYS, help=f"validity in days ({AUTHORITY_DAYS})")
+    init.add_argument("--days", type=int, default=AUTHORITY_DAYS, help=f"validity in days (default: {AUTHORITY_DAYS})")
     _add_passphrase_file(init)
     init.add_argument("--ask-passphrase", action="store_true", help="ask for a passphrase at the terminal")
 
@@ -56,11 +56,13 @@ def add_parser(subparsers: Subparsers) -> None:
 
     revoke = _add_action(actions, "revoke", run_revoke, "remove a platform's name from access control permanently")
     revoke.add_argument("platform", help="name of the platform")
-    revoke.add_argument("--reason", default="", help="reason, for the list")
+    revoke.add_argument("--reason", default="", help="reason of the revocation, for `list`")
 
     listing = _add_action(actions, "list", run_list, "list all certificates; exit status 1 if one in use ends soon")
-    listing.add_argument("--json", action="store_true", help="one JSON object for each line")
-    listing.add_argument("--warn-days", type=float, default=WARN_DAYS, metavar="DAYS", help="limit of soon (30)")
+    listing.add_argument("--json", action="store_true", help="print one JSON object for each certificate")
+    listing.add_argument(
+        "--warn-days", type=float, default=WARN_DAYS, metavar="DAYS", help="a certificate ends soon within DAYS (30)"
+    )
 
     router = _add_action(actions, "router-config", run_router_config, "write a router's configuration (JSON5)")
     _add_router_options(router)
@@ -74,7 +76,12 @@ def _add_action(
 ) -> argparse.ArgumentParser:
     parser = actions.add_parser(name, allow_abbrev=False, help=text)
     parser.add_argument(
-        "--dir", type=Path, default=DEFAULT_FOLDER, dest="folder", metavar="DIR", help="folder of the authority (pki)"
+        "--dir",
+        type=Path,
+        default=DEFAULT_FOLDER,
+        dest="folder",
+        metavar="DIR",
+        help="authority's folder (default: pki)",
     )
     parser.set_defaults(run=run)
     return parser
@@ -88,8 +95,10 @@ def _add_certificate_options(parser: argparse.ArgumentParser) -> None:
         metavar="NAME_OR_ADDRESS",
         help="DNS name or IP address of its router; can be repeated",
     )
-    parser.add_argument("--days", type=float, default=CERTIFICATE_DAYS, help=f"validity in days ({CERTIFICATE_DAYS:g})")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="new folder for its files (DIR/issued/NAME)")
+    parser.add_argument(
+        "--days", type=float, default=CERTIFICATE_DAYS, help=f"days of validity (default: {CERTIFICATE_DAYS:g})"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="new folder for its files (default: DIR/issued/NAME)")
     _add_passphrase_file(parser)
 
 
@@ -103,19 +112,19 @@ def _add_router_options(parser: argparse.ArgumentParser) -> None:
     default = RouterOptions("")
     parser.add_argument("--platform", required=True, help="platform of the router")
     parser.add_argument(
-        "--listen", nargs="*", default=[], metavar="ENDPOINT", help="for other platforms: tls/ADDRESS:PORT"
+        "--listen", nargs="*", default=[], metavar="ENDPOINT", help="endpoint for other platforms: tls/ADDRESS:PORT"
     )
     parser.add_argument(
         "--local",
         nargs="*",
         default=list(default.local),
         metavar="ENDPOINT",
-        help=f"for the platform's own services, without certificates ({', '.join(default.local)})",
+        help=f"endpoint of the platform's own services, no certificates (default: {', '.join(default.local)})",
     )
     parser.add_argument(
         "--open-local",
         action="store_true",
-        help="allow other than loopback addresses there: no other program can reach that network",
+        help="accept other addresses than loopback in --local, for a network that no other program can reach",
     )
     parser.add_argument(
         "--connect", nargs="*", default=[], metavar="ENDPOINT", help="routers to link to: tls/HOST:PORT"

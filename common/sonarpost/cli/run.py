@@ -16,7 +16,7 @@ from sonarpost.config import SERVICES
 def add_parser(subparsers: Subparsers) -> None:
     """Add the subcommands."""
     run = subparsers.add_parser("run", help="run one service of the chain", description="Run one service.")
-    run.add_argument("service", choices=SERVICES, help="name of the service, a table of the file")
+    run.add_argument("service", choices=SERVICES, help="name of the service")
     run.add_argument("--config", type=Path, required=True, help="TOML file of the platform")
     run.set_defaults(run=run_service)
     route = subparsers.add_parser("router", help="run an embedded Zenoh router", description=router.__doc__)

@@ -36,10 +36,14 @@ def add_parser(subparsers: Subparsers) -> None:
     ):
         value = getattr(default, name)
         option = f"--{name.replace('_', '-')}"
-        parser.add_argument(option, type=type(value), default=value, help=f"{text} (%(default)s)")
+        parser.add_argument(option, type=type(value), default=value, help=f"{text} (default: %(default)s)")
     kinds = [kind.value for kind in SeabedKind]
-    parser.add_argument("--seabed", choices=kinds, default=default.seabed.value, help="type of seabed (%(default)s)")
-    parser.add_argument("--bits", type=int, choices=(8, 16), default=default.bits, help="bits per sample (%(default)s)")
+    parser.add_argument(
+        "--seabed", choices=kinds, default=default.seabed.value, help="type of seabed (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--bits", type=int, choices=(8, 16), default=default.bits, help="bits per sample (default: %(default)s)"
+    )
     parser.add_argument("--truth", type=Path, metavar="FILE.json", help="write the ground truth as JSON")
     parser.set_defaults(run=run_simulate)
 

@@ -32,6 +32,7 @@ from sonarpost.files import write_atomically
 
 PIPED_WIDTH = 160
 FORMATS = ("geojson", "kml", "kmz", "csv")
+LABELS = {"geojson": "GeoJSON", "kml": "KML", "kmz": "KMZ", "csv": "CSV"}
 EXIT_INCOMPLETE = 1
 
 _AGO = re.compile(r"(\d+(?:\.\d+)?)([smhd])")
@@ -90,12 +91,12 @@ def add_actions(actions: Subparsers) -> None:
     export = actions.add_parser("export", help="write GeoJSON, KML, KMZ or CSV, or send Cursor-on-Target events")
     _add_filters(export)
     for name in FORMATS:
-        export.add_argument(f"--{name}", type=Path, metavar="FILE", help=f"write {name} to FILE")
+        export.add_argument(f"--{name}", type=Path, metavar="FILE", help=f"write {LABELS[name]} to FILE")
     export.add_argument("--cot", metavar="URL", help="send events to tcp://host:port, tls://… or udp://…")
     for name in ("ca", "certificate", "key"):
         export.add_argument(f"--cot-{name}", type=Path, metavar="PEM", help=f"{name} for --cot tls://…")
     export.add_argument(
-        "--cot-wait", type=float, default=10.0, metavar="SECONDS", help="time limit for reaching the endpoint (10)"
+        "--cot-wait", type=float, default=10.0, metavar="SECONDS", help="time limit for connecting (default: 10)"
     )
     export.set_defaults(run=run_export)
 

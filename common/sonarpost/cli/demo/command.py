@@ -46,20 +46,20 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--survey", type=Path, metavar="FILE_OR_DIR", help="survey file, or a folder of them")
     source.add_argument("--images", type=Path, metavar="DIR", help="send the TIFF and PNG snippets of a folder instead")
-    parser.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="(default %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="output (default: demo-out)")
     link = parser.add_mutually_exclusive_group()
     link.add_argument(
         "--link",
         choices=("v1", "paper"),
         default="v1",
-        help="wire format: v1 with the codec emb, or the paper's with its tile codec (default %(default)s)",
+        help="wire format: v1 with the codec emb, or the paper's with its tile codec (default: %(default)s)",
     )
     link.add_argument("--paper", action="store_const", const="paper", dest="link", help="short for --link paper")
-    parser.add_argument("--rate", type=int, default=1, choices=sorted(RATES), help="Micro-Modem rate (default 1)")
-    parser.add_argument("--loss", type=_probability, default=0.0, metavar="P", help="probability of losing a frame")
+    parser.add_argument("--rate", type=int, default=1, choices=sorted(RATES), help="Micro-Modem rate (default: 1)")
+    parser.add_argument("--loss", type=_probability, default=0.0, metavar="P", help="probability that a frame is lost")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the survey and channel simulators")
     parser.add_argument(
-        "--time-scale", type=_positive, default=20.0, metavar="X", help="simulated seconds a second (default 20)"
+        "--time-scale", type=_positive, default=20.0, metavar="X", help="simulated seconds per second (default: 20)"
     )
     parser.add_argument(
         "--console", action="store_true", help="serve the operator's page and keep it open at the end until Ctrl-C"

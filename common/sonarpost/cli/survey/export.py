@@ -32,7 +32,7 @@ def add_action(actions: Subparsers) -> None:
     """Add the action."""
     parser = actions.add_parser("export", help="write the track of a recording as CSV or GeoJSON")
     parser.add_argument("file", type=Path, metavar="FILE", help="survey file")
-    parser.add_argument("--format", choices=("csv", "geojson"), default="csv", help="(default: %(default)s)")
+    parser.add_argument("--format", choices=("csv", "geojson"), default="csv", help="output format (default: csv)")
     parser.add_argument("--out", type=Path, metavar="FILE", help="output file (default: standard output)")
     add_option_flags(parser)
     parser.set_defaults(run=run)

@@ -25,7 +25,7 @@ def add_action(actions: Subparsers) -> None:
     """Add the action."""
     parser = actions.add_parser("info", help="list contents and irregularities of recordings")
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="survey file")
-    parser.add_argument("--json", action="store_true", help="print one JSON object a file, one a line")
+    parser.add_argument("--json", action="store_true", help="print one JSON object for each file, one per line")
     add_option_flags(parser)
     parser.set_defaults(run=run)
 
